@@ -5,6 +5,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
+SingleComplex = npt.NDArray[np.complex64]
 Complex = npt.NDArray[np.complex128]
 Whole = npt.NDArray[np.intp]
 Long = npt.NDArray[np.int64]

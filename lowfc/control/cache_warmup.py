@@ -6,8 +6,8 @@ LATEST_NS = 80_000
 """Time before the next frame after which a warm-up would delay it."""
 MIN_PERIOD_NS = 500_000
 """Frame period below which there is no time for a warm-up, and no need: the caches stay warm."""
-DRIFT = 50
-"""The schedule moves by 1/DRIFT of the lateness of a frame."""
+LATENESS_DIVISOR = 50
+"""A late frame moves the schedule by its lateness divided by this."""
 
 
 class CacheWarmup:
@@ -28,7 +28,7 @@ class CacheWarmup:
         if not 0 <= late_ns <= LEAD_NS:
             self._due_ns = now_ns
         else:
-            self._due_ns += late_ns // DRIFT
+            self._due_ns += late_ns // LATENESS_DIVISOR
         self._due_ns += self._period_ns
         self._pending = self._period_ns > MIN_PERIOD_NS
 

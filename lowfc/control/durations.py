@@ -19,16 +19,16 @@ class Durations:
 
     def add(self, duration_ns: int) -> None:
         """Count one duration."""
-        place = int(log(duration_ns / _MIN_NS) * _PER_RATIO) + 1 if duration_ns > _MIN_NS else 0
-        self._counts[min(place, _BINS - 1)] += 1
+        index = int(log(duration_ns / _MIN_NS) * _BINS_PER_LOG) + 1 if duration_ns > _MIN_NS else 0
+        self._counts[min(index, _BINS - 1)] += 1
         self.count += 1
         self.max_ns = max(self.max_ns, duration_ns)
 
     def percentiles_ns(self, *fractions: float) -> list[int]:
-        """Percentiles for these fractions, to the upper edge of a bin; 0 if nothing was counted."""
-        places = np.searchsorted(np.cumsum(self._counts), np.ceil(np.array(fractions) * self.count))
-        edges_ns = [round(_MIN_NS * RATIO ** int(place)) if place < _BINS - 1 else self.max_ns for place in places]
+        """Percentiles for these fractions (0 to 1), rounded up to the edge of a bin; 0 if nothing was counted."""
+        indices = np.searchsorted(np.cumsum(self._counts), np.ceil(np.array(fractions) * self.count))
+        edges_ns = [round(_MIN_NS * RATIO ** int(index)) if index < _BINS - 1 else self.max_ns for index in indices]
         return [min(edge_ns, self.max_ns) for edge_ns in edges_ns]
 
 
-_PER_RATIO = 1 / log(RATIO)
+_BINS_PER_LOG = 1 / log(RATIO)

@@ -17,7 +17,7 @@ _SETTLING_TIME_CONSTANTS = 8.0  # time constants of the slowest mode that are di
 
 @dataclass(frozen=True, eq=False)
 class DriftTrial:
-    """Sensor, flux and exposure of a simulated loop.
+    """Sensor, flux and exposure of a simulated loop with a delay of one frame.
 
     Attributes:
         twin: twin of the sensor.
@@ -38,8 +38,8 @@ class DriftTrial:
 
         Args:
             step_nm2: (modes,) variance of each mode's step in a frame, nm^2.
-            gain: (modes,) gains of the integrators; 0 for a mode that is not controlled.
-            frames: Number of frames averaged.
+            gain: (modes,) gains of the integrators; 0 for a mode that is not controlled, but not for all.
+            frames: Number of frames averaged, after those in which the loop settles.
             rng: Generator of all random numbers.
         """
         basis = zernikes(self.noll, *node_radii(self.twin))

@@ -32,7 +32,7 @@ class Focus:
     Attributes:
         band: Passband of Table 4.
         forms: Quadratic forms of the pupil.
-        fields: By wavelength, (1 + modes, k, k) field of the flat wavefront and first-order fields of the 20 modes.
+        fields: By wavelength in nm, (1 + modes, k, k) fields of the pupil, and of the pupil times each of the 20 modes.
         wavefronts_nm: By the number of modes, (wavefronts, modes) random wavefronts matched to Table 3's input.
         aberrated: By the number of modes, (wavefronts, k, k) fields of these wavefronts at the central wavelength.
     """
@@ -130,12 +130,12 @@ class FullLight:
 
 
 @lru_cache(maxsize=8)
-def _nonlinearity_waves(one: FullLight, modes: int) -> float:
-    signal, truth = one.central(), one.focus.wavefronts_nm[modes]
+def _nonlinearity_waves(candidate: FullLight, modes: int) -> float:
+    signal, truth = candidate.central(), candidate.focus.wavefronts_nm[modes]
     R = reconstructor(signal.I0, signal.H[:, :modes], np.ones_like(signal.I0), 1.0, 0.0, "pinv")
-    images = [one.image(field) for field in one.focus.aberrated[modes]]
+    images = [candidate.image(field) for field in candidate.focus.aberrated[modes]]
     residuals = truth - (np.array(images) - signal.I0) @ R.T
-    return float(residual_rms(one.forms.gram[:modes, :modes], residuals).mean()) / WAVELENGTH_NM
+    return float(residual_rms(candidate.forms.gram[:modes, :modes], residuals).mean()) / WAVELENGTH_NM
 
 
 def sweep(merit_of: Callable[[float], float], low: float, high: float, count: int) -> tuple[Array, float]:
@@ -144,7 +144,7 @@ def sweep(merit_of: Callable[[float], float], low: float, high: float, count: in
     The refinement searches between the neighbours of the best evenly spaced value.
 
     Args:
-        merit_of: Merit of a value.
+        merit_of: Function from a value to its merit, which is minimised.
         low: Lower end of the range.
         high: Upper end; equal to `low` for a single value.
         count: Number of values, at least 3.

@@ -10,9 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lowfc.arrays import Array, Complex
+from lowfc.arrays import Array, Complex, SingleComplex
 from lowfc.design.merit import WAVELENGTH_NM, PupilForms, Signal
 from lowfc.optics.chain.band import Band, uniform
 from lowfc.optics.chain.focal_mask import bowtie, disk
@@ -20,8 +19,8 @@ from lowfc.optics.chain.fourier import kernel, to_image, to_pupil
 from lowfc.optics.chain.grid import OPEN_AREA, pupil_axis
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
 
-Single = NDArray[np.complex64]
 Hole = tuple[float, float, float]
+"""Centre x, y and diameter of a hole, in pupil diameters."""
 
 FOCAL_MASKS: dict[str, Callable[[int], Array]] = {"disk": disk, "bowtie": bowtie}
 
@@ -30,6 +29,7 @@ IMAGE_WIDTH = 20
 PIXELS_PER = 4
 """Pixels per lambda0 / D (Table 1)."""
 FOCAL_SAMPLES_PER = 8
+"""Samples on the focal-plane mask per lambda0 / D (Sect. 3)."""
 _PIXEL = 1.0 / (PIXELS_PER**2 * OPEN_AREA)
 """Fraction of the open circle's light on a pixel at which the field is 1."""
 
@@ -43,6 +43,7 @@ and up to 1.4e-3 for a single wavefront. The constants are within 12 % of the me
 mean squares."""
 
 RELAY_SAMPLES = 128
+"""Samples across the relay pupil."""
 SAMPLES_PER = 2
 """Samples at the sensor per lambda0 / D: half as many as pixels, which still sample the image completely."""
 
@@ -56,8 +57,8 @@ class Group:
         kernel: (samples, relay) kernel from the relay pupil to the sensor, along one axis; conserves energy.
     """
 
-    relay: Single
-    kernel: Single
+    relay: SingleComplex
+    kernel: SingleComplex
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,7 @@ class Optics:
     band_modes: int
     forms: PupilForms
     samples_per: int
-    at_pixels: Single
+    at_pixels: SingleComplex
 
 
 def build_optics(
@@ -134,7 +135,7 @@ def build_optics(
     )
 
 
-def hole_fields(optics: Optics, hole: Hole) -> Single:
+def hole_fields(optics: Optics, hole: Hole) -> SingleComplex:
     """Contribution of a hole (x, y, diameter) to the fields (fields, samples, samples) at the sensor, eqs. (2), (6).
 
     Samples on the rim are weighted by the fraction that the hole covers.
@@ -162,7 +163,7 @@ class Mask:
     """
 
     optics: Optics
-    fields: Single
+    fields: SingleComplex
     paper_tilt = "sam"
 
     @property
@@ -214,7 +215,7 @@ def _covered(samples: int, centre: float, diameter: float) -> slice:
     return slice(max(first, 0), min(last, samples))
 
 
-def _image_and_response(fields: Single, wavelength_nm: float) -> tuple[Array, Array]:
+def _image_and_response(fields: SingleComplex, wavelength_nm: float) -> tuple[Array, Array]:
     """Image (samples,) per pixel, and its derivative (samples, modes) per nm; 2 Im{E0 conj(Ek)}."""
     flat, modes = fields[0], fields[1:]
     I0 = (flat.real**2 + flat.imag**2).ravel().astype(np.float64)

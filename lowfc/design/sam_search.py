@@ -9,8 +9,9 @@ from math import ceil, exp, hypot, inf, log
 
 import numpy as np
 
+from lowfc.arrays import SingleComplex
 from lowfc.design.goal import Goal, merit
-from lowfc.design.sam_merit import RELAY_SAMPLES, Mask, Optics, Single, hole_fields
+from lowfc.design.sam_merit import RELAY_SAMPLES, Mask, Optics, hole_fields
 
 Orbit = tuple[int, int, int]
 """Centre x, y and diameter of a hole, in thousandths of the pupil's diameter."""
@@ -51,8 +52,8 @@ class Bounds:
             raise ValueError(f"the number of holes must be at least 1 and in order, got {self.count}")
         if not SMALLEST <= self.diameter[0] <= self.diameter[1] <= UNIT - 2 * self.edge:
             raise ValueError(
-                f"hole diameters must be in order and lie between {SMALLEST / UNIT} and 1 pupil diameter less the "
-                f"edge, got {self.diameter[0] / UNIT} to {self.diameter[1] / UNIT}"
+                f"hole diameters must be in order and lie between {SMALLEST / UNIT} and {1 - 2 * self.edge / UNIT:g} "
+                f"pupil diameters, got {self.diameter[0] / UNIT} to {self.diameter[1] / UNIT}"
             )
         if self.gap < 0 or self.edge < 0:
             raise ValueError(f"gaps must not be negative, got {self.gap / UNIT} and {self.edge / UNIT}")
@@ -147,7 +148,7 @@ def images(orbit: Orbit, symmetry: str) -> tuple[Orbit, ...]:
     return (orbit,) if mirrored == orbit else (orbit, mirrored)
 
 
-def orbit_fields(optics: Optics, orbit: Orbit, symmetry: str) -> Single:
+def orbit_fields(optics: Optics, orbit: Orbit, symmetry: str) -> SingleComplex:
     """Contribution of the orbit's holes to the fields at the sensor."""
     return np.asarray(np.sum([hole_fields(optics, hole) for hole in holes((orbit,), symmetry)], axis=0))
 

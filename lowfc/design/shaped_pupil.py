@@ -46,7 +46,7 @@ class Request:
         outer: Outer radius of the dark zone, in lambda/D.
         half_angle_deg: Half-angle of the dark zone from the x axis, on both sides, in degrees; 90: all around.
         contrast: Largest intensity in the dark zone, over the star's peak; checked every 0.1 lambda/D and on its edges.
-        limit: Contrast in the linear programs, over the required one; below 1 fewer rounds are needed.
+        limit: Contrast in the linear programs, over the required one: a value below 1 saves rounds.
         cells: Cells in half the diameter: 8, 16, 32, 64, 128 or 256.
         step: Spacing of the first grid of points, in lambda/D.
         symmetry: quarter: about both axes; octant: also about the diagonals, for the zone too; four times faster.
@@ -68,8 +68,8 @@ class Request:
             raise ValueError(f"cells must be 8, 16, 32, 64, 128 or 256 in half the diameter, got {self.cells}")
         if not 0 < self.inner <= _last_inner(self.outer) or self.outer > self.cells:
             raise ValueError(
-                f"the dark zone must begin above 0 and end at least {FINE_STEP:g} lambda/D above that, by the number "
-                f"of cells in half the diameter ({self.cells} lambda/D) at most; got {self.inner:g} to "
+                f"the dark zone must begin above 0, end at least {FINE_STEP:g} lambda/D further out, and end at most "
+                f"at the number of cells in half the diameter, {self.cells} lambda/D; got {self.inner:g} to "
                 f"{self.outer:g} lambda/D"
             )
         if not 0 < self.half_angle_deg <= 90:

@@ -32,6 +32,7 @@ Kind = Literal["integrator", "lqg"]
 KINDS: tuple[Kind, ...] = ("integrator", "lqg")
 
 DELAY = 1.0
+"""Delay of the loop, frames: a command takes effect at the next frame."""
 _MIN_DRIFT = 1e-12  # drift in the model of a filter for a line only, nm^2 per frame
 _GAINS = np.geomspace(0.01, 1.0, 30)
 _LINE_RATIOS = np.geomspace(1e-6, 1e10, 49)  # variance of a line over that of a frame's noise
@@ -116,5 +117,5 @@ def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> 
 
 def tolerated_variance(form: float, quartic: float, contrast: float) -> float:
     """Variance, nm^2, of a Gaussian mode that adds this mean contrast, if amplitude a adds form a^2 + quartic a^4."""
-    root = np.sqrt(form**2 + 12.0 * max(quartic, 0.0) * contrast)
+    root = np.sqrt(form**2 + 12.0 * max(quartic, 0.0) * contrast)  # the mean of a^4 is three times the variance squared
     return float(2.0 * contrast / (form + root))

@@ -266,6 +266,7 @@ def test_the_number_of_channels_is_limited() -> None:
     for number in range(MAX_CHANNELS):
         assert loop.ask("channel", text=f"c{number}", actuators_nm=shape).accepted
     assert not loop.ask("channel", text="one-more", actuators_nm=shape).accepted
+    assert "no channel 'one-more' to remove" in loop.ask("channel", text="one-more").text
     assert loop.ask("channel", text="c3", actuators_nm=2 * shape).accepted
 
 

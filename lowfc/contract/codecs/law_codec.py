@@ -127,4 +127,4 @@ def command_channels_of(
             raise ValueError(f"the table {one.id[:12]} of the probe sequence is missing")
         else:
             play = Play(plays[one.id], one.first_sequence, one.frames)
-    return empty._replace(offset_nm=offset_nm, shifts_nm=tuple(shifts_nm), play=play).at(channels, to_modes)
+    return empty._replace(offset_nm=offset_nm, shifts_nm=tuple(shifts_nm), play=play).with_all(channels, to_modes)

@@ -17,6 +17,7 @@ def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_
 
     Pixels that were bad stay bad. I0 and H are normalised to the flux on the remaining pixels. A plain R is recomputed
     from them, for this read noise of a pixel and electrons per DN; any other keeps its response to the modes.
+    `operator_hash` and `id` of the result are empty.
 
     Raises:
         ValueError: the remaining pixels do not tell the modes apart.
@@ -41,7 +42,10 @@ def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_
 def with_reference(
     calibration: Calibration, reference: Array, flux_dn: float, read_noise_e: float, gain_e: float
 ) -> Calibration:
-    """The calibration with another zero point (pixels,), in flux fractions, and mean flux; H stays.
+    """The calibration with another zero point (pixels,), in flux fractions, and mean flux, DN.
+
+    H stays. A plain R is recomputed, for this read noise of a pixel and electrons per DN; any other stays.
+    `operator_hash` and `id` of the result are empty.
 
     Raises:
         ValueError: there is no light on the good pixels.
@@ -54,10 +58,9 @@ def with_reference(
 
 
 def _is_plain(calibration: Calibration) -> bool:
-    """Whether R follows from I0 and H.
+    """Whether R is plain: computed from I0 and H, without nuisance parameters and regularisation.
 
-    It does not if nuisance parameters are fitted or R is regularised, and the noise of a measured H must not enter R
-    (see `regularised`).
+    That of a measured H is not, since the noise of H must not enter it (see `regularised`).
     """
     estimator, *parts = calibration.estimator.split("+")
     return estimator in ESTIMATORS and all(part in ("aligned", "first") or part.startswith("at ") for part in parts)

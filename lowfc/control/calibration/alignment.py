@@ -90,10 +90,8 @@ def align(real: Array, computed: Array) -> Alignment:
     light = real - background
     if not light.sum() > 0:
         raise ValueError("the reference image has no light above its edge")
-    scales = {
-        _size(light) / _size(np.asarray(computed, np.float64)),
-        1.0,
-    }  # a detector region may cut off the image's wings
+    # 1: a detector region may cut off the image's wings.
+    scales = {_size(light) / _size(np.asarray(computed, np.float64)), 1.0}
     spectrum = np.fft.rfft2(light, _doubled(light.shape))
     fits = []
     for parity in (1, -1):

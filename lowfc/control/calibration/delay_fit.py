@@ -55,9 +55,8 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
     """
     if len(fractions) < MIN_FRAMES:
         raise ValueError(f"the delay needs at least {MIN_FRAMES} frames without a gap, got {len(fractions)}")
-    light = np.sqrt(
-        np.maximum(reference, 0) + 1e-3 * reference.max()
-    )  # photon noise is proportional to the square root of the light
+    # Photon noise is proportional to the square root of the light.
+    light = np.sqrt(np.maximum(reference, 0) + 1e-3 * reference.max())
     first = LAGS - 1
     instruments = _lagged(poke)
     moved = instruments if command is None else _lagged(poke + command)

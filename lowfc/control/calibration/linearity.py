@@ -59,7 +59,8 @@ class Gains:
 def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Whole, frames: int) -> Gains:
     """Gain and cross-talk of a mode that followed the levels (levels,) of `levels`, from open-loop errors.
 
-    Errors are (frames, modes); `starts` (levels,) are the first of the `frames` frames that saw each level.
+    Errors are (frames, modes); `starts` (levels,) are the first of the `frames` frames that saw each level. A
+    standard error needs two cycles or more.
     """
     means = np.stack([error_nm[start : start + frames].mean(axis=0) for start in starts])
     per_cycle = (means * np.sign(levels_nm)[:, None]).reshape(-1, len(_SIGNS), error_nm.shape[1]).mean(axis=1)

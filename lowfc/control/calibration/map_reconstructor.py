@@ -34,7 +34,7 @@ def map_reconstructor(
         calibration: The calibration in use.
         prior_nm2: (modes,) mean square of an uncorrected mode; 0 for a corrected mode.
         flux_dn: Sum of the good pixels, for the weights.
-        camera: Camera settings.
+        camera: Camera settings; if they or their gain are unknown, the calibration's own R is returned.
     """
     R, prior_nm2 = calibration.reconstructor, np.asarray(prior_nm2, np.float64)
     uncorrected = prior_nm2 > 0

@@ -23,7 +23,7 @@ class Plan:
     Attributes:
         table: (frames, columns) amplitudes of each frame's command, in the unit of its shapes: nm rms of wavefront for
             modes, nm of surface for single actuators.
-        used: (frames,) whether the exposure that sees only this row may be used.
+        used: (frames,) whether an exposure that sees this row alone may be used.
         per_column: number of frames of the cycle that measure each column.
     """
 
@@ -74,8 +74,8 @@ def cycle(patterns: Array, hold: int, settle: int, rest: int, *, backwards: bool
 def dither(columns: int, amplitude: float, frames: int, hold: int, seed: int) -> Plan:
     """Pseudo-random pushes and pulls of all modes at once, to be played in a closed loop.
 
-    Columns are modes, the amplitude is in nm rms of wavefront, and signs may change every `hold` frames: the loop
-    corrects 1 least. Each piece has its own seed.
+    Columns are modes, the amplitude is in nm rms of wavefront, and signs may change every `hold` frames: with a hold of
+    1, the loop removes least of the pokes. Each piece has its own seed.
     """
     rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, 7])))
     states = rng.integers(0, 2, (-(-frames // hold), columns)) * 2.0 - 1.0
@@ -104,13 +104,12 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
     lags = len(weights) - 1
     first = min(int(sequence[0]), 0) - lags
     last = max(int(sequence[-1]), 0)
-    row = np.full(last - first + 1, -1)  # place in the padded table, whose last row is zeros
-    obeyed = np.zeros(row.size, np.bool_)
-    obeyed[sequence[commanded] - first] = True
-    obeyed[: max(int(sequence[0]) - first, 0)] = True  # earlier commands are assumed to have been applied
-    places = np.arange(first, last + 1)
-    row = np.where((places >= 0) & (places < len(table)), places, len(table))
-    newest = np.maximum.accumulate(np.where(obeyed, np.arange(row.size), 0))
+    frames = np.arange(first, last + 1)
+    row = np.where((frames >= 0) & (frames < len(table)), frames, len(table))  # the padded table ends with zeros
+    applied = np.zeros(row.size, np.bool_)
+    applied[sequence[commanded] - first] = True
+    applied[: max(int(sequence[0]) - first, 0)] = True  # earlier commands are assumed to have been applied
+    newest = np.maximum.accumulate(np.where(applied, np.arange(row.size), 0))
     padded = np.vstack([table, np.zeros((1, table.shape[1]))])
     in_force = padded[row[newest]]
     at = sequence - first
@@ -128,7 +127,7 @@ def usable(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: 
     """
     place = sequence - lag
     within = (place >= 0) & (place < len(plan))
-    made = set(sequence[commanded].tolist())
-    whole = [all(n in made or n < 0 for n in range(at - lag - 1, at + 1)) for at in sequence.tolist()]
-    seen_whole = plan.used[np.clip(place, 0, len(plan) - 1)] & np.array(whole, dtype=np.bool_)
-    return np.asarray(within & seen_whole, dtype=np.bool_)
+    sent = set(sequence[commanded].tolist())
+    complete = [all(n in sent or n < 0 for n in range(at - lag - 1, at + 1)) for at in sequence.tolist()]
+    used = plan.used[np.clip(place, 0, len(plan) - 1)]
+    return np.asarray(within & used & np.array(complete, dtype=np.bool_), dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Reconstructor of a measured or computed response matrix, with optional truncation or damping.
+"""Reconstructor of a measured or computed response matrix H, with optional truncation or damping.
 
 A measured H contains the noise of thousands of pixels. Its own (H'WH)^-1 H'W contains that noise twice: it measures
 every mode too small, and adds noise to every frame. R = (R_a H)^-1 R_a, with any R_a of full rank that does not depend
@@ -13,7 +13,7 @@ from lowfc.arrays import Array
 from lowfc.control.calibration.calibration import ESTIMATORS
 from lowfc.control.calibration.response_fit import WORST_CONDITION
 
-_NOISE = (
+_SINGULAR = (
     "the response does not tell the modes apart: use more cycles, a larger amplitude or a brighter star; or drop "
     "combinations of modes with --truncate"
 )
@@ -58,7 +58,7 @@ def reconstruct(
         good: (pixels,) 1 for a used pixel, else 0.
         flux_e: Electrons on the good pixels.
         read_noise_e: Read noise of a pixel.
-        estimator: For a computed H: weighted or pinv, as for `control.calibration.reconstructor`.
+        estimator: For a computed H: weighted or pinv, as for `calibration.reconstructor`.
         truncate: Combinations of modes with a singular value below this fraction of the largest are dropped.
         tikhonov: Combinations are damped by s^2 / (s^2 + (tikhonov s_largest)^2).
 
@@ -78,7 +78,7 @@ def reconstruct(
         rows = initial * good
         product = rows @ response
         if not np.linalg.cond(product) < WORST_CONDITION:
-            raise ValueError(_NOISE)
+            raise ValueError(_SINGULAR)
         unbiased = np.linalg.solve(product, rows)
         power = np.linalg.inv((unbiased * variance) @ unbiased.T)  # H'WH for the weighted estimator
         signal = power @ unbiased
@@ -86,7 +86,7 @@ def reconstruct(
     squares, combinations = squares[::-1], combinations[:, ::-1]
     smallest = max(1e-16, truncate**2) * squares[0]
     if not squares[0] > 0 or (truncate == 0 and not squares[-1] > smallest):
-        raise ValueError(_NOISE)
+        raise ValueError(_SINGULAR)
     kept = np.where(squares > smallest, squares / (squares + tikhonov**2 * squares[0]), 0.0)
     inverse = (combinations * (kept / np.where(squares > smallest, squares, 1.0))) @ combinations.T
     matrix = inverse @ signal

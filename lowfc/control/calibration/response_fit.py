@@ -68,7 +68,7 @@ class Sums(NamedTuple):
 
     Attributes:
         initial: R_a.
-        answers: (cycles, modes, modes) R_a H of each cycle, without unit.
+        products: (cycles, modes, modes) R_a H of each cycle, without unit.
         response: (pixels, modes) sum of H.
         reference: (pixels,) sum of I0 over `references` cycles.
         references: number of cycles with frames without a poke.
@@ -76,7 +76,7 @@ class Sums(NamedTuple):
     """
 
     initial: Initial
-    answers: Array
+    products: Array
     response: Array
     reference: Array
     references: int
@@ -91,17 +91,16 @@ class Sums(NamedTuple):
     @property
     def cycles(self) -> int:
         """Number of cycles."""
-        return len(self.answers)
+        return len(self.products)
 
     def plus(self, cycle: Cycle) -> "Sums":
         """Sums with one more cycle."""
-        rested = cycle.reference is not None
         return Sums(
             self.initial,
-            np.concatenate([self.answers, (self.initial.matrix @ cycle.response)[None]]),
+            np.concatenate([self.products, (self.initial.matrix @ cycle.response)[None]]),
             self.response + cycle.response,
             self.reference + cycle.reference if cycle.reference is not None else self.reference,
-            self.references + rested,
+            self.references + (cycle.reference is not None),
             self.flux_dn + cycle.flux_dn,
         )
 
@@ -151,8 +150,7 @@ def cycle_response(
         seen: (frames, modes) modes of the mirror in each exposure, nm of wavefront.
         instruments: (frames, modes) instrumental variables: the poke alone in each exposure; `seen` in open loop.
         used: (frames,) 1 for a usable frame, else 0.
-        slowest: Frequency, cycles per frame; the slower part of the pokes is not used, since most of the disturbance is
-            there.
+        slowest: Lowest frequency of the pokes that is used, cycles per frame: most of the disturbance is below.
 
     Raises:
         ValueError: the pokes in the usable frames do not tell the modes apart.
@@ -187,8 +185,8 @@ def measured(sums: Sums) -> Measured:
     n = sums.cycles
     if n < 1:
         raise ValueError("no cycle was measured")
-    response, kept = sums.response / n, without_outliers(sums.answers)
-    mean = sums.answers.mean(axis=0)
+    response, kept = sums.response / n, without_outliers(sums.products)
+    mean = sums.products.mean(axis=0)
     if np.linalg.cond(mean) < WORST_CONDITION:
         response = response @ np.linalg.solve(mean, kept.mean(axis=0))
     reference = sums.reference / sums.references if sums.references else None
@@ -226,7 +224,7 @@ def row_error(products: Array) -> Array:
 
 
 def best_initial(candidates: list[Initial], response: Array, mode: int, variance: Array) -> Initial:
-    """The candidate with the least noise for a mode; a later one must be better than an earlier one by `_BETTER`.
+    """The candidate with the least noise for a mode; a later one needs less than `_BETTER` of an earlier one's noise.
 
     The response (pixels,) to a poke of the mode is in flux fractions; the variance (pixels,) is that of a frame.
     """

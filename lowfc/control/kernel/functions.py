@@ -21,8 +21,8 @@ def scan(
 ) -> tuple[np.uint64, np.uint16]:
     """Products of one block of a frame with R, in one pass over its counts.
 
-    Counts, used, dark and scratch are (block,), as in `measure`; the block's tiles begin at `row`. The result, not yet
-    normalised, is in `sums_nm` (modes rounded up to five,).
+    `counts`, `used` and `dark` are this block's part of `pixels`, `good` and `dark` in `measure`; the block's tiles
+    begin at `row`. The result, not yet normalised, is in `sums_nm` (modes rounded up to five,).
 
     Returns:
         Sum of the used counts, and the highest used count.
@@ -187,8 +187,8 @@ def respond(
         stroke_nm: largest deviation of an actuator from flat.
         slew_nm: largest move of an actuator.
         neighbour_nm: largest difference between neighbours.
-        results: (3 modes + states,) output: error without shift and target, pseudo-open-loop modes without shift,
-            command, x.
+        results: (3 modes + states,) output: error less shift and target, pseudo-open-loop modes less shift, command
+            and x.
         actuators_nm: (rows, columns) output, nm of surface.
 
     Returns:

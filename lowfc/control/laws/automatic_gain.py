@@ -9,7 +9,7 @@ from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.virtual import VirtualIntegrators, Weights
 
 MIN_GAIN = 1e-3
-"""Least gain of the rows, which start at the highest gain with margins and halve each time; another row has gain 0."""
+"""Lower limit of the rows' gains: the highest gain that keeps the margins, halved repeatedly; one more row has 0."""
 BLOCKS = 10
 """Blocks of a window, for the standard errors of its means."""
 CONFIDENCE = 2.0
@@ -30,9 +30,9 @@ MIN_CORRECTED = 0.1
 """Ratio of injected noise to correctable power below which the least gain is used if no gain is shown to be better."""
 
 SURE = 4.0
-"""Standard errors beyond which another mode counts as showing the squares of tip and tilt."""
+"""Standard errors above which the cross-talk of tip and tilt into another mode counts as certain."""
 SUSPECTED = 2.0
-"""The same in the margin that a gain must have: cross-talk that is uncertain on a faint star may add ten times what
+"""The same for the cross-talk that a gain must tolerate: uncertain cross-talk on a faint star may add ten times what
 the gain removes."""
 MARGIN = 5.0
 """Factor of the measured cross-talk that a gain must tolerate: beyond its range a sensor underestimates tilt."""
@@ -89,7 +89,7 @@ class GainBank:
             limit_nm: (modes,) largest command.
             weights: Which commands an exposure sees.
             delay_frames: Of the loop.
-            windows: Frames of the first window, and of those after it.
+            windows: Frames of the first window, and of each later one before it grows.
         """
         halvings = int(np.log2(highest_gain(delay_frames) / MIN_GAIN))
         rows = highest_gain(delay_frames) * 0.5 ** np.arange(halvings, -1.0, -1)
@@ -106,7 +106,7 @@ class GainBank:
         self.restart()
 
     def restart(self) -> None:
-        """Restart, as for another star."""
+        """Forget all frames, as for another star."""
         self._loops = self._at_rest
         self._cross_talk = TiltCrossTalk(self._at_rest.kept.size)
         self._before_nm: Single | None = None
@@ -173,7 +173,7 @@ class GainBank:
         own = blocks[:, now, np.arange(now.size)]
         beyond = blocks - own[:, None]
         mean = np.where(now == 0, beyond.mean(axis=0), beyond[-EARLY:].mean(axis=0))
-        shown = np.where(now == 0, self._no_noise(mean), (beyond[-EARLY:] < 0).all(axis=0))
+        shown = np.where(now == 0, self._beyond_noise(mean), (beyond[-EARLY:] < 0).all(axis=0))
         sure = np.where(shown, mean, np.inf)
         grown = (now <= 1) & shown.any(axis=0)
         absent = (cross_talk_nm != 0) & (own[-EARLY:] > 0).all(axis=0)
@@ -237,7 +237,7 @@ class GainBank:
         return blocks
 
     def _handicapped(self, cross_talk_nm: Array) -> Array:
-        """The same with the margin that a gain must have; cross-talk in favour of a gain is not counted."""
+        """As `_without`, but cross-talk (modes,) counts `MARGIN` times if it speaks against a gain, else not at all."""
         against = np.mean(self._means, axis=0) * cross_talk_nm > 0
         return self._without(np.where(against, MARGIN * cross_talk_nm, 0))
 
@@ -247,18 +247,18 @@ class GainBank:
         rows, helps = own + self._alike(own), own.mean(axis=0) < 0
         if self.first:
             beyond_open = rows.mean(axis=0)
-            better = helps & self._no_noise(beyond_open)
+            better = helps & self._beyond_noise(beyond_open)
             return np.where(better.any(axis=0), np.argmin(np.where(better, beyond_open, np.inf), axis=0), 0)
         beyond_now, better = _better(rows - rows[:, now, modes][:, None])
-        better = helps & np.where(now == 0, self._no_noise(beyond_now), better)
+        better = helps & np.where(now == 0, self._beyond_noise(beyond_now), better)
         better[0] = _better(-own)[1][now, modes]
         best = np.argmin(np.where(better, beyond_now, np.inf), axis=0)
         best = np.where(better.any(axis=0), best, now)
         near = np.clip(best, np.maximum(now - 1, 0), now + 1)
         return np.where((now <= 1) | better[0], best, near)
 
-    def _no_noise(self, mean: Array) -> Mask:
-        """Whether a mean over the blocks, of gains (rows, modes) beyond none, is below what white noise would show.
+    def _beyond_noise(self, mean: Array) -> Mask:
+        """Whether a mean over the blocks (rows, modes), less that of gain 0, is lower than white noise explains.
 
         Commands do not depend on the noise of later frames, so the differences of frames are independent.
         """
@@ -267,7 +267,7 @@ class GainBank:
         )
 
     def _alike(self, blocks: Array) -> Array:
-        """Blocks of modes that have the disturbance-to-noise ratio of the majority."""
+        """The modes' median of the blocks, relative to the noise of each mode; 0 for fewer modes than `FEW`."""
         if blocks.shape[-1] < FEW:
             return np.zeros_like(blocks)
         noise_nm2 = np.maximum(np.mean(self._changed, axis=0), 1e-12)
@@ -302,8 +302,8 @@ class GainBank:
     def _clear(self, window: int) -> None:
         self._block = max(window // BLOCKS, 1)
         self._longest = self._block * LONGEST
-        self._kept = tuple(list[Array]() for _ in range(6))
-        self._blocks, self._powers, self._changed, self._means, self._tilts, self._spreads = self._kept
+        self._lists = tuple(list[Array]() for _ in range(6))
+        self._blocks, self._powers, self._changed, self._means, self._tilts, self._spreads = self._lists
         self._throughout = True
         self._begin_block()
 
@@ -317,11 +317,11 @@ class GainBank:
     def _lengthen(self) -> None:
         """Continue with blocks of twice the length; the longest window drops its older half."""
         if 2 * self._block > self._longest:
-            for values in self._kept:
+            for values in self._lists:
                 del values[: BLOCKS // 2]
             return
         self._block *= 2
-        for values in self._kept:
+        for values in self._lists:
             values[:] = list(np.array(values).reshape(BLOCKS // 2, 2, *values[0].shape).mean(axis=1))
 
 
@@ -384,14 +384,14 @@ def _better(blocks: Array) -> tuple[Array, Mask]:
 
 
 def injected(gain: Single) -> Single:
-    """Fraction (modes,) of a frame's noise variance that an integrator of this gain, no delay, puts on the mirror."""
+    """Fraction (modes,) of a frame's noise variance that an integrator of this gain puts on the mirror, delay 1."""
     return gain / (2 - gain)
 
 
 def uncorrected_prior_nm2(verdict: Verdict, uncorrected: Mask, noise_nm2: Array) -> Single:
     """Mean square (modes,) of the uncorrected modes (modes,), nm^2, as `Weighting.prior_nm2`: 0 for the others.
 
-    The measured power less the noise and two standard errors of that noise.
+    It is the measured power less the noise, plus two standard errors of that noise.
     """
     if verdict.noise_nm2 is not None:
         noise_nm2 = np.maximum(noise_nm2, verdict.noise_nm2)

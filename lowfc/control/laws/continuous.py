@@ -22,7 +22,7 @@ _FILTER_REACH = 48
 """Frames before and after from which a mean between measurements is interpolated."""
 
 _MOMENTS = 8
-_LONGEST = 5  # periods until a command is applied
+_LONGEST = 5  # a command applied later, in periods, is implausible
 
 
 class Timing(NamedTuple):

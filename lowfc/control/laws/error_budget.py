@@ -148,7 +148,7 @@ def measurement_error(
 
     def spectrum_of(column: Array) -> Spectrum | None:
         ends = np.cumsum([len(piece) for piece in error.values])[:-1]
-        return spectrum(TimeSeries(tuple(np.split(column, ends)), error.bridged), law.rate_hz)
+        return spectrum(TimeSeries(tuple(np.split(column, ends)), error.interpolated), law.rate_hz)
 
     smooth, rough, each = spectrum_of(linear), spectrum_of(rest), spectrum_of(basis)
     if smooth is None or rough is None or each is None:

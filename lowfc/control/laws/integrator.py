@@ -49,7 +49,7 @@ class Integrator:
 
 
 def integrate(integrator: Integrator, command_nm: Single, error_nm: Single) -> tuple[Single, bool]:
-    """Compute command[k+1] = kept command[k] - gain error[k], clipped to each mode's limit; and whether any was.
+    """The next command, kept * command - gain * error, clipped to each mode's limit; and whether any was clipped.
 
     All (modes,) float32, nm of wavefront rms.
     """

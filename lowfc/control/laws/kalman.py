@@ -70,4 +70,4 @@ def _riccati(A: Array, Q: Array, C: Array) -> Array:
         seen = (seen + seen.T) / 2
         if np.abs(grown).max() <= 1e-12 * np.abs(found).max():
             return np.asarray(found)
-    raise ValueError(f"no Kalman filter settles within {2**_DOUBLINGS} frames: of a line nothing is seen")
+    raise ValueError(f"no Kalman filter settles within {2**_DOUBLINGS} frames: a line is far below the noise")

@@ -13,7 +13,7 @@ from lowfc.control.laws.stability import delay_weights
 Signal = Literal["error", "pol"]
 
 _LARGEST_POLE = 0.99
-"""Of an integrator's prediction of pol without frames, while the loop is open: below 1, so that it is stable."""
+"""Largest pole of an integrator's prediction of pol during missing frames in an open loop: below 1, for stability."""
 MAX_STATES = 512
 """Most states of a law: a step with this number takes a frame period at 1 kHz."""
 SIGNALS: tuple[Signal, ...] = ("error", "pol")
@@ -23,7 +23,7 @@ SIGNALS: tuple[Signal, ...] = ("error", "pol")
 class LinearLaw:
     """x[k] = F x[k-1] + G y[k] + U c[k-1], command[k] = K x[k]; single precision, as in the loop.
 
-    y is the measured error or the pseudo-open-loop modes of frame k, c the modal command after all limits. For a
+    y[k] is the error or the pseudo-open-loop modes of frame k, c the modal command after all limits. For a
     missing or refused frame, x[k] = A x[k-1] + U c[k-1].
 
     Attributes:
@@ -158,9 +158,10 @@ def law_from_blocks(
 def integrator_block(gain: float, leak: float, signal: Signal, delay_frames: float) -> Block:
     """c[k] = (1 - leak) c[k-1] - gain e[k], of the error or of pseudo-open-loop modes.
 
-    For the latter, e[k] = pol[k] + sum_j w_j c[k-1-j], for which the block stores commands. During missing frames it
-    holds: the prediction of pol cancels the commands. At the gains where that prediction alone would grow while the
-    loop is open, the command changes, by up to 9 % at the gains that keep the margins.
+    For the latter, e[k] = pol[k] + sum_j w_j c[k-1-j], for which the block stores commands. During missing frames pol
+    is predicted to cancel the stored commands, so that the command keeps its value, apart from the leak. Above a gain
+    of 0.99 / w_0 this prediction would be unstable in an open loop: it is damped, and the command changes, by up to 9 %
+    at the gains that keep the margins.
     """
     if signal == "error":
         return Block(np.zeros((1, 1)), np.array([-gain]), np.array([1 - leak]), np.zeros((1, 1)), np.ones(1))

@@ -17,7 +17,7 @@ from lowfc.control.loop.wording import counted
 SAME_RATE = 0.01
 """Relative difference allowed between a law's frame rate and the camera's."""
 MAX_COUPLED_STATES = 100
-"""Most coupled states: computing the poles of this many takes 30 ms, during which no frame is processed."""
+"""Most coupled states: computing the poles of this many takes about 30 ms."""
 
 MAX_SETTLING_FRAMES = 4000
 """Upper limit of a law's settling time, frames."""
@@ -25,7 +25,7 @@ MAX_SETTLING_FRAMES = 4000
 _GRID = 2048
 _AROUND_POLE = np.concatenate([-np.geomspace(1e-2, 1e2, 33)[::-1], [0.0], np.geomspace(1e-2, 1e2, 33)])
 _LOWEST = 1e-6  # rad per frame: an integrator has no value at 0 Hz
-_STILL = 1e-6  # excess of a pole above 1 by rounding to single precision, for undriven states
+_ROUNDING = 1e-6  # a pole of undriven states may exceed 1 by this, from rounding to single precision
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ def margins(law: LinearLaw, delay_frames: float) -> Margins:
     for part in _parts(law):
         poles = _poles(part.closed(delay_weights(delay_frames)))
         radius = float(np.abs(poles).max())
-        found.radius[part.modes] = radius if part.driven or radius > 1 + _STILL else min(radius, 1 - _STILL)
+        found.radius[part.modes] = radius if part.driven or radius > 1 + _ROUNDING else min(radius, 1 - _ROUNDING)
         if not part.driven:
             continue
         omega = _frequencies(np.concatenate([poles, _poles(part.F + part.U @ part.K)]))
@@ -110,8 +110,8 @@ def check_stable(law: LinearLaw, delay_frames: float) -> None:
     for part in _parts(law):
         if len(part.F) > MAX_COUPLED_STATES:
             raise ValueError(
-                f"{len(part.F)} states of the law {law.name!r} are coupled; {MAX_COUPLED_STATES} are the most "
-                "whose poles can be found between two frames"
+                f"{len(part.F)} states of the law {law.name!r} are coupled; at most {MAX_COUPLED_STATES} may be, "
+                "so that its stability can be checked quickly"
             )
         matrices = (
             ("closed", part.closed(weights)),
@@ -121,7 +121,7 @@ def check_stable(law: LinearLaw, delay_frames: float) -> None:
         )
         for state, matrix in matrices:
             radius = float(np.abs(_poles(matrix)).max())
-            at_most = 1 + _STILL if state != "closed" or not part.driven else 1.0
+            at_most = 1 + _ROUNDING if state != "closed" or not part.driven else 1.0
             if radius > at_most or (radius == 1 and at_most == 1):
                 modes = ", ".join(f"Z{law.noll[mode]}" for mode in part.modes)
                 true, own = (counted(float(delay), "frame") for delay in (delay_frames, law.delay_frames))
@@ -239,7 +239,7 @@ def _parts(law: LinearLaw) -> list[_Part]:
 
 
 def _first_linked(linked: Mask) -> Whole:
-    """First member of each one's connected group (n,), from links (n, n); scipy.sparse takes 0.3 s to import."""
+    """First member (n,) of the connected group of each node, from links (n, n); scipy.sparse takes 0.3 s to import."""
     while True:
         further = linked.astype(np.float32) @ linked.astype(np.float32) > 0
         if (further == linked).all():
@@ -247,9 +247,9 @@ def _first_linked(linked: Mask) -> Whole:
         linked = further
 
 
-def _solved(of: Complex, right: Complex) -> Complex:
+def _solved(matrices: Complex, right: Complex) -> Complex:
     """`numpy.linalg.solve` of a stack; for one unknown a division is several times faster."""
-    return np.asarray(right / of if of.shape[-1] == 1 else np.linalg.solve(of, right))
+    return np.asarray(right / matrices if matrices.shape[-1] == 1 else np.linalg.solve(matrices, right))
 
 
 def _poles(matrix: Array) -> Complex:

@@ -13,7 +13,7 @@ MAX_INTERPOLATED_FRAMES = 3
 """Longest gap, in frames, that is interpolated; a longer one starts a new piece."""
 SHORTEST, LONGEST = 64, 2048
 """Shortest and longest segment of Welch's method, frames; with fewer than the shortest there is no spectrum."""
-_SEGMENT_SHARE = 4  # of the longest piece: seven segments of it, each over half of the next
+_SEGMENT_SHARE = 4  # a segment is at most this part of the longest piece, which then has at least seven
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,11 +22,11 @@ class TimeSeries:
 
     Attributes:
         values: pieces, (frames, columns) each.
-        bridged: number of interpolated frames among them.
+        interpolated: number of interpolated frames among them.
     """
 
     values: tuple[Array, ...]
-    bridged: int
+    interpolated: int
 
     @property
     def frames(self) -> int:
@@ -35,7 +35,7 @@ class TimeSeries:
 
     def columns(self, which: slice) -> "TimeSeries":
         """The same frames, some of the columns."""
-        return TimeSeries(tuple(piece[:, which] for piece in self.values), self.bridged)
+        return TimeSeries(tuple(piece[:, which] for piece in self.values), self.interpolated)
 
     def joined(self) -> Array:
         """All frames (frames, columns), one piece after the other."""
@@ -66,7 +66,7 @@ class Spectrum:
         return np.asarray(np.sum(self.power_nm2_hz * filtered, axis=0) * self.spacing_hz)
 
     def error_nm2(self, filtered: Array | float = 1.0) -> Array:
-        """Standard error (columns,) of that variance, for noise.
+        """Standard error (columns,) of `variance_nm2` for a noise-like spectrum.
 
         Hann's window correlates neighbours: three of them count as two. Segments that overlap by half are nearly
         independent.
@@ -103,9 +103,10 @@ def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSe
 
 
 def spectrum(run: TimeSeries, rate_hz: float) -> Spectrum | None:
-    """Welch's estimate over all pieces longer than a segment; None if there are none.
+    """Welch's estimate over all pieces of at least a segment; None if there are none.
 
-    Segments have Hann's window and no mean; their length, a power of two, follows from the longest piece.
+    Each segment's mean is subtracted, and Hann's window applied; its length, a power of two, follows from the longest
+    piece.
     """
     longest = max((len(piece) for piece in run.values), default=0)
     if longest < SHORTEST:
@@ -135,9 +136,9 @@ def floor_nm2_hz(found: Spectrum) -> Array:
 
 
 def in_bins(frequency_hz: Array, columns: Sequence[Array], per_decade: int = 20) -> tuple[Array, list[Array]]:
-    """Means over bins of even width in the logarithm of frequency, without 0 Hz.
+    """Means of the frequencies and of each column over bins of even width in the logarithm of frequency, without 0 Hz.
 
-    The frequencies (bins,), and each column.
+    Columns are (frequencies,), and their means (bins,).
     """
     places = np.floor(per_decade * np.log10(frequency_hz[1:])).astype(int)
     starts = np.flatnonzero(np.diff(places, prepend=places[0] - 1))

@@ -1,7 +1,7 @@
 """The integrator's limits: the gains at which its loop oscillates, or has exactly the least allowed margins.
 
-The loop of `lowfc.control.laws.integrator`: command[k+1] = (1 - leak) command[k] - gain error[k], and
-error[k] = disturbance[k] + sum_j w_j command[k - j] + noise[k], with w from the delay in frames.
+The loop of `lowfc.control.laws.integrator`: command[k] = (1 - leak) command[k-1] - gain error[k], and
+error[k] = disturbance[k] + sum_j w_j command[k-1-j] + noise[k], with w from the delay in frames.
 """
 
 from functools import lru_cache
@@ -17,19 +17,19 @@ LOWEST_GAIN = 0.01
 SETTLING = 5.0
 """Time constants of the slowest mode after which a loop counts as settled."""
 
-_LONGEST_DELAY = 1000  # frames; of a damaged file or message it could exceed the memory
+_LONGEST_DELAY = 1000  # frames; a longer one, of a damaged file or message, could exceed the memory
 _BISECTIONS = 50
-"""Bisections of a 4096th of pi, to double precision; importing scipy.optimize would delay every command by 0.3 s."""
+"""Halvings of a 4096th of pi, down to double precision; importing scipy.optimize takes 0.3 s."""
 
 
 def settling_frames(gain: Array | Single, leak: Array | Single, least: float = 0.0) -> int:
-    """Frames until the slowest mode has settled after closing, or the least; gain and leak (modes,) without unit."""
+    """Frames until the slowest mode has settled after closing, but at least `least`; gain and leak are (modes,)."""
     slowest = float((gain + leak)[gain + leak > 0].min(initial=1.0))
     return int(np.ceil(max(SETTLING / slowest, least)))
 
 
 def delay_weights(delay_frames: float) -> Array:
-    """Return w: the fraction of command[k - j], j = 0, 1, ..., seen in exposure k; sums to 1.
+    """Return w: the fraction of command[k-1-j], j = 0, 1, ..., seen in exposure k; sums to 1.
 
     A delay of d frames (d >= 1) is counted from the frame that a command is computed from to the first frame exposed
     wholly with it; a fraction f of a frame sees (1 - f) of the newer and f of the older command.
@@ -77,7 +77,7 @@ def limiting_gain(delay_frames: float, leak: float = 0.0) -> float:
 
 @lru_cache(maxsize=64)
 def highest_gain(delay_frames: float, leak: float = 0.0) -> float:
-    """Integrator gain at which the first of the margins reaches its least allowed value."""
+    """Highest integrator gain that keeps both margins, in gain and in phase."""
     omega = np.linspace(1e-4, np.pi, 1 << 14)
     loop = open_loop(omega, 1.0, leak, delay_frames)
     late = np.unwrap(np.angle(loop)) < -np.radians(180 - MIN_PHASE_MARGIN_DEG)

@@ -28,9 +28,9 @@ from lowfc.control.laws.vibration import FEWEST, Model, identify, resolution_hz
 from lowfc.control.laws.what_if import counterfactual, driven_by
 
 _NARROWER = (0.1, 0.01, 1e-3)  # factors tried on the fitted width of a line that a log cannot resolve
-_FASTER = (10.0,)  # and for lines that move
+_WIDER = (10.0,)  # likewise, for lines that move
 _SETTLING_FRAMES = 5000
-_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # overestimates of the noise, tried until the margins hold
+_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # overestimates of the noise, tried until the margins suffice
 _NEAR_ENOUGH = 0.25
 """Octaves between a filter with sufficient margins and one without: their residuals agree within half a percent."""
 
@@ -41,10 +41,10 @@ class Tuned:
 
     Attributes:
         law: the law, ready to load.
-        margins: for the delay it was made for.
+        margins: its margins at the delay that it was made for.
         predicted_nm: (modes,) rms of the true residual.
-        kinds: of each mode: integrator, pi-notch or lqg.
-        models: of each mode.
+        kinds: law of each mode: integrator, pi-notch or lqg.
+        models: model of each mode.
     """
 
     law: LinearLaw
@@ -59,7 +59,7 @@ class Gains:
     """Integrator gains (modes,) and their residuals, nm rms.
 
     Attributes:
-        gain: the best ones.
+        gain: gain of the least residual over all time.
         predicted_nm: residual over all time.
         sensed_nm: residual of the means over the exposures.
         noise_nm: noise of one frame.
@@ -97,20 +97,20 @@ def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> 
         steady_nm2 = float(longest_nm[:, mode].mean()) ** 2  # a leak leaves a fraction of it: |S| at 0 Hz
         measured = fine.power_nm2_hz[1:, mode : mode + 1] * rate_hz / 2
 
-        def of(gain: float, lost: float = lost) -> LinearLaw:
-            return integrator([gain], [lost], (2,), timing.delay, rate_hz)  # or any other mode
+        def law_of(gain: float, lost: float = lost) -> LinearLaw:
+            return integrator([gain], [lost], (2,), timing.delay, rate_hz)  # the mode does not matter
 
         def steady_residual_nm2(gain: float, lost: float = lost, steady_nm2: float = steady_nm2) -> float:
             return steady_nm2 * (lost / (lost + gain)) ** 2
 
         def residual(gain: float, measured: Array = measured, mode: int = mode, lost: float = lost) -> float:
-            power = residual_spectrum(of(gain, lost), omega, measured, noise_nm2[mode : mode + 1], timing)
+            power = residual_spectrum(law_of(gain, lost), omega, measured, noise_nm2[mode : mode + 1], timing)
             return float(power.sum()) * fine.spacing_hz * 2 / rate_hz + steady_residual_nm2(gain)
 
         bounds = (LOWEST_GAIN, highest_gain(timing.delay, lost))
         found = minimize_scalar(residual, bounds=bounds, method="bounded", options={"xatol": 1e-3})
         gains[mode], residual_nm2[mode] = found.x, found.fun
-        error = np.abs(sensitivity(of(found.x), omega, timing.delay)) ** 2 * measured
+        error = np.abs(sensitivity(law_of(found.x), omega, timing.delay)) ** 2 * measured
         sensed_nm2[mode] = error.sum() * fine.spacing_hz * 2 / rate_hz + steady_residual_nm2(found.x) - noise_nm2[mode]
     rms = (np.sqrt(np.maximum(each, 0.0)) for each in (residual_nm2, sensed_nm2, noise_nm2))
     return Gains(gains, *rms)
@@ -142,10 +142,10 @@ def tune_lqg(
 ) -> Tuned:
     """LQG for modes in which it beats the best integrator, else that integrator; leaks (modes,) without unit.
 
-    The run also decides the width of lines that the spectrum does not resolve, and how fast lines move.
+    Several widths are tried on the run for lines that the spectrum does not resolve; a large one suits a moving line.
 
     Raises:
-        ValueError: no filter, or an unstable law.
+        ValueError: a filter does not converge, or the law is unstable.
     """
     rate_hz, finest_hz = models[0].rate_hz, resolution_hz(run, models[0].rate_hz)
     noise_nm2 = np.array([model.noise_nm2 for model in models])
@@ -156,11 +156,11 @@ def tune_lqg(
     def residual(blocks: Sequence[Block]) -> Array:
         return simulated_residual_nm2(law_of(blocks), run, noise_nm2, timing)
 
-    scaled = ([_scaled(model, factor, finest_hz) for model in models] for factor in (*_NARROWER, *_FASTER))
+    scaled = ([_scaled(model, factor, finest_hz) for model in models] for factor in (*_NARROWER, *_WIDER))
     tried = [models, *scaled]
     steady = [integrator_block(g, lost, "pol", timing.delay) for g, lost in zip(gains.gain, leak, strict=True)]
-    held = [[within_margins(model, timing) for model in candidates] for candidates in tried]
-    robust = [[block or rest for block, rest in zip(blocks, steady, strict=True)] for blocks in held]
+    filters = [[within_margins(model, timing) for model in candidates] for candidates in tried]
+    robust = [[block or rest for block, rest in zip(blocks, steady, strict=True)] for blocks in filters]
     residual_nm2 = np.nan_to_num([residual(blocks) for blocks in robust], nan=np.inf)
     best = residual_nm2.argmin(axis=0)
     modes = range(len(noll))
@@ -171,10 +171,7 @@ def tune_lqg(
 
 
 def tune_pi_notch(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing) -> Tuned:
-    """An integrator with a notch for each line that it can reduce within the margins.
-
-    Leaks (modes,) without unit.
-    """
+    """An integrator with a notch for each line that it can reduce with sufficient margins; leaks (modes,), no unit."""
     rate_hz = models[0].rate_hz
     found = [_notched(*mode, timing) for mode in zip(models, gains.gain.tolist(), leak.tolist(), strict=True)]
     gain, notches = np.array([g for g, _ in found]), [of_mode for _, of_mode in found]
@@ -198,7 +195,7 @@ def _notched(model: Model, gain: float, leak: float, timing: Timing) -> tuple[fl
                 more = (*notches, Notch(line.frequency_hz, width_hz, depth))
                 law = made(more, g)
                 residual = float(predicted_nm(law, [model], timing)[0])
-                if residual < least and _holds(margins.margins(law, timing.delay)):
+                if residual < least and _sufficient(margins.margins(law, timing.delay)):
                     notches, least = more, residual
                     break
         tried.append((least, g, notches))
@@ -273,6 +270,7 @@ def _whole_spectrum(run: TimeSeries, rate_hz: float) -> Spectrum | None:
 
 
 def _scaled(model: Model, factor: float, finest_hz: float) -> Model:
+    """The model with the widths of its unresolved lines multiplied by a factor."""
     lines = (
         replace(line, width_hz=factor * line.width_hz) if line.width_hz < 3 * finest_hz else line
         for line in model.lines
@@ -281,19 +279,19 @@ def _scaled(model: Model, factor: float, finest_hz: float) -> Model:
 
 
 def within_margins(model: Model, timing: Timing) -> Block | None:
-    """Filter of a model, with its noise overestimated as far as the margins require; None if they cannot be reached.
+    """Filter of a model, its noise overestimated as far as sufficient margins require; None if they cannot be reached.
 
     A filter with less weight on its measurements predicts more smoothly; for a model with a known line little is lost.
     """
 
-    def held(octaves: float) -> Block | None:
+    def filtered(octaves: float) -> Block | None:
         block = lqg_block(replace(model, noise_nm2=2.0**octaves * model.noise_nm2), timing)
-        law = law_from_blocks([block], "pol", "lqg", (2,), timing.delay, model.rate_hz)  # or any other mode
-        return block if _holds(margins.margins(law, timing.delay)) else None
+        law = law_from_blocks([block], "pol", "lqg", (2,), timing.delay, model.rate_hz)  # the mode does not matter
+        return block if _sufficient(margins.margins(law, timing.delay)) else None
 
     low = 0.0
     for high in _OCTAVES:
-        found = held(high)
+        found = filtered(high)
         if found is not None:
             break
         low = high
@@ -301,7 +299,7 @@ def within_margins(model: Model, timing: Timing) -> Block | None:
         return None
     while high - low > _NEAR_ENOUGH:
         middle = (low + high) / 2
-        nearer = held(middle)
+        nearer = filtered(middle)
         if nearer is None:
             low = middle
         else:
@@ -309,7 +307,8 @@ def within_margins(model: Model, timing: Timing) -> Block | None:
     return found
 
 
-def _holds(found: margins.Margins) -> bool:
+def _sufficient(found: margins.Margins) -> bool:
+    """Whether a law other than an integrator has the gain margin of an integrator, and 0.7 of its phase margin."""
     return bool(
         found.stable
         and found.gain_margin.min() >= MIN_GAIN_MARGIN

@@ -21,13 +21,13 @@ _LONGEST = 1 << 16  # frames of a segment
 _MAX_LINES = 12
 _SCALES = (3, 9, 27, 81)  # numbers of frequencies over which lines are searched
 _PENALTY = 2.5  # of a line: log-likelihood per log(frequencies); 1.5 is Schwarz's for 3 values, 1 for choosing a place
-_SHARE = 0.3
+_SHARE = 0.3  # of the largest gain in likelihood, which a narrower line must reach to be preferred
 _HANN = 1.5  # neighbours are correlated: three count as two
 _LOBE = 12  # frequencies on either side of a line into which the window spreads it
 _FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
 _PER_DECADE = 48
 _MIN_DRIFT = 1e-8  # variance of its step per variance of noise: a constant is followed in 10^4 frames
-_MIN_NOISE = 1e-3  # of the level of the upper frequencies; drift may explain all of it, but a filter needs noise
+_MIN_NOISE = 1e-3  # of the level at high frequencies, which drift may explain entirely: a filter needs some noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +60,9 @@ class Model:
     lowest_hz: float = 0.0
 
     def spectrum_nm2(self, omega: Array) -> Array:
-        """Spectrum (frequencies,) of the disturbance without noise, frequencies in rad per frame.
+        """Spectrum (frequencies,) of the disturbance without noise, nm^2, at frequencies in rad per frame.
 
-        Its mean over a full circle is the variance.
+        Its mean over all frequencies from -pi to pi is the variance.
         """
         shown = np.maximum(omega, 2 * np.pi * self.lowest_hz / self.rate_hz)
         found = _drift(shown, self.drift_nm2, self.cutoff_hz / self.rate_hz)
@@ -71,7 +71,7 @@ class Model:
         return found
 
     def states(self) -> tuple[Array, Array, Array]:
-        """F, Q, C of x[k] = F x[k-1] + q, disturbance[k] = C x[k], with Q the covariance of q."""
+        """A, Q, C of x[k] = A x[k-1] + q, disturbance[k] = C x[k], with Q the covariance of q."""
         step, seen = [1.0], [1.0]
         if np.isfinite(self.cutoff_hz):  # x0 the walk, x1 its low-pass
             step, seen = [1.0, 1 - _kept(self.cutoff_hz / self.rate_hz)], [0.0, 1.0]
@@ -83,7 +83,7 @@ class Model:
         return self.mean_over(1.0, 0.0), block_diag(*parts), np.array(seen)
 
     def mean_over(self, start: float, length: float) -> Array:
-        """Mean (states, states) of A^u over u in [start, start + length] frames: the mean prediction of the states."""
+        """Mean (states, states) of A^u over u in [start, start + length] frames, A as in `states`: predicts a mean."""
 
         def mean_of(turned: complex) -> complex:
             if not length or not turned:
@@ -169,7 +169,7 @@ class _Whittle:
         return float(np.sum(counts * (np.log(spectrum) + power / spectrum))) * self.segments / _HANN
 
     def grouped(self, lines: tuple[Line, ...], robust: bool) -> tuple[Array, Array, Array]:
-        """Frequency, power and count of groups: single ones near lines and 0, even in the logarithm elsewhere."""
+        """Frequency, power and count of groups: single frequencies near lines and 0, else even in the logarithm."""
         places = np.arange(self.omega.size)
         group = _FULL + np.floor(_PER_DECADE * np.log10(np.maximum(places, 1)))
         single = places < _FULL
@@ -199,7 +199,7 @@ class _Whittle:
         best: tuple[float, Model] | None = None
         for cutoff in (np.inf, 0.03, 0.003):  # cycles per frame to begin with
 
-            def of(parameters: Array, cutoff: float = cutoff) -> Model:
+            def model_of(parameters: Array, cutoff: float = cutoff) -> Model:
                 corner = np.exp(min(parameters[2], 0.0)) * self.rate_hz if np.isfinite(cutoff) else np.inf
                 return replace(
                     model,
@@ -209,7 +209,7 @@ class _Whittle:
                 )
 
             def cost(parameters: Array) -> float:
-                one = of(parameters)
+                one = model_of(parameters)
                 floor = _drift(omega, one.drift_nm2, one.cutoff_hz / self.rate_hz) + one.noise_nm2
                 return self.misfit(power, floor + known, counts)
 
@@ -217,7 +217,7 @@ class _Whittle:
             found = minimize(cost, start, method="Nelder-Mead", options={"maxiter": 300, "xatol": 1e-2, "fatol": 1e-2})
             price = 0.5 * len(start) * np.log(self.omega.size)
             if best is None or found.fun + price < best[0]:
-                best = found.fun + price, of(found.x)
+                best = found.fun + price, model_of(found.x)
         assert best is not None  # noqa: S101  # there was a first one
         return replace(best[1], noise_nm2=max(best[1].noise_nm2, _MIN_NOISE * white))
 
@@ -240,7 +240,7 @@ class _Whittle:
             return None
         # The narrowest that explains most of the power: a wide one could be two separate lines.
         place, scale = next((place, scale) for gain, place, scale in found if gain >= _SHARE * largest)
-        if scale == _SCALES[0]:  # on the highest of the three
+        if scale == _SCALES[0]:  # of its three frequencies, the one of the highest power
             place += int(np.argmax(self.power[place - 1 : place + 2])) - 1
         near = slice(max(place - max(_FULL, 3 * scale), 0), place + max(_FULL, 3 * scale) + 1)
         return self._fit_line(near, place, scale, spectrum[near])
@@ -249,17 +249,17 @@ class _Whittle:
         omega, power, step = self.omega[near], self.power[near], 2 * np.pi / self.rate_hz
         excess = self.power[max(place - scale, 0) : place + scale + 1].sum() / self.power.size
 
-        def of(parameters: Array) -> Line:
+        def line_of(parameters: Array) -> Line:
             width = float(np.clip(np.exp(parameters[1]), 1e-3, 1e3)) * self.spacing_hz
             offset = float(np.clip(parameters[0], -scale / 3, scale / 3)) * self.spacing_hz
             centre = max(float(self.omega[place]) / step + offset, _LOBE * self.spacing_hz)
             return Line(centre, width, float(np.exp(parameters[2])))
 
         def cost(parameters: Array) -> float:
-            return self.misfit(power, known + _line(omega, *_per_frame(of(parameters), self.rate_hz)), 1.0)
+            return self.misfit(power, known + _line(omega, *_per_frame(line_of(parameters), self.rate_hz)), 1.0)
 
         start = np.array([0.0, np.log(0.3 * scale), np.log(excess)])
-        return of(minimize(cost, start, method="Nelder-Mead", options={"maxiter": 400, "xatol": 1e-3}).x)
+        return line_of(minimize(cost, start, method="Nelder-Mead", options={"maxiter": 400, "xatol": 1e-3}).x)
 
     def needed(self, model: Model) -> tuple[Line, ...]:
         """The lines that raise the likelihood significantly: one found early may have represented several."""
@@ -283,7 +283,7 @@ class _Whittle:
             lines = [[0.0, np.log(line.width_hz), np.log(line.variance_nm2)] for line in one.lines]
             return np.concatenate([floor, *lines])
 
-        def of(parameters: Array) -> Model:
+        def model_of(parameters: Array) -> Model:
             floor, rest = parameters[: 2 + corner], parameters[2 + corner :].reshape(-1, 3)
             lines = tuple(
                 Line(line.frequency_hz + float(shift) * spacing, float(np.exp(width)), float(np.exp(variance)))
@@ -299,7 +299,7 @@ class _Whittle:
             )
 
         def cost(parameters: Array) -> float:
-            one = of(parameters)
+            one = model_of(parameters)
             return self.misfit(power, one.spectrum_nm2(omega) + one.noise_nm2, counts)
 
         start = parameters_of(model)
@@ -308,7 +308,7 @@ class _Whittle:
             reach = max(1.0, line.width_hz / spacing)
             wide += [(-reach, reach), (np.log(1e-3 * spacing), width + 2), (variance - 2, variance + 2)]
         found = minimize(cost, start, method="L-BFGS-B", bounds=wide, options={"maxiter": 60})
-        fitted = of(found.x) if found.fun < cost(start) else model
+        fitted = model_of(found.x) if found.fun < cost(start) else model
         fitted = replace(fitted, lines=tuple(self._with_its_power(line, fitted) for line in fitted.lines))
         return replace(fitted, drift_nm2=max(fitted.drift_nm2, _MIN_DRIFT * fitted.noise_nm2))
 

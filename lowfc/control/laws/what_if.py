@@ -43,17 +43,17 @@ def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
 
 def as_logged(law: Integrator) -> Controller:
     """The live loop's integrator with its limits."""
-    noll = tuple(range(2, 2 + law.gain.size))  # not used, like delay and rate
+    noll = tuple(range(2, 2 + law.gain.size))  # these, delay and rate are not used
     return driven_by(integrator(law.gain, law.leak, noll, 1.0, 1.0), law.limit_nm)
 
 
 def exposed(reasons: Long) -> Mask:
-    """Mask of the steps with a new exposure, from the bits `1 << reason` (steps,) of their reasons, without unit."""
+    """Mask (steps,) of the steps with a new exposure; `reasons` (steps,) has the bit `1 << reason` of each reason."""
     return np.asarray((reasons & _NOT_NEW) == 0)
 
 
 def missing_before(sequence: Sequences) -> Whole:
-    """Exposures (steps,) without a step between each step and the one before; `sequence` falls only after a clear."""
+    """Number of exposures without a step (steps,) before each step; `sequence` (steps,) falls only after a clear."""
     same_start = sequence[1:] >> np.uint64(COUNT_BITS) == sequence[:-1] >> np.uint64(COUNT_BITS)
     follows = same_start & (sequence[1:] > sequence[:-1])
     between = np.where(follows, sequence[1:] - sequence[:-1] - np.uint64(1), np.uint64(0))
@@ -143,14 +143,14 @@ def delay_from_times(
         applied_ns: (states,) time of the mirror's report.
 
     Returns:
-        None if there are too few of both.
+        The delay, or None if there are too few such pairs.
     """
-    behind, first = np.unique(applied_sequence, return_index=True)  # a command may be applied repeatedly
+    commanding, first = np.unique(applied_sequence, return_index=True)  # a command may be applied repeatedly
     after = np.searchsorted(exposure_start_ns, applied_ns[first], side="right")
     known = (after > 0) & (after < len(sequence))
-    behind, after = behind[known], after[known]
+    commanding, after = commanding[known], after[known]
     neighbours = sequence[after] - sequence[after - 1] == 1  # else an earlier frame may be missing here
-    delay = (sequence[after] - behind).astype(np.int64)[neighbours]
+    delay = (sequence[after] - commanding).astype(np.int64)[neighbours]
     delay = delay[(delay >= 1) & (delay <= 2 * MAX_DELAY_FRAMES)]
     return float(delay.mean()) if len(delay) >= _FEWEST else None
 

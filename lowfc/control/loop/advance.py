@@ -12,7 +12,7 @@ import numpy as np
 from lowfc.arrays import Single
 from lowfc.control.kernel.stepping import next_command, respond, step_to_flat
 from lowfc.control.loop.camera import CameraSettings
-from lowfc.control.loop.estimator import Estimate, filled, saturated_pixels
+from lowfc.control.loop.estimator import Estimate, fill_saturated, saturated_pixels
 from lowfc.control.loop.inputs import (
     COUNT_BITS,
     Command,
@@ -45,7 +45,7 @@ from lowfc.control.loop.safety import NOT_NEW, Limit, LoopMode, Reason, Rejectio
 from lowfc.control.loop.state import ActiveLoop, Settings, State
 
 UNMEASURED = frozenset({Rejection.NO_CALIBRATION, Rejection.WRONG_SIZE})
-"""Rejections of frames that advance a probe sequence nevertheless: each is an exposure."""
+"""Rejections after which channels and probe sequences move all the same, unless the loop is closed."""
 STEPPED = "its last step is done"
 
 
@@ -88,7 +88,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         settings, state, loop, estimate.error_nm, frame.sequence, events, fused=fused
     )
     if reasons:
-        loop = end_probe(loop, frame.sequence, _acted(reasons), events)
+        loop = end_probe(loop, frame.sequence, _limit_cause(reasons), events)
     if state.refused is not None:
         details: dict[str, object] = {"refused": state.refused_count, "reason": state.refused.name}
         events.append(PendingEvent("FRAMES_ACCEPTED", details))
@@ -155,9 +155,9 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
 
 
 def _camera_started(state: State, frame: Frame) -> State:
-    """The state at the first frame, of the run or of another start of the camera; a lease keeps its remaining frames.
+    """The state at the first frame after a start of the camera; a lease keeps its remaining frames.
 
-    Camera settings are awaited unless the known ones may belong to this start.
+    Camera settings are awaited if the known ones are of another start.
     """
     conditions = state.conditions
     camera, held = conditions.camera, conditions.lease
@@ -198,7 +198,7 @@ def _measure(
     if saturated > settings.max_saturated_pixels:
         return Rejection.SATURATED
     if saturated:
-        pixels = filled(calibration, pixels)
+        pixels = fill_saturated(calibration, pixels)
     estimate = loop.estimator.estimate(pixels, min_flux_dn)
     return Rejection.DARK if estimate is None else (estimate, saturated, False)
 
@@ -209,7 +209,7 @@ def _overruled(state: State, loop: ActiveLoop) -> bool:
     return guard is not None and state.mode is LoopMode.CLOSED and guard.overruled
 
 
-def _acted(limits: tuple[Reason, ...]) -> str:
+def _limit_cause(limits: tuple[Reason, ...]) -> str:
     """Why a probe sequence ends once a limit acts: the mirror no longer shows the requested shape."""
     return f"a limit acted: {', '.join(reason.name for reason in limits)}"
 
@@ -231,7 +231,7 @@ def _refuse(
                 settings, state, loop.predicted(1), loop.history_nm[0], frame.sequence
             )
             if hit:
-                loop = end_probe(loop, frame.sequence, _acted(hit), events)
+                loop = end_probe(loop, frame.sequence, _limit_cause(hit), events)
             _limit_events(state.limits_hit, hit, events)
             reasons = (reason, *hit)
         elif reason not in NOT_NEW:

@@ -10,16 +10,16 @@ GAIN_TOLERANCE = 0.01
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """Camera settings that must match the calibration; the time of reception does not count in a comparison.
+    """Camera settings, as far as a calibration depends on them.
 
     Attributes:
-        time_ns: when they were published.
+        time_ns: when they were published; ignored by `==`.
         shape: rows and columns of the frame.
         bias_dn: level without light and without dark current.
         saturation_dn: highest value a pixel can have.
-        gain_e_per_dn: conversion gain; 0 if unknown, as below.
-        em_gain: electron-multiplying gain.
-        read_noise_e: read noise of one pixel.
+        gain_e_per_dn: conversion gain; 0 if unknown.
+        em_gain: electron-multiplying gain; 0 if unknown.
+        read_noise_e: read noise of one pixel; 0 if unknown.
         region: first row and first column that are read.
         start_s: start of the camera, unix seconds; 0 if unknown.
     """

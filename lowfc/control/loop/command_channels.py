@@ -106,11 +106,11 @@ class CommandChannels(NamedTuple):
 
     Attributes:
         channels: sorted by name.
-        sum_nm: (rows, columns) sum of the channels as far as reached.
+        sum_nm: (rows, columns) sum of the commanded channels as far as reached.
         shift_nm: (modes,) shift of the sensor's zero point by the channels.
         shifts_nm: `shift_nm` of the last frames, newest first, one for each weight of the delay.
-        offset_nm: (modes,) the loop's target.
-        play: the current play.
+        offset_nm: (modes,) the loop's target, nm of wavefront rms.
+        play: the current probe sequence; None if there is none.
     """
 
     channels: tuple[Channel, ...]
@@ -122,7 +122,7 @@ class CommandChannels(NamedTuple):
 
     @classmethod
     def none(cls, grid: tuple[int, int], modes: int, frames: int) -> "CommandChannels":
-        """No additions; `frames` is the number of frames until a command is seen."""
+        """No additions; `frames` is the number of weights of the delay."""
         rest = np.zeros(modes, np.float32)
         return cls((), np.zeros(grid, np.float32), rest, (rest,) * frames, rest)
 
@@ -154,17 +154,16 @@ class CommandChannels(NamedTuple):
         if not moving:
             return self._replace(play=play)
         step = np.float32(step_nm / moving)
-        return self._replace(play=play).at(tuple(_nearer(channel, step) for channel in self.channels), to_modes)
+        return self._replace(play=play).with_all(tuple(_nearer(one, step) for one in self.channels), to_modes)
 
-    def at(self, channels: tuple[Channel, ...], to_modes: Single) -> "CommandChannels":
-        """A copy with these channels, without those that have reached flat."""
+    def with_all(self, channels: tuple[Channel, ...], to_modes: Single) -> "CommandChannels":
+        """A copy with these channels instead of its own, without those that have reached flat."""
         kept = tuple(one for one in channels if one.shape_nm.any() or one.reached_nm.any())
-        sums = [
-            sum((one.reached_nm for one in kept if one.commanded and one.shifts is shifts), np.zeros_like(self.sum_nm))
-            for shifts in (True, False)
-        ]
-        seen_nm = sum((one.reached_nm for one in kept if not one.commanded), sums[0])
-        return self._replace(channels=kept, sum_nm=sums[0] + sums[1], shift_nm=to_modes @ seen_nm.reshape(-1))
+        zero = np.zeros_like(self.sum_nm)
+        shifting_nm = sum((one.reached_nm for one in kept if one.commanded and one.shifts), zero)
+        sum_nm = shifting_nm + sum((one.reached_nm for one in kept if one.commanded and not one.shifts), zero)
+        seen_nm = sum((one.reached_nm for one in kept if not one.commanded), shifting_nm)
+        return self._replace(channels=kept, sum_nm=sum_nm, shift_nm=to_modes @ seen_nm.reshape(-1))
 
     def with_channel(self, name: str, shape_nm: Single, to_modes: Single) -> "CommandChannels":
         """A copy with a new shape for a channel, approached from its current one; `EXTERNAL` is reached at once.
@@ -176,23 +175,23 @@ class CommandChannels(NamedTuple):
         if not (plain and name[0].isalpha() and len(name) <= MAX_NAME_LENGTH):
             raise ValueError(f"a channel's name is up to 32 of a-z, 0-9 and -, a letter first; got {name!r}")
         before = self.channel(name)
-        if before is None and len(self.channels) >= MAX_CHANNELS:
+        if before is None and shape_nm.any() and len(self.channels) >= MAX_CHANNELS:
             raise ValueError(f"there are {MAX_CHANNELS} channels already, which is the most: remove one")
         if name == EXTERNAL:
-            after = self.having(Channel(name, shape_nm, shape_nm), to_modes)
+            after = self.with_one(Channel(name, shape_nm, shape_nm), to_modes)
             more_nm = after.shift_nm - self.shift_nm
             return after._replace(shifts_nm=tuple(one + more_nm for one in self.shifts_nm))
         reached_nm = np.zeros_like(shape_nm) if before is None else before.reached_nm
-        return self.having(Channel.of(name, shape_nm, reached_nm), to_modes)
+        return self.with_one(Channel.of(name, shape_nm, reached_nm), to_modes)
 
     def channel(self, name: str) -> Channel | None:
         """The channel of that name."""
         return next((one for one in self.channels if one.name == name), None)
 
-    def having(self, channel: Channel, to_modes: Single) -> "CommandChannels":
-        """A copy with this channel added, or replaced if there is one of its name."""
+    def with_one(self, channel: Channel, to_modes: Single) -> "CommandChannels":
+        """A copy with this channel added, or in the place of the one of its name."""
         channels = {one.name: one for one in (*self.channels, channel)}
-        return self.at(tuple(channels[name] for name in sorted(channels)), to_modes)
+        return self.with_all(tuple(channels[name] for name in sorted(channels)), to_modes)
 
     def stopped(self, sequence: int) -> "CommandChannels":
         """A copy whose play ends after this frame; its shape is removed with the next command."""
@@ -211,14 +210,17 @@ class CommandChannels(NamedTuple):
         return self.passed(len(self.shifts_nm))
 
     def restarted_from_flat(self, to_modes: Single, *, only_flat: bool = False) -> "CommandChannels":
-        """A copy for a command that relaxes to zero: the channels restart from flat, and the probe sequence ends."""
+        """A copy for a command that relaxes to zero: commanded channels restart from flat, and the probe sequence ends.
+
+        With `only_flat`, all channels but `FLAT` and `EXTERNAL` are removed.
+        """
         flat = np.zeros_like(self.sum_nm)
         kept = (
             Channel.of(one.name, one.shape_nm, flat if one.commanded else one.shape_nm)
             for one in self.channels
             if one.name in (FLAT, EXTERNAL) or not only_flat
         )
-        return self._replace(play=None).at(tuple(kept), to_modes)
+        return self._replace(play=None).with_all(tuple(kept), to_modes)
 
 
 def seen_nm(weights: tuple[tuple[int, np.float32], ...], newest_first: tuple[Single, ...]) -> Single:
@@ -231,7 +233,7 @@ def seen_nm(weights: tuple[tuple[int, np.float32], ...], newest_first: tuple[Sin
 
 
 def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
-    """Check and make a table to play, as far as possible without the loop; shapes as in `PlayTable`, nm.
+    """Make a table to play, and check it as far as possible without the loop; arrays as in `PlayTable`.
 
     Raises:
         ValueError: its parts do not match, it is too large, or a number in it is not finite.

@@ -31,7 +31,8 @@ class Estimator(NamedTuple):
         dark: (pixels,) DN.
         scratch: (pixels,) overwritten by every frame, so that no array of a frame's size is allocated; it carries no
             data from one call to the next.
-        kernel: implementation for normal frames, with its `tables`; None for the reference implementation alone.
+        kernel: implementation for normal frames.
+        tables: arrays of its compiled functions; None if it has none.
     """
 
     rows: Single
@@ -52,8 +53,8 @@ class Estimator(NamedTuple):
 
     def estimate_fused(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
         """Modal error of a frame (pixels,) by the fused step; None if the frame needs the reference step."""
-        found = None if self.tables is None else self.tables.estimate(pixels, min_flux_dn)
-        return None if found is None else Estimate(*found)
+        measured = None if self.tables is None else self.tables.estimate(pixels, min_flux_dn)
+        return None if measured is None else Estimate(*measured)
 
     def estimate(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
         """Modal error of a frame (pixels,); None if its flux is at most `min_flux_dn`."""
@@ -82,8 +83,8 @@ def difference(calibration: Calibration, pixels: Pixels, min_flux_dn: float, out
     return flux_dn
 
 
-def filled(calibration: Calibration, pixels: Pixels) -> Pixels:
-    """Replace the saturated pixels of a frame (pixels,) DN by the reference, scaled to the flux of the other pixels.
+def fill_saturated(calibration: Calibration, pixels: Pixels) -> Pixels:
+    """Replace the saturated pixels of a frame (pixels,) DN by dark plus reference, at the flux of the other pixels.
 
     A pixel with a cosmic ray hit carries no wavefront information, but would enter with all its charge.
     """

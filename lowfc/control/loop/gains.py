@@ -21,7 +21,7 @@ from lowfc.control.loop.state import ActiveLoop, Settings, Weighting
 from lowfc.control.loop.wording import AUTO, counted
 
 _MAX_PREPARED = 64
-"""Most leaks of a request that are prepared; a request with more has more than any calibration has modes."""
+"""Most leaks of a request whose limiting gains are cached; a request with more has more values than there are modes."""
 
 Changed = tuple[ActiveLoop, str, *tuple[PendingEvent, ...]]
 
@@ -37,11 +37,11 @@ def changed_integrator(settings: Settings, loop: ActiveLoop, request: Request) -
         )
     integrator = _changed(loop.integrator, loop.calibration.noll, settings.delay_frames, request)
     if request.name == "gain":  # a gain set by a person is not automatic, and R treats its mode as corrected
-        given = _chosen(loop, request)
+        chosen = _chosen(loop, request)
         weighting = loop.weighting
-        loop = loop._replace(automatic=loop.automatic & ~given)
-        if weighting is not None and (weighting.prior_nm2[given] > 0).any():
-            prior_nm2 = np.where(given, np.float32(0), weighting.prior_nm2)
+        loop = loop._replace(automatic=loop.automatic & ~chosen)
+        if weighting is not None and (weighting.prior_nm2[chosen] > 0).any():
+            prior_nm2 = np.where(chosen, np.float32(0), weighting.prior_nm2)
             loop = loop.with_weighting(weighting._replace(prior_nm2=prior_nm2))
     loop = loop.with_gains(integrator)
     text = f"{request.name} is now {_listed(getattr(integrator, _ATTRIBUTES[request.name]))}"
@@ -61,8 +61,7 @@ def _automatic_gain(settings: Settings, loop: ActiveLoop, request: Request) -> C
         prior_nm2.shape == chosen.shape and np.isfinite(prior_nm2).all() and (prior_nm2 >= 0).all()
     ):
         raise ValueError(f"the mean squares of the modes must be {chosen.size}, finite and at least 0 nm^2")
-    mine = chosen & loop.automatic
-    gain = np.where(mine, changed.gain, loop.integrator.gain)
+    gain = np.where(chosen & loop.automatic, changed.gain, loop.integrator.gain)
     weighting = Weighting(prior_nm2, request.flux_dn) if prior_nm2.any() else None
     loop = loop.with_gains(replace(loop.integrator, gain=gain)).with_weighting(weighting)
     text = _listed(gain)

@@ -33,8 +33,8 @@ WORSE, BETTER = 1.2, 0.25
 LONG_TERM_S = 10.0
 """Time constant of the long-term mean square of the pseudo-open-loop modes."""
 AMPLIFIED = 2.5
-"""Ratio of mean squared error to the long-term mean square of the pseudo-open-loop modes above which it amplifies;
-below `BETTER` of the current mean square, the disturbance has grown and the loop corrects it."""
+"""Ratio of mean squared error to the long-term mean square of the pseudo-open-loop modes above which the loop
+amplifies, unless the error is below `BETTER` of their current mean square: then the disturbance has grown."""
 
 NAMES = ("tip and tilt", "the other modes")
 LAW_RETURNS = "law returns"
@@ -117,10 +117,10 @@ class LawGuard(NamedTuple):
         groups: in the order of `members`.
         frames: frames of the current block.
         sums_nm2: (3, groups) sums of squares: errors, virtual errors, pseudo-open-loop modes.
-        void: whether the virtual loop has not run for the whole block.
+        void: whether the virtual loop was interrupted during the block.
         virtual_nm: commands (modes,) of the controller that does not drive a mode, newest first; empty until it
             starts from the loop's command.
-        x: (states,) of the law as if it drove all modes; None while it does.
+        x: (states,) of the law as if it drove the overruled modes too; None while no mode is overruled.
     """
 
     spans: Spans

@@ -40,7 +40,7 @@ class Request:
 
     Attributes:
         modes: Noll indices that the values are for; empty for all.
-        values: one for all modes, or one for each.
+        values: one for all modes, or one for each; frames of a step, or duration of a lease or permit, s.
         text: name of a channel, target of a probe sequence, or a note.
         actuators_nm: one or more shapes of the mirror, one after the other, nm of surface.
         table: (frames, columns) of a probe sequence.
@@ -128,7 +128,8 @@ class Step(NamedTuple):
 
     Attributes:
         reasons: rejections of the frame, and limits that acted.
-        error_nm: None if the frame was not used; so is `pol_nm`.
+        command_nm: modal command after the frame; empty if there is no active loop.
+        error_nm: modal error that the loop drives to zero; None, like `pol_nm`, if the frame was not used.
     """
 
     frame_sequence: int

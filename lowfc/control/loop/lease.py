@@ -23,7 +23,7 @@ UNRELATED = frozenset({"status", "note", "lease", "renew", "release", "permit"})
 LEASE_OVER = "the lease ended: "
 """Beginning of the refusal of a renewal, before the cause."""
 REMAINING_TIME_SEPARATOR = ", about "
-"""Separator in a holder's description before its remaining time."""
+"""Separates the holder from its remaining time in its description."""
 
 
 class Lease(NamedTuple):
@@ -33,8 +33,8 @@ class Lease(NamedTuple):
         id: identity in the holder's requests; above 0.
         holder: the holder and its purpose, for people.
         until_ns: end by the controller's clock, unless it is renewed.
-        last_sequence: last frame for which it is in force; before the first frame, the number of frames; 0 if the frame
-            rate is unknown.
+        last_sequence: sequence of the last frame for which it is in force; its number of frames if it was granted
+            before the first frame; 0 if the frame rate is unknown.
         ended: cause of its end; empty while it is in force.
         holds: whether it is a permit: a closed loop holds its command while it is in force.
     """
@@ -56,7 +56,7 @@ class Lease(NamedTuple):
         return time_ns > self.until_ns or (self.same_start(frame_sequence) and self.last_sequence < frame_sequence)
 
     def same_start(self, frame_sequence: int) -> bool:
-        """Whether its frames are counted by the start of the camera that took this frame."""
+        """Whether `last_sequence` counts from the same start of the camera as this frame's sequence."""
         return self.last_sequence > 0 and frame_sequence >> COUNT_BITS == self.last_sequence >> COUNT_BITS
 
     def reserved(self, time_ns: int) -> str:

@@ -48,7 +48,7 @@ def loaded(
             if before.play is not None:  # the next command removes its last shape
                 shape_nm = (before.to_actuators @ before.history_nm[0]).reshape(calibration.grid)
             command_channels = loop.channels_or_empty()._replace(play=before.play)
-            command_channels = command_channels.at(before.command_channels.channels, loop.to_modes)
+            command_channels = command_channels.with_all(before.command_channels.channels, loop.to_modes)
             if same:
                 command_channels = command_channels._replace(offset_nm=before.command_channels.offset_nm)
             loop = loop._replace(command_channels=command_channels.settled())
@@ -128,7 +128,7 @@ def interlock_or_permit_cause(state: State) -> str:
 def bench_reported(settings: Settings, state: State, report: BenchReport) -> tuple[State, Outputs]:
     """Evaluate the interlocks on a bench value; one that begins to act makes the loop safer, and none closes it.
 
-    Before the first used frame, `refuse_close` opens the loop too: it started closed. `hold` holds it.
+    Before the first used frame, `refuse_close` also opens a loop that started closed.
     """
     before = state.conditions.acting
     after = judged(settings.interlocks, before, report)
@@ -281,7 +281,7 @@ def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[Pendin
     channels = loop.channels_or_empty()
     before = channels.channel(ADOPTED)
     channel_nm = rest_nm if before is None else before.shape_nm + rest_nm
-    channels = channels.having(Channel(ADOPTED, channel_nm, channel_nm), loop.to_modes).settled()
+    channels = channels.with_one(Channel(ADOPTED, channel_nm, channel_nm), loop.to_modes).settled()
     rms_nm = float(np.sqrt(np.mean(np.square(rest_nm))))
     loop = loop._replace(command_channels=channels)
     return loop, [PendingEvent("SHAPE_ADOPTED", {"rms_nm": rms_nm})]

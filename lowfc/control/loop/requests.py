@@ -176,7 +176,7 @@ def _reset(settings: Settings, state: State, request: Request) -> Handled:
     return state._replace(loop=loop, returning_to_zero=True), "the modal command goes to zero"
 
 
-def _law_of_modes(settings: Settings, state: State, request: Request) -> Handled:
+def _integrator(settings: Settings, state: State, request: Request) -> Handled:
     """gain, leak and limit of the integrator."""
     loop, text, *events = changed_integrator(settings, _calibrated_loop(state), request)
     return state._replace(loop=loop), text, *events
@@ -203,9 +203,10 @@ def _channel(settings: Settings, state: State, request: Request) -> Handled:
             raise ValueError(f"a channel has {grid[0]} x {grid[1]} actuators, got {request.actuators_nm.size}")
         shape_nm = request.actuators_nm.reshape(grid)
     _check_shape(None if request.text == EXTERNAL else settings.limits, shape_nm)
-    channels = loop.channels_or_empty().with_channel(request.text, shape_nm, loop.to_modes)
-    if not request.actuators_nm.size and loop.channels_or_empty().channel(request.text) is None:
-        names = ", ".join(one.name for one in loop.channels_or_empty().channels)
+    before = loop.channels_or_empty()
+    channels = before.with_channel(request.text, shape_nm, loop.to_modes)
+    if not request.actuators_nm.size and before.channel(request.text) is None:
+        names = ", ".join(one.name for one in before.channels)
         raise ValueError(f"there is no channel {request.text!r} to remove; there are {names or 'none'}")
     commanded = (one.shape_nm for one in channels.channels if one.commanded)
     _check_shape(settings.limits, sum(commanded, np.zeros(grid, np.float32)))
@@ -330,9 +331,9 @@ _HANDLERS: dict[str, Handler] = {
     "safe": _mode,
     "clear": _mode,
     "reset": _reset,
-    "gain": _law_of_modes,
-    "leak": _law_of_modes,
-    "limit": _law_of_modes,
+    "gain": _integrator,
+    "leak": _integrator,
+    "limit": _integrator,
     "offset": _offset,
     "channel": _channel,
     "play": _play,

@@ -57,7 +57,7 @@ NOT_NEW = frozenset((Rejection.OUT_OF_ORDER, Rejection.REPEATED, Rejection.AHEAD
 
 
 class Limit(IntEnum):
-    """The limit that changed a command, or why a command was refused; numbered as on the wire."""
+    """Why a command was changed or refused, or that the guard overrules the law; numbered as on the wire."""
 
     MODAL_LIMIT = 20
     STROKE = 21

@@ -28,7 +28,7 @@ SETTLING_FRAMES = 100
 FADING_FRAMES = 100
 """Frames of the cross-fade in which a law takes over."""
 MAX_PREDICTED_FRAMES = 100
-"""Frames missing in a row after which a law restarts."""
+"""Frames missing in a row after which a law observes and fades in again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Settings:
     Attributes:
         limits: limits of the mirror, applied here and again by the mirror.
         delay_frames: frames from the one measured to the first exposed entirely under the resulting command.
-        start_mode: mode once a calibration is loaded: open or closed.
+        start_mode: mode once a calibration is loaded: open, closed, or safe if safe mode was latched.
         max_frame_age_ns: age above which a frame is refused.
         frame_timeout_ns: time without frames after which an event is raised and `on_frame_timeout` applies.
         on_frame_timeout: hold the command, or relax the mirror to flat.
@@ -138,10 +138,11 @@ class LawRunner(NamedTuple):
 
 
 class Weighting(NamedTuple):
-    """Weighting of R: mean squares (modes,) of the uncorrected modes, nm^2, and the flux, DN.
+    """Weighting of R, as for `map_reconstructor`.
 
     Attributes:
-        prior_nm2: 0 for a mode that the loop corrects.
+        prior_nm2: (modes,) mean square of each uncorrected mode, nm^2; 0 for a mode that the loop corrects.
+        flux_dn: flux of the star, DN.
     """
 
     prior_nm2: Single
@@ -149,15 +150,17 @@ class Weighting(NamedTuple):
 
 
 class ActiveLoop(NamedTuple):
-    """The loop once the mirror is known, from a calibration or from the mirror's report.
+    """The loop once the mirror's grid is known, from a calibration or from the mirror's report.
 
     Attributes:
         calibration: the one in use; without modes or pixels if none was loaded.
+        estimator: from frames to modal errors.
+        integrator: gain, leak and limit of each mode; a law has these limits too.
         to_actuators: (actuators, modes) as in the calibration, in the memory layout of the faster product.
         inverse: (modes, actuators) modal command of a mirror shape.
         to_modes: (modes, actuators) modes that the sensor sees of a mirror shape.
-        weights: which commands of the history are seen in an exposure, and how much of each.
-        camera: camera settings of the calibration: its own, or the first received after it was loaded; None until then.
+        delay_weights: (index in `history_nm`, fraction) of each command that an exposure sees.
+        camera: camera settings of the calibration: its own, or the first received that fit it; None until then.
         automatic: (modes,) whether the gain of a mode is automatic.
         weighting: weighting of R; None for the calibration's own R.
         law_runner: linear law in use instead of the integrator; None for the integrator.

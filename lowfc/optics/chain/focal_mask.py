@@ -21,7 +21,7 @@ def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -
 
 
 def phase_spot(samples_per: int = 8, radius: float = 4.0, spot_diameter: float = 1.06) -> Complex:
-    """The disk with a central spot that delays by a quarter of a wave: both masks of the Zernike sensor in one.
+    """The disk with a central spot that delays by a quarter of a wave, as in a Zernike sensor.
 
     Samples on the spot's edge are area-weighted means of both sides, as the spot is only eight samples wide. The phase
     is assumed equal at all wavelengths, and the spot's physical size fixed.

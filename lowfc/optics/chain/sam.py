@@ -16,7 +16,7 @@ class Layout:
     Attributes:
         name: Name of the layout.
         purpose: Purpose of the design, in one line.
-        holes: Centre relative to the pupil's centre and diameter (x, y, diameter) of each hole, in pupil diameters.
+        holes: (x, y, diameter) of each hole, in pupil diameters; (x, y) is its centre, relative to the pupil's centre.
     """
 
     name: str

@@ -6,22 +6,21 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Array, Single, Whole
+from lowfc.arrays import Array, Single, SingleComplex, Whole
 from lowfc.optics.chain.coronagraph import Coronagraph, LyotStop, Wedge, wedge_samples
 from lowfc.optics.chain.fourier import kernel
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.zernike import zernikes
 
-SingleComplex = npt.NDArray[np.complex64]
 _LYOT_SQUARE = 4  # pupil samples across a cell
 
 
 class ScienceCamera:
     """Contrast of a coronagraph, in single precision, from modal wavefronts.
 
-    The field is summed over the open samples of the pupil only. If the four samples of every 2 x 2 square are equal,
-    as in the package's shaped pupil, the wavefront is evaluated once for each square, at its centre; the Fourier kernel
-    is still summed over all four. The pupil of a Lyot coronagraph is averaged over squares of 4 x 4.
+    The field is summed over the open cells of the pupil only: the wavefront is evaluated at each cell's centre, and the
+    Fourier kernel is summed over the cell's samples. A cell has 2 x 2 samples if those of every cell are equal, as in
+    the package's shaped pupil, otherwise one. For a Lyot coronagraph it has 4 x 4, over which the pupil is averaged.
 
     Attributes:
         samples: Samples across the square image, at the positions of `grid.image_axis`.

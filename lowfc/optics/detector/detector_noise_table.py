@@ -3,8 +3,7 @@
 The distribution of the digital number for a mean of m electrons is known: Poisson, plus Gaussian, rounded. The table
 has a row for each m of a grid, with 1024 equally likely entries (Marsaglia, Tsang and Wang 2004). Each probability is
 rounded down to a multiple of 1/1024. The remainder is drawn from a second distribution, `rest`: entries equal to
-`_REMAINDER` select it. A mean between two grid values is
-rounded at random to one of them, so that the mean of the draws is exact.
+`_REMAINDER` select it. A mean between two grid values is rounded at random to one of them, which keeps the mean exact.
 """
 
 import math
@@ -22,7 +21,7 @@ STEP_E = 1 / 64
 _ENTRIES_BITS = 10
 _ENTRIES = 1 << _ENTRIES_BITS
 _FRACTION_BITS = 16  # resolution of the probability of rounding up
-_MAX_TABULATED_E = 64  # tabulated electrons; at a mean of 24 e- a pixel exceeds it once in 1e11 frames
+_MAX_TABULATED_E = 64  # tabulated electrons, from 0; at a mean of 24 e- a pixel has as many once in 1e11 frames
 _TAIL = 8.0  # tabulated range of the read noise, standard deviations
 _WIDEST = 256  # largest range of digital numbers that is tabulated
 _MIN_NOISE_DN = 0.05  # with less read noise the table does not resolve the rounding

@@ -78,7 +78,7 @@ def test_short_gaps_are_interpolated_and_long_gaps_split_the_run() -> None:
     present[12 : 13 + MAX_INTERPOLATED_FRAMES] = False
     found = time_series(numbers(20)[present], values[present])
     assert [len(piece) for piece in found.values] == [12, 20 - 13 - MAX_INTERPOLATED_FRAMES]
-    assert found.bridged == MAX_INTERPOLATED_FRAMES
+    assert found.interpolated == MAX_INTERPOLATED_FRAMES
     assert np.array_equal(found.values[0], values[:12])  # interpolation of a straight line is exact
     assert np.array_equal(found.values[1], values[13 + MAX_INTERPOLATED_FRAMES :])
     assert found.frames == 20 - 1 - MAX_INTERPOLATED_FRAMES

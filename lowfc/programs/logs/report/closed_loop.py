@@ -121,7 +121,7 @@ def stretch_results(run: Run, stretch: Stretch | None) -> Results | None:
         "true": stretch.true,
         "frames": stretch.frames.frames,
         "pieces": len(stretch.frames.values),
-        "frames_bridged": stretch.frames.bridged,
+        "frames_bridged": stretch.frames.interpolated,
         "steps_settling": stretch.settling,
         "steps_earlier": stretch.earlier,
         "steps_limited": int(limited.sum()),
