@@ -7,7 +7,7 @@ import numpy as np
 
 from lowfc.control.calibration.calibration import ESTIMATORS
 from lowfc.design.merit import (
-    HELD,
+    CONTROLLED,
     Candidate,
     condition,
     contrast_noise,
@@ -121,7 +121,7 @@ def predictions(candidate: Candidate) -> dict[str, Any]:
         "condition": {str(m): condition(central, m) for m in MODES},
         "table3_waves": table3,
         "table4_mas": {name: {str(m): table4_mas(in_band, m, name) for m in fitted} for name in ESTIMATORS},
-        "noise_nm": float(np.sqrt(np.trace(exposure_nm2(central, HELD, "weighted")))),
+        "noise_nm": float(np.sqrt(np.trace(exposure_nm2(central, CONTROLLED, "weighted")))),
         "contrast_noise": contrast_noise(forms, central, "weighted"),
         "quantum_share": quantum_share(forms, central),
     }

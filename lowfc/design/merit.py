@@ -20,8 +20,8 @@ from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
 
 WAVELENGTH_NM = 550.0
-HELD = len(NOLLS_14)
-"""Number of controlled modes, in the values of noise, added contrast and share of the quantum limit."""
+CONTROLLED = len(NOLLS_14)
+"""Number of controlled modes, for the noise, the added contrast and the share of the quantum limit."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class PupilForms:
         return cls(
             gram(modes[:, pupil > 0.5]),
             without_negative(contrast_form(Coronagraph(pupil), NOLLS_14, WAVELENGTH_NM)),
-            quantum_information(pupil, modes[:HELD], WAVELENGTH_NM),
+            quantum_information(pupil, modes[:CONTROLLED], WAVELENGTH_NM),
         )
 
 
@@ -90,12 +90,12 @@ class Candidate(Protocol):
         """Residual of Table 3 with the plain pseudo-inverse and without noise, waves."""
 
 
-def covariance_nm2(signal: Signal, electrons_e: float, read_noise_e: float, modes: int, estimator: str) -> Array:
+def covariance_nm2(signal: Signal, light_e: float, read_noise_e: float, modes: int, estimator: str) -> Array:
     """Covariance (modes, modes) of a fit of only the first modes to one frame with photon and read noise.
 
     Args:
         signal: I0 and H of the sensor.
-        electrons_e: Electrons of the light that enters the open circle during the exposure.
+        light_e: Electrons of the light that enters the open circle during the exposure.
         read_noise_e: Read noise of each pixel, electrons.
         modes: Number of fitted modes.
         estimator: "pinv", or "weighted", which attains the Cramer-Rao bound.
@@ -103,8 +103,8 @@ def covariance_nm2(signal: Signal, electrons_e: float, read_noise_e: float, mode
     Raises:
         ValueError: The estimator is not known.
     """
-    H = signal.H[:, :modes] * electrons_e
-    variance_e2 = (np.maximum(signal.I0, 0.0) * electrons_e + read_noise_e**2)[:, None]
+    H = signal.H[:, :modes] * light_e
+    variance_e2 = (np.maximum(signal.I0, 0.0) * light_e + read_noise_e**2)[:, None]
     if estimator == "weighted":
         weighted = np.divide(H, variance_e2, out=np.zeros_like(H), where=variance_e2 > 0)
         return np.asarray(np.linalg.inv(H.T @ weighted) / signal.pixels_per_sample)
@@ -140,13 +140,13 @@ def exposure_nm2(signal: Signal, modes: int, estimator: str) -> Array:
 
 def contrast_noise(forms: PupilForms, signal: Signal, estimator: str) -> float:
     """Contrast added to the dark zone by the noise of 14 modes in one exposure of Table 4's star."""
-    return float(np.sum(forms.contrast * exposure_nm2(signal, HELD, estimator)))
+    return float(np.sum(forms.contrast * exposure_nm2(signal, CONTROLLED, estimator)))
 
 
 def quantum_share(forms: PupilForms, signal: Signal) -> float:
     """Ratio of the quantum limit to the sensor's variance: median over 14 modes, without read noise."""
     bound_nm2 = np.linalg.inv(forms.quantum)
-    return float(np.median(np.diag(bound_nm2) / np.diag(covariance_nm2(signal, 1.0, 0.0, HELD, "weighted"))))
+    return float(np.median(np.diag(bound_nm2) / np.diag(covariance_nm2(signal, 1.0, 0.0, CONTROLLED, "weighted"))))
 
 
 def condition(signal: Signal, modes: int) -> float:

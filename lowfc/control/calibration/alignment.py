@@ -158,9 +158,8 @@ def _residual(model: Array, real: Array) -> tuple[float, float, float]:
 
 def _refine(spline: Array, guess: Geometry, real: Array) -> tuple[float, Geometry]:
     def geometry(values: Array) -> Geometry:
-        return Geometry(
-            float(values[0]) * guess.scale, float(values[1]), float(values[2]), float(values[3]), guess.parity
-        )
+        scale, row, column, rotation_deg = values.tolist()
+        return Geometry(scale * guess.scale, row, column, rotation_deg, guess.parity)
 
     def rest(values: Array) -> Array:
         model = _sample(spline, geometry(values), real.shape)

@@ -51,9 +51,8 @@ class Gains:
         departure[:, self.mode] = self.gain[:, self.mode] - 1
         beyond = np.abs(departure) > limit + SURE * self.error
         unsure = self.error > limit / 2
-        return [
-            False if far.any() else None if vague.any() else True for far, vague in zip(beyond, unsure, strict=True)
-        ]
+        rows = zip(beyond, unsure, strict=True)
+        return [False if far.any() else None if vague.any() else True for far, vague in rows]
 
 
 def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Whole, frames: int) -> Gains:

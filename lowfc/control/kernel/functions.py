@@ -11,13 +11,7 @@ from lowfc.arrays import Pixels, Sequences, Single
 
 
 def scan(
-    counts: Pixels,
-    used: Pixels,
-    dark: Single,
-    tiles: Single,
-    row: int,
-    scratch: Single,
-    sums_nm: Single,
+    counts: Pixels, used: Pixels, dark: Single, tiles: Single, row: int, scratch: Single, sums_nm: Single
 ) -> tuple[np.uint64, np.uint16]:
     """Products of one block of a frame with R, in one pass over its counts.
 

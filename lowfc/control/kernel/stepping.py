@@ -118,7 +118,7 @@ def _update_guard(
 def _guarded(
     state: State, loop: ActiveLoop, law: LawRunner, guard: LawGuard, error_nm: Single, pol_from_target_nm: Single
 ) -> tuple[LawGuard, list[PendingEvent]]:
-    """The guard of a law after a frame, and its events; error and POL (modes,) are relative to the loop's target."""
+    """The guard after a frame, and its events; `law` is advanced, error and POL (modes,) are relative to the target."""
     closed, channels = state.mode is LoopMode.CLOSED, loop.command_channels
     probed = state.returning_to_zero or (channels is not None and channels.play is not None)
     if probed or not (closed or state.mode is LoopMode.OPEN):
@@ -127,9 +127,8 @@ def _guarded(
         return guard.observed(pol_from_target_nm, law.frames), []
     if law.frames < SETTLING_FRAMES + FADING_FRAMES:
         return guard.at_rest(), []
-    limited = any(
-        reason is not Limit.MODAL_LIMIT for reason in state.limits_hit
-    )  # virtual commands have the modal limit, too
+    # Virtual commands have the modal limit, too.
+    limited = any(reason is not Limit.MODAL_LIMIT for reason in state.limits_hit)
     integrator = loop.integrator, loop.delay_weights, loop.history_nm
     return guard.judged(law.law, law.x, *integrator, error_nm, pol_from_target_nm, limited=limited)
 
@@ -137,12 +136,12 @@ def _guarded(
 def next_command(
     settings: Settings, state: State, loop: ActiveLoop, error_nm: Single, sequence: int
 ) -> tuple[ActiveLoop, tuple[Reason, ...], bool]:
-    """The loop with the command after an error (modes,), the limits that acted, and `returning_to_zero` afterwards."""
+    """The loop with its command after an error (modes,), the limits that acted, and the next `returning_to_zero`."""
     if state.mode is LoopMode.SAFE:
         return step_to_flat(settings, loop), (), False
     channels, returning_to_zero = loop.command_channels, state.returning_to_zero
     closed = state.mode is LoopMode.CLOSED
-    # After a limit acted, the mirror has not reached its target.
+    # If a limit acted on the last command, the channels have not been reached yet.
     if not closed and not returning_to_zero and (channels is None or not (channels.moving or state.limits_hit)):
         return loop.holding_command(1), (), False
     command_nm, clipped = loop.history_nm[0], False

@@ -75,12 +75,7 @@ class GainBank:
     """
 
     def __init__(
-        self,
-        kept: Single,
-        limit_nm: Single,
-        weights: Weights,
-        delay_frames: float,
-        windows: tuple[int, int],
+        self, kept: Single, limit_nm: Single, weights: Weights, delay_frames: float, windows: tuple[int, int]
     ) -> None:
         """Make a bank with one mode for each leak.
 

@@ -188,7 +188,6 @@ def integrator(
     Raises:
         ValueError: their lengths differ from the number of modes.
     """
-    blocks = [
-        integrator_block(float(g), float(lost), "error", delay_frames) for g, lost in zip(gain, leak, strict=True)
-    ]
+    modes = zip(gain, leak, strict=True)
+    blocks = [integrator_block(float(g), float(lost), "error", delay_frames) for g, lost in modes]
     return law_from_blocks(blocks, "error", "integrator", noll, delay_frames, rate_hz)

@@ -23,7 +23,7 @@ _BISECTIONS = 50
 
 
 def settling_frames(gain: Array | Single, leak: Array | Single, least: float = 0.0) -> int:
-    """Frames until the slowest mode has settled after closing, but at least `least`; gain and leak are (modes,)."""
+    """Frames until the slowest mode has settled after closing, or `least` if more; gain, leak (modes,) without unit."""
     slowest = float((gain + leak)[gain + leak > 0].min(initial=1.0))
     return int(np.ceil(max(SETTLING / slowest, least)))
 

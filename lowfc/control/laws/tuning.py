@@ -171,7 +171,10 @@ def tune_lqg(
 
 
 def tune_pi_notch(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing) -> Tuned:
-    """An integrator with a notch for each line that it can reduce with sufficient margins; leaks (modes,), no unit."""
+    """An integrator with a notch for each line that it can reduce with sufficient margins.
+
+    Leaks (modes,) without unit.
+    """
     rate_hz = models[0].rate_hz
     found = [_notched(*mode, timing) for mode in zip(models, gains.gain.tolist(), leak.tolist(), strict=True)]
     gain, notches = np.array([g for g, _ in found]), [of_mode for _, of_mode in found]

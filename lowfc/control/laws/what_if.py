@@ -48,7 +48,7 @@ def as_logged(law: Integrator) -> Controller:
 
 
 def exposed(reasons: Long) -> Mask:
-    """Mask (steps,) of the steps with a new exposure; `reasons` (steps,) has the bit `1 << reason` of each reason."""
+    """Mask (steps,): whether a step has a new exposure; `reasons` (steps,) has the bit `1 << reason` of each reason."""
     return np.asarray((reasons & _NOT_NEW) == 0)
 
 
@@ -73,11 +73,11 @@ def seen_nm(weights: Single, command_nm: Single, missing: Whole, first_nm: Singl
     rows = np.arange(len(command_nm))
     place = rows + np.cumsum(held)  # index of each step on an axis of all exposures
     source = np.repeat(rows - 1, held + 1)  # the last step before each exposure
-    given = np.concatenate([first_nm[None], command_nm])
+    commands_nm = np.concatenate([first_nm[None], command_nm])
     seen = np.zeros_like(command_nm)
     for lag, weight in enumerate(weights):
         if weight:
-            seen += weight * given[source[np.maximum(place - lag, 0)] + 1]
+            seen += weight * commands_nm[source[np.maximum(place - lag, 0)] + 1]
     return seen
 
 

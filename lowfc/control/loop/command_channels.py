@@ -233,7 +233,7 @@ def seen_nm(weights: tuple[tuple[int, np.float32], ...], newest_first: tuple[Sin
 
 
 def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
-    """Make a table to play, and check it as far as possible without the loop; arrays as in `PlayTable`.
+    """Make a table to play, checked as far as possible without the loop; shapes as in `PlayTable`, nm.
 
     Raises:
         ValueError: its parts do not match, it is too large, or a number in it is not finite.

@@ -52,7 +52,7 @@ class Request:
         lease_id: identity of the sender's lease, or of the requested one; 0 for none.
         requester: user and program that sent it, for people.
         prior_nm2: mean squares (modes,) of the uncorrected modes, nm^2, by which automatic gains weight R.
-        flux_dn: the flux at which they were measured.
+        flux_dn: the flux at which `prior_nm2` was measured, DN.
     """
 
     time_ns: int

@@ -96,7 +96,10 @@ class BenchReport:
 
 
 def judged(interlocks: tuple[Interlock, ...], acting: tuple[Acting, ...], report: BenchReport) -> tuple[Acting, ...]:
-    """The interlocks that act after a report; the same object if nothing changed."""
+    """The interlocks that act after a report; the same object if nothing changed.
+
+    One that acts already keeps its cause, unless a value replaces a missing one or vice versa.
+    """
     before = {one.number: one for one in acting}
     after = dict(before)
     for number, interlock in enumerate(interlocks):

@@ -62,9 +62,9 @@ class Lease(NamedTuple):
     def reserved(self, time_ns: int) -> str:
         """Message that the loop is reserved."""
         remaining_s = ceil(max(0, self.until_ns - time_ns) * 1e-9)
-        running = "" if self.holds else "while that runs, and "  # a permit ends even if its holder goes on
-        end = "more" if self.holds else "after it"
-        return f"the loop is reserved for {self.holder} ({running}for at most {remaining_s} s {end})"
+        if self.holds:  # a permit ends even if its holder goes on
+            return f"the loop is reserved for {self.holder} (for at most {remaining_s} s more)"
+        return f"the loop is reserved for {self.holder} (while that runs, and for at most {remaining_s} s after it)"
 
 
 def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:

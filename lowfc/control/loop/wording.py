@@ -3,11 +3,11 @@
 PAUSED = "operator asked to pause"
 """Cause of the open mode of a loop that is paused."""
 AUTO = "auto"
-"""Text of a request for automatic gains, and the prefix of the text of those not made by a person."""
+"""Text of a request for automatic gains, and beginning of the text of other requests that they make."""
 MEASURED_FIRST = "the gains are measured before the loop closes"
 """Cause of the open mode in which a loop with automatic gains begins."""
 CAMERA_MISFIT = "the camera does not fit the calibration"
-"""Beginning of the cause of the open mode in which its settings differ from the calibration's."""
+"""Beginning of the cause if the loop is open because the camera's settings differ from the calibration's."""
 MAX_NOTE_LENGTH = 10_000
 """Most characters of a note."""
 

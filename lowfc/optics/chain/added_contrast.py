@@ -65,7 +65,7 @@ def by_group(noll: Sequence[int], each: Array) -> dict[str, float]:
 
 
 def costliest(groups: Mapping[str, float]) -> tuple[str, float]:
-    """The kind of modes that adds most contrast, and its share of the total; groups as sorted by `by_group`."""
+    """The kind of modes that adds most contrast, and its share of the total; `groups` is a result of `by_group`."""
     name, most = next(iter(groups.items()))
     return name, most / (sum(groups.values()) or 1.0)
 

@@ -10,8 +10,8 @@ The conventions::
     phase       2 pi OPD / lambda; wavefronts are optical path differences in nm
     intensity   the light on a pixel divided by the light that enters the open circular pupil, before any mask
 
-All samples lie at half-integer offsets from the optical axis, symmetric about it: no sample is at zero. The focal-plane
-mask and the pixels are hardware: their size in lambda0 / D does not change with the wavelength.
+Numbers of samples are even: samples lie at half-integer offsets from the optical axis, and none is at zero. Focal-plane
+mask and pixels are hardware: their size in lambda0 / D does not change with the wavelength.
 """
 
 import numpy as np

@@ -52,7 +52,7 @@ def mode_group(noll: int) -> str:
 
 
 def noll_to_orders(noll: int) -> tuple[int, int]:
-    """Radial degree n and azimuthal order m of a Noll index; m < 0 is the sine.
+    """Radial degree n and azimuthal order m of a Noll index; m < 0 for a sine.
 
     Raises:
         ValueError: The index is below 1.

@@ -1,9 +1,9 @@
 """A deformable mirror on the twin's nodes: its wavefront in microseconds.
 
-The nodes are too coarse for the print-through of the actuators: sampled there, it would alias to low orders, while in
-the full optics the shaped pupil's fine structure mixes some of it into them. The nodes therefore carry a least-squares
-fit of the surface, and a small correction makes the field at the sensor equal to that of the full surface, to first
-order.
+The nodes are too coarse for the print-through of the actuators: sampled there, it would alias to low orders. In the
+full optics, the shaped pupil's fine structure mixes some of it into low orders. The nodes therefore carry a
+least-squares fit of the surface. A small correction makes the field at the sensor, to first order, that of the full
+surface.
 """
 
 from dataclasses import dataclass
