@@ -110,12 +110,14 @@ def advice(made: Reconstruction, noll: tuple[int, ...], limit_nm: float) -> str:
         limit_nm: Largest command of a mode; the loop cannot follow a combination with more noise than this in a frame.
     """
     noise_nm = 1 / np.maximum(made.singular_values, 1e-300)
-    if not (made.kept > 0.999).all():
-        suppressed = int(np.count_nonzero(made.kept < 0.5))
+    suppressed, least = int(np.count_nonzero(made.kept < 0.5)), float(made.kept.min())
+    if suppressed:
         return (
             f"{suppressed} of {len(noll)} combinations of modes are suppressed: they are not controlled, and their "
             "disturbance remains; the modes in them are measured too small"
         )
+    if least <= 0.999:
+        return f"the worst-measured combination of modes is damped to {least:.0%}: its modes are measured too small"
     bad = np.flatnonzero(noise_nm > limit_nm)
     if bad.size == 0:
         return (

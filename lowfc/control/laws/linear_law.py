@@ -77,13 +77,7 @@ class LinearLaw:
 def matrix_shapes(states: int, modes: int) -> dict[str, tuple[int, int]]:
     """Shape of each matrix of a law, by its name."""
     square, in_, out = (states, states), (states, modes), (modes, states)
-    return {
-        "transition": square,
-        "measurement_gain": in_,
-        "command_gain": in_,
-        "predict_only": square,
-        "output": out,
-    }
+    return {"transition": square, "measurement_gain": in_, "command_gain": in_, "predict_only": square, "output": out}
 
 
 # The hashed names are those of 0.1, so that laws keep their identities.

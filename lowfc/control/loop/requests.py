@@ -209,7 +209,7 @@ def _channel(settings: Settings, state: State, request: Request) -> Handled:
         names = ", ".join(one.name for one in before.channels)
         raise ValueError(f"there is no channel {request.text!r} to remove; there are {names or 'none'}")
     commanded = (one.shape_nm for one in channels.channels if one.commanded)
-    _check_shape(settings.limits, sum(commanded, np.zeros(grid, np.float32)))
+    _check_shape(settings.limits, sum(commanded, np.zeros(grid, np.float32)), "with the other channels, ")
     rms_nm = float(np.sqrt(np.mean(np.square(shape_nm, dtype=np.float64))))
     return _with(state, loop, channels), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
 
@@ -309,17 +309,18 @@ def _with(state: State, loop: ActiveLoop, command_channels: CommandChannels) -> 
     return state._replace(loop=loop._replace(command_channels=command_channels))
 
 
-def _check_shape(limits: Limits | None, shape_nm: Single) -> None:
-    """Refuse a channel that alone exceeds the mirror's limits, so that the operator reads why."""
+def _check_shape(limits: Limits | None, shape_nm: Single, prefix: str = "") -> None:
+    """Refuse a channel, or a sum of channels, that exceeds the mirror's limits without any command of the law."""
     if not np.isfinite(shape_nm).all():
         raise ValueError("every actuator of a channel must be finite")
     if limits is None:  # already on the mirror
         return
     largest_nm, difference_nm = float(np.abs(shape_nm).max()), neighbour_difference_nm(shape_nm)
     if largest_nm > limits.kept_stroke_nm:
-        raise ValueError(f"an actuator is {largest_nm:.4g} nm from flat, the limit is {limits.stroke_nm:g} nm")
+        raise ValueError(f"{prefix}an actuator is {largest_nm:.4g} nm from flat, the limit is {limits.stroke_nm:g} nm")
     if difference_nm > limits.neighbour_nm - limits.margin_nm:
-        raise ValueError(f"neighbours differ by {difference_nm:.4g} nm, the limit is {limits.neighbour_nm:g} nm")
+        limit_nm = limits.neighbour_nm
+        raise ValueError(f"{prefix}neighbours differ by {difference_nm:.4g} nm, the limit is {limit_nm:g} nm")
 
 
 _HANDLERS: dict[str, Handler] = {

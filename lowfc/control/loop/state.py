@@ -299,7 +299,7 @@ class State(NamedTuple):
         limits_hit: limits that acted on the last command.
         frame_timeout: whether the frame timeout has been reported.
         commanded: whether a command has been sent, so that the mirror's shape is no longer adopted.
-        steps_left: frames until the loop opens automatically; 0 for never.
+        steps_left: used frames until the loop opens automatically; 0 for never.
         returning_to_zero: whether the modal command is returning to zero.
         estimate: the last measurement, and `identical_frames`, the number of consecutive equal ones before.
         input_number: count of the inputs that changed the state or produced output; the order of replay.
