@@ -4,6 +4,7 @@ Example: python examples/photon_budget.py 2 5
 """
 
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -16,8 +17,8 @@ from lowfc.optics.detector.photometry import tilt_nm_per_mas
 def budget(magnitudes: Sequence[float]) -> Iterator[str]:
     """Yield a row for each magnitude: the default sensor at the default rate, R computed for this light."""
     config = Configuration()
-    optics = factory.twin(config, None, sys.exit)
-    on_nodes = factory.mirror_on_twin(config, optics, sys.exit)
+    optics = factory.twin(config, None, warnings.warn)
+    on_nodes = factory.mirror_on_twin(config, optics, warnings.warn)
     nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
     yield f"{config.sensor.kind}, {config.camera.rate_hz:g} frames per second: noise of one frame"
     yield "    V   electrons   tilt, mas rms per axis   other modes, nm rms"

@@ -10,15 +10,10 @@ IMAGES = 200
 
 
 class Contrast:
-    """Collects modes at instants evenly spread over a run of unknown length, and computes their contrast.
-
-    Attributes:
-        noll: Noll index of each mode.
-    """
+    """Collects modes at instants evenly spread over a run of unknown length, and computes their contrast."""
 
     def __init__(self, modal: ModalContrast) -> None:
         """Start without instants."""
-        self.noll = modal.noll
         self._modal, self._form = modal, modal.form.astype(np.float32)
         self._kept: list[tuple[Single, Single]] = []
         self._stride, self._frames = 1, 0

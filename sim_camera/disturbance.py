@@ -120,7 +120,7 @@ def preset_disturbance(
         case "bench":
             waves = [
                 _drift(rng, scale * _thermal_nm(noll), _THERMAL_HZ),
-                _lines(rng, np.full(len(_JITTER_HZ), _JITTER_MAS / 2), _JITTER_HZ, tilt_nm),
+                _undamped_lines(rng, np.full(len(_JITTER_HZ), _JITTER_MAS / 2), _JITTER_HZ, tilt_nm),
             ]
         case "reaction-wheel" | "reaction-wheel-ideal":
             waves = [
@@ -133,7 +133,7 @@ def preset_disturbance(
                     for rms_mas, hz in zip(LINES_MAS, LINES_HZ, strict=True)
                 )
             else:
-                waves.append(_lines(rng, np.array(LINES_MAS), LINES_HZ, tilt_nm))
+                waves.append(_undamped_lines(rng, np.array(LINES_MAS), LINES_HZ, tilt_nm))
         case "step":
             step = _STEP_MAS * tilt_nm
         case "kolmogorov":
@@ -209,7 +209,7 @@ def modes_nm(disturbance: Disturbance, first: int, count: int, rate_hz: float) -
     """Modes (count, modes) at the starts of the exposures of the frames from `first` on, nm of wavefront rms."""
     found = _sum_of_waves(disturbance, (first + np.arange(count)) / rate_hz)
     if disturbance.lines:
-        lines = _Lines(disturbance, rate_hz)
+        lines = _DampedLines(disturbance, rate_hz)
         found[:, lines.modes] += lines.at(first, count)[:count].real.sum(axis=1)
     return found
 
@@ -240,7 +240,7 @@ def variances_nm2(disturbance: Disturbance, per_line: int = 401) -> tuple[Array,
     return np.concatenate(frequency_hz), np.concatenate(variance_nm2)
 
 
-class _Lines:
+class _DampedLines:
     """Damped lines at the starts of exposures as rotating complex vectors, drawn in the order of the frames.
 
     Attributes:
@@ -296,7 +296,7 @@ class Sampler:
         self._time_s = ((np.arange(BLOCK)[:, None] + instants) / rate_hz).ravel()
         waves = np.exp(2j * np.pi * np.outer(self._time_s, disturbance.frequency_hz))
         self._waves = np.hstack([waves.real, -waves.imag]).astype(np.float32)
-        self._lines = _Lines(disturbance, rate_hz) if disturbance.lines else None
+        self._lines = _DampedLines(disturbance, rate_hz) if disturbance.lines else None
         self._between = _between(disturbance.lines, instants / rate_hz, 1 / rate_hz)
         self._shape = (BLOCK, len(instants), len(disturbance.noll))
         self._blocks: dict[int, Single] = {}
@@ -380,7 +380,7 @@ def _drift(rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]
     return frequencies, weights[:, None] * _phases(rng, (_WAVES_PER_BAND, len(rms_nm))) * rms_nm
 
 
-def _lines(
+def _undamped_lines(
     rng: np.random.Generator, rms: Array, frequencies_hz: tuple[float, ...], unit_nm: Array
 ) -> tuple[Array, Complex]:
     """Sine waves at fixed frequencies; `rms` of each in units of `unit_nm` (modes,)."""

@@ -192,8 +192,8 @@ class SimulatedCamera:
 
     def settings(self) -> CameraSettings:
         """Camera settings of the next exposure."""
-        time_ns = self._origin_ns and self._start_ns() + self._config.exposure_ns
-        return replace(self._settings, time_ns=time_ns or None)
+        started = self._origin_ns > 0
+        return replace(self._settings, time_ns=self._start_ns() + self._config.exposure_ns if started else None)
 
     def expose(self) -> Exposure | None:
         """Latch the mirror's shape at the start of the next exposure, and compute its frame before the end."""
@@ -228,12 +228,12 @@ class SimulatedCamera:
         """Wait until the mirror has applied the command computed from the last frame.
 
         Raises:
-            BusError: not applied within PATIENCE_S.
+            BusError: no state of the mirror for PATIENCE_S.
         """
         while self._newest_state < self._last_frame and self._service.running:
             self._arrived.clear()
             if not self._states and not self._arrived.wait(PATIENCE_S):
-                raise BusError(self._silent_ones())
+                raise BusError(self._no_progress())
             self._drain()
 
     def close(self) -> None:
@@ -310,7 +310,7 @@ class SimulatedCamera:
                 self._service.unreadable(sample.key, why)
                 continue
             self._latched = shape
-            latest = self._exposed.frame + 1  # after a stall of the host too, the next exposure starts with this shape
+            latest = self._exposed.frame + 1  # the next exposure starts with this shape, even after a stall of the host
             self._path.applied(self._moment(sample.publish_time_ns), shape, latest)
             if state.frame_sequence > self._newest_state:
                 self._newest_state = state.frame_sequence
@@ -332,7 +332,7 @@ class SimulatedCamera:
             event = "COMMANDS_LATE" if self._lateness.habitual else "COMMANDS_IN_TIME"
             self._service.event(event, percent=self._lateness.percent)
 
-    def _silent_ones(self) -> str:
+    def _no_progress(self) -> str:
         now_ns = self._service.clock.host_ns()
         silent = [
             name

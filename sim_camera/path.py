@@ -38,7 +38,7 @@ class MirrorPath:
         weights[:, 0] = 1
         ends = [moment for moment, _ in moves[2:]] + [np.inf]
         for row, ((moment, _), end) in enumerate(zip(moves[1:], ends, strict=False), 1):
-            since = np.minimum(start + instants, end) - moment
+            since = np.maximum(np.minimum(start + instants, end) - moment, 0)
             remaining = np.exp(-since / self._settling) if self._settling else np.zeros(len(instants))
             remaining = np.where(start + instants < moment, 1.0, remaining)
             weights *= remaining[:, None].astype(np.float32)

@@ -20,7 +20,7 @@ from sim_camera.pixels import PixelErrors
 GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 """The two Gauss-Legendre nodes in [0, 1], in exposure times: their mean is exact to third order in time."""
 _MAX_NODES = 256
-"""Limit of the time for a frame, and for the nodes themselves; reached below 1 Hz."""
+"""Largest number of nodes, which bounds the time to compute them and a frame; reached below 1 Hz."""
 
 
 @dataclass(frozen=True, slots=True)

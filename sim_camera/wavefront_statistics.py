@@ -11,9 +11,9 @@ from lowfc.optics.chain.added_contrast import by_group, costliest
 from sim_camera.scene import Truth, Wavefront
 
 BLOCK = 500
-"""Frames summed together: the second half is correct to this many frames."""
+"""Frames summed together at first: the second half is correct to one block."""
 MAX_BLOCKS = 256
-"""Blocks stored; then pairs are merged, so that memory does not grow with the length of the run."""
+"""Blocks stored; then pairs are merged and blocks are twice as long, so that memory does not grow with the run."""
 
 _RMS = "disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas"
 

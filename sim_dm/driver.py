@@ -20,7 +20,7 @@ class SimulatedMirror:
         fixed_nm = {**dict.fromkeys(section.dead, 0.0), **{int(at): height for at, height in section.stuck_nm.items()}}
         self._fixed, self._fixed_nm = list(fixed_nm), list(fixed_nm.values())
         self._settling_ns = section.settling_us * 1e3
-        self._surface_nm = self._at_rest(np.zeros(grid, np.float32))
+        self._surface_nm = self._with_fixed(np.zeros(grid, np.float32))
         errors = section.gain_error, section.hysteresis, section.creep
         self._actuators = Actuators(grid, *errors, config.seed) if any(errors) else None
 
@@ -40,14 +40,14 @@ class SimulatedMirror:
             reached_nm -= self._surface_nm
             reached_nm *= np.float32(-expm1(-max(elapsed_ns, 0) / self._settling_ns))
             reached_nm += self._surface_nm
-        self._surface_nm = self._at_rest(reached_nm)
+        self._surface_nm = self._with_fixed(reached_nm)
         return self._surface_nm
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no hardware is held."""
 
-    def _at_rest(self, surface_nm: Single) -> Single:
-        """Keep dead and stuck actuators in place."""
+    def _with_fixed(self, surface_nm: Single) -> Single:
+        """Set dead and stuck actuators in a surface, in place, and return it."""
         if self._fixed:
             surface_nm.flat[self._fixed] = self._fixed_nm
         return surface_nm

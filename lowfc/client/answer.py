@@ -13,7 +13,7 @@ class Answer(NamedTuple):
         accepted: always true.
         reply: one sentence: what was done.
         frame_sequence: sequence of the first frame for which the request is in force.
-        text: path of the log (`record` only).
+        text: path of the log (`record`); for other requests the text that was sent.
         state: the controller's state (`status` only).
         run: name of the run that answered.
     """

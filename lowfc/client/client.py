@@ -89,7 +89,7 @@ class Client:
     def __init__(self, run: str | None = None, *, bus: Bus | None = None) -> None:
         """Join a run.
 
-        None selects the only run on this host. `disconnect` does not close a `bus` that was passed in.
+        None selects the only run on this host. With a `bus`, which `disconnect` does not close, `run` is only its name.
 
         Raises:
             BusError: there is no such run, none at all, or more than one to choose from.
@@ -217,7 +217,10 @@ class Client:
             self._lease.check()
 
     def permit(self, purpose: str, hold_s: float | None = None, lease_id: int = 0) -> Answer:
-        """Ask permission to move something on the bench; with `hold_s`, the loop holds for that time: see `held`."""
+        """Ask permission to move something on the bench; with `hold_s`, the loop holds for that time: see `held`.
+
+        `lease_id` identifies the hold when it is released; 0 for a new identity.
+        """
         values = () if hold_s is None else hold_s
         return self.ask("permit", values=values, text=by_this_process(purpose), lease_id=lease_id or new_identity())
 
@@ -278,7 +281,7 @@ class Client:
         return self._grid
 
     def camera(self) -> CameraSettings | None:
-        """Camera settings as the controller last received them, to store with a measurement."""
+        """Camera settings as the controller last received them, to store with a measurement; None without any."""
         state = self.status().state
         if state is None or not state.HasField("camera"):
             return None
@@ -301,7 +304,7 @@ class Client:
         """The control law loaded instead of the integrator, by its identity; empty if none has been loaded."""
         published = Published()
         for sample in self._bus.get(LAW.key, timeout_s=ANSWER_S):
-            published.take(LAW, sample.payload)
+            published.store(LAW, sample.payload)
         return published.laws
 
     def frames(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Frame]:
@@ -378,7 +381,7 @@ class Client:
             time.sleep(0.05)
 
     def _get_message(self, topic: Topic, kind: type[M], role: Role) -> M:
-        """The last message of a topic that a process published."""
+        """The last message that a process published on a topic; BusError if there is none."""
         try:
             return kind.FromString(self._get(topic.key, b"", ANSWER_S, role).payload)
         except DecodeError as fault:

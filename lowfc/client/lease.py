@@ -54,7 +54,7 @@ class Lease:
         self._end_s = time.monotonic() + duration_s
 
     def expecting(self, progress: "Counted", rate_hz: float) -> "Counted":
-        """Wrap a progress callback in frames, so that other clients can read the remaining time."""
+        """Wrap a progress callback that counts frames, so that other clients can read the remaining time."""
 
         def count(what: str, done: int, total: int) -> None:
             self.expect((total - done) / rate_hz)
@@ -63,7 +63,7 @@ class Lease:
         return count
 
     def check(self) -> None:
-        """Renew the reservation now; CalibrationError with the reason if it has ended."""
+        """Renew the reservation now; CalibrationError with the reason if it has ended, BusError without an answer."""
         with self._lock:
             if not self._ended:
                 try:

@@ -20,10 +20,10 @@ class MirrorWatch:
     """States of a run's mirrors received since construction, which returns after the first one.
 
     Attributes:
-        frame_sequence: frame of the newest command that every known mirror has applied.
-        applied: frames of the last applied commands, each with the time of the mirror's report, ns of the host's clock.
-        interruption: clause that describes why a mirror did not follow commands meanwhile, or got none because frames
-            stopped, which ends a probe sequence; empty if neither happened.
+        applied: frame sequences of the last applied commands, each with the time of the mirror's report, ns of the
+            host's clock.
+        interruption: clause on the last event since construction that ends a probe sequence: a mirror did not follow
+            commands, or received none because frames stopped; empty without one.
     """
 
     def __init__(self, bus: Bus) -> None:
@@ -44,7 +44,7 @@ class MirrorWatch:
 
     @property
     def frame_sequence(self) -> int:
-        """See the class."""
+        """Sequence of the frame of the newest command that every known mirror has applied."""
         return min(sequence for _, sequence, _ in self._mirrors.values())
 
     def read(self) -> None:

@@ -1,7 +1,7 @@
 """The table of requests: key, fields of `lowfc.v1.Request`, description and `lowfc ctl` command of each.
 
-The client's methods, the commands of `lowfc ctl` and the table in docs/reference/requests.md are generated from it; a
-test compares it with the requests that the controller and the recorder accept.
+The client's methods without arguments, the commands of `lowfc ctl` and the table in docs/reference/requests.md are made
+from it; a test compares it with the requests that the controller and the recorder accept.
 """
 
 from typing import NamedTuple

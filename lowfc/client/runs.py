@@ -14,7 +14,7 @@ def running() -> list[str]:
 
 
 def the_run(name: str | None) -> str:
-    """Find a run by its name or a unique prefix, or the only run without a name; it needs no controller.
+    """Find a run by its name or a unique prefix, or the only run if `name` is None; it may be without a controller.
 
     Raises:
         BusError: there is no such run, none at all, or more than one to choose from.

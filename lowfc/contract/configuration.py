@@ -63,7 +63,7 @@ class Control(Section):
     """Loop mode once a calibration is loaded; sim-loop starts closed if the file does not set it."""
     delay_frames: float = Field(0.0, ge=0, le=10)
     """Measured delay: frames from the frame that a command is computed from to the first frame exposed wholly with it;
-    0: camera.delay_frames. Twice the delay halves the highest stable gain."""
+    0: camera.delay_frames. Twice the delay about halves the highest stable gain."""
     estimator: Literal["weighted", "pinv"] = "weighted"
     """Noise-weighted or plain pseudo-inverse of H."""
     nuisance: list[Literal["background", "shear"]] = Field(default_factory=list)
@@ -227,14 +227,10 @@ class Configuration(Section):
                 f"safety.stroke_nm is {self.safety.stroke_nm:g} nm either way, but mirror.stroke_nm gives only "
                 f"{self.mirror.stroke_nm / 2:g} nm either way"
             )
-        margin_nm = 0.0
-        for key, section, share in ("safety", self.safety, 1.0), ("mirror", self.mirror, 0.5):
-            try:
-                margin_nm = Limits(share * section.stroke_nm, section.slew_nm, section.neighbour_nm).margin_nm
-            except ValueError as fault:
-                raise ValueError(f"{key}.{fault}") from None
+        _limits("safety", self.safety.stroke_nm, self.safety)
+        limits = _limits("mirror", self.mirror.stroke_nm / 2, self.mirror)
         step_nm = self.mirror.stroke_nm / 2**self.mirror.driver_bits
-        least_nm = step_nm + max(0.01, 2 * margin_nm)
+        least_nm = step_nm + max(0.01, 2 * limits.margin_nm)
         for name in ("slew_nm", "neighbour_nm"):
             if getattr(self.mirror, name) <= least_nm:
                 raise ValueError(
@@ -295,6 +291,13 @@ class Configuration(Section):
     def to_toml(self) -> str:
         """The whole configuration as TOML."""
         return tomli_w.dumps(self.model_dump())
+
+
+def _limits(key: str, stroke_nm: float, section: Safety | Mirror) -> Limits:
+    try:
+        return Limits(stroke_nm, section.slew_nm, section.neighbour_nm)
+    except ValueError as fault:
+        raise ValueError(f"{key}.{fault}") from None
 
 
 def load(

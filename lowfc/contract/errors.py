@@ -8,7 +8,7 @@
     │   └── BadMessageError     a message from the bus that violates the contract
     └── RequestRefusedError    the controller refused the request, with the reason
 
-The numerics raise ValueError; the adapters above them name the file or the key and re-raise one of these.
+Numerical code raises ValueError; the adapters above it name the file or the key and re-raise one of these.
 """
 
 import reprlib

@@ -54,7 +54,7 @@ class Topic:
     """A topic of the table.
 
     Attributes:
-        key: zenoh key; `{name}` stands for a mirror's or a process's name.
+        key: zenoh key; `{name}` stands for the name of a mirror, a process or a bench value.
         message: class of the payload.
         rate: every frame, on event, or a number of hertz.
         publishers: roles that may publish it; a router drops messages of other roles.
@@ -83,12 +83,12 @@ class Topic:
     optional: bool = False
 
     def at(self, name: str) -> str:
-        """Key of this topic for the mirror or process `name`."""
+        """Key of this topic for the mirror, process or bench value `name`."""
         return self.key.format(name=name)
 
     @property
     def in_loop(self) -> bool:
-        """Whether it is published every frame by or for the controller: it is sent at once, before all others."""
+        """Whether it is published every frame by or for the controller: it is sent before all other topics."""
         return self.rate is Rate.LOOP and Role.CONTROLLER in self.publishers | self.subscribers
 
     def matches(self, key: str) -> bool:
@@ -141,7 +141,7 @@ CONTROLLER_STATE = Topic(
     wire.ControllerState,
     1.0,
     _CONTROLLER,
-    "The controller's state: all that the next command depends on, with calibration, law and probe sequence.",
+    "The controller's state: all that the next command depends on; calibration, law and probe sequence by identity.",
     queryable=True,
 )
 REQUEST = Topic("lowfc/control/request", wire.Request, Rate.EVENT, _CONTROLLER, "An operator's request and its reply.")
@@ -328,7 +328,7 @@ def floats(data: bytes, *shape: int) -> Single:
 
 
 def fields_of(source: object, names: Iterable[str]) -> dict[str, Any]:
-    """Attributes with these names, which are also the fields of the message."""
+    """Attributes of `source`, a value or a message, by name: both use the same names."""
     return {name: getattr(source, name) for name in names}
 
 

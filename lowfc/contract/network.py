@@ -53,11 +53,11 @@ def _docstrings(section: type[Section]) -> Iterator[tuple[str, str]]:
 class Network(Section):
     """Connection between hosts; without a router, all processes run on this host."""
 
-    router: str = Field("", pattern=r"^(tls/[^\x00]+:[0-9]{1,5})?$")
+    router: str = Field("", pattern=r"^(tls/[^\x00]+:[1-9][0-9]{0,4})?$")
     """Where the router listens, such as "tls/bench.example.org:7447"; empty for none."""
     certificates: WithoutNul = ""
     """Folder with ca.pem and, for each role on this host, ROLE.pem and ROLE.key, made by `lowfc certs`."""
-    listen: str = Field("", pattern=r"^(tls/[^\x00]+:[0-9]{1,5})?$")
+    listen: str = Field("", pattern=r"^(tls/[^\x00]+:[1-9][0-9]{0,4})?$")
     """Address on which the router listens, if it differs from `router`."""
 
     @model_validator(mode="after")

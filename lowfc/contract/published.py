@@ -23,8 +23,8 @@ class Published:
     laws: dict[str, LinearLaw] = field(default_factory=dict)
     plays: dict[str, PlayTable] = field(default_factory=dict)
 
-    def take(self, topic: Topic, payload: bytes) -> None:
-        """Store a received one; an incomplete one is ignored, and decoding what refers to it raises ValueError."""
+    def store(self, topic: Topic, payload: bytes) -> None:
+        """Store a received message of `TOPICS`; an incomplete one is ignored: decoding what refers to it then fails."""
         with contextlib.suppress(DecodeError, ValueError):
             if topic is CALIBRATION:
                 calibration = decode_calibration(wire.Calibration.FromString(payload))

@@ -267,6 +267,6 @@ class Mirror(Section):
     gain_error: float = Field(0.0, ge=0, le=0.5)
     """Simulated mirror: rms error of the actuators' gains, a fraction; drawn from the seed."""
     hysteresis: float = Field(0.0, ge=0, le=0.5)
-    """Simulated mirror: fraction of a move that reverses only after a backlash of 1 to 256 nm; 0.1 for a piezo."""
+    """Simulated mirror: fraction of a move that reverses only after a backlash of 2 to 512 nm; 0.1 for a piezo."""
     creep: float = Field(0.0, ge=0, le=0.1)
     """Simulated mirror: creep per decade of time, 0.1 to 100 s, as a fraction of a move; 0.01 for a piezo."""

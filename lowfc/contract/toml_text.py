@@ -8,8 +8,8 @@ MAX_BYTES = 1 << 20
 """Largest size of a configuration; one with every key has 12 kB."""
 
 _MAX_DOTS = 100  # in a line: the time to parse a dotted key grows with the square of the number of its parts
-_NUMBER = re.compile(r"[0-9]\.[0-9]")
-"""The dot of a number, which does not count; of a key of digits, half of the dots count."""
+_NUMBER = re.compile(r"[0-9]\.[0-9_]++(?:[eE][+-]?[0-9_]++)?(?![\w.-])")
+"""A number with a fraction: its dot does not count. Of a dotted key of digits, at least half of the dots count."""
 
 
 def parsed(content: bytes) -> dict[str, Any]:

@@ -1,13 +1,13 @@
 """Conversion of a camera's own clock to the host's."""
 
 WINDOW_NS = 10_000_000_000
-"""Window of the offset estimate; a clock that is off by 20 ppm drifts 0.2 ms in it."""
+"""Longest window of the offset estimate; a clock that is off by 20 ppm drifts 0.2 ms in it."""
 
 
 class CameraClock:
     """Converts times of a camera whose clock has its own epoch and rate to CLOCK_MONOTONIC.
 
-    The offset is the smallest difference between reception and time stamp in the last 10 s. Converted times are
+    The offset is the smallest difference between reception and time stamp in the last 5 to 10 s. Converted times are
     therefore late by the shortest transfer time.
 
     Example:

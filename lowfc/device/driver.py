@@ -25,9 +25,9 @@ from lowfc.optics.detector.detector import saturation_dn
 class DriverOptions(Section):
     """Base class of a driver's options: derive from it in the driver's class, under the name `Options`.
 
-    A docstring below a field is its help. Unknown keys and other types are refused (a tuple or path is a list or text
-    in TOML); values do not change. They come from `[drivers.NAME]` of the configuration and from the command line:
-    `--frame-rate 100` sets `frame_rate`.
+    A docstring below a field is its help. Unknown keys and values of another type are refused (a tuple or path is a
+    list or text in TOML); options are immutable. They come from `[drivers.NAME]` of the configuration and from the
+    command line: `--frame-rate 100` sets `frame_rate`.
     """
 
 
@@ -125,7 +125,7 @@ _LEAST = {
 
 
 def camera_state(settings: CameraSettings, time_ns: int) -> wire.CameraState:
-    """Message of a camera's settings; ValueError if one cannot be true."""
+    """Message of a camera's settings; ValueError if a value is impossible."""
     for name, least in _LEAST.items():
         if not isinstance(value := getattr(settings, name), Integral) or value < least:
             raise ValueError(f"{name} of the settings is {value!r}, expected a whole number of {least} or more")
@@ -267,7 +267,8 @@ class MirrorExtras:
     def position(self) -> Single | None:
         """Read back the shape (rows, columns), nm of surface; called at the start and after a fault.
 
-        Without this method, or if it returns None, the mirror is driven to flat at once.
+        Without this method, or if it returns None, the mirror is driven to flat at the start; after a fault its last
+        commanded shape is taken as its position.
         """
         raise NotImplementedError
 

@@ -296,7 +296,7 @@ class MirrorLoop:
 
 
 def state_of(status: Status, time_ns: int, refused: Reason | None = None, *, known: bool = True) -> wire.MirrorState:
-    """Message of a mirror's state; `refused`: why the last command was; `known`: whether its position is known."""
+    """Message of a mirror's state: `refused` is why the last command was refused, `known` whether its position is."""
     rows, columns = status.surface_nm.shape
     following = wire.MIRROR_STATUS_FOLLOWING if status.following and known else wire.MIRROR_STATUS_EXPIRED
     return wire.MirrorState(

@@ -18,7 +18,7 @@ from lowfc.control.loop.safety import Limit, Limited, Limits, Reason, Rejection,
 _NONE: Single = np.zeros(0, np.float32)
 
 MAX_VALID_NS = 2_000_000_000
-"""Longest time for which a command may be held; longer requests are shortened to it."""
+"""Longest time for which a command may be held; a longer `valid_for_ns` is shortened to it."""
 AHEAD_NS = 1_000_000_000
 """Largest time by which a frame may be ahead of the mirror's clock; beyond it the surface is timed by that clock."""
 

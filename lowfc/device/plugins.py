@@ -78,7 +78,7 @@ def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = 
 
 
 def faults(config: Configuration, folder: Path) -> list[str]:
-    """List the faults of the sections [drivers.NAME] of a configuration in a folder, one sentence each."""
+    """List the faults of the sections [drivers.NAME] of a configuration whose file is in `folder`, a sentence each."""
     found, files = [], {one.stem for here in (folder, Path.cwd()) for one in here.glob("*.py")}
     for name in config.drivers:
         kinds = [kind for kind in KINDS if name in installed(kind)]
@@ -121,7 +121,7 @@ def _nested(tables: dict[str, Any], name: str) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> DriverOptions:
+def options(driver: Any, configured: dict[str, Any], words: Sequence[str] = ()) -> DriverOptions:
     """Options of a driver's class from a table, overridden by the words of a command line, `--key value`.
 
     ConfigurationError if one is unknown or wrong.
@@ -129,12 +129,13 @@ def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> Dr
     model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
     values, faults = _parsed(words), []
     try:
-        validated = model.model_validate_json(json.dumps(found, default=str))  # TOML too has no tuples, paths or enums
+        # In JSON, as in TOML, a list stands for a tuple, and text for a path or an enum.
+        validated = model.model_validate_json(json.dumps(configured, default=str))
     except ValidationError as error:  # options missing here may be among the words
         faults = [one for one in error.errors() if not (values and one["type"] == "missing")]
     if values and not faults:
         try:
-            validated = model.model_validate({**found, **values}, strict=False)
+            validated = model.model_validate({**configured, **values}, strict=False)
         except ValidationError as error:
             faults = error.errors()
     if faults:

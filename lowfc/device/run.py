@@ -46,7 +46,7 @@ PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 Frames = Annotated[int | None, typer.Option(min=1, help="Stop after so many frames; default: at Ctrl-C or SIGTERM.")]
 LEAVE_S = 2.0
 """Time in which a camera in the controller's process has to end."""
-WaitFor = Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; repeat.")]
+WaitFor = Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; may be repeated.")]
 
 
 def run_camera(
@@ -88,7 +88,7 @@ def camera_beside(driver: Camera, config: Configuration, service: Service) -> It
     Raises:
         BusError: the run has a camera already.
         ConfigurationError: the run is in lockstep.
-        LowfcError: the driver reported a fault that a user has to correct; raised after the block.
+        LowfcError: the driver reported a fault that a user has to correct; raised after the block, as any other error.
     """
     if config.lockstep:
         raise ConfigurationError("in lockstep the camera is a process of its own: leave out --camera, or lockstep")

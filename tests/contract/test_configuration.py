@@ -155,7 +155,10 @@ def test_each_fault_of_a_value_of_several_types_names_its_key() -> None:
     [
         ("tls/bench:99999", "the highest port is 65535, got 99999"),
         ("tls/a..b:7447", "'a..b' is not the name or address"),
-        *((address, "match pattern") for address in ("tcp/bench:7447", "tls/bench", "bench:7447", "tls/:7447x")),
+        *(
+            (address, "match pattern")
+            for address in ("tcp/bench:7447", "tls/bench", "tls/bench:0", "bench:7447", "tls/:7447x")
+        ),
     ],
 )
 def test_an_impossible_address_of_the_router_is_refused(key: str, address: str, message: str) -> None:

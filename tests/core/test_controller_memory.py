@@ -358,7 +358,7 @@ def test_states_refer_to_law_and_probe_sequence_by_identity(rig: Rig) -> None:
     published = Published()
     for topic in (CALIBRATION, LAW, PLAY):
         (answer,) = rig.bus("recorder").get(topic.key)
-        published.take(topic, answer.payload)
+        published.store(topic, answer.payload)
     assert list(published.calibrations) == [rig.calibration.id] == [state.calibration_id]
     assert list(published.laws) == [law.id]
     assert published.plays[state.play.id].rows.shape == (50_000, 14)

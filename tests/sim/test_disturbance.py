@@ -24,7 +24,7 @@ from sim_camera.disturbance import (
     DampedLine,
     Disturbance,
     Sampler,
-    _Lines,
+    _DampedLines,
     modes_nm,
     preset_disturbance,
     screen,
@@ -116,7 +116,7 @@ def test_damped_lines_have_the_configured_power_and_coherence(width: float) -> N
     lag = round(rate_hz / (np.pi * line.width_hz))
     quiet = preset("quiet")
     realisations = [replace(quiet, noll=(2, 3), lines=(line,), seed=seed) for seed in range(400)]
-    found = np.array([_Lines(one, rate_hz).at(0, lag + 1)[[0, lag]] for one in realisations])[:, :, 0]
+    found = np.array([_DampedLines(one, rate_hz).at(0, lag + 1)[[0, lag]] for one in realisations])[:, :, 0]
     assert found.real.std(axis=(0, 1)) == pytest.approx(line.rms_nm, rel=0.1)
     correlation = np.mean(found[:, 1] * found[:, 0].conj(), axis=0) / np.mean(np.abs(found[:, 0]) ** 2, axis=0)
     phase = np.exp(2j * np.pi * line.frequency_hz * lag / rate_hz)
@@ -142,7 +142,7 @@ def test_damped_line_rotates_between_frames() -> None:
     disturbance = replace(preset("quiet"), noll=(2, 3), step_nm=np.zeros(2), static_nm=np.zeros(2))
     disturbance = replace(disturbance, amplitude_nm=np.zeros((0, 2)), lines=(DampedLine(71.0, 0.1, np.ones(2)),))
     instants = np.array([0.0, 0.25, 0.75])
-    sampler, vectors = Sampler(disturbance, instants, RATE_HZ), _Lines(disturbance, RATE_HZ).at(0, 40)[:, 0]
+    sampler, vectors = Sampler(disturbance, instants, RATE_HZ), _DampedLines(disturbance, RATE_HZ).at(0, 40)[:, 0]
     for index in (0, 1, BLOCK - 1, BLOCK, 30):
         turned = np.exp(2j * np.pi * 0.071 * instants)[:, None]
         ends = vectors[index], vectors[index + 1] * np.exp(-2j * np.pi * 0.071)
@@ -153,7 +153,7 @@ def test_damped_line_rotates_between_frames() -> None:
 def test_previous_frame_is_available_after_a_new_block(monkeypatch: pytest.MonkeyPatch) -> None:
     """The truth is computed after the next exposure: damped lines must not be drawn again from the first frame on."""
     sampler = Sampler(preset("reaction-wheel"), np.zeros(1), RATE_HZ)
-    monkeypatch.delattr(_Lines, "_restart")
+    monkeypatch.delattr(_DampedLines, "_restart")
     for index in range(1, 4 * BLOCK):
         before = sampler.at(index - 1)
         sampler.at(index)

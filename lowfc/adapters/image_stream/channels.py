@@ -66,7 +66,7 @@ class OtherChannels:
         counts = {path: (stream.identity, _complete_count(stream)) for path, stream in self._streams.items()}
         if counts != self._counts:
             self._shapes = {
-                stream: whole(stream, self._shapes.get(stream, stream.data[0].astype(np.float32)))
+                stream: complete_shape(stream, self._shapes.get(stream, stream.data[0].astype(np.float32)))
                 for stream in self._streams.values()
             }
             shapes = [shape for shape in self._shapes.values() if shape is not None]
@@ -94,7 +94,7 @@ def _complete_count(stream: Stream) -> int:
     return -1 if stream.writing else count
 
 
-def whole(stream: Stream, otherwise: Single | None = None) -> Single | None:
+def complete_shape(stream: Stream, otherwise: Single | None = None) -> Single | None:
     """Copy the shape in a stream; None if it is not finite.
 
     While the stream is being written, or if its writer died meanwhile, the shape is `otherwise`.

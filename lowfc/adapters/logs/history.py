@@ -271,7 +271,7 @@ class _HistoryBuilder:
         elif topic is COMMAND:
             self._commands.add(publish_ns=message.publish_time_ns)
         elif topic in (LAW, PLAY):
-            history.published.take(topic, message.payload)
+            history.published.store(topic, message.payload)
         if topic not in _DECODED:
             return
         body = topic.message.FromString(message.payload)

@@ -73,9 +73,9 @@ def report_of(message: wire.BenchReport) -> BenchReport:
     return BenchReport(from_timestamp(message.timestamp), message.name, value, message.age_ns)
 
 
-def wire_interlock(one: Interlock) -> wire.Interlock:
+def wire_interlock(interlock: Interlock) -> wire.Interlock:
     """Message of an interlock."""
-    return wire.Interlock(**one._asdict() | {"value": wire_value(one.value)})
+    return wire.Interlock(**interlock._asdict() | {"value": wire_value(interlock.value)})
 
 
 def interlock_of(message: wire.Interlock) -> Interlock:
@@ -84,9 +84,9 @@ def interlock_of(message: wire.Interlock) -> Interlock:
     return Interlock(message.name, message.test, value, action, message.max_age_ns, message.acts_when_old)
 
 
-def wire_acting(one: Acting) -> wire.ActingInterlock:
+def wire_acting(acting: Acting) -> wire.ActingInterlock:
     """Message of an acting interlock."""
-    return wire.ActingInterlock(**one._asdict())
+    return wire.ActingInterlock(**acting._asdict())
 
 
 def acting_of(message: wire.ActingInterlock) -> Acting:

@@ -118,7 +118,7 @@ def decode_mirror(payload: bytes) -> MirrorShape | None:
 
 
 def decode_camera(payload: bytes, start_s: int) -> CameraSettings:
-    """Settings of a CameraState that must match the calibration, from a camera that started at `start_s`.
+    """Camera settings of a CameraState, from a camera that started at `start_s` (unix seconds).
 
     BadMessageError if it cannot be read, has no pixels, or a number in it is invalid.
     """
@@ -158,7 +158,7 @@ def encode_input(report: Report, input_number: int) -> bytes:
 
 
 def decode_input(message: wire.ControlInput, calibrations: Mapping[str, Calibration]) -> Input:
-    """Input of a ControlInput; ValueError if it is unknown, or its calibration is not among these (by id)."""
+    """Input of a ControlInput; ValueError if it is invalid, or its calibration is not among these (by id)."""
     match message.WhichOneof("input"):
         case "mirror":
             shape = _mirror_shape(message.mirror)

@@ -81,7 +81,7 @@ def table_of(message: wire.Play) -> PlayTable:
 
 
 def put_command_channels(message: wire.ControllerState, command_channels: CommandChannels) -> None:
-    """Write the additions to the law's command into a state."""
+    """Write offset, command channels and probe sequence into a state."""
     message.offset_nm.extend(command_channels.offset_nm.tolist())
     message.shift_history_nm.extend(np.concatenate(command_channels.shifts_nm).tolist())
     for one in command_channels.channels:
@@ -99,7 +99,7 @@ def put_command_channels(message: wire.ControllerState, command_channels: Comman
 def command_channels_of(
     message: wire.ControllerState, empty: CommandChannels, to_modes: Single, plays: Mapping[str, PlayTable]
 ) -> CommandChannels | None:
-    """Additions to the command in a state; None if there are none. `empty` has the same shapes.
+    """Offset, command channels and probe sequence of a state; None if it has none. `empty` has the same shapes.
 
     The table of a probe sequence is found in `plays` by its identity; before 0.2 the state held the played rows.
 

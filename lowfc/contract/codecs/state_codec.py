@@ -40,7 +40,7 @@ _LEASE = ("id", "holder", "last_sequence", "ended", "holds")
 
 
 def controller_state(state: State, settings: Settings, time_ns: int) -> wire.ControllerState:
-    """Message of everything the next command depends on, besides the calibration."""
+    """Message of everything the next command depends on; calibration, law and table by identity."""
     conditions, loop, estimate, lease = state.conditions, state.loop, state.estimate, state.conditions.lease
     message = wire.ControllerState(
         timestamp=timestamp(time_ns),

@@ -6,7 +6,14 @@ import time
 import numpy as np
 from pydantic import Field
 
-from lowfc.adapters.image_stream.channels import OtherChannels, channel_names, channel_of, opened, sum_name, whole
+from lowfc.adapters.image_stream.channels import (
+    OtherChannels,
+    channel_names,
+    channel_of,
+    complete_shape,
+    opened,
+    sum_name,
+)
 from lowfc.adapters.image_stream.stream import Stream, StreamError, stream_path
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Single
@@ -62,11 +69,11 @@ class IsioMirror:
         None if it is not finite: the mirror's process then writes zeros.
         """
         self._reopen()
-        shape = whole(self._channel, self._channel.data[0].astype(np.float32))
+        shape = complete_shape(self._channel, self._channel.data[0].astype(np.float32))
         return None if shape is None else shape * np.float32(self._options.nm_per_unit)
 
     def beside(self) -> Single:
-        """Sum of the other channels, without piston; the sum stream includes it."""
+        """Sum of the other channels without its piston, which the process that sums them may subtract."""
         shape = self._others.sum()
         if shape is not self._beside[0]:
             self._beside = shape, (shape - shape.mean()) * np.float32(self._options.nm_per_unit)
@@ -130,7 +137,7 @@ class IsioMirror:
     def _check_silence(self, total: Stream | None, before: int, written_s: float) -> None:
         """RuntimeError if the sum has not followed for `SUM_SILENT_S`, so that the mirror counts as not following.
 
-        A sum that was updated `before` this command, but after the last one, follows, although late.
+        `before` is the sum's count before this command: if it has changed since the last one, the sum follows late.
         """
         self._unanswered_s = min(self._unanswered_s, written_s) if before == self._sum_count else written_s
         self._sum_count = before
@@ -149,7 +156,7 @@ class IsioMirror:
 
     def _reached(self, total: Stream, actuators_nm: Single) -> Single | None:
         """This channel's part of the sum, with its piston ignored; None if it is as written."""
-        shape = whole(total)
+        shape = complete_shape(total)
         if shape is None:
             return None
         rest_nm = (shape - self._others.sum()) * np.float32(self._options.nm_per_unit) - actuators_nm

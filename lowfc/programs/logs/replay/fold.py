@@ -59,7 +59,7 @@ class Replay:
             if inside:
                 self._begun_ns, self._ended_ns = self._begun_ns or now_ns, now_ns
         elif topic in published.TOPICS:
-            context.published.take(topic, message.payload)
+            context.published.store(topic, message.payload)
             for controller in self._controllers.values():
                 controller.retry_pending = True
         elif topic in TOPICS:
