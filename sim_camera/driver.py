@@ -104,11 +104,11 @@ def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scen
 
 
 def ignore(warning: str) -> None:
-    """Drop a warning that the launcher has already printed."""
+    """Drop a warning of the optics: a launcher prints it."""
 
 
-def _middle(name: str, size: int, of: int) -> tuple[int, int]:
-    """First and number of the rows or columns of the readout region, centred."""
+def _centred_region(name: str, size: int, of: int) -> tuple[int, int]:
+    """First and number of the rows or columns of the centred readout region; all for size 0."""
     if size > of:
         raise ConfigurationError(f"options of the simulated camera: {name} is {size}, the sensor has {of}")
     return ((of - size) // 2, size) if size else (0, of)
@@ -141,8 +141,8 @@ class SimulatedCamera:
         """Build the optics, unless `optics` is given; ConfigurationError if the region is larger than the sensor."""
         self._config = config
         self._scene = scene(config) if optics is None else optics
-        row, rows = _middle("rows", options.rows, self._scene.shape[0])
-        column, columns = _middle("columns", options.columns, self._scene.shape[1])
+        row, rows = _centred_region("rows", options.rows, self._scene.shape[0])
+        column, columns = _centred_region("columns", options.columns, self._scene.shape[1])
         self._region = np.s_[row : row + rows, column : column + columns]
         self._contrast: Contrast | None = None
         self._fault = read_fault(Path(options.fault)) if options.fault else None

@@ -308,7 +308,7 @@ class Client:
         return published.laws
 
     def frames(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Frame]:
-        """Stream sensor images from now on, `count` of them or without end; BusError if none arrives."""
+        """Stream sensor images from now on, `count` of them or without end; BusError without one for `patience_s`."""
         return Stream(self._bus.ring(FRAME, WAITING), frame_of, "frame", count, patience_s)
 
     def steps(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Step]:

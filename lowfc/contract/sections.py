@@ -249,9 +249,9 @@ class Mirror(Section):
     stuck_nm: dict[str, float] = Field(default_factory=dict)
     """Actuators stuck at a height: row * columns + column = nm."""
     slew_nm: float = Field(150.0, gt=0.01)
-    """Largest change of an actuator per command that the mirror accepts."""
+    """The mirror's own limit: largest change of an actuator per command."""
     neighbour_nm: float = Field(500.0, gt=0.01)
-    """Largest difference between neighbouring actuators that the mirror accepts."""
+    """The mirror's own limit: largest difference between neighbouring actuators."""
     on_command_timeout: Literal["hold", "flat"] = "flat"
     """Action after a command timeout: hold the shape, or relax to flat within the slew limit."""
     flat: str = ""

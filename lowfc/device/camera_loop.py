@@ -5,7 +5,6 @@ import numpy as np
 from lowfc.adapters.process.realtime import let_send
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels
-from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import COUNT_BITS
 from lowfc.contract.messages import CAMERA_STATE, FRAME, image, wire
 from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure, camera_state
@@ -31,7 +30,7 @@ _NO_EXTRAS = CameraExtras()
 class CameraLoop:
     """Publishes a driver's frames until it is stopped, or for a number of frames."""
 
-    def __init__(self, driver: Camera, service: Service, config: Configuration, frames: int | None = None) -> None:
+    def __init__(self, driver: Camera, service: Service, frames: int | None = None) -> None:
         """Declare the publishers on the bus and publish the first settings."""
         self._driver = driver
         self._service = service

@@ -77,8 +77,9 @@ class Status(NamedTuple):
         channels: last shape (rows, columns) of each command channel, nm of surface; the mirror applies their sum.
         command_nm: modal command of the last command; empty if the mirror's own limits changed it.
         limits_hit: the mirror's own limits that acted on the last command.
-        frame_sequence: sequence of the frame of the last command; its time is `time_ns`.
-        commanded_ns: `time_ns` at the last command; between commands `time_ns` advances by the mirror's clock.
+        frame_sequence: sequence of the frame of the last command.
+        time_ns: time of that frame; between commands it advances by the mirror's clock.
+        commanded_ns: `time_ns` at the last command.
         received_ns: reception of the last command, ns of the mirror's clock.
         valid_for_ns: time for which the last command may be held.
         following: whether a command is in force.

@@ -68,7 +68,7 @@ def run_camera(
         service = join(config, run, Role.CAMERA, config.realtime.camera_cpus)
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
         with closed_on_fault(driver.close), opening("the camera cannot be started"):
-            loop = CameraLoop(driver, service, config, frames)
+            loop = CameraLoop(driver, service, frames)
         service.catch_signals()
         loop.run(wait_for)
 
@@ -97,7 +97,7 @@ def camera_beside(driver: Camera, config: Configuration, service: Service) -> It
     faults: list[Exception] = []
     with closing(camera.bus):
         with closed_on_fault(driver.close), opening("the camera cannot be started"):
-            loop = CameraLoop(driver, camera, config)
+            loop = CameraLoop(driver, camera)
 
         def read() -> None:
             try:

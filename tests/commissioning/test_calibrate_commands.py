@@ -14,7 +14,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from lowfc.adapters.files import calibration_file, factory
-from lowfc.adapters.process.progress import spoken
+from lowfc.adapters.process.progress import progress_lines
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError, RequestRefusedError
@@ -220,7 +220,7 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
 
 def test_progress_without_a_terminal_is_a_line_every_10_s() -> None:
     lines, times = list[str](), iter(np.arange(0.0, 100.0, 0.5))
-    count = spoken(lines.append, lambda: float(next(times)))
+    count = progress_lines(lines.append, lambda: float(next(times)))
     for done in range(0, 2000, 20):
         count("hadamard cycle 3 of 8", done, 4000)
     assert lines[0] == "hadamard cycle 3 of 8: 10%, about 90 s to go"
@@ -229,7 +229,7 @@ def test_progress_without_a_terminal_is_a_line_every_10_s() -> None:
 
 def test_work_before_the_first_cycle_does_not_affect_the_time_to_go() -> None:
     lines, times = list[str](), iter([0.0, 7.0, 10.0, 13.0])
-    count = spoken(lines.append, lambda: next(times))
+    count = progress_lines(lines.append, lambda: next(times))
     count("detecting pokes", 400, 1000)
     for done in (400, 500, 600):
         count("hadamard cycle", done, 1000)
@@ -238,7 +238,7 @@ def test_work_before_the_first_cycle_does_not_affect_the_time_to_go() -> None:
 
 def test_progress_of_several_tasks_in_turn_has_the_time_to_go_of_each() -> None:
     lines, times = list[str](), iter(np.arange(0.0, 100.0, 5.0))
-    count = spoken(lines.append, lambda: float(next(times)))
+    count = progress_lines(lines.append, lambda: float(next(times)))
     for what in ("first", "second"):
         for done in range(4):
             count(what, done, 4)

@@ -99,7 +99,7 @@ DEEP = {f"{CPUS}/cpu0/cpuidle/state2/disable": "0\n"}
 
 
 def trial(refused: dict[str, tuple[str, str]] | None = None, cpus: int = 8, **late_ns: list[int]) -> Trial:
-    defaults = {"normal_ns": [40_000] * 99 + [900_000], "first_ns": [20_000] * 99 + [60_000]}
+    defaults = {"normal_ns": [40_000] * 99 + [900_000], "fifo_ns": [20_000] * 99 + [60_000]}
     return Trial(refused=refused or {}, cpus=set(range(cpus)), **{**defaults, **late_ns})
 
 
@@ -190,12 +190,12 @@ def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
             {"synchronisation": Synchronisation(True, 12e-6, 0.001)},
         ),
         ("synchronisation", "warning", "not synchronised", {"synchronisation": Synchronisation(False, 12e-6, 0.001)}),
-        ("wake-up", "warning", "max 4100 us", {"trial": trial(first_ns=[1000] * 999 + [4_100_000])}),
+        ("wake-up", "warning", "max 4100 us", {"trial": trial(fifo_ns=[1000] * 999 + [4_100_000])}),
         (
             "wake-up",
             "warning",
             "a frame period is 4000 us",
-            {"trial": trial(REFUSED, normal_ns=[500_000], first_ns=[])},
+            {"trial": trial(REFUSED, normal_ns=[500_000], fifo_ns=[])},
         ),
         ("scheduling class", "note", "realtime.priority = 0", {"config": UNASKED}),
         ("scheduling class", "warning", "LimitRTPRIO=50 frames come late", {"trial": trial(REFUSED)}),
@@ -303,7 +303,7 @@ def test_a_trial_leaves_no_real_time_class_or_affinity() -> None:
     assert (os.sched_getscheduler(0), os.sched_getaffinity(0)) == before
     assert tried.cpus >= before[1]
     assert len(tried.normal_ns) == 20
-    assert len(tried.first_ns) == (0 if "priority" in tried.refused else 20)
+    assert len(tried.fifo_ns) == (0 if "priority" in tried.refused else 20)
 
 
 def test_a_trial_without_rights_reports_what_is_refused() -> None:
@@ -311,7 +311,7 @@ def test_a_trial_without_rights_reports_what_is_refused() -> None:
 from lowfc.adapters.process.trial import try_out
 from lowfc.contract.configuration import Realtime
 trial = try_out(Realtime(), set(), 0.01)
-print(*trial.refused["priority"], *trial.refused["lock_memory"], len(trial.normal_ns), len(trial.first_ns), sep="\\n")
+print(*trial.refused["priority"], *trial.refused["lock_memory"], len(trial.normal_ns), len(trial.fifo_ns), sep="\\n")
 """
     done = subprocess.run([*NO_RIGHTS, program], capture_output=True, text=True, timeout=60, check=True)
     refused, cost, unlocked, stall, normal, first = done.stdout.splitlines()

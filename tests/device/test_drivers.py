@@ -75,7 +75,7 @@ def test_a_camera_publishes_what_its_driver_returns() -> None:
     hub, clock = MemoryHub(), FakeClock()
     listener = Listener(hub, clock, FRAME, CAMERA_STATE)
     driver = Ramp(Ramp.Options(), CONFIG)
-    CameraLoop(driver, listener.service("camera"), CONFIG, frames=3).run()
+    CameraLoop(driver, listener.service("camera"), frames=3).run()
     frames = listener.messages(FRAME)
     assert [frame.data for frame in frames] == [np.full((3, 4), level, np.uint16).tobytes() for level in (8, 9, 10)]
     assert {frame.timestamp.ToNanoseconds() for frame in frames} == {clock.now_ns()}
@@ -274,7 +274,7 @@ def test_a_fault_in_the_first_settings_gives_one_sentence() -> None:
 def test_a_camera_that_cannot_be_started_gives_one_sentence_and_is_closed() -> None:
     camera = Ramp(Ramp.Options(), CONFIG)
     camera.start = lambda: 1 / 0  # type: ignore[attr-defined]
-    loop = CameraLoop(camera, Listener(MemoryHub(), FakeClock()).service("camera"), CONFIG)
+    loop = CameraLoop(camera, Listener(MemoryHub(), FakeClock()).service("camera"))
     with pytest.raises(ConfigurationError, match=r"cannot be started: ZeroDivisionError: .* \(test_drivers.py, line"):
         loop.run()
     assert camera.closed
@@ -284,7 +284,7 @@ def test_a_fault_in_an_optional_method_is_counted_and_reported_and_stops_nothing
     camera, listener = Ramp(Ramp.Options(), CONFIG), Listener(MemoryHub(), FakeClock(), FRAME)
     camera.sent = lambda _: 1 / 0  # type: ignore[attr-defined]
     camera.fill = lambda _: {}["temperature"]  # type: ignore[attr-defined]
-    loop = CameraLoop(camera, listener.service("camera"), CONFIG, frames=3)
+    loop = CameraLoop(camera, listener.service("camera"), frames=3)
     loop.run()
     assert len(listener.messages(FRAME)) == 3
     assert loop.watch.failures > 3

@@ -54,7 +54,7 @@ class CameraBench:
         self.clock = FakeClock()
         self.listener = Listener(MemoryHub(), self.clock, FRAME, CAMERA_STATE, HEALTH)
         self.camera = Camera(self.clock, *exposures, settings=settings)
-        self.loop = CameraLoop(self.camera, self.listener.service("camera"), CONFIG, frames)
+        self.loop = CameraLoop(self.camera, self.listener.service("camera"), frames)
 
 
 def exposed(*exposures: Callable[[], Any], frames: int, settings: CameraSettings = SETTINGS) -> Listener:

@@ -41,7 +41,7 @@ def run(driver: Any, frames: int) -> tuple[Listener, list[int]]:
     """Run a driver's loop for a number of frames; return the listener and the frame counts."""
     hub = MemoryHub()
     listener = Listener(hub, HostClock(), FRAME, CAMERA_STATE)
-    CameraLoop(driver, listener.service("camera"), CONFIG, frames).run()
+    CameraLoop(driver, listener.service("camera"), frames).run()
     samples = [sample.sequence & 0xFFFFFFFF for sample in listener.samples[FRAME]]
     return listener, samples
 

@@ -45,12 +45,10 @@ def error_of(call: Callable[[], object]) -> str:
         (b"seed = " + b"{a=" * 100_000, "nested too deeply"),
         (b"seed = " + b"9" * 100_000, "a number in it has too many digits"),
         (b"seed = 0x" + b"f" * 100_000, "seed = a number of too many digits: must be less than"),
-        (b".".join([b"a"] * 200_000) + b" = 1", "line 1 has more than 100 dots"),
-        (b".".join([b"1"] * 200_000) + b" = 1", "line 1 has more than 100 dots"),
-        (b".".join([b"10"] * 50_000) + b" = 1", "line 1 has more than 100 dots"),
-        (b".".join([b"1_0"] * 50_000) + b" = 1", "line 1 has more than 100 dots"),
-        (b".".join([b"0e-0"] * 50_000) + b" = 1", "line 1 has more than 100 dots"),
-        (b".".join([b"0a0"] * 50_000) + b" = 1", "line 1 has more than 100 dots"),
+        *(
+            (b".".join([part] * 150_000) + b" = 1", "line 1 has more than 100 dots")
+            for part in (b"a", b"1", b"10", b"1_0", b"0e-0", b"0a0")
+        ),
         (b"seed = 1\n[" + b" . ".join([b"a"] * 200_000) + b"]", "line 2 has more than 100 dots"),
         (b"".join(b"a.b.c%d = 1\n" % number for number in range(200_000)), "larger than 1048576 bytes"),
         (b"".join(b"a.b.c%d = 1\n" % number for number in range(50_000)), "unknown key 'a'"),

@@ -78,13 +78,7 @@ def access_control(mirrors: Iterable[str]) -> dict[str, Any]:
         rules += own
         subjects.append({"id": role, "cert_common_names": [role]})
         policies.append({"subjects": [role], "rules": [rule["id"] for rule in own]})
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
-    }
+    return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies}
 
 
 def _rules(rights: Grant) -> list[dict[str, Any]]:
@@ -118,5 +112,5 @@ def _receivers(topic: Topic) -> frozenset[Role]:
 
 
 def _own(topic: Topic, role: str, name: str) -> str:
-    """Key of a topic with the name that a role may use: its own, its mirror's, or any mirror's."""
+    """Key of a topic with the name that a role may use: its own, its mirror's, or any name."""
     return topic.at(role if topic is HEALTH else name or ALL)

@@ -41,7 +41,7 @@ def make_certificates(
     Args:
         folder: folder of the authority; created with access for this user only.
         roles: roles to make certificates for, including the router's.
-        addresses: names and IP addresses by which other hosts reach the router; if empty, a renewal keeps the present.
+        addresses: names and IP addresses by which other hosts reach the router; empty: a renewal keeps those it has.
         days: validity of the certificates, days.
         renew: also renew existing certificates, with their present keys; the authority is never renewed.
 

@@ -12,8 +12,8 @@ import psutil
 from lowfc.adapters.bus.run import runtime_path
 
 _PROGRAMS = ("controller", "sim-loop")
-_MOST = 3
-_LONGEST = 48  # characters of a run's name
+_MAX_LISTED = 3
+_MAX_NAME_LENGTH = 48  # characters of a run's name
 _FOLDER = "XDG_RUNTIME_DIR"
 
 
@@ -27,14 +27,14 @@ def none_here() -> str:
         f"no loop of user {_name(os.geteuid())} is running here: {runtime_path()} was searched ({origin}); loops of "
         f"other users, or started with another {_FOLDER}, cannot be reached"
     )
-    more = [f"and {len(found) - _MOST} more"] if len(found) > _MOST else []
-    return "; ".join([message, *(text for text, _ in found[:_MOST]), *more])
+    more = [f"and {len(found) - _MAX_LISTED} more"] if len(found) > _MAX_LISTED else []
+    return "; ".join([message, *(text for text, _ in found[:_MAX_LISTED]), *more])
 
 
 def other_loops() -> Iterator[tuple[str, bool]]:
-    """Yield a sentence for each simulated loop and each separate controller on this host, of any user.
+    """Yield, for each simulated loop and each separate controller on this host, of any user, a sentence and a flag.
 
-    And whether it is a loop of this user in this runtime directory, which is then starting or ending.
+    The flag is set for a loop of this user in this runtime directory, which is then starting or ending.
     """
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):  # it has ended, or is not readable
@@ -54,7 +54,7 @@ def _program(words: Sequence[str]) -> str:
     for before, word in itertools.pairwise(words):
         if before.rpartition("/")[2] == "lowfc" and word in _PROGRAMS:
             name = re.search(r" --run[ =](\S+)", " ".join(words))
-            return f"lowfc {word}" + (f" --run {name[1][:_LONGEST]}" if name else "")
+            return f"lowfc {word}" + (f" --run {name[1][:_MAX_NAME_LENGTH]}" if name else "")
     return ""
 
 

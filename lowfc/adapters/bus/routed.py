@@ -157,7 +157,7 @@ class RouterWatch:
         self._role = role
         self._reported = ""
 
-    def look(self, *, linked: bool) -> None:
+    def update(self, *, linked: bool) -> None:
         """Report a change of the link; call it periodically."""
         if linked:
             why = ""

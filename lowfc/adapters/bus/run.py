@@ -68,16 +68,16 @@ class Links:
 
     def socket(self, role: str) -> Path | None:
         """Unix socket of a role, in addition to its port; None if the directory's name is too long for one."""
-        return self._beside(f"{role}.sock") if role in self.ports else None
+        return self._socket_path(f"{role}.sock") if role in self.ports else None
 
     def direct_link(self, role: str) -> Path | None:
         """Socket of a role's direct link; None if the directory's name is too long for one.
 
         None with a router, whose access control applies to all messages.
         """
-        return None if self.network.router else self._beside(f"{role}.in")
+        return None if self.network.router else self._socket_path(f"{role}.in")
 
-    def _beside(self, name: str) -> Path | None:
+    def _socket_path(self, name: str) -> Path | None:
         path = self.secret_file.parent / name
         return path if len(os.fsencode(path)) <= _MAX_SOCKET_PATH_BYTES else None
 

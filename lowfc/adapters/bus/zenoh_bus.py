@@ -211,7 +211,7 @@ class ZenohBus:
         self._closers.append(ClockAsker(self.offset, self._query_time, self.clock.host_ns).close)
 
     def _query_time(self) -> list[tuple[int, int]]:
-        self._router.look(linked=bool(self._session.info.routers_zid()))
+        self._router.update(linked=bool(self._session.info.routers_zid()))
         answers = self.get(CLOCK_KEY, timeout_s=ROLE_CHECK_S)
         return [(answer.publish_time_ns, answer.receive_time_ns) for answer in answers]
 

@@ -70,10 +70,7 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
     sending = {
         "batch_size": batch_bytes,  # for both directions: the smaller of the two ends applies
         # A full queue delays a put by at most 1 ms, then the message is dropped; at 0 bursts are lost.
-        "queue": {
-            "size": dict.fromkeys(_PRIORITIES, 16),
-            "congestion_control": {"drop": {"wait_before_drop": 1000}},
-        },
+        "queue": {"size": dict.fromkeys(_PRIORITIES, 16), "congestion_control": {"drop": {"wait_before_drop": 1000}}},
     }
     scouting = {"delay": 100, "multicast": {"enabled": False}, "gossip": {"enabled": False}}
     if links.network.router:
@@ -111,28 +108,15 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
         "transport": {
             "unicast": {"open_timeout": _OPEN_MS},
             "auth": {
-                "usrpwd": {
-                    "user": links.user,
-                    "password": links.secret,
-                    "dictionary_file": str(links.secret_file),
-                }
+                "usrpwd": {"user": links.user, "password": links.secret, "dictionary_file": str(links.secret_file)}
             },
-            "link": {
-                "tx": sending,
-                "rx": {"buffer_size": _SPARE_BUFFERS * batch_bytes if monitor else batch_bytes},
-            },
+            "link": {"tx": sending, "rx": {"buffer_size": _SPARE_BUFFERS * batch_bytes if monitor else batch_bytes}},
             # No gain at these sizes, and a receiver descheduled for 100 ms loses messages silently.
             "shared_memory": {"enabled": False},
         },
         # Monitors connect by socket and get no more images than they display: sending them costs the loop time.
         "downsampling": [
-            {
-                "id": "glances",
-                "flows": ["egress"],
-                "messages": ["put"],
-                "link_protocols": [_SOCKET],
-                "rules": throttled,
-            }
+            {"id": "glances", "flows": ["egress"], "messages": ["put"], "link_protocols": [_SOCKET], "rules": throttled}
         ],
     }
 

@@ -20,7 +20,7 @@ def read_array(
 
     Args:
         path: path of the file.
-        what: description of the expected content, for errors.
+        what: clause on the expected content for errors, such as "a mirror's shape is an array (rows, columns)".
         dimensions: permitted numbers of dimensions.
         units: permitted units of a FITS image that states one; empty for any.
 

@@ -104,7 +104,7 @@ class Layout(NamedTuple):
                 f"{data_bytes}"
             )
         counts = (int(header[name]) for name in ("keywords", "semaphores", "traces", "ring"))
-        layout = cls.made(dtype, (planes, rows, columns), *counts, in_time=in_time and axes == 3)
+        layout = cls.computed(dtype, (planes, rows, columns), *counts, in_time=in_time and axes == 3)
         if layout.file_bytes != file_bytes:
             dao = file_bytes - layout.file_bytes == DAO_HEADER_BYTES - HEADER_BYTES
             built = "a library built with DAO_COMPAT wrote it" if dao else "a library built with other options wrote it"
@@ -112,7 +112,7 @@ class Layout(NamedTuple):
         return layout
 
     @classmethod
-    def made(
+    def computed(
         cls,
         dtype: np.dtype[np.generic],
         shape: tuple[int, int, int],

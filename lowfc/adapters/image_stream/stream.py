@@ -127,7 +127,7 @@ class Stream:
         """
         rows, columns = shape
         kind = np.dtype(dtype)
-        layout = Layout.made(kind, (1, rows, columns), 0, SEMAPHORES, TRACES, 0)
+        layout = Layout.computed(kind, (1, rows, columns), 0, SEMAPHORES, TRACES, 0)
         header = np.zeros(1, HEADER)
         fields: dict[str, Any] = {"version": VERSION.encode(), "name": path.name.removesuffix(".im.shm").encode()}
         fields |= {"axes": 2, "size": (columns, rows, 0), "elements": rows * columns, "type": NUMBERS[kind]}

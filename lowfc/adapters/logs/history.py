@@ -287,7 +287,7 @@ class _HistoryBuilder:
         elif isinstance(body, wire.ControlTiming):
             self._timings.add(body)
         elif isinstance(body, wire.Calibration):
-            self._calibrate(body)
+            self._store_calibration(body)
         elif isinstance(body, wire.ControllerState):
             history.controllers.append(body)
         elif isinstance(body, wire.CameraState):
@@ -320,7 +320,7 @@ class _HistoryBuilder:
         np.maximum(extremes.highest_nm, surface, out=extremes.highest_nm)
         np.minimum(extremes.lowest_nm, surface, out=extremes.lowest_nm)
 
-    def _calibrate(self, calibration: wire.Calibration) -> None:
+    def _store_calibration(self, calibration: wire.Calibration) -> None:
         self._calibration = calibration
         self._set_modes(len(calibration.noll))
 

@@ -30,7 +30,7 @@ class _Tally:
         never: number it never sent, according to its Health: frames lost by a camera, without `before`.
         before: number it had never sent before the first recorded message; None until its first Health.
         unconfirmed: number lost at the last call of `news`.
-        safe: `recorded` and `twice` at the last flush.
+        flushed: `recorded` and `twice` at the last flush.
         reported: number reported as lost by `news`.
     """
 
@@ -41,7 +41,7 @@ class _Tally:
     never: int = 0
     before: int | None = None
     unconfirmed: int = 0
-    safe: tuple[int, int] = (0, 0)
+    flushed: tuple[int, int] = (0, 0)
     reported: int = 0
 
     @property
@@ -63,12 +63,12 @@ class _Tally:
             self.recorded += recorded
             self.twice += recorded and not new
             if unwanted:  # never written, so the disk cannot lose it
-                self.safe = self.safe[0] + 1, self.safe[1] + (not new)
+                self.flushed = self.flushed[0] + 1, self.flushed[1] + (not new)
 
     def absorb(self, other: "_Tally") -> None:
         self.published += other.sent
         self.recorded += other.recorded
-        self.safe = self.safe[0] + other.safe[0], 0
+        self.flushed = self.flushed[0] + other.flushed[0], 0
         self.reported += other.reported
         self.never += other.never
 
@@ -110,7 +110,7 @@ class LossAccount:
             topic = _published(health.process, count.topic)
             if topic is not None and self._selection.records_all(topic):
                 self.names.admit(topic, count.topic)
-                author = self._known(health.process) if topic is EVENT else ""
+                author = self._author_name(health.process) if topic is EVENT else ""
                 tally = self._tally(count.topic, author, start_of(sample.sequence), count.published)
                 if tally.before is None:
                     tally.before = count.missing if tally.gaps.first else 0
@@ -121,12 +121,12 @@ class LossAccount:
     def mark_flushed(self) -> None:
         """Note that everything recorded so far has been flushed."""
         for _, tally in self._all():
-            tally.safe = tally.recorded, tally.twice
+            tally.flushed = tally.recorded, tally.twice
 
     def revert(self) -> None:
         """Note that everything recorded since `mark_flushed` was lost."""
         for _, tally in self._all():
-            tally.recorded, tally.twice = tally.safe
+            tally.recorded, tally.twice = tally.flushed
 
     def recorded(self) -> dict[str, int]:
         """Number of messages recorded so far, by key, including keys whose messages were all lost."""
@@ -173,11 +173,11 @@ class LossAccount:
         if topic is not EVENT:
             return ""
         try:
-            return self._known(Log.FromString(sample.payload).name)
+            return self._author_name(Log.FromString(sample.payload).name)
         except DecodeError:
             return _UNNAMED
 
-    def _known(self, author: str) -> str:
+    def _author_name(self, author: str) -> str:
         if author not in self._authors:
             if len(author) > MAX_NAME_LENGTH or len(self._authors) >= MAX_NAMES:
                 return _UNNAMED

@@ -21,14 +21,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from lowfc.adapters.logs.chunk import (
-    CHUNK_HERE,
-    MAX_BYTES,
-    Chunk,
-    CompressionError,
-    UnsoundError,
-    read_chunk,
-)
+from lowfc.adapters.logs.chunk import CHUNK_HERE, MAX_BYTES, Chunk, CompressionError, UnsoundError, read_chunk
 from lowfc.adapters.logs.writer import UNFINISHED
 from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import DataFileError
@@ -127,7 +120,8 @@ class LogFile:
             DataFileError: the file cannot be read.
         """
         magic = self._read(0, len(MAGIC))
-        at, crc, intact = len(MAGIC), zlib.crc32(magic), (begins := MAGIC.startswith(magic))
+        begins = MAGIC.startswith(magic)
+        at, crc, intact = len(MAGIC), zlib.crc32(magic), begins
         if not begins:
             yield Damage(0, len(magic), "it does not begin like an MCAP file")
         while at < self.size:
@@ -140,7 +134,7 @@ class LogFile:
                     at, intact = end, False  # the checksum of the data section needs all of it
                     continue
             try:
-                if opcode in _OF_CHUNKS and self._unchunked and (content := self._loose(at)):
+                if opcode in _OF_CHUNKS and self._unchunked and (content := self._unchunked_records(at)):
                     yield Chunk(at, len(content), zlib.crc32(content), content)
                     crc, at = zlib.crc32(content, crc), at + len(content)
                     continue
@@ -298,8 +292,8 @@ class LogFile:
         statistics = (parsed(Statistics, one[HEAD.size :]) for one in self._in_summary(Opcode.STATISTICS))
         return not self._by_lowfc or any(not one.chunk_count for one in statistics)
 
-    def _loose(self, at: int) -> bytes:
-        """Intact records from `at` on that are usually in chunks."""
+    def _unchunked_records(self, at: int) -> bytes:
+        """Intact records from `at` on of the kinds that are usually in chunks."""
         end = at
         while end - at < _BLOCK_BYTES and len(head := self._read(end, HEAD.size)) == HEAD.size:
             opcode, length = HEAD.unpack(head)

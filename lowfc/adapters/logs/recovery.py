@@ -11,6 +11,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import Damage
 from lowfc.adapters.logs.writer import UNFINISHED, being_recorded, stem_of
 from lowfc.contract.errors import DataFileError
+from lowfc.control.loop.wording import counted
 
 RECOVERY = "recovery"
 """Name of the metadata with the origin of a recovered log."""
@@ -52,10 +53,10 @@ class Recovery:
             return f"{self.log} is intact; {advice}"
         lines = [f"left out {in_words(damage)}" for damage in self.damage]
         if self.unreadable:
-            lines.append(f"left out {self.unreadable} messages: their declaration was in a damaged chunk")
+            lines.append(f"left out {counted(self.unreadable, 'message')}: the declaration was in a damaged chunk")
         if not self.finished:
             lines.append(f"{self.log} had not been finished")
-        return "\n".join([*lines, f"{self.recovered}: {self.messages} messages"])
+        return "\n".join([*lines, f"{self.recovered}: {counted(self.messages, 'message')}"])
 
 
 def recovered_path(source: Path) -> Path:

@@ -13,7 +13,7 @@ class Gaps:
     Attributes:
         first: count of the first message.
         next: highest count plus 1.
-        missing: number of missing messages between the two.
+        missing: number of missing messages between the two, and of former starts.
     """
 
     def __init__(self, first: int, missing: int = 0) -> None:

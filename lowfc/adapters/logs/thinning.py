@@ -30,7 +30,7 @@ def thin(
     Raises:
         DataFileError: a file is not a log, or has no messages, `out` exists already, or it cannot be written.
     """
-    combined = Selection.of(metadata_at_start(log[0])).within(requested)
+    combined = requested.within(Selection.of(metadata_at_start(log[0])))
     reader = WholeLog(log, skip_damaged=True)
     reader.progress = progress
     copied_names = {PART, SELECTION}  # the copy has its own

@@ -22,7 +22,7 @@ def install_advice(extra: str) -> str:
 
 @contextmanager
 def package_required(what: str, extra: str) -> Iterator[None]:
-    """Turn an ImportError in the block into a ConfigurationError: `what`, which is missing; install: the extra."""
+    """Turn an ImportError in the block into a ConfigurationError with `what`, such as "plots require matplotlib"."""
     try:
         yield
     except ImportError as fault:

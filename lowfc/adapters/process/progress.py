@@ -30,10 +30,10 @@ def passing_bar(console: Console, *columns: ProgressColumn) -> Progress:
 def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted]:
     """One bar for several tasks in turn, with `columns` beside its description; it appears with the first progress.
 
-    Without a terminal: lines, see `spoken`.
+    Without a terminal: lines, see `progress_lines`.
     """
     if not console.is_terminal:
-        yield spoken(lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True))
+        yield progress_lines(lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True))
         return
     with passing_bar(console, TextColumn("{task.description}"), BarColumn(), *columns) as bar:
         tasks: list[TaskID] = []
@@ -56,23 +56,23 @@ def reading_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
     return counting_bar(console, DownloadColumn(), TimeRemainingColumn())
 
 
-def spoken(say: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Counted:
+def progress_lines(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Counted:
     """Progress without a terminal: a line every 10 s with the estimated remaining time; `clock` is in seconds."""
     before = -1
-    begun = spoken_at = -inf
+    begun = written = -inf
 
     def count(what: str, done: int, total: int) -> None:
-        nonlocal before, begun, spoken_at
+        nonlocal before, begun, written
         now = clock()
         if before < 0:
-            spoken_at = now
+            written = now
         if before < 0 or done < before:  # the first task, or another one
             before = done
         if done == before:  # exclude the time before the first progress from the rate
             begun = now
-        elif now - spoken_at >= _EVERY_S:
-            spoken_at = now
+        elif now - written >= _EVERY_S:
+            written = now
             seconds = (now - begun) / (done - before) * (total - done)
-            say(f"{what}: {done / total:.0%}, about {seconds:.0f} s to go")
+            write(f"{what}: {done / total:.0%}, about {seconds:.0f} s to go")
 
     return count

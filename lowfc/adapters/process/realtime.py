@@ -72,7 +72,7 @@ def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, di
         "other programs may run first, and one frame in a thousand comes milliseconds late on a busy host; "
         "allow it with LimitRTPRIO= or CAP_SYS_NICE"
     )
-    return _ask(["one BLAS thread", "garbage collector off"], measures + _scheduling(priority, cost))
+    return _request(["one BLAS thread", "garbage collector off"], measures + _scheduling(priority, cost))
 
 
 def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int]]:
@@ -108,7 +108,7 @@ def step_back(priority: int | None, cpus: set[int] | None = None) -> Granted:
     leave_real_time()
     measures = _processors(cpus, "the recorder may get in the loop's way")
     measures += _scheduling(priority, "on a busy host the recorder loses messages")
-    return _ask([] if priority is not None else ["normal scheduling class"], measures)
+    return _request([] if priority is not None else ["normal scheduling class"], measures)
 
 
 def let_send() -> None:
@@ -136,7 +136,8 @@ def leave_real_time() -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def _ask(in_force: list[str], measures: Iterable[_Measure]) -> Granted:
+def _request(in_force: list[str], measures: Iterable[_Measure]) -> Granted:
+    """Request the measures; `in_force` are those granted already."""
     refused = []
     for name, measure, cost in measures:
         try:
@@ -155,8 +156,8 @@ def _processors(cpus: set[int] | None, cost: str) -> list[_Measure]:
 def _scheduling(priority: int | None, cost: str) -> list[_Measure]:
     if priority is None:
         return []
-    first = partial(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(priority))
-    return [(f"SCHED_FIFO priority {priority}", first, cost)]
+    measure = partial(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(priority))
+    return [(f"SCHED_FIFO priority {priority}", measure, cost)]
 
 
 def _disable_cpu_idle() -> None:

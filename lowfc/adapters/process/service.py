@@ -196,7 +196,7 @@ class Service:
     def beat(self, *, alive: bool = True) -> None:
         """Publish Health when due, twice a second, and send the watchdog signal to the service manager if `alive`.
 
-        Call it often, and only on the process's main thread: the watchdog must notice that this thread hangs.
+        Call it often, and only on the thread that does the process's work: the watchdog must notice that it hangs.
         """
         now_ns = self.clock.host_ns()
         if alive:
@@ -221,7 +221,7 @@ class Service:
     def event(self, event: str, **details: object) -> None:
         """Publish an event of the table; callable from any thread.
 
-        Warnings and worse are also printed on standard error, of a flood of warnings only the first.
+        Warnings and errors are also printed on standard error; of a flood of one warning, only the first.
         """
         kind = EVENTS[event]
         log = kind.log(self.name, self.clock.now_ns(), **details)

@@ -40,7 +40,7 @@ class Supervisor:
         self._once("STOPPING=1")
 
     def alive(self, now_ns: int) -> None:
-        """Send the watchdog signal if due; to be called on the main thread only."""
+        """Send the watchdog signal if due; to be called only on the thread that does the process's work."""
         if self.period_ns is not None and now_ns >= self._due_ns:
             self._due_ns = now_ns + self.period_ns
             self._send("WATCHDOG=1")

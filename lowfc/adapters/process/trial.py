@@ -24,13 +24,13 @@ class Trial(NamedTuple):
         refused: refused ones among `priority`, `lock_memory` and `disable_cpu_idle`, each with its cost.
         cpus: processors available to the process.
         normal_ns: lateness of each wake-up in the normal scheduling class, ns.
-        first_ns: lateness of each wake-up under SCHED_FIFO, ns; empty if not requested or refused.
+        fifo_ns: lateness of each wake-up under SCHED_FIFO, ns; empty if not requested or refused.
     """
 
     refused: dict[str, tuple[str, str]]
     cpus: set[int]
     normal_ns: list[int]
-    first_ns: list[int]
+    fifo_ns: list[int]
 
 
 def try_out(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
@@ -69,14 +69,14 @@ def _try(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
     os.sched_setaffinity(0, (cpus & reachable) or inherited)
     refused: dict[str, tuple[str, str]] = {}
 
-    def ask(name: str, priority: int | None = None, **measure: bool) -> None:
+    def request(name: str, priority: int | None = None, **measure: bool) -> None:
         measures = {"lock_memory": False, "disable_cpu_idle": False} | measure
         if found := set_up(priority, None, **measures).refused:
             refused[name] = found[0]
 
-    ask("lock_memory", lock_memory=requested.lock_memory)
-    ask("disable_cpu_idle", disable_cpu_idle=requested.disable_cpu_idle)
+    request("lock_memory", lock_memory=requested.lock_memory)
+    request("disable_cpu_idle", disable_cpu_idle=requested.disable_cpu_idle)
     normal_ns = lateness_ns(wake_ups)
-    ask("priority", requested.priority or None)
-    first_ns = lateness_ns(wake_ups) if requested.priority and "priority" not in refused else []
-    return Trial(refused, reachable, normal_ns, first_ns)
+    request("priority", requested.priority or None)
+    fifo_ns = lateness_ns(wake_ups) if requested.priority and "priority" not in refused else []
+    return Trial(refused, reachable, normal_ns, fifo_ns)

@@ -65,7 +65,7 @@ def decode_frame(payload: bytes, sequence: int, age_ns: int, *, ahead: bool = Fa
 
 
 def encode_step(step: Step, input_number: int) -> bytes:
-    """ControlStep of a step, computed from this input."""
+    """ControlStep of a step, which was computed from the input with this number."""
     message = wire.ControlStep(
         timestamp=timestamp(step.time_ns),
         frame_sequence=step.frame_sequence,
@@ -82,7 +82,7 @@ def encode_step(step: Step, input_number: int) -> bytes:
 
 
 def encode_command(command: Command, valid_for_ns: int, channel: str, input_number: int) -> bytes:
-    """MirrorCommand of a command, computed from this input."""
+    """MirrorCommand of a command, which was computed from the input with this number."""
     rows, columns = command.actuators_nm.shape
     message = wire.MirrorCommand(
         timestamp=timestamp(command.time_ns),

@@ -90,7 +90,7 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
 
 
 def calibration_in_use(message: wire.ControllerState, calibration: Calibration) -> Calibration:
-    """The calibration with the reconstructor in use, which automatic gains weight for the modes not corrected."""
+    """The calibration with the reconstructor in use: automatic gains weight it by the uncorrected modes."""
     prior_nm2 = np.array(message.prior_nm2, np.float32)
     if message.calibration_id != calibration.id or prior_nm2.size != len(calibration.noll):
         return calibration

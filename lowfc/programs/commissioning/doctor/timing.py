@@ -267,7 +267,7 @@ def _wake_up(facts: Facts) -> Check:
 
 def wake_up_us(trial: Trial) -> dict[str, dict[str, float]]:
     """Percentiles of the wake-up latency, us, by scheduling class; the best class last."""
-    classes = {"normal": trial.normal_ns, "SCHED_FIFO": trial.first_ns}
+    classes = {"normal": trial.normal_ns, "SCHED_FIFO": trial.fifo_ns}
     return {
         name: dict(zip(("p50", "p99", "max"), (np.percentile(late_ns, (50, 99, 100)) / 1e3).tolist(), strict=True))
         for name, late_ns in classes.items()
