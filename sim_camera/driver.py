@@ -39,6 +39,8 @@ PATIENCE_S = 5.0
 """In lockstep, the run ends after this much real time without progress."""
 RECENT_S = 2.0
 """Averaging time of the wavefront statistics reported while the loop runs."""
+MAX_WAIT_NS = 500_000_000
+"""Longest wait of a call of `expose`, as of any camera."""
 _REMEMBERED = 256  # mirror states, and publication times of frames
 
 
@@ -188,7 +190,7 @@ class SimulatedCamera:
     def start(self) -> None:
         """Set the time of the first exposure."""
         clock = self._service.clock
-        self._origin_ns = clock.now_ns() + (0 if clock.lockstep else 10 * self._config.period_ns)
+        self._origin_ns = clock.now_ns() + (0 if clock.lockstep else min(10 * self._config.period_ns, MAX_WAIT_NS))
 
     def settings(self) -> CameraSettings:
         """Camera settings of the next exposure."""
@@ -196,10 +198,16 @@ class SimulatedCamera:
         return replace(self._settings, time_ns=self._start_ns() + self._config.exposure_ns if started else None)
 
     def expose(self) -> Exposure | None:
-        """Latch the mirror's shape at the start of the next exposure, and compute its frame before the end."""
+        """Latch the mirror's shape at the start of the next exposure, and compute its frame before the end.
+
+        None if the process is stopping, or if the exposure has not started after `MAX_WAIT_NS`.
+        """
         clock, period_ns = self._service.clock, self._config.period_ns
         start_ns = self._start_ns()
-        clock.sleep_until_ns(start_ns)
+        latest_ns = start_ns if clock.lockstep else clock.now_ns() + MAX_WAIT_NS
+        clock.sleep_until_ns(min(start_ns, latest_ns))
+        if start_ns > latest_ns:
+            return None
         behind_ns = clock.now_ns() - start_ns
         if behind_ns > period_ns:  # the host stalled: continue from now rather than catch up in a burst
             self._origin_ns += behind_ns

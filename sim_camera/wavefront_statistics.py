@@ -89,8 +89,8 @@ class WavefrontAccumulator:
 
     def _statistics(self, mean: npt.NDArray[np.float64]) -> dict[str, Any]:
         flat, added, squares = mean[0], mean[1 : 1 + len(self._noll)], mean[1 + len(self._noll) :]
-        per = np.array([1, 1, *[self._tilts.stop * self._nm_per_mas**2] * 2])
-        rms = np.sqrt(squares.reshape(-1, 4) / per).ravel().tolist()
+        divisors = np.array([1, 1, *[self._tilts.stop * self._nm_per_mas**2] * 2])
+        rms = np.sqrt(squares.reshape(-1, 4) / divisors).ravel().tolist()
         found = dict(zip((*_RMS, *(f"continuous_{name}" for name in _RMS)), rms, strict=False))
         found |= {"instants": self._instants, "added_contrast_flat": float(flat), "added_contrast": float(added.sum())}
         modes, share = costliest(by_group(self._noll, added)) if flat else ("", 0.0)

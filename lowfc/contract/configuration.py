@@ -163,8 +163,8 @@ class Recorder(Section):
     on_event_level: Literal["info", "warning", "error"] = "error"
     """Lowest event level that runs the command."""
     on_event_every_s: float = Field(10.0, ge=0)
-    """Shortest time from the end of the command to its next run, which is for the most severe event since;
-    LOWFC_OTHERS counts the others."""
+    """Shortest time from the end of the command to its next run, which reports the most severe event since then;
+    LOWFC_OTHERS is the number of others."""
 
 
 class Realtime(Section):

@@ -65,7 +65,7 @@ def _mend(data: dict[str, Any], detail: Any) -> str:
     """Remove the key at fault; return the consequence in words."""
     section, *path = detail["loc"]
     table = data.get(section)
-    if isinstance(table, list) and detail["type"] == "extra_forbidden":  # an unknown key of one interlock
+    if isinstance(table, list) and path and detail["type"] == "extra_forbidden":  # a key of one interlock
         table, path = table[path[0]], path[1:]
     if path and isinstance(table, dict):
         table.pop(path[0], None)

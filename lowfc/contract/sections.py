@@ -204,7 +204,8 @@ class Disturbance(Section):
     wheel_course: Literal["ramp", "walk", "run-down"] = "ramp"
     """Change of its speed: linear, random walk, or slowed by friction."""
     wheel_change: float = 0.0
-    """Rate of that change: Hz per second (run-down: at its start), walk: Hz per root second; 0 for constant speed."""
+    """Rate of that change: ramp, Hz per second; walk, Hz per root second; run-down, decrease at time 0 in Hz per
+    second. 0 for constant speed."""
     second_wheel_hz: float = 0.0
     """Initial excess speed of a second, identical wheel, so that the two beat; 0 for no second wheel."""
 

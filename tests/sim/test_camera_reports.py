@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from lowfc.contract.configuration import Configuration
+from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE, wire
 from lowfc.testing.clock import FakeClock
@@ -118,6 +118,14 @@ def test_camera_reports_each_change_of_habitual_lateness() -> None:
             put(sequence)
     assert listener.events()[1:] == ["COMMANDS_LATE", "COMMANDS_IN_TIME", "COMMANDS_LATE"]
     assert camera._lateness.total == 4 * WINDOW
+
+
+def test_a_call_of_a_slow_camera_waits_half_a_second_at_most() -> None:
+    optics = cast("Scene", SimpleNamespace(shape=(80, 80), instants=(), expose=lambda index, shape: np.zeros((80, 80))))
+    camera = SimulatedCamera(SimulatedCamera.Options(), load(None, {"camera.rate_hz": 0.5}), optics)
+    camera.join(Listener(MemoryHub(), FakeClock()).service("camera"))
+    camera.start()
+    assert [camera.expose() is None for _ in range(5)] == [False, True, True, True, False]
 
 
 def test_region_is_read_at_the_centre_of_the_sensor() -> None:

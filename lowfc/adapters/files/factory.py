@@ -18,13 +18,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.contract.messages import fields_of
 from lowfc.contract.sections import InterlockSection, SensorSection
-from lowfc.control.calibration.calibration import (
-    Calibration,
-    noise_nm2,
-    normalise_flux,
-    reconstructor,
-    unnormalised,
-)
+from lowfc.control.calibration.calibration import Calibration, noise_nm2, normalise_flux, reconstructor, unnormalised
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.interlocks import Action, Interlock
 from lowfc.control.loop.safety import Limits, LoopMode
@@ -255,12 +249,7 @@ def analytic_calibration(
 
 
 def actuators_to_modes(
-    reconstructor: Array,
-    reference: Array,
-    good: Array,
-    optics: Twin,
-    on_nodes: TwinMirror,
-    opd_nm: Array | None = None,
+    reconstructor: Array, reference: Array, good: Array, optics: Twin, on_nodes: TwinMirror, opd_nm: Array | None = None
 ) -> Array:
     """Z (modes, actuators) = R H: nm of wavefront that R measures per nm of surface of each actuator.
 

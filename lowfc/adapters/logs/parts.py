@@ -132,7 +132,8 @@ def one_by_one(names: Sequence[Path], out: Path | None = None, *, as_json: bool 
     """
     logs: dict[tuple[str, ...], dict[int, Path]] = {}
     for path in _files(names):
-        key, number = _place(path) if len(names) > 1 or path != names[0] else ((), 1)
+        alone = [path] == list(names)  # named by itself: its place in a recording does not matter
+        key, number = ((), 1) if alone else _place(path)
         parts = logs.setdefault(key or (str(path.absolute()),), {})
         if number in parts:
             raise ConfigurationError(f"{parts[number]} and {path} are the same part of one log: name one of them")

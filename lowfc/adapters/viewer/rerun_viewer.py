@@ -281,11 +281,7 @@ def _state(client: "ViewerClient") -> "ViewerState":
 _REINSTALL = "install it again: pip install --force-reinstall rerun-sdk"
 _NO_SCREEN = "use --web and a browser, --headless-screenshot FILE.png, or --save FILE.rrd"
 _PACKAGES = "apt install mesa-vulkan-drivers libvulkan1"
-_ADVICE = {
-    Show.NATIVE: f"; {_NO_SCREEN}",
-    Show.HEADLESS: f"; if it has no Vulkan driver: {_PACKAGES}",
-    Show.WEB: "",
-}
+_ADVICE = {Show.NATIVE: f"; {_NO_SCREEN}", Show.HEADLESS: f"; if it has no Vulkan driver: {_PACKAGES}", Show.WEB: ""}
 
 
 def stream_url(port: int) -> str:

@@ -250,12 +250,12 @@ def request(
 
     ValueError if a part of it is incomplete or missing.
     """
-    table, basis = floats(message.table, -1, message.columns or 1), floats(message.actuators, -1)
+    table, shapes_nm = floats(message.table, -1, message.columns or 1), floats(message.actuators, -1)
     if message.play_id:
         if message.play_id not in plays:
             raise ValueError(f"the table {message.play_id[:12]} of a probe sequence is missing")
         known_table = plays[message.play_id]
-        table, basis = known_table.rows, known_table.basis.reshape(-1)
+        table, shapes_nm = known_table.rows, known_table.basis.reshape(-1)
     calibration = None
     if message.HasField("calibration"):
         known = calibrations.get(message.calibration.id)
@@ -266,7 +266,7 @@ def request(
         tuple(message.modes),
         tuple(message.values),
         message.text,
-        basis,
+        shapes_nm,
         table,
         law_of(message.law, laws) if message.HasField("law") else None,
         calibration,
