@@ -67,7 +67,7 @@ def test_the_command_runs_in_the_normal_scheduling_class_and_at_most_once_per_in
 
 
 def test_a_command_that_fails_or_hangs_raises_an_event_that_does_not_run_it_again(monkeypatch) -> None:
-    monkeypatch.setattr(alarms, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(alarms, "TIMEOUT_S", 0.2)
     run = Alarmed("if test $LOWFC_EVENT = MIRROR_LOST; then sleep 100; fi; exit 3")
     run.camera.event("CAMERA_RESTARTED")
     until(run.failures)

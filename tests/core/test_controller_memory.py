@@ -70,6 +70,9 @@ def configured(**overrides: object) -> Configuration:
     )
 
 
+CHANGED_CAMERA = wire.CameraState(
+    timestamp=timestamp(START_NS), rows=5, columns=5, bias_dn=100, saturation_dn=65535
+).SerializeToString()
 CONFIG, CLOSED = configured(), configured(control__start_mode="closed")
 GRID = CONFIG.mirror.rows, CONFIG.mirror.columns
 
@@ -276,8 +279,7 @@ def test_safe_mode_flattens_the_mirror_and_is_latched(rig: Rig) -> None:
 def test_a_camera_that_changes_opens_the_loop(rig: Rig) -> None:
     rig.expose(1)
     rig.ask("close")
-    changed = wire.CameraState(timestamp=timestamp(START_NS), rows=5, columns=5, bias_dn=100, saturation_dn=65535)
-    rig.settings.put(changed.SerializeToString())
+    rig.settings.put(CHANGED_CAMERA)
     rig.until("CAMERA_CHANGED", lambda: "CAMERA_CHANGED" in rig.events())
     rig.expose(1)
     assert rig.steps(1)[0].mode == wire.LOOP_MODE_OPEN
@@ -389,7 +391,7 @@ def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration:
         controller.run()
 
 
-def test_a_warm_up_changes_no_state_and_publishes_nothing(
+def test_a_warm_up_changes_no_state_publishes_nothing_and_loses_no_settings(
     calibration: Calibration, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     warmed_up: list[bool] = []
@@ -412,6 +414,9 @@ def test_a_warm_up_changes_no_state_and_publishes_nothing(
             rig.put(pixels)
             time.sleep(0.1)  # two periods
         assert [list(step.reasons) for step in rig.steps(5)] == [[]] * 5
+        monkeypatch.setattr(rig.controller._warmup, "due", lambda now_ns: True)
+        rig.settings.put(CHANGED_CAMERA)
+        rig.until("CAMERA_CHANGED", lambda: "CAMERA_CHANGED" in rig.events())
     assert len(warmed_up) >= 3
     assert all(warmed_up)
 
@@ -439,7 +444,7 @@ def test_of_frames_that_waited_only_the_newest_is_integrated(calibration: Calibr
         pixels = scene.expose(0, rig.offset_nm)
         payload = image(pixels, 1, "camera").SerializeToString()
         dispatch = next(one for one in rig.services[0].arrivals if one.key == FRAME.key)
-        until(lambda: rig.controller._adopted)
+        until(lambda: rig.controller._mirror_adopted)
         now_ns = HostClock().now_ns()
         newest = rig.settings.last[1].sequence + 100
         for age in range(9, -1, -1):  # periods; all arrive at once, as after a pause of the controller

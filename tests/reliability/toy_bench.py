@@ -152,7 +152,7 @@ class ToyBench(ChaosBench):
         self._controller._camera.await_first()
         self._controller._adopt_mirror()
         self._controller._bench.query()
-        self._controller._adopted = True
+        self._controller._mirror_adopted = True
 
     def await_end(self, name: str, status: int) -> str:
         assert self._fault

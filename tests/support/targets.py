@@ -133,7 +133,7 @@ class Processes:
         self.services = [Service(name, "fuzz", self.clock, MemoryBus(self.hub, name, self.clock)) for name in ROLES]
         self.mirror = MirrorLoop(SimulatedMirror(DriverOptions(), CONFIG), self.services[1], CONFIG)
         self.controller = Controller(CONFIG, self.services[0], CALIBRATION, "a test", Latch(()))
-        self.controller._adopted = True
+        self.controller._mirror_adopted = True
         camera = MemoryBus(self.hub, "camera", self.clock)
         self.frames, self.settings_of = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
         self.commands = MemoryBus(self.hub, "somebody", self.clock).publisher(COMMAND, "dm")

@@ -17,6 +17,7 @@ from lowfc.adapters.image_stream.channels import OtherChannels, channel_names, f
 from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, StreamError, stream_path
 from lowfc.adapters.process.clock import Clock, HostClock
 from lowfc.adapters.process.realtime import lower_priority
+from lowfc.adapters.process.terminal import AnyRun
 from lowfc.client import Client
 from lowfc.client.runs import the_known_run
 from lowfc.client.stream import step_of
@@ -35,10 +36,10 @@ _REFUSED_S = 2.0
 
 
 def bridge_isio(
-    run: Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")] = None,
+    run: AnyRun = None,
     prefix: Annotated[str, typer.Option(help="Prefix of the streams' names.")] = "lowfc",
     beside: Annotated[
-        str, typer.Option(help="Channel that the loop writes: it does not undo the mirror's other channels.")
+        str, typer.Option(help="Channel that the loop writes; the loop does not undo this mirror's other channels.")
     ] = "",
     external: Annotated[list[str] | None, typer.Option(help="Channel that the loop must not undo; repeat.")] = None,
     nm_per_unit: Annotated[float, typer.Option(min=1e-9, help="Surface per unit of a channel, nm.")] = 1000.0,
@@ -108,7 +109,7 @@ class StepStreams:
     def _stream(self, name: str, columns: int) -> Stream:
         stream = self._streams.get(name)
         if stream is None or not stream.current() or stream.layout.shape[2] != columns:
-            stream = self._streams[name] = _made(name, columns)
+            stream = self._streams[name] = _open_or_create(name, columns)
         return stream
 
 
@@ -124,7 +125,7 @@ class ExternalChannels:
             stream_path(name)  # StreamError if this cannot be a name
         self._names = names
         self._others: OtherChannels | None = None  # until a controller reports the grid
-        self._known = b""  # the controller's channel as last reported; its state has one that was there before
+        self._known = b""  # shape of the channel at the controller, as last reported or requested
         self._next_request_s = 0.0
         self._fault = ""
 
@@ -154,7 +155,7 @@ class ExternalChannels:
         self._fault = fault
 
 
-def _made(name: str, columns: int) -> Stream:
+def _open_or_create(name: str, columns: int) -> Stream:
     """A stream of one row for this process to write: an existing one, created again if it has another size."""
     path = stream_path(name)
     with contextlib.suppress(StreamAbsentError):

@@ -36,12 +36,12 @@ def commented(config: Configuration) -> str:
 
 def _lines(section: Section, prefix: str = "") -> Iterator[str]:
     """Keys of a section, then the sections in it."""
-    names = section.descriptions()
-    subsections = {name: _tables(getattr(section, name)) for name in names}
-    for name in names:
+    descriptions = section.descriptions()
+    subsections = {name: _subsections(getattr(section, name)) for name in descriptions}
+    for name, description in descriptions.items():
         if subsections[name]:
             continue
-        yield f"# {' '.join(names[name].split())}"
+        yield f"# {' '.join(description.split())}"
         mark = "" if name in section.model_fields_set else "#"
         yield from (f"{mark}{line}" for line in _assignment(name, getattr(section, name)))
     for name, tables in subsections.items():
@@ -50,9 +50,10 @@ def _lines(section: Section, prefix: str = "") -> Iterator[str]:
             yield from ("", header, *_lines(table, f"{prefix}{name}."))
 
 
-def _tables(value: object) -> list[Section]:
+def _subsections(value: object) -> list[Section]:
     """The section or the list of sections of a value; empty for a plain value."""
-    return [one for one in (value if isinstance(value, list) else [value]) if isinstance(one, Section)]
+    values = value if isinstance(value, list) else [value]
+    return [each for each in values if isinstance(each, Section)]
 
 
 def _assignment(name: str, value: object) -> list[str]:
@@ -124,7 +125,7 @@ def config_zenoh(
         keys = {"mirror.name": mirror} if part == Role.MIRROR and mirror else {}
         open_run(run or DEFAULT_RUN, (load(None, keys).mirror.name,))
     try:
-        joined = open_run(run or DEFAULT_RUN if make else the_known_run(run), ())
+        joined = open_run((run or DEFAULT_RUN) if make else the_known_run(run), ())
     except BusError as fault:
         raise fault if make else BusError(f"{fault}; --make creates a run that does not exist") from None
     links = joined.links

@@ -11,6 +11,7 @@ from lowfc.adapters.process.terminal import AnyRun, Json, new_app
 from lowfc.client.requests import BY_NAME
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError
 from lowfc.contract.messages import Role, wire
+from lowfc.control.loop.wording import AUTO
 from lowfc.programs.cli.modes import Modes, noll_of
 from lowfc.programs.cli.output import print_result
 from lowfc.programs.commissioning.calibrate.command import dark, reference
@@ -24,7 +25,6 @@ ctl_app.add_typer(record_app, name="record")
 
 ZERO = "--zero"
 INTEGRATOR = "integrator"
-AUTOMATIC = "auto"
 SIGNAL = (
     "if the controller does not answer, a signal on its host puts it in safe mode: "
     "pkill -USR1 -f '^[^ ]*python.* (-m |[^ ]*/)lowfc controller'"
@@ -41,10 +41,10 @@ def number(word: str) -> float:
 
 def gain_word(word: str) -> str:
     """Parse a gain, or `auto`."""
-    return word if word == AUTOMATIC else str(number(word))
+    return word if word == AUTO else str(number(word))
 
 
-def whole(word: str) -> int:
+def frame_count(word: str) -> int:
     """Parse a number of frames."""
     try:
         return int(word)
@@ -59,13 +59,13 @@ def bench_value(word: str) -> bool | float | str:
     try:
         return float(word)
     except ValueError:
-        if word.startswith("-"):  # see `ignore_unknown_options`
+        if word.startswith("-"):  # with `ignore_unknown_options` a misspelt option arrives here
             raise typer.BadParameter(f"{word!r} is neither an option of this command nor a number") from None
         return word
 
 
 def bench_name(word: str) -> str:
-    """Refuse a misspelt option; see `ignore_unknown_options`."""
+    """Refuse a misspelt option, which `ignore_unknown_options` passes as an argument."""
     if word.startswith("-"):
         raise typer.BadParameter(f"{word!r} is not an option of this command")
     return word
@@ -73,10 +73,10 @@ def bench_name(word: str) -> str:
 
 _EACH = "One value for all modes, or one for each mode."
 Values = Annotated[list[float], typer.Argument(help=_EACH, parser=number)]
-Gains = Annotated[list[str], typer.Argument(help=f"{_EACH[:-1]}; or {AUTOMATIC}.", parser=gain_word)]
+Gains = Annotated[list[str], typer.Argument(help=f"{_EACH[:-1]}; or {AUTO}.", parser=gain_word)]
 ValuesIfAny = Annotated[list[float] | None, typer.Argument(help=f"{_EACH} nm rms of wavefront.", parser=number)]
 Zero = Annotated[bool, typer.Option(ZERO, help="Set it to zero.")]
-Frames = Annotated[int, typer.Argument(help="Number of frames with the loop closed.", parser=whole)]
+Frames = Annotated[int, typer.Argument(help="Number of frames with the loop closed.", parser=frame_count)]
 Text = Annotated[str, typer.Argument(help="The note.")]
 Purpose = Annotated[str, typer.Argument(help="What will be moved.")]
 Hold = Annotated[
@@ -113,11 +113,11 @@ def _of_modes(name: str) -> _Command:
 
 
 def _gain(values: Gains, modes: Modes = None, run: AnyRun = None, as_json: Json = False) -> None:
-    if AUTOMATIC in values and len(values) > 1:
-        raise ConfigurationError(f"gain takes numbers, or `{AUTOMATIC}` alone")
+    if AUTO in values and len(values) > 1:
+        raise ConfigurationError(f"gain takes numbers, or `{AUTO}` alone")
 
     def ask(loop: "Client") -> "Answer":
-        if values == [AUTOMATIC]:
+        if values == [AUTO]:
             return loop.automatic_gain(noll_of(modes))
         return loop.gain([float(word) for word in values], noll_of(modes))
 
@@ -191,7 +191,7 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
 
     parsed = bench_value(value)
     with _joined(run) as loop:
-        loop.status()  # a controller that has replied receives bench values, too
+        loop.status()  # wait for the connection: a controller that has replied also receives the value
         loop.bench(name, parsed)
         state = loop.status().state
         assert state is not None  # noqa: S101  # a status reply always has one
@@ -259,8 +259,8 @@ for _measurement in (dark, reference):
 
 
 @ctl_app.callback()
-def _of_run(context: typer.Context, run: AnyRun = None) -> None:
-    """Accept --run before the request, too."""
+def _run_before_request(context: typer.Context, run: AnyRun = None) -> None:
+    """Accept --run also before the request."""
     defaults, group = {"run": run}, context.command
     assert isinstance(group, TyperGroup)  # noqa: S101  # of `ctl_app`
     context.default_map = {name: {**defaults, "start": defaults, "stop": defaults} for name in group.commands}

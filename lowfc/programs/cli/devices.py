@@ -33,8 +33,7 @@ def camera(
     Example: lowfc camera sim --run bench --config lowfc.toml
     """
     settings = configuration(config)
-    found = opened("camera", driver, settings, context.args)
-    run_camera(found, settings, run, frames, tuple(wait_for or ()))
+    run_camera(opened("camera", driver, settings, context.args), settings, run, frames, tuple(wait_for or ()))
 
 
 @mirror_app.command(cls=command_of("mirror"), context_settings=PASSED_ON)

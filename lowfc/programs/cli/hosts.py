@@ -42,8 +42,8 @@ class HostsResult(Result):
 
     def remarks(self) -> list[str]:
         """The reason if no clock is compared."""
-        none = all(each.clock_offset_us is None for each in self.processes)
-        return ["no clock is compared: the run has no router, or its router reports no clock"] if none else []
+        compared = any(each.clock_offset_us is not None for each in self.processes)
+        return [] if compared else ["no clock is compared: the run has no router, or its router reports no clock"]
 
 
 def certs(
@@ -52,10 +52,10 @@ def certs(
         list[str] | None, typer.Option(help="Host name or IP address of the router; repeat for several.")
     ] = None,
     mirror: Annotated[
-        list[str] | None, typer.Option(help="Name of a mirror; repeat for several. Default: dm, or the present ones.")
+        list[str] | None, typer.Option(help="Name of a mirror; repeat. Default: those in the folder, or dm.")
     ] = None,
     days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificates are valid.")] = 825,
-    renew: Annotated[bool, typer.Option("--renew", help="Renew existing certificates; they keep their keys.")] = False,
+    renew: Annotated[bool, typer.Option("--renew", help="Also renew existing certificates, with their keys.")] = False,
 ) -> None:
     """Make a certificate for each role of a run on several hosts, and the authority that signs them.
 
@@ -69,8 +69,8 @@ def certs(
 
     with package_required("making certificates requires the package cryptography", "deploy"):
         from lowfc.adapters.bus.certificates import make_certificates
-    present = sorted(file.stem.removeprefix("mirror-") for file in folder.glob("mirror-*.pem"))
-    mirrors = [load(None, {"mirror.name": name}).mirror.name for name in mirror or present or ["dm"]]
+    existing = sorted(file.stem.removeprefix("mirror-") for file in folder.glob("mirror-*.pem"))
+    mirrors = [load(None, {"mirror.name": name}).mirror.name for name in mirror or existing or ["dm"]]
     names = (ROUTER, *roles(map(mirror_role, mirrors)))
     made = make_certificates(folder, names, router or [], days, renew=renew)
     for file in made:
@@ -155,16 +155,17 @@ def hosts(
         bus = ZenohBus(links, Role.OPERATOR, HostClock())
         stack.callback(bus.close)
         time.sleep(CONNECT_S)
-        found = Client(run, bus=bus).processes()
-    if not found:
+        processes = Client(run, bus=bus).processes()
+    if not processes:
         raise BusError(f"no process of run {run!r} reports its health")
     if links.network.router:
         for warning in ending_certificates(links.network, datetime.datetime.now(datetime.UTC)):
             sys.stderr.write(f"warning: {warning}; lowfc certs --renew\n")
-    print_result(HostsResult(run=run, processes=[_row(health) for _, health in sorted(found.items())]), as_json=as_json)
+    rows = [_host_process(health) for _, health in sorted(processes.items())]
+    print_result(HostsResult(run=run, processes=rows), as_json=as_json)
 
 
-def _row(health: "wire.Health") -> HostProcess:
+def _host_process(health: "wire.Health") -> HostProcess:
     measured = health.router_round_trip_ns > 0
     return HostProcess(
         process=health.process,

@@ -33,18 +33,18 @@ class Commands(Mapping[str, Any]):
         row = self._rows[name]
         if row.where:
             module, _, attribute = row.where.partition(":")
-            found = getattr(import_module(f"lowfc.programs.{module}"), attribute)
+            command = getattr(import_module(f"lowfc.programs.{module}"), attribute)
         else:
             parts = [part for part in self._parts if part.name.startswith(f"{name} ")]
             commands = [part._replace(name=part.name.removeprefix(f"{name} ")) for part in parts]
-            found = lazy_app(f"{row.description}\n\nExample: lowfc {parts[0].name}", {"Commands": commands})
-            found.callback()(lambda: None)
-        app = found if isinstance(found, typer.Typer) else new_app("")
-        if app is not found:
-            app.command(name)(found)
-        command = get_command(app)
-        command.name = name
-        return command
+            command = lazy_app(f"{row.description}\n\nExample: lowfc {parts[0].name}", {"Commands": commands})
+            command.callback()(lambda: None)
+        app = command if isinstance(command, typer.Typer) else new_app("")
+        if app is not command:  # it is a function
+            app.command(name)(command)
+        click_command = get_command(app)
+        click_command.name = name
+        return click_command
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._rows)
@@ -62,7 +62,7 @@ def lazy_app(help_text: str, panels: Mapping[str, Sequence[Row]], parts: Sequenc
         parts: commands of its groups, named "GROUP COMMAND".
     """
     rows = [row for panel in panels.values() for row in panel]
-    wide = max(len(row.name) for row in rows)
+    width = max(len(row.name) for row in rows)
 
     class Group(TyperGroup):
         def __init__(self, **settings: Any) -> None:
@@ -72,7 +72,7 @@ def lazy_app(help_text: str, panels: Mapping[str, Sequence[Row]], parts: Sequenc
         def format_commands(self, ctx: Any, formatter: Any) -> None:
             for heading, panel in panels.items():
                 with formatter.section(heading):
-                    formatter.write_dl([(f"{row.name:{wide}}", row.description) for row in panel])
+                    formatter.write_dl([(f"{row.name:{width}}", row.description) for row in panel])
 
     app = new_app(help_text)
     app.info.cls = Group

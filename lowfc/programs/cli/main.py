@@ -48,7 +48,7 @@ COMMANDS = {
     ),
     "Measure": (
         Row("latency", "measure.latency.command:latency", "Measure the latency from frame to command on this host."),
-        Row("bench", "", "Measure the optical model and recording."),
+        Row("bench", "", "Measure the speed of the optical model, and recording."),
     ),
     "Trust": (
         Row("validate", "paper.commands:validate", "Reproduce the tables and figures of the paper."),
@@ -63,7 +63,7 @@ PARTS = (
     Row("config show", "cli.config:config_show", "Print every key with its value and description, as TOML."),
     Row("config check", "cli.config:config_check", "Check a configuration file and the files it names."),
     Row("config zenoh", "cli.config:config_zenoh", "Print the zenoh configuration for your own program."),
-    Row("gateway epics", "gateway.command:epics", "Offer a run by EPICS PV Access."),
+    Row("gateway epics", "gateway.command:epics", "Serve a run by EPICS PV Access."),
     Row("bench twin", "measure.bench.twin:twin", "Time the real-time optical model against the full one."),
     Row("bench record", "measure.bench.record:bench_record", "Measure the cost of recording."),
 )

@@ -10,7 +10,7 @@ import typer
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, Json, RunId, configuration
 from lowfc.contract.errors import ConfigurationError
 
-_PATIENCE_S = 30.0
+_WAIT_FOR_S = 30.0
 
 
 def controller(
@@ -56,22 +56,22 @@ def controller(
     signalled: list[int] = []  # signals received before the controller exists
     signal.signal(signal.SIGUSR1, lambda number, _: signalled.append(number))
     settings = configuration(config)
-    driver = None if camera is None else plugins.load("camera", camera)  # opened last: nothing else can fail then
-    found = None
+    driver = None if camera is None else plugins.load("camera", camera)  # opened below, once nothing else can fail
+    loaded = None
     if calibration is None:
-        found = analytic(settings, Console(stderr=True))
+        loaded = analytic(settings, Console(stderr=True))
     elif str(calibration) != "none":
-        found = load(calibration)
+        loaded = load(calibration)
     if settings.realtime.kernel == FUSED and compiled.available():
         with Console(stderr=True).status("compiling the fused step"):
             compiled.kernel(FUSED)
     service = join(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
-    service.require(wait_for or (), _PATIENCE_S, "the controller does not start without")
+    service.require(wait_for or (), _WAIT_FOR_S, "the controller does not start without")
     source = calibration.name if calibration is not None else "the configuration"
     latch = Latch(
         latch_files(open_run(run, (settings.mirror.name,))), lambda why: service.event("LATCH_FAILED", why=why)
     )
-    process = Controller(settings, service, found, source, latch)
+    process = Controller(settings, service, loaded, source, latch)
     signal.signal(signal.SIGUSR1, lambda number, _: process.safe_by_signal())
     if signalled:
         process.safe_by_signal()
@@ -128,14 +128,14 @@ def record(
     if words:
         hint = f"; `lowfc ctl record {words[0]}` controls a running recorder" if words[0] in ("start", "stop") else ""
         raise ConfigurationError(f"lowfc record takes options only, got {' '.join(words)!r}{hint}")
-    of_run = run_path(run) / "config.toml"
-    settings = configuration(of_run if config is None and of_run.exists() else config, overrides)
+    run_config = run_path(run) / "config.toml"
+    settings = configuration(run_config if config is None and run_config.exists() else config, overrides)
     joined = open_run(run, (settings.mirror.name,), network=settings.network)
     if config is not None and Role.LAUNCHER not in joined.links.ports:
-        write_whole(of_run, load(config).to_toml().encode())  # for the others, without the options of this recording
-    if not joined.links.network.router and (nobody := waiting_message(run)):
-        typer.echo(f"recorder: {nobody}", err=True)
-    done = run_recorder(joined, settings, calibration)
-    typer.echo(json.dumps(json_object(done)) if as_json else report(done), err=not as_json)
-    if done.failure:
+        write_whole(run_config, load(config).to_toml().encode())  # for the others, without this recording's options
+    if not joined.links.network.router and (waiting := waiting_message(run)):
+        typer.echo(f"recorder: {waiting}", err=True)
+    summary = run_recorder(joined, settings, calibration)
+    typer.echo(json.dumps(json_object(summary)) if as_json else report(summary), err=not as_json)
+    if summary.failure:
         raise typer.Exit(1)

@@ -72,9 +72,9 @@ def parts_table(parts: Sequence[Result]) -> list[str]:
     return [lines[0], *("   ".join([line, *part.remarks()]) for line, part in zip(lines[1:], parts, strict=True))]
 
 
-def table(heads: Sequence[str], rows: Any) -> list[str]:
-    """Lines of a table; first column left-aligned, the others right-aligned."""
-    cells = [list(heads), *(list(row) for row in rows)]
+def table(headings: Sequence[str], rows: Any) -> list[str]:
+    """Lines of a table (heading, then rows); first column left-aligned, the others right-aligned."""
+    cells = [list(headings), *(list(row) for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     first, *others = widths
     return [

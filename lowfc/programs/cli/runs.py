@@ -59,9 +59,9 @@ def _lines(rows: list[dict[str, Any]]) -> list[str]:
         if row["holding"]:
             mode += f" (command held: {row['holding']})"
         rate = "" if row["rate_hz"] is None else f" at {row['rate_hz']:.0f} Hz, up {row['uptime_s']:.0f} s"
-        silent = any(one["process"] == Role.RECORDER and one["state"] == "starting" for one in row["processes"])
-        none = "its recorder is starting or not answering" if silent else "not recording"
-        recordings = {"recording": f"recording {row['log']}", "none": none}
+        starting = {one["process"] for one in row["processes"] if one["state"] == "starting"}
+        no_recorder = "its recorder is starting or not answering" if Role.RECORDER in starting else "not recording"
+        recordings = {"recording": f"recording {row['log']}", "none": no_recorder}
         processes = ", ".join(one["process"] for one in row["processes"]) or "no process yet"
         recording = recordings.get(row["recording"], f"recording {row['recording']}")
         lines.append(f"{row['run']}  {mode}{rate}; {processes}; {recording}")

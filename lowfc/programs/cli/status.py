@@ -13,7 +13,7 @@ from lowfc.contract.messages import FRAME, Role, from_timestamp, wire
 from lowfc.control.loop.safety import REASONS, Rejection, reason_of
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.control.loop.wording import PAUSED, counted, mode_word
-from lowfc.programs.cli.contrast import contrast_in_words, most_of, with_this_mirror
+from lowfc.programs.cli.contrast import contrast_cases, contrast_in_words, costliest_modes
 from lowfc.programs.launch.watch import mode_name, topic_count, wavefront
 
 NO_HEALTH = wire.Health()
@@ -42,12 +42,12 @@ def json_object(
         }
     command_nm = list(state.command_history_nm)[: len(state.gain)]
     settings = state.settings
-    controller, recorder = processes.get(Role.CONTROLLER, NO_HEALTH), processes.get(Role.RECORDER, NO_HEALTH)
+    controller, recorder = (processes.get(role, NO_HEALTH) for role in (Role.CONTROLLER, Role.RECORDER))
     last_second, frames_in = controller.last_second, topic_count(controller, FRAME.key)
     camera = processes.get(Role.CAMERA, NO_HEALTH)
     simulated = wavefront(camera.recent_wavefront) if camera.HasField("recent_wavefront") else None
     contrast = simulated
-    measured = controller.HasField("recent_wavefront") and last_second.frames  # otherwise it is an old one
+    measured = controller.HasField("recent_wavefront") and last_second.frames  # without frames it is out of date
     if measured and (simulated is None or simulated["added_contrast"] is None):
         contrast = wavefront(controller.recent_wavefront)
     return {
@@ -125,7 +125,7 @@ def json_object(
 
 
 def text(known: dict[str, Any]) -> str:
-    """The state as text; the first line summarises them."""
+    """The state as text; the first line is a summary."""
     since = "" if known["mode_s"] is None else f" for {known['mode_s']:.0f} s ({known['mode_cause']})"
     opens = f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else ""
     playing = known["playing"]
@@ -163,7 +163,7 @@ def _contrast(known: dict[str, Any]) -> dict[str, str]:
     if known["added_contrast"] is None:
         return {}
     of = ", estimated from the sensor" if known["added_contrast_estimated"] else ""
-    return {"contrast": contrast_in_words(with_this_mirror(known["added_contrast"]), most_of(known)) + of}
+    return {"contrast": contrast_in_words(contrast_cases(known["added_contrast"]), costliest_modes(known)) + of}
 
 
 def law_in_words(known: dict[str, Any]) -> str:

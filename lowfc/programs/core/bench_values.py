@@ -10,7 +10,7 @@ from lowfc.contract.messages import BENCH
 from lowfc.control.loop.interlocks import BenchReport, Interlock, Value
 
 ANSWER_S = 0.2
-"""Timeout for the publisher of a value to answer when the controller starts."""
+"""Timeout of the query for a value at the controller's start."""
 
 
 class BenchValues:
@@ -21,10 +21,10 @@ class BenchValues:
     ) -> None:
         self._service = service
         self._report = report
-        ages_ns: dict[str, set[int]] = {}
+        max_ages_ns: dict[str, set[int]] = {}
         for interlock in interlocks:
-            ages_ns.setdefault(interlock.name, set()).add(interlock.max_age_ns)
-        self._slots = [_Slot(service, name, sorted(ages)) for name, ages in ages_ns.items()]
+            max_ages_ns.setdefault(interlock.name, set()).add(interlock.max_age_ns)
+        self._slots = [_Slot(service, name, sorted(ages)) for name, ages in max_ages_ns.items()]
 
     def query(self) -> None:
         """Query the publisher of each value, so that every interlock is evaluated before the first frame."""
@@ -46,12 +46,12 @@ class BenchValues:
 class _Slot:
     """The newest value of one name; after `due_ns` it is too old for another of its interlocks."""
 
-    def __init__(self, service: Service, name: str, ages_ns: list[int]) -> None:
+    def __init__(self, service: Service, name: str, max_ages_ns: list[int]) -> None:
         self.name = name
         self.mailbox = service.mailbox(BENCH, name)
         self.due_ns = inf
         self._unreadable = service.unreadable
-        self._ages_ns = ages_ns
+        self._max_ages_ns = max_ages_ns
         self._value: Value | None = None
         self._received_ns = 0
 
@@ -67,6 +67,6 @@ class _Slot:
             return None
         age_ns = now_ns - self._received_ns
         self.due_ns = self._received_ns + next(
-            (max_age_ns for max_age_ns in self._ages_ns if max_age_ns >= age_ns), inf
+            (max_age_ns for max_age_ns in self._max_ages_ns if max_age_ns >= age_ns), inf
         )
         return BenchReport(now_ns, self.name, self._value, age_ns)

@@ -11,10 +11,10 @@ from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import CAMERA_STATE
 from lowfc.control.loop.camera import CameraSettings
 
-PATIENCE_NS = 20_000_000_000
+LOCKSTEP_WAIT_NS = 20_000_000_000
 """Longest time that the start of a lockstep run waits for the settings."""
-PERIOD_NS = 500_000_000
-"""Shortest time between two queries of a camera that restarted."""
+QUERY_PERIOD_NS = 500_000_000
+"""Shortest time between two queries."""
 
 
 class CameraReports:
@@ -43,17 +43,17 @@ class CameraReports:
         self._apply(settings)
 
     def query(self) -> list[Sample]:
-        """Query the camera, which may publish its settings rarely; at most once per PERIOD_NS, otherwise empty."""
+        """Query the camera, which may publish its settings rarely; empty within QUERY_PERIOD_NS of the last query."""
         now_ns = self._service.clock.host_ns()
         if now_ns < self._due_ns:
             return []
-        self._due_ns = now_ns + PERIOD_NS
+        self._due_ns = now_ns + QUERY_PERIOD_NS
         return list(self._service.bus.get(CAMERA_STATE.key, timeout_s=0.1))
 
     def await_first(self) -> None:
         """Query the settings before the first frame; in lockstep wait for them, so that runs are reproducible."""
         clock = self._service.clock
-        deadline_ns = clock.host_ns() + (PATIENCE_NS if clock.lockstep else 0)
+        deadline_ns = clock.host_ns() + (LOCKSTEP_WAIT_NS if clock.lockstep else 0)
         while self._service.running:
             for sample in self._service.bus.get(CAMERA_STATE.key, timeout_s=0.2):
                 self.take(sample)

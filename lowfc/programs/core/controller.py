@@ -70,7 +70,7 @@ class Controller:
     def __init__(
         self, config: Configuration, service: Service, calibration: Calibration | None, source: str, latch: Latch
     ) -> None:
-        """Declare publishers, subscribers and queries and load the calibration; without one, the loop is idle."""
+        """Join the bus and load the calibration, named `source` in events; without one, the loop is idle."""
         name = config.mirror.name
         self._service = service
         self._latch = latch
@@ -92,7 +92,7 @@ class Controller:
         self._valid_ns = round(config.control.command_timeout_ms * 1e6)
         self._state = State()
         self._lock = threading.Lock()
-        self._adopted = False
+        self._mirror_adopted = False
         self._first_frame: Sample | None = None
         self._unsubscribe_frames = service.dispatch(
             FRAME, self._received, period_ns=config.period_ns, superseded=partial(self._received, superseded=True)
@@ -130,13 +130,13 @@ class Controller:
         self._service.state = "running"
         with self._lock:
             self._send_start_requests()
-            self._adopted = True
+            self._mirror_adopted = True
             if self._first_frame is not None:
                 self._frame(self._first_frame)
         while self._service.running:
             wait_ns = None if self._warmup is None else self._warmup.wait_ns(self._service.clock.host_ns())
             camera = self._camera.wait(min(TICK_NS if wait_ns is None else wait_ns, TICK_NS) * 1e-9)
-            if self._warmup is not None and self._warmup.due(self._service.clock.host_ns()):
+            if camera is None and self._warmup is not None and self._warmup.due(self._service.clock.host_ns()):
                 self._warm_up()
                 continue  # everything else waits until after the frame
             with self._lock:
@@ -176,7 +176,7 @@ class Controller:
     def _received(self, sample: Sample, *, superseded: bool = False) -> None:
         """Process a frame, on the receiving thread; until the mirror's shape is known, keep only the newest one."""
         with self._lock:
-            if not self._adopted:
+            if not self._mirror_adopted:
                 self._first_frame = sample
             elif self._service.running:
                 self._frame(sample, superseded)
@@ -223,10 +223,7 @@ class Controller:
             self._camera.wake()  # `run` does its other work now, then waits until the next warm-up is due
 
     def _warm_up(self) -> None:
-        """Repeat the last step and discard the result, so that its code and data are cached for the next frame.
-
-        Work between two frames evicts them.
-        """
+        """Repeat the last step and discard the result: other work evicts its code and data from the caches."""
         with self._lock:
             if self._last_sample is None or self._state.frame_sequence + 1 >= SEQUENCES:
                 return
@@ -268,7 +265,7 @@ class Controller:
     def _carry_out(
         self, request: Request, lock: AbstractContextManager[object] | None = None
     ) -> tuple[Reply, State, int]:
-        """The reply, the state after it, and its input number; 0 for a request that is no input of the control law."""
+        """Carry out a request; its reply, the state after it, and its input number (0 for `configuration`)."""
         if request.name == CONFIGURATION:
             return Reply(True, self._configuration, self._state.frame_sequence + 1), self._state, 0
         self._arrays.publish(request)
@@ -286,10 +283,10 @@ class Controller:
         """Update the gain watch after the command; in lockstep, apply its requests before the next frame."""
         if outputs.step is None:
             return
-        found = self._gain_watch.observe(outputs.step, self._state)
-        for event in found.events:
+        actions = self._gain_watch.observe(outputs.step, self._state)
+        for event in actions.events:
             self._service.event(event.name, **event.details)
-        for request in found.requests:
+        for request in actions.requests:
             if self._service.clock.lockstep:
                 self._carry_out_internal(request, lock=contextlib.nullcontext())
             else:
@@ -336,7 +333,7 @@ class Controller:
             self._report_mirror()
 
     def _report_mirror(self) -> None:
-        """Report a fault of the mirror to the loop, and its end."""
+        """Report to the loop that a fault of the mirror began or ended."""
         shape = self._mirror.first()
         if shape is not None:  # before the first command: the loop starts from this shape
             self._apply_report(shape)

@@ -24,12 +24,12 @@ STAR_STEP = 0.2
 HARMFUL_WINDOWS = 3
 """Consecutive windows in which an open loop would have had a smaller residual, before this is reported."""
 CAUTIOUS_GAIN = 0.05
-"""Highest gain of the other modes until tip and tilt are corrected: the square of a tilt looks like other modes."""
+"""Highest gain of the other modes after a window with uncorrected tip and tilt, whose squares look like other modes."""
 MIN_FRAMES = 50
 """Smallest number of frames in a window."""
 REQUESTER = "automatic gains"
 _ACTIONS = {"": "nothing is done", "open": "the loop opens", "law": "the integrator takes over"}
-"""What follows from harm, by the name of the request."""
+"""Reaction to harm in words, by the name of its request."""
 
 
 class Actions(NamedTuple):
@@ -46,7 +46,7 @@ class _Group:
     """Modes that are evaluated together: tip and tilt, or the others."""
 
     def __init__(self, mask: Mask, tilt: Mask | None, settings: Settings, loop: ActiveLoop, window_s: float) -> None:
-        """Evaluate the modes in `mask` (modes,); `tilt` (modes,) selects tip and tilt, both in the other group."""
+        """Evaluate the modes in `mask` (modes,); `tilt` (modes,) selects tip and tilt, whose squares look like them."""
         rate_hz = settings.rate_hz or 1.0
         frames = [max(round(seconds * rate_hz), MIN_FRAMES) for seconds in (FIRST_S, window_s)]
         self.mask, self.tilt = mask, tilt
@@ -59,7 +59,7 @@ class _Group:
         )
         self.verdict: Verdict | None = None
         self.gain = loop.integrator.gain[mask]
-        self.harmful = 0
+        self.harmful_windows = 0
         self.unrestricted = window_s == TILT_S
 
 
@@ -114,9 +114,9 @@ class GainWatch:
             self._hold(held)
         open_nm = step.pol_nm if added is None else step.pol_nm - added.offset_nm
         closed = step.mode is LoopMode.CLOSED and not state.returning_to_zero
-        star = self._star(step.flux_dn)
-        if star:
-            return self._another_star(step, loop, star)
+        flux_ratio = self._flux_change(step.flux_dn)
+        if flux_ratio:
+            return self._star_changed(step, loop, flux_ratio)
         closing = step.mode is LoopMode.CLOSED and self._mode is LoopMode.OPEN and self.closing_harm
         events = (PendingEvent("CLOSING_HARMS", {"harm": self.closing_harm}),) if closing else ()
         self._mode = step.mode
@@ -134,8 +134,8 @@ class GainWatch:
         ]
         if not judged:
             return Actions(events=events) if events else NOTHING
-        found = self._judge(judged, step, state, loop)
-        return found._replace(events=(*events, *found.events))
+        actions = self._judge(judged, step, state, loop)
+        return actions._replace(events=(*events, *actions.events))
 
     def _hold(self, frames: int) -> None:
         for group in self._groups:
@@ -147,12 +147,14 @@ class GainWatch:
             return None
         open_nm2, now_nm2 = np.zeros((2, len(self._contrast)))
         for group in self._groups:
-            one, mask, closed = group.verdict, group.mask, self._mode is LoopMode.CLOSED
-            if one is None or one.noise_nm2 is None or mask.size != now_nm2.size or (closed and one.loop_nm2 is None):
+            known, mask, closed = group.verdict, group.mask, self._mode is LoopMode.CLOSED
+            if known is None or known.noise_nm2 is None or mask.size != now_nm2.size:
                 return None
-            open_nm2[mask] = now_nm2[mask] = np.maximum(one.power_nm2 - one.noise_nm2, 0)
-            if one.loop_nm2 is not None and closed:
-                now_nm2[mask] = np.maximum(open_nm2[mask] + one.loop_nm2, injected(group.gain) * one.noise_nm2)
+            open_nm2[mask] = now_nm2[mask] = np.maximum(known.power_nm2 - known.noise_nm2, 0)
+            if closed:
+                if known.loop_nm2 is None:
+                    return None
+                now_nm2[mask] = np.maximum(open_nm2[mask] + known.loop_nm2, injected(group.gain) * known.noise_nm2)
         per_nm2 = np.diag(self._contrast)
         return float(per_nm2 @ open_nm2), per_nm2 * now_nm2
 
@@ -170,7 +172,7 @@ class GainWatch:
         ]
         self._former_flux_dn = 0.0
 
-    def _star(self, flux_dn: float) -> float:
+    def _flux_change(self, flux_dn: float) -> float:
         """Ratio of the flux to the former flux if it has changed in two consecutive averages; else 0."""
         self._flux_sum_dn += flux_dn
         self._flux_frames += 1
@@ -186,7 +188,7 @@ class GainWatch:
         self._changed_in_a_row, self._former_flux_dn = 0, mean
         return ratio
 
-    def _another_star(self, step: Step, loop: ActiveLoop, ratio: float) -> Actions:
+    def _star_changed(self, step: Step, loop: ActiveLoop, ratio: float) -> Actions:
         """Halve the automatic gains until they are measured again; lower them further if the flux fell by more."""
         for group in self._groups:
             group.bank.restart()
@@ -233,17 +235,17 @@ class GainWatch:
         """Sentence on the wavefront that closing would add, from modes evaluated at their present gains."""
         noll, added, harm_nm2 = np.array(loop.calibration.noll), "", np.zeros(len(loop.calibration.noll))
         for group in self._groups:
-            one = group.verdict
-            if one is None or not np.array_equal(gain[group.mask], loop.integrator.gain[group.mask]):
+            verdict = group.verdict
+            if verdict is None or not np.array_equal(gain[group.mask], loop.integrator.gain[group.mask]):
                 continue
-            harmful = one.change_nm2 > CONFIDENCE * one.change_error_nm2
-            harm_nm2[group.mask] = np.where(harmful, one.change_nm2, 0)
-        noise = noll[harm_nm2 > 0].tolist()
-        if not noise:
+            harmful = verdict.change_nm2 > CONFIDENCE * verdict.change_error_nm2
+            harm_nm2[group.mask] = np.where(harmful, verdict.change_nm2, 0)
+        harmful_modes = noll[harm_nm2 > 0].tolist()
+        if not harmful_modes:
             return ""
         if self._contrast is not None and len(self._contrast) == noll.size:
             added = f"{np.diag(self._contrast) @ harm_nm2:.1e} of contrast, "
-        names, indices = ", ".join(f"Z{index}" for index in noise), ",".join(map(str, noise))
+        names, indices = ", ".join(f"Z{index}" for index in harmful_modes), ",".join(map(str, harmful_modes))
         return (
             f"closing adds {added}{harm_nm2.sum() ** 0.5:.3g} nm rms at this star: the noise of {names} exceeds "
             f"their disturbance; `lowfc ctl gain auto --modes {indices}` chooses their gains, 0 in place of auto "
@@ -251,7 +253,7 @@ class GainWatch:
         )
 
     def _noise_nm2(self, loop: ActiveLoop) -> Array | None:
-        """Noise of one frame (modes,), nm^2; None if the camera's gain is unknown."""
+        """Noise variance of one frame (modes,) at this star's flux; None if the camera's gain is unknown."""
         covariance = noise_covariance_nm2(
             loop.calibration, self._former_flux_dn or loop.calibration.flux_dn, loop.camera
         )
@@ -276,16 +278,16 @@ class GainWatch:
     def _harm(self, group: _Group, verdict: Verdict, loop: ActiveLoop) -> list[PendingEvent]:
         """The event if an open loop would have had a smaller residual for `HARMFUL_WINDOWS` consecutive windows."""
         if verdict.loop_nm2 is None:
-            group.harmful = 0
+            group.harmful_windows = 0
             return []
         worse, error = verdict.loop_nm2.sum(), np.sqrt(np.square(verdict.loop_error_nm2).sum())
-        group.harmful = group.harmful + 1 if worse > 3 * error else 0
-        if group.harmful != HARMFUL_WINDOWS:
+        group.harmful_windows = group.harmful_windows + 1 if worse > 3 * error else 0
+        if group.harmful_windows != HARMFUL_WINDOWS:
             return []
         reaction = self._reaction(loop)
-        if reaction == "law":  # repeated if refused; if not, the integrator is judged anew
-            for one in self._groups:
-                one.harmful = 0
+        if reaction == "law":  # judge anew: the integrator, or the law if the request was refused
+            for each in self._groups:
+                each.harmful_windows = 0
         noise_nm2 = self._noise_nm2(loop)
         noise = 0.0 if noise_nm2 is None else float(noise_nm2[group.mask].sum())
         open_nm2 = max(float(verdict.power_nm2.sum()) - noise, 0.0)

@@ -42,7 +42,7 @@ class MirrorReports:
         return self._service.clock.host_ns() >= self._due_ns
 
     def first(self, timeout_s: float = 0.0) -> MirrorShape | None:
-        """The first shape that the mirror reports; None without one, and later."""
+        """The first shape that the mirror reports; None if none has arrived, and after the first."""
         sample = None if self._reported else self._states.take(timeout_s)
         try:
             shape = codec.decode_mirror(sample.payload) if sample is not None else None
@@ -75,7 +75,7 @@ class MirrorReports:
         return self._fault if self._reported else "has not reported yet"
 
     def last(self) -> MirrorShape | None:
-        """The shape commanded at the last but one Health without a fault: the last that the mirror surely applied."""
+        """The shape commanded at the last but one Health before a fault: the last that the mirror surely applied."""
         return self._commanded[0] if self._commanded else None
 
     def close(self) -> None:

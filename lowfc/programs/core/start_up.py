@@ -24,8 +24,8 @@ from lowfc.control.loop.loading import ADOPTED_NM
 from lowfc.control.loop.safety import Limit, LoopMode, limit
 from lowfc.control.loop.state import Settings, State
 
-LIKENESS = 0.5
-"""Projection of the mirror's shape on the flat map above which the flat map is assumed to be on the mirror already."""
+MIN_FLAT_SHARE = 0.5
+"""Share of the flat map in the mirror's shape above which it is assumed to be on the mirror already (1: all of it)."""
 
 
 def check_files(config: Configuration) -> None:
@@ -33,9 +33,9 @@ def check_files(config: Configuration) -> None:
     checks: tuple[Callable[[Configuration], object], ...] = (
         lambda config: factory.sensor(config, lambda _: None),
         active_actuators,
-        _flat_within_limits,
-        _law_of_modes,
-        _stable_gains,
+        _checked_flat_nm,
+        _check_law_modes,
+        _check_gains,
     )
     faults = []
     for check in checks:
@@ -53,21 +53,20 @@ def law(config: Configuration) -> LinearLaw | None:
     if not file:
         return None
     try:
-        found = law_file.load(user_path(file))
+        linear_law = law_file.load(user_path(file))
         settings = factory.settings(config)
-        check_law(found, settings.delay_frames, settings.rate_hz)
+        check_law(linear_law, settings.delay_frames, settings.rate_hz)
     except DataFileError as fault:
         raise ConfigurationError(f"control.law: {fault}") from None
     except ValueError as fault:
         raise ConfigurationError(f"control.law = {file!r}: {fault}") from None
-    return found
+    return linear_law
 
 
 def settings_under(latch: Latch, config: Configuration, event: Callable[..., None]) -> Settings:
-    """The settings of a configuration with its kernel loaded; safe mode outlives the controller.
+    """The settings of a configuration with its kernel loaded; they start in safe mode if the latch is set.
 
-    If the latch cannot be stored, the loop starts open until an operator closes it. An event names the kernel unless it
-    is numpy as configured.
+    If the latch cannot be stored, the loop starts open. An event reports a kernel other than numpy, or a missing one.
     """
     configured = config.realtime.kernel
     settings = replace(factory.settings(config), kernel=compiled.kernel(configured, config.realtime.threads))
@@ -84,9 +83,9 @@ class StartUp:
     """The configured flat map and control law, requested at the start."""
 
     def __init__(self, config: Configuration) -> None:
-        self._file, self._flat_nm = config.mirror.flat, _flat_within_limits(config)
+        self._file, self._flat_nm = config.mirror.flat, _checked_flat_nm(config)
         self._law_file, self._law = config.control.law, law(config)
-        _stable_gains(config)
+        _check_gains(config)
 
     def requests(self, state: State, time_ns: int) -> list[Request]:
         """The requests, in this order, once the mirror's shape is known.
@@ -129,22 +128,22 @@ def _adopted_nm(state: State, flat_nm: Single) -> Single | None:
         return None
     flattened = shapes[0].reshape(-1), flat_nm.reshape(-1)
     adopted, flat = (shape - loop.to_actuators @ (loop.inverse @ shape) for shape in flattened)
-    return shapes[0] if float(adopted @ flat) > LIKENESS * float(flat @ flat) else None
+    return shapes[0] if float(adopted @ flat) > MIN_FLAT_SHARE * float(flat @ flat) else None
 
 
-def _flat_within_limits(config: Configuration) -> Single | None:
-    found = flat_nm(config)
-    if found is not None:
-        acting = limit(factory.settings(config).limits, found, found).reasons
+def _checked_flat_nm(config: Configuration) -> Single | None:
+    shape_nm = flat_nm(config)
+    if shape_nm is not None:
+        acting = limit(factory.settings(config).limits, shape_nm, shape_nm).reasons
         names = [reason.name.lower() for reason in acting if reason is not Limit.SLEW]  # it is approached within slew
         if names:
             raise ConfigurationError(
                 f"mirror.flat = {config.mirror.flat!r}: beyond the limits of [safety]: {', '.join(names)}"
             )
-    return found
+    return shape_nm
 
 
-def _stable_gains(config: Configuration) -> None:
+def _check_gains(config: Configuration) -> None:
     settings = factory.settings(config)
     for key, gain, leak in zip(("tilt_gain", "gain"), settings.gain, settings.leak, strict=True):
         try:
@@ -153,11 +152,11 @@ def _stable_gains(config: Configuration) -> None:
             raise ConfigurationError(f"control.{key}: {fault}") from None
 
 
-def _law_of_modes(config: Configuration) -> None:
-    found = law(config)
-    if found is not None and found.noll != config.noll:
+def _check_law_modes(config: Configuration) -> None:
+    linear_law = law(config)
+    if linear_law is not None and linear_law.noll != config.noll:
         raise ConfigurationError(
-            f"control.law = {config.control.law!r}: it is for modes {_modes(found.noll)}, the sensor's "
+            f"control.law = {config.control.law!r}: it is for modes {_modes(linear_law.noll)}, the sensor's "
             f"{config.sensor.modes} modes are {_modes(config.noll)}"
         )
 

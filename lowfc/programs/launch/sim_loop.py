@@ -68,7 +68,7 @@ def sim_loop(
         prepare(config, run, console)
         children += children_of(config, run, duration_s, record)
         if show is not None:
-            children.insert(len(children) - record, _view(run, show, console))  # the recorder ends last
+            children.insert(len(children) - record, _view(run, show, console))  # before the recorder, which ends last
         for child in children:
             child.start()
         _supervise(config, children, watch, console, duration_s)
@@ -183,7 +183,7 @@ def check(children: list[Child]) -> None:
 
 
 def _report_view_ended(view: Child, console: Console) -> None:
-    """Print the end of the view's standard error, unless its window was just closed."""
+    """Report why the view ended, with the last line of its standard error, unless its window was just closed."""
     if view.status != 0:
         why = view.stderr_tail().splitlines()[-1:] if view.status is not None and view.status > 0 else []
         ending = "; ".join([view.exit_description(), *why])

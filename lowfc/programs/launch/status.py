@@ -13,7 +13,7 @@ from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, FRAME, Role, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.wording import counted, mode_word
-from lowfc.programs.cli.contrast import contrast_in_words, most_of, with_this_mirror
+from lowfc.programs.cli.contrast import contrast_cases, contrast_in_words, costliest_modes
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 SILENT_S = 2.0
@@ -21,7 +21,7 @@ SILENT_S = 2.0
 _RECENT_S = 2.5
 """Span of the recent wavefront statistics, plus the delay of their report."""
 _EVENTS_SHOWN = 4
-_STYLES = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
+_STYLES: dict[int, str] = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
 
 
 def screen(watch: Watch, config: Configuration, duration_s: float | None, elapsed_s: float) -> Panel:
@@ -42,7 +42,7 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     table.add_row("mirror", f"{mirror.state or 'starting'}, {counted(commands.received, 'command')}")
     table.add_row("recorder", recording(recorder))
     for log in watch.events[-_EVENTS_SHOWN:]:
-        table.add_row(Text(printable(log.name)), Text(printable(log.message), style=_STYLES.get(Level(log.level), "")))
+        table.add_row(Text(printable(log.name)), Text(printable(log.message), style=_STYLES.get(log.level, "")))
     left = f" of {duration_s:g} s" if duration_s is not None else ", Ctrl-C ends it"
     sensor = config.sensor.sam if config.sensor.kind == "sam" else config.sensor.kind
     scene = f"{config.disturbance.preset}, V = {config.star.magnitude:g}, {sensor}"
@@ -66,7 +66,7 @@ def status_line(watch: Watch, elapsed_s: float) -> str:
 
 
 def _closed_for(controller: wire.Health, rate_hz: float) -> str:
-    """Time since the loop closed if shorter than the span of the residual's statistics; otherwise empty."""
+    """Text of the time closed if shorter than the span of the residual's statistics; otherwise empty."""
     frames = topic_count(controller, FRAME.key).received
     closed_s = frames / rate_hz - controller.not_closed_ns * 1e-9 if rate_hz else 0.0
     just_closed = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _RECENT_S
@@ -122,19 +122,17 @@ def _loop(results: dict[str, Any]) -> str:
     match results["mode"]:
         case None:
             return "no controller reported"
-        case "closed":
-            return f"closed; not closed for {seconds} in total: {cause}" if results["not_closed_s"] else "closed"
-        case "safe":
-            return f"{mode_word('safe')}, not closed for {seconds}: {cause}"
+        case "closed" if not results["not_closed_s"]:
+            return "closed"
         case mode:
-            return f"{mode} for {seconds}" + (f": {cause}" if cause else "")
+            return f"{mode_word(mode)}; not closed for {seconds} in total" + (f": {cause}" if cause else "")
 
 
-def _when(results: dict[str, Any], name: str, of: str = "") -> str:
+def _sampling(results: dict[str, Any], name: str, instants: str = "") -> str:
     """Text of the times at which a statistic of the true wavefront is sampled."""
     if results["instants_per_frame"] == 1:
         return "sampled at the start of each exposure"
-    return f"continuous ({of}{results[f'sampled_{name}']:.2f} at exposure start)"
+    return f"continuous ({instants}{results[f'sampled_{name}']:.2f} at exposure start)"
 
 
 def _contrast(results: dict[str, Any]) -> list[str]:
@@ -144,7 +142,7 @@ def _contrast(results: dict[str, Any]) -> list[str]:
         return []
     own = "" if results["dark_zone_contrast"] is None else f"coronagraph alone {results['dark_zone_contrast']:.1e}; "
     beyond = ("residual",) if results["beyond_quadratic"] else ()
-    return [f"contrast           {own}{contrast_in_words(with_this_mirror(added), most_of(results), beyond)}"]
+    return [f"contrast           {own}{contrast_in_words(contrast_cases(added), costliest_modes(results), beyond)}"]
 
 
 def _wavefront_lines(results: dict[str, Any]) -> list[str]:
@@ -154,9 +152,9 @@ def _wavefront_lines(results: dict[str, Any]) -> list[str]:
     return [
         f"wavefront          residual {results['residual_rms_nm']:.2f} of {results['disturbance_rms_nm']:.2f} nm rms "
         "over the open pupil, second half of the run, "
-        + _when(results, "residual_rms_nm", f"{results['instants_per_frame']} instants per frame; "),
+        + _sampling(results, "residual_rms_nm", f"{results['instants_per_frame']} instants per frame; "),
         f"tilt per axis      residual {results['tilt_residual_mas']:.2f} of "
-        f"{results['tilt_disturbance_mas']:.2f} mas rms, second half, " + _when(results, "tilt_residual_mas"),
+        f"{results['tilt_disturbance_mas']:.2f} mas rms, second half, " + _sampling(results, "tilt_residual_mas"),
         *_contrast(results),
     ]
 

@@ -25,7 +25,7 @@ def info(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Summarise a log: processes, times, messages of each topic, and what is missing or damaged.
+    """Summarise a log: times, loop modes, events, messages of each topic, and what is missing or damaged.
 
     Example: lowfc info last --digest
     """
@@ -37,13 +37,13 @@ def info(
 
     for number, log in enumerate(one_by_one(logs, as_json=as_json)):
         with reading_bar(Console(stderr=True)) as count:
-            found = survey(log, partial(count, f"reading {titled(log)}"), digest=digest)
-        print_result(found, ("\n" if number else "") + render(found), as_json=as_json)
+            contents = survey(log, partial(count, f"reading {titled(log)}"), digest=digest)
+        print_result(contents, ("\n" if number else "") + render(contents), as_json=as_json)
 
 
-def render(found: Mapping[str, Any]) -> str:
+def render(contents: Mapping[str, Any]) -> str:
     """The summary of a log as text."""
-    lines = [f"{name:14}" + value.replace("\n", "\n" + " " * 14) for name, value in _summary(found).items()]
+    lines = [f"{name:14}" + value.replace("\n", "\n" + " " * 14) for name, value in _summary(contents).items()]
     rows = [
         [
             key,
@@ -54,40 +54,40 @@ def render(found: Mapping[str, Any]) -> str:
             "?" if line["missing"] is None else str(line["missing"]),
             line["schema"],
         ]
-        for key, line in found["topics"].items()
+        for key, line in contents["topics"].items()
     ]
     if rows:
         lines += ["", *table(["topic", "messages", "Hz", "MB", "restarts", "missing", "schema"], rows)]
     return "\n".join(lines)
 
 
-def _summary(found: Mapping[str, Any]) -> dict[str, str]:
+def _summary(contents: Mapping[str, Any]) -> dict[str, str]:
     from lowfc.adapters.logs.selection import SELECTION
     from lowfc.adapters.logs.writer import PART
     from lowfc.programs.logs.survey import recovery_in_words
 
-    metadata, recording = found["metadata"], found["metadata"].get("recording", {})
-    damage = [f"byte {one['position']}, {one['length']} bytes: {one['why']}" for one in found["damage"]]
-    lost = [f"{found['messages_missing']} missing by their sequence numbers"]
+    metadata, recording = contents["metadata"], contents["metadata"].get("recording", {})
+    damage = [f"byte {one['position']}, {one['length']} bytes: {one['why']}" for one in contents["damage"]]
+    lost = [f"{contents['messages_missing']} missing by their sequence numbers"]
     if "messages_lost" in recording:
         lost.append(f"{recording['messages_lost']} counted as lost by the recorder")
-    lost += [f"{count} of {key} (all)" for key, count in found["missing_topics"].items()]
-    if found["unreadable"]:
-        lost.append(f"{found['unreadable']} unreadable, because their channel record was damaged")
+    lost += [f"{count} of {key} (all)" for key, count in contents["missing_topics"].items()]
+    if contents["unreadable"]:
+        lost.append(f"{contents['unreadable']} unreadable, because their channel record was damaged")
     lines = {
-        "log": f"{', '.join(found['files'])}, {found['bytes'] / 1e6:.1f} MB",
-        "digest": _digest(found),
-        "selection": found["selection"],
-        "state": _STATES[found["state"]],
+        "log": f"{', '.join(contents['files'])}, {contents['bytes'] / 1e6:.1f} MB",
+        "digest": _digest(contents),
+        "selection": contents["selection"],
+        "state": _STATES[contents["state"]],
         "stopped": f"recording stopped: {recording['stopped']}" if recording.get("stopped") else "",
         "recovery": recovery_in_words(metadata),
         "damage": "\n".join(damage),
-        "start": "" if found["start"] is None else f"{found['start']}, {found['duration_s']:.3f} s",
-        "messages": f"{found['messages']}; {', '.join(lost)}",
-        "loop": ", ".join(found["loop_modes"]),
-        "events": ", ".join(f"{name} {count}" for name, count in found["events"].items()),
-        "configuration": "\n".join(found["remarks"]),
-        "attachments": ", ".join(f"{name} ({size} bytes)" for name, size in found["attachments"].items()),
+        "start": "" if contents["start"] is None else f"{contents['start']}, {contents['duration_s']:.3f} s",
+        "messages": f"{contents['messages']}; {', '.join(lost)}",
+        "loop": ", ".join(contents["loop_modes"]),
+        "events": ", ".join(f"{name} {count}" for name, count in contents["events"].items()),
+        "configuration": "\n".join(contents["remarks"]),
+        "attachments": ", ".join(f"{name} ({size} bytes)" for name, size in contents["attachments"].items()),
         **{
             name: ", ".join(f"{key} {value}" for key, value in entries.items())
             for name, entries in metadata.items()
@@ -97,7 +97,7 @@ def _summary(found: Mapping[str, Any]) -> dict[str, str]:
     return {name: value for name, value in lines.items() if value}
 
 
-def _digest(found: Mapping[str, Any]) -> str:
+def _digest(contents: Mapping[str, Any]) -> str:
     """Digest, with a remark unless the run was a lockstep run."""
-    digest = str(found.get("digest", ""))
-    return digest if not digest or found["lockstep"] else f"{digest} (not a lockstep run: cannot be reproduced)"
+    digest = str(contents.get("digest", ""))
+    return digest if not digest or contents["lockstep"] else f"{digest} (not a lockstep run: cannot be reproduced)"

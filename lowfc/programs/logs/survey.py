@@ -1,4 +1,4 @@
-"""Contents of a log: processes and times, messages of each topic, and what is missing."""
+"""Contents of a log: times, loop modes, events, messages of each topic, and what is missing."""
 
 import contextlib
 import dataclasses
@@ -52,7 +52,7 @@ class Digest:
         self._first_frame_ns: int | None = None
 
     def enter(self, topic: Topic, message: Sample) -> None:
-        """Take the next message of a log."""
+        """Add the next message of a log."""
         if not topic.deterministic:
             return
         if topic is FRAME and self._first_frame_ns is None:
@@ -66,13 +66,13 @@ class Digest:
 
     def by_key(self) -> dict[str, str]:
         """Hexadecimal digest of each key."""
-        found = {key: state.hexdigest() for key, state in self._keys.items()}
+        digests = {key: digest.hexdigest() for key, digest in self._keys.items()}
         for key, states in self._states.items():
             ordered = [states[sequence] for sequence in sorted(states)]
             early = [digest for time_ns, digest in ordered if time_ns < (self._first_frame_ns or 0)]
             later = [digest for time_ns, digest in ordered if time_ns >= (self._first_frame_ns or 0)]
-            found[key] = hashlib.sha256(b"".join([*early[-1:], *later])).hexdigest()
-        return dict(sorted(found.items()))
+            digests[key] = hashlib.sha256(b"".join([*early[-1:], *later])).hexdigest()
+        return dict(sorted(digests.items()))
 
     def hexdigest(self) -> str:
         """Hexadecimal digest of the log."""
@@ -111,8 +111,9 @@ class _Line:
 
 
 class _Account:
+    """Counts of the messages of a log with this selection of topics."""
+
     def __init__(self, selection: Selection = EVERYTHING) -> None:
-        """Start the account of a log with this selection of topics."""
         self._selection = selection
         self._losses = LossAccount(selection)
         self._lines: dict[str, _Line] = {}
@@ -144,7 +145,7 @@ class _Account:
                     self._modes.append(mode)
             elif topic is EVENT:
                 event = Log.FromString(message.payload)
-                author = event.name  # of several publishers
+                author = event.name  # several processes publish events
                 if event.level >= Level.WARNING:
                     self._events[event.message.partition(" ")[0]] += 1
         line.starts.add((author, start_of(message.sequence)))
@@ -172,8 +173,8 @@ class _Account:
 def survey(
     log: LogFiles, progress: Callable[[int, int], None] | None = None, *, digest: bool = False
 ) -> dict[str, Any]:
-    """Summary of a log, complete or not, from all of its messages; optionally with its and each topic's `Digest`."""
-    reader, account, found = WholeLog(log, skip_damaged=True), _Account(), Digest()
+    """Summary of a log, complete or not, from all of its messages; with `digest`, those of the log and of each key."""
+    reader, account, digests = WholeLog(log, skip_damaged=True), _Account(), Digest()
     reader.progress = progress
     for number, message in enumerate(reader):
         if not number:
@@ -181,15 +182,15 @@ def survey(
         topic = _topic(message.key)
         account.enter(topic, message, reader.schema_of(message))
         if digest and topic is not None:
-            found.enter(topic, message)
+            digests.enter(topic, message)
     configuration, remarks = attached_configuration(reader)
     content = account.json_object()
-    for key, one in found.by_key().items():
-        content["topics"][key]["digest"] = one
+    for key, hexadecimal in digests.by_key().items():
+        content["topics"][key]["digest"] = hexadecimal
     return {
         "log": str(reader.path),
         "files": [str(path) for path in reader.paths],
-        **({"digest": found.hexdigest()} if digest else {}),
+        **({"digest": digests.hexdigest()} if digest else {}),
         "lockstep": configuration.lockstep if configuration is not None else None,
         "selection": reader.selection.description,
         "bytes": reader.size,
@@ -226,7 +227,7 @@ def recovery_in_words(metadata: Mapping[str, Mapping[str, str]]) -> str:
 
 @cache
 def _topic(key: str) -> Topic | None:
-    """Line of the table of topics; None for a key of a newer version."""
+    """Topic of a key; None if this version does not know it."""
     try:
         return topic_of(key)
     except KeyError:

@@ -87,7 +87,7 @@ def _wait_and_read(file: Path) -> str:
     deadline_s = time.monotonic() + _TIMEOUT_S
     while not file.exists():
         if time.monotonic() > deadline_s:
-            raise BusError(f"no frame in {_TIMEOUT_S:g} s, so that nothing can be traced")
+            raise BusError(f"no {file.name} in the run's directory after {_TIMEOUT_S:g} s: nothing can be traced")
         time.sleep(_POLL_S)
     return file.read_text()
 

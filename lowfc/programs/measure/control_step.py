@@ -60,9 +60,8 @@ def time_alone(
     while due_ns < end_ns:
         payload = payloads.at(len(step_ns), due_ns)
         if period_ns is not None:
-            due_ns += period_ns * (
-                1 + max(0, clock.host_ns() - due_ns) // period_ns
-            )  # in the future, so that it sleeps
+            late_ns = max(0, clock.host_ns() - due_ns)
+            due_ns += period_ns * (1 + late_ns // period_ns)  # in the future, so that it sleeps
             clock.sleep_until_ns(due_ns)
         begun_ns = clock.host_ns()
         step(payload)

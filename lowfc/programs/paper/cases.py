@@ -38,14 +38,14 @@ class Prepared:
     """A sensor at the paper's sampling, with the quantities that the tables use, computed on first use."""
 
     def __init__(self, name: str, section: SensorSection, sensor: Sensor | None = None) -> None:
-        """Build the sensor of a section, or take another one behind the section's coronagraph."""
+        """Build the sensor of a section, or use `sensor` behind the section's coronagraph."""
         self.name, self.section = name, section
         self.sensor = sensor_from(section) if sensor is None else sensor
         self._own = threading.local()
 
     @property
     def paper_name(self) -> str:
-        """The paper's sensor with which it is compared, if there is one: "sam" for every layout, also behind a mask."""
+        """Name of the paper's sensor to compare with, if there is one: "sam" for every layout, "bowtie" with any."""
         kind = self.name.partition(":")[0]
         if kind not in SENSORS:
             return "sam"
@@ -167,7 +167,7 @@ class Prepared:
         return zernikes(NOLLS_20, *node_radii(self.twin))
 
     def model(self, modes_nm: Array) -> Array:
-        """The same as `image`, by the twin; thread-safe."""
+        """The same as `image` at the central wavelength, by the twin; thread-safe."""
         if not hasattr(self._own, "evaluator"):
             self._own.evaluator = Evaluator(self.twin)
         opd_nm = modes_nm @ self._node_modes[: len(modes_nm)]

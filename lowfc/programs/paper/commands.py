@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from lowfc.adapters.process.terminal import Json
 from lowfc.contract.errors import ConfigurationError, nearest
 
 TABLES = (
@@ -54,7 +55,7 @@ def validate(
             show_default=False,
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Reproduce the paper's tables and figures; each row has paper, measured, limit and assumption.
 

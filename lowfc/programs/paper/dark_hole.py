@@ -138,7 +138,7 @@ def apply_steps(loop: Client, step_rms_nm: float, base_nm: Array) -> tuple[dict[
 
 
 def channel_results(history: History, marks: dict[str, list[int]], channel_modes_nm: Array) -> dict[str, ChannelResult]:
-    """Results of the channels, from the history of a simulated run and what `apply_steps` returned."""
+    """Results of the channels, from the history of a simulated run and the values of `apply_steps`."""
     truths = history.true
     assert truths is not None  # noqa: S101  # a simulated loop's
     sequences, command = history.steps.sequence, history.steps.command_nm

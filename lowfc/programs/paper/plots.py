@@ -1,4 +1,4 @@
-"""Plots of the figures as PNG files; matplotlib is imported only here, and only when something is plotted."""
+"""Plots of the figures as PNG files; matplotlib is imported only when something is plotted."""
 
 from collections.abc import Callable, Sequence
 from importlib import import_module

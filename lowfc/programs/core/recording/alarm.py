@@ -2,7 +2,7 @@
 
 The recorder runs it, because each run has one, it receives every event, and it is not in the loop; a console may be
 closed, or open twice. A thread in the normal scheduling class starts the command, which inherits that class. Events
-during the command wait for its end; then the command is run once, for the worst of them.
+during the command, and for `recorder.on_event_every_s` after it, wait; then it is run once, for the worst of them.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import EVENT, Log, from_timestamp
 from lowfc.contract.printable import printable
 
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 """Time after which a command is killed."""
 _MAX_WAITING_EVENTS = 1000
 _LEVELS: dict[int, str] = {level.value: level.name.lower() for level in Level}
@@ -28,7 +28,7 @@ _OWN = EVENTS["ON_EVENT_FAILED"].name
 
 
 class Alarm:
-    """Runs a shell command on events of a level, one at a time and not too often."""
+    """Runs a shell command on events of a level or above, one at a time and not too often."""
 
     def __init__(self, service: Service, command: str, level: Level, min_interval_s: float) -> None:
         """Run the command from the next event on; its failure is published as an event that does not trigger it."""
@@ -71,13 +71,13 @@ class Alarm:
                 env={**os.environ, **arguments},
                 start_new_session=True,
             )
-            if status := command.wait(PATIENCE_S):
+            if status := command.wait(TIMEOUT_S):
                 self._fail(f"it ended with exit status {status}")
         except subprocess.TimeoutExpired:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(command.pid, signal.SIGKILL)
             command.wait()
-            self._fail(f"it was killed after {PATIENCE_S:g} s")
+            self._fail(f"it was killed after {TIMEOUT_S:g} s")
         except OSError as fault:
             self._fail(f"it cannot be run: {fault.strerror}")
 

@@ -11,7 +11,7 @@ from lowfc.contract.messages import CAMERA_STATE, HEALTH, TOPICS, wire
 
 
 class Peers:
-    """Processes by their last Health, and in `newest` the newest calibration and states, with which a log starts."""
+    """States of the processes by their last Health; `newest` has calibration and states, with which a log starts."""
 
     def __init__(self, bus: Bus) -> None:
         self.newest: dict[str, Sample] = {}
@@ -63,7 +63,7 @@ class Peers:
         self._new_processes = True
 
     def query_meanwhile(self, *, more: bool) -> list[Sample]:
-        """Query if a process is new, unless not `more`; return the new messages among answers since the last call.
+        """With `more`, query if a process is new; return the new messages among the answers since the last call.
 
         A thread does the query, because a frozen process answers late.
         """

@@ -37,13 +37,13 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
     if short := shortage(user_path(log.folder), limits.min_free_bytes):
         raise DataFileError(short)
 
-    def announced(camera: wire.CameraState | None) -> float:
+    def announced_bytes_per_s(camera: wire.CameraState | None) -> float:
         sys.stderr.write(f"{estimate(config, camera)}\n")
         return bytes_per_s(config, selection, camera)
 
     # Every value, also the defaults that a user's file omits.
     attachments = [Attachment("config.toml", "application/toml", config.to_toml().encode())]
-    attachments += [] if calibration is None else [_attached(calibration, "application/fits")]
+    attachments += [] if calibration is None else [_attachment(calibration, "application/fits")]
     granted = step_back((realtime.priority and realtime.recorder_priority) or None, set(realtime.recorder_cpus) or None)
     clock = clock_of(config)
     origin = {**provenance(run.run_id, config.seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}
@@ -59,8 +59,8 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
             limits=limits,
             granted=granted,
             selection=selection,
-            expected_bytes_per_s=announced,
-            awaited=_launched(run),
+            expected_bytes_per_s=announced_bytes_per_s,
+            awaited=_launched_processes(run),
         )
         recorder.catch_signals()
         recorder.service.announces = True
@@ -77,13 +77,13 @@ def log_limits(config: Configuration) -> LogLimits:
     return LogLimits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6), int(log.file_mode, 8))
 
 
-def _launched(run: Run) -> AbstractSet[str]:
+def _launched_processes(run: Run) -> AbstractSet[str]:
     """The processes that a launcher starts besides the recorder; the launcher itself sends no Health."""
     ports = run.links.ports.keys()
     return ports - {Role.LAUNCHER, Role.RECORDER} if Role.LAUNCHER in ports else frozenset()
 
 
-def _attached(path: Path, media_type: str) -> Attachment:
+def _attachment(path: Path, media_type: str) -> Attachment:
     try:
         return Attachment(path.name, media_type, input_file.read_whole(path, _MAX_ATTACHMENT_BYTES))
     except OSError as fault:

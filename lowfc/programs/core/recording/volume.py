@@ -11,7 +11,7 @@ from lowfc.contract.messages import COMMAND, FRAME, MIRROR_STATE, STEP, SURFACE,
 from lowfc.optics.chain.sensor import Sensor
 
 _FLOAT_BYTES, _COUNT_BYTES = 4, 2
-_SURFACE_PIXELS = 64  # side of the published image of the mirror's surface
+_SURFACE_SIDE = 64  # pixels of the published image of the mirror's surface
 _MESSAGE_BYTES = 110  # times, sequence, flags, record header and index entry of a message
 _COMPRESSED_FRACTION = {FRAME: 0.6, COMMAND: 0.9, MIRROR_STATE: 0.55}
 """Size of a payload after LZ4 relative to before, measured with the simulated camera at V = 2; 1 for other topics."""
@@ -28,14 +28,14 @@ def payload_bytes(config: Configuration, camera: wire.CameraState | None = None)
         FRAME: pixels * _COUNT_BYTES,
         COMMAND: actuators * _FLOAT_BYTES,
         MIRROR_STATE: actuators * _FLOAT_BYTES,
-        SURFACE: _SURFACE_PIXELS**2 * _FLOAT_BYTES,
+        SURFACE: _SURFACE_SIDE**2 * _FLOAT_BYTES,
         STEP: 3 * modes * _FLOAT_BYTES,
         TRUTH: 2 * modes * _FLOAT_BYTES,
     }
 
 
 def bytes_per_s(config: Configuration, recorded: Selection, camera: wire.CameraState | None = None) -> float:
-    """Growth of a log, bytes per second: compressed message size times rate, summed over the topics."""
+    """Growth of a log, bytes per second: compressed message size times rate, summed over the large topics."""
     return sum(
         (size * _COMPRESSED_FRACTION.get(topic, 1.0) + _MESSAGE_BYTES) * _rate_hz(topic, config, recorded)
         for topic, size in payload_bytes(config, camera).items()

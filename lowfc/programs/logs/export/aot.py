@@ -15,7 +15,7 @@ AOT describes a telescope with a Shack-Hartmann or pyramid sensor. A log is mapp
       time                end of the exposure, and frame count
       modal_coefficients  measured modal error, nm rms of wavefront; NaN if the frame was refused
       commands            surface at each actuator as sent, m; NaN if the log has no command for this frame
-      modes               Zernike polynomials in Noll's order, over the circle
+      modes               Zernike polynomials of the calibration's modes, over the circle
       measurements_to_modes, modes_to_measurements, modes_to_commands: R (at the end of the log, as automatic gains
                           weighted it), H and MODES2ACT
       time_filter_num, _den: the integrator g / (z - (1 - leak)) of each mode, at the end of the log
@@ -115,8 +115,8 @@ class _System:
             integration_time=camera.exposure_ns * 1e-9 if camera is not None else None,
         )
         if with_frames:
-            times = self._history.frame_sequence
-            clock = aotpy.Time(uid="frames", frame_numbers=[float(count_of(int(one))) for one in times])
+            sequences = self._history.frame_sequence
+            clock = aotpy.Time(uid="frames", frame_numbers=[float(count_of(int(each))) for each in sequences])
             detector.pixel_intensities = aotpy.Image(_FRAMES, np.zeros((1, 1, 1), np.float32), "adu", time=clock)
         return detector
 
@@ -187,7 +187,7 @@ class _System:
         history, calibration = self._history, self._calibration
         closed = float(np.mean(history.steps.mode == LoopMode.CLOSED))
         recorded = history.log.metadata.get("lowfc", {})
-        found: dict[str, tuple[Any, str | None]] = {
+        cards: dict[str, tuple[Any, str | None]] = {
             "LOG": (history.log.path.name, None),  # no comments: a card has 80 characters
             "RUN": (recorded.get("run", ""), None),
             "CALID": (calibration.id, None),
@@ -201,18 +201,18 @@ class _System:
             ),
         }
         if history.camera is not None:
-            found |= {
+            cards |= {
                 "EPERADU": (history.camera.gain_e_per_dn, "[electron/adu] conversion gain"),
                 "RDNOISE": (history.camera.read_noise_e, "[electron] read noise of a pixel and frame"),
                 "BIAS": (history.camera.bias_dn, "[adu] level without light"),
                 "EMGAIN": (history.camera.em_gain, "electron-multiplying gain"),
             }
         if history.configuration is not None:
-            found["STARMAG"] = (history.configuration.star.magnitude, "V magnitude of the star")
-            found["SENSOR"] = (history.configuration.sensor.kind, "kind of wavefront sensor (not a pyramid)")
+            cards["STARMAG"] = (history.configuration.star.magnitude, "V magnitude of the star")
+            cards["SENSOR"] = (history.configuration.sensor.kind, "kind of wavefront sensor (not a pyramid)")
         return [
             aotpy.Metadatum(key, header_text(value) if isinstance(value, str) else value, comment)
-            for key, (value, comment) in found.items()
+            for key, (value, comment) in cards.items()
         ]
 
 

@@ -20,7 +20,7 @@ class Column:
     """One quantity of every step, or one array of the calibration.
 
     Attributes:
-        name: name that ends in the unit.
+        name: name; ends in the unit if there is one.
         values: array (steps,) or (steps, modes); any shape for a calibration.
         unit: unit in FITS notation; empty for none.
         description: description of the quantity.
@@ -42,7 +42,7 @@ class Column:
 def step_columns(history: History) -> list[Column]:
     """All quantities of a run's steps, one row for each step in the order of recording.
 
-    Quantities joined by frame sequence (truth, durations, mirror) are NaN if the log does not have them.
+    Truth, durations and mirror are joined by frame sequence; NaN where the log does not have them.
     """
     steps = history.steps
     if not steps.sequence.size:

@@ -66,8 +66,7 @@ def export(
     from lowfc.adapters.logs.thinning import thin, thinned_path
     from lowfc.adapters.process.progress import reading_bar
 
-    table_options, log_options = bool(frames or force), bool(topics)
-    if log_options if decimate is None else (to is not None or table_options):
+    if (decimate is None and topics) or (decimate is not None and (to is not None or frames or force)):
         raise ConfigurationError(
             "--to, --frames and --force convert the log; --topics needs --decimate, which writes a smaller log: use "
             "one or the other"
@@ -77,8 +76,8 @@ def export(
         if decimate is not None:
             chosen = selection(decimate, topics or ())
             with reading_bar(console) as count:
-                done = thin(log, out or thinned_path(log[0], chosen), chosen, partial(count, "copying"))
-            print_result(done, render_copy(done), as_json=as_json)
+                results = thin(log, out or thinned_path(log[0], chosen), chosen, partial(count, "copying"))
+            print_result(results, render_copy(results), as_json=as_json)
         else:
             results = export_log(log, to or Format.FITS, out, frames=frames, force=force, console=console)
             print_result(results, render(results), as_json=as_json)

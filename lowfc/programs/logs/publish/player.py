@@ -34,12 +34,12 @@ from lowfc.programs.logs.publish.selection import Selection, role_of
 BEHIND_NS = 1_000_000
 """Delay after which a message is counted as behind."""
 LONG_WAIT_NS = 10_000_000_000
-"""Wait for the next message from which on it is announced."""
+"""Time to the next message above which it is announced."""
 
 _MAX_SLEEP_NS = 100_000_000
 _PROGRESS_NS = 200_000_000
 _SETTLE_S = 0.5  # programs without a port retry their connection every 0.2 s
-_PATIENCE_S = 2.0
+_WAIT_FOR_S = 2.0
 _REORDERING_NS = 2_000_000_000  # by which messages in a log may be out of order
 
 
@@ -81,10 +81,10 @@ def publish(
     with _joined(run, selection, granted) as (service, buses):
         console.print(f"publishing in run {run_id!r} as {', '.join(buses)}", highlight=False)
         player = Player(service, buses, selection, speed)
-        if _linked(service, selection.live, wait_for, console):
+        if _wait_for_receivers(service, selection.live, wait_for, console):
             service.state = "running"
-        found = player.play(logs, console)
-        return {"run": run_id, "logs": [str(path) for path in logs], "speed": speed, **found}
+        results = player.play(logs, console)
+        return {"run": run_id, "logs": [str(path) for path in logs], "speed": speed, **results}
 
 
 class Player:
@@ -231,16 +231,16 @@ def _joined(run: Run, selection: Selection, granted: Granted) -> Iterator[tuple[
         yield service, buses
 
 
-def _linked(service: Service, live: Collection[str], wait_for: Collection[str], console: Console) -> bool:
+def _wait_for_receivers(service: Service, live: Collection[str], wait_for: Collection[str], console: Console) -> bool:
     """Wait for the processes that receive the first message; False if stopped meanwhile."""
     service.state = "ready"
-    missing = service.wait_for(wait_for, _PATIENCE_S)
+    missing = service.wait_for(wait_for, _WAIT_FOR_S)
     if missing and service.running:
         console.print(f"waiting for {', '.join(missing)} of run {service.run_id!r}; Ctrl-C ends it", highlight=False)
     while missing and service.running:
-        missing = service.wait_for(missing, _PATIENCE_S)
+        missing = service.wait_for(missing, _WAIT_FOR_S)
     begun_s = time.monotonic()
-    service.wait_for(live, _PATIENCE_S)  # a user's own program may not send Health
+    service.wait_for(live, _WAIT_FOR_S)  # a user's own program may not send Health
     while service.running and time.monotonic() - begun_s < _SETTLE_S:
         time.sleep(0.02)
     return service.running

@@ -86,7 +86,7 @@ def role_of(key: str) -> str:
     name = name_in(topic, key)
     if topic is HEALTH:
         return name
-    if topic is BENCH:  # a recorded one would describe the devices connected now
+    if topic is BENCH:  # a recorded value would count as that of a device of the live bench
         return Role.BENCH
     if len(topic.publishers) > 1:
         return ""

@@ -76,7 +76,7 @@ class Account(Result):
         return self.frames > 0 and same and (self.commands > 0 or not self.commands_missing)
 
     def add(self, later: "Account") -> None:
-        """Add the account of the next segment; its worker has read further, so its state of the logs is the newer."""
+        """Add the account of the next segment, whose worker has read further and knows the later state of the logs."""
         for name, field in type(self).model_fields.items():
             if field.annotation in (int, Counter[str]) or name == "log_s":
                 setattr(self, name, getattr(self, name) + getattr(later, name))

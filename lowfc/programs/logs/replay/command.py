@@ -21,11 +21,12 @@ _HOST = ("lowfc", "git", "python", "numpy", "numba", "scipy", "blas", "processor
 def _host_differs(there: dict[str, str]) -> dict[str, tuple[str, str]]:
     """Differences in versions and processor between the log's host and this one."""
     here = provenance()
-    found = {key: (there[key], here.get(key, "")) for key in _HOST if key in there and there[key] != here.get(key, "")}
-    if "cpu_features" in found:
-        before, now = (set(features.split()) for features in found["cpu_features"])
-        found["cpu_features"] = " ".join(sorted(before - now)), " ".join(sorted(now - before))
-    return found
+    both = {key: (there[key], here.get(key, "")) for key in _HOST if key in there}
+    differs = {key: (before, now) for key, (before, now) in both.items() if before != now}
+    if "cpu_features" in differs:
+        before, now = (set(features.split()) for features in differs["cpu_features"])
+        differs["cpu_features"] = " ".join(sorted(before - now)), " ".join(sorted(now - before))
+    return differs
 
 
 def replay_log(
@@ -54,12 +55,12 @@ def replay_log(
     total = sum(path.stat().st_size for path in files if path.exists())
     begun_s = time.monotonic()
     with reading_bar(Console(stderr=True)) as count:
-        found = replay_files(files, tolerance, jobs or 0, lambda done: count("replaying", done, total), kernel or "")
-    found.speed = round(found.log_s / (time.monotonic() - begun_s), 2)
-    found.log_s = round(found.log_s, 3)
-    found.version, found.tolerance_nm = found.recorded_on.get("lowfc", ""), tolerance
-    found.no_end = missing_end_text(files, finished=found.finished)
-    found.host_differs = _host_differs(found.recorded_on)
-    print_result(found, as_json=as_json)
-    if not found.identical:
+        account = replay_files(files, tolerance, jobs or 0, lambda done: count("replaying", done, total), kernel or "")
+    account.speed = round(account.log_s / (time.monotonic() - begun_s), 2)
+    account.log_s = round(account.log_s, 3)
+    account.version, account.tolerance_nm = account.recorded_on.get("lowfc", ""), tolerance
+    account.no_end = missing_end_text(files, finished=account.finished)
+    account.host_differs = _host_differs(account.recorded_on)
+    print_result(account, as_json=as_json)
+    if not account.identical:
         raise typer.Exit(1)

@@ -25,7 +25,7 @@ from lowfc.programs.logs.replay.former import FormerVersion, changed_rule
 from lowfc.programs.logs.replay.frames import Frames
 
 PATIENCE_NS = 2_000_000_000
-"""Messages of several publishers are recorded in the order of arrival; one later than this counts as missing."""
+"""Longest time to wait in the log for a message of another publisher, because messages are in the order of arrival."""
 _STATES_KEPT = 256
 _BEFORE = "recorded before the first complete state of the controller"
 

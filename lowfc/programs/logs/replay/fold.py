@@ -39,7 +39,7 @@ class Replay:
         return (self._ended_ns - self._begun_ns) * 1e-9
 
     def begin_file(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
-        """Begin a file; controllers and frames of another recording are forgotten, as lockstep runs share sequences."""
+        """Begin a file; forget controllers and frames of another recording, because lockstep runs share sequences."""
         recording = metadata.get("lowfc", {}).get("run", ""), metadata.get(PART, {}).get("of", "")
         if recording != self._recording:
             self.finish()

@@ -79,5 +79,5 @@ class FormerVersion:
             if ignored or (known is not None and field.number not in known):
                 message.ClearField(field.name)
             elif field.message_type is not None:
-                for one in value if field.is_repeated else (value,):
-                    self._prune(one)
+                for nested in value if field.is_repeated else (value,):
+                    self._prune(nested)

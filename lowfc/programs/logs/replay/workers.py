@@ -41,7 +41,7 @@ def replay_files(
     `progress` is called with the bytes replayed so far.
     """
     chunk_ends_ns = [_chunk_ends_ns(path) for path in paths]
-    ends_ns = [one for ends in chunk_ends_ns for one in ends]
+    ends_ns = [end_ns for ends in chunk_ends_ns for end_ns in ends]
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigurationError("a log is named twice; name each once, in the order they were recorded")
     if len(paths) > 1:
@@ -61,16 +61,16 @@ def replay_files(
             for account in pool.imap(partial(_replay_segment, paths, tolerance_nm, kernel), segments):
                 accounts.append(account)
                 progress(size * len(accounts) // count)
-    whole = accounts[0]
+    total = accounts[0]
     for account in accounts[1:]:
-        whole.add(account)
-    unaccounted = whole.steps - whole.frames - whole.unchecked
-    whole.leave_out("without a state of the controller before them", max(0, unaccounted))
-    return whole
+        total.add(account)
+    unaccounted = total.steps - total.frames - total.unchecked
+    total.leave_out("without a state of the controller before them", max(0, unaccounted))
+    return total
 
 
 def _chunk_ends_ns(path: Path) -> list[int]:
-    """Log times at which the chunks of a log end, by its summary; none for an unfinished log."""
+    """Log times of the last message in each chunk of a log, by its summary; none for an unfinished log."""
     with LogFile(path) as file:
         return [chunk.message_end_time for chunk in file.index()]
 

@@ -39,8 +39,8 @@ def budget_results(run: Run, stretch: Stretch | None, spectra: Spectra | None, m
         {"name": name, "how": how} | _columns(term, masks) | {"missing": term is None}
         for name, (term, how) in terms.items()
     ]
-    found = [term for term, _ in terms.values() if term is not None]
-    total = Term(np.sum([np.maximum(term.variance_nm2, 0) for term in found], axis=0)) if found else None
+    known = [term for term, _ in terms.values() if term is not None]
+    total = Term(np.sum([np.maximum(term.variance_nm2, 0) for term in known], axis=0)) if known else None
     missing = [name for name, (term, _) in terms.items() if term is None]
     true = Term(stretch.residual_ms_nm2) if stretch.residual_ms_nm2 is not None and stretch.frames.values else None
     measured = _mean_square(stretch.signal(ERROR).joined()) if stretch.frames.values else None
@@ -64,30 +64,30 @@ def budget_results(run: Run, stretch: Stretch | None, spectra: Spectra | None, m
 def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None) -> dict[str, Entry]:
     """Each term and its source, or None and what would be required."""
     law, timing = stretch.law, stretch.timing
-    found: dict[str, Entry] = {}
+    entries: dict[str, Entry] = {}
     if noise is None:
-        found = dict.fromkeys(("photon noise", "read noise"), (None, f"requires {_NO_CAMERA}"))
+        entries = dict.fromkeys(("photon noise", "read noise"), (None, f"requires {_NO_CAMERA}"))
     else:
-        for name, one_nm, source in (
+        for name, frame_nm, source in (
             ("photon noise", noise.photon_nm, "measured flux"),
             ("read noise", noise.read_nm, "camera's read noise and rounding"),
         ):
             how = f"{source}, through the reconstructor, {_THROUGH}"
-            found[name] = (white_noise(law, one_nm), how if noise.total_nm.any() else "the simulation has no noise")
+            entries[name] = (white_noise(law, frame_nm), how if noise.total_nm.any() else "the simulation has no noise")
     if spectra is None:
-        found["lag"] = (None, f"requires {_TOO_SHORT}")
+        entries["lag"] = (None, f"requires {_TOO_SHORT}")
     elif stretch.true:
         mean_nm = stretch.signal(DISTURBANCE).joined().mean(axis=0)
         how = "spectrum of the true disturbance times the rejection"
-        found["lag"] = (lag(law, spectra[DISTURBANCE], mean_nm, timing), how)
+        entries["lag"] = (lag(law, spectra[DISTURBANCE], mean_nm, timing), how)
     else:
         mean_nm = stretch.signal(POL).joined().mean(axis=0)
         how = "pseudo-open-loop spectrum minus its noise floor, times the rejection"
-        found["lag"] = (lag_under_noise(law, spectra[POL], mean_nm, timing), how)
+        entries["lag"] = (lag_under_noise(law, spectra[POL], mean_nm, timing), how)
     crosstalk, nonlinearity = _measurement_terms(stretch, noise)
-    found["cross-talk and aliasing"] = crosstalk
-    found["nonlinearity"] = nonlinearity
-    return found
+    entries["cross-talk and aliasing"] = crosstalk
+    entries["nonlinearity"] = nonlinearity
+    return entries
 
 
 def _measurement_terms(stretch: Stretch, noise: SensorNoise | None) -> tuple[Entry, Entry]:
@@ -101,8 +101,8 @@ def _measurement_terms(stretch: Stretch, noise: SensorNoise | None) -> tuple[Ent
         command_seen = replace(error, values=tuple(a - b for a, b in zip(error.values, pol.values, strict=True)))
         split = measurement_error(stretch.law, error, stretch.signal(SENSED), command_seen, noise.total_nm)
     if split is None:
-        nothing = (None, f"requires {missing}")
-        return nothing, nothing
+        unknown = (None, f"requires {missing}")
+        return unknown, unknown
     linear = "linear part of (error - true residual): fit to a constant, the residual and the command"
     rest = "remainder of (error - true residual) beyond the noise of a frame"
     return (split.crosstalk, f"{linear}, {_THROUGH}"), (split.nonlinearity, f"{rest}, {_THROUGH}")

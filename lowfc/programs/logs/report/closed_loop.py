@@ -33,7 +33,7 @@ class Stretch:
 
     Attributes:
         rows: steps of the stretch, after settling.
-        settling: number of steps left out for settling; `earlier`: further steps left out of a long stretch.
+        settling: number of steps left out for settling; `earlier`: further steps left out after these, see `MAX_STEPS`.
         timing: timing of the loop; sampled if the log's truth is sampled.
         frames: columns of error, pseudo-open-loop and, if the log has truth, disturbance, residual and the residual's
             mean over the exposure.
@@ -91,14 +91,14 @@ def longest_stretch(run: Run) -> Stretch | None:
         residual_ms_nm2 = np.nanmean(true.modes_residual_rms_nm[rows].astype(float) ** 2, axis=0)
         if true.continuous and history.exposure_fraction is not None:
             timing = Timing.of(in_force.delay_frames, history.exposure_fraction)
-    found = time_series(steps.sequence[rows], np.hstack(signals))
-    noll = tuple(range(2, 2 + gain.size))
+    frames = time_series(steps.sequence[rows], np.hstack(signals))
+    noll = tuple(range(2, 2 + gain.size))  # only their number is used
     rate_hz = history.rate_hz or 1.0  # unknown, and unused, for a single step
     if in_force.linear is None:
         law = integrator(gain, leak, noll, in_force.delay_frames, rate_hz)
     else:
         law = replace(in_force.linear, delay_frames=in_force.delay_frames, rate_hz=rate_hz)
-    return Stretch(rows, settling, earlier, in_force, law, timing, found, residual_ms_nm2)
+    return Stretch(rows, settling, earlier, in_force, law, timing, frames, residual_ms_nm2)
 
 
 def why_none(run: Run) -> str:
@@ -144,7 +144,7 @@ Spectra = list[Spectrum]
 
 
 def spectra_of(stretch: Stretch | None) -> Spectra | None:
-    """None if there is no stretch or it is too short."""
+    """Spectra of the signals of a stretch; None without one, or if it is too short."""
     if stretch is None:
         return None
     found = [spectrum(stretch.signal(number), stretch.law.rate_hz) for number in range(4 if stretch.true else 2)]
@@ -227,7 +227,7 @@ def _band_rms(frequency_hz: Array, power: Array, low_hz: float, high_hz: float) 
 def noise_of(history: History, rows: slice) -> SensorNoise | None:
     """Sensor noise of one frame at the flux of these steps, through the reconstructor in use at their end.
 
-    None if the log lacks camera or calibration.
+    None if the log lacks calibration, flux, or the camera's gain.
     """
     camera, calibration = history.camera, history.calibration
     flux_dn = history.steps.flux_dn[rows]

@@ -24,8 +24,8 @@ INK, FAINT, OPEN, CLOSED = (COLOURS[name] for name in ("ink", "faint", "open", "
 _MODES = {"open": OPEN, "closed": CLOSED, "safe": COLOURS["safe"], "idle": FAINT}
 _BESIDE_TRUTH: dict[str, Any] = {"linestyle": ":", "linewidth": 0.9, "alpha": 0.7}
 """Style of measured curves if the log also has the true ones."""
-_NEAR = 0.25
-"""Fraction of the stroke above which its limit is drawn."""
+_LIMIT_DRAWN_FROM = 0.25
+"""Fraction of the stroke limit used above which the limit is drawn."""
 _MAX_MARKS = 300
 _SECONDS = "seconds since the first step"
 
@@ -293,7 +293,7 @@ def _stroke(figure: "Figure", report: Report) -> bool:
     limit_nm, title = results["stroke_limit_nm"], "over time"
     if limit_nm is not None:
         title += f"; the limit is {limit_nm:g} nm"
-        if results["stroke_most_share"] > _NEAR:  # otherwise it would flatten the curve
+        if results["stroke_most_share"] > _LIMIT_DRAWN_FROM:  # otherwise it would flatten the curve
             plot.axhline(limit_nm, color=COLOURS["error"], linestyle="--")
     plot.set(ylabel="largest |actuator|, nm of surface", xlabel=_SECONDS, title=title)
     plot.set_ylim(bottom=0)

@@ -17,7 +17,7 @@ from lowfc.programs.logs.report.source import Results, Run
 def residual_results(run: Run, stretch: Stretch | None) -> Results:
     """Rms in nm of each mode and signal, and of tip and tilt per axis in mas; None for signals not in the log.
 
-    Closed loop: the longest stretch under one law, settled, without and with the correction. Open loop: all its steps.
+    Closed loop: over the longest stretch under one law, after settling. Open loop: over all its steps.
     """
     history = run.history
     steps = history.steps
@@ -91,9 +91,9 @@ def bin_starts(rows: int, most: int) -> Whole:
 
 
 def _contrast(true: Truths, rows: Whole, config: Configuration | None) -> Results | None:
-    """Contrast added to the dark zone by the disturbance (open) and by the residual (closed).
+    """Contrast added to the dark zone by the disturbance (open) and by the residual (closed) of these steps.
 
-    None without truth, or for a coronagraph without a science image.
+    None without truth or configuration, or for a coronagraph without a science image.
     """
     covariances = {}
     for name, rms_nm, sampled_nm in (
@@ -109,13 +109,14 @@ def _contrast(true: Truths, rows: Whole, config: Configuration | None) -> Result
 
 
 def _rms(values: Single, rows: Whole) -> Array | None:
+    """Rms (modes,) of the rows without NaN; None without any."""
     found = values[rows] if values.size else values
     known = found[np.isfinite(found).all(axis=1)].astype(float)
     return np.sqrt(np.mean(known**2, axis=0)) if len(known) else None
 
 
-def _at(values: Array | None, place: int) -> float | None:
-    return float(values[place]) if values is not None else None
+def _at(values: Array | None, index: int) -> float | None:
+    return float(values[index]) if values is not None else None
 
 
 def _tilt_mas(values: Array | None, noll: tuple[int, ...], configuration: Configuration | None) -> Results | None:

@@ -22,7 +22,7 @@ Results = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class InForce:
-    """A control law in force: gain and leak (modes,) of the integrator, delay, and the linear law in use instead of it.
+    """A control law in force: gain and leak (modes,) of the integrator, delay, and the linear law used instead.
 
     Attributes:
         first: step from which on it is in force; comparisons ignore it.

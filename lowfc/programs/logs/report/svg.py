@@ -22,8 +22,8 @@ COLOURS = {
     "safe": "#7f3c8e",
     "paper": "#fcfbfa",
 }
-"""Placeholders, replaced by the page's variables of these names; near Okabe and Ito's palette, which is safe for colour
-blindness. Open loop and closed loop have the same colours in all drawings."""
+"""Placeholders, replaced by the page's variables of these names; most hues are near Okabe and Ito's palette, safe for
+colour blindness. Open loop and closed loop have the same colours in all drawings."""
 
 _STYLE: Any = {
     "svg.fonttype": "none",

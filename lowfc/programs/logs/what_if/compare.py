@@ -111,7 +111,8 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
 def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> tuple[dict[str, Array], dict[str, Any] | None]:
     """Rms (modes,) of the true residual, sampled in the frames and continuous, as logged and for the what-if.
 
-    The second value is the contrast added to the dark zone by the continuous residual, if known.
+    `moved_nm` (steps, modes) is the what-if's command minus the logged one, as seen by each exposure. The second value
+    is the contrast added to the dark zone by the continuous residual, if known.
     """
     assert run.true_nm is not None  # noqa: S101  # the caller knows
     disturbance_nm, residual_nm = (values.astype(np.float64) for values in run.true_nm)

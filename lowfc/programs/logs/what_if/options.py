@@ -83,7 +83,7 @@ def requested(
 
 
 def law(what: WhatIf, noll: tuple[int, ...], logged: Integrator) -> Integrator:
-    """The law of the what-if: the logged or the configured one, with the given values replaced."""
+    """The law of the what-if: the logged or the configured one, with the values of `overrides`."""
     base = logged
     if what.config is not None:
         base = settings(what.config).integrator(noll)

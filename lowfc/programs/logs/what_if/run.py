@@ -69,9 +69,8 @@ class SeenCommands(NamedTuple):
         torn: Mask = np.abs(computed_nm - assumed_nm).max(axis=1) > _TORN_NM
         if measured_delay is None or abs(measured_delay - controller_delay) <= DELAY_DIFFERS:
             return cls(controller_delay, weights, assumed_nm, torn)
-        whole = round(measured_delay)
-        near = abs(measured_delay - whole) <= DELAY_DIFFERS
-        delay_frames = float(whole) if near else measured_delay
+        rounded = round(measured_delay)
+        delay_frames = float(rounded) if abs(measured_delay - rounded) <= DELAY_DIFFERS else measured_delay
         weights = delay_weights(delay_frames).astype(np.float32)
         return cls(delay_frames, weights, seen_nm(weights, steps.command_nm, missing, assumed_nm[0]), torn)
 

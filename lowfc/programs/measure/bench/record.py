@@ -19,7 +19,7 @@ from lowfc.programs.cli.output import print_result
 RATES_HZ = (1000.0, 2000.0, 5000.0)
 
 _READY_S = 30.0
-_PATIENCE_S = 60.0
+_STOP_S = 60.0
 _POLL_S = 0.5
 _WARM_UP_S = 0.5
 _COPY_S = 0.5
@@ -81,7 +81,7 @@ def measure(rates_hz: tuple[float, ...], seconds: float, folder: Path | None = N
 
     rates: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(prefix="lowfc-bench-", dir=folder) as name:
-        copy_us, frame_bytes = _copying(Path(name))
+        copy_us, frame_bytes = _copy_cost(Path(name))
         with passing_bar(Console(stderr=True)) as bar:
             task = bar.add_task("recording", total=len(rates_hz))
             for rate_hz in rates_hz:
@@ -128,7 +128,7 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
     with contextlib.ExitStack() as stack:
         stack.callback(run.remove)
         recorder.start()
-        stack.callback(recorder.stop, _PATIENCE_S)  # no effect if it has ended
+        stack.callback(recorder.stop, _STOP_S)  # no effect if it has ended
         traffic = stack.enter_context(contextlib.closing(Traffic(run, rate_hz)))
         deadline_s = time.monotonic() + _READY_S
         while not traffic.wait_for("recorder", _POLL_S):
@@ -143,7 +143,7 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
         elapsed_s = time.monotonic() - begun_s
         own_s, after = time.process_time() - own_s, process.cpu_times()
         traffic.finish()
-        recorder.stop(_PATIENCE_S)
+        recorder.stop(_STOP_S)
         if recorder.status:
             raise BusError(f"the recorder failed: {recorder.exit_description()}; {recorder.stderr_tail()}")
     done = json.loads(recorder.stdout_path.read_bytes())
@@ -154,20 +154,20 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
         "cpu_share": (after.user + after.system - before.user - before.system) / elapsed_s,
         "publisher_cpu_share": own_s / elapsed_s,
         "messages_published": traffic.messages,
-        "log_bytes": _removed([Path(log) for log in done["logs"]]),
+        "log_bytes": _remove([Path(log) for log in done["logs"]]),
         **{name: done[name] for name in _RECORDER_KEYS},
     }
 
 
-def _removed(logs: list[Path]) -> int:
-    """Remove logs, of which a long or fast recording has several; their size in bytes."""
+def _remove(logs: list[Path]) -> int:
+    """Remove the logs of a recording, which may be several; return their total size, bytes."""
     size = sum(log.stat().st_size for log in logs)
     for log in logs:
         log.unlink()
     return size
 
 
-def _copying(folder: Path) -> tuple[float, float]:
+def _copy_cost(folder: Path) -> tuple[float, float]:
     """Processor time of copying one frame's payloads to a file, us, and their size, bytes."""
     from lowfc.programs.measure.traffic import frame_payloads
 

@@ -37,7 +37,7 @@ def twin(as_json: Json = False) -> None:
 def bench_twin(seconds: float = 1.0, cache_dir: Path | None = None) -> dict[str, Any]:
     """Measure the three twins; the results of the live loop's default are also at the top level.
 
-    Times are medians of one frame, from the phase to the binned image, with the two models in turn. `relative_l2` is
+    Times are medians of one frame, from the wavefront to the binned image, one model after the other. `relative_l2` is
     the worst of 20 random wavefronts of radial degrees 1 to 5 within the bounds of Subedi et al. 2015, Sect. 3.1.
     """
     optics = sensor_named(SENSOR)

@@ -98,7 +98,7 @@ def run_repeats(options: LatencyOptions, run: Run, progress: Callable[[str], Non
 def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = None) -> dict[str, Any]:
     """One repeat of the loop alone: statistics of its frames, and the last reports of its processes.
 
-    This process is woken only ten times a second and by Health; frames and mirror states wait in rings.
+    Only timing (10 Hz), Health and a poll (4 Hz) wake this process; frames and mirror states wait in rings.
 
     Args:
         options: options.
@@ -227,9 +227,8 @@ def _run(
     meanwhile: Callable[[], None],
     started: Callable[[], None] = lambda: None,
 ) -> None:
-    with (
-        deferred_signals() as interrupted
-    ):  # while a process forks, Python may swallow an exception of a signal handler
+    # Deferred: while a process forks, Python may swallow an exception of a signal handler.
+    with deferred_signals() as interrupted:
         for child in children:
             child.start()
         started()

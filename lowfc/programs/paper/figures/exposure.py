@@ -18,7 +18,6 @@ BRIGHT = (
 )
 FULL_CHAIN = "Images by the full optical chain; iterations with the twin, accurate to about 1e-5."
 
-
 ESTIMATORS = tuple(label(kind, iterations) for kind in KINDS for iterations in ITERATIONS)
 PINV = label("pinv", 0)
 WEIGHTED, WEIGHTED_1, WEIGHTED_2 = (label("weighted", iterations) for iterations in ITERATIONS)

@@ -87,9 +87,9 @@ def plot_fig3(context: Context, path: Path) -> None:
     panels: list[plots.Panel] = []
     for ready in chosen:
         mask = np.abs(ready.sensor.focal_mask) ** 2
-        whole = np.pad(mask, (widest - len(mask)) // 2)
+        padded = np.pad(mask, (widest - len(mask)) // 2)
         half_width = widest / (2.0 * ready.sensor.samples_per)
-        panels.append(plots.picture(whole, ready.name, plots.SKY, half_width, (0.0, 1.0), "reflectivity"))
+        panels.append(plots.picture(padded, ready.name, plots.SKY, half_width, (0.0, 1.0), "reflectivity"))
     plots.draw(path, panels, "Fig. 3. Focal-plane masks: bright parts reflect to the sensor.")
 
 

@@ -165,12 +165,12 @@ def deviations(estimates: Array) -> Array:
 
 def linear_range(deviation: Array) -> float:
     """Amplitude at which a deviation (amplitudes,) first exceeds 10 %; infinite if it never does."""
-    above = np.flatnonzero(deviation > _DEVIATION)
+    x, y = np.append(0.0, AMPLITUDES), np.append(0.0, deviation)
+    above = np.flatnonzero(y > _DEVIATION)
     if not above.size:
         return float("inf")
-    ends = slice(above[0] - 1, above[0] + 1) if above[0] else slice(0, 1)
-    x, y = np.concatenate([[0.0], AMPLITUDES[ends]])[-2:], np.concatenate([[0.0], deviation[ends]])[-2:]
-    return float(np.interp(_DEVIATION, y, x))
+    ends = slice(above[0] - 1, above[0] + 1)
+    return float(np.interp(_DEVIATION, y[ends], x[ends]))
 
 
 @lru_cache(maxsize=8)

@@ -31,7 +31,6 @@ _PAPER_WAVES = {"reconstructed": 0.038, "residual": 0.030}
 _ESTIMATORS = (PINV, WEIGHTED, WEIGHTED_2)
 _BEST = "best possible fit"
 
-
 _Screen = tuple[Array, dict[str, Array]]
 """A screen (n, n) in nm, and its estimates (modes,) in nm by each estimator and by the best fit."""
 

@@ -36,7 +36,7 @@ LOOP_SENSORS = ("sam", "zwfs_tuned")
 """Sensors for which loops are run."""
 RATE_HZ, MAGNITUDE, EXPOSURE = 1000.0, 2.0, 0.5
 OBSERVED_S, CLOSED_S, MEAN_S = 10.0, 24.0, 2.0
-"""Durations: of the loop that a law is identified from, of the loop that is judged, of a mean as in SCExAO."""
+"""Durations: of the loop from which a law is identified, of the loop that is judged, of a mean as in SCExAO."""
 GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
 ROMAN_MAS, SCEXAO_MAS = 0.4, {"laboratory": 0.02, "sky": 0.15}
 AVERAGED_S = 100.0
@@ -45,12 +45,13 @@ REACHED, NOT_REACHED = "reached", "not reached"
 
 ABOUT = """An anchor is a published value and lowfc's value by the same definition. *paper* is the published value,
 *limit* lowfc's with the noise of the quantum limit of the light. Loops are the real processes in lockstep, judged by
-the true wavefront in continuous time, over the second half of a run. A verdict compares lowfc's value (the predicted
-one, if theory gives one) with the published one.
+the true wavefront, in continuous time over the second half of a run; the means as in SCExAO are of the tilt at the
+start of each exposure, from 4 s on. A verdict compares lowfc's value (the predicted one, if theory gives one) with the
+published one.
 """
 LOOP = (
     f"lowfc sim-loop --lockstep: V = {MAGNITUDE:g}, 2 m, {RATE_HZ:g} Hz, exposure of half the period, delay of one "
-    "frame, 14 modes, 1 e- read noise, monochromatic with the photons of 110 nm; true tilt per axis, continuous time."
+    "frame, 14 modes, 1 e- read noise, monochromatic with the photons of 110 nm; true tilt per axis."
 )
 ROMAN = (
     "Roman (WFIRST) coronagraph, Milestone 6 (Shi et al., final report, 2015): below 0.4 mas rms per axis for most "
@@ -91,7 +92,7 @@ def anchors(context: Context) -> list[Row]:
 
 
 def _with_verdict(row: Row, allowed: float | None = None) -> list[Row]:
-    """A row and its verdict against the allowed or the published value, if there is one; by `predicted` if there is."""
+    """A row, and its verdict if a value is allowed or published; it judges `predicted` if known, else `measured`."""
     best, ours = row.paper if allowed is None else allowed, row.measured if row.predicted is None else row.predicted
     if best is None:
         return [row]
@@ -106,8 +107,8 @@ def _pointing(context: Context, name: str) -> list[Row]:
     rows: list[Row] = []
     nm_per_mas = tilt_nm_per_mas(2.0)
     made = partial(Row, name, unit="mas", modes=len(NOLLS_14))
-    with tempfile.TemporaryDirectory() as text:
-        folder = Path(text)
+    with tempfile.TemporaryDirectory() as name_of_folder:
+        folder = Path(name_of_folder)
         sensor = _sensor_toml(name)
         (folder / "gains.toml").write_text(f"{GAINS}{sensor}")
         for preset in ("reaction-wheel", "reaction-wheel-ideal"):

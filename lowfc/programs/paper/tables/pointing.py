@@ -32,7 +32,6 @@ ASSUMPTION = (
     "few per cent."
 )
 
-
 CENTRED = "paper: 'the estimate distribution is centered on the true value'; predicted: from the image without noise."
 
 

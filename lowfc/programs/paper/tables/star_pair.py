@@ -45,8 +45,8 @@ def _maps() -> tuple[Array, Array, Mask]:
     """Second-order maps (modes, samples, samples) of contrast per nm^2, the map of a flat wavefront, the dark zone."""
     samples = 2 * int(np.ceil(DARK_ZONE.outer)) * _SAMPLES_PER
     flat = _image(np.zeros(len(NOLLS_14)), samples)
-    waves = _SMALL_NM * np.eye(len(NOLLS_14))
-    maps = np.array([(_image(one, samples) + _image(-one, samples)) / 2 - flat for one in waves])
+    pure_modes_nm = _SMALL_NM * np.eye(len(NOLLS_14))
+    maps = np.array([(_image(one, samples) + _image(-one, samples)) / 2 - flat for one in pure_modes_nm])
     return maps / _SMALL_NM**2, flat, wedge_samples(DARK_ZONE, samples, samples, _SAMPLES_PER)
 
 

@@ -61,7 +61,7 @@ CHECK = (
 
 @dataclass(frozen=True, eq=False)
 class Contrasts:
-    """Contrast of each mode alone: form a^2 + quartic a^4, both (modes,)."""
+    """Contrast that each mode alone, a nm rms, adds: form a^2 + quartic a^4, both (modes,)."""
 
     form: Array
     quartic: Array
@@ -87,14 +87,14 @@ def contrasts(pupil: str, focal_radius: float) -> Contrasts:
         )
     quartic = np.zeros(len(NOLLS_14))
     for mode, each in enumerate(form.tolist()):
-        amplitude = np.sqrt(_LARGEST / each)
+        amplitude_nm = np.sqrt(_LARGEST / each)
         while True:
-            waves = amplitude * np.eye(len(NOLLS_14))[mode]
-            added = (modal.by_image(waves) + modal.by_image(-waves)) / 2 - own
+            modes_nm = amplitude_nm * np.eye(len(NOLLS_14))[mode]
+            added = (modal.by_image(modes_nm) + modal.by_image(-modes_nm)) / 2 - own
             if added < _LARGEST:
                 break
-            amplitude *= 0.7
-        quartic[mode] = max((added - each * amplitude**2) / amplitude**4, 0.0)
+            amplitude_nm *= 0.7
+        quartic[mode] = max((added - each * amplitude_nm**2) / amplitude_nm**4, 0.0)
     return Contrasts(form, quartic)
 
 
@@ -118,7 +118,7 @@ def frame_noise_nm2(name: str, magnitude: float) -> Array:
 
 
 def quantum_noise_nm2(name: str, magnitude: float) -> Array:
-    """Variance (14,) of each mode in a frame at the quantum limit, with all modes fitted."""
+    """Variance (14,) of each mode in a frame at the quantum limit, with all 14 modes fitted."""
     return _quantum_noise_of_one_nm2(name) / light_e(magnitude)
 
 
