@@ -3,7 +3,6 @@
 The tests named in `test_docs` run the commands of real-time loops and of views.
 """
 
-import json
 import re
 import shutil
 from pathlib import Path
@@ -88,8 +87,7 @@ def test_bad_night(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "tests" / "golden", tmp_path / "tests" / "golden")
     info, report, replay, killed, recovered, whole = followed(tmp_path, "bad_night").values()
     assert "FRAMES_REFUSED 6, NO_FRAMES 3" in info
-    verdict = json.loads(report)["verdict"]
-    assert verdict["heading"] == "Not a good run"
+    assert report.startswith("Not a good run: ")
     assert (tmp_path / "night.html").is_file()
     assert "163 frames" in replay
     assert "rule changed" in replay
