@@ -22,7 +22,7 @@ from lowfc.programs.commissioning.calibrate import pokes
 from lowfc.programs.commissioning.calibrate.run import partial_of
 from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.commission import commissioning
-from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning, first_of
+from lowfc.programs.commissioning.commission.commissioning import Commissioning, CommissionOptions, provisional_path
 from lowfc.programs.commissioning.commission.first_calibration import linear_nm
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, Agreement, agreement_checks
 from tests.support.in_process_loop import InProcessLoop, computed
@@ -75,7 +75,7 @@ class Bench:
             self.loop,
             self.config,
             computed((model or self.config).to_toml()),
-            Commission(self.out, **{**defaults, "close": True, **options}),
+            CommissionOptions(self.out, **{**defaults, "close": True, **options}),
             self.report,
             lambda what, done, total: None,
             self.questions.append,
@@ -116,7 +116,7 @@ def test_commissioning_closes_a_loop_with_another_frame_size(commissioned: tuple
     made = calibration_file.load(bench.out)
     assert made.shape == (64, 64)
     assert made.saturation_dn == 2**14 - 1
-    assert not first_of(bench.out).exists()
+    assert not provisional_path(bench.out).exists()
     assert not partial_of(bench.out).exists()
 
 
@@ -232,7 +232,7 @@ def test_a_resumed_commissioning_continues_and_reports_an_operator_who_opens_the
         bench.commission()
     bench.loop.ask = ask  # type: ignore[method-assign]
     bench.loop.ask("release", lease_id=1)
-    assert first_of(bench.out).exists()
+    assert provisional_path(bench.out).exists()
     assert "without a verdict" in bench.shown
     assert "has no verdict" in bench.loop.ask("close", lease_id=0).reply
     bench.loop.ask("open", lease_id=0)
@@ -272,7 +272,7 @@ def test_a_failed_commissioning_restores_the_previous_calibration(
 
 def test_a_finished_commissioning_cannot_be_resumed(commissioned: tuple[Bench, dict[str, Any]]) -> None:
     bench, _ = commissioned
-    first_of(bench.out).unlink(missing_ok=True)
+    provisional_path(bench.out).unlink(missing_ok=True)
     with pytest.raises(CalibrationError, match="nothing to resume"):
         bench.commission(resume=True)
 

@@ -24,13 +24,13 @@ from lowfc.adapters.process.trial import Trial, lateness_ns, try_out
 from lowfc.contract.configuration import Configuration, Realtime, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.commissioning.checks import Check, note, ok
-from lowfc.programs.commissioning.doctor import command, permissions, room, timing
+from lowfc.programs.commissioning.doctor import command, permissions, resources, timing
 from lowfc.programs.commissioning.doctor.facts import Facts, gather, ranges
 from lowfc.programs.core.recording.volume import bytes_per_s
 from tests.support.loops import lowfc, refusal, until
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "howto" / "doctor.md"
-CHECKS = {**timing.CHECKS.functions, **room.CHECKS.functions}
+CHECKS = {**timing.CHECKS.functions, **resources.CHECKS.functions}
 NO_RIGHTS = [
     *(["setpriv", "--inh-caps=-all", "--bounding-set=-sys_nice,-ipc_lock,-sys_resource"] if os.geteuid() == 0 else []),
     *("prlimit", "--rtprio=0", "--memlock=65536", sys.executable, "-P", "-c"),
@@ -393,7 +393,7 @@ def test_the_document_describes_every_check_by_its_docstring() -> None:
 def test_the_check_of_the_control_step_names_the_kernel(
     kernel: str, available: bool, status: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(room.compiled, "available", lambda: available)
+    monkeypatch.setattr(resources.compiled, "available", lambda: available)
     found = examine(facts(tmp_path, config=load(None, {"realtime.kernel": kernel})))["control step"]
     assert found.status == status
     assert text in f"{found.got} {found.advice}"

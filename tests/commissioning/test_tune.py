@@ -26,7 +26,7 @@ from lowfc.control.laws.margins import check_stable
 from lowfc.control.laws.tuning import Gains, Tuned
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
-from lowfc.programs.commissioning.tune.command import integrate
+from lowfc.programs.commissioning.tune.command import apply_gains
 from lowfc.programs.commissioning.tune.data import Telemetry, telemetry_from_log, telemetry_from_run
 from lowfc.programs.commissioning.tune.result import result_of, tuned
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
@@ -292,11 +292,11 @@ class RequestedLoop(InProcessLoop):
 
 def test_tuned_gains_are_applied_whichever_law_is_active() -> None:
     loop = RequestedLoop()
-    answer = integrate(loop, [0.3, 0.25, 0.1], NOLL)
+    answer = apply_gains(loop, [0.3, 0.25, 0.1], NOLL)
     assert answer.reply == "gain is now 0.3 0.25 0.1"
     assert loop.requests == ["gain"]
     loop.law(LAWS["pi"])
-    integrate(loop, [0.2, 0.2, 0.1], NOLL)
+    apply_gains(loop, [0.2, 0.2, 0.1], NOLL)
     assert loop.law_and_gains() == (None, [0.2, 0.2, 0.1])
 
 
@@ -305,10 +305,10 @@ def test_the_previous_law_stays_active_if_the_gains_are_refused() -> None:
     loop.law(LAWS["pi"])
     before = loop.law_and_gains()
     with pytest.raises(RequestRefusedError, match=r"^gain refused: gain must be at least 0 and below"):
-        integrate(loop, [0.3, 0.3, 9.0], NOLL)
+        apply_gains(loop, [0.3, 0.3, 9.0], NOLL)
     assert loop.law_and_gains() == before == (LAWS["pi"].name, [0.4, 0.4, 0.2])
     with pytest.raises(RequestRefusedError, match="are not controlled"):
-        integrate(loop, [0.3, 0.3], (2, 9))
+        apply_gains(loop, [0.3, 0.3], (2, 9))
     assert loop.law_and_gains() == before
 
 
@@ -318,13 +318,13 @@ def test_the_previous_law_is_restored_without_an_answer_or_the_error_says_that_i
     before = loop.law_and_gains()
     loop.unanswered = (3,)
     with pytest.raises(BusError, match="did not answer"):
-        integrate(loop, [0.3, 0.3, 0.3], NOLL)
+        apply_gains(loop, [0.3, 0.3, 0.3], NOLL)
     assert loop.law_and_gains() == before
     loop.unanswered = (6, 7)
     with pytest.raises(
         RequestRefusedError, match=f"the integrator now drives .* law {before[0]!r} could not be restored"
     ):
-        integrate(loop, [0.3, 0.3, 0.3], NOLL)
+        apply_gains(loop, [0.3, 0.3, 0.3], NOLL)
     assert loop.law_and_gains() == (None, before[1])
 
 

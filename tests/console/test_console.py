@@ -466,6 +466,7 @@ def test_verdict_and_tiles_have_the_text_of_the_view() -> None:
 def test_pictures_and_sparklines_have_a_fixed_size() -> None:
     assert sparkline([1.0, float("nan"), 0.5, 0.0], 3) == " █▁"
     assert sparkline([], 3) == ""
+    assert sparkline([-0.01, -0.02], 3) == "▁▁"  # light of a blocked star, less the dark
     for shape in ((6, 7), (34, 34), (1, 300)):
         small = reduced(np.full(shape, 4.0))
         assert small.shape == (_PIXELS, _PIXELS)

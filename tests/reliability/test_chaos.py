@@ -24,7 +24,7 @@ from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, TRUTH, Log, Topic, wire
-from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Ended, Outcome
+from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Outcome, ProcessEnd
 from lowfc.programs.reliability.chaos.case import Case, lacking
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.command import _run, chaos, configured
@@ -98,7 +98,7 @@ def evidence(good_entries: dict[Topic, tuple[Entry, ...]]) -> Evidence:
 @pytest.fixture
 def outcome(tmp_path: Path) -> Outcome:
     found = Outcome(tmp_path, CONFIG, marks={"quiet": ns(300), "end": ns(FRAMES)}, mode=wire.LOOP_MODE_CLOSED)
-    found.ended = [Ended("camera", 0, 0.1, True), Ended("controller", 0, 0.1, True)]
+    found.ended = [ProcessEnd("camera", 0, 0.1, True), ProcessEnd("controller", 0, 0.1, True)]
     return found
 
 
@@ -112,7 +112,7 @@ def unflushed(evidence: Evidence, outcome: Outcome) -> None:
 
 
 def ended(name: str, *how: object) -> Callable[[Evidence, Outcome], None]:
-    return lambda _, outcome: outcome.ended.append(Ended(name, *how))
+    return lambda _, outcome: outcome.ended.append(ProcessEnd(name, *how))
 
 
 LARGE_RESIDUALS = [truth(FRAMES - 1, 5 * (WITHIN * 2 + FLOOR_NM))] * 100

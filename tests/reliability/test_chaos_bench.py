@@ -21,7 +21,7 @@ from lowfc.adapters.process.child import Child
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import TIMING, Role, wire
 from lowfc.programs.reliability.chaos import bench, console, disk, processes
-from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench, Ended
+from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench, ProcessEnd
 from lowfc.programs.reliability.chaos.case import WHILE_FRAMES
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.console import TerminalConsole
@@ -80,7 +80,7 @@ def test_a_process_that_a_process_leaves_behind_is_reported(sleeping: ChaosBench
     sleeping.restart(Role.CAMERA, ["sh", "-c", "sleep 60 & exit 0"], ready=False)
     until(lambda: sleeping.children[Role.CAMERA].status == 0)
     sleeping.end()
-    assert sleeping.outcome.ended == [Ended("camera", 0, sleeping.outcome.ended[0].after_s, requested=False)]
+    assert sleeping.outcome.ended == [ProcessEnd("camera", 0, sleeping.outcome.ended[0].after_s, requested=False)]
     (left,) = sleeping.outcome.alive
     os.kill(int(left.split("(")[1].split(",")[0]), signal.SIGKILL)
 

@@ -25,7 +25,7 @@ from lowfc.contract.messages import CAMERA_STATE, FRAME, HEALTH, STEP, TRUTH, Ro
 from lowfc.device.driver import CameraSettings, DriverOptions, camera_state
 from lowfc.device.mirror_loop import MirrorLoop
 from lowfc.programs.core.controller import Controller
-from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench, Ended, Outcome
+from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench, Outcome, ProcessEnd
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_dm.driver import SimulatedMirror
@@ -135,7 +135,7 @@ class ToyBench(ChaosBench):
     def kill(self, name: str) -> None:
         self._latch.close()  # its thread has had time to write
         self._services.pop(name).bus.close()
-        self.outcome.ended.append(Ended(name, -signal.SIGKILL, 0.0, True))
+        self.outcome.ended.append(ProcessEnd(name, -signal.SIGKILL, 0.0, True))
 
     def restart(self, name: str, command: list[str] | None = None, *, ready: bool = True) -> None:
         """Start a controller with the calibration file that its command ends with."""
@@ -156,14 +156,14 @@ class ToyBench(ChaosBench):
 
     def await_end(self, name: str, status: int) -> str:
         assert self._fault
-        self.outcome.ended.append(Ended(name, status, 0.0, True))
+        self.outcome.ended.append(ProcessEnd(name, status, 0.0, True))
         return self._fault
 
     def end(self, timeout_s: float = 0.0) -> None:
         self.mark("end")
         for name, service in self._services.items():
             service.finish()
-            self.outcome.ended.append(Ended(name, 0, 0.0, True))
+            self.outcome.ended.append(ProcessEnd(name, 0, 0.0, True))
         self._latch.close()
         self._log.finish({})
         self.health[Role.RECORDER] = wire.Health(recording=wire.Recording(messages=self._recorder.messages))

@@ -14,17 +14,17 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.optics.twin.twin import Twin
 from lowfc.optics.twin.twin_mirror import TwinMirror
 
-Wavefront = Callable[[Twin, TwinMirror], Array]
-"""Function of a twin and the mirror on its nodes that returns the wavefront at the used nodes, nm."""
+WavefrontFunction = Callable[[Twin, TwinMirror], Array]
+"""Computes the wavefront at the used nodes, nm, from a twin and the mirror on its nodes."""
 
 
-def analytic(config: Configuration, console: Console, at: Wavefront | None = None) -> Calibration:
+def analytic(config: Configuration, console: Console, at: WavefrontFunction | None = None) -> Calibration:
     """Compute I0, H and R from the paper's equations; the optical model is cached for the simulated camera.
 
     Args:
         config: Configuration of the instrument.
         console: Terminal for the progress bar and warnings.
-        at: Wavefront at the zero point; flat when None.
+        at: Computes the wavefront at the zero point; flat when None.
     """
 
     def warn(text: str) -> None:

@@ -105,8 +105,8 @@ def numbers(text: str) -> list[float]:
         raise ConfigurationError(f"{text!r}: write numbers, as in 0.3 or 0.3 0.2") from None
 
 
-def requested(key: str, name: str, confirm: str = "") -> Action:
-    """The button of a declared request, with its fields as a form."""
+def request_action(key: str, name: str, confirm: str = "") -> Action:
+    """Make the button of a declared request, with its fields as a form."""
     declared = BY_NAME[name]
 
     def ask(loop: Client, values: Values) -> Answer:
@@ -136,22 +136,22 @@ _OUT = Field("out", "out: output file (FITS)", lambda: f"calibration-{datetime.n
 _LOAD = Field(LOAD, "load: load it into the loop, which must be open (yes, no)", lambda: "yes")
 _TARGET = (Field("target", "target"), Field("observer", "observer"))
 
-SAFE = requested("s", "safe")
+SAFE = request_action("s", "safe")
 ACTIONS = (
-    requested("c", "close"),
-    requested("o", "open"),
-    requested("p", "pause"),
-    requested("t", "step"),
-    requested("g", "gain"),
-    requested("l", "leak"),
-    requested("x", "limit"),
-    requested("w", "law"),
+    request_action("c", "close"),
+    request_action("o", "open"),
+    request_action("p", "pause"),
+    request_action("t", "step"),
+    request_action("g", "gain"),
+    request_action("l", "leak"),
+    request_action("x", "limit"),
+    request_action("w", "law"),
     Action("i", "no law", "Return from a linear law to the integrator.", ask=lambda loop, _: loop.law()),
-    requested("f", "offset"),
-    requested("h", "channel"),
-    requested("z", "reset"),
-    requested("y", "stop"),
-    requested("k", "clear", confirm="Leave safe mode? The loop is open afterwards."),
+    request_action("f", "offset"),
+    request_action("h", "channel"),
+    request_action("z", "reset"),
+    request_action("y", "stop"),
+    request_action("k", "clear", confirm="Leave safe mode? The loop is open afterwards."),
     Action(
         "d",
         "dark",
@@ -178,10 +178,10 @@ ACTIONS = (
         ),
         task=("calibrate",),
     ),
-    requested("a", "load"),
+    request_action("a", "load"),
     Action("r", "record", "Start a new log, with a note of target and observer.", _TARGET, _record),
     Action("v", "end log", BY_NAME["record/stop"].description, ask=lambda loop, _: loop.record(False)),
-    requested("n", "note"),
+    request_action("n", "note"),
 )
 """Buttons in the order of the screen."""
 ALL_ACTIONS = {one.name: one for one in (*ACTIONS, SAFE)}

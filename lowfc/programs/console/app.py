@@ -41,7 +41,7 @@ RESTARTED = "restarted"
 _LEFT = 62  # columns of the left half
 _RESTART_CHECK_EVERY = 10  # readings
 _OTHER_KEYS = (
-    ("↑↓ ←→", "knobs", "Choose a gain knob and turn it: largest gain of its modes, whose ratios stay"),
+    ("↑↓ ←→", "knobs", "Choose a gain knob and turn it (the gains of its modes keep their ratios)"),
     ("u", "auto", "Set the gains of the chosen knob to automatic"),
     ("m", "mute", "Switch the terminal's bell for errors on or off"),
     ("? q", "help, quit", "This help, or leave the console (the loop goes on)"),

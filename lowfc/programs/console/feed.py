@@ -66,9 +66,9 @@ class Reading(NamedTuple):
 
 
 class Feed(Monitor):
-    """Readings of the run; the configuration, too, is queried."""
+    """Reads a run several times a second; it also queries the configuration."""
 
-    _patience_s = 1.0  # in a thread of its own
+    _patience_s = 1.0  # longer than in the base class, since queries have their own thread here
 
     def __init__(self, bus: Bus, run_id: str, clock: Clock) -> None:
         """Subscribe."""

@@ -124,10 +124,10 @@ def sparks(reading: Reading) -> list[Text]:
 
 
 def sparkline(values: Sequence[float], width: int) -> str:
-    """The last values as bars from zero to the largest; a space where there is none."""
+    """The last values as bars from zero to the largest, the lowest bar below zero; a space where there is none."""
     last = np.array(values[-width:])
     largest = max(np.nanmax(last, initial=0.0), 1e-9) if last.size else 1.0
-    return "".join(" " if np.isnan(one) else _SPARKS[min(int(one / largest * 8), 7)] for one in last)
+    return "".join(" " if np.isnan(one) else _SPARKS[min(int(max(one, 0.0) / largest * 8), 7)] for one in last)
 
 
 def modes(reading: Reading, width: int) -> list[Text]:

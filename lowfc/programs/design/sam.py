@@ -202,7 +202,7 @@ def render(result: dict[str, Any]) -> str:
                 f"to the contrast; {predicted['quantum_share']:.1%} of the quantum limit"
             )
     lines.append(
-        "predicted; in Table 4 the weighted estimator attains the Cramer-Rao bound, 'bound' is that of Table 3"
+        "all values are predicted; 'bound' is the Cramer-Rao bound, which the weighted estimator attains in Table 4"
     )
     if not result["interrupted"]:
         lines.append(f"written to {result['file']}; reproduced on the same kind of processor by: {result['command']}")

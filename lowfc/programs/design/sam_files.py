@@ -112,7 +112,7 @@ def write_plot(path: Path, points: Sequence[Point], search: Search) -> None:
 
 
 def front(points: Sequence[Point]) -> list[Point]:
-    """The Pareto front: points that no other point equals or beats in both tables."""
+    """The Pareto front: points than which no other is better in one table and at least as good in the other."""
     return [
         point
         for point in points

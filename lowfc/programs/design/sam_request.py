@@ -25,7 +25,7 @@ class Search:
         edge: Least distance from a hole to the pupil's edge, in pupil diameters.
         symmetry: none, or the axis of a mirror symmetry: x or y.
         seed: Seed of all random numbers.
-        chains: Independent searches, of which the best is used.
+        chains: Independent searches, of which the best is used; along a front, one for each weight.
         steps: Steps of each chain.
         name: Name of the layout.
     """

@@ -73,7 +73,7 @@ class EpicsGateway:
         return int(self._server.conf()["EPICS_PVAS_SERVER_PORT"])
 
     def update(self, values: dict[str, Any], fault: str) -> None:
-        """Post the variables that have changed; with a fault, mark all as invalid."""
+        """Post a new image, and the variables that have changed; with a fault, these are marked as invalid."""
         for one in self._variables:
             value = values.get(one.name, _EMPTY.get(one.kind))
             if value is None:

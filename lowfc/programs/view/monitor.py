@@ -21,7 +21,7 @@ class Monitor:
     """
 
     _patience_s = 0.2
-    """Of a query of one topic."""
+    """Timeout of a query of one topic."""
 
     def __init__(self, bus: Bus, clock: Clock) -> None:
         """Subscribe."""

@@ -56,7 +56,7 @@ def draw_logs(
     newest_frame = last_frame = -1, 0  # sequence and publish time, so far and in the logs before
     damaged, no_end, run, host = 0, "", "", ""
     stroke_nm: float | None = None
-    lost: dict[str, int] = {}  # by recording; the account of its last file is that of all
+    lost: dict[str, int] = {}  # by recording; its last file has the account of all its files
     for log in logs:
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
         for number, message in enumerate(reader):
@@ -83,8 +83,8 @@ def draw_logs(
                 same_start = start_of(sent[0]) == start_of(last_frame[0])
                 if same_start and sent[0] <= last_frame[0] and sent[1] > last_frame[1]:
                     raise DataFileError(
-                        f"{log} repeats frame numbers of the log before it, as another lockstep run: show one run at a "
-                        "time"
+                        f"{log} repeats frame numbers of the log before it, as a log of another lockstep run does: "
+                        "show one run at a time"
                     )
                 newest_frame = max(newest_frame, sent)
             if message.receive_time_ns > LAST_NS:

@@ -26,8 +26,6 @@ from lowfc.programs.commissioning.acceptance.probe import (
 KIND: Kind = "capture-range"
 SIZES = (0.5, 1.0, 1.5)
 """Amplitudes tested, as multiples of the required capture range."""
-_AVERAGED_PART = 4
-"""Denominator: levels are compared over the last quarter of their hold time."""
 
 
 class CaptureMode(ModeResult):
@@ -49,8 +47,8 @@ class CaptureResult(AcceptanceResult):
 def play(live: Live, *, modes: Sequence[int]) -> list[ProbeResponse]:
     """Add shapes of each mode to the mirror in closed loop, in steps of growing amplitude, until one is not corrected.
 
-    Each shape is ramped up and down at the slew limit, in a frame or two: for the loop this equals closing on a static
-    error. After a shape that was not corrected, the command is reset to zero.
+    Each shape is ramped up and down at half the slew limit: if that takes few frames, it equals closing the loop on a
+    static error. After a shape that was not corrected, the command is reset to zero.
     """
     plan = [trials for noll in chosen(modes, live.loop.noll) if (trials := _trials(live, noll))]
     live.expect(sum(len(table) for trials in plan for _, table, _ in trials))
@@ -74,7 +72,7 @@ def _trials(live: Live, noll: int) -> list[tuple[dict[str, Any], Single, Single]
     # settling_frames() of an integrator ignores the delay, hence twice that; of a linear law it is five time constants
     # of the slowest pole, of which three are enough: they leave 5 %.
     hold = round(live.loop.settling_frames() * (2 if isinstance(law, Integrator) else 0.6))
-    averaged = hold // _AVERAGED_PART
+    averaged = hold // 4  # levels are compared over the last quarter of their hold time
     shape = live.calibration.modes_to_actuators[:, row][None]
     step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
     trials = []
@@ -106,7 +104,7 @@ def removed(trial: ProbeResponse) -> bool:
 def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> CaptureResult:
     """Evaluate the capture range of each tested mode."""
     if not trials:
-        raise AcceptanceError("all gains are zero: no mode has a capture range")
+        raise AcceptanceError("the gains of the tested modes are zero: they have no capture range")
     modes = []
     for noll in dict.fromkeys(trial.what["noll"] for trial in trials):
         of_mode = [trial for trial in trials if trial.what["noll"] == noll]

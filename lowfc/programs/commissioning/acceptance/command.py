@@ -150,8 +150,8 @@ def _carry_out(
         for remark in history.remarks:
             sys.stderr.write(f"warning: {remark}\n")
         responses = logged_responses(history, test.KIND)
-        if history.configuration is None or history.calibration is None:
-            raise DataFileError(f"{log.path}: has no configuration, so the requirements are unknown")
+        if history.configuration is None:
+            raise DataFileError(f"{log.path}: has no configuration, so camera and requirements are unknown")
         config_in_use = history.configuration.model_copy(update=required)
     else:
         with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:

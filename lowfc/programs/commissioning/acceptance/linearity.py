@@ -56,7 +56,7 @@ class LinearityMode(ModeResult):
 
 
 class LinearityResult(AcceptanceResult):
-    """Linearity; the row of a mode ends with gain - 1 and the largest cross-talk at each amplitude, nm."""
+    """Linearity; the row of a mode ends with gain - 1 and the largest cross-talk at each amplitude (nm rms)."""
 
     required_nm: float = result_field("required linear to", "nm", "g")
     required_gain_error: float = result_field("required |gain - 1|", form="g")

@@ -93,7 +93,7 @@ class Live:
     def play(
         self, kind: Kind, what: dict[str, Any], mode: LoopMode, table: Single, basis: Single | None = None
     ) -> ProbeResponse:
-        """Play a table and return the steps meanwhile; without shapes in `basis` it is added to the offset.
+        """Play a table and return the loop's response; without shapes in `basis` the table is added to the offset.
 
         With a table without columns no probe is added: only the steps are recorded.
         """

@@ -192,7 +192,8 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
             interrupted = play and event.message.startswith(INTERRUPTIONS)
             if interrupted and times_ns.size and times_ns[0] <= from_timestamp(event.timestamp) <= times_ns[-1]:
                 raise DataFileError(f"{path}: {event.message}, during the measurement")
-        before = [one for one in history.controllers if one.frame_sequence < first and len(one.gain) == modes]
+        states = history.controllers
+        before = [state for state in states if state.frame_sequence < first and len(state.gain) == modes]
         if not before:
             raise DataFileError(f"{path}: does not contain the state of the controller before the test")
         decoded = codec.request(request, request.name, 0, plays=history.published.plays)

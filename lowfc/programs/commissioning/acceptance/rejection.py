@@ -144,13 +144,14 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> R
     law, delay_frames = response.loop.linear, response.loop.delay_frames
     theory_s = margins.rejection(law, frequency_hz, delay_frames)[line_rows, found.mode]
     theory_t = margins.noise_transfer(law, frequency_hz, delay_frames)[line_rows, found.mode]
-    of_s = departure(found.rejection, theory_s, found.error, tolerance_db)
-    of_t = departure(found.noise_transfer, theory_t, found.error, tolerance_db)
+    departure_s = departure(found.rejection, theory_s, found.error, tolerance_db)
+    departure_t = departure(found.noise_transfer, theory_t, found.error, tolerance_db)
     modes = []
     for mode, noll in enumerate(response.loop.noll):
         rows = np.flatnonzero(found.mode == mode)
         if rows.size:
-            rejection, noise = _comparison(of_s, rows, frequency_hz), _comparison(of_t, rows, frequency_hz)
+            rejection = _comparison(departure_s, rows, frequency_hz)
+            noise = _comparison(departure_t, rows, frequency_hz)
             within = rejection.within and noise.within
             enough = rejection.judged >= MIN_JUDGED * rows.size
             modes.append(
@@ -176,9 +177,9 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> R
         lowest_hz=float(frequency_hz.min()),
         highest_hz=float(frequency_hz.max()),
         lines=int(found.mode.size),
-        lines_judged=int(np.count_nonzero(of_s.judged)),
-        largest_departure_db=_largest(of_s),
-        largest_noise_departure_db=_largest(of_t),
+        lines_judged=int(np.count_nonzero(departure_s.judged)),
+        largest_departure_db=_largest(departure_s),
+        largest_noise_departure_db=_largest(departure_t),
         modes=modes,
         points=[
             {
@@ -186,12 +187,12 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> R
                 "frequency_hz": float(frequency_hz[row]),
                 "rejection": float(np.abs(found.rejection[row])),
                 "rejection_theory": float(theory_s[row]),
-                "rejection_error_db": float(of_s.error_db[row]),
-                "rejection_judged": bool(of_s.judged[row]),
+                "rejection_error_db": float(departure_s.error_db[row]),
+                "rejection_judged": bool(departure_s.judged[row]),
                 "noise_transfer": float(np.abs(found.noise_transfer[row])),
                 "noise_transfer_theory": float(theory_t[row]),
-                "noise_transfer_error_db": float(of_t.error_db[row]),
-                "noise_transfer_judged": bool(of_t.judged[row]),
+                "noise_transfer_error_db": float(departure_t.error_db[row]),
+                "noise_transfer_judged": bool(departure_t.judged[row]),
             }
             for row in line_rows
         ],
@@ -210,10 +211,10 @@ def draw(found: dict[str, Any], figure: Any) -> None:
             colour = f"C{number % 10}"
             ax.loglog(hz, [point[f"{name}_theory"] for point in points], "-", color=colour, linewidth=1)
             for judged, marker, face in ((True, "o", colour), (False, "o", "none")):
-                of = [point for point in points if point[f"{name}_judged"] is judged]
+                shown = [point for point in points if point[f"{name}_judged"] is judged]
                 ax.loglog(
-                    [point["frequency_hz"] for point in of],
-                    [point[name] for point in of],
+                    [point["frequency_hz"] for point in shown],
+                    [point[name] for point in shown],
                     marker,
                     color=colour,
                     markerfacecolor=face,

@@ -19,7 +19,7 @@ from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, largest_nm, sequence
-from lowfc.programs.commissioning.calibrate.recording import Player, check_size, watch
+from lowfc.programs.commissioning.calibrate.recording import Player, check_size, next_frames
 from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 from lowfc.programs.commissioning.calibrate.tasks import reporter, write
 
@@ -50,7 +50,7 @@ def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResu
     console = Console(stderr=True)
     with Client(run) as loop, loop.reserved("lowfc calibrate align"):
         config, before = configuration_of(loop), replace(loop.calibration(), camera=loop.camera())
-        pixels = watch(loop, frames)
+        pixels = next_frames(loop, frames)
         check_size(pixels.shape[1:], before)
         light_dn = pixels.mean(axis=0) - before.dark.reshape(before.shape).astype(np.float64)
         flux_dn = float(light_dn.reshape(-1) @ before.good)

@@ -17,9 +17,9 @@ from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS
 AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
 """Default amplitude of a mode by method, nm rms of wavefront."""
 MIN_SNR = 20.0
-"""Signal-to-noise ratio required of a calibration with a given number of cycles."""
+"""Signal-to-noise ratio required by default if the number of cycles is given."""
 FULL_AMPLITUDE_SNR = 70.0
-"""Highest signal-to-noise ratio for the default amplitude: the error of third-order terms goes as its square."""
+"""Highest signal-to-noise ratio for the default amplitude, since third-order errors grow as the amplitude squared."""
 MAX_HADAMARD_NM = 3.0
 """Largest amplitude of a mode, nm rms: all modes at once add up to some four times that, within the linear range."""
 SETTLE = 2
@@ -39,7 +39,7 @@ ALWAYS_ALLOWED_CYCLES = 32
 CHECK_PART = 0.25
 """Number of check cycles relative to the cycles that R is computed from."""
 _MIN_CHECKS = 3
-_OF_THE_SLEW = 0.8
+_SLEW_FRACTION = 0.8
 """Largest fraction of the slew limit that a poke uses."""
 SEED = 1
 DELAY_FRAMES = 600
@@ -105,7 +105,7 @@ class Pokes:
         return max(-(-frames // self.cycle(0).per_column), MIN_CYCLES)
 
     def more_cycles(self, cycles: int, error: float) -> int:
-        """Number of cycles required, given the standard error after `cycles`; `cycles` if too many are required."""
+        """Number of cycles required, given the error after `cycles`; `cycles` if they suffice or it is too many."""
         needed = cycles_for(self._request.snr, cycles, error)
         allowed = max(MAX_CYCLES_RATIO * self.cycles(), ALWAYS_ALLOWED_CYCLES)
         reachable = self._request.cycles is None and needed <= allowed
@@ -137,13 +137,13 @@ class Pokes:
             )
         shapes = self._cycle(0, 1.0).table @ self._basis
         steepest = float(np.abs(np.diff(shapes, axis=0)).max())
-        largest = _OF_THE_SLEW * self._slew_nm / max(steepest, 1e-9)
+        largest = _SLEW_FRACTION * self._slew_nm / max(steepest, 1e-9)
         if requested is None:
             return min(default_nm(method, self._request.snr), largest)
         if requested > largest:
             raise CalibrationError(
-                f"--amplitude {requested:g} nm: from push to pull an actuator would move by more than {_OF_THE_SLEW:g} "
-                f"of the slew limit; at most {largest:.3g} nm"
+                f"--amplitude {requested:g} nm: from push to pull an actuator would move by more than "
+                f"{_SLEW_FRACTION:g} of the slew limit; at most {largest:.3g} nm"
             )
         return requested
 
@@ -157,7 +157,7 @@ def largest_nm(config: Configuration, calibration: Calibration) -> Array:
     """Largest amplitude (modes,) at which push to pull stays within the slew limit, nm rms of wavefront."""
     slew_nm = min(config.safety.slew_nm, config.mirror.slew_nm)
     steepest = np.abs(calibration.modes_to_actuators).max(axis=0)
-    return np.asarray(_OF_THE_SLEW * slew_nm / (2 * np.maximum(steepest, 1e-9)), dtype=np.float64)
+    return np.asarray(_SLEW_FRACTION * slew_nm / (2 * np.maximum(steepest, 1e-9)), dtype=np.float64)
 
 
 def default_nm(method: str, snr: float) -> float:

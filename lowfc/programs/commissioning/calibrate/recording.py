@@ -28,8 +28,8 @@ AFTERWARDS = 8
 """Frames recorded after the end of a probe sequence: the longest delay that can be measured."""
 MAX_FRAMES_BEHIND = 100
 """Frames by which the mirror's reports may lag behind the controller's steps; beyond it the mirror is dead."""
-CHECKED = 100
-"""Frames between two renewals of the lease."""
+LEASE_CHECK_FRAMES = 100
+"""Frames between two checks that the lease is still in force."""
 MAX_REFUSED_FRAMES = 50
 """Consecutive refused frames after which a probe sequence is abandoned."""
 ATTEMPTS = 5
@@ -128,7 +128,7 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
                     _check_devices(mirror, step.frame_sequence, first)
                     recorded.append(step)
                     _check_refused(recorded)
-                    if len(recorded) % CHECKED == 0:
+                    if len(recorded) % LEASE_CHECK_FRAMES == 0:
                         loop.check_lease()
                 step = next(steps)
         _check_devices(mirror, step.frame_sequence, first)
@@ -136,7 +136,7 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
     return _recording(images, recorded, first)
 
 
-def watch(loop: Client, count: int) -> Pixels:
+def next_frames(loop: Client, count: int) -> Pixels:
     """The next `count` frames (count, rows, columns), DN; BusError if they stop."""
     return np.array([image.pixels for image in loop.frames(count)])
 

@@ -44,7 +44,7 @@ class Verdict(Result):
 
 
 class CalibrationProperties(Result):
-    """Properties of a calibration; lists have one value per mode, in the order of `noll`."""
+    """Properties of a calibration; `singular_values` and `kept` are by combination of modes, other lists by mode."""
 
     method: str = result_field("method")
     modes: int = result_field("modes")
@@ -83,7 +83,7 @@ class CalibrationResult(Verdict, CalibrationProperties):
 
 
 class Comparison(Result):
-    """Differences of two calibrations; lists have one value per mode, in the order of `noll`."""
+    """Differences of two calibrations: `estimators` and `bad_pixels` of each of the two, other lists by mode."""
 
     modes: int = result_field("modes")
     noll: list[int] = result_field("mode", form="Z{}", column=True)
@@ -261,7 +261,7 @@ def judge(
 
 
 def comparison(one: Calibration, other: Calibration) -> Comparison:
-    """Differences of two calibrations; lists have one value per mode, in the order of `noll`."""
+    """Differences of two calibrations: I0 and H of the second, as measured with R of the first."""
     if not comparable(one, other):
         raise CalibrationError(
             "calibrations with different sensors or modes cannot be compared: the first has "

@@ -39,7 +39,7 @@ from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, checks
 from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size
 
-_LIKE = 0.3
+_MIN_CORRELATION = 0.3
 """Smallest correlation of the first poke's image with the calibration in use without a warning."""
 
 
@@ -91,12 +91,12 @@ class Calibrator:
         self.pokes = Pokes(self.config, self.before, self.noise_nm, request)
         self._progress = progress
         self._player = Player(loop, self.before, report, self._closed)
-        self._what: dict[str, Any] = {
+        self._conditions: dict[str, Any] = {
             "method": request.method,
             "amplitude_nm": self.pokes.amplitude_nm,
             "calibration": self.before.id,
         }
-        self._resumed = resumed(partial_of(request.out), self._what) if request.resume else None
+        self._resumed = resumed(partial_of(request.out), self._conditions) if request.resume else None
         self.completed = self._resumed.cycles if self._resumed else 0
 
     @contextlib.contextmanager
@@ -136,7 +136,7 @@ class Calibrator:
         return state.mode if state is not None else wire.LOOP_MODE_OPEN
 
     def run(self, delay: Delay | None = None) -> CalibrationData:
-        """Measure the delay unless known, which checks that pokes are detected, then the response."""
+        """Measure the delay, unless given, which also checks that pokes are detected; then measure the response."""
         delay = self.delay() if delay is None else delay
         return CalibrationData(self._cycles(delay), delay)
 
@@ -153,14 +153,14 @@ class Calibrator:
         return check(np.array(answers), R @ data.measured.response, data.measured.error * np.sqrt(cycles))
 
     @property
-    def _best(self) -> int:
+    def _quietest_mode(self) -> int:
         """Index of the mode with the lowest noise; not tip or tilt, the most disturbed, unless there is no other."""
         tilt = np.array([index in TIP_TILT for index in self.before.noll])
         return int(np.where(tilt & ~tilt.all(), np.inf, self.noise_nm).argmin())
 
     def delay(self) -> Delay:
         """Measure the delay from poke to image with the mode of lowest noise."""
-        mode = self._best
+        mode = self._quietest_mode
         plan = self.pokes.delay(mode)
         self._show("detecting pokes", max(self.pokes.cycles(), self.completed), self.completed)
         found = self._player.first_poke(mode, plan)
@@ -175,7 +175,7 @@ class Calibrator:
     def _compare_response(self, response: Array, mode: int) -> None:
         known = self.before.response[:, mode].astype(np.float64)
         like = correlation(response, known)
-        if abs(like) < _LIKE:
+        if abs(like) < _MIN_CORRELATION:
             self._report(
                 f"warning: the image of Z{self.before.noll[mode]} differs from that of the calibration in use "
                 f"(correlation {like:.2f}): is the sensor aligned (`lowfc calibrate align`)?"
@@ -204,7 +204,7 @@ class Calibrator:
                 done = sums.cycles
                 self._show(f"{request.method} cycle {done + 1} of {needed}", needed, done)
                 sums = sums.plus(self._player.cycle(pokes.cycle(done), delay.delay_frames))
-                keep(path, sums, self._what)
+                keep(path, sums, self._conditions)
                 self.completed = sums.cycles
             found = measured(sums)
             more = pokes.more_cycles(needed, float(found.error.max()))
@@ -240,7 +240,7 @@ class Calibrator:
             before.flux_dn * camera.gain_e_per_dn / camera.em_gain,
             factory.equivalent_read_noise_e(camera),
         )
-        return best_initial(full_rank, delay.response, self._best, variance)
+        return best_initial(full_rank, delay.response, self._quietest_mode, variance)
 
 
 def partial_of(out: Path) -> Path:
@@ -249,7 +249,7 @@ def partial_of(out: Path) -> Path:
 
 
 def keep(path: Path, sums: Sums, what: dict[str, Any]) -> None:
-    """Write the completed cycles and their description; DataFileError if it cannot be written."""
+    """Write the completed cycles, with method, amplitude and calibration as `what`; DataFileError if that fails."""
     stream = io.BytesIO()
     arrays = sums._asdict() | {"initial": sums.initial.matrix, "estimator": sums.initial.estimator}
     np.savez(stream, what=np.array(json.dumps(what, sort_keys=True)), **arrays)

@@ -28,9 +28,9 @@ from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Twin, node_radii
 from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
 from lowfc.programs.cli.result import Result, result_field
-from lowfc.programs.commissioning.analytic import Wavefront, analytic
+from lowfc.programs.commissioning.analytic import WavefrontFunction, analytic
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
-from lowfc.programs.commissioning.calibrate.recording import Report, check_size, watch
+from lowfc.programs.commissioning.calibrate.recording import Report, check_size, next_frames
 from lowfc.programs.commissioning.calibrate.result import (
     CalibrationResult,
     compute_reconstructor,
@@ -115,7 +115,7 @@ def computed(
     return result_of(config, calibration, quality, "analytic", request.out)
 
 
-def zero_point(config: Configuration, text: str) -> tuple[str, Wavefront]:
+def zero_point(config: Configuration, text: str) -> tuple[str, WavefrontFunction]:
     """The wavefront of --at: modes as in 4=15,7=-10, Noll index = nm rms, or a file as for `lowfc ctl channel`.
 
     Returns:
@@ -152,7 +152,7 @@ def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load
     """Write the calibration in use with a new dark and mask, from the loop's frames or a cube."""
     require_folder(out)
     with Client(run) as loop, _in_use(loop) as (before, noise):
-        cube = watch(loop, frames) if file is None else images(file)
+        cube = next_frames(loop, frames) if file is None else images(file)
         if file is None:
             check_size(cube.shape[1:], before)
         elif cube.shape[1:] != before.shape:
@@ -170,7 +170,7 @@ def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> Refere
     """Write the calibration in use with the present image as its reference."""
     require_folder(out)
     with Client(run) as loop, _in_use(loop) as (before, noise):
-        cube = watch(loop, frames)
+        cube = next_frames(loop, frames)
         check_size(cube.shape[1:], before)
         pixels = cube.reshape(frames, -1)
         light, flux = normalised(pixels, before.dark.astype(np.float64), before.good.astype(np.float64))

@@ -49,11 +49,11 @@ def commission(
     from lowfc.client import Client, configuration_of
     from lowfc.programs.commissioning.analytic import analytic
     from lowfc.programs.commissioning.calibrate.tasks import reporter
-    from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning, first_of
+    from lowfc.programs.commissioning.commission.commissioning import Commissioning, CommissionOptions, provisional_path
 
     if dark is not None and no_dark:
         raise ConfigurationError("--dark FILE and --no-dark exclude each other: use one")
-    resumes = resume and (first_of(out).exists() or out.exists())
+    resumes = resume and (provisional_path(out).exists() or out.exists())
     if dark is None and not no_dark and not resumes and not sys.stdin.isatty():
         raise ConfigurationError(
             "without a terminal nobody can be asked to block the star for a dark: give dark frames with --dark FILE, "
@@ -64,7 +64,7 @@ def commission(
     require_folder(out)
     console = Console(stderr=True)
     report = reporter(console)
-    options = Commission(out, frames, dark, no_dark, snr, cycles, resume, close)
+    options = CommissionOptions(out, frames, dark, no_dark, snr, cycles, resume, close)
 
     def confirm(what: str) -> None:
         typer.confirm(what, default=True, abort=True, err=True)

@@ -26,7 +26,7 @@ from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.commissioning.calibrate.pokes import MIN_SNR, CalibrationRequest, Pokes
-from lowfc.programs.commissioning.calibrate.recording import CHECKED, Player, Report, watch
+from lowfc.programs.commissioning.calibrate.recording import LEASE_CHECK_FRAMES, Player, Report, next_frames
 from lowfc.programs.commissioning.calibrate.result import finish_calibration
 from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of, stored
 from lowfc.programs.commissioning.calibrate.tasks import images
@@ -41,8 +41,8 @@ from lowfc.programs.commissioning.commission.first_light import (
 METHOD = "hadamard"
 DEFAULT_SNR = 50.0
 """Signal-to-noise ratio required of the noisiest mode, unless the number of cycles is given."""
-LOOKED_AT = 32
-"""Frames for determining size, rate and flux."""
+CAMERA_FRAMES = 32
+"""Frames from which size, rate and brightness are determined."""
 CHECK_GAIN = 0.1
 """Gain of the closed-loop check in place of automatic gains, which are 0 before they are measured.
 
@@ -51,7 +51,7 @@ It is stable at any usual delay; with a wrong sign the error grows tenfold in 25
 MAX_OF_PREDICTED = 1.5
 """Largest ratio of measured to predicted error in the closed loop."""
 MIN_PREDICTED = 1000
-"""Open-loop frames for the prediction of the residual, and closed-loop frames for its measurement."""
+"""Least frames, after settling, for the prediction of the residual, and for its measurement."""
 STEPS = (
     *("camera", "dark and bad pixels", "reference image", "delay", "orientation and sign", "poke amplitude"),
     *("response", "verdict", "prediction", "closed loop"),
@@ -59,7 +59,7 @@ STEPS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Commission:
+class CommissionOptions:
     """The options of `lowfc commission`."""
 
     out: Path
@@ -72,7 +72,7 @@ class Commission:
     close: bool
 
 
-def first_of(out: Path) -> Path:
+def provisional_path(out: Path) -> Path:
     """File of the provisional calibration until the final one is written."""
     return out.with_name(f"{out.name}.first.fits")
 
@@ -85,7 +85,7 @@ class Commissioning:
         loop: Client,
         config: Configuration,
         computed: Calibration,
-        options: Commission,
+        options: CommissionOptions,
         report: Report,
         progress: Counted,
         confirm: Callable[[str], None],
@@ -95,12 +95,12 @@ class Commissioning:
         self._report, self._progress, self._confirm = report, progress, confirm
         self._results: dict[str, Any] = {}
         self._delay: Delay | None = None
-        self._kept: Path | None = None  # the file of the provisional calibration, once this one uses it
+        self._kept: Path | None = None  # file of the provisional calibration, once that is in use
         self._advice = ""  # after an early end, once the calibration is loaded
 
     def run(self) -> tuple[dict[str, Any], str]:
         """Carry out all steps; return the results, and the text for people."""
-        options, first_file = self._options, first_of(self._options.out)
+        options, first_file = self._options, provisional_path(self._options.out)
         if options.resume and not first_file.is_file():
             if options.out.is_file():
                 raise CalibrationError(
@@ -210,7 +210,7 @@ class Commissioning:
 
     def _first(self) -> Calibration:
         self._step("camera")
-        frames = list(self._loop.frames(LOOKED_AT))
+        frames = list(self._loop.frames(CAMERA_FRAMES))
         camera = camera_fits(self._config, self._loop.camera_state(), frames, self._report)
         self._step("dark and bad pixels")
         options, sensor = self._options, without_dark(camera)
@@ -220,10 +220,10 @@ class Commissioning:
             self._report(f"no dark: the camera's bias of {camera.bias_dn:g} DN for all pixels, and no bad pixels")
         else:
             self._confirm("block the star; is it dark?")
-            sensor = darkened(camera, watch(self._loop, options.frames), self._report)
+            sensor = darkened(camera, next_frames(self._loop, options.frames), self._report)
             self._confirm("unblock the star; is it visible?")
         self._step("reference image")
-        before = referenced(sensor, watch(self._loop, options.frames), self._computed, self._report)
+        before = referenced(sensor, next_frames(self._loop, options.frames), self._computed, self._report)
         self._step("delay")
         player = Player(self._loop, before, self._report)
         self._delay = delay = first_delay(player, self._config)
@@ -323,7 +323,7 @@ class Commissioning:
                 raise CalibrationError(f"the loop went from {mode.in_words} to {step.mode.in_words}")
             if len(steps) >= frames:
                 break
-            if len(steps) % CHECKED == 0:
+            if len(steps) % LEASE_CHECK_FRAMES == 0:
                 self._loop.check_lease()
         return steps_as_columns(steps, len(self._computed.noll))
 

@@ -21,7 +21,7 @@ from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 
 FIRST_NM = AMPLITUDE_NM["poke"]
 MAX_FIRST_NM = 32.0
-"""Largest amplitude of the first pokes, nm rms of wavefront; it is doubled until they are detected."""
+"""Amplitude up to which that of the first pokes is doubled until they are detected, nm rms of wavefront."""
 MAX_MISFIT = 0.35
 """Largest residual of the image after the fit of the computed one; above it the sensor is not the configured one."""
 MIN_LIKENESS = 0.5
@@ -124,7 +124,7 @@ def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: f
             plan = _poke_cycle(modes, amplitude_nm, again)
             gains[level, again] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
     off = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
-    # variance of the mean of two, times two amplitudes; at least the average over modes (tip and tilt scatter more)
+    # variance of a mean of two gains, for both amplitudes; at least the average over modes (tip and tilt scatter more)
     squares = np.square(np.diff(gains, axis=1)).mean(axis=(0, 1)) / 2
     error = np.sqrt(np.maximum(squares, squares.mean()))
     worst = int((off - _SURE * error).argmax())

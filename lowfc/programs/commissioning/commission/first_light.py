@@ -82,7 +82,7 @@ def camera_fits(
 
 
 def without_dark(camera: CameraSettings) -> Sensor:
-    """A sensor without a measured dark: its bias for all pixels, no bad pixels."""
+    """A sensor without a measured dark: the camera's bias for all pixels, no bad pixels."""
     pixels = camera.shape[0] * camera.shape[1]
     return Sensor(camera, np.full(pixels, float(camera.bias_dn)), np.ones(pixels), measured=False)
 

@@ -71,9 +71,9 @@ def mirror(
 ) -> None:
     """Send commands to a mirror and check its states against the contract; exit status 1 if a check fails.
 
-    The check takes the place of the controller, which must not be running. The commands are 5 % of what the
-    configuration allows in one move. If the mirror passes, the check then exceeds the stroke, slew and neighbour limits
-    a little, unless --gentle, to test that the mirror keeps them. At the end the mirror returns to its shape.
+    The check takes the place of the controller, which must not be running. Ordinary commands are 5 % of what the
+    configuration allows in one move. Unless --gentle, the mirror is also raised by up to 10 nm, to see it relax; if it
+    passes, commands then exceed its stroke, slew and neighbour limits. At the end it returns to its shape.
 
     Example: lowfc conformance mirror --run bench --config lowfc.toml
     """

@@ -25,8 +25,8 @@ TURN_S = 0.002
 Show = Callable[[str], None]
 
 _PATTERN_SEED = 5
-_GENTLE = 0.05
-_MAX_MOVES = 400
+_GENTLE = 0.05  # ordinary commands as a fraction of the smallest limit
+_MAX_MOVES = 400  # to a distant shape
 
 
 class Expected:

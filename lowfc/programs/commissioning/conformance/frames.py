@@ -13,14 +13,14 @@ from lowfc.programs.commissioning.conformance.line import NS
 from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
 from lowfc.programs.commissioning.conformance.settings import SETTINGS
 
-_SILENT_PERIODS = 5
-_JITTER = 0.1
-_SMOOTHER = 2.0
-_READOUT_NS = 50_000_000
-_FULL = 0.01
-_STOPPED_NS = 300_000_000
-_VARIED = 8
-_AGE_NS = 1_000_000
+_SILENT_PERIODS = 5  # longest wait between frames that is not reported
+_JITTER = 0.1  # of the period
+_SMOOTHER = 2.0  # ratio of roughness at which bytes count as swapped
+_READOUT_NS = 50_000_000  # longest plausible time from end of exposure to publication
+_FULL = 0.01  # fraction of saturated pixels that is reported
+_STOPPED_NS = 300_000_000  # a shorter silence at either end does not count
+_VARIED = 8  # different values needed to judge the alignment of bits
+_AGE_NS = 1_000_000  # tolerance of times
 _OWN_WAIT_NS = 10_000_000  # shorter waits may be caused by this host, not by the camera
 
 ARRIVED: Table[Camera] = Table()

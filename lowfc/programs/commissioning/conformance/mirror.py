@@ -19,9 +19,9 @@ SLACK_NS = 400_000_000
 
 _FOLLOWING, _EXPIRED = wire.MIRROR_STATUS_FOLLOWING, wire.MIRROR_STATUS_EXPIRED
 _LONG_NS = 60 * NS
-_REFUSED_EVERY_NS = 50_000_000
+_REFUSED_EVERY_NS = 50_000_000  # between refused commands
 _RAISED_NM = 10.0  # height above the shape to which the mirror relaxes
-_REFUSAL_S = 0.15
+_REFUSAL_S = 0.15  # time in which a command would show in the states
 _NEAR, _BEYOND, _FAR = 0.9, 1.05, 2.0  # multiples of a limit
 _SETTLE_S = 0.05  # for drivers that report measured actuator heights, not the targets
 

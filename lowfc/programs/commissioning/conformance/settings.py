@@ -90,7 +90,7 @@ def _size(camera: Camera) -> Check | None:
     return wrong(got, "exchange rows and columns" if swapped else "publish the size of the region that is sent")
 
 
-@SETTINGS.check("settings' range", "no pixel above saturation_dn and the converter")
+@SETTINGS.check("settings' range", "no pixel above saturation_dn or the converter's largest value")
 def _range(camera: Camera) -> Check | None:
     if (state := camera.settings) is None or not camera.frames:
         return None

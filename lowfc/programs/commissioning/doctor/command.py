@@ -80,10 +80,10 @@ def doctor(
 def examine(facts: "Facts") -> list[Check]:
     """The result of every check; a note if a check cannot read its data."""
     from lowfc.contract.errors import LowfcError
-    from lowfc.programs.commissioning.doctor import room, timing
+    from lowfc.programs.commissioning.doctor import resources, timing
 
     unknown = (OSError, ValueError, LookupError, LowfcError)
-    return [*timing.CHECKS.of(facts, unknown), *room.CHECKS.of(facts, unknown)]
+    return [*timing.CHECKS.of(facts, unknown), *resources.CHECKS.of(facts, unknown)]
 
 
 def measured(facts: "Facts") -> dict[str, Any]:

@@ -18,13 +18,13 @@ CHECKS: Table[Facts] = Table()
 PROCESSES = ("camera", "controller", "mirror", "recorder")
 
 _IN_LOOP = 3  # number of these processes that are in the control loop
-_SLOW_EXIT_US = 50
+_SLOW_EXIT_US = 50  # longest acceptable exit from an idle state
 _SLOW_SOURCES = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
 _SLOW_READING_NS = 1000
-_READINGS = 200
-_PART_OF_PERIOD = 0.1
-_STOLEN = 1e-3
-_BUSY = 0.1
+_READINGS = 200  # of the clock, timed together
+_PART_OF_PERIOD = 0.1  # acceptable p99 of the wake-up, in frame periods
+_STOLEN = 1e-3  # larger shares of stolen time are called much
+_BUSY = 0.1  # smallest share of a processor that is reported
 _BUSY_SHOWN = 3
 
 

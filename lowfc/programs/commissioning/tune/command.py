@@ -57,7 +57,7 @@ def tune(
             telemetry = telemetry_from_log(reader)
     else:
         with Client(run) as loop, passing_bar(console) as bar:
-            task = bar.add_task("listening", total=live)
+            task = bar.add_task("observing", total=live)
             telemetry = telemetry_from_run(loop, live or 0.0, lambda passed_s: bar.update(task, completed=passed_s))
     with passing_bar(console) as bar:
         bar.add_task(f"tuning {controller}", total=None)
@@ -74,12 +74,12 @@ def tune(
     if apply:
         with Client(run) as loop:
             integrator = controller == "integrator"
-            answer = integrate(loop, gains.gain.tolist(), telemetry.noll) if integrator else loop.law(best.law)
+            answer = apply_gains(loop, gains.gain.tolist(), telemetry.noll) if integrator else loop.law(best.law)
         found.applied = answer.sentence
     print_result(found, as_json=as_json)
 
 
-def integrate(loop: "Client", gains: list[float], noll: tuple[int, ...]) -> "Answer":
+def apply_gains(loop: "Client", gains: list[float], noll: tuple[int, ...]) -> "Answer":
     """Let the integrator drive the mirror with these gains; on refusal the previous law stays in force."""
     from lowfc.contract.codecs.law_codec import driving
 

@@ -45,7 +45,7 @@ class CaseFailedError(LowfcError):
 
 
 @dataclass(slots=True)
-class Ended:
+class ProcessEnd:
     """End of a process.
 
     Attributes:
@@ -83,7 +83,7 @@ class Outcome:
     folder: Path
     config: Configuration
     marks: dict[str, int] = field(default_factory=dict)
-    ended: list[Ended] = field(default_factory=list)
+    ended: list[ProcessEnd] = field(default_factory=list)
     alive: list[str] = field(default_factory=list)
     killed_ns: list[int] = field(default_factory=list)
     mode: int = 0
@@ -241,7 +241,7 @@ class ChaosBench:
     def _record_end(self, child: Child, after_s: float, *, requested: bool) -> None:
         if id(child) not in self._recorded_ends:
             self._recorded_ends.add(id(child))
-            self.outcome.ended.append(Ended(child.name, child.status or 0, after_s, requested))
+            self.outcome.ended.append(ProcessEnd(child.name, child.status or 0, after_s, requested))
 
     def _receive(self, sample: Sample) -> None:
         topic = topic_of(sample.key)

@@ -190,7 +190,8 @@ def render(results: dict[str, Any]) -> str:
         lines.append(f"{row['name']:{width}}  {_result(row):6}  {row['seconds']:5.1f} s  {_recovery(row)}")
         lines += [f"    {wrong}" for wrong in _wrong(row)]
         lines += [f"    {name}: {value}" for name, value in row["figures"].items()]
-        lines += [f"    logs: {row['log']}"] * (row["log"] is not None)
+        if row["log"] is not None:
+            lines.append(f"    logs: {row['log']}")
     totals = [f"{results['passed']} passed", f"{results['failed']} failed"]
     if results["skipped"]:
         totals.append(f"{results['skipped']} skipped")

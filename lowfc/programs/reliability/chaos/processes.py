@@ -96,14 +96,14 @@ def _stalled_viewer(bench: ChaosBench) -> None:
 
 
 class CommandTimes:
-    """Frame-to-command latencies of a bench that has begun; those of `measure` are measurements of its case."""
+    """Frame-to-command latencies of a bench that has begun; its outcome has those of each measured phase."""
 
     def __init__(self, bench: ChaosBench) -> None:
         assert bench.bus is not None  # noqa: S101  # the bench has begun
-        self.found: dict[str, dict[str, float]] = {}
+        self.phases: dict[str, dict[str, float]] = {}
         self._latencies_ns: list[int] = []
         bench.bus.subscribe(TIMING, self._receive)
-        bench.outcome.measurements["frame_to_command"] = self.found
+        bench.outcome.measurements["frame_to_command"] = self.phases
 
     def drain(self) -> dict[str, float]:
         """Number of frames timed since the last call, their p50 and p99; empty without frames."""
@@ -119,7 +119,7 @@ class CommandTimes:
         self.drain()
         time.sleep(seconds)
         if found := self.drain():
-            self.found[name] = found
+            self.phases[name] = found
 
     def _receive(self, sample: Sample) -> None:
         self._latencies_ns.extend(wire.ControlTiming.FromString(sample.payload).frame_to_command_ns)
@@ -132,7 +132,7 @@ def compare(bench: ChaosBench, stall: Callable[[], contextlib.AbstractContextMan
     with stall():
         times.measure("during", STALL_S)
     times.measure("after", CALM_S)
-    if len(times.found) == 3:
-        before, during, after = (one["p99_us"] for one in times.found.values())
+    if len(times.phases) == 3:
+        before, during, after = (one["p99_us"] for one in times.phases.values())
         bench.outcome.measurements["p99_during_over_calm"] = round(during / ((before + after) / 2), 2)
         bench.outcome.measurements["p99_after_over_before"] = round(after / before, 2)

@@ -58,11 +58,10 @@ def process_statistics(samples: Sequence[Usage]) -> dict[str, Any]:
         checks = {"memory": leaks, "handles": _grew(handles), "threads": _grew(threads)}
         grows, too_short = [name for name, grew in checks.items() if grew], []
     measured = {"memory": [round(one, 2) for one in memory_mb], "handles": handles, "threads": threads}
-    ends = {
-        f"{what}_{at}{'_mb' * (what == 'memory')}": value
-        for what, values in measured.items()
-        for at, value in (("first", values[0]), ("most", max(values)), ("last", values[-1]))
-    }
+    ends: dict[str, Any] = {}
+    for what, values in measured.items():
+        unit = "_mb" if what == "memory" else ""
+        ends |= {f"{what}_first{unit}": values[0], f"{what}_most{unit}": max(values), f"{what}_last{unit}": values[-1]}
     return {**ends, **_per_hour("memory_mb", memory), "grows": grows, "too_short": too_short}
 
 
@@ -85,7 +84,7 @@ def _per_hour(name: str, found: tuple[float, float] | None) -> dict[str, float |
 def too_short(processes: Mapping[str, Mapping[str, Any]], latency: Mapping[str, float | None]) -> list[str]:
     """Checks for which the time was too short."""
     found = [f"the {name}'s {what}" for name, one in processes.items() for what in one["too_short"]]
-    return found + ["the latency"] * (latency["p50_us_per_hour"] is None)
+    return [*found, "the latency"] if latency["p50_us_per_hour"] is None else found
 
 
 def verdict(results: Mapping[str, Any]) -> str:

@@ -19,7 +19,7 @@ HISTOGRAM = "latency/histogram"
 WHOLE = Plot("latency/frame_to_command", "Frame to command, last second, us", {"p50": BLUE, "p99": ORANGE, "max": RED})
 PARTS = Plot(
     "latency/stages",
-    "Stages of it, p99 of the last second, us",
+    "Stages, p99 of the last second, us",
     dict(zip(STAGES[:-1], distinct(len(STAGES) - 1), strict=True)),
 )
 COUNTS = Plot(

@@ -60,9 +60,9 @@ class RunState:
         snapshot: last snapshot.
         mode: loop mode; None before the first message about it. `why` is the cause of its last change.
         running_s: time since the first message.
-        rate_hz: frame rate, from the times of the steps; None with less than two steps.
+        rate_hz: frame rate, from the times of the steps; None with fewer than two steps.
         controller, camera, mirror, recorder: liveness of the processes; with several mirrors that of the worst.
-        frame_silent_s, step_silent_s: time without a frame or step; None up to 1 s or ten frame periods.
+        frame_silent_s, step_silent_s: time without a frame or step; None up to 1 s, or ten frame periods if longer.
         recent, now, totals: counts of each reason, of "steps", and of "skipped", "missing", "late" and "lost", in
             `RECENT_S`, in `NOW_S` and since the start.
         flux: light on the newest frame as a fraction of the calibration's; None without both.

@@ -217,10 +217,8 @@ class Watcher:
         if not self._steady.feed(snapshot):
             return
         if before != (self._steady.mode, self._steady.law):
-            self._comparison, self._compared_ns = (
-                None,
-                snapshot.time_ns,
-            )  # the last result was for another law or loop mode
+            self._comparison = None  # the last result was for another law or loop mode
+            self._compared_ns = snapshot.time_ns
         if snapshot.time_ns - self._compared_ns >= COMPARISON_PERIOD_NS:
             self._compared_ns = snapshot.time_ns
             rate_hz = frame_rate_hz(snapshot.camera, snapshot.steps)

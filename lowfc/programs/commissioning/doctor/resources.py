@@ -17,8 +17,8 @@ from lowfc.programs.core.recording.volume import bytes_per_s, configured_selecti
 CHECKS: Table[Facts] = Table()
 """The docstring of each check describes its subject; docs/howto/doctor.md also describes its warning."""
 
-_STALL_S = 0.1
-_OPEN_FILES = 256
+_STALL_S = 0.1  # stall of a reader that socket buffers should outlast
+_OPEN_FILES = 256  # needed by a process
 _LIMITS = "`lowfc doctor --setup` (memlock unlimited in /etc/security/limits.d), or the service LimitMEMLOCK=infinity"
 
 
