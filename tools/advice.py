@@ -191,7 +191,7 @@ ADVICE: dict[str, Advice] = {
     ),
     "VIEW_STUCK": Advice("the viewer's window reads no data.", "close it if it hangs, and start `lowfc view` again."),
     "VIEW_RENEWED": Advice(
-        "the viewer hung or exceeded its memory limit.", "reload the page in a browser; a window returns by itself."
+        "the viewer hung, ended or used too much memory.", "reload the page in a browser; a window returns by itself."
     ),
     "BAD_MESSAGE": Advice(
         "a message could not be decoded or has an impossible time: another version, or a faulty program.",

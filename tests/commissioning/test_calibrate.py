@@ -22,7 +22,7 @@ from lowfc.control.calibration.response_fit import Initial, Sums, cross_talk
 from lowfc.programs.commissioning.calibrate import pokes, recording
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
 from lowfc.programs.commissioning.calibrate.result import measured_calibration
-from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator, keep, partial_of, resumed
+from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator, partial_of, resumed, store
 from tests.support.in_process_loop import BRIGHT, InProcessLoop
 
 OUT = Path("night.fits")
@@ -171,7 +171,7 @@ def test_a_closed_loop_is_opened_for_pokes_and_closed_afterwards() -> None:
 
 def test_unreadable_cycles_give_an_error_of_one_line() -> None:
     path = partial_of(OUT)
-    keep(path, Sums.none(Initial(np.zeros((2, 4)), "weighted")), {"method": "poke"})
+    store(path, Sums.none(Initial(np.zeros((2, 4)), "weighted")), {"method": "poke"})
     intact = path.read_bytes()
     other_array = io.BytesIO()
     np.save(other_array, np.zeros(3))

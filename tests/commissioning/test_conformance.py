@@ -35,7 +35,7 @@ from lowfc.control.loop.safety import Limits
 from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.device.mirror_loop import command_of, state_of
 from lowfc.device.mirror_protection import Command, Status
-from lowfc.programs.commissioning.checks import Check, put
+from lowfc.programs.commissioning.checks import Check, print_report
 from lowfc.programs.commissioning.conformance import command as conformance
 from lowfc.programs.commissioning.conformance.camera import watch
 from lowfc.programs.commissioning.conformance.command import FIELDS, STATUSES
@@ -465,12 +465,12 @@ def test_configured_dead_and_stuck_actuators_are_no_fault(dead: list[int], untes
 
 def test_the_report_has_advice_for_failed_checks(capsys: pytest.CaptureFixture[str]) -> None:
     checks = list(camera_checks(watch(Camera(frame=setting(encoding="16UC1")), 1.0, lambda _: None)))
-    put(checks, STATUSES, FIELDS, None)
+    print_report(checks, STATUSES, FIELDS, None)
     text = capsys.readouterr().out
     assert "'16UC1'" in text
     assert "with encoding mono16" in text
     assert text.splitlines()[-1].startswith("1 wrong, 0 warnings")
-    put(checks, STATUSES, FIELDS, {"run": "bench"})
+    print_report(checks, STATUSES, FIELDS, {"run": "bench"})
     printed = json.loads(capsys.readouterr().out)
     assert (printed["run"], printed["counts"]) == ("bench", {"ok": len(checks) - 1, "warning": 0, "wrong": 1})
     assert {"name": "encoding", "status": "wrong"}.items() <= printed["checks"][5].items()

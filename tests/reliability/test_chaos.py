@@ -30,7 +30,7 @@ from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.command import _run, chaos, configured
 from lowfc.programs.reliability.chaos.evidence import FORGED_S, Entry, Evidence, read
 from lowfc.programs.reliability.chaos.frames import FAULTY_FRAMES, FIRST
-from lowfc.programs.reliability.chaos.rules import FLOOR_NM, WITHIN, Finding, judge, recovered_s, restart_steps_nm
+from lowfc.programs.reliability.chaos.rules import FLOOR_NM, MAX_RATIO, Finding, judge, recovered_s, restart_steps_nm
 from sim_camera.faults import Kind
 
 START_S = 1_800_000_000
@@ -115,7 +115,7 @@ def ended(name: str, *how: object) -> Callable[[Evidence, Outcome], None]:
     return lambda _, outcome: outcome.ended.append(ProcessEnd(name, *how))
 
 
-LARGE_RESIDUALS = [truth(FRAMES - 1, 5 * (WITHIN * 2 + FLOOR_NM))] * 100
+LARGE_RESIDUALS = [truth(FRAMES - 1, 5 * (MAX_RATIO * 2 + FLOOR_NM))] * 100
 STEPS = (0, STEP.key, START_S)
 FAULTS: list[tuple[str, str, Callable[[Evidence, Outcome], object]]] = [
     ("limits", "stroke", lambda e, _: e.entries[COMMAND].append(shape(FRAMES, 701))),

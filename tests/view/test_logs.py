@@ -186,7 +186,7 @@ def test_the_trend_of_a_night_has_a_limited_number_of_spans() -> None:
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
     averages.add(np.array([snapshot.truths.time_ns[0] + 10 * 3600 * 10**9]), slice(0, 3), np.ones((1, 2)))
     after_ns, rms_nm = averages.wavefront()
-    assert span_means.MOST / 2 <= len(after_ns) <= span_means.MOST
+    assert span_means.MAX_SPANS / 2 <= len(after_ns) <= span_means.MAX_SPANS
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
     assert np.isnan(rms_nm[1:-1]).all()  # nothing in between: a gap
     for days in (6, 12, 100):  # a view may run for weeks; the last is an error of the clock

@@ -451,13 +451,13 @@ def test_latencies_are_those_of_the_last_second() -> None:
     health = {Role.CONTROLLER: LastHealth(0, controller, controller), Role.RECORDER: LastHealth(0, recorder, recorder)}
     for number, timings in enumerate(batches):
         drawn(panel, tape, number * 100_000_000, timings=timings, health=health)
-    times_ns, found = tape.column(latency.WHOLE.path)
+    times_ns, found = tape.column(latency.TOTAL.path)
     np.testing.assert_array_equal(times_ns - START_NS, np.arange(4) * latency.Latency.period_ns)
     last_us = {stage: np.concatenate([one[stage] for one in batches[6:]]) / 1e3 for stage in STAGES}
     whole_us = last_us["frame_to_command"]
     np.testing.assert_allclose(found[-1], [*np.percentile(whole_us, [50, 99]), whole_us.max()])
-    stages_us = [np.percentile(last_us[stage], 99) for stage in tape.names(latency.PARTS.path)]
-    np.testing.assert_allclose(tape.column(latency.PARTS.path)[1][-1], stages_us)
+    stages_us = [np.percentile(last_us[stage], 99) for stage in tape.names(latency.STAGE_DURATIONS.path)]
+    np.testing.assert_allclose(tape.column(latency.STAGE_DURATIONS.path)[1][-1], stages_us)
     bars = tape.last(latency.HISTOGRAM)
     counts, middles = (np.array(values_of(one)[0]["buffer"]) for one in (bars.values, bars.abscissa))
     widths = np.array(values_of(bars.widths)).ravel()
@@ -471,6 +471,6 @@ def test_a_silent_controller_has_no_latency() -> None:
     tape, panel = Tape(), latency.Latency()
     drawn(panel, tape, 0, timings={stage: np.full(10, 400_000) for stage in STAGES})
     drawn(panel, tape, 5_000_000_000)
-    assert len(tape.rows[latency.WHOLE.path]) == 1
+    assert len(tape.rows[latency.TOTAL.path]) == 1
     assert not any(values_of(tape.last(latency.HISTOGRAM).values)[0]["buffer"])
     assert not tape.rows[latency.COUNTS.path], "no Health has arrived"

@@ -102,7 +102,7 @@ class Table(Generic[S]):
 
         return enter
 
-    def of(self, subject: S, unknown: tuple[type[Exception], ...] = ()) -> Iterator[Check]:
+    def run(self, subject: S, unknown: tuple[type[Exception], ...] = ()) -> Iterator[Check]:
         """Run every check on `subject`; a check that raises one of the `unknown` exceptions gives a note."""
         for template, function in self.functions.values():
             try:
@@ -115,7 +115,7 @@ class Table(Generic[S]):
                 yield found._replace(name=template.name, expected=template.expected)
 
 
-def put(
+def print_report(
     checks: list[Check], worst_first: tuple[Status, ...], fields: Mapping[str, str], about: dict[str, Any] | None
 ) -> None:
     """Print a report.
@@ -126,10 +126,10 @@ def put(
         fields: JSON key to attribute of a check.
         about: Other members of the JSON object; None for a text table.
     """
-    ended = Counter(check.status for check in checks)
+    numbers = Counter(check.status for check in checks)
     if about is not None:
         rows = [{key: getattr(check, attribute) for key, attribute in fields.items()} for check in checks]
-        counts = {str(status): ended[status] for status in reversed(worst_first)}
+        counts = {str(status): numbers[status] for status in reversed(worst_first)}
         sys.stdout.write(json.dumps({"checks": rows, "counts": counts} | about) + "\n")
         return
     from rich.console import Console
@@ -147,7 +147,7 @@ def put(
     console = Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False)
     console.print(grid)
     words = [
-        f"{ended[status]} {status}" if status in (Status.OK, Status.WRONG) else counted(ended[status], status)
+        f"{numbers[status]} {status}" if status in (Status.OK, Status.WRONG) else counted(numbers[status], status)
         for status in worst_first
     ]
     console.print(f"\n{', '.join(words)}")

@@ -26,7 +26,7 @@ from lowfc.programs.console.feed import Feed, Reading
 from lowfc.programs.console.form import Form, Help
 from lowfc.programs.console.gains import Gains
 from lowfc.programs.console.history import History
-from lowfc.programs.console.keys import AT_ONCE, OrderedKeys
+from lowfc.programs.console.keys import IMMEDIATE_KEY, OrderedKeys
 from lowfc.programs.console.lines import Lines
 from lowfc.programs.console.phrases import phrased
 from lowfc.programs.console.task import Task
@@ -97,7 +97,7 @@ class Console(OrderedKeys):
     BINDINGS: ClassVar[list[BindingType]] = [
         *(Binding(f"{one.key},{one.key.upper()}", f"press({one.name!r})") for one in ACTIONS),
         Binding("s,S", f"press({SAFE.name!r})"),
-        Binding(AT_ONCE, f"press({SAFE.name!r})", priority=True),
+        Binding(IMMEDIATE_KEY, f"press({SAFE.name!r})", priority=True),
         *(Binding(key, f"choose({by})") for key, by in (("up", -1), ("down", 1))),
         *(Binding(key, f"turn({by})") for key, by in (("left", -1), ("right", 1), ("minus", -1), ("plus", 1))),
         Binding("u,U", "automatic"),

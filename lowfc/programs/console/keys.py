@@ -8,7 +8,7 @@ from textual.app import App
 from textual.dom import DOMNode
 from textual.screen import Screen
 
-AT_ONCE = "f12"
+IMMEDIATE_KEY = "f12"
 """Key that does not wait for the others."""
 _TIMEOUT_S = 1.0
 """Longest time that a key waits for the previous one."""
@@ -33,8 +33,8 @@ class OrderedKeys(App[str]):
         return False
 
     async def on_event(self, event: events.Event) -> None:
-        """Queue keys, except `AT_ONCE`."""
-        if not isinstance(event, events.Key) or event.is_forwarded or event.key == AT_ONCE:
+        """Queue keys, except `IMMEDIATE_KEY`."""
+        if not isinstance(event, events.Key) or event.is_forwarded or event.key == IMMEDIATE_KEY:
             await super().on_event(event)
             return
         self._waiting.append(event)

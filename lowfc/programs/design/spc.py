@@ -44,8 +44,8 @@ Value = TypeVar("Value")
 class ShapedPupil(Result):
     """Properties of the mask found.
 
-    `below_optimum_at_limit_fraction` is the fraction of the circle by which the best mask with `limit` times the
-    contrast may be more open; with the contrast itself it may be more.
+    `below_optimum_at_limit_fraction`: the best mask with `limit` times the required contrast is more open by at most
+    this fraction of the circle; the best one with the required contrast may be still more open.
     """
 
     open_area_fraction: float = result_field("open area", "of the circle", ".2%")

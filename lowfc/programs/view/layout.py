@@ -83,13 +83,13 @@ def _operator() -> rrb.Container:
         column_shares=[1, 1, 1, 1, 2],
     )
     courses = rrb.Horizontal(_picture(trend.TREND), wavefront.RMS.view(), wavefront.TILT.view(), _CONTRAST())
-    below = rrb.Horizontal(_MODE(), latency.WHOLE.view(), _events(), column_shares=[2, 3, 4])
+    below = rrb.Horizontal(_MODE(), latency.TOTAL.view(), _events(), column_shares=[2, 3, 4])
     return rrb.Vertical(_picture(tiles.TILES), pictures, courses, below, row_shares=[10, 9, 9, 7], name=Tab.OPERATOR)
 
 
 def _whole_log() -> rrb.Container:
     courses = rrb.Horizontal(_picture(trend.TREND), wavefront.TILT.view(), _CONTRAST())
-    rates = rrb.Horizontal(loop.FLUX.view(), mirror.STROKE.view(), latency.WHOLE.view(), latency.COUNTS.view())
+    rates = rrb.Horizontal(loop.FLUX.view(), mirror.STROKE.view(), latency.TOTAL.view(), latency.COUNTS.view())
     below = rrb.Horizontal(_MODE(), _events(worst=True), column_shares=[3, 5])
     return rrb.Vertical(_picture(tiles.TILES), courses, rates, below, row_shares=[11, 10, 8, 9], name=Tab.OPERATOR)
 
@@ -114,7 +114,7 @@ def _engineering() -> rrb.Container:
         rrb.Vertical(wavefront.GROUPS.view(), *spectra_, mirror.STROKE.view(), row_shares=[2, 4, 4, 2]),
         rrb.Vertical(
             histogram,
-            latency.PARTS.view(),
+            latency.STAGE_DURATIONS.view(),
             latency.COUNTS.view(),
             rrb.Horizontal(loop.FLUX.view(), loop.SATURATED.view()),
         ),

@@ -18,7 +18,7 @@ from lowfc.control.calibration.alignment import Alignment, Geometry, align, onto
 from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.analytic import analytic
-from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, largest_nm, sequence
+from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, first_poke_plan, largest_nm
 from lowfc.programs.commissioning.calibrate.recording import Player, check_size, next_frames
 from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 from lowfc.programs.commissioning.calibrate.tasks import reporter, write
@@ -44,7 +44,7 @@ class AlignResult(Result):
         return ["the pokes have the right sign"]
 
 
-def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResult:
+def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResult:
     """Fit the sensor's geometry, resample the computed calibration to its pixels and write the file."""
     require_folder(out)
     console = Console(stderr=True)
@@ -62,7 +62,7 @@ def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResu
         calibration = on_sensor(config, computed, found.geometry, flux_dn, before)
         mode = int(np.argmax(np.linalg.norm(calibration.response, axis=0)))
         amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_nm(config, calibration)[mode]))
-        poke = Player(loop, calibration, reporter(console)).first_poke(mode, sequence(amplitude_nm))
+        poke = Player(loop, calibration, reporter(console)).first_poke(mode, first_poke_plan(amplitude_nm))
         if poke.response @ calibration.response[:, mode] < 0:
             found = replace(found, geometry=found.geometry.rotated_180())
             calibration = on_sensor(config, computed, found.geometry, flux_dn, before)

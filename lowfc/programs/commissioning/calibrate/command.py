@@ -100,7 +100,7 @@ def calibrate(
                 raise ConfigurationError(f"{option} is for pokes, but --method analytic computes: omit it")
         if "--run" in options and not load:
             raise ConfigurationError("--run has no effect with --method analytic unless --load is given: omit it")
-        print_result(tasks.computed(config, request, at, run, load=load), as_json=as_json)
+        print_result(tasks.compute_calibration(config, request, at, run, load=load), as_json=as_json)
         return
     for option in ("--config", "--at"):
         if option in options:
@@ -108,7 +108,7 @@ def calibrate(
                 f"{option} requires --method analytic: a running loop is measured at its present wavefront and with "
                 "its own configuration"
             )
-    result = tasks.poked(request, run, load=load)
+    result = tasks.calibrate_with_pokes(request, run, load=load)
     print_result(result, as_json=as_json)
     if not result.recommended:
         raise typer.Exit(1)
@@ -135,13 +135,13 @@ def dark(
 
     Example: lowfc calibrate dark --frames 1000 --out night.fits
     """
-    from lowfc.programs.commissioning.calibrate.tasks import darkened
+    from lowfc.programs.commissioning.calibrate.tasks import take_dark
 
     if file is not None and "--frames" in given(context):
         raise ConfigurationError("--frames has no effect with --file, whose frames are all used: omit it")
     if file is None and not star_blocked:
         typer.confirm("block the star; is it dark?", default=True, abort=True, err=True)
-    print_result(darkened(out, run, frames, file, load=load), as_json=as_json)
+    print_result(take_dark(out, run, frames, file, load=load), as_json=as_json)
 
 
 @calibrate_app.command()
@@ -159,9 +159,9 @@ def reference(
 
     Example: lowfc calibrate reference --frames 5000 --out night.fits
     """
-    from lowfc.programs.commissioning.calibrate.tasks import referenced
+    from lowfc.programs.commissioning.calibrate.tasks import take_reference
 
-    print_result(referenced(out, run, frames, load=load), as_json=as_json)
+    print_result(take_reference(out, run, frames, load=load), as_json=as_json)
 
 
 @calibrate_app.command()
@@ -178,6 +178,6 @@ def align(
 
     Example: lowfc calibrate align --out aligned.fits
     """
-    from lowfc.programs.commissioning.calibrate.align import aligned
+    from lowfc.programs.commissioning.calibrate.align import align_sensor
 
-    print_result(aligned(out, run, frames, load=load), as_json=as_json)
+    print_result(align_sensor(out, run, frames, load=load), as_json=as_json)

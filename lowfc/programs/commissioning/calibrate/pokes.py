@@ -94,7 +94,7 @@ class Pokes:
         """The plan for measuring the delay: pokes of one mode; in closed loop with the total rms of a dither."""
         closed = self._request.method == "in-loop"
         amplitude = self.amplitude_nm * float(np.sqrt(self._modes)) if closed else AMPLITUDE_NM["poke"]
-        return sequence(min(amplitude, float(self._largest_nm[mode])))
+        return first_poke_plan(min(amplitude, float(self._largest_nm[mode])))
 
     def cycles(self) -> int:
         """Number of cycles required by photon and read noise."""
@@ -113,7 +113,7 @@ class Pokes:
 
     def frames(self, cycles: int, done: int = 0) -> int:
         """Frames of the remaining cycles and of their check cycles."""
-        return (cycles + checks(cycles) - done) * (len(self.cycle(0)) + AFTERWARDS)
+        return (cycles + check_cycles(cycles) - done) * (len(self.cycle(0)) + AFTERWARDS)
 
     def _cycle(self, number: int, amplitude_nm: float) -> poke_plan.Plan:
         request = self._request
@@ -148,7 +148,7 @@ class Pokes:
         return requested
 
 
-def sequence(amplitude_nm: float) -> poke_plan.Plan:
+def first_poke_plan(amplitude_nm: float) -> poke_plan.Plan:
     """The pokes of one mode for `Player.first_poke`; amplitude in nm rms of wavefront."""
     return poke_plan.dither(1, amplitude_nm, DELAY_FRAMES, 1, SEED)
 
@@ -171,6 +171,6 @@ def cycles_for(snr: float, cycles: int, error: float) -> int:
     return max(ceil(min(cycles * (error * snr / MARGIN) ** 2, 1e9)), cycles + 1)
 
 
-def checks(cycles: int) -> int:
+def check_cycles(cycles: int) -> int:
     """Number of check cycles for a reconstructor made from a number of cycles."""
     return max(_MIN_CHECKS, round(CHECK_PART * cycles))

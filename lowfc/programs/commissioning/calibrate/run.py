@@ -36,7 +36,7 @@ from lowfc.control.calibration.response_fit import (
 )
 from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.loop.wording import counted
-from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, checks
+from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, check_cycles
 from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size
 
 _MIN_CORRELATION = 0.3
@@ -144,7 +144,7 @@ class Calibrator:
         """Cross-talk of a new calibration at the present zero point, from separate cycles."""
         R = calibration.reconstructor.astype(np.float64)
         cycles = data.measured.cycles
-        count = checks(cycles)
+        count = check_cycles(cycles)
         answers = []
         for number in range(count):
             self._show(f"check {number + 1} of {count}", cycles, cycles + number)
@@ -196,7 +196,7 @@ class Calibrator:
             self._report(f"continuing after {counted(sums.cycles, 'cycle')}")
         needed = max(pokes.cycles(), sums.cycles)
         self._report(
-            f"{needed} cycles of {len(pokes.cycle(0))} frames and {checks(needed)} check cycles; "
+            f"{needed} cycles of {len(pokes.cycle(0))} frames and {check_cycles(needed)} check cycles; "
             + self._to_go(needed, sums.cycles)
         )
         while True:
@@ -204,7 +204,7 @@ class Calibrator:
                 done = sums.cycles
                 self._show(f"{request.method} cycle {done + 1} of {needed}", needed, done)
                 sums = sums.plus(self._player.cycle(pokes.cycle(done), delay.delay_frames))
-                keep(path, sums, self._conditions)
+                store(path, sums, self._conditions)
                 self.completed = sums.cycles
             found = measured(sums)
             more = pokes.more_cycles(needed, float(found.error.max()))
@@ -248,7 +248,7 @@ def partial_of(out: Path) -> Path:
     return out.with_name(out.name + ".part.npz")
 
 
-def keep(path: Path, sums: Sums, what: dict[str, Any]) -> None:
+def store(path: Path, sums: Sums, what: dict[str, Any]) -> None:
     """Write the completed cycles, with method, amplitude and calibration as `what`; DataFileError if that fails."""
     stream = io.BytesIO()
     arrays = sums._asdict() | {"initial": sums.initial.matrix, "estimator": sums.initial.estimator}
@@ -258,7 +258,7 @@ def keep(path: Path, sums: Sums, what: dict[str, Any]) -> None:
 
 def resumed(path: Path, what: dict[str, Any]) -> Sums:
     """Read completed cycles; DataFileError if there are none, the file is damaged or of another calibration."""
-    before, sums = stored(path)
+    before, sums = stored_cycles(path)
     for key, value in what.items():
         if before.get(key) != value:
             raise DataFileError(
@@ -268,7 +268,7 @@ def resumed(path: Path, what: dict[str, Any]) -> Sums:
     return sums
 
 
-def stored(path: Path) -> tuple[dict[str, Any], Sums]:
+def stored_cycles(path: Path) -> tuple[dict[str, Any], Sums]:
     """Read the completed cycles, with the method, amplitude and calibration that they are of."""
     if not path.is_file():
         raise DataFileError(f"nothing to resume: there is no {path}; omit --resume")

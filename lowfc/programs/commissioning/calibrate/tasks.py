@@ -62,7 +62,7 @@ class ReferenceResult(Result):
     file: str = result_field("written")
 
 
-def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:
+def calibrate_with_pokes(request: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:
     """Calibrate a running loop with pokes; write the file at the end."""
     require_folder(request.out)
     console = Console(stderr=True)
@@ -93,7 +93,7 @@ def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> Calibr
     return result
 
 
-def computed(
+def compute_calibration(
     file: Path | None, request: CalibrationRequest, at: str | None, run: str | None, *, load: bool
 ) -> CalibrationResult:
     """Compute a calibration from a configuration, flat or at a wavefront, and write the file."""
@@ -148,7 +148,7 @@ def _modes(text: str) -> dict[int, float]:
     return found
 
 
-def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load: bool) -> DarkResult:
+def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, load: bool) -> DarkResult:
     """Write the calibration in use with a new dark and mask, from the loop's frames or a cube."""
     require_folder(out)
     with Client(run) as loop, _in_use(loop) as (before, noise):
@@ -166,7 +166,7 @@ def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load
     return DarkResult(frames=len(cube), dark_dn=level, noise_dn=noise_dn, **counts, file=str(out))
 
 
-def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> ReferenceResult:
+def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> ReferenceResult:
     """Write the calibration in use with the present image as its reference."""
     require_folder(out)
     with Client(run) as loop, _in_use(loop) as (before, noise):

@@ -28,7 +28,7 @@ from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.commissioning.calibrate.pokes import MIN_SNR, CalibrationRequest, Pokes
 from lowfc.programs.commissioning.calibrate.recording import LEASE_CHECK_FRAMES, Player, Report, next_frames
 from lowfc.programs.commissioning.calibrate.result import finish_calibration
-from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of, stored
+from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of, stored_cycles
 from lowfc.programs.commissioning.calibrate.tasks import images
 from lowfc.programs.commissioning.commission.first_calibration import aligned, first_delay, linear_nm, poked
 from lowfc.programs.commissioning.commission.first_light import (
@@ -154,7 +154,7 @@ class Commissioning:
         delay = self._delay if self._delay is not None else first_delay(player, config)
         resume = resumed and partial_of(options.out).is_file()
         if resume:
-            amplitude_nm = float(stored(partial_of(options.out))[0]["amplitude_nm"])
+            amplitude_nm = float(stored_cycles(partial_of(options.out))[0]["amplitude_nm"])
         else:
             self._step("poke amplitude")
             default_nm = Pokes(config, first, factory.frame_noise_nm(config, first), self._request()).amplitude_nm

@@ -15,7 +15,7 @@ from lowfc.control.calibration.calibration import FIRST, Calibration
 from lowfc.control.calibration.delay_fit import Delay
 from lowfc.control.calibration.response_fit import correlation
 from lowfc.programs.commissioning.calibrate.align import computed_scale, in_words, on_sensor
-from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, largest_nm, sequence
+from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, first_poke_plan, largest_nm
 from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError, Report
 from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 
@@ -39,7 +39,7 @@ def first_delay(player: Player, config: Configuration) -> Delay:
     while True:
         amplitude_nm = min(amplitude_nm, most_nm)
         try:
-            found = player.first_poke(0, sequence(amplitude_nm))
+            found = player.first_poke(0, first_poke_plan(amplitude_nm))
             break
         except PokesNotSeenError:
             if amplitude_nm >= min(MAX_FIRST_NM, most_nm):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lowfc.adapters.process.terminal import ConfigFile, Json, configuration, new_app
-from lowfc.programs.commissioning.checks import Check, Status, put
+from lowfc.programs.commissioning.checks import Check, Status, print_report
 
 if TYPE_CHECKING:
     from lowfc.adapters.bus.run import Run
@@ -140,6 +140,6 @@ def _line(run: "Run", role: str) -> "Iterator[Line]":
 
 
 def _end(device: str, run_id: str, checks: list[Check], as_json: bool) -> None:
-    put(checks, STATUSES, FIELDS, {"device": device, "run": run_id} if as_json else None)
+    print_report(checks, STATUSES, FIELDS, {"device": device, "run": run_id} if as_json else None)
     if any(check.status is Status.WRONG for check in checks):
         raise typer.Exit(1)

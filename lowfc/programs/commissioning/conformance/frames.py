@@ -30,12 +30,12 @@ FRAMES: Table[Camera] = Table()
 
 def camera_checks(camera: Camera) -> Iterator[Check]:
     """All checks of a camera."""
-    yield from ARRIVED.of(camera)
-    yield from PUBLISHER.of(camera)
+    yield from ARRIVED.run(camera)
+    yield from PUBLISHER.run(camera)
     if camera.frames:
-        yield from FRAMES.of(camera)
-    yield from SETTINGS.of(camera)
-    yield from PROCESS.of(camera)
+        yield from FRAMES.run(camera)
+    yield from SETTINGS.run(camera)
+    yield from PROCESS.run(camera)
 
 
 @ARRIVED.check("frames", f"{FRAME.key}: foxglove.RawImage, one for each exposure")

@@ -57,7 +57,7 @@ def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool 
         if mirror.states and not _bad(found, "grid", "state"):
             mirror.go(base_nm)
     mirror.seconds = (mirror.line.now_ns() - begun_ns) / NS
-    return [*found, *PUBLISHER.of(mirror), *PROCESS.of(mirror)]
+    return [*found, *PUBLISHER.run(mirror), *PROCESS.run(mirror)]
 
 
 def _bad(found: list[Check], *names: str) -> bool:

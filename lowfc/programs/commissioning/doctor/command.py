@@ -9,7 +9,7 @@ import typer
 
 from lowfc.adapters.process.terminal import ConfigFile, Json, configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.programs.commissioning.checks import Check, Status, put
+from lowfc.programs.commissioning.checks import Check, Status, print_report
 
 if TYPE_CHECKING:
     from lowfc.programs.commissioning.doctor.facts import Facts
@@ -65,14 +65,14 @@ def doctor(
     settings = configuration(config)
     if device is not None:
         checks = list(device_checks(device, settings))
-        put(checks, (Status.WRONG, Status.OK), FIELDS, {"device": device} if as_json else None)
+        print_report(checks, (Status.WRONG, Status.OK), FIELDS, {"device": device} if as_json else None)
         if any(check.status is Status.WRONG for check in checks):
             raise typer.Exit(1)
         return
     sys.stderr.write(f"measuring wake-up latency: 1000 sleeps per second for {TRIAL_S:g} s in each scheduling class\n")
     facts = gather(Host(), settings, TRIAL_S)
     checks = examine(facts)
-    put(checks, STATUSES, FIELDS, measured(facts) if as_json else None)
+    print_report(checks, STATUSES, FIELDS, measured(facts) if as_json else None)
     if strict and any(check.status is Status.WARNING for check in checks):
         raise typer.Exit(1)
 
@@ -83,7 +83,7 @@ def examine(facts: "Facts") -> list[Check]:
     from lowfc.programs.commissioning.doctor import resources, timing
 
     unknown = (OSError, ValueError, LookupError, LowfcError)
-    return [*timing.CHECKS.of(facts, unknown), *resources.CHECKS.of(facts, unknown)]
+    return [*timing.CHECKS.run(facts, unknown), *resources.CHECKS.run(facts, unknown)]
 
 
 def measured(facts: "Facts") -> dict[str, Any]:

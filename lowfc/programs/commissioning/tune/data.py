@@ -234,8 +234,8 @@ def _telemetry(
 ) -> Telemetry:
     was_closed, index = steps.mode == LoopMode.CLOSED, np.arange(len(steps.mode))
     opened = np.flatnonzero(~was_closed)
-    frames_closed = index - np.concatenate([[-1], opened])[np.searchsorted(opened, index)]
-    closed, rows = True, usable & was_closed & (frames_closed > _SETTLING_S * rate_hz)
+    last_opened = np.concatenate([[-1], opened])[np.searchsorted(opened, index)]
+    closed, rows = True, usable & was_closed & (index - last_opened > _SETTLING_S * rate_hz)
     pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if _longest(pol) < FEWEST:
         closed, rows = False, usable

@@ -33,7 +33,7 @@ _POLL_S = 0.02
 _QUIET_FRAMES = 250
 _LAST_HEALTH_S = 0.2
 SETTLED_FRAMES = 500
-"""Frames after a fault: two seconds, of which the last is judged."""
+"""Frames after a fault: two seconds at the default rate, of which the last is judged."""
 PATIENCE_S = 5.0
 """Time that a process may take to exit after the signal to stop."""
 START_S = 240.0

@@ -88,7 +88,7 @@ def read(folder: Path) -> Evidence:
         try:
             for message in reader:
                 last_ns = message.receive_time_ns
-                _enter(found, message, number if reader.finished else None)
+                _add(found, message, number if reader.finished else None)
         except DataFileError as fault:
             found.unreadable.append(str(fault))
         found.last_ns.append((last_ns, reader.finished))
@@ -99,7 +99,7 @@ def read(folder: Path) -> Evidence:
     return found
 
 
-def _enter(found: Evidence, message: Sample, number: int | None) -> None:
+def _add(found: Evidence, message: Sample, number: int | None) -> None:
     found.messages += 1
     start_s, count = start_of(message.sequence), count_of(message.sequence)
     if start_s <= FORGED_S:

@@ -16,14 +16,14 @@ from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Outcome
 from lowfc.programs.reliability.chaos.case import Case
 from lowfc.programs.reliability.chaos.evidence import Entry, Evidence
 
-WITHIN = 2.0
+MAX_RATIO = 2.0
 """Largest ratio of the residual after recovery to that before the fault."""
 FLOOR_NM = 1.0
 """Noise of the residual, added to the limit."""
 FLUSHED_S = 1.0
 """Messages recorded longer than this before a kill must be in the log, which is flushed four times a second."""
 SPAN_NS = 1_000_000_000
-SHORT_FRAMES = 50
+RMS_FRAMES = 50
 ROUNDING_NM = 0.03
 """Largest difference of a mirror state from its command: the driver rounds to 0.023 nm."""
 REFUSALS = frozenset({*range(wire.REASON_NO_CALIBRATION, wire.REASON_STUCK + 1), wire.REASON_HELD})
@@ -39,7 +39,7 @@ class Finding(NamedTuple):
     found: str
 
 
-def _found(rule: str, wrong: list[str], otherwise: str) -> Finding:
+def _finding(rule: str, wrong: list[str], otherwise: str) -> Finding:
     """A rule that held if nothing is wrong; at most three violations are named."""
     return Finding(rule, not wrong, "; ".join(wrong[:3]) or otherwise)
 
@@ -71,7 +71,7 @@ def _limits(outcome: Outcome, evidence: Evidence) -> Finding:
         if step_nm > config.safety.slew_nm + ROUNDING_NM
     ]
     count = f"{len(commands)} commands, {len(states)} states"
-    return _found("limits", wrong if states else [count], count)
+    return _finding("limits", wrong if states else [count], count)
 
 
 def _violations(what: str, limits: Limits, shapes: list[Entry], moving: Mask) -> Iterator[str]:
@@ -118,13 +118,13 @@ def recovered_s(outcome: Outcome, evidence: Evidence) -> float | None:
     if not started or "quiet" not in outcome.marks:
         return None
     begun_ns, quiet_ns = started[0].log_time_ns, outcome.marks["quiet"]
-    most_nm = WITHIN * evidence.residual_nm(quiet_ns - SPAN_NS, quiet_ns) + FLOOR_NM
+    most_nm = MAX_RATIO * evidence.residual_nm(quiet_ns - SPAN_NS, quiet_ns) + FLOOR_NM
     times_ns, residuals_nm = evidence.residuals_nm()
     later = times_ns >= begun_ns
     times_ns, squares = times_ns[later], residuals_nm[later] ** 2
-    if squares.size < SHORT_FRAMES:
+    if squares.size < RMS_FRAMES:
         return None
-    rms_nm = np.sqrt(np.convolve(squares, np.full(SHORT_FRAMES, 1 / SHORT_FRAMES), "valid"))
+    rms_nm = np.sqrt(np.convolve(squares, np.full(RMS_FRAMES, 1 / RMS_FRAMES), "valid"))
     good = np.flatnonzero(rms_nm <= most_nm)
     return float((times_ns[good[0]] - begun_ns) * 1e-9) if good.size else None
 
@@ -157,7 +157,7 @@ def _bad_frames(case: Case, evidence: Evidence) -> Finding:
         bad = [step for step in steps if case.bad(_number(step))]
         wrong += [f"bad frame {_number(step)} was used" for step in bad if step.message.error_nm]
         wrong += [] if bad else ["no bad frame was received"]
-    return _found("bad frames", wrong, f"{len(refused)} refused, {len(steps)} steps")
+    return _finding("bad frames", wrong, f"{len(refused)} refused, {len(steps)} steps")
 
 
 def _recovery(case: Case, outcome: Outcome, evidence: Evidence) -> Finding:
@@ -170,7 +170,7 @@ def _recovery(case: Case, outcome: Outcome, evidence: Evidence) -> Finding:
     if outcome.notes:
         return Finding("recovery", False, "; ".join(outcome.notes))
     if not case.safe:
-        held = outcome.mode == wire.LOOP_MODE_CLOSED and after <= WITHIN * before + FLOOR_NM
+        held = outcome.mode == wire.LOOP_MODE_CLOSED and after <= MAX_RATIO * before + FLOOR_NM
         return Finding("recovery", held, f"residual {before:.2f} -> {after:.2f} nm, {mode}")
     states = evidence.entries[MIRROR_STATE]
     flat_nm = float(np.abs(states[-1].actuators_nm).max()) if states else float("inf")
@@ -220,7 +220,7 @@ def _account(outcome: Outcome, evidence: Evidence) -> Finding:
         wrong.append(f"the recording failed ({outcome.failure}), but no message is counted as lost")
     if not evidence.messages:
         wrong.append("there is no log")
-    return _found("account", wrong, f"{evidence.messages} recorded, {lost} counted as lost")
+    return _finding("account", wrong, f"{evidence.messages} recorded, {lost} counted as lost")
 
 
 def _processes(case: Case, outcome: Outcome) -> Finding:
@@ -239,4 +239,4 @@ def _processes(case: Case, outcome: Outcome) -> Finding:
     if not {ended.name for ended in outcome.ended} & set(map(str, Role)):
         wrong.append("no process ended")
     slowest_s = max((ended.after_s for ended in outcome.ended), default=0.0)
-    return _found("processes", wrong, f"ended within {slowest_s:.1f} s")
+    return _finding("processes", wrong, f"ended within {slowest_s:.1f} s")

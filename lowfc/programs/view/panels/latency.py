@@ -16,8 +16,8 @@ from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
 
 HISTOGRAM = "latency/histogram"
-WHOLE = Plot("latency/frame_to_command", "Frame to command, last second, us", {"p50": BLUE, "p99": ORANGE, "max": RED})
-PARTS = Plot(
+TOTAL = Plot("latency/frame_to_command", "Frame to command, last second, us", {"p50": BLUE, "p99": ORANGE, "max": RED})
+STAGE_DURATIONS = Plot(
     "latency/stages",
     "Stages, p99 of the last second, us",
     dict(zip(STAGES[:-1], distinct(len(STAGES) - 1), strict=True)),
@@ -43,7 +43,7 @@ _AXIS_PERCENTILE = 99.0
 class Latency(Panel):
     """Latency from a frame to its command, and its stages."""
 
-    plots = (WHOLE, PARTS, COUNTS)
+    plots = (TOTAL, STAGE_DURATIONS, COUNTS)
     period_ns = 500_000_000
 
     def __init__(self) -> None:
@@ -62,8 +62,8 @@ class Latency(Panel):
             return
         us = np.concatenate([stages_us for _, stages_us in self._recent] or [np.zeros((0, len(STAGES)))])
         if len(us):
-            WHOLE.add_one(stream, now_ns, *np.percentile(us[:, -1], [50, 99, 100]))
-            PARTS.add_one(stream, now_ns, *np.percentile(us[:, :-1], 99, axis=0))
+            TOTAL.add_one(stream, now_ns, *np.percentile(us[:, -1], [50, 99, 100]))
+            STAGE_DURATIONS.add_one(stream, now_ns, *np.percentile(us[:, :-1], 99, axis=0))
             self._scale.fit(np.percentile(us[:, -1], [_AXIS_PERCENTILE]), now_ns)
         self._draw_histogram(stream, now_ns, us[:, -1])
         controller, recorder = (snapshot.health.get(role) for role in (Role.CONTROLLER, Role.RECORDER))

@@ -18,15 +18,15 @@ from lowfc.programs.view.snapshot import Snapshot
 
 IMAGE = "science/image"
 CONTRAST = Plot("science/contrast", "Mean contrast over 2 λ/D from the mask's edge, log10", width=1.6)
-_WIDE = 2.0
+_ZONE_WIDTH = 2.0
 """Width of the zone in which contrast is averaged, from the inner edge of the dark zone on, lambda / D."""
 
-_MEAN_OF = 5
+_AVERAGED = 5
 """Number of wavefronts averaged in one image, each the newest of a snapshot."""
 _DARKEST, _BRIGHTEST = -10, -4
 """Range of the colour scale, log10 of contrast."""
-_HALF_WIDTH, _SAMPLES_PER = 12, 4
-_SAMPLES = 2 * _HALF_WIDTH * _SAMPLES_PER
+_HALF_WIDTH, _SAMPLING = 12, 4  # of an image, lambda / D; samples per lambda / D
+_SAMPLES = 2 * _HALF_WIDTH * _SAMPLING
 _GAP, _BAR = 6, 5  # samples between the pictures, and across the colour scale
 _SECOND = _SAMPLES + _GAP  # start of the second picture; `_SCALE`: start of the colour scale
 _SCALE = 2 * _SECOND
@@ -49,13 +49,13 @@ class Science(Panel):
     def __init__(self, coronagraph: Coronagraph, wavelength_nm: float) -> None:
         self._coronagraph = coronagraph
         zone = coronagraph.dark_zone
-        self._wedge = Wedge(zone.inner, min(zone.inner + _WIDE, zone.outer), zone.half_opening_deg)
+        self._wedge = Wedge(zone.inner, min(zone.inner + _ZONE_WIDTH, zone.outer), zone.half_opening_deg)
         self._wavelength_nm = wavelength_nm
         self._noll: tuple[int, ...] = ()
         self._camera: ScienceCamera | None = None
         self._flat = np.nan
         self._wavefronts: dict[str, deque[tuple[Single, Single]]] = {
-            source: deque(maxlen=_MEAN_OF) for source in _NAMES
+            source: deque(maxlen=_AVERAGED) for source in _NAMES
         }
         self._picture = Picture(f"{IMAGE}/contrast")
         self._named = ""
@@ -76,7 +76,7 @@ class Science(Panel):
         noll = snapshot.calibration.noll
         if self._camera is None or noll != self._noll:  # wavefronts of other modes are dropped
             self._noll = noll
-            self._camera = ScienceCamera(self._coronagraph, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLES_PER)
+            self._camera = ScienceCamera(self._coronagraph, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLING)
             self._flat = self._camera.mean_contrast(self._camera.image(np.zeros(len(noll))), self._wedge)
             self._clear()
         for source, wavefronts in self._wavefronts.items():
@@ -127,7 +127,7 @@ def _outlines(wedge: Wedge) -> list[Array]:
     opening = np.deg2rad(wedge.half_opening_deg) * np.linspace(-1, 1, 33)
     arcs = [radius * _directions(opening) for radius in (wedge.inner, wedge.outer)]
     right = np.concatenate([arcs[0], arcs[1][::-1], arcs[0][:1]])
-    return [_SAMPLES / 2 + _SAMPLES_PER * line for line in (wedge.inner * _directions(angle), right, -right)]
+    return [_SAMPLES / 2 + _SAMPLING * line for line in (wedge.inner * _directions(angle), right, -right)]
 
 
 def _directions(angle: Array) -> Array:

@@ -36,7 +36,7 @@ REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.HELD: ("loop held", "an interlock or a lease holds the loop"),
 }
 """Reasons for refusing a frame: text and advice."""
-_OF_FRAMES = [reason for reason in REFUSED if reason not in (Rejection.NO_MIRROR, Rejection.HELD)]
+_FRAME_REASONS = [reason for reason in REFUSED if reason not in (Rejection.NO_MIRROR, Rejection.HELD)]
 """Reasons for an alarm of the tile FRAMES; the others are those of the tile LOOP."""
 
 
@@ -88,8 +88,8 @@ def _lost(state: RunState, lost: int, due: float) -> Tile:
 
 
 def _refused(state: RunState, due: float) -> Tile:
-    all_are, refused = all_refused(state, _OF_FRAMES), sum(state.recent[reason] for reason in _OF_FRAMES)
-    most = max(_OF_FRAMES, key=lambda reason: (state.now if all_are else state.recent)[reason])
+    all_are, refused = all_refused(state, _FRAME_REASONS), sum(state.recent[reason] for reason in _FRAME_REASONS)
+    most = max(_FRAME_REASONS, key=lambda reason: (state.now if all_are else state.recent)[reason])
     word, advised = REFUSED[most]
     if all_are:
         advice = f"Every frame is refused, {word}: {advised}. The mirror holds."

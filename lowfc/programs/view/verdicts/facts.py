@@ -13,7 +13,7 @@ from lowfc.programs.view.snapshot import Snapshot
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.tile import numbers, short
 
-_MOST = 3
+_MAX_NAMED = 3
 """Largest number of modes of an offset that are named one by one."""
 
 
@@ -51,6 +51,6 @@ def _offset(values_nm: list[float], noll: tuple[int, ...]) -> str:
     places = np.flatnonzero(values_nm)
     if not places.size:
         return "no offset"
-    if len(noll) != len(values_nm) or len(places) > _MOST:
+    if len(noll) != len(values_nm) or len(places) > _MAX_NAMED:
         return f"offset {np.linalg.norm(values_nm):.3g} nm rms, {counted(len(places), 'mode')}"
     return f"offset {', '.join(f'{mode_name(noll[place])} {values_nm[place]:.3g}' for place in places)} nm"

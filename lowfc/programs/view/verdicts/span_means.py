@@ -1,4 +1,4 @@
-"""Wavefront and light of a whole run, averaged in at most `MOST` spans of equal length."""
+"""Wavefront and light of a whole run, averaged in at most `MAX_SPANS` spans of equal length."""
 
 import numpy as np
 import numpy.typing as npt
@@ -6,7 +6,7 @@ import numpy.typing as npt
 from lowfc.arrays import Array, Long
 from lowfc.programs.view.snapshot import Snapshot, Wavefronts
 
-MOST = 600
+MAX_SPANS = 600
 """Largest number of spans: beyond it, pairs are merged, so that a night needs no more memory than ten minutes."""
 _FIRST_NS = 1_000_000_000
 _FARTHEST_NS = 7 * 86_400 * 10**9  # a longer jump is an error of the camera's clock
@@ -67,7 +67,7 @@ class SpanMeans:
         if not after_ns.size:
             return
         self._last_ns = max(self._last_ns, int(after_ns.max()))
-        while (last := self._last_ns // self.span_ns) >= MOST:
+        while (last := self._last_ns // self.span_ns) >= MAX_SPANS:
             self.span_ns *= 2
             self._sums = np.pad(self._sums, ((0, len(self._sums) % 2), (0, 0)))
             self._sums = self._sums[0::2] + self._sums[1::2]

@@ -227,13 +227,13 @@ class Watcher:
     def _sample(self, snapshot: Snapshot) -> _Sample:
         steps = snapshot.steps
         counts = Counts(count_reasons(steps.reasons))
-        counts.update(steps=len(steps.mode), **self._grown(snapshot))
+        counts.update(steps=len(steps.mode), **self._count_increases(snapshot))
         true, measured = snapshot.wavefronts(true=True), snapshot.wavefronts(true=False)
         squares = _squares(snapshot, true), _squares(snapshot, measured)
         durations_ns = snapshot.timings["frame_to_command"]
         return _Sample(snapshot.host_ns, counts, squares, steps.sequence, steps.time_ns, durations_ns)
 
-    def _grown(self, snapshot: Snapshot) -> dict[str, int]:
+    def _count_increases(self, snapshot: Snapshot) -> dict[str, int]:
         """Increase of the processes' counts since the last snapshot, or since the first Health of a new process."""
         grown: dict[str, int] = {}
         for name, (role, count_in) in _COUNTERS.items():
