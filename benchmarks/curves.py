@@ -60,7 +60,7 @@ def step_times(size: Size, seconds: float) -> Result:
     payloads = cycle([made.at(index, HostClock().host_ns()) for index in range(FRAMES)])
     times: Result = {"step_us": timed(lambda: step(next(payloads)), seconds)}
     if step.state.mode is not LoopMode.CLOSED or step.state.counts:
-        raise RuntimeError(f"{size}: the step is {step.state.mode.name.lower()}, and was {step.state.counts}")
+        raise RuntimeError(f"{size}: loop {step.state.mode.name.lower()}, refused or limited: {step.state.counts}")
     one_half, other_half = np.ones((2, size.bytes // 8), np.float32)
     times["stream_us"] = timed(lambda: one_half.dot(other_half), seconds)
     R, shapes = calibration.reconstructor, calibration.modes_to_actuators

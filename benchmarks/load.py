@@ -104,10 +104,7 @@ def role_of(words: Sequence[str]) -> str | None:
 
 
 def run_lowfc(words: Sequence[str], seconds: float) -> dict[str, Any]:
-    """JSON of `lowfc` with these arguments, and usage (`shares`).
-
-    Or failure: the last line of its standard error, or the timeout.
-    """
+    """JSON of `lowfc` with these arguments, and usage (`shares`); or failure: its last stderr line, or the timeout."""
     command = [sys.executable, "-P", "-m", "lowfc", *words, "--duration", f"{seconds:g}", "--json"]
     timeout_s = _START_S + _SLOWEST * seconds
     with tempfile.TemporaryDirectory() as folder, watched() as moments:

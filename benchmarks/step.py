@@ -127,9 +127,9 @@ def _timed(
     durations: dict[str, list[int]] = {stage: [] for stage in STAGES}
     found = {STEP: alone(step), PRODUCT: alone(product)}
     with _clocked(durations):
-        whole = alone(step)
+        timed_step_ns = alone(step)
     stages = {stage: np.array(each, np.int64) for stage, each in durations.items()}
-    return found | stages | {REST: whole - np.sum([*stages.values()], axis=0)}
+    return found | stages | {REST: timed_step_ns - np.sum([*stages.values()], axis=0)}
 
 
 @contextmanager

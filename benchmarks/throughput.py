@@ -125,8 +125,10 @@ def find(words: Sequence[str], rates: Sequence[float], seconds: float, report: R
         return not complaints(runs[-1])
 
     def one_at(index: int, *, sustained: bool) -> Result | None:
-        found = (run for run in runs if run["requested_hz"] in rates[index : index + 1])
-        return next((run for run in found if sustained is not bool(complaints(run))), None) if index >= 0 else None
+        if not 0 <= index < len(rates):
+            return None
+        at_rate = (run for run in runs if run["requested_hz"] == rates[index])
+        return next((run for run in at_rate if sustained is not bool(complaints(run))), None)
 
     index = search(sustains, len(rates))
     report(f"{command}: {COMPARED_HZ:g} Hz")

@@ -85,7 +85,7 @@ def run() -> Iterator[Run]:
 
 
 @pytest.fixture(autouse=True)
-def _same_process() -> Iterator[None]:
+def _unchanged_scheduling() -> Iterator[None]:
     """Check that a command run in this process leaves scheduling class, niceness and processors unchanged."""
     before = _scheduling()
     yield

@@ -7,12 +7,12 @@ class Advice(NamedTuple):
     """Cause and remedy of an event or a reason.
 
     Attributes:
-        why: its cause.
-        what: its remedy.
+        cause: why it occurs.
+        remedy: what to do.
     """
 
-    why: str
-    what: str
+    cause: str
+    remedy: str
 
 
 _NOTHING = "nothing; for information only."
@@ -110,7 +110,7 @@ ADVICE: dict[str, Advice] = {
     "LEASE_TAKEN": Advice("a program reserved the loop.", "wait, or `lowfc ctl open`, which ends the reservation."),
     "LEASE_RELEASED": Advice("the program has finished and released the loop.", _NOTHING),
     "LEASE_ENDED": Advice(
-        "the holder did not renew it in time, or somebody requested safe, open, pause or stop.",
+        "the holder did not renew it in time, its time is over, or somebody requested safe, open, pause or stop.",
         "check the program that held it; it must stop by itself.",
     ),
     "INTERLOCK_ACTS": Advice(
@@ -161,7 +161,7 @@ ADVICE: dict[str, Advice] = {
         "lower `camera.rate_hz`, or give the loop its processors and real-time rights (`lowfc doctor`); if the bench "
         "cannot be faster, set `control.delay_frames` to the measured delay.",
     ),
-    "COMMANDS_IN_TIME": Advice("less than an eighth of the commands are late.", _NOTHING),
+    "COMMANDS_IN_TIME": Advice("at most an eighth of the last 500 commands are late.", _NOTHING),
     "FRAMES_LOST": Advice(
         "the camera's own frame numbers have gaps: frames were lost in the camera, its cable or its driver.",
         "check cable, bandwidth and packet size; a lower rate or a smaller region helps.",
@@ -191,7 +191,8 @@ ADVICE: dict[str, Advice] = {
     ),
     "VIEW_STUCK": Advice("the viewer's window reads no data.", "close it if it hangs, and start `lowfc view` again."),
     "VIEW_RENEWED": Advice(
-        "the viewer hung, ended or used too much memory.", "reload the page in a browser; a window returns by itself."
+        "the viewer hung, ended, failed to draw or exceeded its memory limit.",
+        "reload the page in a browser; a window returns by itself.",
     ),
     "BAD_MESSAGE": Advice(
         "a message could not be decoded or has an impossible time: another version, or a faulty program.",

@@ -10,20 +10,20 @@ from collections.abc import Callable
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.messages import Role
-from tools.pictures import BRIGHT, PICTURES, SMALL_WELL, Night, night
+from tools.pictures import BRIGHT, PICTURES, SMALL_WELL, PictureRun, picture_run
 
-EASY = {"camera.rate_hz": 100.0}
+SLOW = {"camera.rate_hz": 100.0}
 """At this rate the pictures do not need a quiet host."""
 LOOK_S = 6.0
 """Time before the change of state, and after the console shows it."""
 PATIENCE_S = 60
 
 
-def picture(run: Night, name: str, word: str, meanwhile: Callable[[], object]) -> None:
+def picture(run: PictureRun, name: str, word: str, meanwhile: Callable[[], object]) -> None:
     """Change the state of a run by `meanwhile`, wait until the console shows `word`, and store the picture."""
     from lowfc.programs.console.app import Console
 
-    async def look() -> None:
+    async def take_picture() -> None:
         app = Console(bus, run.run.run_id, HostClock())
         async with app.run_test(size=(100, 30)) as pilot:
             await pilot.pause(LOOK_S)
@@ -32,34 +32,36 @@ def picture(run: Night, name: str, word: str, meanwhile: Callable[[], object]) -
                 await pilot.pause(1.0)
                 if any(word in str(app.query_one(where).render()) for where in ("#verdict", "#tiles")):
                     break
+            else:
+                raise SystemExit(f"the console did not show {word!r} within {PATIENCE_S} s")
             await pilot.pause(LOOK_S)
             shown = app.export_screenshot(title=f"lowfc console, {name.replace('-', ' ')}")
             (PICTURES / f"console-{name}.svg").write_text(shown)
 
     bus = ZenohBus(run.run.links, Role.OPERATOR, HostClock(), monitor=True)
     try:
-        asyncio.run(look())
+        asyncio.run(take_picture())
     finally:
         bus.close()
     sys.stderr.write(f"{name}\n")
 
 
 def make() -> None:
-    """Every state."""
-    with night(BRIGHT | EASY) as run:
+    """Take the pictures of every state."""
+    with picture_run(BRIGHT | SLOW) as run:
         loop = run.client()
         picture(run, "healthy", "CLOSED", lambda: loop.note("HD 209458, seeing 0.8 arcsec"))
         picture(run, "open", "OPEN", loop.open_loop)
         loop.close_loop()
-        picture(run, "star-gone", "GONE", lambda: run.other_camera(BRIGHT | EASY | {"star.magnitude": 9.0}))
-    with night(SMALL_WELL | EASY) as run:
-        picture(run, "saturated", "SATURATED", lambda: run.other_camera(SMALL_WELL | EASY | {"star.magnitude": -2.0}))
-    with night(BRIGHT | EASY) as run:
+        picture(run, "star-gone", "GONE", lambda: run.restart_camera(BRIGHT | SLOW | {"star.magnitude": 9.0}))
+    with picture_run(SMALL_WELL | SLOW) as run:
+        picture(run, "saturated", "SATURATED", lambda: run.restart_camera(SMALL_WELL | SLOW | {"star.magnitude": -2.0}))
+    with picture_run(BRIGHT | SLOW) as run:
         picture(run, "camera-dead", "NO FRAMES", lambda: run.kill(Role.CAMERA))
         picture(run, "not-connected", "NOT CONNECTED", lambda: kill_all(run))
 
 
-def kill_all(run: Night) -> None:
+def kill_all(run: PictureRun) -> None:
     """Kill the remaining processes of a run whose camera is dead."""
     for name in (Role.CONTROLLER, run.mirror, Role.RECORDER):
         run.kill(name)

@@ -22,16 +22,17 @@ def table() -> str:
     """A row for each law, a column for each timing; mas rms per axis."""
     laws = {
         "integrator, highest gain": [_integrator(timing) for timing in _CASES],
-        "Kalman filter that nulls one instant": [_filter(timing, timing.applied, 0.0) for timing in _CASES],
+        "Kalman filter that nulls one instant": [_kalman(timing, timing.applied, 0.0) for timing in _CASES],
         "Kalman filter that nulls the mean of the next exposure": [
-            _filter(timing, timing.applied, timing.exposure) for timing in _CASES
+            _kalman(timing, timing.applied, timing.exposure) for timing in _CASES
         ],
         "Kalman filter that nulls the mean over the command's period (`lqg`)": [
-            _filter(timing, timing.applied, timing.held) for timing in _CASES
+            _kalman(timing, timing.applied, timing.held) for timing in _CASES
         ],
     }
     rows = [
-        (name, *(f"{_left(law, t):.3f}" for law, t in zip(made, _CASES, strict=True))) for name, made in laws.items()
+        (name, *(f"{_residual_mas(law, t):.3f}" for law, t in zip(made, _CASES, strict=True)))
+        for name, made in laws.items()
     ]
     floor = float(np.sqrt(np.square(LINES_MAS) @ hold_floor(_omega())))
     rows.append(("lower bound for a command held for a period", *(f"{floor:.3f}" for _ in _CASES)))
@@ -47,13 +48,13 @@ def _integrator(timing: Timing) -> LinearLaw:
     return integrator([highest_gain(timing.delay)], [0.0], (2,), timing.delay, RATE_HZ)
 
 
-def _filter(timing: Timing, start: float, length: float) -> LinearLaw:
-    """Filter with the exact lines whose command nulls the mean over [start, start + length] periods."""
+def _kalman(timing: Timing, start: float, length: float) -> LinearLaw:
+    """Kalman filter of the exact lines; its command nulls the mean over [start, start + length] periods."""
     lines = tuple(Line(hz, _NO_WIDTH_HZ, mas**2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
     model = Model(_NO_DRIFT_NM2, np.inf, lines, _NO_NOISE_NM2, RATE_HZ)
     foreseen = model.mean_over(start, length) @ np.linalg.inv(model.mean_over(0.0, timing.exposure))
     return replace(lqg([model], (2,), timing), output=(-model.states()[2] @ foreseen)[None].astype(np.float32))
 
 
-def _left(law: LinearLaw, timing: Timing) -> float:
+def _residual_mas(law: LinearLaw, timing: Timing) -> float:
     return float(np.sqrt(np.square(LINES_MAS) @ residual_power(law, _omega(), timing)[:, 0]))

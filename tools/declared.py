@@ -173,11 +173,11 @@ def events(*levels: Level) -> str:
 
 
 def _event(event: Event) -> str:
-    why, what = ADVICE[event.name]
+    cause, remedy = ADVICE[event.name]
     shown = re.sub(r"\{(\w+)[^}]*\}", r"{\1}", event.description)
     return (
         f"### {event.name}\n\n`{event.level.name} {event.name} {shown.replace('`', '')}`\n\n"
-        f"Why: {why}\n\nWhat to do: {what}\n"
+        f"Why: {cause}\n\nWhat to do: {remedy}\n"
     )
 
 

@@ -30,15 +30,15 @@ MAGNITUDES = (0.0, 2.0, 5.0)
 STEPS_MAS = 5.0
 """Half the height of a square wave of period 4 s in tip and tilt."""
 MINUTES = 10.0
-_IDENTIFY, _SETTLE, _BEFORE, _CHUNK = 48_000, 12_000, 2_000, 10_000
-
+_IDENTIFY, _SETTLE, _BEFORE = 48_000, 12_000, 2_000
+"""Frames: for identification of a law, in open loop, and in closed loop before the lines move."""
 
 LawOf = Callable[[Configuration, Array, ModalBench], tuple[LinearLaw, Array]]
-"""A law and integrator gains (modes,) from a configuration, the covariance of a frame's noise, and an open loop."""
+"""Makes a law and integrator gains (modes,) from a configuration, the covariance of a frame's noise and a loop."""
 
 
 def identified_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
-    """LQG law and integrator gains identified from a log, as by an operator."""
+    """LQG law and integrator gains identified from the closed loop, as `lowfc tune` does."""
     bench.settle(1_000)
     bench.run(_IDENTIFY)
     run, timing = bench.pol(), timing_of(config)
@@ -78,8 +78,8 @@ def moved(case: Case, factor: float, seed: int, *, guard: bool = True, law: bool
     """Tilt from 1 s to 3 s after lines have moved, mas rms per axis, and times of LAW_OVERRULED, s after the move."""
     bench = case.bench(case.configured(seed, **{"control.guard": guard}), case.law if law else None)
     bench.run(_BEFORE)
-    if bench.events and bench.events[-1][1].name == "LAW_OVERRULED":
-        raise RuntimeError(f"the law was overruled before its lines moved: {bench.events[-1]}")
+    if any(event.name == "LAW_OVERRULED" for _, event in bench.events):
+        raise RuntimeError(f"the law was overruled before its lines moved: {bench.events}")
     bench.new_record()
     bench.move_lines(factor)
     bench.run(3 * int(RATE_HZ))
@@ -99,7 +99,7 @@ def undisturbed(case: Case, seed: int, minutes: float = MINUTES) -> int:
 
 
 def measure() -> Results:
-    """Results of all cases and seeds."""
+    """Measure all cases with all seeds."""
     with threadpool_limits(1):
         cases = {preset: Case(preset, 0.0) for preset, _ in MOVED}
         rows = [_row(cases[preset], preset, factor) for preset, factor in track(MOVED, "moved lines")]

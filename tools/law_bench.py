@@ -17,7 +17,7 @@ from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.tuning import Tuned, best_gains, identified, tune_integrator, tune_lqg, tune_pi_notch
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import Command as Commanded
+from lowfc.control.loop.inputs import Command as ModalCommand
 from lowfc.control.loop.inputs import Frame, Input, Load, Outputs, PendingEvent, Request, Step
 from lowfc.control.loop.state import State
 from lowfc.device import DriverOptions
@@ -132,7 +132,7 @@ class Bench:
 
     def ask(self, name: str, **fields: Any) -> None:
         """Send an operator's request; ValueError if it is refused."""
-        outputs = self.take(Request(self._index * self.config.period_ns, name, **fields))
+        outputs = self.process_input(Request(self._index * self.config.period_ns, name, **fields))
         if outputs.reply is None or not outputs.reply.accepted:
             raise ValueError(f"{name}: {outputs.reply}")
 
@@ -155,8 +155,8 @@ class Bench:
         self._index += 1
         return exposed_nm, pixels
 
-    def take(self, input_: Input) -> Outputs:
-        """Give the controller an input."""
+    def process_input(self, input_: Input) -> Outputs:
+        """Advance the controller by an input."""
         self.state, outputs = advance(self.settings, self.state, input_)
         return outputs
 
@@ -164,7 +164,7 @@ class Bench:
         """Frame of the last exposure."""
         return Frame(start + self._index - 1, 10**18 + (self._index - 1) * self.config.period_ns, 0, pixels)
 
-    def follow(self, frame: Frame, command: Commanded) -> None:
+    def move_mirror(self, frame: Frame, command: ModalCommand) -> None:
         """Move the mirror by the command for a frame; ValueError if it refuses."""
         received = Command("lowfc", frame.sequence, frame.time_ns, 10**9, command.actuators_nm, command.command_nm)
         self._status, refused = apply_command(
@@ -175,30 +175,30 @@ class Bench:
         self._path.applied(self._index, self._status.surface_nm)
 
     def run(self, frames: int, *, record: bool = True) -> None:
-        """Expose, control, move the mirror; without `record`, which takes a quarter of the time, for events only."""
+        """Expose, control, move the mirror; `record` keeps steps and truths, and takes a quarter of the time."""
         for _ in range(frames):
             index = self._index
             exposed_nm, pixels = self.expose()
             path = self._path.over(index, self.scene.instants)
             frame = self.frame(pixels)
-            outputs = self.take(frame)
-            self._watched(outputs)
+            outputs = self.process_input(frame)
+            self._record_and_watch(outputs)
             if outputs.step is None or outputs.step.pol_nm is None:
                 self.frames_refused += 1
             elif record:
                 self.steps.append(outputs.step)
                 self.truths.append(self.scene.truth(index, exposed_nm, path))
             if outputs.command is not None:
-                self.follow(frame, outputs.command)
+                self.move_mirror(frame, outputs.command)
 
-    def _watched(self, outputs: Outputs) -> None:
-        """Apply the requests of the gain watch, as the controller does."""
+    def _record_and_watch(self, outputs: Outputs) -> None:
+        """Record events, and apply the requests of the gain watch as the controller does."""
         events = list(outputs.events)
         if outputs.step is not None and self.watch is not None:
-            found = self.watch.observe(outputs.step, self.state)
-            events += found.events
-            for request in found.requests:
-                events += self.take(request).events
+            actions = self.watch.observe(outputs.step, self.state)
+            events += actions.events
+            for request in actions.requests:
+                events += self.process_input(request).events
         self.events += [(self._index - 1, event) for event in events]
 
     def pol(self) -> TimeSeries:

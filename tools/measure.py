@@ -114,9 +114,9 @@ def table(name: str) -> str:
         return DECLARED[name]()
     if name in COMPOSED:
         return COMPOSED[name]()
-    one, results = MEASUREMENTS[name], measured(name)
-    text = one.render(results)
-    if one.has_provenance:
+    measurement, results = MEASUREMENTS[name], measured(name)
+    text = measurement.render(results)
+    if measurement.has_provenance:
         return text
     between = "" if text.endswith("\n") else " "
     return f"{text}{between}{where(name, results)}\n"

@@ -116,9 +116,9 @@ class ModalBench(Bench):
             modes_nm = self._sampler.at(self._index)
             pixels = _encoded(modes_nm[:2].mean(axis=0) + mirror_nm + noise_nm[count % _NOISE_BLOCK])
             time_ns = 10**18 + self._index * self.config.period_ns
-            outputs = self.take(Frame((1 << 32) + self._index, time_ns, 0, pixels))
+            outputs = self.process_input(Frame((1 << 32) + self._index, time_ns, 0, pixels))
             self._index += 1
-            self._watched(outputs)
+            self._record_and_watch(outputs)
             newest_nm = self._mirror_shapes_nm[0]
             if outputs.command is not None:
                 newest_nm = 2 * outputs.command.actuators_nm.ravel()

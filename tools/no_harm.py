@@ -25,7 +25,7 @@ IMAGED = ("sam", "zwfs")
 """Sensors for which some stars are repeated with simulated images."""
 MODAL = ("sam", "sam27d10_bal14", "clowfs", "zwfs", "bar")
 IMAGED_MAGNITUDES = (2, 5, 8)
-OF_DARK_ZONE = 0.01
+TOLERATED = 0.01
 """Tolerated added contrast as a fraction of the dark zone's own, in addition to three standard errors."""
 RATE_HZ, SECONDS = 250.0, 20.0
 GAINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.1)
@@ -39,7 +39,8 @@ def _configured(sensor: str, preset: str, magnitude: float, seed: int, gains: di
 
 
 @lru_cache(maxsize=64)
-def _noise(sensor: str, magnitude: float) -> Array:
+def _noise_nm2(sensor: str, magnitude: float) -> Array:
+    """Covariance (modes, modes) of one frame's noise."""
     config = _configured(sensor, "bench", magnitude, 1, {})
     return factory.frame_noise_nm2(config, calibrated(config))
 
@@ -66,40 +67,44 @@ def _residual_nm2(bench: ModalBench) -> Array:
     return np.asarray(np.square(bench.residual_nm()).mean(axis=0))
 
 
-def _modal(sensor: str, preset: str, magnitude: float, seed: int, gains: dict[str, Any]) -> Array:
-    """Mean squares (modes,) of the residual over the second half."""
-    return _residual_nm2(ModalBench(_configured(sensor, preset, magnitude, seed, gains), _noise(sensor, magnitude)))
+def _closed_nm2(sensor: str, preset: str, magnitude: float, seed: int, gains: dict[str, Any]) -> Array:
+    """Mean squares (modes,) of the closed loop's residual over the second half."""
+    return _residual_nm2(ModalBench(_configured(sensor, preset, magnitude, seed, gains), _noise_nm2(sensor, magnitude)))
 
 
-def of_modes(case: tuple[str, str, float]) -> Results:
-    """Contrast, closed minus open, of one sensor, preset and star, by modes; for bright stars also fixed gains."""
+def modal_case(case: tuple[str, str, float]) -> Results:
+    """Contrast that closing adds for a sensor, preset and star, by modal benches; for bright stars fixed gains too."""
     sensor, preset, magnitude = case
     form, own = _contrast(sensor)
     try:
-        _noise(sensor, magnitude)
+        _noise_nm2(sensor, magnitude)
     except CalibrationError as saturated:
         return {"sensor": sensor, "preset": preset, "magnitude": magnitude, "saturates": str(saturated)}
-    left = np.array([_modal(*case, seed, _AUTO) for seed in SEEDS])
-    before = np.array([_open_nm2(preset, seed) for seed in SEEDS])
-    found = _row(case, (left - before) @ np.diag(form), own, np.sqrt(before.sum(axis=1).mean()), left)
+    residual_nm2 = np.array([_closed_nm2(*case, seed, _AUTO) for seed in SEEDS])
+    disturbance_nm2 = np.array([_open_nm2(preset, seed) for seed in SEEDS])
+    open_nm = np.sqrt(disturbance_nm2.sum(axis=1).mean())
+    found = _row(case, (residual_nm2 - disturbance_nm2) @ np.diag(form), own, open_nm, residual_nm2)
     if magnitude in BRIGHT and preset != "quiet":
         seeds = SEEDS[:2]
         fixed = np.array(
-            [np.mean([_modal(*case, seed, dict.fromkeys(_AUTO, gain)) for seed in seeds], axis=0) for gain in GAINS]
+            [
+                np.mean([_closed_nm2(*case, seed, dict.fromkeys(_AUTO, gain)) for seed in seeds], axis=0)
+                for gain in GAINS
+            ]
         )
         tilt = fixed[:, :2].sum(axis=1).min()
         best = tilt + fixed[:, 2:].sum(axis=1).min()
-        found["of_best"] = float(np.sqrt(left[: len(seeds)].sum(axis=1).mean() / best))
-        found["of_best_tilt"] = float(np.sqrt(left[: len(seeds), :2].sum(axis=1).mean() / tilt))
+        found["of_best"] = float(np.sqrt(residual_nm2[: len(seeds)].sum(axis=1).mean() / best))
+        found["of_best_tilt"] = float(np.sqrt(residual_nm2[: len(seeds), :2].sum(axis=1).mean() / tilt))
     return found
 
 
-def of_images(case: tuple[str, str, float]) -> Results:
-    """As `of_modes`, with every image simulated."""
+def imaged_case(case: tuple[str, str, float]) -> Results:
+    """As `modal_case` without fixed gains, with every image simulated."""
     sensor, preset, magnitude = case
     form, own = _contrast(sensor)
     calibration = calibrated(_configured(sensor, preset, magnitude, 1, _AUTO))
-    changes, left, before = [], [], []
+    changes, residual_nm2, disturbance_nm2 = [], [], []
     for seed in SEEDS:
         bench = Bench(_configured(sensor, preset, magnitude, seed, _AUTO), calibration)
         bench.run(2 * _HALF)
@@ -107,11 +112,11 @@ def of_images(case: tuple[str, str, float]) -> Results:
         residual, disturbance = (
             np.array([getattr(truth, name) for truth in truths], float) for name in ("residual_nm", "disturbance_nm")
         )
-        left.append(np.square(residual).mean(axis=0))
-        before.append(np.square(disturbance).mean(axis=0))
-        changes.append((left[-1] - before[-1]) @ np.diag(form))
-    open_nm = np.sqrt(np.sum(before, axis=1).mean())
-    return _row(case, np.array(changes), own, open_nm, np.array(left)) | {"images": True}
+        residual_nm2.append(np.square(residual).mean(axis=0))
+        disturbance_nm2.append(np.square(disturbance).mean(axis=0))
+        changes.append((residual_nm2[-1] - disturbance_nm2[-1]) @ np.diag(form))
+    open_nm = np.sqrt(np.sum(disturbance_nm2, axis=1).mean())
+    return _row(case, np.array(changes), own, open_nm, np.array(residual_nm2)) | {"images": True}
 
 
 def _row(case: tuple[str, str, float], change: Array, own: float, open_nm: float, residual_nm2: Array) -> Results:
@@ -132,7 +137,7 @@ def _row(case: tuple[str, str, float], change: Array, own: float, open_nm: float
 def harms(row: Results) -> bool:
     """Whether closing the loop adds more contrast than tolerated."""
     errors = 0 if row["preset"] == "quiet" else 3
-    return bool(row["change"] > errors * row["error"] + OF_DARK_ZONE * row["own"])
+    return bool(row["change"] > errors * row["error"] + TOLERATED * row["own"])
 
 
 def measure(
@@ -142,8 +147,8 @@ def measure(
     modes = [(one, preset, star) for one in sensors for preset in PRESETS for star in magnitudes]
     images = [(one, preset, star) for one in imaged for preset in PRESETS for star in IMAGED_MAGNITUDES]
     with threadpool_limits(1), ProcessPoolExecutor(initializer=threadpool_limits, initargs=(1,)) as pool:
-        rows = list(track(pool.map(of_modes, modes), "modes", total=len(modes)))
-        rows += list(track(pool.map(of_images, images), "images", total=len(images)))
+        rows = list(track(pool.map(modal_case, modes), "modes", total=len(modes)))
+        rows += list(track(pool.map(imaged_case, images), "images", total=len(images)))
     return {"rows": rows, "seeds": len(SEEDS), "rate_hz": RATE_HZ, "seconds": SECONDS}
 
 
@@ -160,7 +165,7 @@ def render(results: Results) -> str:
                 | {preset: "{open_nm:.2f} to {closed_nm:.2f}".format(**row) for preset, row in mine.items()}
             )
     harmful = [row for row in rows if harms(row)]
-    stars = _listed(modal)
+    stars = _magnitudes(modal)
     bright = [row for row in rows if "of_best" in row]
     compared = [row["of_best"] for row in bright]
     names = "; ".join(
@@ -175,14 +180,14 @@ def render(results: Results) -> str:
         f"of {results['seconds']:g} s at {results['rate_hz']:g} Hz, mean of {results['seeds']} seeds. "
         f"Number of cases: {len(rows)} (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them "
         "with every image simulated). A case counts as harmful if closing adds more contrast than "
-        f"{100 * OF_DARK_ZONE:g} % of the dark zone's own plus three standard errors (`quiet`: "
-        f"{100 * OF_DARK_ZONE:g} % alone). Harmful cases, with the ratio of added contrast to the dark zone's own: "
+        f"{100 * TOLERATED:g} % of the dark zone's own plus three standard errors (`quiet`: "
+        f"{100 * TOLERATED:g} % alone). Harmful cases, with the ratio of added contrast to the dark zone's own: "
         f"{names or 'none'}. On bright stars "
-        f"(V = {_listed(bright)}) the residual with automatic gains is {min(compared):.2f} to {max(compared):.2f} "
+        f"(V = {_magnitudes(bright)}) the residual with automatic gains is {min(compared):.2f} to {max(compared):.2f} "
         "times that of the best fixed gains, chosen afterwards."
     )
 
 
-def _listed(rows: list[Results]) -> str:
-    """The magnitudes of rows."""
+def _magnitudes(rows: list[Results]) -> str:
+    """The magnitudes of rows, each once, as text."""
     return ", ".join(f"{one:g}" for one in sorted({row["magnitude"] for row in rows}))

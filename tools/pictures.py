@@ -50,21 +50,21 @@ def picture(name: str, source: str, *more: str, meanwhile: Callable[[], object] 
     sys.stderr.write(f"{name}\n")
 
 
-class Night(ChaosBench):
+class PictureRun(ChaosBench):
     """A run that is brought into the states of the pictures."""
 
-    def look(self, name: str, tab: str = "operator", meanwhile: Callable[[], object] | None = None) -> None:
-        """Take a picture of it."""
+    def take_picture(self, name: str, tab: str = "operator", meanwhile: Callable[[], object] | None = None) -> None:
+        """Take a picture of the run."""
         picture(name, f"--run {self.run.run_id}", "--tab", tab, "--seconds", f"{LOOK_S}", meanwhile=meanwhile)
 
-    def other_camera(self, keys: dict[str, Any]) -> None:
-        """Restart the camera with another star."""
+    def restart_camera(self, keys: dict[str, Any]) -> None:
+        """Restart the camera with other settings, such as another star."""
         file = self.folder / "other.toml"
         file.write_text(load(None, keys).to_toml())
         self.kill(Role.CAMERA)
         self.restart(Role.CAMERA, [*self.children[Role.CAMERA].command, "--config", str(file)], ready=False)
 
-    def stumble(self) -> None:
+    def stop_controller_repeatedly(self) -> None:
         """Stop the controller repeatedly for 40 ms."""
         for _ in range(12):
             self.signal(Role.CONTROLLER, signal.SIGSTOP)
@@ -74,11 +74,11 @@ class Night(ChaosBench):
 
 
 @contextlib.contextmanager
-def night(keys: dict[str, Any]) -> Iterator[Night]:
+def picture_run(keys: dict[str, Any]) -> Iterator[PictureRun]:
     """A run with these settings, for a few pictures."""
     with tempfile.TemporaryDirectory() as name:
         config = load(None, keys | {"recorder.folder": name}, spread(os.sched_getaffinity(0)))
-        run = Night(config, Path(name), random.Random(1), None)  # noqa: S311  # nothing secret
+        run = PictureRun(config, Path(name), random.Random(1), None)  # noqa: S311  # nothing secret
         try:
             run.begin()
             time.sleep(6)  # a starting loop skips some frames, and the tiles show that for five seconds
@@ -88,21 +88,21 @@ def night(keys: dict[str, Any]) -> Iterator[Night]:
 
 
 def make() -> None:
-    """Every state, and every tab."""
-    with night(BRIGHT) as run:
+    """Take the pictures of every state and every tab."""
+    with picture_run(BRIGHT) as run:
         loop = run.client()
         for tab in ("operator", "optics", "engineering"):
-            run.look(tab, tab)
-        run.look("open", meanwhile=loop.open_loop)
+            run.take_picture(tab, tab)
+        run.take_picture("open", meanwhile=loop.open_loop)
         loop.close_loop()
         time.sleep(5)
-        run.look("frames-lost", meanwhile=run.stumble)
+        run.take_picture("frames-lost", meanwhile=run.stop_controller_repeatedly)
         time.sleep(5)
-        run.look("recording-stopped", meanwhile=lambda: loop.record(False))
+        run.take_picture("recording-stopped", meanwhile=lambda: loop.record(False))
         picture("log", str(max(run.folder.glob("*.mcap"))))
         loop.record(True)
-        run.look("star-gone", meanwhile=lambda: run.other_camera(BRIGHT | {"star.magnitude": 9.0}))
-    with night(BRIGHT) as run:
-        run.look("controller-dead", meanwhile=lambda: run.kill(Role.CONTROLLER))
-    with night(SMALL_WELL) as run:
-        run.look("saturated", meanwhile=lambda: run.other_camera(SMALL_WELL | {"star.magnitude": -2.0}))
+        run.take_picture("star-gone", meanwhile=lambda: run.restart_camera(BRIGHT | {"star.magnitude": 9.0}))
+    with picture_run(BRIGHT) as run:
+        run.take_picture("controller-dead", meanwhile=lambda: run.kill(Role.CONTROLLER))
+    with picture_run(SMALL_WELL) as run:
+        run.take_picture("saturated", meanwhile=lambda: run.restart_camera(SMALL_WELL | {"star.magnitude": -2.0}))

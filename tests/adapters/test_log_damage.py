@@ -32,15 +32,15 @@ from tests.support.mutated_logs import (
     boundaries,
     changed,
     chunks_of,
+    contents,
     flipped,
-    identity,
     mutations,
     small_log,
     small_samples,
 )
 
 Message = tuple[str, bytes, int, int, int]
-SENT: list[Message] = identity(small_samples())
+SENT: list[Message] = contents(small_samples())
 
 
 def read_of(reader: LogReader) -> tuple[list[Message], str]:
@@ -49,8 +49,8 @@ def read_of(reader: LogReader) -> tuple[list[Message], str]:
     try:
         read.extend(reader)
     except DataFileError as error:
-        return identity(read), str(error)
-    return identity(read), ""
+        return contents(read), str(error)
+    return contents(read), ""
 
 
 @pytest.mark.parametrize("finished", [True, False])
@@ -162,7 +162,7 @@ NO_CHUNKS = {"use_chunking": False}
 def test_a_rewritten_log_is_read_as_the_original(tmp_path: Path, source: Path, options: dict[str, Any]) -> None:
     path = rewritten(source, tmp_path / "rewritten.mcap", options)
     reader = LogReader(path)
-    assert sorted(identity(list(reader))) == sorted(SENT)
+    assert sorted(contents(list(reader))) == sorted(SENT)
     assert (reader.damage, reader.unreadable, reader.finished, reader.complete) == ([], 0, True, True)
     assert reader.metadata == METADATA | {"recording": {"messages": str(len(SENT))}}
     assert reader.attachments == {one.name: one.data for one in ATTACHMENTS}
@@ -199,14 +199,14 @@ def test_only_the_damaged_chunk_of_a_rewritten_log_is_lost(
         os.truncate(path, chunks[-1][1])
     changed(path, chunks[5][0] + at, b"\xff")
     reader = LogReader(path, skip_damaged=True)
-    read = identity(list(reader))
+    read = contents(list(reader))
     assert set(SENT).issuperset(read)
     assert len(SENT) / 2 < len(read) < len(SENT)
     assert reader.damage[0].position == chunks[5][0]
     assert sum(one.length for one in reader.damage) < chunks[6][0] - chunks[5][0] + 1
     done = recover(path, tmp_path / "recovered.mcap")
     assert done.recovered is not None
-    assert identity(list(LogReader(done.recovered))) == read
+    assert contents(list(LogReader(done.recovered))) == read
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,7 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
     path = rewritten(source, tmp_path / "rewritten.mcap", NO_CRCS)
     data = path.read_bytes()
     changed(path, next(one for one in boundaries(data) if data[one] == opcode) + at, new)
-    assert sorted(identity(list(LogReader(path)))) == sorted(SENT)
+    assert sorted(contents(list(LogReader(path)))) == sorted(SENT)
     with LogFile(path) as file:
         assert list(file.index()) == []
 
@@ -238,10 +238,10 @@ def test_of_two_logs_in_one_file_the_first_is_read_and_the_second_reported(
     second = rewritten(source, tmp_path / "second.mcap", {}).read_bytes()
     second = second[: len(second) - cuts[1]]
     source.write_bytes(first)
-    expected = identity(list(LogReader(source)))
+    expected = contents(list(LogReader(source)))
     source.write_bytes(first + second)
     reader = LogReader(source, skip_damaged=True)
-    assert identity(list(reader)) == expected
+    assert contents(list(reader)) == expected
     damage = reader.damage[-1]
     assert len(reader.damage) == 1 + bool(cuts[0])
     assert (damage.position, damage.length) == (len(first), len(second))
@@ -253,7 +253,7 @@ def test_another_file_after_a_log_is_damage(source: Path) -> None:
     log = source.read_bytes()
     source.write_bytes(log + b"no log" + log[-8:])
     reader = LogReader(source, skip_damaged=True)
-    assert identity(list(reader)) == SENT
+    assert contents(list(reader)) == SENT
     assert [damage.why for damage in reader.damage] == ["the summary is damaged, or another file was appended"]
 
 
@@ -276,7 +276,7 @@ def test_unchunked_messages_are_covered_by_the_data_checksum_and_read_up_to_a_tr
     assert [one.why.partition(",")[0] for one in reader.damage] == ["its parts are intact"]
     os.truncate(path, middle)
     reader = LogReader(path)
-    read = identity(list(reader))
+    read = contents(list(reader))
     assert len(SENT) / 4 < len(read) < len(SENT)
     assert set(SENT).issuperset(read)
     assert not reader.complete

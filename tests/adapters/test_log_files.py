@@ -32,8 +32,8 @@ from tests.support.mutated_logs import (
     START_S,
     changed,
     chunks_of,
+    contents,
     flipped,
-    identity,
     small_log,
     small_samples,
 )
@@ -51,7 +51,7 @@ def written(path: Path, messages: list[Sample]) -> Path:
 def test_a_written_log_is_read_back(tmp_path: Path) -> None:
     reader = LogReader(small_log(tmp_path / "logs" / "a.mcap"))
     read = list(reader)
-    assert identity(read) == identity(SENT)
+    assert contents(read) == contents(SENT)
     assert {reader.schema_of(m) for m in read} >= {"foxglove.RawImage", "lowfc.v1.ControlStep"}
     assert reader.complete
     assert reader.metadata == {**METADATA, "recording": {"messages": str(len(SENT))}}

@@ -22,8 +22,8 @@ from tests.support.toy import (
     SOME,
     START,
     TOY,
-    answered,
     calibration,
+    check_reply,
     feed,
     frame,
     frame_sequence,
@@ -286,7 +286,7 @@ def test_gain_and_leak_are_set_for_all_some_or_each_mode(name: str) -> None:
 def test_a_bad_value_is_refused_and_changes_nothing(request_: Request, message: str) -> None:
     state = running()
     after, (outputs,) = feed(DEFAULTS, state, request_)
-    answered(outputs, False, message)
+    check_reply(outputs, False, message)
     assert not outputs.changed
     assert after.loop.integrator is state.loop.integrator
 
@@ -307,7 +307,7 @@ def test_gain_and_leak_are_refused_if_unstable_together() -> None:
     for requests in ([above, leaky], [leaky, above]):
         _, (one, other) = feed(setup, loaded(setup), *requests)
         assert one.reply.accepted
-        answered(other, False, "below 1.8", "a delay of 1 frame and a leak of 0.2 becomes unstable; got 1.9")
+        check_reply(other, False, "below 1.8", "a delay of 1 frame and a leak of 0.2 becomes unstable; got 1.9")
     for requests in ([below, leaky], [leaky, below], [above, ask("leak", 0.2, modes=(3, 4))]):
         _, all_outputs = feed(setup, loaded(setup), *requests)
         assert all(outputs.reply.accepted for outputs in all_outputs)
@@ -316,7 +316,7 @@ def test_gain_and_leak_are_refused_if_unstable_together() -> None:
 def test_a_request_with_more_leaks_than_modes_is_refused_without_computing_their_gains() -> None:
     before = limiting_gain.cache_info().misses
     _, outputs = feed(DEFAULTS, loaded(DEFAULTS), ask("leak", *np.linspace(0.01, 0.9, 900).tolist()))
-    answered(outputs[0], False, "give one value, or one for each of the 3 modes; got 900")
+    check_reply(outputs[0], False, "give one value, or one for each of the 3 modes; got 900")
     assert limiting_gain.cache_info().misses == before
 
 
@@ -326,7 +326,7 @@ def test_a_mode_that_a_request_names_twice_has_one_value() -> None:
             DEFAULTS, loaded(DEFAULTS), ask(name, 0.1, modes=(2, 2)), ask(name, 0.1, 0.2, modes=(2, 2))
         )
         assert one.reply.accepted
-        answered(two, False, "got 2")
+        check_reply(two, False, "got 2")
 
 
 def test_the_first_step_after_closing_is_gain_times_error() -> None:

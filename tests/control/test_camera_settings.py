@@ -25,8 +25,8 @@ from tests.support.toy import (
     SHAPE,
     SOME,
     START,
-    answered,
     calibration,
+    check_reply,
     feed,
     frame,
     frame_sequence,
@@ -202,7 +202,7 @@ def idle(frames: int = 3, shape_nm: float = 0.0) -> State:
 
 def play(state: State, table: Single, basis: Single = BASIS) -> State:
     state, outputs = advance(DEFAULTS, state, Request(0, "play", text=MIRROR, actuators_nm=basis, table=table))
-    answered(outputs, True)
+    check_reply(outputs, True)
     return state
 
 
@@ -253,7 +253,7 @@ def test_an_idle_loop_holds_the_mirror_and_safe_relaxes_it() -> None:
     state, all_outputs = feed(DEFAULTS, idle(shape_nm=30.0), odd(4))
     assert np.allclose(surfaces(all_outputs), 30)
     state, outputs = advance(DEFAULTS, state, Request(0, "safe"))
-    answered(outputs, True)
+    check_reply(outputs, True)
     state, all_outputs = feed(DEFAULTS, state, odd(5), odd(6))
     assert not surfaces(all_outputs)[-1].any()
     state, _ = advance(DEFAULTS, state, Request(0, "clear"))
@@ -272,7 +272,7 @@ def test_safe_mode_from_before_the_start_remains() -> None:
 @pytest.mark.parametrize("name", ["close", "step"])
 def test_an_idle_loop_is_not_closed_with_a_reason(begin: object, name: str) -> None:
     _, outputs = advance(DEFAULTS, begin(), Request(0, name, values=(3.0,) if name == "step" else ()))  # type: ignore[operator]
-    answered(outputs, False, "lowfc commission")
+    check_reply(outputs, False, "lowfc commission")
 
 
 def test_a_calibration_ends_the_idle_mode_and_the_mirror_keeps_its_shape() -> None:

@@ -21,6 +21,7 @@ DEFAULTS = settings()
 DISTURBED = np.array([10.0, -5.0, 3.0])
 ACTUATORS = GRID[0] * GRID[1]
 STEP_NM = DEFAULTS.limits.kept_slew_nm / 2
+LOAD_OTHER = Request(0, "load", calibration=replace(calibration(scale=1.01), id="other"))
 
 
 class ToyLoop:
@@ -35,7 +36,7 @@ class ToyLoop:
         self.outputs: list[Outputs] = []
         self.to_modes = np.linalg.pinv(TOY.modes_to_actuators)
 
-    def take(self, input_: Input) -> Outputs:
+    def process_input(self, input_: Input) -> Outputs:
         self.state, outputs = advance(self.setup, self.state, input_)
         self.outputs.append(outputs)
         if outputs.command is not None:
@@ -48,13 +49,13 @@ class ToyLoop:
             self.count += 1
             seen_nm = np.asarray(disturbance_nm) + self.to_modes @ self.surfaces[-1].reshape(-1)
             self.wavefronts.append(seen_nm)
-            self.take(frame(self.count, seen_nm))
+            self.process_input(frame(self.count, seen_nm))
 
     def ask(self, name: str, **fields: object) -> Reply:
         """Send a request as an operator: encoded and decoded."""
         request = Request(0, name, **fields)  # type: ignore[arg-type]
         payload = encode_request(request, Reply(False, "", 0), 0, None)
-        return self.take(decode_request(payload, name, 0)).reply
+        return self.process_input(decode_request(payload, name, 0)).reply
 
     @property
     def events(self) -> list[str]:
@@ -95,7 +96,7 @@ def test_the_zero_point_shifts_with_the_delay_of_the_mirror(delay_frames: float)
         shapes = [loop.surfaces[max(-1 - lag, -len(loop.surfaces))] for lag in range(len(weights))]
         seen = sum(weight * shape for weight, shape in zip(weights, shapes, strict=True))
         loop.count += 1
-        outputs = loop.take(frame(loop.count, loop.to_modes @ np.asarray(seen).reshape(-1)))
+        outputs = loop.process_input(frame(loop.count, loop.to_modes @ np.asarray(seen).reshape(-1)))
         assert outputs.step.error_nm is not None
         assert np.abs(outputs.step.error_nm).max() < 0.05
 
@@ -205,9 +206,9 @@ def test_events_that_end_a_probe_sequence(end: str) -> None:
     loop.run(5, np.zeros(3))
     assert np.allclose(loop.surfaces[-1], 6.0)
     if end == "restart":
-        loop.take(Frame(frame_sequence(1, START + 5), 0, 0, TOY.pixels((0, 0, 0))))
+        loop.process_input(Frame(frame_sequence(1, START + 5), 0, 0, TOY.pixels((0, 0, 0))))
     elif end == "load":
-        assert loop.take(Request(0, end, calibration=replace(calibration(scale=1.01), id="other"))).reply.accepted
+        assert loop.process_input(LOAD_OTHER).reply.accepted
     elif end != "limit":
         assert loop.ask(end).accepted
     loop.run(1 if end == "restart" else 12, np.zeros(3))
@@ -325,7 +326,7 @@ def test_reset_removes_the_modal_command_within_the_slew_limit(mode: LoopMode) -
 def test_a_foreign_shape_of_the_mirror_is_adopted_as_a_channel() -> None:
     loop = ToyLoop()
     shape_nm = dark_hole(30.0) + (TOY.modes_to_actuators @ DISTURBED).reshape(GRID).astype(np.float32)
-    loop.take(MirrorShape(0, shape_nm, np.zeros(0, np.float32)))
+    loop.process_input(MirrorShape(0, shape_nm, np.zeros(0, np.float32)))
     assert "SHAPE_ADOPTED" in loop.events
     loop.surfaces = [shape_nm]
     seen = loop.to_modes @ shape_nm.reshape(-1)
@@ -360,7 +361,7 @@ def test_a_law_takes_over_and_returns_control_without_a_jump() -> None:
 def test_in_safe_mode_no_shape_of_the_mirror_is_adopted() -> None:
     loop = ToyLoop(mode=LoopMode.SAFE)
     shape_nm = dark_hole(30.0)
-    loop.take(MirrorShape(0, shape_nm, np.zeros(0, np.float32)))
+    loop.process_input(MirrorShape(0, shape_nm, np.zeros(0, np.float32)))
     loop.surfaces = [shape_nm]
     loop.run(10, np.zeros(3))
     assert not loop.surfaces[-1].any()
@@ -372,7 +373,7 @@ def test_in_safe_mode_no_shape_of_the_mirror_is_adopted() -> None:
 def test_safe_mode_of_a_mirror_that_reports_late_removes_the_channels() -> None:
     loop = ToyLoop()
     assert loop.ask("channel", text="dark-hole", actuators_nm=dark_hole().reshape(-1)).accepted
-    loop.take(MirrorShape(0, np.zeros(GRID, np.float32), np.zeros(0, np.float32), safe=True))
+    loop.process_input(MirrorShape(0, np.zeros(GRID, np.float32), np.zeros(0, np.float32), safe=True))
     assert loop.state.mode is LoopMode.SAFE
     loop.run(10, np.zeros(3))
     assert loop.ask("clear").accepted
@@ -386,7 +387,7 @@ def test_a_calibration_loaded_in_safe_mode_leaves_nothing_on_the_mirror() -> Non
     assert loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(60.0).reshape(-1)).accepted
     loop.run(60)
     assert loop.ask("safe").accepted
-    assert loop.take(Request(0, "load", calibration=replace(calibration(scale=1.01), id="other"))).reply.accepted
+    assert loop.process_input(LOAD_OTHER).reply.accepted
     assert loop.surfaces[-1].any(), "it has not reached flat yet"
     loop.run(60)
     assert loop.ask("clear").accepted
@@ -429,12 +430,11 @@ def test_loading_another_calibration_moves_nothing() -> None:
     loop = ToyLoop()
     loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(20.0).reshape(-1))
     loop.run(60)
-    request = Request(0, "load", calibration=replace(calibration(scale=1.01), id="other"))
-    refused = loop.take(request).reply
+    refused = loop.process_input(LOAD_OTHER).reply
     assert not refused.accepted  # while the loop is closed
     loop.ask("open")
     before = loop.surfaces[-1]
-    loaded_now = loop.take(request)
+    loaded_now = loop.process_input(LOAD_OTHER)
     assert loaded_now.reply.accepted
     assert "CALIBRATION_LOADED" in [event.name for event in loaded_now.events]
     loop.run(5)
@@ -444,7 +444,7 @@ def test_loading_another_calibration_moves_nothing() -> None:
     assert np.allclose(loop.surfaces[-1], before, atol=0.5)  # frames are rounded to DN
     loop.ask("open")
     before = loop.surfaces[-1]
-    loop.take(Load(0, calibration((2, 3)), "test"))  # the part outside these modes becomes a channel
+    loop.process_input(Load(0, calibration((2, 3)), "test"))  # the part outside these modes becomes a channel
     loop.ask("channel", text="other", actuators_nm=dark_hole(1.0).reshape(-1))
     loop.run(10)
     assert np.allclose(loop.surfaces[-1], before + dark_hole(1.0), atol=1.1)

@@ -23,7 +23,7 @@ from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, S
 from lowfc.programs.cli import status
 from sim_camera.disturbance import LINE_WIDTH, LINES_HZ, LINES_MAS
 from tests.support.in_process_loop import SMALL_MIRROR
-from tests.support.toy import NOLL, calibration, feed, frame, live, loaded, names, settings
+from tests.support.toy import NOLL, calibration, feed, frame, loaded, names, run_toy, settings
 from tools.guard import MOVED, SEEDS, Case, identified_law, moved, undisturbed
 from tools.law_bench import Bench, calibrated, configured, timing_of
 from tools.modal_bench import ModalBench
@@ -69,7 +69,7 @@ def run(
 ) -> tuple[list[str], State]:
     """Names of the reasons of the last step, and the state, after some frames of a slow wave."""
     rows = slice(first, first + frames)
-    steps, _, state = live(setup, SWAY_NM[rows], state=state, first=first, **changes)
+    steps, _, state = run_toy(setup, SWAY_NM[rows], state=state, first=first, **changes)
     return [reason.name for reason in steps[-1].reasons], state
 
 
@@ -158,7 +158,7 @@ def test_the_law_returns_once_it_would_be_far_better() -> None:
     noisy = replace(state.loop.integrator, gain=np.array([1.9, 1.9, 0.3], np.float32))
     state = state._replace(loop=state.loop._replace(integrator=noisy))
     quiet = np.zeros(((spans.better + 3) * spans.block, len(NOLL)))
-    steps, _, state = live(setup, quiet, NOISE_NM[: len(quiet)], state, frames + 1)
+    steps, _, state = run_toy(setup, quiet, NOISE_NM[: len(quiet)], state, frames + 1)
     assert [group.takeovers for group in state.loop.law_runner.guard.groups] == [1, 0]
     assert state.loop.law_runner.alone()
     by_the_integrator = [step.reasons for step in steps].count((Limit.LAW_OVERRULED,))

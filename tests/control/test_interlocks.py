@@ -12,7 +12,7 @@ from lowfc.control.loop.interlocks import Action, BenchReport, Interlock, Value
 from lowfc.control.loop.loading import holding_cause
 from lowfc.control.loop.safety import LoopMode, Rejection
 from lowfc.control.loop.state import Settings, State
-from tests.support.toy import GRID, SOME, answered, calibration, feed, frame, loaded, names, settings
+from tests.support.toy import GRID, SOME, calibration, check_reply, feed, frame, loaded, names, settings
 
 S = 1_000_000_000
 MOVER = 7
@@ -113,15 +113,15 @@ def test_each_action_and_that_clearing_the_interlock_undoes_nothing(action: Acti
     refused, clears = action is not Action.WARN, mode is LoopMode.SAFE
     for name, values in (("close", ()), ("step", (3.0,))):
         _, outputs = applied(setup, state, name, values=values)
-        answered(outputs, not refused, *(["mask is true"] if refused and not clears else []))
+        check_reply(outputs, not refused, *(["mask is true"] if refused and not clears else []))
     if clears:
         _, outputs = applied(setup, state, "clear")
-        answered(outputs, False, "an interlock acts: mask is true")
+        check_reply(outputs, False, "an interlock acts: mask is true")
     after, all_outputs = feed(setup, state, mask(False))
     assert names(all_outputs) == ["INTERLOCK_CLEARED"]
     assert after.mode is state.mode
     after, outputs = applied(setup, after, "clear" if clears else "close")
-    answered(outputs, True)
+    check_reply(outputs, True)
 
 
 @pytest.mark.parametrize("action", [Action.REFUSE_CLOSE, Action.OPEN, Action.SAFE])
@@ -184,9 +184,9 @@ def test_a_permit_holds_a_closed_loop_for_its_duration() -> None:
     setup = under(Action.WARN)
     state = running(setup)
     _, outputs = permit(setup, state)
-    answered(outputs, False, "the loop is closed")
+    check_reply(outputs, False, "the loop is closed")
     state, outputs = permit(setup, state, 0.01)
-    answered(outputs, True, "granted for 0.01 s: the loop holds its command")
+    check_reply(outputs, True, "granted for 0.01 s: the loop holds its command")
     state, all_outputs = feed(setup, state, *(frame(count, SOME) for count in range(6, 18)))
     assert [one.step.reasons for one in all_outputs] == [(Rejection.HELD,)] * 10 + [()] * 2
     assert names(all_outputs) == ["FRAMES_REFUSED", "LEASE_ENDED", "FRAMES_ACCEPTED"]
@@ -198,12 +198,12 @@ def test_a_permit_can_be_released_and_ended_by_open() -> None:
     setup = under(Action.WARN)
     held, _ = permit(setup, running(setup), 5.0)
     _, outputs = applied(setup, held, "gain", values=(0.1,))
-    answered(outputs, False, "reserved for moving the mask (for at most 5 s more)")
+    check_reply(outputs, False, "reserved for moving the mask (for at most 5 s more)")
     state, outputs = applied(setup, held, "release", lease_id=MOVER)
     _, all_outputs = feed(setup, state, frame(6, SOME))
     assert all_outputs[-1].step.reasons == ()
     state, outputs = applied(setup, held, "open")
-    answered(outputs, True, "this ended the reservation for moving the mask")
+    check_reply(outputs, True, "this ended the reservation for moving the mask")
 
 
 def test_a_permit_is_granted_unless_the_loop_is_closed() -> None:
@@ -212,9 +212,9 @@ def test_a_permit_is_granted_unless_the_loop_is_closed() -> None:
         state, _ = applied(setup, running(setup), name)
         for seconds in (0.0, 5.0):
             after, outputs = permit(setup, state, seconds)
-            answered(outputs, True, f"the loop is {state.mode.in_words}")
+            check_reply(outputs, True, f"the loop is {state.mode.in_words}")
         _, outputs = applied(setup, after, "close" if name == "open" else "clear")
-        answered(outputs, False, "reserved for moving the mask")
+        check_reply(outputs, False, "reserved for moving the mask")
 
 
 def test_a_permit_is_refused_during_a_lease_or_a_probe_sequence() -> None:
@@ -222,19 +222,19 @@ def test_a_permit_is_refused_during_a_lease_or_a_probe_sequence() -> None:
     reserved, _ = applied(setup, running(setup), "lease", text="a calibration", values=(10.0,), lease_id=3)
     shape, table = np.full(GRID, 3, np.float32).reshape(-1), np.ones((50, 1), np.float32)
     played, outputs = applied(setup, running(setup), "play", text=MIRROR, actuators_nm=shape, table=table)
-    answered(outputs, True)
+    check_reply(outputs, True)
     for state, why in ((reserved, "a calibration"), (played, "a probe sequence is being played")):
         for seconds in (0.0, 5.0):
             after, outputs = permit(setup, state, seconds)
-            answered(outputs, False, why)
+            check_reply(outputs, False, why)
             assert after.conditions.lease == state.conditions.lease
     _, outputs = permit(setup, running(setup), 61.0)
-    answered(outputs, False, "at most 60 s")
+    check_reply(outputs, False, "at most 60 s")
 
 
 def test_a_renewed_permit_still_holds() -> None:
     setup = under(Action.WARN)
     state, _ = permit(setup, running(setup), 5.0)
     state, outputs = applied(setup, state, "renew", text="moving the mask", values=(5.0,), lease_id=MOVER)
-    answered(outputs, True)
+    check_reply(outputs, True)
     assert feed(setup, state, frame(6, SOME))[1][-1].step.reasons == (Rejection.HELD,)

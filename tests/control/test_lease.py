@@ -14,7 +14,7 @@ from lowfc.control.loop.lease import MAX_S
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
-from tests.support.toy import GRID, NOLL, SOME, answered, feed, frame, frame_sequence, loaded, names, settings
+from tests.support.toy import GRID, NOLL, SOME, check_reply, feed, frame, frame_sequence, loaded, names, settings
 
 DEFAULTS = settings(rate_hz=1000.0)
 HOLDER = "lowfc calibrate (anna, pid 7)"
@@ -40,7 +40,7 @@ def played(state: State, frames: int = 500, lease_id: int = MINE) -> State:
     table = np.ones((frames, 1), np.float32)
     request = Request(0, "play", text=MIRROR, actuators_nm=shape, table=table, lease_id=lease_id)
     state, outputs = applied(state, request)
-    answered(outputs, True)
+    check_reply(outputs, True)
     return state
 
 
@@ -56,23 +56,23 @@ GRANTED = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", 
 def test_requests_of_other_clients_are_refused_with_the_holders_name(name: str) -> None:
     state = held()
     after, outputs = applied(state, Request(4 * S, name))
-    answered(outputs, False, HOLDER, "6 s", "lowfc ctl open")
+    check_reply(outputs, False, HOLDER, "6 s", "lowfc ctl open")
     assert all(now is was for now, was in zip(after[:-1], state[:-1], strict=True))
 
 
 def test_the_holders_requests_are_granted() -> None:
     state, outputs = applied(held(), Request(S, "gain", values=(0.3,), lease_id=MINE))
-    answered(outputs, True)
+    check_reply(outputs, True)
     state, outputs = applied(state, Request(S, "open", lease_id=MINE))
     assert state.mode is LoopMode.OPEN
     state, outputs = applied(state, Request(2 * S, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
-    answered(outputs, True)
+    check_reply(outputs, True)
 
 
 @pytest.mark.parametrize("name", ["safe", "open", "pause", "stop"])
 def test_safe_open_pause_and_stop_end_any_lease_and_its_probe_sequence(name: str) -> None:
     state, outputs = applied(played(held()), Request(S, name))
-    answered(outputs, True)
+    check_reply(outputs, True)
     assert "LEASE_ENDED" in names([outputs])
     assert not remaining_rows(state)
     state, outputs = applied(state, Request(2 * S, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
@@ -99,7 +99,7 @@ def test_close_reports_whether_the_loop_was_closed_already() -> None:
 def test_a_former_holder_is_refused_with_the_reason(name: str, ended: bool) -> None:
     state = applied(held(), Request(S, "pause"))[0] if ended else loaded(DEFAULTS)
     _, outputs = applied(state, Request(2 * S, name, values=(0.1,), lease_id=MINE))
-    answered(outputs, False, ("operator asked to pause" if ended else "did the controller restart"))
+    check_reply(outputs, False, ("operator asked to pause" if ended else "did the controller restart"))
 
 
 def test_safe_mode_ends_and_refuses_a_lease() -> None:
@@ -108,26 +108,26 @@ def test_safe_mode_ends_and_refuses_a_lease() -> None:
     _, outputs = applied(state, Request(S, "lease", values=(5.0,), text=HOLDER, lease_id=12))
     assert "safe mode" in outputs.reply.text
     _, outputs = applied(state, Request(S, "clear"))
-    answered(outputs, True)
+    check_reply(outputs, True)
 
 
 @pytest.mark.parametrize("name", ["status", "note"])
 def test_status_and_note_do_not_end_a_lease(name: str) -> None:
     state, outputs = applied(held(), Request(S, name, text="cloud"))
-    answered(outputs, True)
+    check_reply(outputs, True)
     assert not state.conditions.lease.ended
 
 
 def test_a_lease_has_one_holder_who_alone_can_release_it() -> None:
     state = held()
     after, outputs = applied(state, Request(S, "lease", values=(5.0,), text="somebody", lease_id=12))
-    answered(outputs, False)
+    check_reply(outputs, False)
     after, outputs = applied(after, Request(S, "release", lease_id=12))
     assert after.conditions == state.conditions
     after, outputs = applied(after, Request(S, "release", lease_id=MINE))
     assert names([outputs]) == ["LEASE_RELEASED"]
     after, outputs = applied(after, Request(S, "gain", values=(0.2,)))
-    answered(outputs, True)
+    check_reply(outputs, True)
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_a_lease_has_one_holder_who_alone_can_release_it() -> None:
 def test_an_incomplete_lease_is_refused(fields: dict[str, object], why: str) -> None:
     request = Request(0, "lease", values=(5.0,), text=HOLDER, lease_id=MINE)
     _, outputs = applied(loaded(DEFAULTS), replace(request, **fields))  # type: ignore[arg-type]  # each of its own type
-    answered(outputs, False, why)
+    check_reply(outputs, False, why)
 
 
 def test_a_lease_ends_after_its_number_of_frames() -> None:
@@ -168,7 +168,7 @@ def test_without_frames_a_lease_ends_by_the_clock() -> None:
 
 def test_an_expired_lease_ends_before_the_next_request() -> None:
     _state, outputs = applied(held(1.0), Request(S + 1, "gain", values=(0.3,)))
-    answered(outputs, True)
+    check_reply(outputs, True)
     assert names([outputs]) == ["LEASE_ENDED"]
 
 

@@ -7,7 +7,7 @@ from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.inputs import Command, Frame, MirrorReport, MirrorShape, Request, Tick
 from lowfc.control.loop.safety import LoopMode, Rejection
 from lowfc.control.loop.state import LawRunner, State
-from tests.support.toy import GRID, NOLL, SOME, answered, feed, frame, loaded, names, settings
+from tests.support.toy import GRID, NOLL, SOME, check_reply, feed, frame, loaded, names, settings
 
 DEFAULTS = settings()
 LOST, BACK = MirrorReport(0, "does not answer"), MirrorReport(0, "")
@@ -77,22 +77,22 @@ def test_a_lost_mirror_restarts_the_law() -> None:
 def test_without_a_mirror_an_open_loop_measures_and_is_not_closed() -> None:
     state, all_outputs = feed(DEFAULTS, running(), Request(0, "open"), LOST, *frames(6), Request(0, "close"))
     assert all_outputs[2].step.error_nm is not None
-    answered(all_outputs[-1], False, "the mirror does not answer", "would only hold")
-    answered(feed(DEFAULTS, state, Request(0, "step", values=(3.0,)))[1][0], False, "does not answer")
-    answered(feed(DEFAULTS, state, BACK, *frames(7), Request(0, "close"))[1][-1], True)
+    check_reply(all_outputs[-1], False, "the mirror does not answer", "would only hold")
+    check_reply(feed(DEFAULTS, state, Request(0, "step", values=(3.0,)))[1][0], False, "does not answer")
+    check_reply(feed(DEFAULTS, state, BACK, *frames(7), Request(0, "close"))[1][-1], True)
 
 
 def test_a_lost_mirror_ends_the_probe_sequence_and_refuses_others() -> None:
     probe = Request(0, "play", text="offset", table=np.zeros((50, 3), np.float32))
     _, all_outputs = feed(DEFAULTS, running(), probe, *frames(6), LOST, probe)
-    answered(all_outputs[0], True)
+    check_reply(all_outputs[0], True)
     assert names(all_outputs[2:3]) == ["MIRROR_LOST", "PLAY_ENDED"]
-    answered(all_outputs[-1], False, "does not answer")
+    check_reply(all_outputs[-1], False, "does not answer")
 
 
 def test_safe_flattens_a_lost_mirror() -> None:
     state, all_outputs = feed(DEFAULTS, running(30), LOST, Request(0, "safe"), *frames(*range(31, 60)))
-    answered(all_outputs[1], True)
+    check_reply(all_outputs[1], True)
     assert not all_outputs[-1].command.actuators_nm.any()
     assert state.mode is LoopMode.SAFE
 
@@ -117,5 +117,5 @@ def test_without_a_camera_the_loop_is_not_closed(first_frames: list[Frame]) -> N
     setup = settings(start_mode=LoopMode.OPEN)
     state, _ = feed(setup, loaded(setup), *first_frames, Tick(0, DEFAULTS.frame_timeout_ns + 1))
     for request in (Request(0, "close"), Request(0, "step", values=(2.0,))):
-        answered(feed(setup, state, request)[1][0], False, "no frame comes")
-    answered(feed(setup, state, *frames(2), Request(0, "close"))[1][-1], True)
+        check_reply(feed(setup, state, request)[1][0], False, "no frame comes")
+    check_reply(feed(setup, state, *frames(2), Request(0, "close"))[1][-1], True)

@@ -305,7 +305,7 @@ def test_the_integrator_takes_over_from_a_harmful_law_once_the_loop_is_not_reser
     law = loop.settings.integrator(loop.config.noll)
     loop.load(integrator(law.gain, law.leak, loop.config.noll, loop.settings.delay_frames, 250.0))
     loop.run(100)
-    loop.take(Request(loop.steps[-1].time_ns, "lease", (), (60.0,), "another client", lease_id=1))
+    loop.process_input(Request(loop.steps[-1].time_ns, "lease", (), (60.0,), "another client", lease_id=1))
     loop.run(1000)
     assert [one["action"] for one in named(loop, "LOOP_HARMS")] == ["the integrator takes over"]
     assert loop.state.loop.law_runner is not None  # refused

@@ -22,7 +22,7 @@ from lowfc.client import Client
 from lowfc.contract.messages import EVENT, STEP, Log, Role, wire
 from tests.support.image_streams.cacao import CAMERA, TOTAL, file_of
 from tests.support.image_streams.plain import PlainStream
-from tests.support.loops import going_on, loop, run, until
+from tests.support.loops import in_background, loop, run, until
 
 pytestmark = [pytest.mark.exclusive, pytest.mark.slow]
 
@@ -122,8 +122,8 @@ def folder(tmp_path: Path, own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize("loop", [LOOP, LOOP_OF_ONE], ids=["two processes", "one process"])
 def test_a_loop_runs_on_streams_with_other_mirror_channels(folder: Path, loop: tuple[str, ...]) -> None:
     (folder / "bench.toml").write_text(bench_of(rate_hz=200, preset="quiet", tilt_nm=15))
-    with closing(Bench(folder)) as bench, going_on(folder, MIRROR), bench.listening():
-        with going_on(folder, *loop):
+    with closing(Bench(folder)) as bench, in_background(folder, MIRROR), bench.listening():
+        with in_background(folder, *loop):
             until(bench.converged, 60)
             refused = run(folder, "mirror", "isio", "--run", "other", "--config", "bench.toml")
             assert refused.returncode == 2
@@ -137,7 +137,7 @@ def test_a_loop_runs_on_streams_with_other_mirror_channels(folder: Path, loop: t
 @pytest.mark.parametrize("loop", [LOOP, LOOP_OF_ONE], ids=["two processes", "one process"])
 def test_stream_faults_are_reported_and_recovered_from(folder: Path, loop: tuple[str, ...]) -> None:
     (folder / "bench.toml").write_text(bench_of(rate_hz=200, preset="quiet", tilt_nm=15))
-    with closing(Bench(folder)) as bench, going_on(folder, MIRROR, *loop), bench.listening():
+    with closing(Bench(folder)) as bench, in_background(folder, MIRROR, *loop), bench.listening():
         until(bench.converged, 60)
         _a_stopped_reader_resumes_with_the_newest_image(bench)
         bench.send("renew")
@@ -181,7 +181,7 @@ def _a_stopped_reader_resumes_with_the_newest_image(bench: Bench) -> None:
 
 
 def _other_channels_are_not_undone(bench: Bench) -> None:
-    with going_on(bench.folder, BRIDGE), Client("bench") as client:
+    with in_background(bench.folder, BRIDGE), Client("bench") as client:
         calibration = client.calibration()
         until(lambda: all(file_of(bench.folder, f"lowfc_{name}").exists() for name in ("flux", "error")))
         error = PlainStream(file_of(bench.folder, "lowfc_error"), len(calibration.noll), 1, 9)
@@ -202,7 +202,11 @@ def _other_channels_are_not_undone(bench: Bench) -> None:
 
 def test_a_minute_at_500_hz_loses_no_frame_and_matches_the_simulated_loop(folder: Path) -> None:
     (folder / "bench.toml").write_text(bench_of(rate_hz=500, preset="bench", tilt_nm=0))
-    with going_on(folder, CONTROLLER), closing(Bench(folder)) as bench, going_on(folder, MIRROR, CAMERA_DRIVER):
+    with (
+        in_background(folder, CONTROLLER),
+        closing(Bench(folder)) as bench,
+        in_background(folder, MIRROR, CAMERA_DRIVER),
+    ):
         until(lambda: file_of(folder, CHANNEL).exists() and bench.stream(CHANNEL).count > 100, 60)
         with bench.listening():
             time.sleep(62)

@@ -17,7 +17,7 @@ from lowfc.client import Client
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import EVENT, FRAME, MIRROR_STATE, STEP, Log, Role, wire
 from lowfc.device.camera_loop import PATIENCE_S
-from tests.support.loops import LOWFC, STILL, going_on, run, until
+from tests.support.loops import LOWFC, STILL, in_background, run, until
 
 DYING = """
 import os, time
@@ -52,7 +52,7 @@ def test_a_restarted_camera_process_is_a_new_start(tmp_path: Path) -> None:
         bus.subscribe(FRAME, lambda sample: starts.append(start_of(sample.sequence)))
         died = subprocess.run([*LOWFC, *words], cwd=tmp_path, timeout=60, check=False)
         assert died.returncode == 7, "a failure: the units in deploy restart it"
-        with going_on(tmp_path, f"lowfc {' '.join(words)}"):
+        with in_background(tmp_path, f"lowfc {' '.join(words)}"):
             until(lambda: len(set(starts)) == 2)
     assert starts == sorted(starts)
 
@@ -158,14 +158,14 @@ def bench(tmp_path: Path, own_runtime: Path) -> Iterator[Bench]:
     (tmp_path / "faulty.py").write_text(FAULTY)
     (tmp_path / "bench.toml").write_text(STILL)
     made = Bench(tmp_path)
-    with made.listening(), going_on(tmp_path, CONTROLLER, CAMERA):
+    with made.listening(), in_background(tmp_path, CONTROLLER, CAMERA):
         yield made
 
 
 @pytest.mark.slow
 @pytest.mark.exclusive
 def test_a_camera_hang_of_five_seconds_is_reported_and_the_loop_holds_and_resumes(bench: Bench) -> None:
-    with going_on(bench.folder, MIRROR):
+    with in_background(bench.folder, MIRROR):
         bench.settled()
         bench.inject("camera", "hang")
         until(lambda: bench.named("camera", "DRIVER_HANGS") and bench.named("controller", "NO_FRAMES"))
@@ -178,7 +178,7 @@ def test_a_camera_hang_of_five_seconds_is_reported_and_the_loop_holds_and_resume
 @pytest.mark.slow
 @pytest.mark.exclusive
 def test_a_mirror_hang_of_five_seconds_blocks_commands_and_the_mirror_goes_flat_before_the_next(bench: Bench) -> None:
-    with going_on(bench.folder, MIRROR):
+    with in_background(bench.folder, MIRROR):
         bench.settled()
         bench.inject("mirror", "hang")
         begun_s = time.monotonic()
@@ -203,7 +203,7 @@ def test_a_hanging_camera_in_the_controllers_process_does_not_block_the_controll
     (tmp_path / "bench.toml").write_text(STILL)
     bench = Bench(tmp_path)
     both = f"{CONTROLLER} --camera faulty.py:Camera"
-    with bench.listening(), going_on(tmp_path, MIRROR, both), ExitStack() as stack:
+    with bench.listening(), in_background(tmp_path, MIRROR, both), ExitStack() as stack:
         bench.settled()
         client = stack.enter_context(Client("bench"))
         processes = client.processes()
@@ -240,7 +240,7 @@ def test_a_dead_mirror_process_is_reported_and_the_loop_holds_until_its_restart(
     until(lambda: bench.named("controller", "MIRROR_LOST"))
     until(lambda: list(bench.steps[-1].reasons) == [wire.REASON_NO_MIRROR] and bench.commanded(before_nm))
     calls = len(bench.calls_nm())
-    with going_on(bench.folder, MIRROR):
+    with in_background(bench.folder, MIRROR):
         until(lambda: bench.named("controller", "MIRROR_BACK"))
         assert bench.calls_nm()[calls] == 0, "its idle state comes first"
         bench.settled()

@@ -31,7 +31,7 @@ from lowfc.device.drivers.basler import BaslerCamera
 from lowfc.device.drivers.genicam import GenicamOptions
 from lowfc.testing.listener import Listener
 from lowfc.testing.memory_bus import MemoryHub
-from tests.support.loops import command, going_on, interrupt, start, until
+from tests.support.loops import command, in_background, interrupt, start, until
 
 CONFIG = load(None, {"camera.rate_hz": 200.0})
 OPTIONS = {"rows": 60, "columns": 80, "region_row": 16, "region_column": 32, "rate_hz": 200.0, "exposure_us": 500.0}
@@ -297,10 +297,10 @@ def test_a_closed_loop_counts_every_failed_buffer(emulated: None, tmp_path: Path
     arguments = "--run failing --config bench.toml"
     with (
         _healths("failing") as health,
-        going_on(tmp_path, f"lowfc controller {arguments}", f"lowfc mirror sim {arguments}"),
+        in_background(tmp_path, f"lowfc controller {arguments}", f"lowfc mirror sim {arguments}"),
     ):
         until(lambda: {"controller", "mirror-dm"} <= set(health))
-        with going_on(tmp_path, f"lowfc camera failing.py:Failing {arguments}"):
+        with in_background(tmp_path, f"lowfc camera failing.py:Failing {arguments}"):
             until(lambda: "camera" in health and health["camera"].state == "running")
             time.sleep(5)
         until(lambda: health["camera"].state == "stopped")
@@ -378,7 +378,7 @@ def _conforms(folder: Path, driver: str, options: str, rate_hz: float) -> None:
         f"[drivers.{plugins.section(driver)}]\nrows = 80\ncolumns = 80\n{options}"
     )
     words = "--run vendor --config bench.toml"
-    with _healths("vendor") as health, going_on(folder, f"lowfc camera {driver} {words}"):
+    with _healths("vendor") as health, in_background(folder, f"lowfc camera {driver} {words}"):
         until(lambda: "camera" in health and health["camera"].state == "running")
         found = json.loads(command(folder, f"lowfc conformance camera {words} --json"))
     wrong = [check for check in found["checks"] if check["status"] == "wrong"]

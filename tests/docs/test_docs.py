@@ -13,7 +13,7 @@ from tests.docs import test_tutorials as tutorials
 from tests.e2e.test_bench_day import COMMANDS as BENCH_DAY
 from tests.e2e.test_operator import COMMANDS as OPERATING
 from tests.e2e.test_own_hardware import COMMISSIONING, DOCUMENTED
-from tests.support.loops import command, going_on, interrupt, output_of, recorded_bytes, start, until
+from tests.support.loops import command, in_background, interrupt, output_of, recorded_bytes, start, until
 from tests.support.viewers import on_screen
 
 ROOT = Path(__file__).parents[2]
@@ -172,7 +172,7 @@ def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("recorder", [BY_HAND[3], RECORD_SELECTED])
 def test_the_processes_started_separately(tmp_path: Path, recorder: str) -> None:
-    with going_on(tmp_path, *BY_HAND[:3], recorder) as all_stderr:
+    with in_background(tmp_path, *BY_HAND[:3], recorder) as all_stderr:
         status = [sys.executable, "-m", "lowfc", "ctl", "status", "--run", "bench"]
         until(lambda: subprocess.run(status, cwd=tmp_path, capture_output=True, check=False).returncode == 0, 120)
         until(lambda: recorded_bytes(tmp_path) > 4e6)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.loops import command, going_on, interrupt, output_of, recorded_bytes, start, until
+from tests.support.loops import command, in_background, interrupt, output_of, recorded_bytes, start, until
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "tutorials"
@@ -128,6 +128,6 @@ def test_your_camera_with_the_vendors_emulation(
     (line,) = re.findall(r"^    (PYLON_CAMEMU=1 lowfc camera .*)$", text, re.MULTILINE)
     monkeypatch.setenv("PYLON_CAMEMU", "1")
     (tmp_path / "basler.toml").write_text(re.findall(r"```toml\n(.*?)```", text, re.DOTALL)[0])
-    with going_on(tmp_path, line.partition(" ")[2]):
+    with in_background(tmp_path, line.partition(" ")[2]):
         until(lambda: (own_runtime / "lowfc" / "basler").exists())
         assert "0 wrong" in command(tmp_path, BASLER)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lowfc.client import running
-from tests.support.loops import LOWFC, command, going_on, until
+from tests.support.loops import LOWFC, command, in_background, until
 
 pytestmark = pytest.mark.exclusive
 
@@ -60,7 +60,7 @@ def run(folder: Path, line: str) -> str:
 
 @contextmanager
 def loop(folder: Path, *options: str) -> Iterator[None]:
-    with going_on(folder, shlex.join(["lowfc", "sim-loop", "--config", "lowfc.toml", *options])):
+    with in_background(folder, shlex.join(["lowfc", "sim-loop", "--config", "lowfc.toml", *options])):
         until(lambda: running() and subprocess.run(STATUS, capture_output=True, check=False).returncode == 0, 60)
         yield
 
@@ -84,7 +84,7 @@ def test_every_command_of_the_calibration_and_acceptance_pages_runs(tmp_path: Pa
         assert run(tmp_path, line)
     with loop(tmp_path, "--no-record"):
         assert run(tmp_path, LAW)
-    with going_on(tmp_path, WITH_IT):
+    with in_background(tmp_path, WITH_IT):
         until(lambda: "bench" in running())
         until(lambda: subprocess.run(STATUS, capture_output=True, check=False).returncode == 0)
     assert {"computed.fits", "there.fits", "night.fits", "aligned.fits", "lqg.fits", "rejection.png"} <= {

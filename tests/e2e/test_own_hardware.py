@@ -18,7 +18,7 @@ from lowfc.adapters.files import calibration_file
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Client
 from lowfc.contract.messages import FRAME, MIRROR_STATE, STEP, Role, wire
-from tests.support.loops import PROGRAMS, command, going_on, until
+from tests.support.loops import PROGRAMS, command, in_background, until
 
 pytestmark = pytest.mark.exclusive
 
@@ -101,7 +101,7 @@ def conformance(folder: Path, *commands: str) -> None:
 
 
 def test_the_loop_closes_on_a_camera_and_a_mirror_of_ones_own(bench: Path) -> None:
-    with going_on(bench, *DEVICES), listening() as bus:
+    with in_background(bench, *DEVICES), listening() as bus:
         wait_for_devices(bus)
         conformance(bench, *CONFORMANCE)
         errors_nm: list[list[float]] = []
@@ -115,7 +115,7 @@ def test_the_loop_closes_on_a_camera_and_a_mirror_of_ones_own(bench: Path) -> No
             return float(np.linalg.norm(np.mean(measured, axis=0))) if len(measured) == 100 else np.nan
 
         bus.subscribe(STEP, note)
-        with going_on(bench, LOOP[0]):
+        with in_background(bench, LOOP[0]):
             until(lambda: np.isfinite(rms_nm()))
             before_nm = rms_nm()
             assert "loop closed" in command(bench, LOOP[1])
@@ -134,7 +134,7 @@ def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(ben
     np.save(bench / "frames.npy", np.random.default_rng(1).poisson(spot, (50, 80, 80)).astype(np.uint16))
     HostClock()  # this boot's clock, for a program that does not make it
     command(bench, PLAIN[0].replace("bench", "plain"))
-    with going_on(bench, *SIMULATED, PLAIN[1]):
+    with in_background(bench, *SIMULATED, PLAIN[1]):
         with listening() as bus:
             wait_for_devices(bus)
         conformance(bench, *CONFORMANCE, CONFORMANCE[0].partition(" --config")[0].replace("bench", "plain"))
@@ -143,7 +143,7 @@ def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(ben
 @pytest.mark.slow
 def test_the_camera_of_the_tutorial_passes_conformance(bench: Path, own_runtime: Path) -> None:
     (bench / "counting.py").write_text(block("python", (ROOT / "docs/tutorials/your_camera.md").read_text()))
-    with going_on(bench, COUNTING[0]):
+    with in_background(bench, COUNTING[0]):
         until(lambda: (own_runtime / "lowfc/counting").exists())
         conformance(bench, COUNTING[1])
     assert "2 ok" in command(bench, DOCTOR)
@@ -195,7 +195,7 @@ def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path, own: bool)
         drivers = "lowfc mirror examples/mirror.py:MyMirror", "lowfc camera examples/small_camera.py:SmallCamera"
         devices = [line.replace(a, b) for line, a, b in zip(devices, sim, drivers, strict=True)]
         assert not any(" sim " in line for line in devices)
-    with going_on(bench, *devices, CONTROLLER):
+    with in_background(bench, *devices, CONTROLLER):
         with listening() as bus:
             wait_for_devices(bus)
         process = started(bench, f"{COMMISSION} --json")
@@ -211,5 +211,5 @@ def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path, own: bool)
             state = client.status().state
             assert state.mode_cause == "asked to close for lowfc commission"
         assert calibration_file.load(bench / "calibration.fits").shape == (64, 64)
-    with going_on(bench, *devices, LATER):
+    with in_background(bench, *devices, LATER):
         until(lambda: closed(bench), 60)

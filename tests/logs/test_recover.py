@@ -12,7 +12,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import recover, recovered_path
 from lowfc.contract.errors import DataFileError
 from tests.support.loops import json_of, lowfc
-from tests.support.mutated_logs import ATTACHMENTS, flipped, identity, mutations, small_log, small_samples
+from tests.support.mutated_logs import ATTACHMENTS, contents, flipped, mutations, small_log, small_samples
 from tests.support.other_readers import foxglove, rerun
 
 MUTATIONS = 120  # of complete and of unfinished logs together
@@ -94,7 +94,7 @@ def test_an_unfinished_log_is_completed(tmp_path: Path) -> None:
     assert part.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["night-recovered.mcap", "night.mcap.part"]
     old, copy = LogReader(part), LogReader(new)
-    assert identity(list(copy)) == identity(list(old)) == identity(small_samples())
+    assert contents(list(copy)) == contents(list(old)) == contents(small_samples())
     assert copy.records[:-1] == old.records
     assert copy.attachments == {attachment.name: attachment.data for attachment in ATTACHMENTS}
     assert copy.metadata.keys() == {"lowfc", "recovery"}

@@ -1,4 +1,4 @@
-"""Feed damaged inputs to readers, detect crashes, hangs and memory growth: python tests/support/fuzzing.py --help."""
+"""Feed damaged inputs to readers, detect crashes, hangs and memory growth: python -m tests.support.fuzzing --help."""
 
 import argparse
 import json

@@ -123,16 +123,16 @@ class InProcessLoop(Client):
         if self._lose(len(self.surfaces_nm) - 1):
             return
         frame = self._bench.frame(pixels, self.first)
-        outputs = self._bench.take(frame)
+        outputs = self._bench.process_input(frame)
         if not self.mirror_bus.closed:
-            self._bench.follow(frame, outputs.command)
+            self._bench.move_mirror(frame, outputs.command)
             self._states.put(wire.MirrorState(frame_sequence=frame.sequence).SerializeToString())
         for kind, waiting in self._listeners:
             waiting.append(Image(frame.sequence, frame.time_ns, pixels) if kind == "frames" else outputs.step)
 
     def silence_camera(self) -> None:
         """Let the controller find that no frame came within its frame timeout, before the next one."""
-        for event in self._bench.take(Tick(0, 60_000_000)).events:
+        for event in self._bench.process_input(Tick(0, 60_000_000)).events:
             message = EVENTS[event.name].log("controller", 0, **event.details)
             self.mirror_bus.publisher(EVENT).put(message.SerializeToString())
 
@@ -154,7 +154,7 @@ class InProcessLoop(Client):
             self.stops += 1
         numbers = tuple(np.atleast_1d(np.asarray(values, float)).tolist())
         request = Request(0, name, tuple(np.atleast_1d(modes).tolist()) if np.size(modes) else (), numbers, **fields)
-        outputs = self._bench.take(request)
+        outputs = self._bench.process_input(request)
         if not outputs.reply.accepted:
             raise RequestRefusedError(f"{name} refused: {outputs.reply.text}")
         state = controller_state(self._bench.state, self._bench.settings, 0) if name == "status" else None

@@ -142,7 +142,7 @@ def command(folder: Path, line: str, timeout_s: float = 120, good: tuple[int, ..
 
 
 @contextlib.contextmanager
-def going_on(folder: Path, *lines: str) -> Iterator[list[str]]:
+def in_background(folder: Path, *lines: str) -> Iterator[list[str]]:
     """Run documented commands in the background, then stop them; yields the list of their standard errors."""
     processes = [
         subprocess.Popen([PROGRAMS / program, *rest], cwd=folder, stderr=subprocess.PIPE, text=True)

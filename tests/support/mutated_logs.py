@@ -61,8 +61,8 @@ def small_log(path: Path, *, finished: bool = True) -> Path:
     return log.part
 
 
-def identity(messages: list[Sample]) -> list[tuple[str, bytes, int, int, int]]:
-    """Content of messages as tuples, to compare sent and read ones."""
+def contents(messages: list[Sample]) -> list[tuple[str, bytes, int, int, int]]:
+    """Fields of messages as tuples, to compare sent and read ones."""
     return [(m.key, m.payload, m.sequence, m.publish_time_ns, m.receive_time_ns) for m in messages]
 
 

@@ -138,9 +138,9 @@ class Stage:
                 step.pol_nm.extend(open_nm)
             self.send(STEP, step)
             stages = dict.fromkeys(("transport_ns", "wakeup_ns", "compute_ns", "publish_ns"), (1,))
-            whole_ns = (1000 * self.latency_us,)
+            latency_ns = (1000 * self.latency_us,)
             sequence = (frame["frame_sequence"],)
-            self.send(TIMING, wire.ControlTiming(frame_sequence=sequence, frame_to_command_ns=whole_ns, **stages))
+            self.send(TIMING, wire.ControlTiming(frame_sequence=sequence, frame_to_command_ns=latency_ns, **stages))
 
 
 class Tape:

@@ -29,7 +29,6 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, image, wire
-from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings
@@ -52,6 +51,7 @@ from tests.support.safety_checks import Simulated, violations
 from tests.support.toy import GRID, NOLL, calibration, frame, loaded, settings
 
 NORMAL = settings(interlocks=INTERLOCKS)
+LAW = integrator(np.full(len(NOLL), 0.4), np.zeros(len(NOLL)), NOLL, 1.0, 1000.0)
 CONFIG = load(None, {"mirror.rows": GRID[0], "mirror.columns": GRID[1], "realtime.cache_warmup": False})
 
 
@@ -93,7 +93,7 @@ class Loop:
         self.state = loaded(NORMAL)
         self.count = 0
 
-    def take(self, input_: Input) -> None:
+    def process_input(self, input_: Input) -> None:
         before = self.state.loop.actuators_nm if self.state.loop is not None else np.zeros(GRID, np.float32)
         self.state, outputs = advance(NORMAL, self.state, input_)
         if outputs.step is not None:
@@ -107,14 +107,14 @@ class Loop:
         """Take a frame preceded by the 16 bytes of its envelope."""
         self.count += 1
         sequence, time_ns = Envelope.decode_checked(payload[:16])
-        self.take(codec.decode_frame(payload[16:], sequence, -time_ns))
+        self.process_input(codec.decode_frame(payload[16:], sequence, -time_ns))
 
     def request(self, name: str, payload: bytes) -> None:
         request = codec.decode_request(payload, name, 0)
-        self.take(request)
+        self.process_input(request)
         codec.encode_request(request, codec.Reply(True, "", 0), 1, None)
         self.count += 1
-        self.take(frame(self.count))
+        self.process_input(frame(self.count))
 
 
 def targets(folder: Path) -> list[Target]:
@@ -172,8 +172,8 @@ EXTREMES = (0, 1, 5, 1 << 31, 1 << 32, 1_800_000_000 << 32, 1 << 62, (1 << 62) +
 
 def _messages() -> list[Target]:
     loop, processes = Loop(), Processes()
-    whole = frame(1).pixels
-    assert whole is not None
+    pixels = frame(1).pixels
+    assert pixels is not None
     state = loaded(NORMAL)
     shape = np.ones(GRID, np.float32)
     modes = np.ones(len(NOLL), np.float32)
@@ -184,11 +184,13 @@ def _messages() -> list[Target]:
     mirror_state = wire.MirrorState(rows=4, columns=5, actuators=shape.tobytes(), command_nm=modes.tolist())
     camera = wire.CameraState(rows=6, columns=7, bias_dn=100, saturation_dn=6e4)
     return [
-        Target("envelope", (Envelope(1 << 32, 5).encode(),), Envelope.decode, (LowfcError,)),
-        Target("frame", (ENVELOPE + image(whole, 5, "sensor").SerializeToString(),), loop.frame, (LowfcError,), cost=3),
+        Target("envelope", (ENVELOPE,), Envelope.decode, (LowfcError,)),
+        Target(
+            "frame", (ENVELOPE + image(pixels, 5, "sensor").SerializeToString(),), loop.frame, (LowfcError,), cost=3
+        ),
         Target(
             "camera to controller",
-            (image(whole, 5, "sensor").SerializeToString(),),
+            (image(pixels, 5, "sensor").SerializeToString(),),
             processes.frame,
             message=codec.RawImage,
             cost=10,
@@ -247,12 +249,12 @@ def _messages() -> list[Target]:
 def _mirror(loop: Loop, data: bytes) -> None:
     shape = codec.decode_mirror(data)
     if shape is not None:
-        loop.take(shape)
+        loop.process_input(shape)
         advance(NORMAL, loaded(NORMAL), shape)  # a controller that has sent no command adopts the shape
 
 
 def _camera(loop: Loop, data: bytes) -> None:
-    loop.take(codec.decode_camera(data, 3))
+    loop.process_input(codec.decode_camera(data, 3))
 
 
 @cache
@@ -292,10 +294,8 @@ def _shown(data: bytes) -> None:
 
 
 def _valid_requests() -> list[wire.Request]:
-    law = Integrator(*(np.full(len(NOLL), value, np.float32) for value in (0.4, 0.0, 50.0)))
     shape = np.ones(GRID, np.float32).tobytes()
     table = np.ones((5, 1), np.float32).tobytes()
-    whole = wire.Calibration.FromString(encode_calibration(CALIBRATION, 0))
     return [
         wire.Request(name="gain", modes=[2, 3], values=[0.3, 0.2]),
         wire.Request(name="limit", values=[40.0]),
@@ -304,8 +304,8 @@ def _valid_requests() -> list[wire.Request]:
         wire.Request(name="close"),
         wire.Request(name="channel", text="dark-hole", actuators=shape),
         wire.Request(name="play", text="mirror", table=table, columns=1, actuators=shape),
-        wire.Request(name="law", law=wire_law(integrator(law.gain, law.leak, NOLL, 1.0, 1000.0))),
-        wire.Request(name="load", calibration=whole),
+        wire.Request(name="law", law=wire_law(LAW)),
+        wire.Request(name="load", calibration=wire.Calibration.FromString(encode_calibration(CALIBRATION, 0))),
         wire.Request(name="note", text="clouds"),
     ]
 
@@ -333,11 +333,9 @@ def _bytes_of(save: Callable[[Path], object], path: Path) -> tuple[bytes]:
 
 
 def _files(folder: Path) -> list[Target]:
-    law = Integrator(*(np.full(len(NOLL), value, np.float32) for value in (0.4, 0.0, 50.0)))
-    linear = integrator(law.gain, law.leak, NOLL, 1.0, 1000.0)
     with_modes = identified(replace(CALIBRATION, actuators_to_modes=np.ones((len(NOLL), 20), np.float32)))
     fits = tuple(calibration_file.to_bytes(each) for each in (CALIBRATION, with_modes))
-    laws = _bytes_of(partial(law_file.save, linear), folder / "law.fits")
+    laws = _bytes_of(partial(law_file.save, LAW), folder / "law.fits")
     pupils = _bytes_of(lambda path: np.savez(path, quarter=np.ones((4, 4))), folder / "pupil.npz")
     sam = json.loads(layouts.SHIPPED.read_text(encoding="utf-8"))["layouts"]["sam27d07"]
     sams = tuple(json.dumps(one).encode() for one in (sam, {"layouts": {"a": sam}}))
@@ -359,16 +357,16 @@ def _logs(folder: Path) -> list[Target]:
     whole = tuple(
         small_log(folder / f"log{finished}.mcap", finished=finished).read_bytes() for finished in (True, False)
     )
-    night = SyntheticLog().frames(30).request("gain", (0.3,)).frames(20)
-    run = (night.write(folder / "night.mcap").read_bytes(),)
+    log = SyntheticLog().frames(30).request("gain", (0.3,)).frames(20)
+    run = (log.write(folder / "run.mcap").read_bytes(),)
 
     def recovered(path: Path) -> None:
         with tempfile.TemporaryDirectory(dir=folder) as out:
             recover(path, Path(out) / "out.mcap")
 
-    path, wrong = folder / "input.mcap", (LowfcError,)
+    path, errors = folder / "input.mcap", (LowfcError,)
     return [
-        Target("log, read", whole, _by(lambda path: list(LogReader(path, skip_damaged=True)), path), wrong, cost=300),
-        Target("log, its history", run, _by(lambda path: read_history(LogReader(path)), path), wrong, cost=300),
-        Target("log, recovered", whole, _by(recovered, path), wrong, cost=600),
+        Target("log, read", whole, _by(lambda path: list(LogReader(path, skip_damaged=True)), path), errors, cost=300),
+        Target("log, its history", run, _by(lambda path: read_history(LogReader(path)), path), errors, cost=300),
+        Target("log, recovered", whole, _by(recovered, path), errors, cost=600),
     ]

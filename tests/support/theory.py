@@ -1,4 +1,4 @@
-"""Residual of an integrator loop from its open-loop transfer function, independent of `lowfc.control.laws.margins`."""
+"""Laws for tests, loops that run them, and a theory of the integrator independent of `lowfc.control.laws.margins`."""
 
 from collections.abc import Iterable
 

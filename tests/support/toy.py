@@ -98,8 +98,8 @@ def settings(**changes: object) -> Settings:
     return Settings(**(defaults | changes))
 
 
-def loaded(what: Settings) -> State:
-    return advance(what, State(), Load(0, calibration(), "test"))[0]
+def loaded(settings: Settings) -> State:
+    return advance(settings, State(), Load(0, calibration(), "test"))[0]
 
 
 def frame(count: int, modes_nm: npt.ArrayLike = (0, 0, 0), **changes: object) -> Frame:
@@ -112,11 +112,11 @@ def frame(count: int, modes_nm: npt.ArrayLike = (0, 0, 0), **changes: object) ->
     return Frame(**(defaults | changes))
 
 
-def feed(what: Settings, state: State, *inputs: Input) -> tuple[State, list[Outputs]]:
+def feed(settings: Settings, state: State, *inputs: Input) -> tuple[State, list[Outputs]]:
     """State after these inputs, and the outputs of each."""
     all_outputs = []
     for input_ in inputs:
-        state, outputs = advance(what, state, input_)
+        state, outputs = advance(settings, state, input_)
         all_outputs.append(outputs)
     return state, all_outputs
 
@@ -125,15 +125,15 @@ def names(all_outputs: list[Outputs]) -> list[str]:
     return [event.name for outputs in all_outputs for event in outputs.events]
 
 
-def answered(outputs: Outputs, accepted: bool, *words: str) -> None:
+def check_reply(outputs: Outputs, accepted: bool, *words: str) -> None:
     """Assert that a request was accepted or refused with a reply that contains these words."""
     assert outputs.reply.accepted is accepted, outputs.reply.text
     for word in words:
         assert word in outputs.reply.text
 
 
-def live(
-    what: Settings,
+def run_toy(
+    settings: Settings,
     disturbance_nm: Array,
     noise_nm: npt.ArrayLike = 0.0,
     state: State | None = None,
@@ -144,7 +144,7 @@ def live(
     """Run the loop; return its steps, the residual (frames, modes) in each exposure, and the final state.
 
     Args:
-        what: settings of the controller.
+        settings: settings of the controller.
         disturbance_nm: (frames, modes) disturbance, nm rms of wavefront.
         noise_nm: measurement noise, added to the residual.
         state: initial state; that of `loaded` when None.
@@ -152,8 +152,8 @@ def live(
         missing: indices of exposures whose frames do not arrive, from 0.
         dark: indices of exposures without light.
     """
-    state = loaded(what) if state is None else state
-    weights, to_modes = delay_weights(what.delay_frames), np.linalg.pinv(TOY.modes_to_actuators)
+    state = loaded(settings) if state is None else state
+    weights, to_modes = delay_weights(settings.delay_frames), np.linalg.pinv(TOY.modes_to_actuators)
     commanded = [np.zeros(len(NOLL))] * len(weights)
     noise_nm = np.broadcast_to(noise_nm, disturbance_nm.shape)
     steps, residual_nm = [], np.empty(disturbance_nm.shape)
@@ -162,7 +162,9 @@ def live(
         newest = commanded[0]
         if count not in missing:
             light = {"pixels": TOY.pixels((0, 0, 0), flux_dn=0)} if count in dark else {}
-            state, outputs = advance(what, state, frame(first + count, residual_nm[count] + noise_nm[count], **light))
+            state, outputs = advance(
+                settings, state, frame(first + count, residual_nm[count] + noise_nm[count], **light)
+            )
             assert outputs.step is not None
             steps.append(outputs.step)
             if outputs.command is not None:

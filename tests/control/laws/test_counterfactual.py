@@ -18,7 +18,7 @@ from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import Limits, Rejection
 from lowfc.control.loop.state import Settings
 from tests.support.theory import law_of
-from tests.support.toy import frame_sequence, live, settings
+from tests.support.toy import frame_sequence, run_toy, settings
 
 WIDE = {"limits": Limits(7000.0, 7000.0, 7000.0), "limit_nm": (5000.0, 5000.0)}
 DELAYS = [1.0, 1.4, 2.0, 3.0]
@@ -37,7 +37,7 @@ def weights(delay_frames: float) -> np.ndarray:
 
 def used(setup: Settings, disturbance_nm: np.ndarray) -> list[Step]:
     """Steps of the live loop with missing and dark frames."""
-    return live(setup, disturbance_nm, missing=MISSING, dark=DARK)[0]
+    return run_toy(setup, disturbance_nm, missing=MISSING, dark=DARK)[0]
 
 
 def columns(steps: list[Step]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

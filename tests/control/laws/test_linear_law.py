@@ -20,7 +20,7 @@ from lowfc.control.laws.pi_notch import Notch, pi_notch
 from lowfc.control.laws.stability import delay_weights, limiting_gain
 from tests.support import theory
 from tests.support.theory import LAWS, integrators, law_of, linear, run
-from tests.support.toy import live, settings
+from tests.support.toy import run_toy, settings
 
 RATE_HZ = 1000.0
 
@@ -72,7 +72,7 @@ def test_an_impossible_delay_is_refused(delay: float) -> None:
 def test_pseudo_open_loop_modes_equal_the_disturbance(delay: float) -> None:
     setup = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0))
     constant = np.array([12.0, -7.0, 5.0])
-    steps, _, _ = live(setup, np.tile(constant, (60, 1)))
+    steps, _, _ = run_toy(setup, np.tile(constant, (60, 1)))
     for step in steps:
         assert np.abs(step.pol_nm - constant).max() < 0.05
     assert np.abs(steps[-1].command_nm + constant * [0.3 / 0.31, 0.3 / 0.31, 1]).max() < 0.05

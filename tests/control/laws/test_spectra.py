@@ -29,7 +29,7 @@ from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import Settings, State
 from tests.support.theory import linear
-from tests.support.toy import NOLL, calibration, frame, live, loaded, settings
+from tests.support.toy import NOLL, calibration, frame, loaded, run_toy, settings
 
 RATE_HZ = 500.0
 
@@ -145,7 +145,7 @@ def through(setup: Settings, requests: Iterable[Request], frames: int) -> tuple[
         assert outputs.reply.accepted, outputs.reply.text
     slow = 3 * np.sin(2e-4 * np.arange(frames))[:, None]
     noise = 0.3 * np.random.default_rng(3).standard_normal((frames, len(NOLL)))
-    steps, _, state = live(setup, slow + noise, state=state, first=2)
+    steps, _, state = run_toy(setup, slow + noise, state=state, first=2)
     error_nm, command_nm = (
         np.array([getattr(step, name) for step in steps], float) for name in ("error_nm", "command_nm")
     )

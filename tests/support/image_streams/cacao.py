@@ -3,7 +3,7 @@
 A program with a configuration file and a folder of streams as arguments, independent of the run: it writes frames to
 `camnsv`, sums the existing channels dm00disp00 to dm00disp11 into `dm00disp`, without the mean, and applies the sum to
 the optics. It executes lines of standard input between two frames: `renew` and `region` recreate the camera's stream,
-`die` ends the program in the middle of an image, `stop` prints the residual wavefront and ends.
+`die` ends the program in the middle of an image, `stop` prints the frame count and the residual, and ends.
 """
 
 import json
@@ -12,6 +12,7 @@ import select
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,7 @@ def file_of(folder: Path, name: str) -> Path:
 class Comb:
     """Thread that sums the channels, like CACAO's DM comb process."""
 
-    def __init__(self, folder: Path, rows: int, columns: int, publish: object) -> None:
+    def __init__(self, folder: Path, rows: int, columns: int, publish: Callable[[np.ndarray], None]) -> None:
         """Create the sum and the first channel; other channels are found once they exist."""
         self.shape = (columns, rows)
         self.folder, self.publish = folder, publish
@@ -72,7 +73,7 @@ class Comb:
                 total = np.sum([one.pixels[0] for one in self.channels.values()], axis=0)
                 total -= total.mean()
                 self.total.write(total)
-                self.publish(total * 1000)  # type: ignore[operator]
+                self.publish(total * 1000)
 
 
 def main() -> None:
