@@ -38,9 +38,8 @@ class MirrorPath:
         weights[:, 0] = 1
         ends = [moment for moment, _ in moves[2:]] + [np.inf]
         for row, ((moment, _), end) in enumerate(zip(moves[1:], ends, strict=False), 1):
-            since = np.maximum(np.minimum(start + instants, end) - moment, 0)
-            remaining = np.exp(-since / self._settling) if self._settling else np.zeros(len(instants))
-            remaining = np.where(start + instants < moment, 1.0, remaining)
+            since = np.maximum(np.minimum(start + instants, end) - moment, 0.0)
+            remaining = np.exp(-since / self._settling) if self._settling else 1.0 * (start + instants < moment)
             weights *= remaining[:, None].astype(np.float32)
             weights[:, row] = 1 - remaining
         return [shape for _, shape in moves], weights

@@ -63,7 +63,7 @@ def test_settled_shapes_are_dropped() -> None:
 
 def test_time_before_the_previous_shape_is_replaced_by_its_time() -> None:
     """As after a stall of the host, when frames restart: the weights of the shapes still sum to 1."""
-    path = MirrorPath(FLAT, settling=0.01)
+    path = MirrorPath(FLAT, settling=0.001)
     for moment, shape in ((0.7, ONE), (0.2, TWO), (0.75, ONE)):
         path.applied(moment, shape)
     _, weights = path.over(0, np.linspace(0, 1, 50))
