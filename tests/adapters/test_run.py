@@ -282,7 +282,8 @@ def test_a_failed_write_leaves_the_old_file_only(tmp_path: Path, monkeypatch) ->
         write_whole(path, content)
     os.mkfifo(tmp_path / "pipe")
     wrong = [(special, "not a regular file") for special in (tmp_path / "pipe", Path(), Path("/"), tmp_path)]
-    for file, why in (*wrong, (tmp_path / ("x" * 300), "File name too long")):
+    unwritable = Path("/proc/calibration.fits"), "No such file"  # for root too
+    for file, why in (*wrong, (tmp_path / ("x" * 300), "File name too long"), unwritable):
         for refusing in (require_folder, partial(write_whole, content=b"")):
             with pytest.raises(DataFileError, match=f"^{file} cannot be written: {why}"):
                 refusing(file)

@@ -5,6 +5,7 @@ import errno
 import os
 import secrets
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -52,7 +53,7 @@ def require_folder(*files: Path | None) -> None:
     """Check that files can be written later, as by `being_written`; None is skipped.
 
     Raises:
-        DataFileError: A file's folder does not exist, or the file cannot be replaced.
+        DataFileError: A file's folder does not exist or cannot be written, or the file cannot be replaced.
         ConfigurationError: Two files are the same.
     """
     written = [file for file in files if file is not None]
@@ -61,6 +62,8 @@ def require_folder(*files: Path | None) -> None:
             if not file.parent.is_dir():
                 raise DataFileError(f"{file} cannot be written: there is no directory {file.parent}")
             _require_replaceable(file)
+            with tempfile.TemporaryFile(dir=file.parent):
+                pass
         except OSError as error:
             raise DataFileError(f"{file} cannot be written: {error.strerror}") from error
     if len({file.resolve() for file in written}) < len(written):
