@@ -10,7 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -29,7 +29,7 @@ from lowfc.contract.errors import BusError
 from lowfc.contract.messages import CALIBRATION, COMMAND, FRAME, HEALTH, REQUEST_KEY, TRUTH, Topic
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from tests.support.loops import until
+from tests.support.loops import socket_options, until
 
 PATIENCE_S = 30.0
 Join = Callable[..., ZenohBus]
@@ -85,17 +85,7 @@ def test_no_link_blocks_its_process_while_it_is_closed(run: Run, join: Join) -> 
     buses = [join(run, role) for role in ("controller", "camera")]
     until(lambda: all(bus.peers() for bus in buses))
 
-    def lingering() -> list[int]:
-        found = []
-        for descriptor in (int(path.name) for path in Path("/proc/self/fd").iterdir()):
-            with suppress(OSError):
-                one = socket.socket(fileno=descriptor)
-                if one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER):
-                    found.append(descriptor)
-                one.detach()
-        return found
-
-    until(lambda: not lingering())
+    until(lambda: not any(socket_options(socket.SOL_SOCKET, socket.SO_LINGER)))
 
 
 def test_a_query_returns_the_last_message_with_its_envelope(pair: tuple[Bus, Bus]) -> None:

@@ -5,6 +5,7 @@ import json
 import os
 import shlex
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -175,6 +176,19 @@ def until(
             return
         assert time.monotonic() < deadline_s, "timeout"
         time.sleep(0.01)
+
+
+def socket_options(level: int, option: int) -> list[int]:
+    """Value of an option of each of this process's sockets that has it."""
+    found = []
+    for descriptor in (int(path.name) for path in Path("/proc/self/fd").iterdir()):
+        with contextlib.suppress(OSError):
+            one = socket.socket(fileno=descriptor)
+            try:
+                found.append(one.getsockopt(level, option))
+            finally:
+                one.detach()
+    return found
 
 
 def recorded_bytes(folder: Path) -> int:

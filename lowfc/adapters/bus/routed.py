@@ -24,7 +24,7 @@ CA_KEY = "ca.key"
 """File name of the authority's key, which must not be on any host of the loop."""
 
 CONNECT_MS = 1000
-_LEASE_MS = 2000
+LEASE_MS = 2000
 _ALERT_S = 0.5
 _ABSENT = {
     *(errno.ECONNREFUSED, errno.ECONNRESET, errno.ETIMEDOUT),
@@ -225,7 +225,7 @@ def _transport(tls: dict[str, object], sending: dict[str, Any]) -> dict[str, Any
             "tls": tls,
             # A link that is silent for the lease is closed, and restored as soon as possible. Messages sent while it is
             # silent wait, and arrive stale if it recovers before that.
-            "tx": {**sending, "lease": _LEASE_MS, "keep_alive": 4},
+            "tx": {**sending, "lease": LEASE_MS, "keep_alive": 4},
         },
         "shared_memory": {"enabled": False},
     }

@@ -13,7 +13,7 @@ from zenoh.handlers import Callback
 
 from lowfc.adapters.bus.access import ROUTER
 from lowfc.adapters.bus.bus import ALL
-from lowfc.adapters.bus.routed import client_session, router_session
+from lowfc.adapters.bus.routed import LEASE_MS, client_session, router_session
 from lowfc.adapters.bus.run import Links
 from lowfc.contract.messages import TOPICS
 
@@ -40,21 +40,27 @@ def keep_thread_state() -> None:
 
 
 def close_links_at_once(session: zenoh.Session) -> None:
-    """Turn SO_LINGER off on the TCP sockets of this process after each new link of a session.
+    """Let no dead link delay a process: sets options of its TCP sockets after each new link of a session.
 
-    Zenoh sets 10 s. Closing the link of a process that is stopped would block the thread that receives, and no
-    request would be answered for as long. The kernel still sends what was written.
+    SO_LINGER off; zenoh sets 10 s. Closing the link of a process that is stopped would block the thread that receives,
+    and no request would be answered for as long. The kernel still sends what was written.
+
+    Across hosts, TCP_USER_TIMEOUT is the lease. Otherwise a link that was cut while data waited in its buffer is not
+    closed until the network is back and the kernel sends again, up to two minutes later.
     """
 
     def changed(event: zenoh.LinkEvent) -> None:
         if event.kind != zenoh.SampleKind.PUT or event.link.src.startswith(_SOCKET):  # closed without a wait
             return
+        far = event.link.dst.rpartition(":")[2] if event.link.dst.startswith("tls/") else ""
         for descriptor in (int(path.name) for path in Path("/proc/self/fd").iterdir()):
             with contextlib.suppress(OSError):  # not a socket, or closed since
                 found = socket.socket(fileno=descriptor)
                 try:
                     if found.family in (socket.AF_INET, socket.AF_INET6):
                         found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+                        if str(found.getpeername()[1]) == far:
+                            found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LEASE_MS)
                 finally:
                     found.detach()
 
