@@ -153,9 +153,14 @@ def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
     assert ending_certificates(network, now + (99 - WARN_DAYS) * day) == []
     date = now + 100 * day
     assert ending_certificates(network, now + (100.5 - WARN_DAYS) * day) == [
-        f"the certificate of {role} ends in {WARN_DAYS - 1} days, on {date:%Y-%m-%d}" for role in ("camera", "router")
+        f"{role}'s certificate ends in {WARN_DAYS - 1} days, on {date:%Y-%m-%d}: lowfc certs --renew"
+        for role in ("camera", "router")
     ]
     assert len(ending_certificates(network, now + (3650 - WARN_DAYS + 1) * day)) == 3, "including that of the authority"
+    (tmp_path / "viewer.key").chmod(0o644)
+    (warning,) = ending_certificates(network, now)
+    assert "viewer.key can be read by every user" in warning
+    (tmp_path / "viewer.key").chmod(0o640)
     (tmp_path / "camera.key").write_bytes((tmp_path / "viewer.key").read_bytes())
     (warning,) = ending_certificates(network, now)
     assert "camera.pem is not a valid certificate" in warning

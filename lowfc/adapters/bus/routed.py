@@ -4,6 +4,7 @@ import contextlib
 import datetime
 import errno
 import socket
+import stat
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -202,7 +203,7 @@ def require_certificate(network: Network, role: str) -> None:
 
 
 def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
-    """Warnings about certificates in this host's folder that are absent, invalid or end within `WARN_DAYS`."""
+    """Warnings about certificates in this host's folder: absent, invalid, end within `WARN_DAYS`, key not secret."""
     folder = user_path(network.certificates)
     roles = sorted(key.stem for key in folder.glob("*.key") if key.name != CA_KEY)
     warnings = [] if roles else [f"{folder} has no certificate with its key, ROLE.pem and ROLE.key"]
@@ -212,9 +213,14 @@ def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
         except DataFileError as fault:
             warnings.append(str(fault))
             continue
+        key = folder / f"{role}.key"
+        if key.stat().st_mode & stat.S_IROTH:
+            warnings.append(f"{key} can be read by every user of this host, who could then act as {role}: chmod o-rwx")
         left = found.ends - now
         if left < datetime.timedelta(days=WARN_DAYS):
-            warnings.append(f"the certificate of {role} ends in {left.days} days, on {found.ends:%Y-%m-%d}")
+            warnings.append(
+                f"{role}'s certificate ends in {left.days} days, on {found.ends:%Y-%m-%d}: lowfc certs --renew"
+            )
     return warnings
 
 

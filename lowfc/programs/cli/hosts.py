@@ -160,7 +160,7 @@ def hosts(
         raise BusError(f"no process of run {run!r} reports its health")
     if links.network.router:
         for warning in ending_certificates(links.network, datetime.datetime.now(datetime.UTC)):
-            sys.stderr.write(f"warning: {warning}; lowfc certs --renew\n")
+            sys.stderr.write(f"warning: {warning}\n")
     rows = [_host_process(health) for _, health in sorted(processes.items())]
     print_result(HostsResult(run=run, processes=rows), as_json=as_json)
 
