@@ -103,6 +103,8 @@ def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkey
     turbulence = stream(folder, "dm00disp01", GRID[1], GRID[0], make=True)
     turbulence.write(np.full(GRID, 0.02, np.float32))
     stream(folder, "dm00disp03", GRID[1], GRID[0], make=True).write(np.full(GRID, 9, np.float32))  # the loop's own
+    stream(folder, "dm00disp04", GRID[1], GRID[0], make=True).write(np.full(GRID, np.nan, np.float32))
+    stream(folder, "dm00disp05", 7, 6, make=True)
     plain, rounds = bridge.Client.channel, 0
     restarts = iter([False] * 4 + [case == "again"])
 
@@ -140,7 +142,10 @@ def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkey
     for shape in reported:
         assert shape == pytest.approx(np.full(GRID[0] * GRID[1], 40.0))
     assert removed.size == 0
-    assert done.stderr.count("dm00disp01 not reported to the loop: busy") == (case == "busy")
+    left_out = [line for line in done.stderr.splitlines() if line.startswith("other channels: dm00disp01")]
+    assert len(left_out) == (2 if case == "again" else 1)
+    assert all(f"stream 'dm00disp0{one}" in left_out[0] for one in ("5' has 7 x 6", "4' has values that are not"))
+    assert done.stderr.count("dm00disp01, dm00disp04 not reported to the loop: busy") == (case == "busy")
     assert done.stderr.count("not reported to the loop: no controller") == (case == "late")
 
 

@@ -47,21 +47,33 @@ class OtherChannels:
         self._counts: dict[Path, tuple[tuple[int, int, int], int]] = {}
         self._shapes: dict[Stream, Single | None] = {}
         self._sum: Single = np.zeros(grid, np.float32)
+        self._misfits: list[str] = []
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the existing channels."""
         return tuple(stream.name for stream in self._streams.values())
 
+    @property
+    def unusable(self) -> list[str]:
+        """The reason for each existing channel that is left out."""
+        not_finite = [stream.name for stream, shape in self._shapes.items() if shape is None]
+        return self._misfits + [f"stream {name!r} has values that are not finite" for name in not_finite]
+
     def sum(self) -> Single:
         """Sum of the channels (rows, columns); the same array object until a channel is written."""
         now_s = time.monotonic()
         current = {path: stream for path, stream in self._streams.items() if stream.current()}
         if len(current) < len(self._streams) or now_s - self._searched_s >= _SEARCH_S:
-            self._searched_s = now_s
+            self._searched_s, self._misfits = now_s, []
             for path in self._paths:
-                if path not in current and (stream := opened(path, self._grid)) is not None:
-                    current[path] = stream
+                try:
+                    if path not in current:
+                        current[path] = opened(path, self._grid)
+                except StreamAbsentError:
+                    continue
+                except StreamError as fault:
+                    self._misfits.append(str(fault))
         self._streams = current
         counts = {path: (stream.identity, _complete_count(stream)) for path, stream in self._streams.items()}
         if counts != self._counts:
@@ -74,13 +86,17 @@ class OtherChannels:
         return self._sum
 
 
-def opened(path: Path, grid: tuple[int, int]) -> Stream | None:
-    """Open a stream of a mirror's shapes; None if there is no usable one."""
-    try:
-        stream = Stream(path)
-    except StreamError:
-        return None
-    return stream if fits(stream, grid) else None
+def opened(path: Path, grid: tuple[int, int]) -> Stream:
+    """Open a stream of a mirror's shapes; StreamError if there is none, or it has another grid or layout."""
+    stream = Stream(path)
+    if not fits(stream, grid):
+        planes, rows, columns = stream.layout.shape
+        depth = f" x {planes}" if planes > 1 else ""
+        raise StreamError(
+            f"stream {stream.name!r} has {columns} x {rows}{depth} pixels of {stream.layout.dtype}, expected {grid[1]} "
+            f"x {grid[0]} of float32, as [mirror] has {grid[0]} rows and {grid[1]} columns"
+        )
+    return stream
 
 
 def fits(stream: Stream, grid: tuple[int, int]) -> bool:
@@ -114,13 +130,6 @@ def channel_of(name: str, grid: tuple[int, int]) -> Stream:
     StreamError if it has another grid, another process writes it, or another program does not finish creating it.
     """
     stream = _opened_or_created(stream_path(name), grid)
-    if not fits(stream, grid):
-        planes, rows, columns = stream.layout.shape
-        depth = f" x {planes}" if planes > 1 else ""
-        raise StreamError(
-            f"stream {name!r} has {columns} x {rows}{depth} pixels of {stream.layout.dtype}, expected {grid[1]} x "
-            f"{grid[0]} of float32, as [mirror] has {grid[0]} rows and {grid[1]} columns"
-        )
     if pid := stream.other_writer():
         raise StreamError(f"process {pid} writes stream {name!r}: stop it first, or choose a channel of your own")
     return stream
@@ -130,7 +139,7 @@ def _opened_or_created(path: Path, grid: tuple[int, int]) -> Stream:
     end_s = time.monotonic() + _CREATION_S
     while path.exists():
         try:
-            return Stream(path)
+            return opened(path, grid)
         except StreamAbsentError as fault:
             if time.monotonic() > end_s:
                 raise StreamError(f"{fault}; if no program is creating it, delete {path}") from None

@@ -127,7 +127,7 @@ class ExternalChannels:
         self._others: OtherChannels | None = None  # until a controller reports the grid
         self._known = b""  # shape of the channel at the controller, as last reported or requested
         self._next_request_s = 0.0
-        self._fault = ""
+        self._fault = self._found = ""
 
     def pass_on(self) -> None:
         """Request the channel `external` if it differs from the controller's."""
@@ -142,6 +142,12 @@ class ExternalChannels:
             if self._others is None:
                 self._others = OtherChannels(self._names, self._client.mirror_grid())
             shape_nm = self._others.sum() * self._nm_per_unit
+            found = f"other channels: {', '.join(self._others.names) or 'none yet'}"
+            if unusable := self._others.unusable:
+                found += f"; left out: {'; '.join(unusable)}"
+            if found != self._found:
+                self._found = found
+                sys.stderr.write(f"{printable(found)}\n")
             requested = shape_nm.tobytes() if shape_nm.any() else b""
             if requested != self._known:
                 self._client.channel(EXTERNAL, shape_nm if requested else None)

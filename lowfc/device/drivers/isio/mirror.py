@@ -1,5 +1,6 @@
 """Driver of a mirror behind an ImageStreamIO channel: CACAO sums the channels and drives the actuators."""
 
+import contextlib
 import math
 import time
 
@@ -123,8 +124,9 @@ class IsioMirror:
         self._total, now_s = None, time.monotonic()
         if self._total_name and now_s - self._searched_s >= _SEARCH_S:
             self._searched_s = now_s
-            self._total = opened(stream_path(self._total_name), self._grid)
-            self._total_expected |= self._total is not None
+            with contextlib.suppress(StreamError):
+                self._total = opened(stream_path(self._total_name), self._grid)
+                self._total_expected = True
         return self._total
 
     def _updated(self, total: Stream, before: int) -> bool:
