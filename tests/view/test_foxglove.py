@@ -22,7 +22,7 @@ from google.protobuf.message_factory import GetMessageClass
 from websockets.sync.client import connect
 
 from lowfc.adapters.bus.bus import ALL
-from lowfc.adapters.bus.run import Run
+from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.errors import BusError, ConfigurationError
@@ -118,6 +118,7 @@ def running(bus: MemoryBus) -> Iterator[FoxgloveBridge]:
     finally:
         bridge.service.stop("the test is over")
         thread.join(PATIENCE_S)
+        bridge.close()
         assert not thread.is_alive()
 
 
@@ -226,13 +227,24 @@ def test_the_process_serves_a_real_run(tmp_path: Path, run: Run) -> None:
             while got["/" + STEP.key] < COUNT:
                 got[client.next()[0]] += 1
             assert 0 < got["/" + FRAME.key] < COUNT / 2, "only images are thinned"
+            assert set(received) == {Role.VIEWER}
             client.connection.socket.close()  # like a killed client
             until(lambda: steps.put(STEP_BYTES * 1000) and steps.published > COUNT + 20)
-        assert set(received) == {Role.VIEWER}
+        bus.close()
+        run.remove()  # the run starts again
+        bus = ZenohBus(open_run(run.run_id).links, Role.CONTROLLER, HostClock())
+        calibrations = bus.publisher(CALIBRATION)
+        with connected(int(address.rpartition(":")[2].rstrip(";"))) as client:
+            client.subscribe("/" + CALIBRATION.key)
+            received.clear()
+            bus.subscribe(HEALTH, lambda sample: received.append(sample.key), ALL)
+            until(lambda: received)
+            calibrations.put(b"")
+            assert client.next()[0] == "/" + CALIBRATION.key
         process.send_signal(signal.SIGTERM)
         _, stderr = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
         process.wait()
         bus.close()
-    assert (process.returncode, stderr) == (0, "")
+    assert (process.returncode, stderr.count("serving run")) == (0, 1), stderr

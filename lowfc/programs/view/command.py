@@ -46,11 +46,10 @@ def view(
         others = logs, native, web, save, headless_screenshot, seconds, config, as_json, web_port
         if any(others) or tab != Tab.OPERATOR or memory_mb != _MEMORY_MB:
             raise ConfigurationError("--foxglove serves a running loop until Ctrl-C, with --run and --port alone")
-        from lowfc.adapters.bus.run import open_run
         from lowfc.adapters.process.clock import HostClock
         from lowfc.programs.view.foxglove_bridge import DEFAULT_PORT, serve_foxglove
 
-        serve_foxglove(open_run(the_known_run(run), ()), HostClock(), DEFAULT_PORT if port is None else port)
+        serve_foxglove(the_known_run(run), HostClock(), DEFAULT_PORT if port is None else port)
         return
     if logs and (seconds or run):
         raise ConfigurationError("--seconds and --run are for a running loop, not for logs")

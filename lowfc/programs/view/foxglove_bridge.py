@@ -5,16 +5,18 @@ and returns at once, so the bus's threads log directly. A client that does not r
 1024 wait for it.
 """
 
+import contextlib
 import logging
 import sys
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from lowfc.adapters.bus.bus import ALL, Bus, Sample, states
 from lowfc.adapters.bus.names import Names
-from lowfc.adapters.bus.run import Run
+from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.writer import declaration
 from lowfc.adapters.process.clock import Clock
@@ -55,8 +57,7 @@ class FoxgloveBridge:
         logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # a client that disconnects is not an error
         self._foxglove: Any = foxglove
         self._context = self._foxglove.Context()
-        self._bus = bus
-        self._names = Names()
+        self._clock, self._run_id = clock, run_id
         self._channels: dict[str, Channel] = {}
         self._channels_lock = threading.Lock()
         self.last_states: dict[str, Sample] = {}
@@ -74,15 +75,21 @@ class FoxgloveBridge:
                 f"cannot listen on {HOST}:{port} ({fault}); stop the program that uses it, or use another --port"
             ) from None
         self.port: int = self._server.port
+        self.join(bus)
+
+    def join(self, bus: Bus) -> None:
+        """Subscribe to a run, in place of an earlier one of its name, whose bus is closed."""
+        self._bus, self._names = bus, Names()
+        self.last_states.clear()
         # Before the service, which subscribes to Health: peers take that subscription to mean that all others exist.
         for topic in SHOWN:
             bus.subscribe(topic, partial(self._publish, topic))
-        self.service = Service(Role.VIEWER, run_id, clock, bus)
+        self.service = Service(Role.VIEWER, self._run_id, self._clock, bus)
 
-    def run(self) -> None:
-        """Serve until stopped."""
+    def run(self, restarted: Callable[[], bool] = lambda: False) -> None:
+        """Serve until stopped, or until the run has `restarted`."""
         self.service.state = "running"
-        while self.service.running:
+        while self.service.running and not restarted():
             if self.service.newcomers():
                 for topic, sample in states(self._bus, SHOWN, _PATIENCE_S):  # published before the connection
                     last = self.last_states.get(sample.key)
@@ -92,6 +99,9 @@ class FoxgloveBridge:
             self.service.beat()
             time.sleep(_POLL_S)
         self.service.finish()
+
+    def close(self) -> None:
+        """Disconnect the applications."""
         self._server.stop()
 
     def on_subscribe(self, client: "Client", channel: "ChannelView") -> None:
@@ -129,13 +139,20 @@ class FoxgloveBridge:
             return self._channels[key]
 
 
-def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> None:
-    """Serve a run to Foxglove and Lichtblick until SIGTERM or SIGINT; see `FoxgloveBridge`."""
-    bus = ZenohBus(run.links, Role.VIEWER, clock, monitor=True)
-    try:
-        bridge = FoxgloveBridge(bus, clock, run.run_id, port)
-        bridge.service.catch_signals()
-        sys.stderr.write(f"serving run {run.run_id!r} at ws://{HOST}:{bridge.port}; Ctrl-C ends it\n")
-        bridge.run()
-    finally:
-        bus.close()
+def serve_foxglove(run_id: str, clock: Clock, port: int = DEFAULT_PORT) -> None:
+    """Serve a run, and each later one of its name, until SIGTERM or SIGINT; see `FoxgloveBridge`."""
+    bridge: FoxgloveBridge | None = None
+    while bridge is None or bridge.service.running:
+        joined = open_run(run_id, ())
+        with contextlib.closing(ZenohBus(joined.links, Role.VIEWER, clock, monitor=True)) as bus:
+            earlier = None if bridge is None else bridge.service
+            if bridge is None:
+                bridge = FoxgloveBridge(bus, clock, run_id, port)
+            else:
+                bridge.join(bus)
+            bridge.service.catch_signals()
+            if earlier is not None and not earlier.running:  # a signal has arrived meanwhile
+                bridge.service.stop(earlier.why)
+            sys.stderr.write(f"serving run {run_id!r} at ws://{HOST}:{bridge.port}; Ctrl-C ends it\n")
+            bridge.run(joined.restarted)
+    bridge.close()
