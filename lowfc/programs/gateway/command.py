@@ -19,6 +19,7 @@ from lowfc.contract.messages import Role
 from lowfc.programs.gateway.epics import EpicsGateway, protocol
 from lowfc.programs.gateway.variables import Put, Variable, status_of, variables
 from lowfc.programs.gateway.watch import Watch
+from lowfc.programs.view.monitor import preload
 
 PERIOD_S = 0.1
 """Update period of the variables."""
@@ -36,6 +37,7 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
     Example: lowfc gateway epics --run bench
     """
     protocol()  # raises now if p4p is missing
+    preload()
     joined = open_run(the_run(run), ())
     run_id, of_run = joined.run_id, joined.path / "config.toml"
     known = configuration(config) if config is not None or not of_run.exists() else load(of_run)
