@@ -5,6 +5,7 @@ import contextlib
 import os
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -31,6 +32,8 @@ from lowfc.programs.console.history import History
 from lowfc.programs.console.panels import _PIXELS, halves, reduced, sparkline
 from lowfc.programs.console.phrases import phrased
 from lowfc.programs.console.task import Task
+from lowfc.programs.view.verdicts.run_state import Liveness
+from lowfc.programs.view.verdicts.tile import Level
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.console.live_run import RUN, LiveRun
 from tests.support.loops import until
@@ -461,6 +464,10 @@ def test_verdict_and_tiles_have_the_text_of_the_view() -> None:
     assert panels.verdict(reading, RUN) == (verdict.level, f"CHECK  {verdict.headline}")
     for line, tile in zip(panels.tiles(reading), verdict.tiles, strict=True):
         assert all(word in line.plain for word in (tile.title, tile.value, tile.detail))
+    silent = reading._replace(silent_s=3.0)
+    assert panels.verdict(silent, RUN)[0] is Level.BAD
+    ended = replace(silent.state, controller=silent.state.controller._replace(life=Liveness.STOPPED))
+    assert panels.verdict(silent._replace(state=ended), RUN)[0] is Level.NEUTRAL
 
 
 def test_pictures_and_sparklines_have_a_fixed_size() -> None:

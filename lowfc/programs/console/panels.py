@@ -45,6 +45,8 @@ def verdict(reading: Reading, run: str) -> tuple[Level, str]:
     """Text of the verdict, or of a lost connection."""
     if reading.silent_s is None:
         return Level.WARNING, f"NOT CONNECTED  no message of run {run} yet"
+    if not reading.connected and reading.state.controller.life is Liveness.STOPPED:
+        return Level.NEUTRAL, f"NOT CONNECTED  the processes of run {run} were stopped on request: values are hidden"
     if not reading.connected:
         return Level.BAD, (
             f"NOT CONNECTED  no message of run {run} for {duration(reading.silent_s)}: values are hidden. The run was "
