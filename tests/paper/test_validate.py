@@ -2,6 +2,7 @@
 
 import json
 import sys
+import threading
 from itertools import product
 from pathlib import Path
 from unittest.mock import Mock
@@ -380,3 +381,17 @@ def test_fitting_flux_and_shear_adds_noise_for_clowfs_but_not_for_sam(committed)
     )
     assert with_nuisances["sam"] == pytest.approx(plain_one["sam"], rel=1e-6)
     assert with_nuisances["clowfs"] > 1.5 * plain_one["clowfs"]
+
+
+def test_an_interruption_does_not_wait_for_running_items():
+    released, ended = threading.Event(), threading.Event()
+
+    def item(index):
+        if index:
+            released.wait(30.0)
+            ended.set()
+
+    with pytest.raises(KeyboardInterrupt):
+        Context(jobs=2, progress=Mock(side_effect=KeyboardInterrupt)).map("", item, range(2))
+    assert not ended.is_set()
+    released.set()

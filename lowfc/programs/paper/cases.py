@@ -3,11 +3,11 @@
 import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from math import isfinite
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -290,8 +290,8 @@ class Context:
         """Apply the function to all items on `jobs` threads, with progress; results in the order of the items."""
         todo: Sequence[Item] = list(items)
         results: list[Result] = []
-        with ThreadPoolExecutor(self.jobs) as pool:
-            for result in pool.map(function, todo):
+        with ThreadPool(self.jobs) as pool:  # its threads are daemons: Ctrl-C does not wait for them
+            for result in pool.imap(function, todo):
                 results.append(result)
                 self.progress(what, len(results), len(todo))
         return results
