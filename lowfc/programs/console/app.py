@@ -65,7 +65,7 @@ class Console(OrderedKeys):
     #verdict {{ width: 1fr; height: 2; padding: 0 1; text-style: bold; }}
     #clock {{ width: 11; height: 2; padding: 0 1; text-style: bold; }}
     #readings {{ height: 17; }}
-    #left {{ width: {_LEFT}; }}
+    #left {{ width: 1fr; min-width: {_LEFT}; }}
     #right {{ width: 1fr; padding: 0 0 0 1; }}
     #tiles {{ height: 8; }}
     #modes, #pictures {{ height: 7; }}
