@@ -56,7 +56,7 @@ def open_executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
 
 
 def _begin_worker() -> None:
-    """End with the search, even if that is killed."""
+    """Make this worker end with the search, even if the search is killed."""
     Thread(target=_end_with_parent, daemon=True).start()
 
 

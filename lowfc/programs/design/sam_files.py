@@ -112,7 +112,7 @@ def write_plot(path: Path, points: Sequence[Point], search: Search) -> None:
 
 
 def front(points: Sequence[Point]) -> list[Point]:
-    """The Pareto front: points than which no other is better in one table and at least as good in the other."""
+    """The Pareto front: all points but those beaten in one table by a point that is at least as good in the other."""
     return [
         point
         for point in points

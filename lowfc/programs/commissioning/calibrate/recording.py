@@ -48,7 +48,7 @@ class PokesNotSeenError(CalibrationError):
 
 
 class Recording(NamedTuple):
-    """Frames of a probe sequence, counted from the first whose command had a row.
+    """Frames of a probe sequence; number 0 is the first frame whose command had a row of the table.
 
     Attributes:
         sequence: frame numbers (frames,), increasing; lost frames are missing.
@@ -95,7 +95,7 @@ def _lag(delay_frames: float) -> int:
 
 
 def _weights(delay_frames: float) -> Array:
-    """Fraction of the row `lag` frames before that an exposure sees (lags,)."""
+    """Fraction (lags,) that an exposure sees of the row commanded `lag` frames before it."""
     return np.concatenate([[0.0], delay_weights(max(delay_frames, 1.0))])
 
 

@@ -12,7 +12,7 @@ from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.line import NS, Collected
 
 LATE_NS = 20_000_000
-"""Clock difference at which every frame would be late (`control.max_frame_age_ms`)."""
+"""Clock difference above which every frame is refused as late by default (`control.max_frame_age_ms`)."""
 
 _AHEAD_NS = 1_000_000
 _DECADE_S = 10 * 365 * 86_400

@@ -39,7 +39,7 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
 
 
 def _kinds(name: str) -> list[plugins.Kind]:
-    """Kinds of driver that are installed under this name, or that a class in a module or file is; at least one."""
+    """Kinds of driver installed under this name, or implemented by the class of this name; the first kind if none."""
     found = [kind for kind in plugins.KINDS if name in plugins.installed(kind)]
     return found or [kind for kind in plugins.KINDS if _loads(kind, name)] or [*plugins.KINDS[:1]]
 

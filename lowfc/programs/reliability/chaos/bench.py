@@ -41,7 +41,7 @@ WAIT_S = 60.0
 
 
 class CaseFailedError(LowfcError):
-    """A case failed, or waited in vain."""
+    """A case failed, or a wait timed out."""
 
 
 @dataclass(slots=True)
@@ -201,7 +201,7 @@ class ChaosBench:
         self._start(Child(name, command or self.children[name].command, stderr), ready=ready)
 
     def await_end(self, name: str, status: int) -> str:
-        """Wait until a process ends by itself with the expected exit status; the end of its standard error."""
+        """Wait until a process ends by itself with the expected exit status; return the end of its stderr."""
         child, begun_s = self.children[name], time.monotonic()
         self.wait(lambda: child.status is not None, f"the end of {name}")
         self._record_end(child, time.monotonic() - begun_s, requested=True)

@@ -82,7 +82,7 @@ def no_mounts() -> str:
 
 
 def lacking(requirement: str, *command: str) -> str:
-    """Try a harmless command: the requirement and why the command failed, empty if it succeeded."""
+    """Try a harmless command; return the requirement and why the command failed, or empty if it succeeded."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603  # ours
     except OSError as fault:

@@ -158,7 +158,7 @@ def _run(case: "Case", folder: Path, rng: random.Random) -> "Outcome":
 
 
 def configured(case: "Case", folder: Path) -> "Configuration":
-    """The configuration of a case: the loop closed, at the default rate, its log in the case's folder."""
+    """The configuration of a case: the loop closed, its log in the case's folder, and the keys of the case."""
     from lowfc.adapters.process.realtime import spread
     from lowfc.contract.configuration import FIXED_GAINS, load
 

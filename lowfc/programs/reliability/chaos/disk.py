@@ -89,7 +89,7 @@ def _stalled(bench: ChaosBench) -> None:
 
 
 def _on_slow_disk(bench: ChaosBench, seconds: float, after: int, times: int) -> None:
-    """Replace the recorder by one of which writes number `after` + 1 to `after` + `times` take `seconds`."""
+    """Replace the recorder by one whose writes number `after` + 1 to `after` + `times` take `seconds` each."""
     command = bench.children[Role.RECORDER].command
     at = command.index("-m")
     _replace_recorder(bench, [*command[:at], "-c", _SLOW, str(seconds), str(after), str(times), *command[at + 2 :]])

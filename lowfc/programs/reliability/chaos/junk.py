@@ -55,7 +55,7 @@ class Intruder:
         self._counts[topic] += 1
 
     def ask(self, name: str, payload: bytes, timeout_s: float) -> int:
-        """Send a request to the controller; the number of answers."""
+        """Send a request to the controller; return the number of answers."""
         return len(self._bus.get(REQUEST_KEY.format(name=name), payload, timeout_s))
 
 

@@ -27,8 +27,6 @@ RMS_FRAMES = 50
 ROUNDING_NM = 0.03
 """Largest difference of a mirror state from its command: the driver rounds to 0.023 nm."""
 REFUSALS = frozenset({*range(wire.REASON_NO_CALIBRATION, wire.REASON_STUCK + 1), wire.REASON_HELD})
-HOST_EVENTS = frozenset({"COMMANDS_LATE", "FRAMES_REFUSED", "FRAMES_MISSING", "REALTIME_REFUSED", "DISK_SLOW"})
-"""Warnings that a busy host can cause."""
 
 
 class Finding(NamedTuple):
@@ -186,7 +184,7 @@ def _events(case: Case, evidence: Evidence) -> Finding:
         if not any(event.message.startswith(expected) for event in events)
     ]
     names = [(event.message.partition(" ")[0], event.level) for event in events]
-    allowed = {*(text.partition(" ")[0] for text in case.expected), *case.allowed, *HOST_EVENTS}
+    allowed = {*(text.partition(" ")[0] for text in case.expected), *case.allowed}
     warnings = Counter(name for name, level in names if level >= Level.WARNING)
     errors = {name for name, level in names if level >= Level.ERROR}
     wrong += [f"{warnings[name]} unexpected {name}" for name in sorted(errors - allowed)]

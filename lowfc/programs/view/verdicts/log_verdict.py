@@ -26,7 +26,7 @@ _NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", N
 
 
 class LogVerdict:
-    """Sums over all snapshots of a log."""
+    """The verdict on a log, from sums over all its snapshots."""
 
     def __init__(self) -> None:
         self._means = SpanMeans()
