@@ -49,7 +49,7 @@ SAMPLES_PER = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class RelayFields:
     """Fields in the relay pupil at one wavelength.
 
     Attributes:
@@ -78,7 +78,7 @@ class Optics:
 
     focal_masks: tuple[str, ...]
     band: Band
-    groups: tuple[Group, ...]
+    groups: tuple[RelayFields, ...]
     band_modes: int
     forms: PupilForms
     samples_per: int
@@ -111,11 +111,11 @@ def build_optics(
     amplitudes = [pupil.astype(np.complex128), *(pupil * modes).astype(np.complex128)]
     samples = IMAGE_WIDTH * samples_per
 
-    def group(scale: float, names: tuple[str, ...], count: int) -> Group:
+    def group(scale: float, names: tuple[str, ...], count: int) -> RelayFields:
         masks = [FOCAL_MASKS[name](FOCAL_SAMPLES_PER) for name in names]
         relay = [_relay(field, mask, relay_samples, scale) for mask in masks for field in amplitudes[:count]]
         to_sensor = kernel(samples, samples_per, relay_samples, scale)
-        return Group(
+        return RelayFields(
             np.stack(relay).astype(np.complex64), (to_sensor * scale**0.5 / relay_samples).astype(np.complex64)
         )
 

@@ -215,7 +215,7 @@ def _anywhere(rng: np.random.Generator, bounds: Bounds, paired: bool, diameter: 
 
 
 def _on_axis(bounds: Bounds, orbit: Orbit, paired: bool) -> Orbit:
-    """The orbit, moved onto the symmetry axis if there is one, unless it is a pair."""
+    """The orbit; a single hole is moved onto the symmetry axis, if there is one."""
     x, y, diameter = orbit
     if bounds.symmetry == "none" or paired:
         return orbit

@@ -119,7 +119,7 @@ def _doubled(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 def _placed(spline: Array, geometry: Geometry, shape: tuple[int, ...], spectrum: Complex) -> Geometry:
-    """The geometry with the centre at which the model best matches an image, to a pixel.
+    """The geometry with the centre at which the model best matches an image, to within a pixel.
 
     Args:
         spline: Spline of the computed image.
@@ -148,7 +148,7 @@ def _sample(spline: Array, geometry: Geometry, shape: tuple[int, ...]) -> Array:
 
 
 def _residual(model: Array, real: Array) -> tuple[float, float, float]:
-    """Relative residual after a fit of flux and background, and these two."""
+    """Relative residual after a fit of flux and background, and the fitted flux and background."""
     shape, light = model - model.mean(), real - real.mean()
     square = float(np.vdot(shape, shape))
     flux = float(np.vdot(shape, light)) / square if square else 0.0

@@ -12,7 +12,7 @@ from lowfc.arrays import Array, Single, Whole
 FEWEST_CYCLES = 3
 """Least cycles of the lowest line in a period; with fewer, it cannot be told from a drift of the mean."""
 _APART = 3  # least number of odd bins between lines of a mode: the noise is measured between them
-_DRAWS = 32  # random sets of phases; the one with the lowest crest is used
+_DRAWS = 32  # random sets of phases; the one with the lowest peak is used
 
 
 def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, highest: float) -> list[Whole]:
@@ -55,7 +55,7 @@ def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, hi
 
 
 def multisine(period_frames: int, bins: list[Whole], rms_nm: float, seed: int) -> Single:
-    """One period (period_frames, modes) of sines of equal amplitude, with random phases of a low crest.
+    """One period (period_frames, modes) of sines of equal amplitude, whose random phases give a low crest factor.
 
     Args:
         period_frames: Frames in the period.
@@ -82,7 +82,7 @@ def with_lead_in(period: Single, lead_frames: int) -> Single:
 
 
 def build_staircase(levels_nm: npt.ArrayLike, hold_frames: int, largest_step_nm: float) -> tuple[Array, Whole]:
-    """A staircase from zero over all levels and back to zero, with the fewest frames between levels.
+    """A staircase from zero over all levels and back to zero, in as few steps as the largest step allows.
 
     Args:
         levels_nm: (levels,) in order.

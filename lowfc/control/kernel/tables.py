@@ -62,7 +62,7 @@ class Tables(NamedTuple):
 
     @classmethod
     def of(cls, kernel: Kernel, calibration: Calibration, reference_nm: Single) -> "Tables | None":
-        """Tables of a calibration; None if the kernel has no compiled functions or the calibration no pixels."""
+        """Tables of a calibration; None if the kernel has no compiled functions, or the calibration has no pixels."""
         modes, pixels = calibration.reconstructor.shape
         if kernel.measure is None or kernel.respond is None or not modes * pixels:
             return None

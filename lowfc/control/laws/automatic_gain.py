@@ -77,7 +77,7 @@ class GainBank:
     def __init__(
         self, kept: Single, limit_nm: Single, weights: Weights, delay_frames: float, windows: tuple[int, int]
     ) -> None:
-        """Make a bank with one mode for each leak.
+        """Make a bank with a mode for each element of `kept`.
 
         Args:
             kept: (modes,) 1 - leak.
@@ -121,9 +121,9 @@ class GainBank:
         self._clear(self._windows[0])
 
     def add_frame(self, open_nm: Single, error_nm: Single, tilt_nm: Single | None = None, *, closed: bool) -> bool:
-        """Add the modes (modes,) of one frame, of the open loop and of the loop; return whether a block is complete.
+        """Add one frame: open-loop modes and the real loop's errors (modes,); return whether a block is complete.
 
-        A bank of other modes also needs tip and tilt (2,), as the sensor saw them.
+        A bank of modes other than tip and tilt also needs these two (2,), as the sensor saw them.
         """
         if closed is not self._closed and not self.first:
             self._add_up()
@@ -216,13 +216,13 @@ class GainBank:
         return found
 
     def _cross_talk_nm(self, tilts: list[Array]) -> list[Array]:
-        """Cross-talk (modes,) of tip and tilt over these blocks: the certain part, and the possible."""
+        """Cross-talk (modes,) of tip and tilt over these blocks, if certain, and if suspected; otherwise 0."""
         found, error = self._cross_talk.mean_nm(np.mean(tilts, axis=0))
         accepted: list[Array] = [np.where(np.abs(found) > errors * error, found, 0) for errors in (SURE, SUSPECTED)]
         return [self._of_own @ one for one in accepted]
 
     def _without(self, cross_talk_nm: Array) -> Array:
-        """Mean squares (blocks, rows and the loop itself, modes) less the open loop's, nm^2, of the true modes.
+        """Mean squares of the true modes less those in open loop (blocks, rows and the real loop, modes), nm^2.
 
         Cross-talk (modes,) is measured but not real: a loop of any gain but 0 puts it on the mirror and then no longer
         measures it.

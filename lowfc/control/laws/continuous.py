@@ -144,9 +144,9 @@ def means_while_applied(measured_nm: Array, timing: Timing) -> tuple[Array, Arra
 def held_residual_nm2(
     law: LinearLaw, measured_nm: Array, command_nm: Array, noise_nm2: Array, timing: Timing
 ) -> tuple[Array, int]:
-    """Sum of squares (modes,) of the residuals of the means that commands were to null, and the number of frames.
+    """Sum of squares (modes,) of the means of `means_while_applied` plus the commands, and the number of frames.
 
-    The means are those of `means_while_applied`; the contribution of the measurements' noise (modes,) is subtracted.
+    The contribution of the measurements' noise (modes,) is subtracted.
     """
     ahead_nm, response = means_while_applied(measured_nm, timing)
     rows = np.isfinite(ahead_nm).all(axis=1)

@@ -76,7 +76,7 @@ def white_noise(law: LinearLaw, noise_nm: Array) -> Term:
 
 
 def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """Residual of a disturbance, by the spectrum and the mean (modes,) of its values at the start of each exposure.
+    """Residual of a disturbance, from spectrum and mean (modes,) of its values at the start of each exposure.
 
     It is a mean over the periods, or over the starts of exposures if `timing.held` is 0.
     """
@@ -84,9 +84,9 @@ def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -
 
 
 def lag_under_noise(law: LinearLaw, measured: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """The same for a disturbance (mean (modes,)) measured in the exposures, with white noise.
+    """As `lag`, from spectrum and mean (modes,) of the measurements, which are means over exposures with white noise.
 
-    The noise, the floor of its spectrum, is subtracted.
+    The noise, the floor of the spectrum, is subtracted.
     """
     exposed = np.abs(mean_over(_omega(law, measured), timing.exposure)) ** 2
     passed = _passed(law, measured, timing) / exposed[:, None]

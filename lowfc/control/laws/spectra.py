@@ -62,7 +62,7 @@ class Spectrum:
         return float(self.frequency_hz[1])
 
     def variance_nm2(self, filtered: Array | float = 1.0) -> Array:
-        """Variance (columns,) behind a filter whose power transmission is (frequencies,) or (frequencies, columns)."""
+        """Variance (columns,) after a filter whose power transmission is (frequencies,) or (frequencies, columns)."""
         return np.asarray(np.sum(self.power_nm2_hz * filtered, axis=0) * self.spacing_hz)
 
     def error_nm2(self, filtered: Array | float = 1.0) -> Array:

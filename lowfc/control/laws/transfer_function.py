@@ -119,7 +119,7 @@ def departure(value: Complex, theory: Array, error: Array, tolerance_db: float) 
 
 
 def _hann(values: Array) -> Complex:
-    """Spectrum (frequencies, columns) under Hann's window, where a line has its height."""
+    """Spectrum (frequencies, columns) under Hann's window, scaled so that a line has its amplitude."""
     spectrum = np.fft.rfft(values, axis=0) * (2 / len(values))
     after = spectrum.copy()
     after[1:-1] -= (spectrum[:-2] + spectrum[2:]) / 2

@@ -243,9 +243,9 @@ def frame_noise_nm2(models: Sequence[Model], noise_nm2: Array) -> Array:
 
 
 def simulated_residual_nm2(law: LinearLaw, run: TimeSeries, noise_nm2: Array, timing: Timing) -> Array:
-    """Mean square (modes,) residual of the means that a law's commands are to null.
+    """Mean square (modes,) of what a law leaves of each mode's mean over the period in which a command is in force.
 
-    Changes within a command's period, which no law can remove, are not included. Each piece of the run, (frames, modes)
+    Changes within that period, which no law can remove, are not included. Each piece of the run, (frames, modes)
     of pseudo-open-loop modes with noise (modes,), starts with a law at rest and a flat mirror; the frames until it has
     settled do not count.
     """

@@ -32,12 +32,12 @@ class VirtualIntegrators(NamedTuple):
 
     @classmethod
     def at_rest(cls, gain: Single, kept: Single, limit_nm: Single, weights: Weights) -> "VirtualIntegrators":
-        """Before the first command."""
+        """Integrators before their first command."""
         lags = 1 + max(lag for lag, _ in weights)
         return cls(gain, kept, limit_nm, weights, (np.zeros_like(gain),) * lags)
 
     def advanced(self, pol_nm: Single) -> tuple["VirtualIntegrators", Single]:
-        """One frame later, and the errors (rows, modes) that would have been measured, nm of wavefront rms."""
+        """A copy one frame later, and the errors (rows, modes) that would have been measured, nm of wavefront rms."""
         error_nm = pol_nm
         for lag, weight in self.weights:
             error_nm = error_nm + (self.history_nm[lag] if weight == 1 else weight * self.history_nm[lag])
@@ -47,6 +47,6 @@ class VirtualIntegrators(NamedTuple):
         return self._replace(history_nm=(command_nm, *self.history_nm[:-1])), error_nm
 
     def held(self, frames: int = 1) -> "VirtualIntegrators":
-        """Some frames later, without measurements: commands are held, as in the loop."""
+        """A copy some frames later, without measurements: commands are held, as in the loop."""
         held = self.history_nm[:1] * min(frames, len(self.history_nm))
         return self._replace(history_nm=(held + self.history_nm)[: len(self.history_nm)])

@@ -50,7 +50,7 @@ class Spans(NamedTuple):
 
     @classmethod
     def at(cls, rate_hz: float) -> "Spans":
-        """At this rate."""
+        """The durations at a frame rate."""
         block = max(FEWEST, round(BLOCK_S * rate_hz))
         better, long_term = (max(1, round(seconds * rate_hz / block)) for seconds in (BETTER_S, LONG_TERM_S))
         return cls(block, max(1, round(FADED_S * rate_hz)), better, long_term)

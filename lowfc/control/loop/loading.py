@@ -261,7 +261,7 @@ def _with_camera(state: State, camera: CameraSettings) -> State:
 
 
 def _expected(loop: ActiveLoop, camera: CameraSettings) -> CameraSettings:
-    """Settings of the calibration; if it has none yet, the camera's as far as the calibration allows."""
+    """Settings of the calibration; if it has none yet, the camera's with the calibration's shape and saturation."""
     if loop.camera is not None:
         return loop.camera
     calibration = loop.calibration

@@ -175,7 +175,7 @@ def _waves(sensor: Sensor, scale: float) -> Array:
 
 
 def _kernels(sensor: Sensor, scale: float, functions: Array) -> Array:
-    """Kernel (functions, n) from the relay pupil to the functions on the sensor, with the factors of one axis."""
+    """Kernel (functions, n) from the relay pupil to the functions on the sensor, with the scale of one axis."""
     samples = sensor.pupil.shape[0]
     angles = 2.0 * np.pi * scale * np.outer(image_axis(sensor.samples, sensor.samples_per), pupil_axis(samples))
     kernels = functions.T @ np.cos(angles)
