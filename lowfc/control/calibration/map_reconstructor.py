@@ -1,4 +1,4 @@
-"""MAP reconstructor of the corrected modes: the uncorrected modes have a prior, their mean square."""
+"""Maximum-a-posteriori (MAP) reconstructor of the corrected modes: the prior of the others is their mean square."""
 
 import numpy as np
 

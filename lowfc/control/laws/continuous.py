@@ -32,7 +32,7 @@ class Timing(NamedTuple):
         delay: from the frame that a command is computed from to the first frame exposed wholly with it.
         applied: from the start of an exposure until the command computed from it is in force.
         exposure: its length; 0 for an instant.
-        held: time over which the residual counts: a period, or 0 for the instant of the command alone.
+        held: time over which the residual counts, from `applied` on: a period, or 0 for that instant alone.
     """
 
     delay: float
