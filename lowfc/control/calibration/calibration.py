@@ -86,10 +86,7 @@ class Calibration:
     def identity(self) -> str:
         """The correct `id`: a hash of all other content."""
         camera = self.camera
-        settings = camera and (
-            *(camera.shape, camera.region, camera.bias_dn, camera.saturation_dn),
-            *(camera.gain_e_per_dn, camera.em_gain, camera.read_noise_e),
-        )
+        settings = None if camera is None else tuple(getattr(camera, name) for name in _CAMERA_IDENTITY)
         parts = [(name, getattr(self, name)) for name in _IDENTITY]
         return identity([*parts, ("camera", settings)])
 
@@ -98,6 +95,7 @@ _IDENTITY = (
     *("noll", "reference", "response", "reconstructor", "good", "dark", "modes_to_actuators", "shape", "grid"),
     *("flux_dn", "saturation_dn", "estimator", "wavelength_nm", "operator_hash", "actuators_to_modes"),
 )
+_CAMERA_IDENTITY = ("shape", "region", "bias_dn", "saturation_dn", "gain_e_per_dn", "em_gain", "read_noise_e")
 
 
 def array_shapes(modes: int, shape: tuple[int, int], grid: tuple[int, int]) -> dict[str, tuple[int, ...]]:

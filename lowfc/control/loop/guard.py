@@ -92,7 +92,7 @@ class Group(NamedTuple):
         if self.overruled:
             better = not void and virtual_nm2 < BETTER * error_nm2
             after = after._replace(blocks=self.blocks + 1 if better else 0)
-            if self.final or after.blocks < spans.better << (self.takeovers - 1):
+            if self.final or after.blocks < spans.better * 2 ** (self.takeovers - 1):
                 return after, ""
             return after._replace(overruled=False, blocks=0), LAW_RETURNS
         worse = not void and error_nm2 > WORSE * virtual_nm2
@@ -210,7 +210,7 @@ class LawGuard(NamedTuple):
         """
         spans, groups = self.spans, self.groups
         overruled = self.overruled
-        if overruled and any(group.faded != spans.faded * group.overruled for group in groups):
+        if overruled and any(group.faded != (spans.faded if group.overruled else 0) for group in groups):
             return self.with_groups([_faded(group, spans) for group in groups]), []
         squares = np.empty((3, pol_nm.size), np.float32)
         squares[0], squares[1], squares[2] = error_nm, error_nm, pol_nm

@@ -65,7 +65,7 @@ class Interlock(NamedTuple):
     def _holds(self, value: Value) -> bool:
         if isinstance(value, float) and isinstance(self.value, float) and self.test in _BOUNDS:
             return value > self.value if self.test == "above" else value < self.value
-        return (value == self.value) is (self.test == "equal")
+        return value == self.value if self.test == "equal" else value != self.value
 
     def _compared(self) -> str:
         return "" if self.test == "equal" else f", {self.test if self.test in _BOUNDS else 'not'} {shown(self.value)}"

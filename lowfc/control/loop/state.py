@@ -81,7 +81,8 @@ class Settings:
 
     def automatic(self, noll: tuple[int, ...]) -> Mask:
         """The modes (modes,) whose gain is automatic at the start."""
-        return np.array([self.auto_gain[index not in TIP_TILT] for index in noll], dtype=bool)
+        tilt, others = self.auto_gain
+        return np.array([tilt if index in TIP_TILT else others for index in noll], dtype=bool)
 
 
 class LawRunner(NamedTuple):
