@@ -163,8 +163,8 @@ def test_a_process_with_many_pids_is_stored_once(hub: MemoryHub) -> None:
     stranger = MemoryBus(hub, "operator", FakeClock()).publisher(HEALTH, "stranger")
     for number in range(FORGED):
         stranger.put(health(number))
-        assert camera.newcomers()
-    assert not camera.newcomers()
+        assert camera.has_newcomers()
+    assert not camera.has_newcomers()
     assert len(camera._known) == 1
 
 

@@ -134,7 +134,7 @@ import gc, json, os, sys
 import numpy
 from threadpoolctl import threadpool_info
 {limits}
-from lowfc.adapters.process.realtime import set_up, step_back
+from lowfc.adapters.process.realtime import set_up, set_up_below_loop
 granted = {call}
 print(json.dumps({{
     "granted": granted.granted, "refused": granted.refused,
@@ -196,7 +196,7 @@ def test_refused_measures_are_reported_with_their_cost() -> None:
 
 def test_a_class_below_the_normal_one_stays() -> None:
     found = report(
-        "step_back(None, None)", f"os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0)); {UNPRIVILEGED}"
+        "set_up_below_loop(None, None)", f"os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0)); {UNPRIVILEGED}"
     )
     assert found["policy"] == os.SCHED_IDLE
 
@@ -235,7 +235,7 @@ def test_cpu_idle_stays_disabled_while_the_process_lives() -> None:
 def test_the_recorder_leaves_its_parents_scheduling_class() -> None:
     real_time, cpu = fifo_permitted(), min(os.sched_getaffinity(0))
     limits = "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))" if real_time else ""
-    found = report(f"step_back(None, {{{cpu}}})", limits)
+    found = report(f"set_up_below_loop(None, {{{cpu}}})", limits)
     assert (found["policy"], found["cpus"]) == (os.SCHED_OTHER if real_time else os.sched_getscheduler(0), [cpu])
     assert found["granted"] == ["normal scheduling class", f"processors [{cpu}]"]
 

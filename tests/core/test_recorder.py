@@ -172,21 +172,21 @@ def test_the_loss_account_counts_gaps_from_the_first_message_of_each_start() -> 
         account.enter(*entry(FRAME, count, start_s=101), recorded=True)
     account.enter(*entry(FRAME, 6, start_s=101), recorded=False)
     assert account.lost() == {FRAME.key: 4}
-    assert (account.news(), account.news()) == ({FRAME.key: 4}, {})
+    assert (account.newly_lost(), account.news()) == ({FRAME.key: 4}, {})
     account.enter(*entry(FRAME, 8, start_s=101), recorded=True)
-    assert account.news() == {FRAME.key: 1}
+    assert account.newly_lost() == {FRAME.key: 1}
 
 
 def test_a_late_message_is_removed_from_the_losses() -> None:
     account = LossAccount()
     for count in (5, 9, 7):
         account.enter(*entry(FRAME, count), recorded=True)
-    assert (account.lost(), account.news()) == ({FRAME.key: 2}, {FRAME.key: 2})
+    assert (account.lost(), account.newly_lost()) == ({FRAME.key: 2}, {FRAME.key: 2})
     account.enter(*entry(FRAME, 6), recorded=True)
     account.enter(*entry(FRAME, 8), recorded=False)  # not written to the disk
-    assert (account.lost(), account.news(), account.recorded()) == ({FRAME.key: 1}, {}, {FRAME.key: 4})
+    assert (account.lost(), account.newly_lost(), account.recorded()) == ({FRAME.key: 1}, {}, {FRAME.key: 4})
     account.enter(*entry(FRAME, 12), recorded=True)
-    assert (account.lost(), account.news()) == ({FRAME.key: 3}, {FRAME.key: 1}), "two were reported already"
+    assert (account.lost(), account.newly_lost()) == ({FRAME.key: 3}, {FRAME.key: 1}), "two were reported already"
 
 
 def reconcile(account: LossAccount, published: int, state: str = "", missing: int = 0, start_s: int = 100) -> None:
@@ -204,11 +204,11 @@ def test_frames_that_the_camera_missed_before_publishing_are_not_losses() -> Non
     reconcile(account, 51, missing=7)  # missed before the first frame received
     account.enter(*entry(FRAME, 53), recorded=True)
     reconcile(account, 54, missing=9)
-    assert (account.lost(), account.news()) == ({}, {})
+    assert (account.lost(), account.newly_lost()) == ({}, {})
     account.enter(*entry(FRAME, 56), recorded=True)
-    assert account.news() == {}, "the camera may still report that it missed them"
+    assert account.newly_lost() == {}, "the camera may still report that it missed them"
     reconcile(account, 57, missing=10)
-    assert (account.news(), account.news()) == ({FRAME.key: 1}, {}), "one was lost on the bus"
+    assert (account.newly_lost(), account.news()) == ({FRAME.key: 1}, {}), "one was lost on the bus"
 
 
 def test_duplicates_neither_count_as_losses_nor_hide_them() -> None:

@@ -151,7 +151,7 @@ def test_a_recording_can_be_stopped_without_a_controller(own_runtime: Path, benc
 def test_an_impossible_recording_is_refused_before_any_file_is_created(
     options: tuple[object, ...], complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lowfc.programs.core.recording.process.step_back", lambda *_: NOTHING)
+    monkeypatch.setattr("lowfc.programs.core.recording.process.set_up_below_loop", lambda *_: NOTHING)
     done = lowfc("record", "--run", new_run_id(), *(str(option).format(tmp_path) for option in options))
     assert (done.exception.exit_status, complaint in str(done.exception)) == (2, True)
     assert list(tmp_path.iterdir()) == []

@@ -10,7 +10,7 @@ import pytest
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files import calibration_file
-from lowfc.adapters.logs.parts import LAST, WholeLog, in_order, one_by_one, the_one
+from lowfc.adapters.logs.parts import LAST, WholeLog, named_files, named_log, named_logs
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import recover
 from lowfc.adapters.logs.series import STANDARD, LogSeries
@@ -64,40 +64,40 @@ def test_last_is_the_newest_log_with_all_its_files(folder: Path, samples: list[S
     assert [older, *newer] != sorted([older, *newer])
     Path(folder, "notes.txt").touch()
     Path(folder, "zzz.mcap").touch()
-    assert in_order([Path(LAST)]) == newer
-    assert the_one([folder / LAST]) == tuple(newer)
-    assert in_order([*reversed(newer)]) == newer
-    assert one_by_one([newer[1], older, newer[0]]) == [(newer[0], newer[1]), (older,)]
+    assert named_files([Path(LAST)]) == newer
+    assert named_log([folder / LAST]) == tuple(newer)
+    assert named_files([*reversed(newer)]) == newer
+    assert named_logs([newer[1], older, newer[0]]) == [(newer[0], newer[1]), (older,)]
     with pytest.raises(ConfigurationError, match="one log"):
-        the_one([older, *newer])
+        named_log([older, *newer])
     with pytest.raises(ConfigurationError, match="same part"):
-        in_order([older, older])
+        named_files([older, older])
     Path(LAST).symlink_to(older)
-    assert in_order([Path(LAST)]) == [Path(LAST)]
+    assert named_files([Path(LAST)]) == [Path(LAST)]
 
 
 def test_last_without_a_log_is_an_error(folder: Path) -> None:
     with pytest.raises(DataFileError, match=r"newest log in logs, which cannot be read: No such file.*FOLDER/last"):
-        in_order([Path(LAST)])
+        named_files([Path(LAST)])
     folder.mkdir()
     with pytest.raises(DataFileError, match="there is none"):
-        in_order([Path(LAST)])
+        named_files([Path(LAST)])
 
 
 def test_a_log_of_a_killed_recorder_is_the_last_until_it_is_recovered(folder: Path, samples: list[Sample]) -> None:
     files = recorded(folder, samples[:300], 2, finish=False)
     assert files[1].name.endswith(".mcap.part")
-    assert in_order([Path(LAST)]) == files
+    assert named_files([Path(LAST)]) == files
     saved = folder / files[1].name.replace(".mcap.part", "-recovered.mcap")
     recover(files[1], saved)
-    assert in_order([Path(LAST)]) == [files[0], saved]
+    assert named_files([Path(LAST)]) == [files[0], saved]
 
 
 def test_logs_without_the_name_of_their_series_are_separate(folder: Path) -> None:
     """Logs of 0.1 have no such name."""
     logs = [LogWriter(folder / f"20260101T00000{n}Z.mcap", 0, METADATA).finish({}) for n in range(3)]
-    assert one_by_one(logs) == [(log,) for log in logs]
-    assert in_order([Path(LAST)]) == logs[-1:]
+    assert named_logs(logs) == [(log,) for log in logs]
+    assert named_files([Path(LAST)]) == logs[-1:]
 
 
 def test_the_files_of_a_log_are_read_as_one(folder: Path, samples: list[Sample]) -> None:

@@ -37,11 +37,12 @@ def read_certificate(authority: Path, certificate: Path, key: Path, *, server: b
         for context in (listening, connecting):
             context.load_cert_chain(certificate, key)
         to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
-        ends = listening.wrap_bio(to_server, to_client, server_side=True), connecting.wrap_bio(to_client, to_server)
-        for end in ends * _ROUNDS:
+        sides = listening.wrap_bio(to_server, to_client, server_side=True), connecting.wrap_bio(to_client, to_server)
+        for side in sides * _ROUNDS:
             with contextlib.suppress(ssl.SSLWantReadError):
-                end.do_handshake()
-        found: dict[str, Any] = {**(ends[server].getpeercert() or {})}
+                side.do_handshake()
+        verifying = sides[1] if server else sides[0]
+        found: dict[str, Any] = {**(verifying.getpeercert() or {})}
         name = dict(pair for part in found["subject"] for pair in part)["commonName"]
         authorities: list[dict[str, Any]] = verifier.get_ca_certs()
         last_s = min(ssl.cert_time_to_seconds(one["notAfter"]) for one in (found, *authorities))

@@ -276,11 +276,7 @@ class ZenohBus:
         self._session.declare_queryable(key_expression, Callback(queried, indirect=False))
 
     def get(
-        self,
-        key: str,
-        payload: bytes = b"",
-        timeout_s: float = 1.0,
-        priority: zenoh.Priority = zenoh.Priority.DATA,
+        self, key: str, payload: bytes = b"", timeout_s: float = 1.0, priority: zenoh.Priority = zenoh.Priority.DATA
     ) -> list[Sample]:
         """See `Bus.get`."""
         answers: list[Sample] = []

@@ -29,9 +29,9 @@ class _Tally:
         twice: number of those recorded that were duplicates.
         never: number it never sent, according to its Health: frames lost by a camera, without `before`.
         before: number it had never sent before the first recorded message; None until its first Health.
-        unconfirmed: number lost at the last call of `news`.
+        unconfirmed: number lost at the last call of `newly_lost`.
         flushed: `recorded` and `twice` at the last flush.
-        reported: number reported as lost by `news`.
+        reported: number reported as lost by `newly_lost`.
     """
 
     gaps: Gaps
@@ -139,7 +139,7 @@ class LossAccount:
         """Number of messages lost so far, by key, without keys that lost none."""
         return self._sum(lambda tally: tally.lost)
 
-    def news(self) -> dict[str, int]:
+    def newly_lost(self) -> dict[str, int]:
         """Number of messages lost since the last call, by key; late messages are not subtracted again."""
         found = self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():

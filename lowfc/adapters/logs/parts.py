@@ -115,7 +115,7 @@ class WholeLog(LogReader):
         self.complete = all(part.complete for part in self.parts)
 
 
-def one_by_one(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Parts]:
+def named_logs(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Parts]:
     """Logs named on a command line, each with all of its named files.
 
     `last` is the newest log in the default folder, with all files of its recording, and FOLDER/last that of another
@@ -143,22 +143,22 @@ def one_by_one(names: Sequence[Path], out: Path | None = None, *, as_json: bool 
     return found
 
 
-def the_one(names: Sequence[Path]) -> Parts:
-    """The single log named on a command line; see `one_by_one`.
+def named_log(names: Sequence[Path]) -> Parts:
+    """The single log named on a command line; see `named_logs`.
 
     Raises:
         ConfigurationError: several logs are named.
         DataFileError: the folder contains no log.
     """
-    found = one_by_one(names)
+    found = named_logs(names)
     if len(found) > 1:
         raise ConfigurationError(f"this command reads one log: name one, not {_listed(found)}; the newest is `{LAST}`")
     return found[0]
 
 
-def in_order(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Path]:
-    """Files of consecutive logs in the order named, files of a recording in their order; see `one_by_one`."""
-    files = [path for parts in one_by_one(names) for path in parts]
+def named_files(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Path]:
+    """Files of consecutive logs in the order named, files of a recording in their order; see `named_logs`."""
+    files = [path for parts in named_logs(names) for path in parts]
     _refuse_several([(path,) for path in files], out, as_json=as_json)
     return files
 

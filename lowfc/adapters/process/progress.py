@@ -6,15 +6,7 @@ from collections.abc import Callable, Iterator
 from math import inf
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    DownloadColumn,
-    Progress,
-    ProgressColumn,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, DownloadColumn, Progress, ProgressColumn, TaskID, TextColumn, TimeRemainingColumn
 
 Counted = Callable[[str, int, int], None]
 """Progress callback: description of the work, amount done, total amount."""

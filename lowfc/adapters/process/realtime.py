@@ -99,7 +99,7 @@ def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int
     }
 
 
-def step_back(priority: int | None, cpus: set[int] | None = None) -> Granted:
+def set_up_below_loop(priority: int | None, cpus: set[int] | None = None) -> Granted:
     """Set up a process that must keep up with the loop but never delay it, such as the recorder.
 
     Its SCHED_FIFO priority, if granted, is below the loop's and above everything else: in the normal class on a busy

@@ -151,7 +151,7 @@ class Service:
         self.arrivals.append(dispatch)
         return self.bus.subscribe(topic, dispatch.put, name or ALL)
 
-    def newcomers(self) -> bool:
+    def has_newcomers(self) -> bool:
         """Whether a process has joined or restarted since the last call."""
         there = {(name, health.pid) for name, health in list(self.last_health.items())}
         new = not there <= self._known

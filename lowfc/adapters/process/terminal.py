@@ -86,7 +86,7 @@ def run_app(app: Callable[[], object]) -> NoReturn:
     sys.exit(0)
 
 
-def given(context: typer.Context) -> list[str]:
+def options_set(context: typer.Context) -> list[str]:
     """Options (such as --out) and arguments (such as logs) that the command line sets."""
     return [
         parameter.opts[0]

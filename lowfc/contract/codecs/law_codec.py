@@ -56,7 +56,7 @@ def overruled(state: wire.ControllerState) -> list[str]:
     return [name for name, group in zip(NAMES, groups, strict=False) if group.overruled]
 
 
-def gains_of(state: wire.ControllerState) -> Integrator:
+def integrator_of(state: wire.ControllerState) -> Integrator:
     """The integrator of a controller's state."""
     gain, leak, limit_nm = (np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm))
     return Integrator(gain, leak, limit_nm)

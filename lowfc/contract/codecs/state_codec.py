@@ -10,7 +10,7 @@ import numpy as np
 from lowfc.contract.codecs.bench_codec import acting_of, interlock_of, wire_acting, wire_interlock
 from lowfc.contract.codecs.calibration_codec import camera_settings, wire_camera
 from lowfc.contract.codecs.codec import wire_mode, wire_reasons
-from lowfc.contract.codecs.law_codec import command_channels_of, gains_of, law_header, law_of, put_command_channels
+from lowfc.contract.codecs.law_codec import command_channels_of, integrator_of, law_header, law_of, put_command_channels
 from lowfc.contract.messages import fields_of, floats, from_timestamp, timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import map_reconstructor
@@ -121,7 +121,7 @@ def decode_state(
         if calibration is None or calibration.id != message.calibration_id:
             raise ValueError(f"calibration {message.calibration_id[:12]} of the controller's state is missing")
         loop = ActiveLoop.at_rest(settings, calibration)
-        law = gains_of(message)
+        law = integrator_of(message)
         history = np.array(message.command_history_nm, np.float32).reshape(len(loop.history_nm), -1)
         actuators = floats(message.actuators, *calibration.grid)
         modes, prior_nm2 = len(calibration.noll), np.array(message.prior_nm2, np.float32)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lowfc.adapters.process.terminal import INTERRUPTED, Json, given, new_app
+from lowfc.adapters.process.terminal import INTERRUPTED, Json, new_app, options_set
 from lowfc.contract.errors import ConfigurationError
 from lowfc.design.shaped_pupil import Request
 from lowfc.programs.cli.output import print_result
@@ -66,7 +66,7 @@ def sam(
         raise ConfigurationError("--jobs and --scheduler exclude each other: use one")
     if resume is not None:
         of_search = {flag(field.name) for field in fields(Search)}
-        for option in given(context):
+        for option in options_set(context):
             if option in of_search:
                 raise ConfigurationError(f"--resume continues the search of {resume}: omit {option}")
         search, found = read_state(resume, pupil_digest())

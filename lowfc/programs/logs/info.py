@@ -31,11 +31,11 @@ def info(
     """
     from rich.console import Console
 
-    from lowfc.adapters.logs.parts import one_by_one, titled
+    from lowfc.adapters.logs.parts import named_logs, titled
     from lowfc.adapters.process.progress import reading_bar
     from lowfc.programs.logs.survey import survey
 
-    for number, log in enumerate(one_by_one(logs, as_json=as_json)):
+    for number, log in enumerate(named_logs(logs, as_json=as_json)):
         with reading_bar(Console(stderr=True)) as count:
             contents = survey(log, partial(count, f"reading {titled(log)}"), digest=digest)
         print_result(contents, ("\n" if number else "") + render(contents), as_json=as_json)

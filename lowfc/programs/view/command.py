@@ -53,14 +53,14 @@ def view(
         return
     if logs and (seconds or run):
         raise ConfigurationError("--seconds and --run are for a running loop, not for logs")
-    from lowfc.adapters.logs.parts import in_order
+    from lowfc.adapters.logs.parts import named_files
     from lowfc.programs.view.session import show_logs, show_run
     from lowfc.programs.view.target import Target
 
     target = Target(native, web, save, headless_screenshot, tab, memory_mb, port or 0, web_port or 0)
     settings = None if config is None else configuration(config)
     if logs:
-        results = show_logs(in_order(logs), settings, target)
+        results = show_logs(named_files(logs), settings, target)
     else:
         results = show_run(the_known_run(run), settings, target, seconds)
     if as_json:

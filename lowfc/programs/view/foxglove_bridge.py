@@ -90,7 +90,7 @@ class FoxgloveBridge:
         """Serve until stopped, or until the run has `restarted`."""
         self.service.state = "running"
         while self.service.running and not restarted():
-            if self.service.newcomers():
+            if self.service.has_newcomers():
                 for topic, sample in states(self._bus, SHOWN, _PATIENCE_S):  # published before the connection
                     last = self.last_states.get(sample.key)
                     if last is None or last.sequence < sample.sequence:

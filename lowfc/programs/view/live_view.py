@@ -149,7 +149,7 @@ class LiveView:
     def _check(self, now_s: float) -> None:
         render, viewer = self._render, self.viewer
         assert render is not None  # noqa: S101  # `_begin` made it
-        if self.service.newcomers() or (not self._earlier_events_requested and self._recorder_absent(now_s)):
+        if self.service.has_newcomers() or (not self._earlier_events_requested and self._recorder_absent(now_s)):
             self._add_earlier(render)
         own_bytes, stuck_s = resident_bytes(), now_s - max(render.drawn_s, self._awake_s)
         viewer_bytes = viewer.resident_bytes() if viewer is not None else 0

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.adapters.process.terminal import AnyRun, Json, LogsIfAny, configuration, given, new_app
+from lowfc.adapters.process.terminal import AnyRun, Json, LogsIfAny, configuration, new_app, options_set
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli.modes import Modes, noll_of
 from lowfc.programs.cli.result import print_result
@@ -130,14 +130,14 @@ def _carry_out(
     from lowfc.adapters.files.drawing import figure_class, png
     from lowfc.adapters.files.whole_file import require_folder, write_whole
     from lowfc.adapters.logs.history import read_history
-    from lowfc.adapters.logs.parts import WholeLog, the_one
+    from lowfc.adapters.logs.parts import WholeLog, named_log
     from lowfc.adapters.process.progress import counting_bar
     from lowfc.client import Client
     from lowfc.programs.commissioning.acceptance.live import Live
     from lowfc.programs.commissioning.acceptance.probe import logged_responses
 
     if logs:
-        for option in given(context):
+        for option in options_set(context):
             if option not in ("logs", "--config", "--plot", "--json"):
                 raise ConfigurationError(f"{option} is for a test of a running loop, but a log is evaluated: omit it")
     required = {} if config is None else {"acceptance": configuration(config).acceptance}
@@ -145,7 +145,7 @@ def _carry_out(
     # an error now rather than after the test if matplotlib is missing
     figure = None if plot is None else figure_class()(figsize=(10, 5), layout="constrained")
     if logs:
-        log = WholeLog(the_one(logs), skip_damaged=True)
+        log = WholeLog(named_log(logs), skip_damaged=True)
         history = read_history(log)
         for remark in history.remarks:
             sys.stderr.write(f"warning: {remark}\n")

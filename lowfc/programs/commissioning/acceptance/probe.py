@@ -16,7 +16,7 @@ from lowfc.adapters.logs.history import History
 from lowfc.arrays import Array, Long, Single
 from lowfc.client.mirror_watch import INTERRUPTIONS
 from lowfc.contract.codecs import codec
-from lowfc.contract.codecs.law_codec import driving, gains_of
+from lowfc.contract.codecs.law_codec import driving, integrator_of
 from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.errors import DataFileError, LowfcError
 from lowfc.contract.messages import from_timestamp, wire
@@ -253,5 +253,5 @@ def loop_of(
     state: wire.ControllerState, calibration: Calibration, rate_hz: float, laws: Mapping[str, LinearLaw]
 ) -> Loop:
     """The loop that a controller state describes; `laws` contains its linear law, if it has one."""
-    law, in_use = driving(state, laws) or gains_of(state), calibration_in_use(state, calibration)
+    law, in_use = driving(state, laws) or integrator_of(state), calibration_in_use(state, calibration)
     return Loop(law, calibration.noll, state.delay_frames, rate_hz, in_use)

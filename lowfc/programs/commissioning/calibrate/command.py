@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from lowfc.adapters.process.terminal import AnyRun, ConfigFile, Json, given, new_app
+from lowfc.adapters.process.terminal import AnyRun, ConfigFile, Json, new_app, options_set
 from lowfc.contract.errors import ConfigurationError
 from lowfc.control.calibration.response_fit import MIN_CYCLES
 from lowfc.programs.cli.result import print_result
@@ -76,7 +76,7 @@ def calibrate(
 
     Example: lowfc calibrate --method poke --snr 300 --out night.fits
     """
-    options = given(context)
+    options = options_set(context)
     if context.invoked_subcommand is not None:
         if options:
             raise ConfigurationError(f"{options[0]} is before `{context.invoked_subcommand}`: put the options after it")
@@ -137,7 +137,7 @@ def dark(
     """
     from lowfc.programs.commissioning.calibrate.tasks import take_dark
 
-    if file is not None and "--frames" in given(context):
+    if file is not None and "--frames" in options_set(context):
         raise ConfigurationError("--frames has no effect with --file, whose frames are all used: omit it")
     if file is None and not star_blocked:
         typer.confirm("block the star; is it dark?", default=True, abort=True, err=True)

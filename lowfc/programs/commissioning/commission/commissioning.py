@@ -13,7 +13,7 @@ from lowfc.adapters.logs.columns import Steps, steps_as_columns
 from lowfc.adapters.process.progress import Counted
 from lowfc.arrays import Single
 from lowfc.client import Client
-from lowfc.contract.codecs.law_codec import driving, gains_of
+from lowfc.contract.codecs.law_codec import driving, integrator_of
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, LowfcError
 from lowfc.contract.messages import wire
@@ -259,7 +259,7 @@ class Commissioning:
         A linear law in force stays in force.
         """
         state, noll = self._state(), self._computed.noll
-        integrator, law = gains_of(state), driving(state, self._loop.laws())
+        integrator, law = integrator_of(state), driving(state, self._loop.laws())
         if law is not None:
             settling = SETTLING_FRAMES + FADING_FRAMES + margins.settling_frames(law, state.delay_frames)
             return driven_by(law, integrator.limit_nm), settling, []

@@ -36,7 +36,7 @@ def tune(
     from lowfc.adapters.files.drawing import figure_class
     from lowfc.adapters.files.law_file import save
     from lowfc.adapters.files.whole_file import require_folder, write_whole
-    from lowfc.adapters.logs.parts import WholeLog, the_one
+    from lowfc.adapters.logs.parts import WholeLog, named_log
     from lowfc.adapters.process.progress import passing_bar, reading_bar
     from lowfc.client import Client
     from lowfc.programs.commissioning.tune.data import telemetry_from_log, telemetry_from_run
@@ -51,7 +51,7 @@ def tune(
     if plot is not None:
         figure_class()  # an error now rather than after the work if matplotlib is missing
     if logs:
-        reader = WholeLog(the_one(logs), skip_damaged=True)
+        reader = WholeLog(named_log(logs), skip_damaged=True)
         with reading_bar(console) as count:
             reader.progress = partial(count, "reading")
             telemetry = telemetry_from_log(reader)

@@ -12,7 +12,7 @@ from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask, Single
 from lowfc.client import Client, MirrorWatch, configuration_of
-from lowfc.contract.codecs.law_codec import driving, gains_of
+from lowfc.contract.codecs.law_codec import driving, integrator_of
 from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, DataFileError
@@ -150,7 +150,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
         loop.run_id,
         rate_hz,
         _timing(seen.delay_frames, config.camera.exposure_fraction, steps, watch, rate_hz),
-        (gains_of(states[-1]), driving(states[-1], loop.laws())),
+        (integrator_of(states[-1]), driving(states[-1], loop.laws())),
         steps,
         usable,
         (None, None),

@@ -10,7 +10,7 @@ from lowfc.adapters.logs.series import LogLimits, shortage
 from lowfc.adapters.logs.writer import Attachment
 from lowfc.adapters.process.join import clock_of
 from lowfc.adapters.process.provenance import provenance
-from lowfc.adapters.process.realtime import step_back
+from lowfc.adapters.process.realtime import set_up_below_loop
 from lowfc.contract.codecs import input_file
 from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
@@ -44,7 +44,9 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
     # Every value, also the defaults that a user's file omits.
     attachments = [Attachment("config.toml", "application/toml", config.to_toml().encode())]
     attachments += [] if calibration is None else [_attachment(calibration, "application/fits")]
-    granted = step_back((realtime.priority and realtime.recorder_priority) or None, set(realtime.recorder_cpus) or None)
+    granted = set_up_below_loop(
+        (realtime.priority and realtime.recorder_priority) or None, set(realtime.recorder_cpus) or None
+    )
     clock = clock_of(config)
     origin = {**provenance(run.run_id, config.seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}
     bus = ZenohBus(run.links, Role.RECORDER, clock)

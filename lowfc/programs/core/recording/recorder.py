@@ -311,7 +311,7 @@ class Recorder:
         self.service.event("RECORDING_FAILED", why=fault)
 
     def _report_losses(self) -> None:
-        for topic, count in self._account.news().items():
+        for topic, count in self._account.newly_lost().items():
             self.service.event("MESSAGES_LOST", topic=topic, count=count)
 
     def _drain(self) -> None:

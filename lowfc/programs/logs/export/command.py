@@ -62,7 +62,7 @@ def export(
     """
     from rich.console import Console
 
-    from lowfc.adapters.logs.parts import one_by_one
+    from lowfc.adapters.logs.parts import named_logs
     from lowfc.adapters.logs.thinning import thin, thinned_path
     from lowfc.adapters.process.progress import reading_bar
 
@@ -72,7 +72,7 @@ def export(
             "one or the other"
         )
     console = Console(stderr=True)
-    for log in one_by_one(logs, out, as_json=as_json):
+    for log in named_logs(logs, out, as_json=as_json):
         if decimate is not None:
             chosen = selection(decimate, topics or ())
             with reading_bar(console) as count:

@@ -23,12 +23,12 @@ def publish(
 
     Example: lowfc publish last --speed 2
     """
-    from lowfc.adapters.logs.parts import in_order
+    from lowfc.adapters.logs.parts import named_files
     from lowfc.programs.logs.publish.player import publish as play
     from lowfc.programs.logs.publish.player import render
 
     results = play(
-        in_order(logs), run, speed=speed, topics=topics or (), allow_commands=allow_commands, wait_for=wait_for or ()
+        named_files(logs), run, speed=speed, topics=topics or (), allow_commands=allow_commands, wait_for=wait_for or ()
     )
     print_result(results, render(results), as_json=as_json)
     if results["interrupted"]:

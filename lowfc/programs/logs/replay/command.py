@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from lowfc.adapters.logs.parts import in_order
+from lowfc.adapters.logs.parts import named_files
 from lowfc.adapters.logs.recovery import missing_end_text
 from lowfc.adapters.process.progress import reading_bar
 from lowfc.adapters.process.provenance import provenance
@@ -51,7 +51,7 @@ def replay_log(
     """
     from lowfc.programs.logs.replay.workers import replay_files
 
-    files = in_order(logs)
+    files = named_files(logs)
     total = sum(path.stat().st_size for path in files if path.exists())
     begun_s = time.monotonic()
     with reading_bar(Console(stderr=True)) as count:

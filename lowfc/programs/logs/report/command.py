@@ -30,9 +30,9 @@ def report(
 
     Example: lowfc report last
     """
-    from lowfc.adapters.logs.parts import one_by_one
+    from lowfc.adapters.logs.parts import named_logs
 
-    found = one_by_one(logs, out, as_json=as_json)
+    found = named_logs(logs, out, as_json=as_json)
     if out is not None and out.suffix not in _ENDINGS:  # a report replaces an earlier one, and nothing else
         raise DataFileError(f"a report is an HTML page: use --out FILE.html, not {out}")
     for log in found:

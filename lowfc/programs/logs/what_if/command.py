@@ -30,7 +30,7 @@ def what_if(
     from rich.console import Console
 
     from lowfc.adapters.logs.history import read_history
-    from lowfc.adapters.logs.parts import WholeLog, the_one, titled
+    from lowfc.adapters.logs.parts import WholeLog, named_log, titled
     from lowfc.adapters.process.progress import reading_bar
     from lowfc.programs.logs.what_if.compare import render
     from lowfc.programs.logs.what_if.compare import what_if as compared
@@ -38,7 +38,7 @@ def what_if(
     from lowfc.programs.logs.what_if.run import LoggedRun
 
     what = requested(changes, config, calibration, controller)
-    reader = WholeLog(log := the_one(logs), skip_damaged=True)
+    reader = WholeLog(log := named_log(logs), skip_damaged=True)
     with reading_bar(Console(stderr=True)) as count:
         reader.progress = partial(count, f"reading {titled(log)}")
         results = compared(LoggedRun(read_history(reader)), what)

@@ -11,7 +11,7 @@ from lowfc.adapters.logs.columns import Steps, rows_of
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Mask, Sequences, Single, Whole
 from lowfc.contract.codecs.codec import decode_frame
-from lowfc.contract.codecs.law_codec import gains_of
+from lowfc.contract.codecs.law_codec import integrator_of
 from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
@@ -234,7 +234,7 @@ def _target_nm(states: Sequence[wire.ControllerState], sequence: Sequences, mode
 def _law_and_delay(history: History, calibration: Calibration) -> tuple[Integrator, float]:
     state = history.controller
     if state is not None and len(state.gain) == len(calibration.noll):
-        return gains_of(state), state.delay_frames
+        return integrator_of(state), state.delay_frames
     if history.configuration is None:
         raise DataFileError(f"{history.log.path}: its gains and delay are unknown: it has no controller state")
     known = settings(history.configuration)

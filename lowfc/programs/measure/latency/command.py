@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lowfc.adapters.files.whole_file import require_folder, write_whole
-from lowfc.adapters.process.terminal import ConfigFile, Json, LogsOrMeasure, configuration, given
+from lowfc.adapters.process.terminal import ConfigFile, Json, LogsOrMeasure, configuration, options_set
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli.output import print_result
 
@@ -111,7 +111,7 @@ def latency(
 
 def _refuse_others(context: typer.Context, what: str, *used: str) -> None:
     """Refuse the options that have no effect with `--compare` or with logs."""
-    for option in given(context):
+    for option in options_set(context):
         if option not in (what, *used):
             raise ConfigurationError(f"{option} has no effect with {what}: omit it")
 
@@ -165,12 +165,12 @@ def _measure(options: "LatencyOptions") -> dict[str, Any]:
 def _of_log(names: list[Path]) -> dict[str, Any]:
     from rich.console import Console
 
-    from lowfc.adapters.logs.parts import the_one, titled
+    from lowfc.adapters.logs.parts import named_log, titled
     from lowfc.adapters.process.progress import reading_bar
     from lowfc.programs.measure.latency.log import log_statistics
     from lowfc.programs.measure.latency.summary import together
 
-    log = the_one(names)
+    log = named_log(names)
     with reading_bar(Console(stderr=True)) as count:
         results, about = log_statistics(log, partial(count, f"reading {titled(log)}"))
     return together([results]) | about
