@@ -133,5 +133,5 @@ def config_zenoh(
     known = roles(links.mirrors) if links.network.router else local
     if role not in known:
         raise BusError(f"run {joined.run_id!r} has no role {role!r}; its roles are {', '.join(known)}")
-    HostClock()  # writes the file that the zenoh configuration refers to
+    HostClock()  # writes the offset of the clock to a file, which the program reads
     typer.echo(json.dumps(session_config(links, role), indent=2))

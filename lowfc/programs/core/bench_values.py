@@ -14,7 +14,7 @@ ANSWER_S = 0.2
 
 
 class BenchValues:
-    """One slot per name: even a flood of values costs the loop only one check of each slot per frame."""
+    """The newest value of each name in a slot: even a flood of values costs only one check of each slot per frame."""
 
     def __init__(
         self, service: Service, interlocks: Iterable[Interlock], report: Callable[[BenchReport], None]

@@ -136,7 +136,7 @@ class Recorder:
                 return
 
     def _begin(self, *, anew: bool = True) -> None:
-        """Begin a log, or unless `anew` its next part, with the calibration and states that its messages depend on."""
+        """Begin a log, or without `anew` its next file, with the calibration and states that its messages depend on."""
         if anew:
             self._messages_before, self._lost_before = self._series.messages, self._account.lost()
         self._series.begin(self._peers.newest.values(), new_recording=anew)

@@ -1,1 +1,1 @@
-"""`lowfc what-if`: a log under other gains, another reconstructor or another law."""
+"""`lowfc what-if`: a log with other gains, another reconstructor or another controller."""
