@@ -93,10 +93,10 @@ LawFile = Annotated[str, typer.Argument(help="Law file (FITS), or `integrator`."
 _Command = Callable[..., None]
 
 
-def _plain(name: str) -> _Command:
+def _plain_command(name: str) -> _Command:
     def ask(run: AnyRun = None, as_json: Json = False) -> None:
         try:
-            _ask(run, as_json, lambda loop: loop.ask(name))
+            _request_and_print(run, as_json, lambda loop: loop.ask(name))
         except (BusError, DataFileError) as fault:
             if name != "safe":
                 raise
@@ -105,9 +105,9 @@ def _plain(name: str) -> _Command:
     return ask
 
 
-def _of_modes(name: str) -> _Command:
+def _values_command(name: str) -> _Command:
     def ask(values: Values, modes: Modes = None, run: AnyRun = None, as_json: Json = False) -> None:
-        _ask(run, as_json, lambda loop: loop.ask(name, noll_of(modes), values))
+        _request_and_print(run, as_json, lambda loop: loop.ask(name, noll_of(modes), values))
 
     return ask
 
@@ -121,7 +121,7 @@ def _gain(values: Gains, modes: Modes = None, run: AnyRun = None, as_json: Json 
             return loop.automatic_gain(noll_of(modes))
         return loop.gain([float(word) for word in values], noll_of(modes))
 
-    _ask(run, as_json, ask)
+    _request_and_print(run, as_json, ask)
 
 
 def _close(run: AnyRun = None, as_json: Json = False) -> None:
@@ -130,13 +130,13 @@ def _close(run: AnyRun = None, as_json: Json = False) -> None:
         answer = loop.close_loop()
         return answer._replace(reply=f"{answer.reply}; {harm}") if harm else answer
 
-    _ask(run, as_json, ask)
+    _request_and_print(run, as_json, ask)
 
 
 def _status(run: AnyRun = None, as_json: Json = False) -> None:
     from lowfc.programs.cli.status import json_object, text
 
-    with _joined(run) as loop:
+    with _client(run) as loop:
         state, processes = loop.status().state, loop.processes()
         assert state is not None  # noqa: S101  # a status reply always has one
     known = json_object(state, processes, loop.run_id)
@@ -147,18 +147,18 @@ def _configuration(run: AnyRun = None, as_json: Json = False) -> None:
     import json
     import tomllib
 
-    with _joined(run) as loop:
+    with _client(run) as loop:
         text = loop.configuration()
     known = json.loads(json.dumps(tomllib.loads(text), default=str))  # dates of a driver's options as text
     print_result(known, f"# run {loop.run_id}\n{text.rstrip()}", as_json=as_json)
 
 
 def _step(frames: Frames, run: AnyRun = None, as_json: Json = False) -> None:
-    _ask(run, as_json, lambda loop: loop.step(frames))
+    _request_and_print(run, as_json, lambda loop: loop.step(frames))
 
 
 def _note(text: Text, run: AnyRun = None, as_json: Json = False) -> None:
-    _ask(run, as_json, lambda loop: loop.note(text))
+    _request_and_print(run, as_json, lambda loop: loop.note(text))
 
 
 def _offset(
@@ -166,7 +166,7 @@ def _offset(
 ) -> None:
     if zero == bool(values):
         raise ConfigurationError(f"offset requires values or {ZERO}")
-    _ask(run, as_json, lambda loop: loop.offset([0.0] if zero else values or (), noll_of(modes)))
+    _request_and_print(run, as_json, lambda loop: loop.offset([0.0] if zero else values or (), noll_of(modes)))
 
 
 def _channel(name: Channel, file: Shape = None, zero: Zero = False, run: AnyRun = None, as_json: Json = False) -> None:
@@ -175,11 +175,11 @@ def _channel(name: Channel, file: Shape = None, zero: Zero = False, run: AnyRun 
     if zero == (file is not None):
         raise ConfigurationError(f"channel requires a file or {ZERO}")
     shape = None if file is None else read_shape(file)
-    _ask(run, as_json, lambda loop: loop.channel(name, shape))
+    _request_and_print(run, as_json, lambda loop: loop.channel(name, shape))
 
 
 def _permit(text: Purpose, hold: Hold = None, run: AnyRun = None, as_json: Json = False) -> None:
-    _ask(run, as_json, lambda loop: loop.permit(text, hold))
+    _request_and_print(run, as_json, lambda loop: loop.permit(text, hold))
 
 
 def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json = False) -> None:
@@ -190,7 +190,7 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
     from lowfc.programs.cli.status import interlocks, json_object
 
     parsed = bench_value(value)
-    with _joined(run) as loop:
+    with _client(run) as loop:
         loop.status()  # wait for the connection: a controller that has replied also receives the value
         loop.bench(name, parsed)
         state = loop.status().state
@@ -207,19 +207,19 @@ def _load(file: CalibrationFile, run: AnyRun = None, as_json: Json = False) -> N
     from lowfc.adapters.files import calibration_file
 
     calibration = calibration_file.load(file)
-    _ask(run, as_json, lambda loop: loop.load(calibration))
+    _request_and_print(run, as_json, lambda loop: loop.load(calibration))
 
 
 def _law(file: LawFile, run: AnyRun = None, as_json: Json = False) -> None:
     from lowfc.adapters.files import law_file
 
     law = None if file == INTEGRATOR else law_file.load(Path(file))
-    _ask(run, as_json, lambda loop: loop.law(law))
+    _request_and_print(run, as_json, lambda loop: loop.law(law))
 
 
-def _recording(name: str) -> _Command:
+def _recording_command(name: str) -> _Command:
     def ask(run: AnyRun = None, as_json: Json = False) -> None:
-        with _joined(run) as loop:
+        with _client(run) as loop:
             answer = loop.record(name == "record/start")
         result = {"run": answer.run, "accepted": answer.accepted, "reply": answer.reply, "log": answer.text}
         print_result(result, f"{answer.reply} (run {answer.run})", as_json=as_json)
@@ -241,13 +241,16 @@ _OWN: dict[str, _Command] = {
     "law": _law,
 }
 """Commands of requests that need more than their declared fields, or print more than the reply."""
-_BY_FIELDS: dict[tuple[str, ...], Callable[[str], _Command]] = {(): _plain, ("modes", "values"): _of_modes}
+_BY_FIELDS: dict[tuple[str, ...], Callable[[str], _Command]] = {
+    (): _plain_command,
+    ("modes", "values"): _values_command,
+}
 
 for _name, _request in BY_NAME.items():
     if _request.example:
         _fields = tuple(field for field, _ in _request.fields)
         _records = _name.startswith("record/")
-        _command = _recording(_name) if _records else _OWN.get(_name) or _BY_FIELDS[_fields](_name)
+        _command = _recording_command(_name) if _records else _OWN.get(_name) or _BY_FIELDS[_fields](_name)
         (record_app if _records else ctl_app).command(
             _request.name,
             help=f"{_request.description}\n\nExample: lowfc ctl {_request.example}",
@@ -266,14 +269,14 @@ def _run_before_request(context: typer.Context, run: AnyRun = None) -> None:
     context.default_map = {name: {**defaults, "start": defaults, "stop": defaults} for name in group.commands}
 
 
-def _joined(run: str | None) -> "Client":
+def _client(run: str | None) -> "Client":
     from lowfc.client import Client
 
     return Client(run)
 
 
-def _ask(run: str | None, as_json: bool, ask: "Callable[[Client], Answer]") -> None:
-    with _joined(run) as loop:
+def _request_and_print(run: str | None, as_json: bool, ask: "Callable[[Client], Answer]") -> None:
+    with _client(run) as loop:
         answer = ask(loop)
         result = {name: getattr(answer, name) for name in ("run", "accepted", "reply", "frame", "frame_sequence")}
         print_result(result, answer.sentence, as_json=as_json)  # before the end of the connection, which may take long

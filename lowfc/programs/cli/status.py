@@ -130,16 +130,16 @@ def text(known: dict[str, Any]) -> str:
     opens = f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else ""
     playing = known["playing"]
     rows = {
-        "loop": _mode(known, since) + opens,
-        **{name: _of_mirror(one) for name, one in known["mirrors"].items()},
+        "loop": _mode_in_words(known, since) + opens,
+        **{name: _mirror_in_words(one) for name, one in known["mirrors"].items()},
         "frame": f"number {known['frame']}; {known['frames_used']} used since the controller started"
-        + (f"; the last was refused as {_spoken(known['refused'])}" if known["refused"] else ""),
+        + (f"; the last was refused as {_in_words(known['refused'])}" if known["refused"] else ""),
         "command": f"{known['command_rms_nm']:.3f} nm rms" + (", returning to zero" if known["homing"] else ""),
         "offset": f"{known['offset_rms_nm']:.3f} nm rms",
-        **_contrast(known),
+        **_contrast_row(known),
         "law": law_in_words(known),
         "gain": _values(known["gain"])
-        + _automatic(known["gain_automatic"])
+        + _automatic_in_words(known["gain_automatic"])
         + ("" if known["law"]["name"] == "integrator" else ", for the integrator only"),
         "leak": _values(known["leak"]),
         "limit": _values(known["limit_nm"], " nm"),
@@ -150,8 +150,8 @@ def text(known: dict[str, Any]) -> str:
         "reserved": f"for {known['reserved_for']}" if known["reserved_for"] else "no",
         "interlocks": interlocks(known),
         "mirror limits": f"stroke {known['stroke_nm']:g} nm, slew {known['slew_nm']:g} nm a frame, "
-        f"neighbours {known['neighbour_nm']:g} nm; {_acting(known['limits_hit'])}",
-        "counted": ", ".join(_counted(name, count) for name, count in known["counts"].items()) or "nothing refused",
+        f"neighbours {known['neighbour_nm']:g} nm; {_limits_in_words(known['limits_hit'])}",
+        "counted": ", ".join(_count_text(name, count) for name, count in known["counts"].items()) or "nothing refused",
         "delay": counted(float(known["delay_frames"]), "frame"),
         "calibration": (known["calibration_id"][:12] or "none")
         + (", provisional: from the first steps of commissioning" if known["calibration_provisional"] else ""),
@@ -159,7 +159,7 @@ def text(known: dict[str, Any]) -> str:
     return "\n".join([_in_short(known), *(f"{name:14} {value}" for name, value in rows.items())])
 
 
-def _contrast(known: dict[str, Any]) -> dict[str, str]:
+def _contrast_row(known: dict[str, Any]) -> dict[str, str]:
     if known["added_contrast"] is None:
         return {}
     of = ", estimated from the sensor" if known["added_contrast_estimated"] else ""
@@ -215,7 +215,7 @@ def _in_short(known: dict[str, Any]) -> str:
     warning = known["last_warning"]
     return " · ".join(
         (
-            _mode(known),
+            _mode_in_words(known),
             *measured,
             f"{counted(known['frames_skipped'] + known['frames_missing'], 'frame')} lost",
             recording.get(known["recording"], f"recording {known['recording']}"),
@@ -241,7 +241,7 @@ def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Heal
     return {"process": process, "age_s": round(age_s, 3), "text": text}
 
 
-def _mode(known: dict[str, Any], since: str = "") -> str:
+def _mode_in_words(known: dict[str, Any], since: str = "") -> str:
     word = ("paused" if known["paused"] else mode_word(known["mode"])) + since
     return f"{word}, command held: {known['holding']}" if known["holding"] else word
 
@@ -251,33 +251,33 @@ def _reason(number: int) -> str:
     return next((reason.name for reason in REASONS if reason == number), str(number))
 
 
-def _of_mirror(mirror: dict[str, Any]) -> str:
+def _mirror_in_words(mirror: dict[str, Any]) -> str:
     if mirror["refused"]:
         return f"refuses commands: {mirror['refused']}"
     state = "last command expired" if mirror["expired"] else "follows commands"
-    return f"{state}; {_acting(mirror['limits_hit'])}" if mirror["limits_hit"] else state
+    return f"{state}; {_limits_in_words(mirror['limits_hit'])}" if mirror["limits_hit"] else state
 
 
-def _automatic(modes: list[bool]) -> str:
+def _automatic_in_words(modes: list[bool]) -> str:
     if not any(modes):
         return ""
     return " (automatic)" if all(modes) else f" (automatic: {sum(modes)} of {len(modes)})"
 
 
-def _acting(limits: list[str]) -> str:
-    return f"limits acting: {', '.join(map(_spoken, limits))}" if limits else "no limit acting"
+def _limits_in_words(limits: list[str]) -> str:
+    return f"limits acting: {', '.join(map(_in_words, limits))}" if limits else "no limit acting"
 
 
-def _counted(reason: str, count: int) -> str:
+def _count_text(reason: str, count: int) -> str:
     """Text of how often a frame was refused for a reason or a limit acted."""
     if reason == Rejection.NO_FRAME.name:
         return f"no frame {counted(count, 'time')}"
     if reason in Rejection.__members__:
-        return f"{counted(count, 'frame')} refused as {_spoken(reason)}"
-    return f"{_spoken(reason)} acted on {counted(count, 'command')}"
+        return f"{counted(count, 'frame')} refused as {_in_words(reason)}"
+    return f"{_in_words(reason)} acted on {counted(count, 'command')}"
 
 
-def _spoken(reason: str) -> str:
+def _in_words(reason: str) -> str:
     return reason.lower().replace("_", " ")
 
 

@@ -44,11 +44,11 @@ class StageTiming:
         received_ns, start_ns, ready_ns, sent_ns = times_ns
         message = self._message
         message.frame_sequence.append(frame_sequence)
-        message.transport_ns.append(_column(received_ns - published_ns))
-        message.wakeup_ns.append(_column(start_ns - received_ns))
-        message.compute_ns.append(_column(ready_ns - start_ns))
-        message.publish_ns.append(_column(sent_ns - ready_ns))
-        message.frame_to_command_ns.append(_column(sent_ns - published_ns))
+        message.transport_ns.append(_clipped(received_ns - published_ns))
+        message.wakeup_ns.append(_clipped(start_ns - received_ns))
+        message.compute_ns.append(_clipped(ready_ns - start_ns))
+        message.publish_ns.append(_clipped(sent_ns - ready_ns))
+        message.frame_to_command_ns.append(_clipped(sent_ns - published_ns))
         if sent_ns >= self._due_ns:
             self.publish(sent_ns)
 
@@ -174,7 +174,7 @@ class NotClosed:
         """Note the loop mode; return the time not closed, ns, and the causes, most frequent first."""
         with self._lock:  # called from the main and the receiving thread
             if not state.frame_sequence:
-                return self._total_ns, self._listed()
+                return self._total_ns, self._causes_in_words()
             before_ns, self._since_ns = self._since_ns, None
             if before_ns is not None:
                 self._total_ns += max(0, now_ns - before_ns)
@@ -185,9 +185,9 @@ class NotClosed:
                     if cause in self._causes or len(self._causes) < MAX_CAUSES:
                         self._causes[cause] += 1
                 self._cause = cause
-            return self._total_ns, self._listed()
+            return self._total_ns, self._causes_in_words()
 
-    def _listed(self) -> str:
+    def _causes_in_words(self) -> str:
         if len(self._causes) < 2:
             return "".join(self._causes)
         named = dict(self._causes.most_common(CAUSES_NAMED))
@@ -196,6 +196,6 @@ class NotClosed:
         return "; ".join(f"{cause} ({counted(times, 'time')})" for cause, times in named.items())
 
 
-def _column(duration_ns: int) -> int:
+def _clipped(duration_ns: int) -> int:
     """Clip a duration to the 32 bits of its column: a camera's clock may be wrong, or a process was stopped."""
     return min(max(0, duration_ns), 0xFFFF_FFFF)

@@ -87,7 +87,7 @@ class GainWatch:
         loop = state.loop
         if loop is None or not loop.calibration.noll:
             return NOTHING
-        self._begin(loop)
+        self._restart_if_changed(loop)
         if loop.weighting is not self._weighting:
             self._weighting = loop.weighting
             response = single(loop.estimator.rows[:-1] @ loop.calibration.response)
@@ -158,7 +158,7 @@ class GainWatch:
         per_nm2 = np.diag(self._contrast)
         return float(per_nm2 @ open_nm2), per_nm2 * now_nm2
 
-    def _begin(self, loop: ActiveLoop) -> None:
+    def _restart_if_changed(self, loop: ActiveLoop) -> None:
         identity = loop.calibration.id, loop.integrator.leak.tobytes(), loop.integrator.limit_nm.tobytes()
         if identity == self._identity:
             return
@@ -196,7 +196,9 @@ class GainWatch:
         if not loop.automatic.any():
             return Actions(events=events)
         lowered = loop.integrator.gain * np.float32(min(ratio, 0.5))
-        return Actions((self._gains(step, loop, np.where(loop.automatic, lowered, loop.integrator.gain)),), events)
+        return Actions(
+            (self._gain_request(step, loop, np.where(loop.automatic, lowered, loop.integrator.gain)),), events
+        )
 
     def _judge(self, judged: list[_Group], step: Step, state: State, loop: ActiveLoop) -> Actions:
         noise_nm2 = self._noise_nm2(loop) if any(group.bank.complete for group in judged) else None
@@ -215,10 +217,10 @@ class GainWatch:
             if not group.unrestricted:
                 group.unrestricted = True
                 group.bank.begin_first_window()
-            events += self._harm(group, verdict, loop)
+            events += self._harm_events(group, verdict, loop)
         requests = []
         if loop.automatic.any() and (initial or not np.array_equal(gain, loop.integrator.gain)):
-            requests.append(self._gains(step, loop, gain))
+            requests.append(self._gain_request(step, loop, gain))
         self.closing_harm = "" if state.mode is LoopMode.CLOSED else self._closing_harm(gain, loop)
         close_pending = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
         if close_pending and all(group.verdict is not None for group in self._groups):
@@ -259,7 +261,7 @@ class GainWatch:
         )
         return None if covariance is None else np.diag(covariance)
 
-    def _gains(self, step: Step, loop: ActiveLoop, gain: Single) -> Request:
+    def _gain_request(self, step: Step, loop: ActiveLoop, gain: Single) -> Request:
         """The request for gains (modes,), with the prior of the uncorrected modes for R."""
         noise_nm2, uncorrected = self._noise_nm2(loop), loop.automatic & (gain == 0)
         prior_nm2: tuple[float, ...] = ()
@@ -275,7 +277,7 @@ class GainWatch:
             step.time_ns, "gain", (), values, AUTO, requester=REQUESTER, prior_nm2=prior_nm2, flux_dn=flux_dn
         )
 
-    def _harm(self, group: _Group, verdict: Verdict, loop: ActiveLoop) -> list[PendingEvent]:
+    def _harm_events(self, group: _Group, verdict: Verdict, loop: ActiveLoop) -> list[PendingEvent]:
         """The event if an open loop would have had a smaller residual for `HARMFUL_WINDOWS` consecutive windows."""
         if verdict.loop_nm2 is None:
             group.harmful_windows = 0

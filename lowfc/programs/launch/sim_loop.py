@@ -73,7 +73,7 @@ def sim_loop(
             child.start()
         _supervise(config, children, watch, console, duration_s)
     except ProcessDiedError as fault:
-        log = watch.of(Role.RECORDER).recording.file
+        log = watch.health_of(Role.RECORDER).recording.file
         raise ProcessDiedError(f"{fault}\nrecorded until then: {log}" if log else str(fault)) from fault
     finally:
         ends.close()
@@ -142,7 +142,7 @@ def _supervise(
     with deferred_signals() as interrupted, _display(console) as show:
         begun_s = time.monotonic()
         shown_s = 0.0
-        while camera.status is None and watch.of(Role.CAMERA).state != "stopped" and not interrupted():
+        while camera.status is None and watch.health_of(Role.CAMERA).state != "stopped" and not interrupted():
             check(children[1:])
             if view is not None and view.status is not None:
                 _report_view_ended(view, console)
@@ -162,7 +162,7 @@ def _supervise(
     for child in children:
         if child.name == Role.VIEWER:
             continue
-        if child.name == Role.RECORDER and watch.of(Role.RECORDER).recording.failure:
+        if child.name == Role.RECORDER and watch.health_of(Role.RECORDER).recording.failure:
             continue  # the loop ended normally without it; the summary gives the reason
         if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # stopped before it was ready: no failure
             raise died(child)

@@ -26,16 +26,16 @@ _STYLES: dict[int, str] = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FA
 
 def screen(watch: Watch, config: Configuration, duration_s: float | None, elapsed_s: float) -> Panel:
     """The live status of a loop."""
-    camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
-    mirror, recorder = watch.of(mirror_role(config.mirror.name)), watch.of(Role.RECORDER)
+    camera, controller = watch.health_of(Role.CAMERA), watch.health_of(Role.CONTROLLER)
+    mirror, recorder = watch.health_of(mirror_role(config.mirror.name)), watch.health_of(Role.RECORDER)
     frames = topic_count(controller, FRAME.key)
     commands = topic_count(mirror, COMMAND.at(config.mirror.name))
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", justify="right")
     table.add_column()
-    silent = _silent(watch)
+    silent = _silence_notice(watch)
     table.add_row("loop", f"{mode(controller)}, {silent or f'{camera.rate_hz:.0f} Hz of {config.camera.rate_hz:g} Hz'}")
-    table.add_row("wavefront", silent or _wavefront(camera))
+    table.add_row("wavefront", silent or _wavefront_in_words(camera))
     table.add_row("frame to command", latency(controller.frame_to_command))
     table.add_row("frame to mirror", latency(camera.frame_to_mirror))
     table.add_row("frames", f"{frames.received} received, {frames.skipped} skipped, {frames.missing} missing")
@@ -51,17 +51,17 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
 
 def status_line(watch: Watch, elapsed_s: float) -> str:
     """The status in one line, for output that is not a terminal."""
-    camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
+    camera, controller = watch.health_of(Role.CAMERA), watch.health_of(Role.CONTROLLER)
     if not camera.HasField("recent_wavefront"):
         return f"{elapsed_s:5.0f} s  no frame yet"
-    if silent := _silent(watch):
+    if silent := _silence_notice(watch):
         return f"{elapsed_s:5.0f} s  {mode(controller)}  {silent}"
     frames, recent = topic_count(controller, FRAME.key), wavefront(camera.recent_wavefront)
     return (
         f"{elapsed_s:5.0f} s  {mode(controller)}{_closed_for(controller, camera.rate_hz)}  {camera.rate_hz:6.0f} Hz  "
-        f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms  {_added(recent)}"
+        f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms  {_contrast(recent)}"
         f"frame to command {latency(controller.frame_to_command)}  "
-        f"skipped {frames.skipped} missing {frames.missing}  {recording(watch.of(Role.RECORDER))}"
+        f"skipped {frames.skipped} missing {frames.missing}  {recording(watch.health_of(Role.RECORDER))}"
     )
 
 
@@ -73,19 +73,19 @@ def _closed_for(controller: wire.Health, rate_hz: float) -> str:
     return f" for {closed_s:.1f} s" if just_closed else ""
 
 
-def _silent(watch: Watch) -> str:
+def _silence_notice(watch: Watch) -> str:
     """A notice if the camera stopped sending Health, so that its statistics are out of date; otherwise empty."""
     silent_s = watch.silent_s(Role.CAMERA)
-    reported = bool(watch.of(Role.CAMERA).process)
+    reported = bool(watch.health_of(Role.CAMERA).process)
     return f"the camera has been silent for {silent_s:.0f} s" if reported and silent_s > SILENT_S else ""
 
 
-def _added(recent: dict[str, Any]) -> str:
+def _contrast(recent: dict[str, Any]) -> str:
     added = recent["added_contrast"]
     return "" if added is None else f"contrast {added['closed']:+.1e} of {added['open']:+.1e}  "
 
 
-def _wavefront(camera: wire.Health) -> str:
+def _wavefront_in_words(camera: wire.Health) -> str:
     if not camera.HasField("recent_wavefront"):
         return "no frame yet"
     recent = wavefront(camera.recent_wavefront)
@@ -117,7 +117,7 @@ def recording(recorder: wire.Health) -> str:
     return f"{counted(done.messages, 'message')}, {done.bytes / 1e6:.1f} MB, {done.lost} lost"
 
 
-def _loop(results: dict[str, Any]) -> str:
+def _loop_in_words(results: dict[str, Any]) -> str:
     seconds, cause = f"{results['not_closed_s']:.1f} s", results["not_closed_cause"]
     match results["mode"]:
         case None:
@@ -135,7 +135,7 @@ def _sampling(results: dict[str, Any], name: str, instants: str = "") -> str:
     return f"continuous ({instants}{results[f'sampled_{name}']:.2f} at exposure start)"
 
 
-def _contrast(results: dict[str, Any]) -> list[str]:
+def _contrast_lines(results: dict[str, Any]) -> list[str]:
     """The line with the contrast added to the dark zone; empty if unknown."""
     added = results["added_contrast"]
     if added is None:
@@ -155,7 +155,7 @@ def _wavefront_lines(results: dict[str, Any]) -> list[str]:
         + _sampling(results, "residual_rms_nm", f"{results['instants_per_frame']} instants per frame; "),
         f"tilt per axis      residual {results['tilt_residual_mas']:.2f} of "
         f"{results['tilt_disturbance_mas']:.2f} mas rms, second half, " + _sampling(results, "tilt_residual_mas"),
-        *_contrast(results),
+        *_contrast_lines(results),
     ]
 
 
@@ -169,7 +169,7 @@ def summary_text(results: dict[str, Any]) -> str:
         return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in values.items())
 
     lines = [
-        f"loop               {_loop(results)}",
+        f"loop               {_loop_in_words(results)}",
         f"rate               {results['rate_hz']:.1f} Hz",
         f"frames             {results['frames_published']} published, {results['frames_processed']} processed, "
         f"{results['frames_skipped']} skipped, {results['frames_missing']} missing",

@@ -18,14 +18,14 @@ class Watch:
     events: list[Log]
     _names: Names = field(default_factory=Names)
 
-    def of(self, name: str) -> wire.Health:
+    def health_of(self, name: str) -> wire.Health:
         """Last Health of a process; empty before the first."""
         return self.health.get(name, wire.Health())
 
     def silent_s(self, name: str) -> float:
         """Time from a process's last Health to the newest Health of all processes."""
         newest_ns = max((health.timestamp.ToNanoseconds() for health in self.health.values()), default=0)
-        return (newest_ns - self.of(name).timestamp.ToNanoseconds()) * 1e-9
+        return (newest_ns - self.health_of(name).timestamp.ToNanoseconds()) * 1e-9
 
     def add_health(self, sample: Sample) -> None:
         """Store a Health."""
@@ -40,7 +40,7 @@ class Watch:
 
 def summary(watch: Watch, record: bool, lockstep_hz: float | None = None) -> dict[str, Any]:
     """Summary of a run, from the last Health of each process; `lockstep_hz` is the frame rate in simulated time."""
-    camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
+    camera, controller = watch.health_of(Role.CAMERA), watch.health_of(Role.CONTROLLER)
     frames, not_closed_s = topic_count(controller, FRAME.key), controller.not_closed_ns * 1e-9
     periods = frames.received - 1  # from the first frame to the last
     rate_hz = camera.mean_rate_hz if lockstep_hz is None else lockstep_hz
@@ -71,7 +71,7 @@ def summary(watch: Watch, record: bool, lockstep_hz: float | None = None) -> dic
         "logs": [],
     }
     if record:
-        recorder = watch.of(Role.RECORDER)
+        recorder = watch.health_of(Role.RECORDER)
         recording, frames_in_log = recorder.recording, topic_count(recorder, FRAME.key)
         lost = {topic.topic: topic.missing for topic in recorder.topics if topic.missing}
         # Without the camera's last Health, the recorder cannot count frames lost after the last recorded one.
@@ -123,9 +123,4 @@ def topic_count(health: wire.Health, key: str) -> wire.TopicCount:
 
 
 def _microseconds(latency: wire.Latency) -> dict[str, float]:
-    return {
-        "p50": latency.p50_ns / 1e3,
-        "p99": latency.p99_ns / 1e3,
-        "p99_9": latency.p99_9_ns / 1e3,
-        "max": latency.max_ns / 1e3,
-    }
+    return {name: getattr(latency, f"{name}_ns") / 1e3 for name in ("p50", "p99", "p99_9", "max")}

@@ -51,7 +51,7 @@ app = new_app("A bare zenoh echo.")
 def ask(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 10.0) -> None:
     """Send frames in place of the camera, and time each round trip."""
     settings = configuration(config)
-    joined = _joined(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
+    joined = _join(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
     payloads = Payloads(np.load(joined.path / FRAMES_FILE))
     round_trip_ns = _ask(settings, joined, payloads, seconds)
     with being_written(joined.path / ECHO_FILE) as part, part.open("wb") as file:
@@ -66,7 +66,7 @@ def answer(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds
 
     settings = configuration(config)
     calibration = calibration_file.load(open_run(run, (settings.mirror.name,)).path / "calibration.fits")
-    joined = _joined(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
+    joined = _join(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
     payloads = Payloads(np.load(joined.path / FRAMES_FILE))
     clock = HostClock()
     step = ControlStep(settings, calibration, clock.host_ns())
@@ -138,7 +138,7 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
     session.close()  # type: ignore[no-untyped-call]
 
 
-def _joined(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Run:
+def _join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Run:
     """Set this process up as that of the role in the loop; the run with the links of the two processes only."""
     prepare(config, cpus)
     run = open_run(run_id, (config.mirror.name,))

@@ -56,7 +56,7 @@ class Peers:
 
     def query(self) -> list[Sample]:
         """Query calibration and states published before this process started, or lost; return the new ones."""
-        return self._new(self._get())
+        return self._store_new(self._query_all())
 
     def query_soon(self) -> None:
         """Query at the next opportunity: a message may have been lost."""
@@ -68,17 +68,17 @@ class Peers:
         A thread does the query, because a frozen process answers late.
         """
         if more and self._new_processes and self._answers is None:
-            self._answers = self._thread.submit(self._get)
+            self._answers = self._thread.submit(self._query_all)
             self._new_processes = False
         if self._answers is None or not self._answers.done():
             return []
         answers, self._answers = self._answers, None
-        return self._new(answers.result())
+        return self._store_new(answers.result())
 
-    def _get(self) -> list[Sample]:
+    def _query_all(self) -> list[Sample]:
         return [sample for _, sample in states(self._bus, TOPICS)]
 
-    def _new(self, answers: list[Sample]) -> list[Sample]:
+    def _store_new(self, answers: list[Sample]) -> list[Sample]:
         new = [sample for sample in answers if self.store(sample)]
         self._queried.update((sample.key, sample.sequence) for sample in new)
         return new

@@ -87,7 +87,7 @@ class Recorder:
         # Before the service subscribes to Health: a peer that knows of this subscription knows of all others.
         for topic in TOPICS:
             bus.subscribe(topic, partial(self._backlog.put, topic))
-        self.service = Service(Role.RECORDER, run_id, clock, bus, granted=granted, fill=self._fill)
+        self.service = Service(Role.RECORDER, run_id, clock, bus, granted=granted, fill=self._fill_health)
         self._queries: deque[Query] = deque()
         bus.queryable(RECORD_KEY.format(name=ALL), self._queries.append)
 
@@ -98,7 +98,7 @@ class Recorder:
         """
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves it
-                signal.signal(number, self._signalled)
+                signal.signal(number, self._stop_by_signal)
 
     def run(self) -> Summary:
         """Record until stopped; DataFileError if the first log cannot be opened."""
@@ -118,7 +118,7 @@ class Recorder:
         self.service.finish()
         return summary
 
-    def _signalled(self, number: int, frame: FrameType | None) -> None:
+    def _stop_by_signal(self, number: int, frame: FrameType | None) -> None:
         self._skip_drain = not self.service.running
         self.service.stop(signal.Signals(number).name)
 
@@ -277,7 +277,7 @@ class Recorder:
         """Flush; begin the next log if this one is full, and end the recording if the disk is nearly full."""
         try:
             self._series.flush()
-            self._flushed()
+            self._note_flush()
             if self._failure or self._paused:
                 return
             if short := self._series.shortage():
@@ -296,7 +296,7 @@ class Recorder:
         growth = self._series.bytes_per_s or self._expected_bytes_per_s
         return growth_in_words(growth, self._folder, self._min_free_bytes) if growth else ""
 
-    def _flushed(self) -> None:
+    def _note_flush(self) -> None:
         self._account.mark_flushed()
         if self._oldest_ns:
             age_ns = self._clock.host_ns() - self._oldest_ns
@@ -358,7 +358,7 @@ class Recorder:
             **{f"lost {key}": str(count) for key, count in lost.items()},
         }
 
-    def _fill(self, health: wire.Health) -> None:
+    def _fill_health(self, health: wire.Health) -> None:
         lost = self._account.lost()
         health.recording.files.extend(map(str, self._series.files[-MAX_HEALTH_LOGS:]))
         health.recording.file = health.recording.files[-1] if health.recording.files else ""

@@ -166,7 +166,7 @@ class _System:
             time=clock,
             closed=bool(np.mean(steps.mode == LoopMode.CLOSED) > 0.5),
             framerate=self._history.rate_hz,
-            modes=aotpy.Image("MODES", _modes(calibration.noll)),
+            modes=aotpy.Image("MODES", _mode_images(calibration.noll)),
             modal_coefficients=aotpy.Image("MODAL ERROR", steps.error_nm, "nm", time=clock),
             measurements_to_modes=aotpy.Image("R", in_use.reconstructor[:, None, good], "nm"),
             modes_to_measurements=aotpy.Image("H", calibration.response[good][:, None, :], "nm-1"),
@@ -233,7 +233,7 @@ def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibrati
             rows[row] = surface_nm.ravel() * np.float32(_NM)
 
 
-def _modes(noll: tuple[int, ...]) -> Single:
+def _mode_images(noll: tuple[int, ...]) -> Single:
     """Zernike polynomials (modes, rows, columns) over the circle, 0 outside."""
     axis = (np.arange(_MODES_PIXELS) + 0.5) / (_MODES_PIXELS / 2) - 1
     x, y = np.meshgrid(axis, axis)

@@ -69,7 +69,7 @@ def publish(
     if not 0 < speed < float("inf"):
         raise ConfigurationError(f"--speed must be above 0 (1: as recorded); got {speed:g}")
     console = Console(stderr=True)
-    run = open_run(run_id, _mirrors(logs[0]))
+    run = open_run(run_id, _mirror_names(logs[0]))
     for role in wait_for:
         if role not in run.links.ports:
             raise ConfigurationError(
@@ -78,7 +78,7 @@ def publish(
             )
     selection = Selection(run.links, topics, run.links.live() | set(wait_for), allow_commands=allow_commands)
     granted = set_up(None, None, lock_memory=False, disable_cpu_idle=False)
-    with _joined(run, selection, granted) as (service, buses):
+    with _join(run, selection, granted) as (service, buses):
         console.print(f"publishing in run {run_id!r} as {', '.join(buses)}", highlight=False)
         player = Player(service, buses, selection, speed)
         if _wait_for_receivers(service, selection.live, wait_for, console):
@@ -217,7 +217,7 @@ def render(results: dict[str, Any]) -> str:
 
 
 @contextlib.contextmanager
-def _joined(run: Run, selection: Selection, granted: Granted) -> Iterator[tuple[Service, dict[str, ZenohBus]]]:
+def _join(run: Run, selection: Selection, granted: Granted) -> Iterator[tuple[Service, dict[str, ZenohBus]]]:
     """Join the run in the roles of the selected topics, or as `replay` if events are the only topic."""
     with contextlib.ExitStack() as held:
         clock = HostClock()
@@ -246,7 +246,7 @@ def _wait_for_receivers(service: Service, live: Collection[str], wait_for: Colle
     return service.running
 
 
-def _mirrors(log: Path) -> tuple[str, ...]:
+def _mirror_names(log: Path) -> tuple[str, ...]:
     """Names of the mirrors in a log, for a new run; in an unfinished log only the first mirror is found."""
     topics = MIRROR_STATE, COMMAND
     reader = LogReader(log, topics=topics, skip_damaged=True)

@@ -50,7 +50,7 @@ def budget_results(run: Run, stretch: Stretch | None, spectra: Spectra | None, m
         "sum_lacks": missing,
         "true_residual": _columns(true, masks),
         "measured_error": _columns(measured, masks),
-        "sum_over_true": _over(total, true, masks),
+        "sum_over_true": _ratios(total, true, masks),
         "frame_noise": None
         if noise is None
         else {
@@ -123,7 +123,7 @@ def _columns(term: Term | None, masks: Masks) -> Results:
     }
 
 
-def _over(total: Term | None, true: Term | None, masks: Masks) -> dict[str, float | None]:
+def _ratios(total: Term | None, true: Term | None, masks: Masks) -> dict[str, float | None]:
     if total is None or true is None:
         return dict.fromkeys(masks)
     ratios = {}

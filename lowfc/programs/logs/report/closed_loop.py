@@ -191,9 +191,9 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
             columns["residual_predicted"] = rejected + added.sum(axis=1)
     centres_hz, means = in_bins(frequency_hz, list(columns.values()))
     binned = dict(zip(columns, means, strict=True))
-    over = {"measured_over_theory": _ratio(binned["error"], binned["error_predicted"])}
+    over = {"measured_over_theory": _amplitude_ratio(binned["error"], binned["error_predicted"])}
     if "residual_predicted" in binned:
-        over["true_over_theory"] = _ratio(binned["residual"], binned["residual_predicted"])
+        over["true_over_theory"] = _amplitude_ratio(binned["residual"], binned["residual_predicted"])
     highest_hz = float(frequency_hz[-1])
     edges_hz = [0.0, *(edge for edge in BANDS_HZ if frequency_hz[1] < edge < highest_hz), highest_hz]
     bands = [
@@ -210,7 +210,7 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
     }
 
 
-def _ratio(measured: Array, theory: Array) -> Results:
+def _amplitude_ratio(measured: Array, theory: Array) -> Results:
     """Ratio of measured to theoretical amplitude over all bins: median and the range of 90 % of them."""
     known = (theory > 0) & (measured > 0)
     if not known.any():

@@ -58,7 +58,7 @@ def requests(run: Run) -> list[Results]:
     found = [request for request in run.history.requests if request.name not in ("status", "renew")]
     return [
         {
-            "time_s": _when(run, request),
+            "time_s": _request_time_s(run, request),
             "name": request.name,
             "modes": list(request.modes),
             "values": list(request.values),
@@ -132,7 +132,7 @@ def _limits(reasons: Long) -> dict[str, int]:
     }
 
 
-def _when(run: Run, request: wire.Request) -> float:
+def _request_time_s(run: Run, request: wire.Request) -> float:
     """Time of the first step with a request in force, or of the last step before it."""
     sequence = run.history.steps.sequence
     later = sequence >= request.frame_sequence

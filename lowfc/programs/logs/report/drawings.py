@@ -162,8 +162,8 @@ def _spectra(figure: "Figure", report: Report) -> bool:
         quiet = _BESIDE_TRUTH if true else {}
         above.plot(frequency_hz, power["pseudo_open_loop"], color=OPEN, label="open: pseudo-open-loop", **quiet)
         above.plot(frequency_hz, power["error"], color=CLOSED, label="closed: measured error", **quiet)
-        ratio = np.sqrt(_over(power["error"], power["pseudo_open_loop"]))
-        theory = np.sqrt(_over(power["error_predicted"], power["pseudo_open_loop"]))
+        ratio = np.sqrt(_ratio(power["error"], power["pseudo_open_loop"]))
+        theory = np.sqrt(_ratio(power["error_predicted"], power["pseudo_open_loop"]))
         below.plot(frequency_hz, ratio, color=CLOSED, label="measured error / pseudo-open-loop", **quiet)
         below.plot(frequency_hz, theory, color=INK, linestyle="--", linewidth=0.9, label="theory: rejection")
         if true:
@@ -175,7 +175,7 @@ def _spectra(figure: "Figure", report: Report) -> bool:
             style = {"color": INK, "linestyle": "--", "linewidth": 0.9}
             above.plot(frequency_hz, power["residual_predicted"], label="closed: theory, rejection and noise", **style)
             clear = power["disturbance_left"] > 0.5 * power["residual_predicted"]
-            rejected = np.where(clear, np.sqrt(_over(power["residual"], power["disturbance"])), np.nan)
+            rejected = np.where(clear, np.sqrt(_ratio(power["residual"], power["disturbance"])), np.nan)
             label = "true residual / disturbance, where noise is lower"
             below.plot(frequency_hz, rejected, "o", color=CLOSED, markersize=4, markerfacecolor="none", label=label)
         above.set(title=group["name"], xscale="log", yscale="log")
@@ -185,13 +185,12 @@ def _spectra(figure: "Figure", report: Report) -> bool:
             axes.yaxis.set_minor_formatter("")
     grid[0][0].set_ylabel("nm²/Hz")
     grid[1][0].set_ylabel("closed / open, amplitude")
-    handles = [*grid[0][0].get_legend_handles_labels()[0], *grid[1][0].get_legend_handles_labels()[0]]
-    labels = [*grid[0][0].get_legend_handles_labels()[1], *grid[1][0].get_legend_handles_labels()[1]]
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    (handles, labels), (below_handles, below_labels) = (row[0].get_legend_handles_labels() for row in grid)
+    figure.legend(handles + below_handles, labels + below_labels, loc="outside lower center", ncols=3)
     return True
 
 
-def _over(one: Array, other: Array) -> Array:
+def _ratio(one: Array, other: Array) -> Array:
     return np.divide(one, other, out=np.full_like(one, np.nan), where=other > 0)
 
 

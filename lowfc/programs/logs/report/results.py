@@ -61,7 +61,7 @@ def report_of(run: Run) -> Report:
 def _log(run: Run) -> Results:
     log = run.history.log
     account = log.metadata.get("recording", {})
-    lost = {name.removeprefix("lost "): _count(text) for name, text in account.items() if name.startswith("lost ")}
+    lost = {name.removeprefix("lost "): _number(text) for name, text in account.items() if name.startswith("lost ")}
     return {
         "file": log.path.name,
         "files": [path.name for path in log.paths],
@@ -75,14 +75,14 @@ def _log(run: Run) -> Results:
         "remarks": run.history.remarks,
         "messages": sum(run.history.counts.values()),
         "messages_by_topic": dict(sorted(run.history.counts.items())),
-        "messages_lost": _count(account.get("messages_lost", "")),
+        "messages_lost": _number(account.get("messages_lost", "")),
         "lost_by_topic": {name: count for name, count in lost.items() if count is not None},
         "messages_unreadable": log.unreadable,
         "steps_left_out": run.history.excluded_messages,
     }
 
 
-def _count(text: str) -> int | None:
+def _number(text: str) -> int | None:
     return int(text) if re.fullmatch("[0-9]{1,20}", text) else None  # the log may have any text
 
 

@@ -97,10 +97,10 @@ def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None
     log = WholeLog(files, skip_damaged=True)
     log.progress = progress
     history = read_history(log)
-    return Run(history, _laws(history))
+    return Run(history, _laws_in_force(history))
 
 
-def _laws(history: History) -> tuple[InForce, ...]:
+def _laws_in_force(history: History) -> tuple[InForce, ...]:
     """The laws of a run, from the states that controllers publish at every change."""
     steps = history.steps
     found: list[InForce] = []

@@ -130,7 +130,7 @@ def _frames(results: Results) -> Results:
     light = results["light"]
     faults = []
     if light["frames_refused"]:
-        faults.append(f"{counted(light['frames_refused'], 'frame')} refused ({_listed(light['refused'])})")
+        faults.append(f"{counted(light['frames_refused'], 'frame')} refused ({_with_counts(light['refused'])})")
     if light["frames_saturated"]:
         faults.append(f"{counted(light['frames_saturated'], 'frame')} with saturated pixels")
     return _check("light", LOOK if faults else GOOD, "; ".join(faults) or "no frame refused, none saturated")
@@ -140,7 +140,7 @@ def _mirror(results: Results) -> Results:
     mirror = results["mirror"]
     limits = Counter(mirror["limits_at_mirror"]) | Counter(mirror["limits_at_controller"])  # the larger of both
     if limits:
-        return _check("mirror", LOOK, f"limits acted: {_listed(limits)}")
+        return _check("mirror", LOOK, f"limits acted: {_with_counts(limits)}")
     share = mirror["stroke_most_share"]
     if share is None:
         return _check("mirror", UNKNOWN, "this log does not show the stroke used")
@@ -154,12 +154,10 @@ def _events(results: Results) -> Results:
     worst = grave or warned
     if not worst:
         return _check("events", GOOD, "no warning, no error")
-    names = _listed(
-        {name: sum(one["name"] == name for one in worst) for name in sorted({one["name"] for one in worst})}
-    )
+    names = _with_counts(Counter(sorted(event["name"] for event in worst)))
     what = "error" if grave else "warning"
     return _check("events", BAD if grave else LOOK, f"{counted(len(worst), what)}: {names}")
 
 
-def _listed(counts: dict[str, int]) -> str:
-    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items(), key=lambda pair: -pair[1]))
+def _with_counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in Counter(counts).most_common())

@@ -90,7 +90,7 @@ def latency(
 
         figure_class()  # fail before the work if it is missing
     if logs:
-        results = _of_log(logs)
+        results = _from_log(logs)
     else:
         settings = _configuration(config, rate, camera, plain=plain_scheduling)
         from lowfc.adapters.process import compiled
@@ -162,7 +162,7 @@ def _measure(options: "LatencyOptions") -> dict[str, Any]:
     }
 
 
-def _of_log(names: list[Path]) -> dict[str, Any]:
+def _from_log(names: list[Path]) -> dict[str, Any]:
     from rich.console import Console
 
     from lowfc.adapters.logs.parts import named_log, titled

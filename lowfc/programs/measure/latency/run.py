@@ -151,17 +151,17 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
         statistics["stalls"] = stalls_of(joined, options.config.period_ns, traces)
     if "frame_to_command" not in statistics["latency_us"]:
         raise BusError("the controller reported no timing after the warm-up: use a longer --duration")
-    controller, recording = watch.of(Role.CONTROLLER), watch.of(Role.RECORDER).recording
+    controller, recording = watch.health_of(Role.CONTROLLER), watch.health_of(Role.RECORDER).recording
     if recording.failure:
         raise BusError(f"the recorder stopped: {recording.failure}")
-    loop = {role: watch.of(role) for role in (Role.CAMERA, Role.CONTROLLER, mirror_role(options.config.mirror.name))}
+    roles = Role.CAMERA, Role.CONTROLLER, mirror_role(options.config.mirror.name)
     reports = {
-        "memory_mb": {str(role): health.memory_bytes / 1e6 for role, health in loop.items()},
+        "memory_mb": {str(role): watch.health_of(role).memory_bytes / 1e6 for role in roles},
         "granted": list(controller.realtime_granted),
         "refused": list(controller.realtime_refused),
         "logs": list(recording.files),
         "messages_lost": recording.lost if options.record else None,
-        "commands_late": watch.of(Role.CAMERA).commands_late if options.simulated else None,
+        "commands_late": watch.health_of(Role.CAMERA).commands_late if options.simulated else None,
     }
     return statistics | controller_counts(controller) | reports
 
@@ -180,7 +180,7 @@ def _children(options: LatencyOptions, run: Run) -> list[Child]:
     if options.simulated:
         children[0].command += waits[-2:] if options.view else []
     else:
-        arguments = ["-m", "lowfc.programs.measure.frame_source", *_shared(run), "--seconds", str(seconds), *waits]
+        arguments = ["-m", "lowfc.programs.measure.frame_source", *_options(run), "--seconds", str(seconds), *waits]
         children[0] = program(str(Role.CAMERA), arguments, run.path / f"{Role.CAMERA}.stderr")
     if options.trace:
         children[1:1] = [_bare_loop(run, role, seconds) for role in TRACED]
@@ -188,7 +188,7 @@ def _children(options: LatencyOptions, run: Run) -> list[Child]:
 
 
 def _bare_loop(run: Run, role: Role, seconds: float) -> Child:
-    arguments = ["-m", bare_loop.__name__, str(role), *_shared(run), "--seconds", str(seconds)]
+    arguments = ["-m", bare_loop.__name__, str(role), *_options(run), "--seconds", str(seconds)]
     return program(f"bare loop beside the {role}", arguments, run.path / f"bare-{role}.stderr")
 
 
@@ -198,7 +198,7 @@ def _write_pids(run: Run, children: list[Child]) -> None:
 
 
 def _references(options: LatencyOptions, run: Run) -> dict[str, Any]:
-    arguments = [*_shared(run), "--seconds", str(options.duration_s / 2)]
+    arguments = [*_options(run), "--seconds", str(options.duration_s / 2)]
     children = [
         program(f"echo ({verb})", ["-m", echo.__name__, verb, *arguments], run.path / f"echo-{verb}.stderr")
         for verb in ("ask", "answer")
@@ -217,7 +217,7 @@ def _references(options: LatencyOptions, run: Run) -> dict[str, Any]:
     return found | {"echo_lost": int(np.sum(round_trip_ns < 0))}
 
 
-def _shared(run: Run) -> list[str]:
+def _options(run: Run) -> list[str]:
     return ["--run", run.run_id, "--config", str(run.path / "config.toml")]
 
 

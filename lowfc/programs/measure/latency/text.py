@@ -75,7 +75,7 @@ def picture(results: Mapping[str, Any]) -> bytes:
     for span in LOOP_SPANS:
         if span in results["latency_us"]:
             counted.stairs(results["histogram"]["counts"][span], edges, label=SPANS[span])
-    counted.set(xscale="log", yscale="log", xlabel="us", ylabel="frames", title=_what(results))
+    counted.set(xscale="log", yscale="log", xlabel="us", ylabel="frames", title=_title(results))
     counted.legend()
     begun_s = 0.0
     for number, repeat in enumerate(results["over_time"]):
@@ -123,7 +123,7 @@ def _remarks(results: Mapping[str, Any]) -> list[str]:
         lines.append(Stalls.model_validate(results["stalls"]).text())
     if results.get("memory_mb"):
         lines.append("memory: " + ", ".join(f"{name} {mb:.0f} MB" for name, mb in results["memory_mb"].items()))
-    lines.append(_what(results))
+    lines.append(_title(results))
     if results["settings"].get("log"):
         lines += faults(results["damaged"], results["no_end"])
     host = results["host"]
@@ -136,7 +136,7 @@ def _remarks(results: Mapping[str, Any]) -> list[str]:
     return lines + [f"{word}: {', '.join(host[word])}" for word in ("granted", "refused") if host.get(word)]
 
 
-def _what(results: Mapping[str, Any]) -> str:
+def _title(results: Mapping[str, Any]) -> str:
     settings, count = results["settings"], len(results["repeats"])
     if settings.get("log"):
         return f"{Path(settings['log']).name}, {results['rate_hz']:.1f} Hz"

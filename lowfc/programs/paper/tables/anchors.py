@@ -132,16 +132,16 @@ def _pointing(context: Context, name: str) -> list[Row]:
                 )
             )
             if preset == "reaction-wheel":
-                rows += _with_verdict(_means(driven, _history(folder / run["log"]), "sky"))
+                rows += _with_verdict(_means_row(driven, _history(folder / run["log"]), "sky"))
         context.progress(f"anchors {name}, bench", 9, 12)
         run = _sim_loop("bench", folder, "gains.toml", CLOSED_S, context.seed)
         rows += _with_verdict(
-            _means(partial(made, estimator="integrator"), _history(folder / run["log"]), "laboratory")
+            _means_row(partial(made, estimator="integrator"), _history(folder / run["log"]), "laboratory")
         )
     return rows
 
 
-def _means(made: Callable[..., Row], history: History, where: str) -> Row:
+def _means_row(made: Callable[..., Row], history: History, where: str) -> Row:
     """Row with the standard deviation of means of the true tilt after the first four seconds."""
     truths = history.true
     assert truths is not None  # noqa: S101  # a simulated loop's
