@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from lowfc.arrays import Array, Mask, Whole
+from lowfc.arrays import Array, Integers, Mask
 from lowfc.design.dark_zone import FINE_STEP, edge_points, fine_grid, first_points
 from lowfc.design.linear_program import maximise
 from lowfc.optics.chain.coronagraph import Wedge
@@ -260,7 +260,7 @@ def _levels(request: Request) -> list[int]:
     return [*coarser, finest]
 
 
-def _variables(cells: int, symmetry: str) -> tuple[Whole, Whole, Array]:
+def _variables(cells: int, symmetry: str) -> tuple[Integers, Integers, Array]:
     """Indices y and x (n,) of the independent cells, and the number of cells that each represents by symmetry."""
     y, x = np.nonzero(_circle_quarter(cells))
     if symmetry == "quarter":

@@ -13,7 +13,7 @@ from tools.advice import ADVICE, REASONS
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("client", "device", "optics", "design", "control")
-ARRAYS = re.compile(r"\b(Array|Single|Complex|Whole|Long|Mask|Pixels|ArrayLike)\b")
+ARRAYS = re.compile(r"\b(Array|Single|Complex|Integers|Long|Mask|Pixels|ArrayLike)\b")
 SHAPE = re.compile(r"\([\w+*/ .-]+,\)|\([\w+*/ .-]+(, ?[\w+*/ .-]+)+\)|shapes? as|any shape")
 UNIT = re.compile(
     r"\b(nm2?|um|mas|DN|electrons?|e-|ns|s|Hz|rad|deg|waves|frames|diameters|lambda0?|"

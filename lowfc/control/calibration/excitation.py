@@ -7,7 +7,7 @@ between them. No two lines are neighbours, so that Hann's window separates them.
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Array, Single, Whole
+from lowfc.arrays import Array, Integers, Single
 
 FEWEST_CYCLES = 3
 """Least cycles of the lowest line in a period; with fewer, it cannot be told from a drift of the mean."""
@@ -15,7 +15,7 @@ _APART = 3  # least number of odd bins between lines of a mode: the noise is mea
 _DRAWS = 32  # random sets of phases; the one with the lowest peak is used
 
 
-def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, highest: float) -> list[Whole]:
+def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, highest: float) -> list[Integers]:
     """Choose the lines of each mode, evenly in the logarithm of frequency as far as possible.
 
     Args:
@@ -54,7 +54,7 @@ def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, hi
     return [places[mode::modes] for mode in range(modes)]
 
 
-def multisine(period_frames: int, bins: list[Whole], rms_nm: float, seed: int) -> Single:
+def multisine(period_frames: int, bins: list[Integers], rms_nm: float, seed: int) -> Single:
     """One period (period_frames, modes) of sines of equal amplitude, whose random phases give a low crest factor.
 
     Args:
@@ -81,7 +81,7 @@ def with_lead_in(period: Single, lead_frames: int) -> Single:
     return np.concatenate([period[np.arange(-lead_frames, 0) % len(period)], period])
 
 
-def build_staircase(levels_nm: npt.ArrayLike, hold_frames: int, largest_step_nm: float) -> tuple[Array, Whole]:
+def build_staircase(levels_nm: npt.ArrayLike, hold_frames: int, largest_step_nm: float) -> tuple[Array, Integers]:
     """A staircase from zero over all levels and back to zero, in as few steps as the largest step allows.
 
     Args:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Array, Whole
+from lowfc.arrays import Array, Integers
 
 SURE = 3.0
 """Standard errors by which a value must exceed a limit to count as beyond it."""
@@ -55,7 +55,7 @@ class Gains:
         return [False if far.any() else None if vague.any() else True for far, vague in rows]
 
 
-def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Whole, frames: int) -> Gains:
+def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Integers, frames: int) -> Gains:
     """Gain and cross-talk of a mode that followed the levels (levels,) of `levels`, from open-loop errors.
 
     Errors are (frames, modes); `starts` (levels,) are the first of the `frames` frames that saw each level. A

@@ -123,7 +123,7 @@ def usable(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: 
         plan: The plan that was played.
         sequence: (exposures,) ascending, counted from the frame whose command had the first row.
         commanded: (exposures,) whether the frame led to a command.
-        lag: Whole frames from a row's frame to the exposure that sees it.
+        lag: Integers frames from a row's frame to the exposure that sees it.
     """
     place = sequence - lag
     within = (place >= 0) & (place < len(plan))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Array, Whole
+from lowfc.arrays import Array, Integers
 
 MIN_CYCLES = 4
 """Least number of cycles for a useful scatter."""
@@ -174,7 +174,7 @@ def cycle_response(
     return Cycle(response, reference, float(flux_dn[kept].mean()))
 
 
-def _slow(times: Whole, frames: int, slowest: float) -> Array:
+def _slow(times: Integers, frames: int, slowest: float) -> Array:
     """Orthonormal basis (times, any) of slow changes in a piece: the mean, and all cosines below a frequency."""
     orders = np.arange(1 + int(2 * frames * slowest))
     return np.linalg.qr(np.cos(np.pi * np.outer((times + 0.5) / frames, orders)))[0]

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lowfc.arrays import Array, Mask, Single, Whole
+from lowfc.arrays import Array, Integers, Mask, Single
 from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.virtual import VirtualIntegrators, Weights
 
@@ -236,7 +236,7 @@ class GainBank:
         against = np.mean(self._means, axis=0) * cross_talk_nm > 0
         return self._without(np.where(against, MARGIN * cross_talk_nm, 0))
 
-    def _chosen(self, blocks: Array, now: Whole) -> Whole:
+    def _chosen(self, blocks: Array, now: Integers) -> Integers:
         """Best row (modes,) of each mode whose current row is `now`."""
         own, modes = blocks[:, :-1], np.arange(now.size)
         rows, helps = own + self._alike(own), own.mean(axis=0) < 0
@@ -268,7 +268,7 @@ class GainBank:
         noise_nm2 = np.maximum(np.mean(self._changed, axis=0), 1e-12)
         return np.asarray(np.median(blocks / noise_nm2, axis=-1, keepdims=True) * noise_nm2)
 
-    def _row_of(self, gain: Single) -> Whole:
+    def _row_of(self, gain: Single) -> Integers:
         """Row (modes,) nearest to each gain."""
         nearest = np.argmin(np.abs(np.log(np.maximum(gain, 1e-9)) - np.log(self.rows[1:, None])), axis=0) + 1
         return np.where(gain < self.rows[1] / 2, 0, nearest)

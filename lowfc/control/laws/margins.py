@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lowfc.arrays import Array, Complex, Mask, Whole
+from lowfc.arrays import Array, Complex, Integers, Mask
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.wording import counted
@@ -175,7 +175,7 @@ def sensitivity(law: LinearLaw, omega: Array, delay_frames: float | None = None)
 class _Part:
     """Coupled states and modes of a law, in double precision."""
 
-    modes: Whole
+    modes: Integers
     F: Array
     G: Array
     U: Array
@@ -238,7 +238,7 @@ def _parts(law: LinearLaw) -> list[_Part]:
     return found
 
 
-def _first_linked(linked: Mask) -> Whole:
+def _first_linked(linked: Mask) -> Integers:
     """First member (n,) of the connected group of each node, from links (n, n); scipy.sparse takes 0.3 s to import."""
     while True:
         further = linked.astype(np.float32) @ linked.astype(np.float32) > 0

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Array, Sequences, Whole
+from lowfc.arrays import Array, Integers, Sequences
 from lowfc.control.loop.inputs import COUNT_BITS
 
 MAX_INTERPOLATED_FRAMES = 3
@@ -147,7 +147,7 @@ def in_bins(frequency_hz: Array, columns: Sequence[Array], per_decade: int = 20)
     return means[0], means[1:]
 
 
-def _even(position: Whole, rows: Array) -> Array:
+def _even(position: Integers, rows: Array) -> Array:
     """Rows at every position from the first to the last, interpolated where there is none."""
     everywhere = np.arange(position[-1] + 1)
     if everywhere.size == position.size:

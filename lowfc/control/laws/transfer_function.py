@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lowfc.arrays import Array, Complex, Mask, Whole
+from lowfc.arrays import Array, Complex, Integers, Mask
 
 _FAINTEST = 1e-3  # relative to the mode's highest line; below is rounding to single precision
 _ADJACENT = np.array([*range(-16, -1), *range(2, 17)])  # bins from which a line's noise is measured
@@ -31,7 +31,7 @@ class Lines:
         error: (lines,) standard error of each of S's two components.
     """
 
-    mode: Whole
+    mode: Integers
     frequency: Array
     rejection: Complex
     error: Array
@@ -77,7 +77,7 @@ def measured(error_nm: Array, added_nm: Array) -> Lines:
         raise ValueError(f"errors {error_nm.shape} and added signal {added_nm.shape} must have the same frames")
     frames = len(error_nm)
     response, added = _hann(error_nm), _hann(added_nm)
-    found: list[tuple[Whole, Whole, Complex, Array]] = []
+    found: list[tuple[Integers, Integers, Complex, Array]] = []
     for mode in range(error_nm.shape[1]):
         plain = np.abs(np.fft.rfft(added_nm[:, mode])) / frames
         places = np.flatnonzero(plain[1:-1] > _FAINTEST * plain[1:-1].max(initial=0.0)) + 1

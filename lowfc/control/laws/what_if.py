@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Array, Long, Mask, Sequences, Single, Whole
+from lowfc.arrays import Array, Integers, Long, Mask, Sequences, Single
 from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw, at_rest, integrator, predict_and_update, respond
 from lowfc.control.laws.stability import delay_weights
@@ -52,7 +52,7 @@ def exposed(reasons: Long) -> Mask:
     return np.asarray((reasons & _NOT_NEW) == 0)
 
 
-def missing_before(sequence: Sequences) -> Whole:
+def missing_before(sequence: Sequences) -> Integers:
     """Number of exposures without a step (steps,) before each step; `sequence` (steps,) falls only after a clear."""
     same_start = sequence[1:] >> np.uint64(COUNT_BITS) == sequence[:-1] >> np.uint64(COUNT_BITS)
     follows = same_start & (sequence[1:] > sequence[:-1])
@@ -60,7 +60,7 @@ def missing_before(sequence: Sequences) -> Whole:
     return np.concatenate([np.zeros(min(1, len(sequence)), np.int64), between.astype(np.int64)])
 
 
-def seen_nm(weights: Single, command_nm: Single, missing: Whole, first_nm: Single) -> Single:
+def seen_nm(weights: Single, command_nm: Single, missing: Integers, first_nm: Single) -> Single:
     """Command (steps, modes) that each exposure saw; under exposures without a step the command is held.
 
     Args:
@@ -81,7 +81,7 @@ def seen_nm(weights: Single, command_nm: Single, missing: Whole, first_nm: Singl
     return seen
 
 
-def counterfactual(controller: Controller, weights: Single, pol_nm: Single, missing: Whole) -> tuple[Single, Single]:
+def counterfactual(controller: Controller, weights: Single, pol_nm: Single, missing: Integers) -> tuple[Single, Single]:
     """Fold a controller over a disturbance, from a flat mirror; return its errors and commands (steps, modes).
 
     Args:
@@ -109,7 +109,7 @@ def counterfactual(controller: Controller, weights: Single, pol_nm: Single, miss
     return error_nm, command_nm
 
 
-def delay_from_truth(true_nm: Single, command_nm: Single, missing: Whole) -> float | None:
+def delay_from_truth(true_nm: Single, command_nm: Single, missing: Integers) -> float | None:
     """Delay in frames at which the commands (steps, modes) best match the mirror's true motion (steps, modes).
 
     The least-squares fit of `delay_weights`; `true_nm` may have rows of NaN. None if the commands hardly move.
@@ -132,7 +132,7 @@ def delay_from_truth(true_nm: Single, command_nm: Single, missing: Whole) -> flo
 
 
 def delay_from_times(
-    sequence: Sequences, exposure_start_ns: Whole, applied_sequence: Sequences, applied_ns: Whole
+    sequence: Sequences, exposure_start_ns: Integers, applied_sequence: Sequences, applied_ns: Integers
 ) -> float | None:
     """Mean delay in frames: from a command's frame to the first whose exposure began after the command was applied.
 
@@ -155,7 +155,7 @@ def delay_from_times(
     return float(delay.mean()) if len(delay) >= _FEWEST else None
 
 
-def frames_since(begins: Mask, running: Mask, missing: Whole) -> Whole:
+def frames_since(begins: Mask, running: Mask, missing: Integers) -> Integers:
     """Frames (steps,) since the loop started to run or restarted; -1 where it does not run."""
     place = np.arange(len(running)) + np.cumsum(missing)
     started = running & (begins | ~np.concatenate([[False], running[:-1]]))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Array, Single, SingleComplex, Whole
+from lowfc.arrays import Array, Integers, Single, SingleComplex
 from lowfc.optics.chain.coronagraph import Coronagraph, LyotStop, Wedge, wedge_samples
 from lowfc.optics.chain.fourier import kernel
 from lowfc.optics.chain.grid import pupil_axis
@@ -127,7 +127,7 @@ class _Lyot:
     stop: Single
 
     @classmethod
-    def of(cls, lyot: LyotStop, square: int, used: tuple[Whole, Whole]) -> "_Lyot":
+    def of(cls, lyot: LyotStop, square: int, used: tuple[Integers, Integers]) -> "_Lyot":
         n, k = len(lyot.stop), len(lyot.opaque)
         cells = kernel(k, lyot.samples_per, n, 1.0).reshape(k, n // square, square)
         y, x = (cells[:, each].sum(axis=2).astype(np.complex64) / np.float32(n) for each in used)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from lowfc.arrays import Array, Complex, Whole
+from lowfc.arrays import Array, Complex, Integers
 from lowfc.optics.chain.grid import OPEN_AREA, image_axis, pupil_axis
 from lowfc.optics.chain.relay import ApertureMask, direct_kernel, half_band
 from lowfc.optics.chain.sensor import Sensor
@@ -74,7 +74,7 @@ def field_operator(
     functions: Array,
     y_factors: Array,
     x_factors: Array,
-    products: Whole,
+    products: Integers,
     advance: Callable[[], None] = lambda: None,
 ) -> Array:
     """Real matrix (rows, products) from amplitudes of separable functions in the pupil.
@@ -114,9 +114,9 @@ def _focal_rows(
     waves: Array,
     y_factors: Array,
     x_factors: Array,
-    products: Whole,
+    products: Integers,
     advance: Callable[[], None],
-) -> Iterator[tuple[int, int, Whole, Array]]:
+) -> Iterator[tuple[int, int, Integers, Array]]:
     """Focal-plane amplitudes row by row, for amplitudes in the pupil; arguments as for `field_operator`.
 
     Yields:

@@ -14,7 +14,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from lowfc.arrays import Array, Complex, Single, Whole
+from lowfc.arrays import Array, Complex, Integers, Single
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Twin:
 
     spec: TwinSpec
     axis: Array
-    used: Whole
+    used: Integers
     area_weights: Array
     operators: tuple[Operator, ...]
     to_pixels: Array

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lowfc.arrays import Array, Mask, Whole
+from lowfc.arrays import Array, Integers, Mask
 from lowfc.optics.chain.band import Band, monochromatic
 from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.chain.sensor import Sensor
@@ -88,7 +88,7 @@ def _adjoint(to_samples: Array, weights: Mask) -> Array:
     return np.asarray(to_samples.T @ weights.astype(np.float64) @ to_samples)
 
 
-def _intensity_sampling(sensor: Sensor, spec: TwinSpec, scale: float) -> tuple[Whole, Array]:
+def _intensity_sampling(sensor: Sensor, spec: TwinSpec, scale: float) -> tuple[Integers, Array]:
     """Choose the sensor samples at which intensities are evaluated, and compute the matrix from them to pixels.
 
     Intensities have twice the field's bandwidth; a pivoted QR of that band's prolate functions selects the samples.

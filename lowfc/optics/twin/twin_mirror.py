@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lowfc.arrays import Single, Whole
+from lowfc.arrays import Integers, Single
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.mirror import Mirror, influence_factors
 from lowfc.optics.chain.sensor import Sensor
@@ -35,7 +35,7 @@ class TwinMirror:
         expand: (used, few) smooth surface with the same effect at the sensor.
     """
 
-    used: Whole
+    used: Integers
     y_factors: Single
     x_factors: Single
     reduce: Single
@@ -92,7 +92,7 @@ def poke_wavefronts_nm(mirror: TwinMirror) -> Single:
     return np.asarray(2 * surfaces)
 
 
-def _at_nodes(used: Whole, y_factors: NDArray[np.floating], x_factors: NDArray[np.floating]) -> NDArray[np.floating]:
+def _at_nodes(used: Integers, y_factors: NDArray[np.floating], x_factors: NDArray[np.floating]) -> NDArray[np.floating]:
     """Influence functions (used, actuators) at the nodes of a square grid, from their factors along y and x."""
     rows, columns = np.divmod(used, len(y_factors))
     return (y_factors[rows][:, :, None] * x_factors[columns][:, None, :]).reshape(used.size, -1)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.arrays import Array, Whole
+from lowfc.arrays import Array, Integers
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.excitation import lines, multisine, with_lead_in
 from lowfc.control.laws import margins
@@ -228,7 +228,7 @@ def draw(found: dict[str, Any], figure: Any) -> None:
     axes[1].legend(fontsize=6, ncols=2)
 
 
-def _comparison(of: Departure, rows: Whole, frequency_hz: Array) -> Comparison:
+def _comparison(of: Departure, rows: Integers, frequency_hz: Array) -> Comparison:
     judged = rows[of.judged[rows]]
     worst = float(of.db[judged][np.argmax(np.abs(of.db[judged]))]) if judged.size else None
     return Comparison(

@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Array, Long, Mask, Pixels, Whole
+from lowfc.arrays import Array, Integers, Long, Mask, Pixels
 from lowfc.client import Client, Frame, MirrorWatch
 from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import CalibrationError, LowfcError
@@ -85,7 +85,7 @@ class Recording(NamedTuple):
         return bool(self.commanded.all()) and len(self.sequence) == len(self.steps) == self.steps[-1] + 1
 
     @property
-    def _steps_of_frames(self) -> Whole:
+    def _steps_of_frames(self) -> Integers:
         return np.searchsorted(self.steps, self.sequence)
 
 

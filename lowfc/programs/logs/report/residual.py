@@ -4,7 +4,7 @@ import numpy as np
 
 from lowfc.adapters.files.factory import contrast_of
 from lowfc.adapters.logs.columns import TruthRows, Truths
-from lowfc.arrays import Array, Single, Whole
+from lowfc.arrays import Array, Integers, Single
 from lowfc.contract.configuration import Configuration
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
@@ -85,12 +85,12 @@ def binned_rms(run: Run, most: int = 300) -> dict[str, Array]:
     return found
 
 
-def bin_starts(rows: int, most: int) -> Whole:
+def bin_starts(rows: int, most: int) -> Integers:
     """First row of each bin; bins have equal width and limited number."""
     return np.arange(0, rows, max(1, -(-rows // most)))
 
 
-def _contrast(true: Truths, rows: Whole, config: Configuration | None) -> Results | None:
+def _contrast(true: Truths, rows: Integers, config: Configuration | None) -> Results | None:
     """Contrast added to the dark zone by the disturbance (open) and by the residual (closed) of these steps.
 
     None without truth or configuration, or for a coronagraph without a science image.
@@ -108,7 +108,7 @@ def _contrast(true: Truths, rows: Whole, config: Configuration | None) -> Result
     return added_contrast(contrast_of(config), covariances) if config is not None else None
 
 
-def _rms(values: Single, rows: Whole) -> Array | None:
+def _rms(values: Single, rows: Integers) -> Array | None:
     """Rms (modes,) of the rows without NaN; None without any."""
     found = values[rows] if values.size else values
     known = found[np.isfinite(found).all(axis=1)].astype(float)

@@ -9,7 +9,7 @@ import numpy as np
 from lowfc.adapters.files.factory import settings
 from lowfc.adapters.logs.columns import Steps, rows_of
 from lowfc.adapters.logs.history import History
-from lowfc.arrays import Mask, Sequences, Single, Whole
+from lowfc.arrays import Integers, Mask, Sequences, Single
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.codecs.law_codec import integrator_of
 from lowfc.contract.codecs.state_codec import calibration_in_use
@@ -56,7 +56,7 @@ class SeenCommands(NamedTuple):
     def of(
         cls,
         steps: Steps,
-        missing: Whole,
+        missing: Integers,
         states: Sequence[wire.ControllerState],
         controller_delay: float,
         measured_delay: float | None,

@@ -5,7 +5,7 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
-from lowfc.arrays import Long, Whole
+from lowfc.arrays import Integers, Long
 from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.optics.chain.zernike import mode_name, noll_to_orders
 from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, ORANGE, PINK, RED, YELLOW, distinct
@@ -36,7 +36,7 @@ class Wavefront(Panel):
         self._nm_per_mas = nm_per_mas
         self._noll: tuple[int, ...] = ()
         self._true = False
-        self._groups: list[Whole] = []
+        self._groups: list[Integers] = []
         self._tilts: list[int] = []
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
