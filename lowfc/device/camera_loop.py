@@ -92,6 +92,10 @@ class CameraLoop:
             watch.returned()
             if exposure is None:
                 return None
+            if not (isinstance(exposure, Exposure) and isinstance(exposure.pixels, np.ndarray)):
+                raise TypeError(
+                    f"expose() returned {type(exposure).__name__}, expected Exposure with a numpy array, or None"
+                )
             if exposure.pixels.shape != (settings.rows, settings.columns):
                 settings = self._publish_settings()  # the region changed during the exposure
             pixels = _checked(exposure.pixels, settings)

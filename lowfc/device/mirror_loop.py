@@ -13,7 +13,7 @@ from lowfc.adapters.bus.start_check import StartCheck
 from lowfc.adapters.files.factory import true_mirror
 from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.adapters.process.service import Service
-from lowfc.arrays import Single, single
+from lowfc.arrays import Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BadMessageError, ConfigurationError
@@ -228,7 +228,7 @@ class MirrorLoop:
         try:
             found_nm = method(*arguments)
             if found_nm is not None:
-                found_nm = single(found_nm)
+                found_nm = np.array(found_nm, np.float32, order="C")  # a driver may use its array again
                 flat = found_nm.reshape(-1)
                 if found_nm.shape != self._protection.grid:
                     raise ValueError(f"it returned {found_nm.shape} actuators, expected {self._protection.grid}")

@@ -204,6 +204,12 @@ def of_mirror(mirror: Mirror, config: Configuration = CONFIG, **options: Any) ->
     return found(mirror_checks(Dialogue(mirror, Expected(config)), 0.2, **{"show": lambda _: None, **options}))
 
 
+def failing(health: Any) -> Any:
+    """Health of a driver that fails all the time."""
+    health.driver_failures = health.timestamp.ToNanoseconds()
+    return health
+
+
 def setting(**values: Any) -> Callable[..., Any]:
     """Function that sets fields of a message."""
 
@@ -302,6 +308,7 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "a bit depth of -1": ({"state": setting(bit_depth=2**32 - 1)}, {"settings' values": WRONG}),
     "no answer": ({"answer": lambda _: []}, {"settings on request": WARNING}),
     "no health": ({"health": lambda _: None}, {"health": WARNING}),
+    "driver fails": ({"health": failing}, {"health": WARNING}),
     "another's health": ({"health": setting(process="mycam")}, {"health": WARNING}),
 }
 

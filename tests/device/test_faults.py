@@ -75,9 +75,21 @@ def exposed(*exposures: Callable[[], Any], frames: int, settings: CameraSettings
         (good(end_ns=float("nan")), "NaN"),
         (good(lost=-1), "lost is -1"),
         (good(lost=1 << 32), "lost is 4294967296"),
-        (lambda: "nothing", "AttributeError"),
+        (lambda: "nothing", "expose() returned str"),
+        (good(pixels=GOOD.tolist()), "expected Exposure with a numpy array"),
     ],
-    ids=["raises", "shape", "NaN", "future", "past", "NaN time", "negative loss", "impossible loss", "nonsense"],
+    ids=[
+        "raises",
+        "shape",
+        "NaN",
+        "future",
+        "past",
+        "NaN time",
+        "negative loss",
+        "impossible loss",
+        "nonsense",
+        "list",
+    ],
 )
 def test_camera_failures_are_reported_once_counted_and_retried(bad: Callable[[], Any], message: str) -> None:
     recovered = [good()] * 251  # more than 1 s at 250 Hz
@@ -300,14 +312,16 @@ def test_a_failed_mirror_goes_flat_before_it_follows_commands_again(bad: Any, me
     assert bench.service.health().driver_failures == 2
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.int32])
-def test_positions_of_any_number_type_are_reported_as_float32(dtype: type) -> None:
-    mirror = Mirror()
+@pytest.mark.parametrize("dtype", [np.float64, np.int32, np.float32])
+def test_positions_of_any_number_type_are_copied_as_float32(dtype: type) -> None:
+    mirror, reached = Mirror(), np.full((4, 5), 100, dtype)
     bench = Bench(mirror)
-    mirror.plan = [lambda commanded: (commanded - 40).astype(dtype)]
+    mirror.plan = [lambda _: reached]
     shape = decode_mirror(bench.command(140.0).SerializeToString())
     assert shape is not None
     assert (shape.actuators_nm == 100).all()
+    reached[:] = 0  # the driver uses its array again
+    assert (bench.loop._status.surface_nm == 100).all()
 
 
 def test_a_hanging_mirror_reports_no_position_and_goes_flat_before_the_next_command() -> None:

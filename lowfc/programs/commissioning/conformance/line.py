@@ -16,7 +16,7 @@ from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
-from lowfc.contract.messages import HEALTH, Topic, wire
+from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, wire
 
 NS = 1_000_000_000
 EVERYTHING = "lowfc/**"
@@ -148,7 +148,12 @@ class Collected:
 
     @property
     def failing(self) -> str:
-        """Last warning of the device's process if its driver fails; empty otherwise."""
+        """Last failure, else last warning, of the device's process if its driver fails; empty otherwise."""
+        for message in reversed(self.on(EVENT.key)):
+            with contextlib.suppress(DecodeError):
+                event = Log.FromString(message.payload)
+                if event.name == self.process and event.message.startswith("DRIVER_FAILED"):
+                    return event.message
         for message in reversed(self.on(HEALTH.at(self.process))):
             with contextlib.suppress(DecodeError):
                 health = wire.Health.FromString(message.payload)

@@ -99,7 +99,7 @@ def _health(device: Collected) -> Check:
     if not payloads:
         return warning(f"none of {device.process} in {device.seconds:.1f} s", f"publish it: {cost}")
     try:
-        last = [wire.Health.FromString(payload) for payload in payloads][-1]
+        first, *_, last = [wire.Health.FromString(payload) for payload in (payloads[0], *payloads)]
     except DecodeError:
         return wrong("it is not a lowfc.v1.Health", "encode the message as declared")
     rate_hz = len(payloads) / device.seconds
@@ -111,6 +111,10 @@ def _health(device: Collected) -> Check:
         return warning("topics[].published is missing", f"count the messages of every topic: {cost}")
     if not from_timestamp(last.timestamp):
         return warning("no timestamp", "set it: a silent process is recognised by it")
+    if failures := last.driver_failures - first.driver_failures:
+        return warning(
+            f"{failures} failures of its driver: {device.failing}", "correct that first: it fails others, too"
+        )
     return ok(f"{len(payloads)} in {device.seconds:.1f} s, state {last.state!r}")
 
 
