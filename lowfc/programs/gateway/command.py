@@ -16,8 +16,9 @@ from lowfc.client import Client
 from lowfc.client.runs import the_run
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import Role
+from lowfc.programs.cli.status import json_object
 from lowfc.programs.gateway.epics import EpicsGateway, protocol
-from lowfc.programs.gateway.variables import Put, Variable, status_of, variables
+from lowfc.programs.gateway.variables import Put, Variable, variables
 from lowfc.programs.gateway.watch import Watch
 
 PERIOD_S = 0.1
@@ -90,7 +91,7 @@ def _serve(
         if now_s >= due_s:
             due_s = now_s + PERIOD_S
             view = watch.update()
-            status = status_of(view, loop.run_id)
+            status = json_object(view.state, view.processes, loop.run_id)
             values = {one.name: one.read(view, status) for one in offered if one.read is not None}
             gateway.update(values, "" if view.connected else "the controller does not answer")
         changed.wait(max(0.0, min(due_s, bench_s) - time.monotonic()))

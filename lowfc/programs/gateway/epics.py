@@ -61,6 +61,9 @@ class EpicsGateway:
             self._server = p4p.server.Server(providers=[provided], conf=served, useenv=False)
         except RuntimeError as fault:
             raise BusError(f"cannot serve PV Access on {address}:{port}: {fault}") from None
+        if self.port != port:  # the library would serve on another one
+            self._server.stop()
+            raise BusError(f"cannot serve PV Access on {address}:{port}: it is in use; set another gateway.port")
         searched = {"EPICS_PVA_ADDR_LIST": config.search, "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
         self._context = p4p.client.thread.Context("pva", conf=searched, useenv=False)
         self._monitors = [

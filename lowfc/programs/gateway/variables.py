@@ -12,7 +12,7 @@ import numpy as np
 from lowfc.client import Answer, Client
 from lowfc.client.requests import DECLARED, Declaration
 from lowfc.contract.messages import Role, wire
-from lowfc.programs.cli.status import interlocks, json_object
+from lowfc.programs.cli.status import interlocks
 from lowfc.programs.gateway.watch import RunView
 
 
@@ -65,24 +65,14 @@ def _step(field: str) -> Callable[[RunView, dict[str, Any]], Any]:
 
 
 READINGS = (
-    Variable(
-        "mode",
-        Kind.TEXT,
-        "",
-        "Loop mode: starting, idle, open (also when paused), closed or safe.",
-        _status("mode", ""),
-    ),
+    Variable("mode", Kind.TEXT, "", "Starting, idle, open (also when paused), closed or safe.", _status("mode", "")),
     Variable("verdict", Kind.TEXT, "", "State of the loop in a sentence.", lambda view, _: view.verdict.headline),
     Variable("verdict_level", Kind.TEXT, "", "Level of the verdict.", lambda view, _: view.verdict.level.name.lower()),
     Variable("holding", Kind.TEXT, "", "Why a closed loop holds its command.", _status("holding", "")),
     Variable("interlocks", Kind.TEXT, "", "Interlocks that are tripped.", lambda _, status: interlocks(status)),
     Variable("reserved_for", Kind.TEXT, "", "Holder of the loop's reservation.", _status("reserved_for", "")),
     Variable(
-        "residual",
-        Kind.NUMBER,
-        "nm",
-        "Modal error, rms over the last second, with noise.",
-        _status("residual_rms_nm", 0.0),
+        "residual", Kind.NUMBER, "nm", "Modal error with noise, rms of a second.", _status("residual_rms_nm", 0.0)
     ),
     Variable("flux", Kind.NUMBER, "", "Flux relative to the calibration.", _status("flux_fraction", 0.0)),
     Variable("rate", Kind.NUMBER, "Hz", "Frame rate.", _status("rate_hz", 0.0)),
@@ -127,8 +117,3 @@ def variables() -> Iterator[Variable]:
         declared = puts.pop(reading.name, None)
         yield reading if declared is None else reading._replace(put=declared.put)
     yield from puts.values()
-
-
-def status_of(view: RunView, run: str) -> dict[str, Any]:
-    """The values of `lowfc ctl status`, from which most variables are read."""
-    return json_object(view.state, view.processes, run)
