@@ -118,7 +118,6 @@ def running(bus: MemoryBus) -> Iterator[FoxgloveBridge]:
     finally:
         bridge.service.stop("the test is over")
         thread.join(PATIENCE_S)
-        bridge.close()
         assert not thread.is_alive()
 
 

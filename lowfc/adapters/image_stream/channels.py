@@ -44,7 +44,7 @@ class OtherChannels:
         self._grid = grid
         self._streams: dict[Path, Stream] = {}
         self._searched_s = -_SEARCH_S
-        self._counts: dict[Path, tuple[tuple[int, int, int], int]] = {}
+        self._counts: dict[Stream, int] = {}
         self._shapes: dict[Stream, Single | None] = {}
         self._sum: Single = np.zeros(grid, np.float32)
         self._misfits: list[str] = []
@@ -75,7 +75,7 @@ class OtherChannels:
                 except StreamError as fault:
                     self._misfits.append(str(fault))
         self._streams = current
-        counts = {path: (stream.identity, _complete_count(stream)) for path, stream in self._streams.items()}
+        counts = {stream: _complete_count(stream) for stream in self._streams.values()}
         if counts != self._counts:
             self._shapes = {
                 stream: complete_shape(stream, self._shapes.get(stream, stream.data[0].astype(np.float32)))

@@ -156,8 +156,7 @@ class ExternalChannels:
             fault = str(error)
             self._next_request_s = now_s + (_REFUSED_S if isinstance(error, RequestRefusedError) else _REQUESTS_S)
         if fault and fault != self._fault:
-            names = ", ".join(self._others.names if self._others else self._names)
-            sys.stderr.write(f"{names} not reported to the loop: {printable(fault)}\n")
+            sys.stderr.write(f"other channels not reported to the loop: {printable(fault)}\n")
         self._fault = fault
 
 

@@ -1,5 +1,6 @@
 """The command `lowfc console`."""
 
+import contextlib
 import signal
 import sys
 
@@ -19,36 +20,22 @@ def console(run: AnyRun = None) -> None:
     from lowfc.adapters.process.realtime import lower_priority
 
     lower_priority()
-    from lowfc.client.runs import the_run
-
-    run_id = the_run(run)
-    while _show_console(run_id):
-        pass
-
-
-def _show_console(run_id: str) -> bool:
-    """Show the console until it is closed; True if the run restarted, so that the console must connect again."""
     from lowfc.adapters.bus.run import open_run
     from lowfc.adapters.bus.zenoh_bus import ZenohBus
     from lowfc.adapters.process.join import clock_of
+    from lowfc.client.runs import the_run
     from lowfc.contract.configuration import load
     from lowfc.contract.messages import Role
     from lowfc.programs.console.app import RESTARTED, Console
 
-    joined = open_run(run_id, ())
-    config = joined.path / "config.toml"
-    clock = clock_of(load(config if config.exists() else None))
-    bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
-    try:
-        app = Console(
-            bus,
-            run_id,
-            clock,
-            restarted=joined.restarted,
-            terminal_gone=lambda: not sys.stdin.isatty(),
-        )
-        for number in (signal.SIGTERM, signal.SIGINT):  # textual's threads would outlive an exception
-            signal.signal(number, lambda *_: app.exit())
-        return app.run() == RESTARTED
-    finally:
-        bus.close()
+    run_id = the_run(run)
+    result: str | None = RESTARTED
+    while result == RESTARTED:
+        joined = open_run(run_id, ())
+        config = joined.path / "config.toml"
+        clock = clock_of(load(config if config.exists() else None))
+        with contextlib.closing(ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)) as bus:
+            app = Console(bus, run_id, clock, joined.restarted, terminal_gone=lambda: not sys.stdin.isatty())
+            for number in (signal.SIGTERM, signal.SIGINT):  # textual's threads would outlive an exception
+                signal.signal(number, lambda *_, app=app: app.exit())
+            result = app.run()

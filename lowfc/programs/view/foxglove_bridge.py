@@ -99,10 +99,8 @@ class FoxgloveBridge:
             self.service.beat()
             time.sleep(_POLL_S)
         self.service.finish()
-
-    def close(self) -> None:
-        """Disconnect the applications."""
-        self._server.stop()
+        if not self.service.running:
+            self._server.stop()
 
     def on_subscribe(self, client: "Client", channel: "ChannelView") -> None:
         """Send a client the state in force; called by the server."""
@@ -155,4 +153,3 @@ def serve_foxglove(run_id: str, clock: Clock, port: int = DEFAULT_PORT) -> None:
                 bridge.service.stop(earlier.why)
             sys.stderr.write(f"serving run {run_id!r} at ws://{HOST}:{bridge.port}; Ctrl-C ends it\n")
             bridge.run(joined.restarted)
-    bridge.close()
