@@ -476,7 +476,7 @@ def test_every_log_of_a_measured_recording_counts_and_is_removed(tmp_path: Path)
     logs = [tmp_path / "1.mcap", tmp_path / "2.mcap"]
     for log in logs:
         log.write_bytes(b"1234")
-    assert bench_module._removed(logs) == 8
+    assert bench_module._remove(logs) == 8
     assert list(tmp_path.iterdir()) == []
 
 

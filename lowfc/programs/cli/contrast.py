@@ -51,7 +51,7 @@ def contrast_in_words(
     """The added contrast of each case, and the modes that contribute most to the last one."""
     cases = ", ".join(f"{name} {value:+.1e}" for name, value in added.items() if value is not None)
     largest = "" if most is None else f"; {most[0]} contributes most ({100 * most[1]:.0f} %)"
-    caveat = f"; beyond quadratic, full images differ by more than 10 %: {', '.join(beyond)}" if beyond else ""
+    caveat = f"; full images differ from the quadratic form by more than 10 %: {', '.join(beyond)}" if beyond else ""
     return f"added to the dark zone's contrast: {cases}{largest}{caveat}"
 
 

@@ -64,9 +64,9 @@ class Recorder:
     ) -> None:
         """Subscribe to everything; `run` starts the recording. Each log starts with `metadata` and `attachments`.
 
-        Recording starts once each of the `awaited` processes has sent Health, or after a timeout. By default these are
-        all on the bus; across hosts it is any one, because the bus counts only the router. `expected_bytes_per_s` is
-        called before the first log begins, with the camera's state if there is one: growth until it has been measured.
+        Recording starts once each of the `awaited` processes has sent Health, or after a timeout. If none is named, it
+        awaits all on the bus; across hosts any one, because the bus counts only the router. `expected_bytes_per_s` is
+        called before the first log begins, with the camera's state or None; its result counts until growth is measured.
         """
         self._awaited = awaited
         self._bus = bus

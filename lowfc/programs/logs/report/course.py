@@ -53,7 +53,7 @@ def events(run: Run) -> list[Results]:
 
 
 def requests(run: Run) -> list[Results]:
-    """Operators' requests and their answers, except for the status and the renewal of leases."""
+    """Requests, also the controller's own, and their answers, except for the status and the renewal of leases."""
     steps = run.history.steps
     found = [request for request in run.history.requests if request.name not in ("status", "renew")]
     return [

@@ -17,7 +17,7 @@ from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.laws.linear_law import LinearLaw
 
 Results = dict[str, Any]
-"""Values that JSON can represent."""
+"""Results by their names in `--json`; NaN becomes null there."""
 
 
 @dataclass(frozen=True, slots=True)

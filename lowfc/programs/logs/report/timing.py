@@ -28,7 +28,7 @@ def timing_results(run: Run) -> Results:
 
 
 def intervals_ns(run: Run) -> dict[str, Long]:
-    """Intervals between frames and between commands by their send times, except across a restart of the camera.
+    """Intervals between frames, except across a restart of the camera, and between commands, by their send times.
 
     Intervals between frames are omitted if the log does not have every frame.
     """
