@@ -120,10 +120,11 @@ def config_zenoh(
 
     Example: lowfc config zenoh --role camera --run bench
     """
+    made = None
     if make and not run_path(run or DEFAULT_RUN).is_dir():
         part, _, mirror = role.partition("-")
         keys = {"mirror.name": mirror} if part == Role.MIRROR and mirror else {}
-        open_run(run or DEFAULT_RUN, (load(None, keys).mirror.name,))
+        made = open_run(run or DEFAULT_RUN, (load(None, keys).mirror.name,))
     try:
         joined = open_run((run or DEFAULT_RUN) if make else the_known_run(run), ())
     except BusError as fault:
@@ -132,6 +133,8 @@ def config_zenoh(
     local = sorted({*links.ports, "bench", "operator", "launcher"})
     known = roles(links.mirrors) if links.network.router else local
     if role not in known:
+        if made is not None:
+            made.remove()
         raise BusError(f"run {joined.run_id!r} has no role {role!r}; its roles are {', '.join(known)}")
     HostClock()  # writes the offset of the clock to a file, which the program reads
     typer.echo(json.dumps(session_config(links, role), indent=2))

@@ -107,7 +107,7 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
 
     Raises:
         ProcessDiedError: a process ended unexpectedly or with an error.
-        BusError: the controller did not report its timing.
+        BusError: the controller did not report its timing, or the recording stopped early.
     """
     watch, timings = Watch({}, []), TimingRows()
     states, frames = (Columns(sequence="Q", publish_ns="q") for _ in range(2))
