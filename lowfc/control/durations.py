@@ -5,7 +5,7 @@ from math import log
 import numpy as np
 
 _MIN_NS = 1_000
-RATIO = 1.01
+RATIO = 1.01  # upper over lower edge of a bin
 _BINS = 2_000
 
 

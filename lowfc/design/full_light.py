@@ -21,7 +21,7 @@ from lowfc.optics.chain.fourier import to_image
 from lowfc.optics.chain.sensor import Sensor, from_focus, pixel_sums, pupil_radii
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
 
-_WAVEFRONTS = 20
+_WAVEFRONTS = 20  # random wavefronts for each number of modes
 _SEED = 1
 
 

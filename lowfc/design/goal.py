@@ -21,7 +21,7 @@ from lowfc.design.merit import (
 from lowfc.design.paper import MODES, TABLE3_WAVES, TABLE4_MAS, TABLE4_MODES
 
 MERITS = ("paper", "table3", "table4", "condition", "throughput", "pareto", "contrast")
-WEIGHTED = ("paper", "pareto")
+WEIGHTED = ("paper", "pareto")  # merits with a weight between Tables 3 and 4
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from lowfc.optics.chain.coronagraph import Coronagraph
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
 
-WAVELENGTH_NM = 550.0
+WAVELENGTH_NM = 550.0  # Table 1
 CONTROLLED = len(NOLLS_14)
 """Number of controlled modes, for the noise, the added contrast and the share of the quantum limit."""
 

@@ -16,7 +16,7 @@ from lowfc.design.sam_merit import RELAY_SAMPLES, Mask, Optics, hole_fields
 Orbit = tuple[int, int, int]
 """Centre x, y and diameter of a hole, in thousandths of the pupil's diameter."""
 
-UNIT = 1000
+UNIT = 1000  # lengths are integers, this many to the diameter of the pupil
 SMALLEST = ceil(UNIT / RELAY_SAMPLES)
 """Smallest diameter of a hole: one sample of the relay pupil, since a smaller hole may cover none."""
 SYMMETRIES = ("none", "x", "y")

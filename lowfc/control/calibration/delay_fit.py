@@ -13,7 +13,7 @@ from lowfc.arrays import Array
 
 LAGS = 6
 """Number of frames in which a poke is searched for, from its own frame on."""
-MIN_FRAMES = 40 * LAGS
+MIN_FRAMES = 40 * LAGS  # consecutive ones from which a delay is measured
 MIN_SNR = 10.0
 """Least signal-to-noise ratio of a detected poke; noise alone exceeds it with a probability below 1e-13."""
 

@@ -16,12 +16,12 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import sensitivity
 from lowfc.control.laws.stability import delay_weights
 
-_FILTER_POINTS = 4096
+_FILTER_POINTS = 4096  # of the transform from a response to its taps
 _FILTER_OMEGA = np.linspace(0, np.pi, _FILTER_POINTS // 2 + 1)
 _FILTER_REACH = 48
 """Frames before and after from which a mean between measurements is interpolated."""
 
-_MOMENTS = 8
+_MOMENTS = 8  # instants of a period over which a mean square is taken
 _LONGEST = 5  # a command applied later, in periods, is implausible
 
 

@@ -13,7 +13,7 @@ from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import Block, LinearLaw, law_from_blocks
 from lowfc.control.laws.vibration import Model
 
-_DOUBLINGS = 40
+_DOUBLINGS = 40  # most iterations
 
 
 def lqg(models: Sequence[Model], noll: tuple[int, ...], timing: Timing) -> LinearLaw:

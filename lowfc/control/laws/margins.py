@@ -22,7 +22,7 @@ MAX_COUPLED_STATES = 100
 MAX_SETTLING_FRAMES = 4000
 """Upper limit of a law's settling time, frames."""
 
-_GRID = 2048
+_GRID = 2048  # frequencies of each regular grid
 _AROUND_POLE = np.concatenate([-np.geomspace(1e-2, 1e2, 33)[::-1], [0.0], np.geomspace(1e-2, 1e2, 33)])
 _LOWEST = 1e-6  # rad per frame: an integrator has no value at 0 Hz
 _ROUNDING = 1e-6  # a pole of undriven states may exceed 1 by this, from rounding to single precision

@@ -22,8 +22,8 @@ Controller = Callable[[Any, Single, Single], tuple[Any, Single]]
 
 MAX_DELAY_FRAMES = 5
 """Longest plausible delay of a working loop, frames."""
-_STILL_NM = 0.01
-_FEWEST = 20
+_STILL_NM = 0.01  # rms difference of successive commands below which they hardly move
+_FEWEST = 20  # steps or commands from which a delay is determined
 _NOT_NEW = sum(1 << reason for reason in NOT_NEW)
 
 

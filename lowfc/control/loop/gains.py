@@ -23,7 +23,7 @@ from lowfc.control.loop.wording import AUTO, counted
 _MAX_PREPARED = 64
 """Most leaks of a request whose limiting gains are cached; a request with more has more values than there are modes."""
 
-Changed = tuple[ActiveLoop, str, *tuple[PendingEvent, ...]]
+Changed = tuple[ActiveLoop, str, *tuple[PendingEvent, ...]]  # the loop after a request, its reply, events
 
 
 def changed_integrator(settings: Settings, loop: ActiveLoop, request: Request) -> Changed:

@@ -36,7 +36,7 @@ AMPLIFIED = 2.5
 """Ratio of mean squared error to the long-term mean square of the pseudo-open-loop modes above which the loop
 amplifies, unless the error is below `BETTER` of their current mean square: then the disturbance has grown."""
 
-NAMES = ("tip and tilt", "the other modes")
+NAMES = ("tip and tilt", "the other modes")  # of the groups
 LAW_RETURNS = "law returns"
 
 

@@ -13,6 +13,7 @@ from lowfc.control.loop.inputs import COUNT_BITS, Request
 from lowfc.control.loop.wording import AUTO
 
 MAX_S = 60.0
+"""Longest duration of a lease or permit without renewal, s."""
 MAX_HOLDER = 200
 """Most characters of the holder's description."""
 

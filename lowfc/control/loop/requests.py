@@ -21,7 +21,7 @@ from lowfc.control.loop.safety import Limits, LoopMode, Rejection, neighbour_dif
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
 from lowfc.control.loop.wording import MAX_NOTE_LENGTH, MEASURED_FIRST, PAUSED, counted
 
-MAX_STEPS = 1 << 32
+MAX_STEPS = 1 << 32  # frames of a request for steps
 MAX_REPLY_LENGTH = 1000
 """Most characters of a reply."""
 
@@ -84,7 +84,7 @@ def _short(text: str) -> str:
     return text if len(text) <= MAX_REPLY_LENGTH else f"{text[: MAX_REPLY_LENGTH - 3]}..."
 
 
-Handled = tuple[State, str, *tuple[PendingEvent, ...]]
+Handled = tuple[State, str, *tuple[PendingEvent, ...]]  # the state after a request, its reply, events
 Handler = Callable[[Settings, State, Request], Handled]
 
 
