@@ -180,7 +180,7 @@ def _slow(times: Integers, frames: int, slowest: float) -> Array:
     return np.linalg.qr(np.cos(np.pi * np.outer((times + 0.5) / frames, orders)))[0]
 
 
-def measured(sums: Sums) -> Measured:
+def fit_response(sums: Sums) -> Measured:
     """Response, standard error and reference from all cycles; ValueError if there is no cycle."""
     n = sums.cycles
     if n < 1:

@@ -59,7 +59,7 @@ class Departure:
     within: Mask
 
 
-def measured(error_nm: Array, added_nm: Array) -> Lines:
+def measure_lines(error_nm: Array, added_nm: Array) -> Lines:
     """S at the lines of the signal added to the loop's input.
 
     Hann's window keeps high frequencies, which the loop does not reject, out of the low ones, where the error is small;

@@ -116,7 +116,7 @@ def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> 
     return Gains(gains, *rms)
 
 
-def identified(run: TimeSeries, rate_hz: float) -> list[Model]:
+def identify_modes(run: TimeSeries, rate_hz: float) -> list[Model]:
     """A model of each mode of pseudo-open-loop modes (frames, modes).
 
     Raises:

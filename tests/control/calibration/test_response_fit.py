@@ -29,7 +29,7 @@ from lowfc.control.calibration.response_fit import (
     check,
     cross_talk,
     cycle_response,
-    measured,
+    fit_response,
     normalised,
     row_error,
     without_outliers,
@@ -152,7 +152,7 @@ def calibrated(patterns: np.ndarray, cycles: int, drift: float = 0.0) -> Measure
         frames = exposed(plan.table + wander, 100 + number)
         fractions, flux = fractions_of(frames)
         sums = sums.plus(cycle_response(fractions, flux, plan.table, plan.table, plan.used.astype(float)))
-    return measured(sums)
+    return fit_response(sums)
 
 
 @pytest.mark.parametrize("patterns", [poke_patterns(MODES, 8.0), hadamard_patterns(MODES, 3.0)])

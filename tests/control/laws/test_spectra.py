@@ -23,7 +23,7 @@ from lowfc.control.laws.spectra import (
     time_series,
 )
 from lowfc.control.laws.stability import delay_weights, settling_frames
-from lowfc.control.laws.transfer_function import departure, measured, seen_of_mirror
+from lowfc.control.laws.transfer_function import departure, measure_lines, seen_of_mirror
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import LoopMode
@@ -166,7 +166,7 @@ def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: fl
     error_nm, _, _ = through(setup, [request], len(table))
     weights = delay_weights(delay_frames)
     added = -period.astype(float) if target == "offset" else seen_of_mirror(period.astype(float), weights)
-    found = measured(error_nm[lead:], added)
+    found = measure_lines(error_nm[lead:], added)
 
     assert [np.sort(np.round(found.frequency[found.mode == mode] * PERIOD)).tolist() for mode in range(3)] == [
         one.tolist() for one in places
@@ -233,8 +233,8 @@ def test_a_vibration_near_a_line_raises_its_error() -> None:
     place = int(lines(PERIOD, 1, 10, 0.005, 0.3)[0][4])
     time = np.arange(PERIOD)
     error = 0.5 * period + 0.01 * rng.standard_normal(period.shape)
-    quiet = measured(error, period)
-    vibrating = measured(error + np.sin(2 * np.pi * (place + 0.4) / PERIOD * time)[:, None], period)
+    quiet = measure_lines(error, period)
+    vibrating = measure_lines(error + np.sin(2 * np.pi * (place + 0.4) / PERIOD * time)[:, None], period)
     assert np.abs(quiet.rejection - 0.5).max() < 0.02
     assert vibrating.error[4] > 10 * quiet.error[4]
     assert abs(vibrating.rejection[4] - 0.5) < 5 * vibrating.error[4]
@@ -242,9 +242,9 @@ def test_a_vibration_near_a_line_raises_its_error() -> None:
 
 def test_a_measurement_without_a_signal_is_refused() -> None:
     with pytest.raises(ValueError, match="nothing was added"):
-        measured(np.zeros((100, 3)), np.zeros((100, 3)))
+        measure_lines(np.zeros((100, 3)), np.zeros((100, 3)))
     with pytest.raises(ValueError, match="same frames"):
-        measured(np.zeros((100, 3)), np.zeros((99, 3)))
+        measure_lines(np.zeros((100, 3)), np.zeros((99, 3)))
 
 
 def test_a_staircase_limits_its_steps_and_holds_its_levels() -> None:

@@ -11,7 +11,7 @@ from lowfc.control.calibration.excitation import lines, multisine, with_lead_in
 from lowfc.control.laws import margins
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
-from lowfc.control.laws.transfer_function import Departure, Lines, departure, measured, seen_of_mirror
+from lowfc.control.laws.transfer_function import Departure, Lines, departure, measure_lines, seen_of_mirror
 from lowfc.control.loop.command_channels import MIRROR, OFFSET
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted
@@ -131,7 +131,7 @@ def transfer_function(response: ProbeResponse) -> Lines:
     response.check(LoopMode.CLOSED)
     period = response.table[-response.what["period_frames"] :].astype(float)
     added = -period if response.target == OFFSET else seen_of_mirror(period, delay_weights(response.loop.delay_frames))
-    return measured(response.filled(response.error_nm)[-len(period) :], added)
+    return measure_lines(response.filled(response.error_nm)[-len(period) :], added)
 
 
 def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> RejectionResult:

@@ -32,7 +32,7 @@ from lowfc.control.calibration.response_fit import (
     best_initial,
     check,
     correlation,
-    measured,
+    fit_response,
 )
 from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.loop.wording import counted
@@ -206,7 +206,7 @@ class Calibrator:
                 sums = sums.plus(self._player.cycle(pokes.cycle(done), delay.delay_frames))
                 store(path, sums, self._conditions)
                 self.completed = sums.cycles
-            found = measured(sums)
+            found = fit_response(sums)
             more = pokes.more_cycles(needed, float(found.error.max()))
             if more <= needed:
                 return found

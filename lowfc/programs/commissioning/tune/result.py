@@ -16,7 +16,7 @@ from lowfc.control.laws.tuning import (
     Tuned,
     best_gains,
     frame_noise_nm2,
-    identified,
+    identify_modes,
     predicted_nm,
     predicted_nm2,
     tune_integrator,
@@ -38,7 +38,7 @@ def tuned(run: Telemetry, controller: str) -> tuple[Tuned, Gains]:
     """The best law of a kind for a run; ValueError if there are too few frames, or no law of this kind is stable."""
     leak = run.law.leak.astype(np.float64)
     gains = best_gains(run.pol, run.rate_hz, run.timing, leak)
-    models = identified(run.pol, run.rate_hz)
+    models = identify_modes(run.pol, run.rate_hz)
     match controller:
         case "integrator":
             return tune_integrator(models, gains, run.noll, leak, run.timing), gains

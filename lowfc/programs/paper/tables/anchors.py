@@ -20,7 +20,7 @@ from lowfc.contract.errors import LowfcError
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.kalman import lqg
 from lowfc.control.laws.spectra import time_series
-from lowfc.control.laws.tuning import identified, predicted_nm
+from lowfc.control.laws.tuning import identify_modes, predicted_nm
 from lowfc.design.paper import TABLE4_MAS
 from lowfc.design.tolerance import best_gain, drift_residual_nm2
 from lowfc.design.trials import noisy_e
@@ -162,7 +162,7 @@ def _means_row(made: Callable[..., Row], history: History, where: str) -> Row:
 def _quantum_pointing_nm(history: History, name: str) -> float:
     """Tilt per axis predicted for LQG from this log, with the noise of the quantum limit."""
     steps = history.steps
-    models = identified(time_series(steps.sequence, steps.pol_nm[:, :2]), RATE_HZ)
+    models = identify_modes(time_series(steps.sequence, steps.pol_nm[:, :2]), RATE_HZ)
     scale = (EXPOSURE / RATE_HZ) / (tolerance.EXPOSURE / tolerance.RATE_HZ)
     noise = tolerance.quantum_noise_nm2(name, MAGNITUDE)[:2] / scale
     models = [replace(model, noise_nm2=float(n)) for model, n in zip(models, noise, strict=True)]
