@@ -15,7 +15,7 @@ from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import delay_weights
-from lowfc.control.laws.tuning import Tuned, best_gains, identified, tune_integrator, tune_lqg, tune_pi_notch
+from lowfc.control.laws.tuning import Tuned, best_gains, identify_modes, tune_integrator, tune_lqg, tune_pi_notch
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Command as ModalCommand
 from lowfc.control.loop.inputs import Frame, Input, Load, Outputs, PendingEvent, Request, Step
@@ -227,7 +227,7 @@ def tuned(run: TimeSeries, config: Configuration, kinds: Sequence[str] = ("lqg",
     noll = config.noll[: run.values[0].shape[1]]
     rate_hz, none = config.camera.rate_hz, np.zeros(len(noll))
     timing = timing_of(config)
-    gains, models = best_gains(run, rate_hz, timing, none), identified(run, rate_hz)
+    gains, models = best_gains(run, rate_hz, timing, none), identify_modes(run, rate_hz)
     makers: dict[str, Callable[[], Tuned]] = {
         "integrator": lambda: tune_integrator(models, gains, noll, none, timing),
         "pi-notch": lambda: tune_pi_notch(models, gains, noll, none, timing),
