@@ -164,7 +164,7 @@ def test_infeasible_request_reports_the_nearest_feasible_one(tmp_path):
         ({"cells": 100}, "cells must be 8, 16"),
         ({"outer": 20.0, "cells": 16}, "16 lambda/D"),
         ({"inner": 20.0}, "20 to 20"),
-        ({"inner": 4.01, "outer": 4.09, "half_angle_deg": 1.0}, "at least 0.1 lambda/D above"),
+        ({"inner": 4.01, "outer": 4.09, "half_angle_deg": 1.0}, "at least 0.1 lambda/D further out"),
         ({"half_angle_deg": 95.0}, "half-angle"),
         ({"contrast": 0.0}, "contrast must"),
         ({"limit": 1.1}, "limit"),
