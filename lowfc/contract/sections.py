@@ -173,9 +173,10 @@ class Camera(Section):
     """Simulated camera: instants of each period over which the true wavefront is averaged. With 1, wavefront and image
     are those at the start of the exposure, without blur."""
     noise: bool = True
-    """Photon and read noise; off only for tests of the control law."""
+    """Simulated camera: photon and read noise; off only for tests of the control law."""
     photon_noise: Literal["fast", "exact"] = "fast"
-    """fast: faint pixels from a tabulated distribution, variance at most 6e-5 e-^2 too large; exact: all electrons."""
+    """Simulated camera: fast: faint pixels from a tabulated distribution, variance at most 6e-5 e-^2 too large;
+    exact: all electrons."""
 
 
 class Disturbance(Section):
@@ -244,7 +245,7 @@ class Mirror(Section):
     driver_bits: int = Field(16, ge=8, le=24)
     """Bits of the driver over the full range."""
     settling_us: NotNegative = 50.0
-    """Time constant of an actuator's first-order response."""
+    """Simulated mirror: time constant of an actuator's first-order response."""
     dead: list[int] = Field(default_factory=list)
     """Actuators that stay flat: row * columns + column."""
     stuck_nm: dict[str, float] = Field(default_factory=dict)

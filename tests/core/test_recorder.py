@@ -172,7 +172,7 @@ def test_the_loss_account_counts_gaps_from_the_first_message_of_each_start() -> 
         account.enter(*entry(FRAME, count, start_s=101), recorded=True)
     account.enter(*entry(FRAME, 6, start_s=101), recorded=False)
     assert account.lost() == {FRAME.key: 4}
-    assert (account.newly_lost(), account.news()) == ({FRAME.key: 4}, {})
+    assert (account.newly_lost(), account.newly_lost()) == ({FRAME.key: 4}, {})
     account.enter(*entry(FRAME, 8, start_s=101), recorded=True)
     assert account.newly_lost() == {FRAME.key: 1}
 
@@ -208,7 +208,7 @@ def test_frames_that_the_camera_missed_before_publishing_are_not_losses() -> Non
     account.enter(*entry(FRAME, 56), recorded=True)
     assert account.newly_lost() == {}, "the camera may still report that it missed them"
     reconcile(account, 57, missing=10)
-    assert (account.newly_lost(), account.news()) == ({FRAME.key: 1}, {}), "one was lost on the bus"
+    assert (account.newly_lost(), account.newly_lost()) == ({FRAME.key: 1}, {}), "one was lost on the bus"
 
 
 def test_duplicates_neither_count_as_losses_nor_hide_them() -> None:

@@ -44,6 +44,7 @@ class Service:
     Attributes:
         name: name of the process, such as "camera" or "mirror-dm".
         running: True until SIGTERM, SIGINT or `stop`.
+        why: cause of the end, once it is stopped.
         work: number of frames, commands or messages processed; `rate_hz` in Health is its rate.
         last_health: newest Health of every other process, by name.
         announces: whether it prints on standard error that it is ready, and which processes it waits for.
