@@ -6,7 +6,7 @@ import numpy.typing as npt
 from lowfc.arrays import Single
 from lowfc.contract.errors import RequestRefusedError
 
-INVALID = (ValueError, TypeError, OverflowError)
+ARGUMENT_ERRORS = (ValueError, TypeError, OverflowError)
 """Errors of numpy and protobuf for an argument that is not of the required type."""
 
 
@@ -14,5 +14,5 @@ def floats(name: str, values: npt.ArrayLike) -> Single:
     """Values of any shape, in their unit, as float32; RequestRefusedError if some are not numbers."""
     try:
         return np.asarray(values, np.float32)
-    except INVALID as fault:
+    except ARGUMENT_ERRORS as fault:
         raise RequestRefusedError(f"{name} refused: {fault}") from None

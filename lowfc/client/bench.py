@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 
-from lowfc.client.arguments import INVALID
+from lowfc.client.arguments import ARGUMENT_ERRORS
 from lowfc.contract.codecs.bench_codec import encode_bench_value
 from lowfc.contract.errors import BadMessageError, ConfigurationError
 from lowfc.contract.sections import BENCH_NAME
@@ -24,5 +24,5 @@ def bench_message(name: str, value: Value, time_ns: int) -> bytes:
     try:
         plain = value.item() if isinstance(value, np.generic) else value  # numpy's `True` is true, not 1
         return encode_bench_value(plain, time_ns)
-    except (BadMessageError, *INVALID) as fault:
+    except (BadMessageError, *ARGUMENT_ERRORS) as fault:
         raise ConfigurationError(f"bench value {name}: {fault}") from None

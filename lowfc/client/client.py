@@ -21,7 +21,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.host import by_this_process, program_name
 from lowfc.arrays import Single
 from lowfc.client.answer import Answer
-from lowfc.client.arguments import INVALID, floats
+from lowfc.client.arguments import ARGUMENT_ERRORS, floats
 from lowfc.client.bench import bench_message
 from lowfc.client.lease import Lease, new_identity
 from lowfc.client.mirror_watch import MirrorWatch
@@ -351,7 +351,7 @@ class Client:
                 lease_id=(self._lease.id if self._lease is not None else 0) if lease_id is None else lease_id,
                 requester=self._requester,
             )
-        except INVALID as fault:
+        except ARGUMENT_ERRORS as fault:
             raise RequestRefusedError(f"{name} refused: {fault}") from None
         if calibration is not None:
             message.calibration.MergeFromString(encode_calibration(calibration, 0))

@@ -4,7 +4,7 @@ import struct
 from typing import NamedTuple
 
 from lowfc.contract.errors import BadMessageError
-from lowfc.contract.messages import LATEST_NS, SEQUENCES
+from lowfc.contract.messages import LATEST_NS, SEQUENCE_BOUND
 from lowfc.control.loop.inputs import COUNT_BITS
 
 __all__ = ["COUNT_BITS", "Envelope", "count_of", "sequence_of", "start_of"]
@@ -45,7 +45,7 @@ class Envelope(NamedTuple):
         BadMessageError as for `decode`, and if the sequence is not below 2^64 - 2^33 or the time is above 2^62 ns.
         """
         sequence, publish_time_ns = found = cls.decode(data)
-        if sequence >= SEQUENCES or publish_time_ns > LATEST_NS:
+        if sequence >= SEQUENCE_BOUND or publish_time_ns > LATEST_NS:
             raise BadMessageError(
                 f"an envelope's sequence is below 2^64 - 2^33 and its time at most 2^62 ns, got {sequence} and "
                 f"{publish_time_ns} ns; the sequence is the publisher's start in unix seconds << 32 | its count"

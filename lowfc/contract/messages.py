@@ -300,7 +300,7 @@ def from_timestamp(stamp: Timestamp) -> int:
 
 LATEST_NS = 1 << 62
 """Latest valid time of a message, in the year 2116."""
-SEQUENCES = (1 << 64) - (1 << 33)
+SEQUENCE_BOUND = (1 << 64) - (1 << 33)
 """Bound of valid sequences, so that neither start nor count can overflow; starts go up to the year 2106."""
 
 
@@ -314,8 +314,8 @@ def checked_time_ns(stamp: Timestamp) -> int:
 
 def checked_sequence(sequence: int) -> int:
     """A received frame sequence; BadMessageError if it is out of range."""
-    if not 0 <= sequence < SEQUENCES:
-        raise BadMessageError(f"its frame sequence is {sequence}, not below {SEQUENCES}")
+    if not 0 <= sequence < SEQUENCE_BOUND:
+        raise BadMessageError(f"its frame sequence is {sequence}, not below {SEQUENCE_BOUND}")
     return sequence
 
 

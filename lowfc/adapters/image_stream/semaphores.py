@@ -7,7 +7,7 @@ import time
 
 from lowfc.adapters.image_stream.layout import SEMAPHORE_BYTES
 
-MOST = 10
+MAX_VALUE = 10
 """Value at which a semaphore is no longer posted: its reader is behind or absent."""
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
@@ -60,12 +60,12 @@ class Semaphores:
                 return
 
     def post_all(self) -> list[int]:
-        """Post each semaphore except those at `MOST`; return the indices posted."""
+        """Post each semaphore except those at `MAX_VALUE`; return the indices posted."""
         value, found = self._value, ctypes.byref(self._value)
         posted = []
         for index, address in enumerate(self._addresses):
             _LIBC.sem_getvalue(address, found)
-            if value.value < MOST:
+            if value.value < MAX_VALUE:
                 _LIBC.sem_post(address)
                 posted.append(index)
         return posted

@@ -28,7 +28,7 @@ from lowfc.contract.messages import (
     PLAY,
     REQUEST,
     REQUEST_KEY,
-    SEQUENCES,
+    SEQUENCE_BOUND,
     STEP,
     TIMING,
     wire,
@@ -225,7 +225,7 @@ class Controller:
     def _warm_up(self) -> None:
         """Repeat the last step and discard the result: other work evicts its code and data from the caches."""
         with self._lock:
-            if self._last_sample is None or self._state.frame_sequence + 1 >= SEQUENCES:
+            if self._last_sample is None or self._state.frame_sequence + 1 >= SEQUENCE_BOUND:
                 return
             frame = codec.decode_frame(self._last_sample.payload, self._state.frame_sequence + 1, 0)
             _, outputs = advance(self._settings, self._state, frame)

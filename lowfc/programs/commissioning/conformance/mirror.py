@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from lowfc.arrays import Mask, Single
-from lowfc.contract.messages import SEQUENCES, from_timestamp, wire
+from lowfc.contract.messages import SEQUENCE_BOUND, from_timestamp, wire
 from lowfc.device.mirror_protection import MAX_VALID_NS
 from lowfc.programs.commissioning.checks import Check, Status, judged, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Show
@@ -71,7 +71,7 @@ def _idle(mirror: Dialogue) -> Iterator[Check]:
         got = f"{mirror.unreadable} states are not a lowfc.v1.MirrorState"
         yield wrong(got, "encode the message as declared")._replace(name="state", expected=expected)
         return
-    if states and (sequence := states[-1].frame_sequence) >= SEQUENCES:
+    if states and (sequence := states[-1].frame_sequence) >= SEQUENCE_BOUND:
         advice = "report the frame_sequence of the applied command, 0 before the first one"
         yield wrong(f"frame_sequence {sequence}", advice)._replace(name="state", expected=expected)
     check, rate_hz = ok(f"{len(states) / IDLE_S:.0f} a second"), len(states) / IDLE_S
