@@ -1,3 +1,5 @@
+"""Log files: written and read again, damaged, truncated, growing, and never overwritten."""
+
 import dataclasses
 import errno
 import tracemalloc

@@ -20,7 +20,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.latch import Latch, latch_files
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import REQUEST_KEY, Role, wire
-from tests.support.loops import lowfc, until
+from tests.support.loops import lowfc, mount, until
 
 pytestmark = pytest.mark.usefixtures("own_runtime")
 FULL_DISK = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
@@ -164,6 +164,7 @@ def test_an_invalid_stored_start_is_ignored(text: str) -> None:
 
 def test_safe_is_requested_even_if_the_runs_directory_is_read_only() -> None:
     run = open_run("night")
+    mount("--bind", run.path, run.path)
     bus = ZenohBus(run.links, "controller", HostClock())
     requested: list[str] = []
 
@@ -174,8 +175,7 @@ def test_safe_is_requested_even_if_the_runs_directory_is_read_only() -> None:
         )
 
     bus.queryable(REQUEST_KEY.format(name=ALL), answer)
-    subprocess.run(["mount", "--bind", run.path, run.path], check=True)
-    subprocess.run(["mount", "-o", "remount,bind,ro", run.path], check=True)
+    mount("-o", "remount,bind,ro", run.path)
     try:
         with pytest.raises(OSError, match="Read-only"):
             (run.path / "start-operator").write_text("")

@@ -1,3 +1,5 @@
+"""What every process does: health, events, unreadable messages, and its end by a signal."""
+
 import os
 import signal
 import subprocess

@@ -394,7 +394,7 @@ def test_mirror_watch_reports_restarts_and_expired_commands_and_ignores_damaged_
         return lambda frame: states.put(wire.MirrorState(frame_sequence=frame).SerializeToString())
 
     slow, quick = process("mirror-slow"), process("mirror-quick")
-    bus = Announced(hub, lambda: slow(1))
+    bus = ReportingBus(hub, lambda: slow(1))
     watch = Client(bus=bus).mirror_watch()
     assert (watch.frame_sequence, watch.interruption) == (1, "")
     slow(7)
@@ -421,7 +421,7 @@ def test_mirror_watch_reports_a_mirror_that_stopped_following(refused: int, why:
     def report(status: int, refused: int = 0) -> None:
         states.put(wire.MirrorState(status=status, refused=refused).SerializeToString())
 
-    watch = Client(bus=Announced(hub, lambda: report(wire.MIRROR_STATUS_EXPIRED))).mirror_watch()
+    watch = Client(bus=ReportingBus(hub, lambda: report(wire.MIRROR_STATUS_EXPIRED))).mirror_watch()
     report(wire.MIRROR_STATUS_FOLLOWING)
     watch.read()
     assert watch.interruption == "", "it did not follow before"
@@ -431,7 +431,7 @@ def test_mirror_watch_reports_a_mirror_that_stopped_following(refused: int, why:
     assert watch.interruption == f"the mirror 'dm' did not follow commands, because {why}"
 
 
-class Announced(MemoryBus):
+class ReportingBus(MemoryBus):
     """A bus on which `report` is called at each subscription of a ring."""
 
     def __init__(self, hub: MemoryHub, report: Callable[[], object]) -> None:
@@ -492,7 +492,7 @@ def test_a_silent_stream_raises_also_at_its_start() -> None:
 
 def test_an_ended_stream_unsubscribes(controller: FakeController) -> None:
     publisher = controller.bus.publisher(FRAME)
-    bus = Announced(controller.hub, lambda: [publisher.put(frame_sample(count).payload) for count in range(3)])
+    bus = ReportingBus(controller.hub, lambda: [publisher.put(frame_sample(count).payload) for count in range(3)])
     loop, before = Client(bus=bus), list(bus._subscriptions)
     assert [frame.pixels[0, 0] for frame in loop.frames(2)] == [0, 1], "from the first frame after the call"
     assert bus._subscriptions == before
@@ -734,7 +734,7 @@ def test_contrast_is_estimated_for_a_real_camera_and_true_for_a_simulated_one() 
     assert real["added_contrast"] == {"open": 2e-9, "closed": 3e-11}
     assert "+3.0e-11, estimated from the sensor" in text(real)
     assert simulated["added_contrast"] == {"open": 4e-9, "closed": 5e-11}
-    assert "as measured" not in text(simulated)
+    assert "estimated" not in text(simulated)
 
 
 def test_a_configuration_with_a_date_is_printed_as_json(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -257,7 +257,7 @@ def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:
 def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
     loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(CalibrationError, match=r"not dark: .*; block the star|not dark"):
+    with pytest.raises(CalibrationError, match=r"not dark: .*; block the star"):
         json_of("dark", "--star-blocked", "--frames", "50")
     rng = np.random.default_rng(5)
     cube = np.rint(100 + 1.5 * rng.standard_normal((64, 80, 80)))
@@ -438,7 +438,7 @@ def test_the_response_is_the_derivative_of_the_image(optics: Twin) -> None:
 
 
 def test_a_mirror_shape_for_at_equals_the_wavefront_it_makes(
-    config: Configuration, optics: Twin, there: Calibration, tmp_path: Path
+    config: Configuration, there: Calibration, tmp_path: Path
 ) -> None:
     flat = analytic(config, SILENT)
     command_nm = np.zeros(len(flat.noll))

@@ -44,7 +44,7 @@ from lowfc.programs.commissioning.conformance.frames import camera_checks
 from lowfc.programs.commissioning.conformance.line import Line, Received
 from lowfc.programs.commissioning.conformance.mirror import mirror_checks
 from lowfc.testing.clock import FakeClock
-from tests.support.loops import lowfc, refusal, until
+from tests.support.loops import json_of, refusal, until
 from tests.support.safety_checks import Simulated
 
 MS = 1_000_000
@@ -503,9 +503,8 @@ def test_conformance_refuses_runs_that_it_cannot_check(tmp_path: Path) -> None:
 def test_an_absent_camera_fails_the_check_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     open_run("bench")
     monkeypatch.setattr(conformance, "CONNECT_S", 0.0)
-    done = lowfc("conformance", "camera", "--run", "bench", "--duration", "0.2", "--json")
-    assert done.exit_code == 1
-    checks = {check["name"]: check for check in json.loads(done.stdout)["checks"]}
+    found = json_of("conformance", "camera", "--run", "bench", "--duration", 0.2, status=1)
+    checks = {check["name"]: check for check in found["checks"]}
     assert checks["frames"]["status"] == "wrong"
     assert "received: nothing" in checks["frames"]["got"]
 

@@ -120,8 +120,7 @@ def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
     found = tune(path)
     assert not found["closed"]
     assert found["modes"][0]["achieved_nm"] is None
-    small = found["tilt_mas"]["open"]
-    assert ("optical gain" in " ".join(found["warnings"])) == (small > 10)
+    assert found["warnings"] == []
     run = telemetry_from_log(LogReader(path))
     larger = replace(run, nm_per_mas=run.nm_per_mas / 10)  # type: ignore[operator]
     warned = result_of(larger, *tuned(larger, "integrator"), "integrator").text()

@@ -68,10 +68,11 @@ def test_an_interlock_holds_and_releases_the_command_at_the_next_frame() -> None
     count, acting, flips, logged = 5, False, 0, []
     start = state
     while flips < 100:
-        input_ = frame(count := count + 1, rng.normal(0, 10, 3))
         if rng.random() < 0.3:
             acting, flips, input_ = not acting, flips + 1, mask(not acting)
-            count -= 1
+        else:
+            count += 1
+            input_ = frame(count, rng.normal(0, 10, 3))
         before, (state, outputs) = state, advance(setup, state, input_)
         logged.append((input_, outputs))
         if outputs.step is not None:
@@ -159,7 +160,6 @@ def test_a_value_that_is_too_old_acts_as_configured() -> None:
         state, all_outputs = feed(setup, running(setup), mask(False, 2 * S + 1), frame(6, SOME))
         assert bool(state.conditions.acting) is acting
         assert all_outputs[-1].step.reasons == ((Rejection.HELD,) if acting else ())
-        setup = under(Action.HOLD, acts_when_old=acting)
         state, all_outputs = feed(setup, running(setup), mask(True), mask(True, 2 * S + 1))
         assert [one.why for one in state.conditions.acting] == ["no value of mask for more than 2 s"] * acting
         assert names(all_outputs) == ["INTERLOCK_ACTS", "INTERLOCK_ACTS" if acting else "INTERLOCK_CLEARED"]

@@ -199,7 +199,7 @@ class Run:
     counts: Counter[tuple[str, bool]]
 
 
-def serialised(input_: Input, outputs: Outputs, state: State, setup: Settings) -> bytes:
+def serialised(input_: Input, outputs: Outputs, state: State) -> bytes:
     """All outputs of an input, as on the bus."""
     step = codec.encode_step(outputs.step, state.input_number) if outputs.step else b""
     command = codec.encode_command(outputs.command, 1, "c", state.input_number) if outputs.command else b""
@@ -218,7 +218,7 @@ def checked_advance(setup: Settings, state: State, input_: Input) -> tuple[State
     before = controller_state(state, setup, 0)
     after, outputs = advance(setup, state, input_)
     again, repeated = advance(setup, state, input_)
-    assert serialised(input_, repeated, again, setup) == serialised(input_, outputs, after, setup)
+    assert serialised(input_, repeated, again) == serialised(input_, outputs, after)
     assert controller_state(again, setup, 0) == controller_state(after, setup, 0)
     assert controller_state(state, setup, 0) == before
     if isinstance(input_, Frame):
@@ -258,7 +258,7 @@ def random_run(setup: Settings, names: list[str], pauses: list[int], seed: int) 
         for input_ in between(script, name, pause, run):
             run.state, outputs = checked_advance(setup, run.state, input_)
             run.inputs.append(input_)
-            run.outputs.append(serialised(input_, outputs, run.state, setup))
+            run.outputs.append(serialised(input_, outputs, run.state))
             if outputs.reply is not None:
                 run.counts[name, outputs.reply.accepted] += 1
     return run
@@ -284,7 +284,7 @@ def replayed(setup: Settings, state: State, run: Run, begin: int) -> tuple[State
             logged = wire.Request.FromString(codec.encode_request(input_, Reply(True, "", 0), 1, None))
             resent = codec.request(logged, logged.name, 7, KNOWN)
         state, outputs = advance(setup, state, resent)
-        sent.append(serialised(resent, outputs, state, setup))
+        sent.append(serialised(resent, outputs, state))
     return state, sent
 
 

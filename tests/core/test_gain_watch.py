@@ -339,10 +339,10 @@ def test_a_mode_can_have_a_manual_gain_and_return_to_automatic() -> None:
 
 def watched(*inputs: Input) -> list[str]:
     """Names of the requests of the gain watch for these inputs to a toy loop with automatic gains."""
-    what = settings(auto_gain=(True, True), start_mode=LoopMode.OPEN)
-    watch, state, found = GainWatch(what, "warn"), loaded(what), []
+    setup = settings(auto_gain=(True, True), start_mode=LoopMode.OPEN)
+    watch, state, found = GainWatch(setup, "warn"), loaded(setup), []
     for input_ in inputs:
-        state, outputs = advance(what, state, input_)
+        state, outputs = advance(setup, state, input_)
         if outputs.step is not None:
             found += [request.name for request in watch.observe(outputs.step, state).requests]
     return found

@@ -56,7 +56,7 @@ def small(whole: Path) -> Path:
     return out
 
 
-def of(messages: list[Sample], topic: Topic) -> list[Sample]:
+def on(messages: list[Sample], topic: Topic) -> list[Sample]:
     return [message for message in messages if topic.matches(message.key)]
 
 
@@ -91,11 +91,11 @@ def test_every_tenth_frame_is_recorded_and_the_others_do_not_count_as_lost(tmp_p
     mirror.finish()
     summary = bench.stop()
     messages = logged(summary)
-    assert [count_of(one.sequence) for one in of(messages, FRAME)] == [0, 10, 20, 30, 40, 50, 70, 80, 90]
-    recorded = [count_of(wire.MirrorState.FromString(one.payload).frame_sequence) for one in of(messages, MIRROR_STATE)]
+    assert [count_of(one.sequence) for one in on(messages, FRAME)] == [0, 10, 20, 30, 40, 50, 70, 80, 90]
+    recorded = [count_of(wire.MirrorState.FromString(one.payload).frame_sequence) for one in on(messages, MIRROR_STATE)]
     assert recorded == [number for ten in range(0, 100, 10) for number in (ten, ten)]
-    assert len(of(messages, COMMAND)) == 95
-    assert not of(messages, SURFACE)
+    assert len(on(messages, COMMAND)) == 95
+    assert not on(messages, SURFACE)
     assert summary.lost == {FRAME.key: 2}
     (path,) = summary.files
     found = survey(path)
@@ -109,10 +109,10 @@ def test_every_tenth_frame_is_recorded_and_the_others_do_not_count_as_lost(tmp_p
 def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
     before, after = list(LogReader(whole)), list(LogReader(small))
     assert bodies_of(after, STEP) == bodies_of(before, STEP)
-    assert len(of(after, COMMAND)) == len(of(before, COMMAND))
-    assert [one.sequence for one in of(after, FRAME)] == [one.sequence for one in of(before, FRAME)][::EVERY]
-    frames = {one.sequence for one in of(after, FRAME)}
-    states = of(after, MIRROR_STATE)
+    assert len(on(after, COMMAND)) == len(on(before, COMMAND))
+    assert [one.sequence for one in on(after, FRAME)] == [one.sequence for one in on(before, FRAME)][::EVERY]
+    frames = {one.sequence for one in on(after, FRAME)}
+    states = on(after, MIRROR_STATE)
     assert {wire.MirrorState.FromString(one.payload).frame_sequence for one in states} == frames
     found = survey(small)
     assert (found["messages_missing"], found["state"], "recovery" in found["metadata"]) == (0, "complete", False)
@@ -120,7 +120,7 @@ def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
     made = Selection(20, frozenset({MIRROR_STATE, SURFACE, TIMING, TRUTH}))
     assert again["selection"] == made.description
     assert Selection.of(survey(path := Path(again["file"]))["metadata"]) == made
-    assert len(of(list(LogReader(path)), FRAME)) == FRAMES // 20
+    assert len(on(list(LogReader(path)), FRAME)) == FRAMES // 20
     with pytest.raises(DataFileError, match="already exists"):
         thin((whole,), small, Selection(2))
 
@@ -136,7 +136,7 @@ def test_a_smaller_copy_has_all_messages_of_an_unknown_topic(tmp_path: Path, mon
     done = thin((log,), tmp_path / "small.mcap", Selection(EVERY))
     messages = list(LogReader(Path(done["file"])))
     assert [one.payload for one in messages if one.key == newer] == [b"newer"] * 3
-    assert len(of(messages, FRAME)) == 3
+    assert len(on(messages, FRAME)) == 3
 
 
 def test_replay_refuses_a_log_without_all_frames_in_one_sentence(small: Path) -> None:
@@ -153,7 +153,7 @@ def test_replay_needs_frames_but_no_other_optional_topic(whole: Path) -> None:
     assert json_of("replay", out)["frames"] == FRAMES
 
 
-def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: Path, tmp_path: Path) -> None:
+def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: Path) -> None:
     changes = requested("gain=0.3", None, None, None)
     found = [what_if(LoggedRun(read_history(LogReader(log))), changes) for log in (whole, small)]
     for results in found:
@@ -220,7 +220,7 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     assert "1 in 10 frames" in estimate(fewer)
 
 
-def test_record_start_names_the_request(tmp_path: Path) -> None:
+def test_record_start_names_the_request() -> None:
     assert "`lowfc ctl record start`" in refusal("record", "start", kind=ConfigurationError)
 
 

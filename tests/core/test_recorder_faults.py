@@ -23,7 +23,7 @@ from lowfc.contract.messages import CALIBRATION, COMMAND, EVENT, FRAME, HEALTH, 
 from lowfc.programs.core.recording import recorder as recorder_module
 from lowfc.programs.core.recording.summary import Summary
 from lowfc.testing.memory_bus import MemoryBus
-from tests.support.loops import until
+from tests.support.loops import mount, until
 from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put
 
 
@@ -37,7 +37,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of 4 MB."""
     folder = tmp_path / "disk"
     folder.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", folder], check=True)
+    mount("-t", "tmpfs", "-o", "size=4m", "tmpfs", folder)
     yield folder
     subprocess.run(["umount", "--lazy", folder], check=True)
 

@@ -176,7 +176,7 @@ def test_workers_ignore_ctrl_c_and_their_death_is_no_error_in_the_search(tmp_pat
         run(search_with(), tmp_path, InProcessExecutor())
 
 
-def test_worker_with_another_pupil_is_refused(tmp_path):
+def test_worker_with_another_pupil_is_refused():
     search = search_with()
     with pytest.raises(ConfigurationError, match="another shaped pupil: install the same lowfc"):
         program.advance_block(search, program.begin(search)[0], "another")

@@ -19,14 +19,7 @@ from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.sections import SensorSection
 from lowfc.design import shaped_pupil
 from lowfc.design.linear_program import NotSolvedError
-from lowfc.design.shaped_pupil import (
-    Request,
-    exchange,
-    is_feasible,
-    properties,
-    relative_field,
-    stored,
-)
+from lowfc.design.shaped_pupil import Request, exchange, is_feasible, properties, relative_field, stored
 from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.chain.fourier import to_image
 from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, image_axis, pupil_axis

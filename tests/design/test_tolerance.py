@@ -9,13 +9,7 @@ from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import noise_gain
 from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.vibration import Line
-from lowfc.design.tolerance import (
-    best_gain,
-    drift_residual_nm2,
-    tolerated_drift,
-    tolerated_lines,
-    tolerated_variance,
-)
+from lowfc.design.tolerance import best_gain, drift_residual_nm2, tolerated_drift, tolerated_lines, tolerated_variance
 from lowfc.optics.chain.focal_mask import phase_spot
 from lowfc.optics.chain.pupil import circle
 from lowfc.optics.chain.relay import PupilImage

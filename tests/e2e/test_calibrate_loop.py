@@ -1,4 +1,4 @@
-"""A running loop is calibrated and accepted: through the bus, interrupted and gone on with."""
+"""A running loop is calibrated, with an interruption and a resumption, and accepted, over the bus."""
 
 import json
 import time
@@ -30,7 +30,7 @@ disable_cpu_idle = false
 
 
 @pytest.mark.slow
-def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Path) -> None:
+def test_an_interrupted_calibration_of_a_running_loop_is_resumed(tmp_path: Path) -> None:
     (tmp_path / "test.toml").write_text(CONFIG)
     how = ("--config", "test.toml", "--no-record", "--open", "--lockstep")  # nothing is late on a busy host
     loop = start(tmp_path, "sim-loop", *how)
@@ -68,7 +68,7 @@ def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Pat
 
 
 def flat(client: Client) -> bool:
-    """Whether nothing is played, nor anything commanded."""
+    """Whether the command is zero."""
     state = client.status().state
     return not np.frombuffer(state.actuators, np.float32).any()
 

@@ -1,4 +1,4 @@
-"""A dark hole is dug while the loop runs: the loop does not undo it, and nothing of it is lost on replay."""
+"""A dark hole is dug while the loop runs: the loop does not undo it, and a replay is identical."""
 
 import json
 
@@ -15,11 +15,11 @@ pytestmark = pytest.mark.slow
 
 GRID = (34, 34)
 DEAD = (352, 561, 595, 757)
-EACH_NM = 2.0
+STEP_RMS_NM = 2.0
 
 
 def flat_nm() -> Array:
-    """Small, for the simulated mirror is flat without it."""
+    """Flat map (rows, columns), nm of surface: small, because the simulated mirror is flat without one."""
     rows, columns = np.indices(GRID)
     return np.asarray(np.sin(rows / 2) * np.cos(columns / 3))
 
@@ -33,7 +33,7 @@ def dark_hole_run(tmp_path_factory: pytest.TempPathFactory) -> DarkHoleRun:
     np.save(folder / "flat.npy", flat_nm())
     np.save(folder / "active.npy", active)
     toml = f'[mirror]\nflat = "flat.npy"\nactive = "active.npy"\ndead = {list(DEAD)}\n'
-    return dark_hole(folder, EACH_NM, toml, flat_nm() * active)
+    return dark_hole(folder, STEP_RMS_NM, toml, flat_nm() * active)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def logged(dark_hole_run: DarkHoleRun) -> dict[str, list[bytes]]:
 def test_the_loop_does_not_undo_the_steps(dark_hole_run: DarkHoleRun) -> None:
     channel = dark_hole_run.channels[SHIFTED]
     assert len(channel.channel_nm) == STEPS + 1
-    assert np.linalg.norm(channel.channel_nm[-1]) > 15, "nm of wavefront that a loop without the shift would take away"
+    assert np.linalg.norm(channel.channel_nm[-1]) > 15, "nm of wavefront that a loop without the shift would undo"
     undone, error = channel.undone()
     assert abs(undone) < 0.01
     assert error < 0.005
@@ -73,7 +73,7 @@ def test_commands_contain_the_flat_map_and_leave_dead_actuators_at_zero(logged: 
 
 
 def test_the_mean_command_is_published_once_a_second(logged: dict[str, list[bytes]]) -> None:
-    """By counting frames, at 1000 Hz: for another adaptive-optics system to take over."""
+    """One in 1000 frames at 1 kHz; another adaptive-optics system can take it over."""
     steps = [wire.ControlStep.FromString(body) for body in logged[f"/{STEP.key}"]]
     offloads = [wire.ModalOffload.FromString(body) for body in logged[f"/{OFFLOAD.key}"]]
     assert len(offloads) == len(steps) // 1000 > 2

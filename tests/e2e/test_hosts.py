@@ -1,6 +1,6 @@
-"""The loop across hosts: camera, controller, mirror and desk in network namespaces of their own, and a router.
+"""The loop across hosts: camera, controller, mirror and desk, each in its own network namespace, and a router.
 
-What happens when a link is cut, and what somebody gets who should get nothing. See docs/howto/hosts.md.
+Links are cut, and programs without a valid certificate try to take part. See docs/howto/hosts.md.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ from tools.law_bench import calibrated
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.exclusive,
-    pytest.mark.skipif(not networks.possible(), reason="network namespaces cannot be made here"),
+    pytest.mark.skipif(not networks.possible(), reason="network namespaces cannot be created here"),
 ]
 
 RUN = "across"
@@ -47,8 +47,8 @@ SUPPORT = Path(__file__).parents[1] / "support"
 ROLES = roles(["mirror-dm"])
 
 
-def give(host: Host, authority: Path, *given: str) -> None:
-    """Certificates of some roles, to a host."""
+def copy_certificates(host: Host, authority: Path, *given: str) -> None:
+    """Copy the certificates of these roles to a host."""
     folder = host.folder / "certs"
     folder.mkdir(mode=0o700, exist_ok=True)
     for name in ("ca.pem", *(f"{role}.{kind}" for role in given for kind in ("pem", "key"))):
@@ -56,7 +56,7 @@ def give(host: Host, authority: Path, *given: str) -> None:
 
 
 class Bench:
-    """The loop on its hosts, and what an observer beside the router hears of it."""
+    """The loop on its hosts, and what an observer on the router's host receives of it."""
 
     def __init__(self, folder: Path) -> None:
         self.authority = folder / "authority"
@@ -68,11 +68,11 @@ class Bench:
         for host in self.lab.hosts.values():
             (host.folder / "lowfc.toml").write_text(TOML.replace("CERTIFICATES", str(host.folder / "certs")))
         calibration_file.save(calibration, self.lab["controller"].folder / "calibration.fits")
-        give(self.lab.middle, self.authority, ROUTER, "viewer")
-        give(self.lab["desk"], self.authority, "recorder", "operator", "viewer")
+        copy_certificates(self.lab.middle, self.authority, ROUTER, "viewer")
+        copy_certificates(self.lab["desk"], self.authority, "recorder", "operator", "viewer")
         for name in ("camera", "controller"):
-            give(self.lab[name], self.authority, name)
-        give(self.lab["mirror"], self.authority, "mirror-dm")
+            copy_certificates(self.lab[name], self.authority, name)
+        copy_certificates(self.lab["mirror"], self.authority, "mirror-dm")
         self.words = {
             "router": ["-m", "lowfc", "router"],
             "camera": ["-m", "sim_camera"],
@@ -116,11 +116,11 @@ class Bench:
         deadline_s = time.monotonic() + timeout_s
         while not condition():
             self.check_alive()
-            assert time.monotonic() < deadline_s, f"waited in vain for {what}: {self.newest()}\n{self.stderr_tail()}"
+            assert time.monotonic() < deadline_s, f"timeout: no {what}: {self.newest()}\n{self.stderr_tail()}"
             time.sleep(0.05)
 
-    def settled(self, timeout_s: float = 40) -> None:
-        """Twenty good frames in a row and the mirror at them, all received from now on."""
+    def wait_until_settled(self, timeout_s: float = 40) -> None:
+        """Wait for more than 20 consecutive good frames and mirror states, received from now on."""
         start = len(self.seen())
 
         def good() -> bool:
@@ -128,7 +128,7 @@ class Bench:
             received = all(sum(one[what] for one in new) > 30 for what in ("steps", "states"))
             return received and new[-1]["good"] > 20 and new[-1]["following"] > 20
 
-        self.wait(good, "a closed loop", timeout_s)
+        self.wait(good, "closed loop", timeout_s)
 
     def check_alive(self) -> None:
         for host in self.lab.hosts.values():
@@ -145,19 +145,19 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     made = Bench(tmp_path_factory.mktemp("hosts"))
     try:
         made.start()
-        made.settled(60)
+        made.wait_until_settled(60)
         yield made
     finally:
         made.lab.close()
 
 
 def clock_offset_ns(host: Host) -> int:
-    """What a host takes for the difference of the epoch and the one monotonic clock that all have here."""
+    """A host's offset from the monotonic clock, which all hosts share here, to its epoch."""
     return int(next((host.folder / "runtime" / "lowfc").glob("clock-*")).read_text())
 
 
 def test_clock_offsets_are_measured_and_requests_and_a_view_work_from_another_host(bench: Bench) -> None:
-    bench.settled()
+    bench.wait_until_settled()
     desk = bench.lab["desk"]
     done = desk.run("-m", "lowfc", "hosts", "--run", RUN, "--json")
     assert done.returncode == 0, done.stderr
@@ -169,16 +169,16 @@ def test_clock_offsets_are_measured_and_requests_and_a_view_work_from_another_ho
         assert abs(rows[process]["clock_offset_us"] - truth_us) <= rows[process]["clock_error_us"] + 0.001
     done = desk.run("-m", "lowfc", "ctl", "open", "--run", RUN)
     assert done.returncode == 0, done.stderr
-    bench.wait(lambda: bench.newest()["good"] == 0, "an open loop")
+    bench.wait(lambda: bench.newest()["good"] == 0, "open loop")
     assert desk.run("-m", "lowfc", "ctl", "close", "--run", RUN).returncode == 0
-    bench.settled()
+    bench.wait_until_settled()
     view = desk.run("-m", "lowfc", "view", "--run", RUN, "--save", "seen.rrd", "--seconds", "2", timeout_s=90)
     assert view.returncode == 0, view.stderr
     assert (desk.folder / "seen.rrd").stat().st_size > 10_000
 
 
-def test_a_log_of_several_hosts_says_how_far_its_latencies_can_be_trusted(bench: Bench) -> None:
-    bench.settled()
+def test_a_log_of_several_hosts_states_the_clock_error_of_its_latencies(bench: Bench) -> None:
+    bench.wait_until_settled()
     desk = bench.lab["desk"]
     done = desk.run("-m", "lowfc", "ctl", "record", "stop", "--run", RUN)
     assert done.returncode == 0, done.stderr
@@ -197,70 +197,71 @@ def test_a_log_of_several_hosts_says_how_far_its_latencies_can_be_trusted(bench:
 
 
 def test_without_the_cameras_link_the_command_is_held_and_repeated(bench: Bench) -> None:
-    bench.settled()
+    bench.wait_until_settled()
     before = bench.events("controller NO_FRAMES")
     with bench.lab.cut("camera"):
         bench.wait(lambda: bench.events("controller NO_FRAMES") > before, "NO_FRAMES")
         start = len(bench.seen())
-        bench.wait(lambda: len(bench.seen()) > start + 15, "a second and a half")
+        bench.wait(lambda: len(bench.seen()) > start + 15, "output of a second and a half")
         during = bench.seen()[start + 5 :]
-        # the controller repeats the held command, so that the mirror's dead-man does not act
+        # the controller repeats the held command, so that it does not expire at the mirror
         assert all(one["steps"] == 0 for one in during)
         assert all(one["status"] == "MIRROR_STATUS_FOLLOWING" for one in during)
         held = {round(one["highest_nm"], 3) for one in during}
         assert len(held) == 1, held
-    bench.settled()
+    bench.wait_until_settled()
     assert bench.events("controller FRAMES_BACK") > 0
 
 
 def test_without_the_mirrors_link_its_command_timeout_acts(bench: Bench) -> None:
-    bench.settled()
+    bench.wait_until_settled()
     mirror = bench.lab["mirror"]
     before = mirror.stderr("mirror-dm").count("COMMAND_EXPIRED")
     with bench.lab.cut("mirror"):
-        bench.wait(lambda: mirror.stderr("mirror-dm").count("COMMAND_EXPIRED") > before, "the mirror's dead-man")
+        bench.wait(
+            lambda: mirror.stderr("mirror-dm").count("COMMAND_EXPIRED") > before, "command timeout of the mirror"
+        )
         assert "relaxing to flat" in mirror.stderr("mirror-dm")
         start = len(bench.seen())
-        bench.wait(lambda: len(bench.seen()) > start + 10, "a second")
+        bench.wait(lambda: len(bench.seen()) > start + 10, "output of a second")
         assert sum(one["states"] for one in bench.seen()[start + 5 :]) == 0
-    bench.settled()
+    bench.wait_until_settled()
 
 
 def test_without_the_controllers_link_the_mirror_relaxes_and_the_controller_holds(bench: Bench) -> None:
-    bench.settled()
+    bench.wait_until_settled()
     controller = bench.lab["controller"]
     before = controller.stderr("controller").count("NO_FRAMES"), bench.events("mirror-dm COMMAND_EXPIRED")
     with bench.lab.cut("controller"):
-        bench.wait(lambda: bench.events("mirror-dm COMMAND_EXPIRED") > before[1], "the mirror's dead-man")
+        bench.wait(lambda: bench.events("mirror-dm COMMAND_EXPIRED") > before[1], "COMMAND_EXPIRED")
         bench.wait(lambda: controller.stderr("controller").count("NO_FRAMES") > before[0], "NO_FRAMES")
-        bench.wait(lambda: bench.newest()["highest_nm"] < 0.1, "a flat mirror")
+        bench.wait(lambda: bench.newest()["highest_nm"] < 0.1, "flat mirror")
         assert bench.newest()["status"] == "MIRROR_STATUS_EXPIRED"
-    bench.settled()
+    bench.wait_until_settled()
 
 
-def test_without_the_desks_link_the_loop_goes_on(bench: Bench) -> None:
-    bench.settled()
+def test_without_the_desks_link_the_loop_continues(bench: Bench) -> None:
+    bench.wait_until_settled()
     events = ("controller NO_FRAMES", "mirror-dm COMMAND_EXPIRED")
-    before = [bench.events(name) for name in events]
+    before, lost = [bench.events(name) for name in events], bench.events("recorder MESSAGES_LOST")
     start = len(bench.seen())
     with bench.lab.cut("desk"):
-        bench.wait(lambda: len(bench.seen()) > start + 40, "four seconds")
+        bench.wait(lambda: len(bench.seen()) > start + 40, "output of four seconds")
         assert [bench.events(name) for name in events] == before
         during = bench.seen()[start:]
         assert sum(one["steps"] for one in during) > 0.8 * 4 * 200
         assert sum("FOLLOWING" in one["status"] for one in during) > 0.9 * len(during)
-    lost = bench.events("recorder MESSAGES_LOST")
-    bench.wait(lambda: bench.events("recorder MESSAGES_LOST") > lost or lost, "the recorder's account of what it lost")
-    bench.settled()
+    bench.wait(lambda: bench.events("recorder MESSAGES_LOST") > lost, "report of the recorder's losses")
+    bench.wait_until_settled()
 
 
 def test_the_router_may_die_and_come_back(bench: Bench) -> None:
-    bench.settled()
+    bench.wait_until_settled()
     router = bench.lab.middle.children.pop("router")
     router.process.kill()
     router.stop(5.0)
     bench.begin(bench.lab.middle, "router")
-    bench.settled()
+    bench.wait_until_settled()
 
 
 FORGER = """
@@ -272,7 +273,7 @@ from lowfc.contract.messages import timestamp, wire
 try:
     session = zenoh.open(zenoh.Config.from_json5(open(sys.argv[1]).read()))
 except zenoh.ZError:
-    print("not let in")
+    print("refused")
     sys.exit()
 received, answers = set(), set()
 for key in ("**", "lowfc/**", "lowfc/mirror/dm/command", "lowfc/camera/frame", "lowfc/control/step", "lowfc/event"):
@@ -295,7 +296,7 @@ session.close()
 
 
 def forge(host: Host, certificate: Path | None, protocol: str = "tls") -> str:
-    """What a program with a session of its own making receives; it forges commands meanwhile."""
+    """Publish forged commands by a session of its own; returns the topics received and the queries answered."""
     tls = {"root_ca_certificate": str(host.folder / "certs" / "ca.pem"), "enable_mtls": True}
     if certificate is not None:
         tls |= {
@@ -317,9 +318,9 @@ def forge(host: Host, certificate: Path | None, protocol: str = "tls") -> str:
 
 
 def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(bench: Bench) -> None:
-    """So that the tests below can fail: it is the certificate that keeps a forger out, and not its message."""
-    bench.settled()
-    give(bench.lab["desk"], bench.authority, "controller")
+    """Only the certificate keeps a forger out, not its message: the next test can fail."""
+    bench.wait_until_settled()
+    copy_certificates(bench.lab["desk"], bench.authority, "controller")
     before = bench.events("mirror-dm COMMAND_REFUSED")
     forge(bench.lab["desk"], bench.lab["desk"].folder / "certs" / "controller")
     bench.wait(
@@ -327,29 +328,29 @@ def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(be
             bench.events("mirror-dm COMMAND_REFUSED") > before
             or any(one["highest_nm"] > 90 for one in bench.seen()[-30:])
         ),
-        "the forged command at the mirror",
+        "forged command at the mirror",
     )
     mirror = bench.lab["mirror"]
     mirror.children.pop("mirror-dm").stop(5.0)  # it waits for frames beyond the forged one
     bench.begin(mirror, "mirror-dm")
-    bench.settled()
+    bench.wait_until_settled()
 
 
 def test_a_forger_gets_nothing_and_moves_nothing(bench: Bench, tmp_path: Path) -> None:
     """With certificates of another role, of no known role, of a foreign authority; with none, and without TLS."""
-    bench.settled()
+    bench.wait_until_settled()
     camera, desk = bench.lab["camera"], bench.lab["desk"]
     make_certificates(bench.authority, ["stranger"], [])
     make_certificates(tmp_path, ROLES, [])
-    give(desk, bench.authority, "stranger")
+    copy_certificates(desk, bench.authority, "stranger")
     before = bench.events("mirror-dm COMMAND_REFUSED")
     start = len(bench.seen())
     assert forge(camera, camera.folder / "certs" / "camera") in ("[] []", "['lowfc/event'] []")  # events are for all
     assert forge(desk, desk.folder / "certs" / "stranger") == "[] []"
     for certificate, protocol in ((tmp_path / "controller", "tls"), (None, "tls"), (None, "tcp")):
-        assert forge(desk, certificate, protocol) == "not let in"
+        assert forge(desk, certificate, protocol) == "refused"
     seen = bench.seen()[start:]
     assert len(seen) > 3
     assert all(one["highest_nm"] < 50 for one in seen)
     assert bench.events("mirror-dm COMMAND_REFUSED") == before
-    bench.settled()
+    bench.wait_until_settled()

@@ -37,7 +37,7 @@ pitches_per_pupil = 10
 
 @pytest.mark.parametrize("rate_hz", [50, pytest.param(250, marks=pytest.mark.slow)])
 def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_path: Path, rate_hz: int) -> None:
-    """Automatic gains are inputs that both runs and a replay have alike."""
+    """Automatic gains are inputs, identical in both runs and in a replay."""
     logs, infos = [], []
     for name in ("one", "two", "other"):
         folder = tmp_path / name
@@ -70,7 +70,7 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
 def test_the_residual_is_the_predicted_one(tmp_path: Path, frames: int) -> None:
     """|S|^2 P_d + |T|^2 P_n for 5 mas rms of tilt per axis and half the limiting gain: within 10 %.
 
-    Beyond 10 mas the sensor's optical gain drops (0.92 at 14 mas), so that this holds for small tilts only.
+    Beyond 10 mas the sensor's optical gain drops (0.92 at 14 mas), so this holds for small tilts only.
     """
     results = loop(
         tmp_path, "--lockstep", "--duration", str(frames / 1000), "--no-record", config=GENTLE, timeout_s=200
@@ -92,8 +92,6 @@ def test_a_lockstep_run_ends_and_names_a_stopped_process(tmp_path: Path) -> None
     assert "no Health from controller" in complaints
     assert "Traceback" not in complaints
 
-
-DOCS = Path(__file__).parents[2] / "docs" / "explanation"
 
 STATIC_NM = dict(zip(range(2, 16), (12, -9, 8, -7, 6, 5, -5, 4, -4, 3, -3, 3, -3, 3), strict=True))
 STILL = f"""
@@ -119,8 +117,8 @@ def test_every_mode_of_a_static_wavefront_is_removed(tmp_path: Path, sensor: str
     truths = [wire.Truth.FromString(payload) for payload in payloads(results["log"])["/lowfc/sim/truth"]]
     first, last = truths[0], truths[-50:]
     np.testing.assert_allclose(first.residual_nm[:14], list(STATIC_NM.values()), atol=0.1)
-    left_nm = np.mean([truth.residual_nm[:14] for truth in last], axis=0)
-    assert np.abs(left_nm).max() < 1.0
+    residual_nm = np.mean([truth.residual_nm[:14] for truth in last], axis=0)
+    assert np.abs(residual_nm).max() < 1.0
     assert np.mean([truth.residual_rms_nm for truth in last]) < 0.15 * first.residual_rms_nm
 
 

@@ -106,7 +106,7 @@ def _refused(folder: Path, *words: str, expected: str, config: str = "") -> str:
     if config:
         (folder / "test.toml").write_text(config)
         words = (*words, "--config", "test.toml")
-    if words[0] in {"record", "view"}:  # they give way to the loop for good, and a test's process would keep that
+    if words[0] in {"record", "view"}:  # they lower the priority of their process for good
         done = run(folder, *words)
         assert (done.returncode, done.stdout) == (2, ""), done.stderr
         complaint = done.stderr.removeprefix("error: ").rstrip("\n")
@@ -176,7 +176,7 @@ def test_unusable_logs_and_files_are_refused_in_one_line(tmp_path: Path, words: 
 def test_a_starting_loop_is_listed_and_makes_an_unnamed_request_ambiguous(
     own_runtime: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So that an unnamed request does not reach the only other one."""
+    """An unnamed request must not reach the only other run."""
     found: list[object] = []
 
     def meanwhile(config: Configuration, run: Run, console: object) -> None:

@@ -66,7 +66,7 @@ class Night:
 
 @pytest.fixture(scope="module")
 def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
-    """All of it is done once; the tests look at what it printed and left."""
+    """Run all commands and programs once; the tests check their output and logs."""
     folder = tmp_path_factory.mktemp("night")
     before = set(running())
     (folder / "test.toml").write_text(FIXED)
@@ -82,7 +82,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
             made.ctl(command)
         for number, program in enumerate(PROGRAMS):
             made.outputs[f"program {number}"] = _program(made, program)
-        _the_rest(made)
+        _requests_beyond_the_document(made)
         made.end()
         yield made
     finally:
@@ -116,8 +116,8 @@ def _program(night: Night, program: str) -> str:
     return printed.getvalue()
 
 
-def _the_rest(night: Night) -> None:
-    """What the document has no command for: plays, refusals, JSON, and a process of its own."""
+def _requests_beyond_the_document(night: Night) -> None:
+    """Requests that the document has no command for: probe sequences, refusals, JSON, and commands as processes."""
     with Client(night.name) as loop:
         grid = loop.calibration().grid
         loop.open_loop()
@@ -177,7 +177,7 @@ def _the_rest(night: Night) -> None:
 
 
 def test_every_request_is_made_by_a_command_of_the_document() -> None:
-    names = {command.split()[2] for command in COMMANDS} - {"bench"}  # which is a value and no request
+    names = {command.split()[2] for command in COMMANDS} - {"bench"}  # a value, not a request
     assert names == {one.example.split()[0] for one in DECLARED if one.example}
 
 

@@ -1,4 +1,4 @@
-"""The examples of hardware.md and commissioning.md in docs/howto as real processes: devices that are not of ours."""
+"""The examples of hardware.md and commissioning.md in docs/howto as real processes: devices of a user."""
 
 import json
 import re
@@ -61,7 +61,7 @@ SIMULATED = ("sim-camera --run bench --config bench.toml", "sim-dm --run bench -
 
 @pytest.fixture
 def bench(tmp_path: Path, own_runtime: Path) -> Path:
-    """A folder with the examples, and runs of its own."""
+    """A folder with the examples, and a private runtime directory."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     (tmp_path / "bench.toml").write_text(BENCH)
     return tmp_path
@@ -97,10 +97,10 @@ def conformance(folder: Path, *commands: str) -> None:
         assert results["device"] in line or results["device"] == "mirror-dm"
         assert results["counts"]["wrong"] == 0
         assert {"clear", "relaxing"}.isdisjoint(one["name"] for one in results["checks"] if one["status"] != "ok")
-        assert results["counts"]["ok"] >= len(results["checks"]) - 5  # of a busy host: warnings
+        assert results["counts"]["ok"] >= len(results["checks"]) - 5  # warnings of a busy host
 
 
-def test_the_loop_closes_on_a_camera_and_a_mirror_of_ones_own(bench: Path) -> None:
+def test_the_loop_closes_with_a_users_camera_and_mirror(bench: Path) -> None:
     with in_background(bench, *DEVICES), listening() as bus:
         wait_for_devices(bus)
         conformance(bench, *CONFORMANCE)
@@ -110,7 +110,7 @@ def test_the_loop_closes_on_a_camera_and_a_mirror_of_ones_own(bench: Path) -> No
             errors_nm.append(list(wire.ControlStep.FromString(sample.payload).error_nm))
 
         def rms_nm() -> float:
-            """Of the mean of the last steps: what the loop has left, without the noise."""
+            """Norm of the mean error of the last 100 steps: the residual without noise; NaN before 100 steps."""
             measured = [error for error in errors_nm[-100:] if error]
             return float(np.linalg.norm(np.mean(measured, axis=0))) if len(measured) == 100 else np.nan
 
@@ -123,16 +123,16 @@ def test_the_loop_closes_on_a_camera_and_a_mirror_of_ones_own(bench: Path) -> No
         states: list[wire.MirrorState] = []
         bus.subscribe(MIRROR_STATE, lambda sample: states.append(wire.MirrorState.FromString(sample.payload)))
         until(lambda: states and not np.frombuffer(states[-1].actuators, np.float32).any())
-        assert not states[-1].command_nm, "a flat mirror that names a command: the next controller takes it for a shape"
+        assert not states[-1].command_nm, "a flat mirror reports no modal command for the next controller to adopt"
     assert before_nm == pytest.approx(17, rel=0.15)
 
 
 @pytest.mark.slow
-def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(bench: Path) -> None:
+def test_the_simulated_devices_and_a_camera_in_plain_zenoh_pass_conformance(bench: Path) -> None:
     y, x = np.mgrid[:80, :80]
     spot = 100 + 2000 * np.exp(-((y - 40) ** 2 + (x - 30) ** 2) / 50)
     np.save(bench / "frames.npy", np.random.default_rng(1).poisson(spot, (50, 80, 80)).astype(np.uint16))
-    HostClock()  # this boot's clock, for a program that does not make it
+    HostClock()  # creates this boot's clock, which the program below only reads
     command(bench, PLAIN[0].replace("bench", "plain"))
     with in_background(bench, *SIMULATED, PLAIN[1]):
         with listening() as bus:
@@ -184,8 +184,8 @@ class SmallCamera(MyCamera):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("own", [False, True])
-def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path, own: bool) -> None:
-    """docs/howto/commissioning.md, as it stands and with drivers of one's own: 64 x 64 pixels, 100 Hz, 14 bits."""
+def test_a_loop_with_a_camera_of_another_size_is_commissioned(bench: Path, own: bool) -> None:
+    """docs/howto/commissioning.md, as written, and with a user's drivers: 64 x 64 pixels, 100 Hz, 14 bits."""
     assert len(COMMISSIONING) == 5
     (bench / "bench.toml").write_text(block("toml"))
     devices = PAGE_DEVICES

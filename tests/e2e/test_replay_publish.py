@@ -1,4 +1,4 @@
-"""A recorded night back on the real bus: what a tool, a late joiner and a controller under test get of it."""
+"""A log republished on the real bus, as received by a tool, a late joiner and a controller under test."""
 
 import json
 import signal
@@ -57,7 +57,7 @@ def logged(log: Path) -> dict[str, list[Sample]]:
 
 
 class Tool:
-    """A user's own program: it is a role without a port, and has no health."""
+    """A user's own program: its role has no port, and it publishes no Health."""
 
     def __init__(self, run: Run, *topics: Topic) -> None:
         self.received: dict[str, list[Sample]] = defaultdict(list)
@@ -143,7 +143,7 @@ def test_a_truncated_log_is_published_faster_and_with_commands(log: Path, run: R
 
 def test_a_live_controller_computes_the_recorded_errors(
     log: Path, logged: dict[str, list[Sample]], run: Run, tool: Tool, tmp_path: Path
-):
+) -> None:
     next(iter(reader := LogReader(log)))
     for name, content in reader.attachments.items():
         (tmp_path / name).write_bytes(content)

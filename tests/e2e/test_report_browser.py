@@ -1,4 +1,4 @@
-"""The report in a real browser: what is on the screen, what the browser complains of, what it fetches."""
+"""The report in a real browser: what it displays, reports and fetches."""
 
 import json
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ WIDTH = 1200
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 
-# What a person cannot see in a picture of the page: boxes, pictures inside of drawings, the whole height.
+# What a screenshot does not show: bounding boxes, images inside drawings, the height of the whole page.
 MEASURE = """(async () => {
   const box = (one) => { const r = one.getBoundingClientRect(); return [r.left, r.top, r.width, r.height]; };
   const images = [...document.querySelectorAll("image, img")].map(async (one) => {
@@ -118,7 +118,7 @@ def test_the_pictures_are_visible_in_light_and_dark_mode(
     for name, (left, top, width, tall) in seen["pictures"].items():
         region = shown[int(top) : int(top + tall), int(left) : int(left + width)]
         brightness = region.mean(axis=2, dtype=np.float32)
-        # Lines and letters cover some of it, and stand out from the paper.
+        # Lines and letters cover a part of the picture, in contrast to the background.
         drawn = np.abs(brightness - paper) > 60
         assert 0.005 < drawn.mean() < 0.9, name
         assert drawn.any(axis=1).mean() > 0.5, f"{name} is empty over half of its height"

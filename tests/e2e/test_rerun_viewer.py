@@ -1,4 +1,4 @@
-"""Rerun's viewer as a child process of ours, and a log as rerun reads it by itself."""
+"""Rerun's viewer as a child process, and a log as rerun itself reads it."""
 
 import os
 import re
@@ -23,7 +23,7 @@ from tests.support.report_log import SyntheticLog
 from tests.support.viewers import complaints, listening, on_screen, pixels, share_of
 
 ORANGE, BLUE = (214, 110, 20), (20, 90, 214)
-SHARE = 0.05  # of the viewer's pixels that an image of two colours gives each of them, at least
+SHARE = 0.05  # least fraction of the viewer's pixels with each colour of an image of two colours
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def test_the_content_security_policy_allows_this_host_only(web: RerunViewer) -> 
 
 
 def _two_colours(viewer: RerunViewer) -> rr.RecordingStream:
-    """A stream that has sent an image, orange above blue; to be disconnected while its viewer is there."""
+    """A stream that has sent an image, orange above blue; disconnect it before its viewer ends."""
     stream = rr.RecordingStream("lowfc-test", recording_id="test")
     stream.connect_grpc(viewer.url)
     image = np.empty((80, 80, 3), np.uint8)
@@ -190,7 +190,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read_by_rerun(log: Path, column: str) -> dict[str, list[Any]]:
-    """Values of a component by topic, as rerun reads a log without anything of ours."""
+    """Values of a component by topic, as rerun reads a log without code of lowfc."""
     found: dict[str, list[Any]] = defaultdict(list)
     for chunk in McapReader(log).stream():
         batch = chunk.to_record_batch()

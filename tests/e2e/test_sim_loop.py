@@ -92,7 +92,7 @@ def test_the_log_grows_at_the_estimated_rate(live: dict[str, Any]) -> None:
 
 
 def test_frame_step_command_and_state_join(topics: dict[str, list[bytes]]) -> None:
-    """Each carries the frame's time and sequence, so that the road of one frame can be followed."""
+    """Each carries the frame's time and sequence, so that the path of one frame can be followed."""
     frames = {from_timestamp(RawImage.FromString(payload).timestamp) for payload in topics["/lowfc/camera/frame"]}
     steps = [wire.ControlStep.FromString(payload) for payload in topics["/lowfc/control/step"]]
     commands = {
@@ -118,7 +118,7 @@ def test_frame_step_command_and_state_join(topics: dict[str, list[bytes]]) -> No
 
 
 def test_npm_mcap_core_reads_the_same_messages(live: dict[str, Any], topics: dict[str, list[bytes]]) -> None:
-    """npm's @mcap/core: same counts, CRCs right, attachments there."""
+    """npm's @mcap/core: same counts, valid CRCs, all attachments."""
     (found,) = foxglove([live["log"]])
     assert found["messages"] == found["counted"] == live["messages_recorded"]
     assert found["counts"] == {topic: len(values) for topic, values in topics.items()}
@@ -143,7 +143,7 @@ def test_a_signal_makes_the_loop_safe_and_a_process_that_dies_is_named(tmp_path:
     assert not stdout
     assert "mirror-dm was killed by SIGKILL" in complaints
     assert "Traceback" not in complaints
-    (log,) = (tmp_path / "logs").glob("*.mcap")  # it is finished all the same
+    (log,) = (tmp_path / "logs").glob("*.mcap")  # it is finished nevertheless
     assert complaints.endswith(f"recorded until then: logs/{log.name}\n")
     recorded = payloads(log)
     assert recorded["/lowfc/camera/frame"]

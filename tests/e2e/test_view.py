@@ -34,7 +34,7 @@ from tests.support.loops import LOWFC, children, interrupt, run, start, until
 from tests.support.report_log import SyntheticLog
 from tests.support.viewers import browser_screenshot, complaints, needs_chromium, on_screen, pixels, share_of
 
-MIN_SHADES = 8  # of a panel with something in it; an empty one has its ground and the letters of its title
+MIN_SHADES = 8  # colours in a panel with content, below its title; an empty one has its background only
 TITLE_ROWS = 30
 
 
@@ -89,7 +89,7 @@ def test_the_web_view_shows_the_live_loop_and_fetches_from_this_host_only(live: 
         picture = artefacts / "live-browser.png"
         good = FILL[Level.GOOD]
         page = browser_screenshot(address.group(), picture, 120, lambda shown: share_of(shown, good) > 0.01, (800, 500))
-        assert share_of(pixels(picture.read_bytes()), good) > 0.01, "no tile says that something is well"
+        assert share_of(pixels(picture.read_bytes()), good) > 0.01, "no tile has the colour of a good state"
         assert all(url.startswith(("http://127.0.0.1", "data:", "blob:")) for url in page.fetched.values())
     finally:
         page_of.send_signal(signal.SIGINT)

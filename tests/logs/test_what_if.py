@@ -335,7 +335,7 @@ def test_a_users_controller_is_run_like_the_integrator(
 
 
 def history(frames: int = 40, **columns: Any) -> History:
-    """The toy's history: an open loop that measures 4 nm of each mode, frame by frame."""
+    """The toy's history: a closed loop that measures 4 nm of each mode in every frame and whose command is zero."""
     values = np.full((frames, 3), 4.0, np.float32)
     default: dict[str, Any] = {
         "sequence": np.array([toy.frame_sequence(count) for count in range(frames)], np.uint64),

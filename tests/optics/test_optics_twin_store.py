@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files import twin_cache
-from lowfc.adapters.files.twin_cache import (
-    default_cache_dir,
-    load_or_build,
-    load_or_fit_mirror,
-    operator_hash,
-)
+from lowfc.adapters.files.twin_cache import default_cache_dir, load_or_build, load_or_fit_mirror, operator_hash
 from lowfc.optics.chain.band import gauss_legendre, monochromatic
 from lowfc.optics.chain.mirror import Mirror
 from lowfc.optics.chain.relay import ApertureMask
@@ -96,12 +91,7 @@ def test_operator_hash_depends_on_every_input(sensor):
 def test_operator_hash_has_not_changed_since_the_first_release(sensor):
     """It is part of the identity of computed calibrations, which must not change; ones round the same on all hosts."""
     ones = np.ones((512, 512))
-    plain = replace(
-        sensor,
-        pupil=ones,
-        focal_mask=np.ones_like(sensor.focal_mask),
-        relay=ApertureMask(ones),
-    )
+    plain = replace(sensor, pupil=ones, focal_mask=np.ones_like(sensor.focal_mask), relay=ApertureMask(ones))
     assert operator_hash(plain, SMALL, monochromatic(550.0)) == HASH_OF_ONES
 
 

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
 from click.testing import Result
 from mcap.reader import make_reader
 from typer.testing import CliRunner
@@ -50,6 +51,12 @@ def run(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120)
         (folder / "test.toml").write_text(config)
         words += ["--config", "test.toml"]
     return subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+def mount(*words: object) -> None:
+    """Mount a file system; skip the test where this is not permitted."""
+    if subprocess.run(["mount", *map(str, words)], check=False).returncode:
+        pytest.skip("mounting a file system is not permitted")
 
 
 def lowfc(*words: object) -> Result:

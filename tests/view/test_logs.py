@@ -259,7 +259,7 @@ def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_th
     assert re.fullmatch(rf"night\.mcap: {place}: {reason}; 0\.\d+ s between the messages around it", remark)
 
 
-def test_a_log_begins_with_its_first_frame_and_not_with_an_older_calibration(tmp_path: Path, shown: Shown) -> None:
+def test_a_log_begins_with_its_first_frame_and_not_with_an_older_calibration(tmp_path: Path) -> None:
     made = SyntheticLog().frames(100)
     calibration = next(one for one in made.samples if one.key == CALIBRATION.key)
     earlier_ns = calibration.receive_time_ns - 3600 * 10**9

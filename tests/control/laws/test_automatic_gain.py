@@ -231,11 +231,11 @@ def _calibration(measured: bool) -> tuple[Calibration, CameraSettings]:
     good = np.ones(pixels)
     R = reconstruct(reference, response, None, good, 1e5, 2.0).matrix
     camera = CameraSettings(0, (20, 20), 0.0, 65535.0, 2.0, 1.0, 2.0)
-    single = [one.astype(np.float32) for one in (reference, response, R, good, np.zeros(pixels))]
+    arrays = [one.astype(np.float32) for one in (reference, response, R, good, np.zeros(pixels))]
     shapes = np.zeros((4, modes), np.float32)
     name = "poke" if measured else "weighted"
     rest = (shapes, (20, 20), (2, 2), 5e4, 65535.0, name, 550.0, "", "id")
-    return Calibration((2, 3, 4, 5, 6), *single, *rest), camera
+    return Calibration((2, 3, 4, 5, 6), *arrays, *rest), camera
 
 
 def test_rows_of_corrected_modes_are_the_map_estimate() -> None:

@@ -1,5 +1,8 @@
 """Continuous-time residual of a loop: theory against simulations with fine time steps."""
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -98,13 +101,11 @@ def test_a_law_that_nulls_another_mean_has_a_larger_residual() -> None:
     assert wheel_residual_mas(exposure, blurred) == pytest.approx(0.954, abs=0.01)
 
 
-def law_nulling(foreseen) -> LinearLaw:  # type: ignore[no-untyped-def]
+def law_nulling(prediction: Callable[[Model], Array]) -> LinearLaw:
     """A law whose command nulls another mean than that over the period in which it is in force."""
-    from dataclasses import replace
-
     law, model = lqg([wheel()], (2,), Timing(1, 1, 0.5)), wheel()
     C = model.states()[2]
-    return replace(law, output=(-C @ foreseen(model))[None].astype(np.float32))
+    return replace(law, output=(-C @ prediction(model))[None].astype(np.float32))
 
 
 def test_the_noise_of_the_command_has_a_closed_form() -> None:

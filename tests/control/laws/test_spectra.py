@@ -253,13 +253,9 @@ def test_a_staircase_limits_its_steps_and_holds_its_levels() -> None:
     stairs, starts = build_staircase(levels_nm, 6, 3.0)
     assert np.abs(np.diff(stairs, prepend=0.0)).max() <= 3.0
     assert stairs[-1] == 0
-    for start, level in zip(starts, levels_nm, strict=True):
+    for start, level, previous in zip(starts, levels_nm, np.roll(levels_nm, 1), strict=True):
         assert (stairs[start : start + 6] == level).all()
-        assert (
-            start == 0
-            or stairs[start - 1] != level
-            or level == levels_nm[max(np.flatnonzero(starts == start)[0] - 1, 0)]
-        )
+        assert start == 0 or level == previous or stairs[start - 1] != level
 
 
 def test_known_gain_and_crosstalk_are_recovered() -> None:

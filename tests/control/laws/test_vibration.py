@@ -47,7 +47,6 @@ def test_width_and_power_of_damped_lines_are_identified() -> None:
 
 
 def test_no_line_is_identified_in_noise() -> None:
-    """For runs of white noise."""
     for seed in range(5):
         noise = np.random.default_rng(seed).standard_normal((4096, 1))
         model = identify(TimeSeries((noise,), 0), RATE_HZ)
