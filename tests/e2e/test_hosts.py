@@ -151,6 +151,14 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         made.lab.close()
 
 
+def test_a_host_has_its_own_network_from_the_start(tmp_path: Path) -> None:
+    for number in range(20):
+        host = Host(f"host{number}", "", tmp_path)
+        namespaces = {Path(f"/proc/{process}/ns/net").readlink() for process in ("self", host.holder.pid)}
+        host.close()
+        assert len(namespaces) == 2
+
+
 def clock_offset_ns(host: Host) -> int:
     """A host's offset from the monotonic clock, which all hosts share here, to its epoch."""
     return int(next((host.folder / "runtime" / "lowfc").glob("clock-*")).read_text())
@@ -218,9 +226,7 @@ def test_without_the_mirrors_link_its_command_timeout_acts(bench: Bench) -> None
     mirror = bench.lab["mirror"]
     before = mirror.stderr("mirror-dm").count("COMMAND_EXPIRED")
     with bench.lab.cut("mirror"):
-        bench.wait(
-            lambda: mirror.stderr("mirror-dm").count("COMMAND_EXPIRED") > before, "command timeout of the mirror"
-        )
+        bench.wait(lambda: mirror.stderr("mirror-dm").count("COMMAND_EXPIRED") > before, "COMMAND_EXPIRED")
         assert "relaxing to flat" in mirror.stderr("mirror-dm")
         start = len(bench.seen())
         bench.wait(lambda: len(bench.seen()) > start + 10, "output of a second")

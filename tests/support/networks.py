@@ -36,9 +36,9 @@ class Host:
         self.address = address
         self.folder = folder / name
         self.shift_ns = clock_shift_ns
-        self.holder = subprocess.Popen(
-            ["unshare", "--net", "cat"], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True
-        )
+        hold = ["unshare", "--net", "sh", "-c", "echo && exec cat"]
+        self.holder = subprocess.Popen(hold, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+        assert self.holder.stdout.readline(), "no namespace was created"  # before it, commands would run in our own
         self.children: dict[str, Child] = {}
         home = self.folder / "runtime" / "lowfc"
         home.mkdir(mode=0o700, parents=True)
@@ -85,8 +85,7 @@ class Host:
     def close(self) -> None:
         for child in self.children.values():
             child.stop(5.0)
-        self.holder.stdin.close()
-        self.holder.wait()
+        self.holder.communicate()
 
 
 class Lab:
