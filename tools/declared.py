@@ -107,7 +107,7 @@ def _about(value: Any) -> str | None:
 
 def limits(rows: Iterable[tuple[str, *tuple[float, ...]]]) -> str:
     """Table of limits."""
-    return markdown(("limit", "value"), ((what, ", ".join(f"{one:g}" for one in values)) for what, *values in rows))
+    return markdown(("limit", "value"), ((name, ", ".join(f"{one:g}" for one in values)) for name, *values in rows))
 
 
 def requirements() -> str:

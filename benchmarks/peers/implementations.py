@@ -35,7 +35,7 @@ class Implementation:
     """
 
     name: str
-    what: str
+    description: str
     log: str
     safety: str
     multi_host: str
@@ -44,9 +44,9 @@ class Implementation:
     kernel: str = ""
 
 
-def _pyrtcao(name: str, what: str, safety: str, *roles: str) -> Implementation:
+def _pyrtcao(name: str, description: str, safety: str, *roles: str) -> Implementation:
     log = "its streams keep the newest frame; its telemetry recorder reads them"
-    return Implementation(f"pyrtcao, {name}", what, log, safety, "no; commanded from elsewhere", roles, PYRTCAO)
+    return Implementation(f"pyrtcao, {name}", description, log, safety, "no; commanded from elsewhere", roles, PYRTCAO)
 
 
 def _lowfc(kernel: str) -> Implementation:

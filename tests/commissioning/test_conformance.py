@@ -336,18 +336,18 @@ def one_dead(shape: Single, height_nm: float = 0.0) -> Single:
     return np.where(np.arange(shape.size).reshape(shape.shape) == 9, np.float32(height_nm), shape)
 
 
-def careless(what: str) -> Callable[..., Command]:
+def careless(check: str) -> Callable[..., Command]:
     """Function of a driver that repairs an invalid command instead of refusing it."""
 
     def change(decoded: Command, command: wire.MirrorCommand, status: Status) -> Command:
         actuators_nm = decoded.actuators_nm
-        if what == "bytes" and actuators_nm is None:
+        if check == "bytes" and actuators_nm is None:
             return decoded._replace(actuators_nm=np.resize(np.frombuffer(command.actuators, np.float32), (6, 7)))
-        if what == "grid" and actuators_nm is not None:
+        if check == "grid" and actuators_nm is not None:
             return decoded._replace(actuators_nm=np.resize(actuators_nm, (6, 7)))
-        if what == "finite" and actuators_nm is not None:
+        if check == "finite" and actuators_nm is not None:
             return decoded._replace(actuators_nm=np.nan_to_num(actuators_nm, nan=0.0, posinf=0.0))
-        if what == "order":
+        if check == "order":
             return decoded._replace(frame_sequence=max(decoded.frame_sequence, status.frame_sequence))
         return decoded
 
@@ -445,8 +445,8 @@ def test_gentle_does_not_test_the_limits() -> None:
 def test_an_interrupted_check_returns_the_mirror_to_its_shape() -> None:
     mirror = Mirror()
 
-    def interrupted(what: str) -> None:
-        if what == "limits":
+    def interrupted(check: str) -> None:
+        if check == "limits":
             mirror.changes["state"] = raising
 
     def raising(state: wire.MirrorState) -> wire.MirrorState:

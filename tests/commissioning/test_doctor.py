@@ -106,12 +106,12 @@ def trial(refused: dict[str, tuple[str, str]] | None = None, cpus: int = 8, **la
 def machine(root: Path, changes: dict[str, object]) -> Host:
     """The suitable host with some files and readings changed; None removes one."""
     host, unreadable = Host(root), Mock(side_effect=OSError("not readable"))
-    for what, value in {**METAL, **changes}.items():
-        if "/" not in what:
-            setattr(host, what, unreadable if value is None else lambda value=value: value)
+    for name, value in {**METAL, **changes}.items():
+        if "/" not in name:
+            setattr(host, name, unreadable if value is None else lambda value=value: value)
         elif value is not None:
-            (root / what).parent.mkdir(parents=True, exist_ok=True)
-            (root / what).write_text(value)
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            (root / name).write_text(value)
     return host
 
 

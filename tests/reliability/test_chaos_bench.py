@@ -138,8 +138,8 @@ def test_a_camera_with_another_clock_is_replaced_by_one_with_the_hosts() -> None
 def test_every_killed_or_stopped_process_continues_in_the_random_case() -> None:
     done: list[tuple[str, str]] = []
 
-    def noted(what: str) -> Callable[[str], None]:
-        return lambda name: done.append((what, name))
+    def noted(action: str) -> Callable[[str], None]:
+        return lambda name: done.append((action, name))
 
     class Stopped:
         def __init__(self, name: str) -> None:
@@ -163,8 +163,8 @@ def test_every_killed_or_stopped_process_continues_in_the_random_case() -> None:
     begun, ended = done[::2], done[1::2]
     assert len(begun) == len(ended) == processes.RANDOM_FAULTS
     follows = {"kill": "restart", "stop": "continue"}
-    assert [(follows[what], name) for what, name in begun] == ended
-    assert {what for what, _ in begun} == {"kill", "stop"}
+    assert [(follows[action], name) for action, name in begun] == ended
+    assert {action for action, _ in begun} == {"kill", "stop"}
 
 
 def test_a_stall_is_compared_with_the_time_before_and_after(monkeypatch: pytest.MonkeyPatch) -> None:
