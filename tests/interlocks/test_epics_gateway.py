@@ -119,7 +119,7 @@ class Operation:
 
 
 def gateway(offered: tuple[Variable, ...] = (), ask: Callable[[Put, Any], object] = print) -> EpicsGateway:
-    return EpicsGateway(CONFIG, offered, ask, lambda: None)
+    return EpicsGateway(CONFIG, offered, ask)
 
 
 def test_a_variable_is_posted_when_it_changes_and_is_invalid_with_a_fault(pvs: Variables) -> None:
@@ -191,11 +191,11 @@ def test_a_put_is_a_request_and_fails_with_its_refusal(pvs: Variables) -> None:
     ],
 )
 def test_a_monitored_variable_is_a_bench_value_while_it_is_valid(update: Any, value: Any, pvs: Variables) -> None:
-    changes: list[dict[str, Any]] = []
-    served = EpicsGateway(CONFIG, (), print, lambda: changes.append(dict(served.bench)))
-    pvs.monitors["BENCH:MASK"](received("before"))
-    pvs.monitors["BENCH:MASK"](update)
-    assert changes == [{"mask": "before"}, {} if value is None else {"mask": value}]
+    served = gateway()
+    for one, bench in ((received("before"), {"mask": "before"}), (update, {} if value is None else {"mask": value})):
+        served.changed.clear()
+        pvs.monitors["BENCH:MASK"](one)
+        assert (served.bench, served.changed.is_set()) == (bench, True)
     assert [type(one) for one in served.bench.values()] == ([] if value is None else [type(value)])
     assert all(bench_message("mask", one, 0) for one in served.bench.values())
 

@@ -18,7 +18,7 @@ from lowfc.contract.configuration import load
 from lowfc.contract.messages import Role
 from lowfc.programs.cli.status import json_object
 from lowfc.programs.gateway.epics import EpicsGateway, protocol
-from lowfc.programs.gateway.variables import Put, Variable, variables
+from lowfc.programs.gateway.variables import Put, variables
 from lowfc.programs.gateway.watch import Watch
 
 PERIOD_S = 0.1
@@ -44,7 +44,7 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
     joined = open_run(the_run(run), ())
     run_id, of_run = joined.run_id, joined.path / "config.toml"
     known = configuration(config) if config is not None or not of_run.exists() else load(of_run)
-    clock, stop, changed, offered = clock_of(known), threading.Event(), threading.Event(), tuple(variables())
+    clock, stop = clock_of(known), threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
@@ -57,12 +57,12 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
 
     with contextlib.ExitStack() as stack:
         stack.callback(lambda: bus.close())
-        gateway = EpicsGateway(known.gateway, offered, request, changed.set)
+        gateway = EpicsGateway(known.gateway, tuple(variables()), request)
         stack.callback(gateway.close)
         where = f"{known.gateway.listen}:{gateway.port}, PVs {known.gateway.prefix}*"
         sys.stderr.write(f"gateway: run {run_id} by PV Access at {where}\n")
         while True:
-            _serve(Client(run_id, bus=bus), Watch(bus, clock), gateway, offered, changed, ended)
+            _serve(Client(run_id, bus=bus), Watch(bus, clock), gateway, ended)
             if stop.is_set():
                 return
             bus.close()
@@ -71,20 +71,13 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
             sys.stderr.write(f"gateway: run {run_id} was started again and is joined\n")
 
 
-def _serve(
-    loop: Client,
-    watch: Watch,
-    gateway: EpicsGateway,
-    offered: tuple[Variable, ...],
-    changed: threading.Event,
-    ended: Callable[[], bool],
-) -> None:
+def _serve(loop: Client, watch: Watch, gateway: EpicsGateway, ended: Callable[[], bool]) -> None:
     """Post the variables and publish the bench values of one run until it has `ended`."""
     due_s, bench_s = 0.0, 0.0
     while not ended():
         now_s = time.monotonic()
-        if changed.is_set() or now_s >= bench_s:
-            changed.clear()
+        if gateway.changed.is_set() or now_s >= bench_s:
+            gateway.changed.clear()
             bench_s = now_s + BENCH_PERIOD_S
             for name, value in list(gateway.bench.items()):
                 loop.bench(name, value)
@@ -92,7 +85,7 @@ def _serve(
             due_s = now_s + PERIOD_S
             view = watch.update()
             status = json_object(view.state, view.processes, loop.run_id)
-            values = {one.name: one.read(view, status) for one in offered if one.read is not None}
+            values = {one.name: one.read(view, status) for one in gateway.variables if one.read is not None}
             gateway.update(values, "" if view.connected else "the controller does not answer")
-        changed.wait(max(0.0, min(due_s, bench_s) - time.monotonic()))
+        gateway.changed.wait(max(0.0, min(due_s, bench_s) - time.monotonic()))
         time.sleep(MIN_PERIOD_S)

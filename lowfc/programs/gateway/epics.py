@@ -1,5 +1,6 @@
 """EPICS PV Access: variables as PVs of a server, other servers' PVs as bench values; by default on loopback only."""
 
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -31,12 +32,12 @@ def protocol() -> Any:
 
 
 class EpicsGateway:
-    """Server of the variables, and PV monitors whose valid values are in `bench`."""
+    """Server of the variables, and PV monitors whose valid values are in `bench`; `changed` is set when it changes."""
 
-    def __init__(self, config: Gateway, variables: Sequence[Variable], ask: Ask, changed: Callable[[], None]) -> None:
-        """Serve; `changed` is called after a change of `bench`, on another thread. BusError if it cannot listen."""
+    def __init__(self, config: Gateway, variables: Sequence[Variable], ask: Ask) -> None:
+        """Serve; BusError if it cannot listen."""
         p4p = protocol()
-        self._variables, self.bench, self._changed = variables, dict[str, Value](), changed
+        self.variables, self.bench, self.changed = variables, dict[str, Value](), threading.Event()
         self._last: dict[str, Any] = {}
         self._pvs: dict[str, Any] = {}
         for one in variables:
@@ -77,7 +78,7 @@ class EpicsGateway:
 
     def update(self, values: dict[str, Any], fault: str) -> None:
         """Post a new image, and the variables that have changed; with a fault, these are marked as invalid."""
-        for one in self._variables:
+        for one in self.variables:
             value = values.get(one.name, _EMPTY.get(one.kind))
             if value is None:
                 continue
@@ -104,7 +105,7 @@ class EpicsGateway:
                 self.bench.pop(name, None)
             else:
                 self.bench[name] = found
-            self._changed()
+            self.changed.set()
 
         return received
 
