@@ -127,7 +127,7 @@ class ExternalChannels:
         self._others: OtherChannels | None = None  # until a controller reports the grid
         self._known = b""  # shape of the channel at the controller, as last reported or requested
         self._next_request_s = 0.0
-        self._fault = self._found = ""
+        self._report = ""
 
     def pass_on(self) -> None:
         """Request the channel `external` if it differs from the controller's."""
@@ -137,27 +137,21 @@ class ExternalChannels:
                 self._known = next((one.actuators for one in channels if one.name == EXTERNAL), b"")
         if (now_s := time.monotonic()) < self._next_request_s:
             return
-        fault = ""
         try:
             if self._others is None:
                 self._others = OtherChannels(self._names, self._client.mirror_grid())
             shape_nm = self._others.sum() * self._nm_per_unit
-            found = f"other channels: {', '.join(self._others.names) or 'none yet'}"
-            if unusable := self._others.unusable:
-                found += f"; left out: {'; '.join(unusable)}"
-            if found != self._found:
-                self._found = found
-                sys.stderr.write(f"{printable(found)}\n")
             requested = shape_nm.tobytes() if shape_nm.any() else b""
             if requested != self._known:
                 self._client.channel(EXTERNAL, shape_nm if requested else None)
                 self._known, self._next_request_s = requested, now_s + _REQUESTS_S
+            report = "; left out: ".join((", ".join(self._others.names) or "none yet", *self._others.unusable))
         except LowfcError as error:
-            fault = str(error)
+            report = f"not reported to the loop: {error}"
             self._next_request_s = now_s + (_REFUSED_S if isinstance(error, RequestRefusedError) else _REQUESTS_S)
-        if fault and fault != self._fault:
-            sys.stderr.write(f"other channels not reported to the loop: {printable(fault)}\n")
-        self._fault = fault
+        if report != self._report:
+            self._report = report
+            sys.stderr.write(f"other channels: {printable(report)}\n")
 
 
 def _open_or_create(name: str, columns: int) -> Stream:
