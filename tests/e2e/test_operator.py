@@ -71,7 +71,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
     before = set(running())
     (folder / "test.toml").write_text(FIXED)
     process = start(
-        folder, "sim-loop", "--config", "test.toml", "--rate", "200", "--json", "--disturbance", "bench", "--seed", "4"
+        folder, "sim-loop", "--config", "test.toml", "--rate", "100", "--json", "--disturbance", "bench", "--seed", "4"
     )
     made = Night(folder, process)
     try:
@@ -101,7 +101,7 @@ def _ready(night: Night) -> None:
     calibration_file.save(calibration, night.folder / "calibration.fits")
     delay = status.settings.delay_frames
     blocks = [integrator_block(0.2, 0.001, "pol", delay)] * len(calibration.noll)
-    law_file.save(law_from_blocks(blocks, "pol", "leaky", calibration.noll, delay, 200.0), night.folder / "law.fits")
+    law_file.save(law_from_blocks(blocks, "pol", "leaky", calibration.noll, delay, 100.0), night.folder / "law.fits")
     rows, columns = np.indices(calibration.grid)
     np.save(night.folder / "shape.npy", 3.0 * np.sin(rows / 3) * np.cos(columns / 4))
 
@@ -173,7 +173,7 @@ def _requests_beyond_the_document(night: Night) -> None:
         night.ctl(command)
     night.outputs["refused"] = refusal("ctl", "gain", "-0.1", "--modes", "2", "--run", night.name)
     with Client(night.name) as loop:
-        list(loop.steps(250))  # so that the last log holds the controller's state, which comes once a second
+        list(loop.steps(125))  # so that the last log holds the controller's state, which comes once a second
 
 
 def test_every_request_is_made_by_a_command_of_the_document() -> None:
@@ -220,7 +220,7 @@ def test_the_commands_say_what_they_did(night: Night) -> None:
     assert f"run {night.name}" in outputs["beginning"]
     assert status["channels"] == []
     assert json.loads(outputs["lowfc ctl note once --json"])["reply"] == "noted"
-    assert json.loads(outputs["lowfc ctl configuration --json"])["camera"]["rate_hz"] == 200.0
+    assert json.loads(outputs["lowfc ctl configuration --json"])["camera"]["rate_hz"] == 100.0
     assert outputs["refused"].startswith("gain refused: gain must be at least 0")
 
 

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.exclusive
 ROOT = Path(__file__).parents[2]
 BENCH = """
 [camera]
-rate_hz = 250
+rate_hz = 100
 
 [disturbance]
 preset = "quiet"

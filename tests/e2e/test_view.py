@@ -30,7 +30,7 @@ from lowfc.programs.view.live_view import LiveView
 from lowfc.programs.view.panels.tiles import FILL
 from lowfc.programs.view.target import Target
 from lowfc.programs.view.verdicts.tile import Level
-from tests.support.loops import LOWFC, children, interrupt, run, start, until
+from tests.support.loops import FIXED, LOWFC, children, interrupt, run, start, until
 from tests.support.report_log import SyntheticLog
 from tests.support.viewers import browser_screenshot, complaints, needs_chromium, on_screen, pixels, share_of
 
@@ -41,7 +41,9 @@ TITLE_ROWS = 30
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Name of a run whose loop is closed."""
-    process = start(tmp_path_factory.mktemp("loop"), "sim-loop", "--rate", "50", "--no-record")
+    folder = tmp_path_factory.mktemp("loop")
+    (folder / "loop.toml").write_text(FIXED)
+    process = start(folder, "sim-loop", "--config", "loop.toml", "--rate", "20", "--no-record")
     try:
         until(lambda: running() or process.poll() is not None)
         yield running()[0]

@@ -26,7 +26,7 @@ STILL = """
 [star]
 magnitude = -1.0
 [camera]
-rate_hz = 200
+rate_hz = 100
 [disturbance]
 preset = "quiet"
 static_nm = {2 = 8.0, 4 = 5.0}
