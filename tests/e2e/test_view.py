@@ -52,53 +52,6 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     assert process.returncode == 130 or process.returncode == 0
 
 
-@pytest.mark.slow
-@on_screen
-def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path) -> None:
-    joined = open_run(live)
-    config = load(joined.path / "config.toml")
-    clock = clock_of(config)
-    bus = ZenohBus(joined.links, Role.VIEWER, clock)
-    target = Target(picture=Path("a.png"))
-    live_view = LiveView(config, live, clock, bus, target)
-    try:
-        live_view.run(5.0)
-        assert live_view.renewals == 0
-        viewer = live_view.viewer
-        for number, tab in enumerate(Tab):
-            blueprint = layout(tab)
-            stream = target.stream(viewer, live, LIVE_WINDOW_S)
-            stream.send_blueprint(blueprint)
-            stream.disconnect()
-            picture = viewer.screenshot(artefacts / f"live-{tab}.png", timeout_s=6)
-            assert pixels(picture).shape == (1000, 1600, 3)
-            shown = {view.name: _shades(viewer, view.id) for view in _views(blueprint.root_container.contents[number])}
-            assert len(shown) > 4
-            assert {name: shades for name, shades in shown.items() if shades < MIN_SHADES} == {}, tab
-        assert complaints(viewer) == []
-    finally:
-        live_view.close()
-        bus.close()
-
-
-@pytest.mark.exclusive
-@pytest.mark.browser
-@needs_chromium
-def test_the_web_view_shows_the_live_loop_and_fetches_from_this_host_only(live: str, artefacts: Path) -> None:
-    page_of = subprocess.Popen([*LOWFC, "view", "--web", "--run", live], stderr=subprocess.PIPE, text=True)
-    try:
-        address = re.search(r"http://127\.0\.0\.1:\S+", page_of.stderr.readline())
-        picture = artefacts / "live-browser.png"
-        good = FILL[Level.GOOD]
-        page = browser_screenshot(address.group(), picture, 120, lambda shown: share_of(shown, good) > 0.01, (800, 500))
-        assert share_of(pixels(picture.read_bytes()), good) > 0.01, "no tile has the colour of a good state"
-        assert all(url.startswith(("http://127.0.0.1", "data:", "blob:")) for url in page.fetched.values())
-    finally:
-        page_of.send_signal(signal.SIGINT)
-        _, rest = page_of.communicate(timeout=20)
-        assert page_of.returncode == 0, rest
-
-
 @pytest.mark.exclusive
 @pytest.mark.slow
 def test_the_loop_continues_when_its_view_is_killed(tmp_path: Path) -> None:
@@ -164,6 +117,53 @@ def test_sim_loop_starts_a_view_with_the_ports_of_its_target(show: Show, expecte
     command = sim_loop._view(open_run("shown"), show, Console(quiet=True)).command
     assert f"--{show}" in command
     assert ("--web-port" in command) == expected
+
+
+@pytest.mark.slow
+@on_screen
+def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path) -> None:
+    joined = open_run(live)
+    config = load(joined.path / "config.toml")
+    clock = clock_of(config)
+    bus = ZenohBus(joined.links, Role.VIEWER, clock)
+    target = Target(picture=Path("a.png"))
+    live_view = LiveView(config, live, clock, bus, target)
+    try:
+        live_view.run(5.0)
+        assert live_view.renewals == 0
+        viewer = live_view.viewer
+        for number, tab in enumerate(Tab):
+            blueprint = layout(tab)
+            stream = target.stream(viewer, live, LIVE_WINDOW_S)
+            stream.send_blueprint(blueprint)
+            stream.disconnect()
+            picture = viewer.screenshot(artefacts / f"live-{tab}.png", timeout_s=6)
+            assert pixels(picture).shape == (1000, 1600, 3)
+            shown = {view.name: _shades(viewer, view.id) for view in _views(blueprint.root_container.contents[number])}
+            assert len(shown) > 4
+            assert {name: shades for name, shades in shown.items() if shades < MIN_SHADES} == {}, tab
+        assert complaints(viewer) == []
+    finally:
+        live_view.close()
+        bus.close()
+
+
+@pytest.mark.exclusive
+@pytest.mark.browser
+@needs_chromium
+def test_the_web_view_shows_the_live_loop_and_fetches_from_this_host_only(live: str, artefacts: Path) -> None:
+    page_of = subprocess.Popen([*LOWFC, "view", "--web", "--run", live], stderr=subprocess.PIPE, text=True)
+    try:
+        address = re.search(r"http://127\.0\.0\.1:\S+", page_of.stderr.readline())
+        picture = artefacts / "live-browser.png"
+        good = FILL[Level.GOOD]
+        page = browser_screenshot(address.group(), picture, 120, lambda shown: share_of(shown, good) > 0.01, (560, 350))
+        assert share_of(pixels(picture.read_bytes()), good) > 0.01, "no tile has the colour of a good state"
+        assert all(url.startswith(("http://127.0.0.1", "data:", "blob:")) for url in page.fetched.values())
+    finally:
+        page_of.send_signal(signal.SIGINT)
+        _, rest = page_of.communicate(timeout=20)
+        assert page_of.returncode == 0, rest
 
 
 def _shades(viewer: RerunViewer, view_id: object) -> int:

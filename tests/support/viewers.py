@@ -124,11 +124,12 @@ class Page:
 
 
 @contextlib.contextmanager
-def browser(folder: Path, size_px: tuple[int, int]) -> Iterator[Page]:
-    """Run a headless Chromium with software WebGL and its own profile; it can connect to this host only."""
+def browser(folder: Path, size_px: tuple[int, int], *, webgl: bool = False) -> Iterator[Page]:
+    """Run a headless Chromium with its own profile; it can connect to this host only. Software WebGL draws slowly."""
     quiet = ("quic", "background-networking", "component-update", "sync", "default-apps", "extensions", "dev-shm-usage")
     options = ["headless", "no-sandbox", "no-first-run", "hide-scrollbars", "remote-debugging-port=0"]
-    options += ["use-angle=swiftshader", "enable-unsafe-swiftshader", "ignore-gpu-blocklist"]
+    drawing = ("use-angle=swiftshader", "enable-unsafe-swiftshader", "ignore-gpu-blocklist")
+    options += drawing if webgl else ("disable-gpu",)
     options += [f"disable-{name}" for name in quiet]
     options += ["proxy-server=http://127.0.0.1:9", f"user-data-dir={folder / 'profile'}"]  # no proxy listens there
     options += [f"window-size={size_px[0]},{size_px[1]}"]
@@ -154,7 +155,7 @@ def browser_screenshot(
     folder = path.parent / f"{path.stem}-browser"
     folder.mkdir()
     try:
-        with browser(folder, size_px) as page:
+        with browser(folder, size_px, webgl=True) as page:
             page.open(address)
             path.write_bytes(page.screenshot_when(shows, seconds))
             return page
