@@ -7,9 +7,6 @@ from html import unescape
 from pathlib import Path
 
 import pytest
-from sphinx.application import Sphinx
-from sphinx.builders.html import StandaloneHTMLBuilder
-from sphinx.util.docutils import docutils_namespace, patch_docutils
 
 from lowfc.client.requests import DECLARED
 from lowfc.contract.configuration import keys
@@ -26,7 +23,7 @@ LONGEST = "measured/paper"
 _ROWS = re.compile(r"((?:^\|.*\n){4})(?:^\|.*\n)+", re.MULTILINE)
 
 
-def first_rows(_app: Sphinx, name: str, source: list[str]) -> None:
+def first_rows(_app: object, name: str, source: list[str]) -> None:
     """Keep the first rows of the tables of the longest page."""
     if name == LONGEST:
         source[0] = _ROWS.sub(r"\1", source[0])
@@ -50,6 +47,10 @@ def test_the_site_has_every_page_and_every_declared_name(
 
     Only the complete site includes docstrings, every row of the longest page, and the index of the search.
     """
+    from sphinx.application import Sphinx
+    from sphinx.builders.html import StandaloneHTMLBuilder
+    from sphinx.util.docutils import docutils_namespace, patch_docutils
+
     if not complete:
         for name in [name for name in BUILT if name.startswith("api ")]:
             monkeypatch.setitem(BUILT, name, str)

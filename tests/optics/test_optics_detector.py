@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 from lowfc.optics.detector.detector import Detector, expose, noise_table_of, saturation_dn
 from lowfc.optics.detector.detector_noise_table import FAINT_E, STEP_E
@@ -23,8 +23,8 @@ def probabilities(camera, mean_e, numbers):
     """Probability of each digital number, from the Poisson and normal distributions."""
     electrons_e = np.arange(400)
     edges = (np.append(numbers, numbers[-1] + 1) - 0.5 - camera.bias_dn) * camera.gain_e_per_dn
-    read = np.diff(stats.norm.cdf((edges - electrons_e[:, None]) / camera.read_noise_e), axis=1)
-    return stats.poisson.pmf(electrons_e, mean_e) @ read
+    read = np.diff(scipy.stats.norm.cdf((edges - electrons_e[:, None]) / camera.read_noise_e), axis=1)
+    return scipy.stats.poisson.pmf(electrons_e, mean_e) @ read
 
 
 CAMERAS = [Detector(), Detector(gain_e_per_dn=0.7, read_noise_e=0.4, bias_dn=90.3)]
@@ -55,7 +55,7 @@ def test_a_million_pixels_pass_the_chi_square_test(camera, mean_e):
     often = expected > least
     expected = np.append(expected[often], max(count - expected[often].sum(), least))
     found = np.append(found[often], found[~often].sum())
-    assert stats.chi2.sf(np.sum((found - expected)[:-1] ** 2 / expected[:-1]), often.sum() - 1) > 1e-3
+    assert scipy.stats.chi2.sf(np.sum((found - expected)[:-1] ** 2 / expected[:-1]), often.sum() - 1) > 1e-3
     assert found[-1] < 10 * least
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 from lowfc.adapters.files.factory import detector
 from lowfc.contract.configuration import Configuration, load
@@ -26,10 +26,10 @@ def test_dark_current_is_poisson_of_the_exposure_time() -> None:
     assert config.dark_e == pytest.approx(0.8)
     frame = expose(detector(config), np.zeros((400, 500)), np.random.default_rng(1))
     counted = np.bincount((frame - 100).ravel(), minlength=8)
-    expected = stats.poisson.pmf(np.arange(8), 0.8) * frame.size
+    expected = scipy.stats.poisson.pmf(np.arange(8), 0.8) * frame.size
     often = expected > 5
     observed = [*counted[often], counted[~often].sum()]
-    p_value = stats.chisquare(observed, [*expected[often], frame.size - expected[often].sum()])[1]
+    p_value = scipy.stats.chisquare(observed, [*expected[often], frame.size - expected[often].sum()])[1]
     assert p_value > 1e-3
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.signal import welch
+import scipy
 
 from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.control.laws.continuous import Timing
@@ -76,7 +76,7 @@ def test_modal_simulation_agrees_with_images() -> None:
     noise_nm = frame_noise_nm(config, calibration)[:2]
     found = []
     for pol in (TimeSeries((bench.pol().values[0][:, :2],), 0), lines.tilts_of(config, noise_nm, lines.FRAMES)):
-        frequency_hz, density = welch(pol.values[0], RATE_HZ, nperseg=2000, axis=0)
+        frequency_hz, density = scipy.signal.welch(pol.values[0], RATE_HZ, nperseg=2000, axis=0)
         level_nm = np.sqrt(density[(frequency_hz > 400) & (frequency_hz < 490)].mean(axis=0) * RATE_HZ / 2)
         np.testing.assert_allclose(level_nm, noise_nm, rtol=0.1)
         found.append(tuned(pol, config)["lqg"])

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from lowfc.control.loop.wording import counted
 from lowfc.programs.cli.result import table
@@ -36,7 +36,7 @@ def slope(times_s: Sequence[float], values: Sequence[float]) -> tuple[float, flo
     if np.count_nonzero(later) < 2 * BLOCKS:
         return None
     at, means = (np.array([part.mean() for part in np.array_split(one[later], BLOCKS)]) for one in (hours, found))
-    fit = stats.linregress(at, means)
+    fit = scipy.stats.linregress(at, means)
     return float(fit.slope), float(np.nan_to_num(fit.stderr))  # NaN if all are equal
 
 
