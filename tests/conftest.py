@@ -19,14 +19,11 @@ FIRST = frozenset(ROOT / name for name in ("optics", "control", "paper", "design
 """Folders whose tests wait for no other process: they run beside the exclusive tests."""
 LONGEST = ("test_lockstep", "test_gain_watch", "test_calibrate", "test_tutorials", "test_commission", "test_what_if")
 """Test files that are started next, so that no worker runs one of them alone at the end."""
-
-
-def pytest_configure() -> None:
-    gc.disable()  # nothing that collection imports is garbage
+gc.disable()  # nothing that the collection of tests imports is garbage
 
 
 def pytest_collection_finish() -> None:
-    gc.freeze()  # later collections need not look at it
+    gc.freeze()
     gc.enable()
 
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import rerun.blueprint as rrb
 from rich.console import Console
@@ -58,7 +59,7 @@ def test_the_loop_continues_when_its_view_is_killed(tmp_path: Path) -> None:
     process = start(tmp_path, "sim-loop", "--web", "--rate", "200", "--duration", "4", "--json")
     until(lambda: "view" in children(process.pid))
     view = children(process.pid)["view"]
-    until(lambda: _grandchildren(view))
+    until(psutil.Process(view).children)
     os.kill(view, signal.SIGKILL)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
@@ -178,7 +179,3 @@ def _views(part: rrb.Container | rrb.View) -> list[rrb.View]:
     if isinstance(part, rrb.View):
         return [part]
     return [view for one in part.contents for view in _views(one)]
-
-
-def _grandchildren(pid: int) -> list[str]:
-    return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()

@@ -5,7 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from matplotlib.image import imread
 
 from lowfc.adapters.files import drawing
 from lowfc.design.fisher import cramer_rao, variance_e
@@ -67,6 +66,8 @@ PLACED = ("fig3", "fig6")
 def test_every_figure_is_plotted(figure, placed, tables, tmp_path, monkeypatch):
     if not placed:
         monkeypatch.setattr(drawing, "lay_out", lambda figure, canvas, dpi: figure.set_layout_engine(None))
+    from matplotlib.image import imread
+
     path = tmp_path / f"{figure}.png"
     FIGURES[figure].plot(FEW, path)
     picture = imread(path)

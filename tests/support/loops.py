@@ -38,8 +38,6 @@ gain = 0.3
 """Configuration of a bright star and a static wavefront of 8 nm tilt and 5 nm focus."""
 LOWFC = [sys.executable, "-m", "lowfc"]
 PROGRAMS = Path(sys.executable).parent
-
-
 FIXED = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
 """Fixed gains, for a loop that is closed from its first frame on."""
 
