@@ -5,6 +5,7 @@ import json
 import multiprocessing.spawn
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
 
+import psutil
 import pytest
 
 from lowfc.adapters.bus.run import runtime_base
@@ -27,7 +29,7 @@ from lowfc.programs.commissioning.checks import Check, note, ok
 from lowfc.programs.commissioning.doctor import command, permissions, resources, timing
 from lowfc.programs.commissioning.doctor.facts import Facts, gather, ranges
 from lowfc.programs.core.recording.volume import bytes_per_s
-from tests.support.loops import lowfc, refusal, until
+from tests.support.loops import LOWFC, lowfc, refusal, until
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "howto" / "doctor.md"
 CHECKS = {**timing.CHECKS.functions, **resources.CHECKS.functions}
@@ -320,6 +322,18 @@ print(*trial.refused["priority"], *trial.refused["lock_memory"], len(trial.norma
     assert "the limit is 64 kB" in unlocked
     assert "swapped out" in stall
     assert (normal, first) == ("10", "0")
+
+
+def test_a_trial_ends_after_an_interrupt() -> None:
+    with subprocess.Popen([*LOWFC, "doctor"], stderr=subprocess.PIPE, text=True, start_new_session=True) as doctor:
+        assert doctor.stderr is not None
+        assert "measuring" in doctor.stderr.readline()
+        until(lambda: any(one.cpu_times().user > 0.1 for one in psutil.Process(doctor.pid).children()))
+        os.killpg(doctor.pid, signal.SIGINT)  # as a terminal does
+        try:
+            assert doctor.communicate(timeout=60)[1] == "interrupted\n"
+        finally:
+            doctor.kill()
 
 
 def test_a_failed_trial_has_its_cause(monkeypatch: pytest.MonkeyPatch) -> None:

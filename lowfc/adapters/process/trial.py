@@ -9,6 +9,7 @@ from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import NamedTuple
 
+from lowfc.adapters.process.child import interrupt_blocked
 from lowfc.adapters.process.realtime import leave_real_time, set_up
 from lowfc.contract.configuration import Realtime
 
@@ -40,7 +41,9 @@ def try_out(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         try:
-            return pool.submit(_try, requested, cpus, seconds).result()
+            with interrupt_blocked():  # Ctrl-C in the trial's process would leave the pool waiting for ever
+                running = pool.submit(_try, requested, cpus, seconds)
+            return running.result()
         except BrokenExecutor as fault:
             raise OSError(f"the trial's process ended: {fault}") from fault
 
