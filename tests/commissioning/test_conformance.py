@@ -2,6 +2,7 @@
 
 import json
 import socket
+import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -229,10 +230,6 @@ def stamped(shift_ns: int) -> Callable[..., RawImage]:
     return change
 
 
-def swapped(sequence: int, time_ns: int) -> bytes:
-    return sequence.to_bytes(8, "big") + time_ns.to_bytes(8, "big")
-
-
 def put_at(function: Callable[[int], int]) -> Callable[[int, int], bytes | None]:
     return lambda sequence, time_ns: envelope(sequence, function(time_ns))
 
@@ -257,7 +254,7 @@ WRONG, WARNING = "wrong", "warning"
 CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "no envelope": ({"attach": lambda *_: None}, {"envelope": WRONG, "settings on request": WRONG}),
     "a short envelope": ({"attach": lambda s, t: b"12345678"}, {"envelope": WRONG, "settings on request": WRONG}),
-    "a big-endian envelope": ({"attach": swapped}, {"sequence": WRONG, "publish time": WRONG}),
+    "a big-endian envelope": ({"attach": struct.Struct(">QQ").pack}, {"sequence": WRONG, "publish time": WRONG}),
     "a count without start": ({"attach": lambda s, t: envelope(s & 0xFFFF, t)}, {"sequence": WRONG}),
     "milliseconds for the start": ({"attach": lambda s, t: envelope(s * 1000 % 2**64, t)}, {"sequence": WRONG}),
     "a constant count": ({"count": lambda count, _: 7}, {"sequence": WRONG}),

@@ -152,7 +152,7 @@ class Collected:
         for message in reversed(self.on(EVENT.key)):
             with contextlib.suppress(DecodeError):
                 event = Log.FromString(message.payload)
-                if event.name == self.process and event.message.startswith("DRIVER_FAILED"):
+                if event.name == self.process and event.message.startswith(("DRIVER_FAILED", "DRIVER_HANGS")):
                     return event.message
         for message in reversed(self.on(HEALTH.at(self.process))):
             with contextlib.suppress(DecodeError):
