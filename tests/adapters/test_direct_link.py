@@ -121,11 +121,8 @@ class ReaderOnTwoPaths:
         self.got: list[int] = []
         self.left = 0
         self.reader = direct_link.DirectReader(
-            path, FRAME.key, self._receive, self._subscribe, time.time_ns, pytest.fail
+            path, FRAME.key, lambda sample: self.got.append(sample.sequence), self._subscribe, time.time_ns, pytest.fail
         )
-
-    def _receive(self, sample: Sample) -> None:
-        self.got.append(sample.sequence)
 
     def _subscribe(self, _: Callable[[Sample], None]) -> Callable[[], None]:
         def leave() -> None:

@@ -21,16 +21,12 @@ def running(count: int = 5) -> State:
     return feed(DEFAULTS, loaded(DEFAULTS), *frames(*range(1, count + 1)))[0]
 
 
-def shape_of(state: State) -> MirrorShape:
-    return MirrorShape(0, state.loop.actuators_nm, state.loop.history_nm[0])
-
-
 def test_a_lost_mirror_moves_the_command_back_to_its_last_shape() -> None:
     """The error persists, since nothing corrects it: otherwise the integrator would run to its limits."""
     last_seen = running(5)
     wound_up = feed(DEFAULTS, last_seen, *frames(*range(6, 30)))[0]
     assert np.abs(wound_up.loop.history_nm[0] - last_seen.loop.history_nm[0]).max() > 20
-    lost = MirrorReport(0, LOST.fault, shape_of(last_seen))
+    lost = MirrorReport(0, LOST.fault, MirrorShape(0, last_seen.loop.actuators_nm, last_seen.loop.history_nm[0]))
     moved_nm = np.abs(wound_up.loop.actuators_nm - last_seen.loop.actuators_nm).max()
     assert moved_nm > DEFAULTS.limits.slew_nm, "it takes more than one step"
     state, all_outputs = feed(DEFAULTS, wound_up, lost, lost)

@@ -29,11 +29,6 @@ _LIVE = re.compile(
 _ALONE = re.compile(r"lowfc (?!sim-loop)")
 
 
-def followed_here(line: str) -> bool:
-    """Whether a command ends by itself and needs no real-time loop."""
-    return not _LIVE.search(line)
-
-
 def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str]:
     """Output of each command of a page, run in order in this folder; only loops are separate processes."""
     text = (PAGES / f"{page}.md").read_text()
@@ -42,7 +37,7 @@ def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str
     printed = {}
     for found in re.findall(r"^    (\S.*)$", text, re.MULTILINE):
         line = found.split("  #")[0].strip()
-        if followed_here(line):
+        if not _LIVE.search(line):  # it ends by itself and needs no real-time loop
             short = line.replace("--duration 20", "--duration 0.5") if shorter else line
             printed[line] = (output_of if _ALONE.match(line) else command)(folder, short)
     return printed

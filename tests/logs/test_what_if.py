@@ -487,11 +487,8 @@ def test_errors_of_a_users_controller_are_reported(tmp_path: Path, body: str | N
     if body is not None:
         path.write_text(body)
 
-    def call() -> None:
-        user_controller(f"{path}:step")(None, np.ones(3, np.float32), np.ones(3, np.float32))
-
     with pytest.raises(ConfigurationError, match=message):
-        call()
+        user_controller(f"{path}:step")(None, np.ones(3, np.float32), np.ones(3, np.float32))
 
 
 def test_options_are_parsed() -> None:

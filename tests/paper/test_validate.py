@@ -313,14 +313,10 @@ def _unexplained(coefficient):
     return 5.0 * (1.0 - coefficient)
 
 
-def _a_fifth(value):
-    return 0.2 * value
-
-
 TOLERANCE = {
     ("fig5", "correlation"): _unexplained,
     **{("fig6", quantity): _unexplained for quantity in ("R^2", "least R^2", "mean R^2")},
-    **{("fig9", quantity): _a_fifth for quantity in ("least residual rms", "largest residual rms")},
+    **{("fig9", quantity): lambda value: 0.2 * value for quantity in ("least residual rms", "largest residual rms")},
 }
 """Tolerance of ten trials for values that depend on the draw and have no standard error."""
 

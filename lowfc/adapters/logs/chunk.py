@@ -62,15 +62,11 @@ def _zstd(data: memoryview, size: int) -> bytes:
         return stream.read(size)
 
 
-def _uncompressed(data: memoryview, size: int) -> bytes:
-    return bytes(data[:size])
-
-
 # Decompressor of each compression, and the largest ratio of sizes that its format allows.
 _COMPRESSIONS: dict[bytes, tuple[Callable[[memoryview, int], bytes], int]] = {
     b"lz4": (_lz4, 255),
     b"zstd": (_zstd, MAX_BYTES),
-    b"": (_uncompressed, 1),
+    b"": (lambda data, size: bytes(data[:size]), 1),
 }
 
 

@@ -77,7 +77,7 @@ class Recording(NamedTuple):
 
     def usable(self, plan: Plan, delay_frames: float) -> Mask:
         """Whether each frame may be used (frames,)."""
-        return usable(plan, self.steps, self.commanded, _lag(delay_frames))[self._steps_of_frames]
+        return usable(plan, self.steps, self.commanded, int(max(delay_frames, 1.0)))[self._steps_of_frames]
 
     @property
     def complete(self) -> bool:
@@ -87,11 +87,6 @@ class Recording(NamedTuple):
     @property
     def _steps_of_frames(self) -> Integers:
         return np.searchsorted(self.steps, self.sequence)
-
-
-def _lag(delay_frames: float) -> int:
-    """Integer part of the delay, frames, at least 1."""
-    return int(max(delay_frames, 1.0))
 
 
 def _weights(delay_frames: float) -> Array:

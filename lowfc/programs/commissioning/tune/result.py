@@ -126,6 +126,7 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
     integrator_nm = tune_integrator(best.models, gains, run.noll, leak, run.timing).predicted_nm
     now_nm = predicted_nm(now, best.models, run.timing) if margins.margins(now, run.timing.delay).stable else None
     achieved_nm = _achieved_nm(run, gains.noise_nm)
+    has_truth = run.true_nm2 is not None or run.continuous_rms_nm is not None
     if achieved_nm is not None and now_nm is not None and run.continuous_rms_nm is None:
         # The frames give the residual of what the exposures see; theory adds the rest.
         sampled_nm = predicted_nm(now, best.models, Timing.sampled(run.timing.delay))
@@ -167,7 +168,7 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
         delay_frames=run.timing.delay,
         closed=run.closed,
         frames=run.pol.frames,
-        achieved_from=None if achieved_nm is None else "truth" if _has_truth(run) else "error less noise",
+        achieved_from=None if achieved_nm is None else "truth" if has_truth else "error less noise",
         tilt_mas=tilt_mas,
         added_contrast=_added_contrast(run, best, now, achieved_nm),
         gain_margin=_finite(float(best.margins.gain_margin.min())),
@@ -226,10 +227,6 @@ def _added_contrast(run: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Arra
             "predicted": predicted_nm2(best.law, best.models, run.noise_nm2, run.timing),
         },
     )
-
-
-def _has_truth(run: Telemetry) -> bool:
-    return not (run.true_nm2 is None and run.continuous_rms_nm is None)
 
 
 def _achieved_nm(run: Telemetry, noise_nm: Array) -> Array | None:

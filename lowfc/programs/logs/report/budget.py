@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lowfc.arrays import Array, Mask
+from lowfc.arrays import Mask
 from lowfc.control.laws.error_budget import SensorNoise, Term, lag, lag_under_noise, measurement_error, white_noise
 from lowfc.programs.logs.report.closed_loop import (
     DISTURBANCE,
@@ -43,7 +43,7 @@ def budget_results(run: Run, stretch: Stretch | None, spectra: Spectra | None, m
     total = Term(np.sum([np.maximum(term.variance_nm2, 0) for term in known], axis=0)) if known else None
     missing = [name for name, (term, _) in terms.items() if term is None]
     true = Term(stretch.residual_ms_nm2) if stretch.residual_ms_nm2 is not None and stretch.frames.values else None
-    measured = _mean_square(stretch.signal(ERROR).joined()) if stretch.frames.values else None
+    measured = Term(np.mean(stretch.signal(ERROR).joined() ** 2, axis=0)) if stretch.frames.values else None
     return {
         "terms": rows,
         "sum": _columns(total, masks),
@@ -106,10 +106,6 @@ def _measurement_terms(stretch: Stretch, noise: SensorNoise | None) -> tuple[Ent
     linear = "linear part of (error - true residual): fit to a constant, the residual and the command"
     rest = "remainder of (error - true residual) beyond the noise of a frame"
     return (split.crosstalk, f"{linear}, {_THROUGH}"), (split.nonlinearity, f"{rest}, {_THROUGH}")
-
-
-def _mean_square(values: Array) -> Term:
-    return Term(np.mean(values**2, axis=0))
 
 
 def _columns(term: Term | None, masks: Masks) -> Results:
