@@ -38,7 +38,7 @@ def wheel(noise_nm2: float = 1e-6) -> Model:
     return Model(1e-9, np.inf, lines, noise_nm2, RATE_HZ)
 
 
-def simulated_residual(law: LinearLaw, omega: float, timing: Timing, frames: int = 4000) -> float:
+def simulated_residual(law: LinearLaw, omega: float, timing: Timing, frames: int = 1500) -> float:
     """Mean square residual over time of sqrt(2) cos(omega t + 1), simulated in fine steps."""
     fine = (np.arange(FINE) + 0.5) / FINE
     weights = delay_weights(timing.delay)
