@@ -94,7 +94,7 @@ def complaints(run: Result) -> list[str]:
 
 
 def grid(lowest_hz: float, highest_hz: float, step: float) -> list[float]:
-    """Rates from the lowest to the highest, each `step` times the one before."""
+    """Rates, Hz, from the lowest up to at most the highest, each `step` times the one before."""
     count = math.floor(math.log(highest_hz / lowest_hz) / math.log(step) + 1e-9)
     return [round(lowest_hz * step**index) for index in range(count + 1)]
 

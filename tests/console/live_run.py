@@ -1,4 +1,4 @@
-"""A run in one process, in real time: real controller and mirror, the toy's frames, a stand-in for the recorder."""
+"""A run in one process, in real time: real controller and mirror, toy sensor, a stand-in for the recorder."""
 
 import threading
 import time
@@ -18,7 +18,7 @@ from lowfc.programs.core.controller import Controller
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_dm.driver import SimulatedMirror
 from tests.support.loops import until
-from tests.support.toy import FLUX_DN, GRID, SATURATION_DN, SHAPE, TOY, calibration
+from tests.support.toy import GRID, SATURATION_DN, SHAPE, TOY, calibration
 
 RUN = "toy"
 CONFIG = load(
@@ -40,19 +40,17 @@ CONFIG = load(
 
 
 class LiveRun:
-    """The run.
+    """A run whose controller, mirror and camera are threads of this process.
 
     Attributes:
         requests: requests as published by the controller, without those that a console sends at its start.
         recorded: names of the requests to the recorder.
-        flux: flux of the star over that of the calibration.
     """
 
     def __init__(self, folder: Path) -> None:
         self.hub, self.clock = MemoryHub(), HostClock()
         self.requests: list[wire.Request] = []
         self.recorded: list[str] = []
-        self.flux = 1.0
         monitor = self.bus("monitor")
         monitor.subscribe(REQUEST, self._add_request)
         mirror_states: list[object] = []
@@ -93,7 +91,7 @@ class LiveRun:
     def _expose(self) -> None:
         self.camera.state = "running"
         while self.camera.running:
-            pixels = TOY.pixels([5.0, -3.0, 2.0], self.flux * FLUX_DN)
+            pixels = TOY.pixels([5.0, -3.0, 2.0])
             self.frames.put(image(pixels, self.clock.now_ns(), "toy").SerializeToString())
             self.camera.work += 1
             self.camera.beat()

@@ -127,7 +127,7 @@ BUTTONS: dict[str, tuple[tuple[str, ...], dict[str, object]]] = {
     "safe": ((), {"name": "safe"}),
     "clear": ((), {"name": "clear"}),
 }
-"""Input typed for each button, and the fields of the request that the controller then publishes."""
+"""Values typed for each button, and some fields of the request that the controller then publishes."""
 ORDER = ("open", *(name for name in BUTTONS if name not in ("open", "close", "pause")), "close", "pause")
 TASKS = {
     "dark": "calibrate dark --star-blocked --frames 400 --out",

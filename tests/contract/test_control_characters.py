@@ -28,7 +28,7 @@ SHOWN = r"clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 café 5" + "\u2009" +
 
 
 def check(output: str, *, keep: str = "\n") -> None:
-    """The output contains the text, but no control character."""
+    """Assert that the output contains the hostile text, but none of its control characters."""
     assert printable(output, keep) == output
     assert "clouds\\x1b[2J" in output
 
@@ -59,7 +59,7 @@ def test_a_command_escapes_its_output_and_errors(
         raise RequestRefusedError(HOSTILE)
 
     monkeypatch.setattr(sys, "argv", ["lowfc"])
-    before = {number: signal.getsignal(number) for number in (2, 15)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with pytest.raises(SystemExit):
             run_app(failing)

@@ -139,7 +139,7 @@ def test_every_reader_reads_the_log_and_reports_the_remarks(log: Path, words: tu
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
     assert done.exit_code == (1 if "acceptance" in words and "FAILED" in done.output else 0), done.output
     output = "".join(done.output.split())
-    for remark in attached_configuration_of(log):
+    for remark in remarks_on(log):
         assert "".join(remark.split()) in output
     assert tempfile.gettempdir() not in output.replace("".join(str(log.parent).split()), "")
     if "--json" in words:
@@ -148,7 +148,7 @@ def test_every_reader_reads_the_log_and_reports_the_remarks(log: Path, words: tu
         assert log.with_suffix(".html").read_text().count("its config.toml:") == len(REMARKS)
 
 
-def attached_configuration_of(log: Path) -> list[str]:
+def remarks_on(log: Path) -> list[str]:
     reader = LogReader(log)
     list(reader)
     remarks = attached_configuration(reader)[1]
@@ -171,8 +171,8 @@ def test_a_view_uses_the_recorded_or_the_default_configuration(
     used: list[Configuration] = []
     drawn = draw_logs([log], None, lambda config: used.append(config) or Renderer(config, tape))  # type: ignore[arg-type]
     assert [config.camera.rate_hz for config in used] == [rate_hz]
-    assert all(str(log) in remark for remark in drawn.remarks[:1])
-    assert toml != OTHER or drawn.remarks == attached_configuration_of(log)
+    assert str(log) in drawn.remarks[0]
+    assert toml != OTHER or drawn.remarks == remarks_on(log)
 
 
 def test_an_acceptance_test_needs_a_configuration(log_with: Callable[[str], Path]) -> None:

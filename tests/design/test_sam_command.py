@@ -155,10 +155,10 @@ def test_a_worker_ends_with_a_search_that_is_killed(tmp_path):
     with (tmp_path / "worker").open("w") as output:
         assert subprocess.run([sys.executable, "-c", KILLED], stdout=output, check=False).returncode == -signal.SIGKILL
     worker = int((tmp_path / "worker").read_text())
-    until(lambda: not runs(worker))
+    until(lambda: not is_running(worker))
 
 
-def runs(pid):
+def is_running(pid):
     try:
         return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:

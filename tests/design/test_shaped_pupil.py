@@ -94,7 +94,6 @@ def test_first_program_has_the_same_optimum_as_another_formulation_and_solver():
 
 def test_command_writes_a_mask_that_meets_the_contrast_between_the_points(tmp_path):
     path, picture = tmp_path / "spc.npz", tmp_path / "spc.png"
-    pytest.importorskip("matplotlib")
     result = json_of("design", "spc", "--outer", 8, "--cells", 64, "--out", path, "--plot", picture)
     assert result["open_area_fraction"] == pytest.approx(0.5317, abs=5e-4)
     assert abs(result["below_optimum_at_limit_fraction"]) < 1e-6

@@ -123,9 +123,9 @@ def test_the_units_are_hardened(units: Path, tmp_path: Path) -> None:
 def test_user_and_folders_are_created(tmp_path: Path) -> None:
     (tmp_path / "etc").mkdir()
     for words in (["systemd-sysusers"], ["systemd-tmpfiles", "--create"]):
-        of = words[0].removeprefix("systemd-")
+        kind = words[0].removeprefix("systemd-")
         done = subprocess.run(
-            [*words, f"--root={tmp_path}", DEPLOY / f"{of}.d" / "lowfc.conf"],
+            [*words, f"--root={tmp_path}", DEPLOY / f"{kind}.d" / "lowfc.conf"],
             capture_output=True,
             text=True,
             check=False,

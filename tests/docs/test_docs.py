@@ -206,19 +206,19 @@ def test_the_views(tmp_path: Path) -> None:
     try:
         until(lambda: recorded_bytes(tmp_path) > 4e6)
         for line in UNTIL_INTERRUPTED[1:4]:
-            look(tmp_path, line)
+            view_and_interrupt(tmp_path, line)
         for line in VIEW_FILES[:2]:
             run(tmp_path, line.replace("--seconds 60", "--seconds 1").replace("now.png", "now.png --seconds 2"))
     finally:
         _, stderr = interrupt(loop)
     assert loop.returncode == 0, stderr
     assert "http://127.0.0.1:" in stderr
-    look(tmp_path, UNTIL_INTERRUPTED[4])
+    view_and_interrupt(tmp_path, UNTIL_INTERRUPTED[4])
     run(tmp_path, VIEW_FILES[2])
     assert {path.name for path in tmp_path.iterdir()} >= {"now.png", "night.rrd", "log.png"}
 
 
-def look(folder: Path, line: str) -> None:
+def view_and_interrupt(folder: Path, line: str) -> None:
     """Run a view until it prints its address, then Ctrl-C."""
     process = start(folder, *line.split()[1:])
     assert "127.0.0.1" in process.stderr.readline()

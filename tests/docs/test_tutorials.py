@@ -1,4 +1,4 @@
-"""Tutorials: every command of each page in order; the first page also in a short form, the others as slow tests.
+"""Tutorials: every command of each page in order. The short form of the first page and the bad night are fast.
 
 The tests named in `test_docs` run the commands of real-time loops and of views.
 """

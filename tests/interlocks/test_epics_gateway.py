@@ -41,7 +41,7 @@ class Variables(dict[str, "Variables.Shared"]):
 
     class Shared:
         def __init__(self, nt: Any, initial: Any, handler: Any = None) -> None:
-            self.nt, self.initial, self.handler = nt, initial, handler
+            self.nt, self.handler = nt, handler
             self.posts: list[tuple[Any, int, str]] = []
 
         def post(self, value: Any, timestamp: float, severity: int = 0, message: str = "") -> None:

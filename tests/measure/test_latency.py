@@ -55,8 +55,8 @@ def frames(
     *,
     scheduled: bool = True,
 ) -> Frames:
-    """Frames published at `put_ns` (or that many, 1 ms apart), commanded after `command_us` (NaN: never), and applied
-    by the mirror 50 us later.
+    """Frames published at `put_ns` (an integer: their number, 1 ms apart), commanded after `command_us` (NaN: never),
+    and applied by the mirror 50 us later.
     """
     put_ns = np.arange(put_ns) * MS if isinstance(put_ns, int) else put_ns
     sequence = START + np.arange(put_ns.size, dtype=np.uint64)

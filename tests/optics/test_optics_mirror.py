@@ -48,7 +48,7 @@ def test_the_driven_actuators_are_the_pupil_and_one_ring():
     np.testing.assert_array_equal(active, active[::-1])
 
 
-def made_and_wanted(commands):
+def wavefronts_and_modes(commands):
     """Wavefronts (20, samples in the pupil) of the commands (actuators, 20), and the modes."""
     u = pupil_axis(256)
     inside, factors = np.hypot(u[:, None], u) <= 0.5, influence_factors(MIRROR, u, 34)
@@ -60,7 +60,7 @@ def test_modes_to_actuators_gives_the_modes_with_half_the_surface():
     commands = modes_to_actuators(MIRROR, NOLLS_20)
     assert commands.shape == (34 * 34, 20)
     assert not commands[~active_actuators(MIRROR).ravel()].any()
-    made, targets = made_and_wanted(commands)
+    made, targets = wavefronts_and_modes(commands)
     assert ((made - targets).std(axis=1) < 0.016).all()  # print-through: 1.1 %, 1.5 % for the worst mode
     assert (made * targets).sum(axis=1) / (targets**2).sum(axis=1) == pytest.approx(1.0, abs=2e-3)
 
@@ -72,7 +72,7 @@ def test_neighbours_compensate_for_unusable_actuators():
     commands = modes_to_actuators(MIRROR, NOLLS_20, usable)
     assert not commands[~usable.ravel()].any()
     uncompensated = modes_to_actuators(MIRROR, NOLLS_20) * usable.ravel()[:, None]
-    errors, others = (np.subtract(*made_and_wanted(each)).std(axis=1) for each in (commands, uncompensated))
+    errors, others = (np.subtract(*wavefronts_and_modes(each)).std(axis=1) for each in (commands, uncompensated))
     assert (errors < 0.95 * others).all()
     assert np.median(errors / others) < 0.8
     few = np.zeros((34, 34), bool)

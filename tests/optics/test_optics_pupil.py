@@ -137,13 +137,13 @@ def test_prolate_pupil_throughput_and_symmetry(apodised):
 
 @pytest.mark.parametrize(("radius", "spot"), [(4.0, 1.06), (2.53, 2.0)])
 def test_the_phase_spot_has_the_area_of_its_circle_and_a_soft_edge(radius, spot):
-    mask, whole = phase_spot(8, radius, spot), disk(8, radius)
-    np.testing.assert_array_equal(mask == 0, whole == 0)
+    mask, plain = phase_spot(8, radius, spot), disk(8, radius)
+    np.testing.assert_array_equal(mask == 0, plain == 0)
     assert mask.imag.sum() / 64 == pytest.approx(np.pi * spot**2 / 4, rel=1e-3)
     r = np.hypot(image_axis(len(mask), 8)[:, None], image_axis(len(mask), 8))
     half_sample = np.sqrt(0.5) / 8
     np.testing.assert_array_equal(mask[r < spot / 2 - half_sample], 1j)
-    np.testing.assert_array_equal(mask[(whole > 0) & (r > spot / 2 + half_sample)], 1)
+    np.testing.assert_array_equal(mask[(plain > 0) & (r > spot / 2 + half_sample)], 1)
     np.testing.assert_array_equal(mask, mask[::-1])
     np.testing.assert_array_equal(mask, mask.T)
 

@@ -215,7 +215,8 @@ def test_wavefronts_that_are_not_at_the_used_nodes_are_refused(fast):
         twin_response(fast, np.zeros((2, 1444)))
 
 
-def test_benchmark_reports_all_three_twins(cache_dir, fast, accurate, broadband, monkeypatch):
+@pytest.mark.usefixtures("fast", "accurate", "broadband")  # in the cache, so that they are not built again
+def test_benchmark_reports_all_three_twins(cache_dir, monkeypatch):
     monkeypatch.setattr(bench, "WAVEFRONTS", 4)
     result = bench.bench_twin(seconds=0.05, cache_dir=cache_dir)
     assert json.loads(json.dumps(result)) == result

@@ -40,7 +40,7 @@ def stored(built, tmp_path):
     return twin, Path(shutil.copy(path, tmp_path))
 
 
-def same(first, second):
+def assert_same(first, second):
     wavefront = np.linspace(-20, 20, first.used.size, dtype=np.float32)
     np.testing.assert_array_equal(Evaluator(first).image(wavefront), Evaluator(second).image(wavefront))
     np.testing.assert_array_equal(first.area_weights, second.area_weights)
@@ -53,7 +53,7 @@ def forbidden(*_):
 
 def test_a_second_call_reads_the_file(sensor, stored, tmp_path):
     again = load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden)
-    same(stored[0], again)
+    assert_same(stored[0], again)
     assert again.operator_hash == operator_hash(sensor, SMALL, monochromatic(550.0))
 
 
@@ -61,7 +61,7 @@ def test_broadband_twins_survive_the_file(sensor, tmp_path):
     band = gauss_legendre(550.0, count=2)
     built = load_or_build(sensor, SMALL, band, cache_dir=tmp_path)
     again = load_or_build(sensor, SMALL, band, cache_dir=tmp_path, progress=forbidden)
-    same(built, again)
+    assert_same(built, again)
     assert [each.weight for each in again.operators] == list(band.weights)
 
 
@@ -100,7 +100,7 @@ def test_changed_source_code_rebuilds_the_cache(sensor, stored, tmp_path, monkey
     load_or_fit_mirror(sensor, twin, mirror, tmp_path)
     before = set(tmp_path.iterdir())
     monkeypatch.setattr(twin_cache, "source_hash", lambda: "of another version")
-    same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path))
+    assert_same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path))
     load_or_fit_mirror(sensor, twin, mirror, tmp_path)
     assert sorted(path.name.partition("-")[0] for path in set(tmp_path.iterdir()) - before) == ["mirror", "twin"]
 
@@ -133,8 +133,8 @@ def test_damaged_file_is_reported_and_rebuilt(sensor, stored, tmp_path):
         assert len(notices) == 1
         assert str(path) in notices[0]
         assert steps[-1] == (32, 32)
-        same(twin, again)
-        same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden))
+        assert_same(twin, again)
+        assert_same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden))
 
 
 def test_a_directory_that_cannot_be_written_is_not_fatal(sensor, stored, tmp_path):
@@ -142,16 +142,16 @@ def test_a_directory_that_cannot_be_written_is_not_fatal(sensor, stored, tmp_pat
     file.write_text("not a directory")
     notices = []
     twin = load_or_build(sensor, SMALL, cache_dir=file / "cache", notice=notices.append)
-    same(stored[0], twin)
+    assert_same(stored[0], twin)
     assert any("cannot be written" in text for text in notices)
 
 
 def test_concurrent_builds_give_one_valid_file(sensor, tmp_path):
     with ThreadPoolExecutor(2) as pool:
         twins = list(pool.map(lambda _: load_or_build(sensor, SMALL, cache_dir=tmp_path), range(2)))
-    same(*twins)
+    assert_same(*twins)
     assert [path.suffix for path in tmp_path.iterdir()] == [".npz"]
-    same(twins[0], load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden))
+    assert_same(twins[0], load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden))
 
 
 def test_the_cache_follows_xdg(monkeypatch, tmp_path):

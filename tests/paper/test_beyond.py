@@ -19,7 +19,7 @@ from lowfc.programs.paper.report import CASES, PICTURES, to_page, to_text
 from lowfc.programs.paper.tables import anchors, star_pair, tolerance
 
 DOCS = Path(__file__).parents[2] / "docs" / "measured"
-LIGHT = "zwfs_tuned"
+SMALLEST = "zwfs_tuned"
 """The sensor with the fewest pixels."""
 
 
@@ -78,19 +78,19 @@ def agree(rows: list[Row], name: str) -> int:
 def test_tolerances_of_a_sensor_have_the_committed_values(monkeypatch):
     for module, name in ((tolerance, "_checked"), (star_pair, "pair_rows")):  # have tests of their own
         monkeypatch.setattr(module, name, lambda argument: [])
-    rows = tolerance.tolerance(Context(sensors=(LIGHT,)))
+    rows = tolerance.tolerance(Context(sensors=(SMALLEST,)))
     assert len(rows) == len(tolerance.MAGNITUDES) * 14 * len(tolerance.ALLOWED) * 2 * len(KINDS)
     shown = [row for row in rows if tolerance.in_text(plain(row))]
     assert agree(shown, "tolerance") == len(shown) == 4 * 2 * 2
 
 
 def test_a_pair_of_stars_has_the_committed_values():
-    rows = list(star_pair.pair_rows(LIGHT))
+    rows = list(star_pair.pair_rows(SMALLEST))
     assert agree(rows, "tolerance") == len(rows) == 8
 
 
 def test_anchors_without_a_loop_have_the_committed_values():
-    rows = [*anchors._hundred_seconds(Context(), LIGHT), *anchors._against_magnitude(LIGHT)]
+    rows = [*anchors._hundred_seconds(Context(), SMALLEST), *anchors._against_magnitude(SMALLEST)]
     assert agree(rows, "anchors") == len(rows) == 14 + len(tolerance.MAGNITUDES)
 
 
@@ -99,10 +99,10 @@ def test_curves_against_magnitude_approach_but_do_not_cross_the_quantum_limit(ta
     panels = []
     monkeypatch.setattr(table, "draw", lambda path, drawn, *_, **__: panels.extend(drawn))
     monkeypatch.setattr(table, "curves", lambda lines, *_, **__: lines)
-    table.plot(Context(sensors=(LIGHT,)), Path("unused"))
+    table.plot(Context(sensors=(SMALLEST,)), Path("unused"))
     assert panels
     for sensor, limit in panels:
-        assert (sensor.name, limit.name) == (LIGHT, "quantum limit")
+        assert (sensor.name, limit.name) == (SMALLEST, "quantum limit")
         gain = limit.y / sensor.y if limit_is_above else sensor.y / limit.y
         assert 1 <= gain[0] < gain[-1]  # read noise matters for faint stars
         assert (np.diff(sensor.y) < 0).all() == limit_is_above
@@ -140,7 +140,7 @@ class Loops:
         assert (lowfc, as_json) == ("lowfc", "--json")
         options = dict(pairwise(words))
         config = load(cwd / options["--config"] if "--config" in options else None)
-        assert name == "tune" or config.sensor == section_of(LIGHT)
+        assert name == "tune" or config.sensor == section_of(SMALLEST)
         self.commands.append((name, options.get("--disturbance", ""), bool(config.control.law)))
         found = {"log": "a.mcap", "tilt_disturbance_mas": 14.0, "tilt_residual_mas": self.residual_mas}
         return SimpleNamespace(returncode=0, stdout=json.dumps(found))
@@ -149,9 +149,7 @@ class Loops:
         rng, frames = np.random.default_rng(4), round(24 * anchors.RATE_HZ)
         seconds = np.arange(frames)[:, None] / anchors.RATE_HZ
         pol_nm = 20.0 * np.sin(2 * np.pi * 29.0 * seconds + [0, 1]) + 0.1 * rng.standard_normal((frames, 2))
-        level_mas = (
-            0.1 * (np.floor(seconds / anchors.MEAN_S) % 2 - 0.5) * [1, 1]
-        )  # of opposite sign in every second mean
+        level_mas = 0.1 * (np.floor(seconds / anchors.MEAN_S) % 2 - 0.5) * [1, 1]  # its means alternate in sign
         steps = SimpleNamespace(sequence=np.arange(frames), pol_nm=pol_nm)
         true = SimpleNamespace(residual_nm=np.hstack([level_mas, level_mas]) * tilt_nm_per_mas(2.0))
         return SimpleNamespace(log=SimpleNamespace(path=log), true=true, steps=steps)
@@ -161,7 +159,7 @@ def test_loops_are_judged_by_the_published_pointing(monkeypatch):
     loops = Loops()
     monkeypatch.setattr(anchors.subprocess, "run", loops.run)
     monkeypatch.setattr(anchors, "_history", loops.history)
-    rows = {row.quantity: row for row in anchors._pointing(Context(), LIGHT)}
+    rows = {row.quantity: row for row in anchors._pointing(Context(), SMALLEST)}
     for preset in ("reaction-wheel", "reaction-wheel-ideal"):
         row = rows[f"tilt, {preset}"]
         assert (row.measured, row.paper) == (0.3, anchors.ROMAN_MAS)
@@ -198,7 +196,7 @@ def test_only_requested_sensors_are_anchored_and_simulated(monkeypatch):
     rows = anchors.anchors(few)
     assert {row.name for row in rows} == {"zwfs"}
     assert tolerance._checked(few) == []
-    assert {row.name for row in tolerance._checked(Context(trials=2, sensors=("zwfs", LIGHT)))} == {LIGHT}
+    assert {row.name for row in tolerance._checked(Context(trials=2, sensors=("zwfs", SMALLEST)))} == {SMALLEST}
     assert all("verdict" not in row.quantity for row in rows), "without a published value"
 
 

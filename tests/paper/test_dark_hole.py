@@ -31,24 +31,24 @@ CONFIG = SMALL_MIRROR | {
 
 
 class LoggedLoop(InProcessLoop):
-    """A loop that keeps its steps."""
+    """A loop that keeps all its steps for `history`."""
 
     def __init__(self) -> None:
         super().__init__(load(None, CONFIG))
         self._grid = self.config.mirror.rows, self.config.mirror.columns
-        self.taken: list[Step] = []
+        self.kept_steps: list[Step] = []
 
     def steps(self, count: int | None = None, patience_s: float = 0.0) -> Iterator[Step]:
         for step in super().steps(count):
-            self.taken.append(step)
+            self.kept_steps.append(step)
             yield step
 
     def history(self) -> Any:
         truths = [self.scene.truth(index, surface).sampled for index, surface in enumerate(self.surfaces_nm)]
         return SimpleNamespace(
             steps=SimpleNamespace(
-                sequence=np.array([step.frame_sequence for step in self.taken]),
-                command_nm=np.array([step.command_nm for step in self.taken]),
+                sequence=np.array([step.frame_sequence for step in self.kept_steps]),
+                command_nm=np.array([step.command_nm for step in self.kept_steps]),
             ),
             true=SimpleNamespace(
                 disturbance_nm=np.array([truth.disturbance_nm for truth in truths]),
@@ -87,7 +87,7 @@ def test_the_loop_undoes_only_the_steps_that_do_not_shift_its_zero_point(monkeyp
     assert [len(marks[channel]) for channel in (SHIFTED, PLAIN)] == [STEPS + 1, 2]
     found = dark_hole.channel_results(loop.history(), marks, channel_nm)
     shifted, plain = found[SHIFTED], found[PLAIN]
-    assert np.linalg.norm(shifted.channel_nm[-1]) > 2, "nm of wavefront that a loop without the shift would take away"
+    assert np.linalg.norm(shifted.channel_nm[-1]) > 2, "nm of wavefront that a loop without the shift would remove"
     assert shifted.undone()[0] == pytest.approx(0, abs=0.04)
     assert plain.undone()[0] == pytest.approx(1, abs=0.04)
     before_nm, after_nm = shifted.residual_nm

@@ -106,7 +106,7 @@ def test_the_document_is_rendered_from_its_results(committed):
 def test_a_table_of_one_sensor_agrees_with_the_committed_one(few, committed, name):
     others = {each[0] for each in compare(few[name], committed[name])}
     own = {row["name"] for row in few[name]["rows"]} & {row["name"] for row in committed[name]["rows"]}
-    # In the complete Table 3 the pupil's first sensor represents the input.
+    # The input of Table 3 is named after the pupil's first sensor, which is another one in the complete table.
     assert others == {row["name"] for row in few[name]["rows"] + committed[name]["rows"]} - own
     assert (SAM in own) == (name not in ("table1", "photometry"))
 

@@ -250,11 +250,11 @@ def test_every_case_has_a_valid_configuration_and_known_events(tmp_path: Path) -
     for case in {str(case.config): case for case in CASES.values()}.values():  # each configuration once
         assert configured(case, tmp_path).control.start_mode == "closed"
     assert {case.fault for case in CASES.values() if case.fault} == set(Kind)
-    first = next(case for case in CASES.values() if case.bad is not None).bad
+    bad = next(case for case in CASES.values() if case.bad is not None).bad
     edges = (FIRST - 1, FIRST, FIRST + FAULTY_FRAMES - 1, FIRST + FAULTY_FRAMES)
-    assert [first(number) for number in edges] == [False, True, True, False]
+    assert [bad(number) for number in edges] == [False, True, True, False]
     assert FORGED_S < START_S
-    bad = CASES["frames-stuck"].bad  # the first ones may be used, up to max_identical_frames
+    bad = CASES["frames-stuck"].bad  # the first frames may be used, up to max_identical_frames
     edges = (FIRST, FIRST + 2, FIRST + 3, FIRST + FAULTY_FRAMES)
     assert [bad(number) for number in edges] == [False, False, True, False]
 
@@ -262,7 +262,7 @@ def test_every_case_has_a_valid_configuration_and_known_events(tmp_path: Path) -
 def run(*arguments: str, status: int = 0) -> str:
     app = typer.Typer()
     app.command("chaos")(chaos)
-    app.command("other")(lambda: None)
+    app.command("other")(lambda: None)  # an app with one command has no names of commands
     done = CliRunner().invoke(app, ["chaos", *arguments], catch_exceptions=False)
     assert done.exit_code == status
     return done.stdout
@@ -270,7 +270,7 @@ def run(*arguments: str, status: int = 0) -> str:
 
 @pytest.fixture
 def without_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cases that run without a loop."""
+    """Replace all cases by ones that run without a loop."""
 
     def judge_notes(case: Case, outcome: Outcome, evidence: Evidence) -> list[Finding]:
         return [Finding("notes", not outcome.notes, "; ".join(outcome.notes))]
@@ -278,7 +278,7 @@ def without_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def act_only(case: Case, folder: Path, rng: object) -> Outcome:
         found = Outcome(folder, load(None))
         try:
-            case.act(None)  # type: ignore[arg-type]  # these need no bench
+            case.act(None)  # type: ignore[arg-type]  # these acts need no bench
         except LowfcError as error:
             found.notes.append(str(error))
         return found

@@ -1,4 +1,4 @@
-"""The bench of a chaos case with processes that only sleep, and the console in a terminal of its own."""
+"""The bench of a chaos case with processes that only sleep, and a console in its own terminal."""
 
 import json
 import os
@@ -34,7 +34,7 @@ SLEEP = ["sleep", "60"]
 
 @pytest.fixture
 def sleeping(own_runtime: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ChaosBench:
-    """A bench whose processes sleep, with a fault of the camera's frames; none has been started."""
+    """A bench with faulty camera frames, whose processes only sleep; they have not been started."""
     monkeypatch.setattr(bench, "_POLL_S", 0.001)
     monkeypatch.setattr(bench, "_LAST_HEALTH_S", 0.0)
     monkeypatch.setattr(bench, "prepare", lambda *_: None)
@@ -76,7 +76,7 @@ def test_how_each_process_ended_is_recorded(sleeping: ChaosBench) -> None:
     assert not sleeping.run.path.exists()
 
 
-def test_a_process_that_a_process_leaves_behind_is_reported(sleeping: ChaosBench) -> None:
+def test_a_child_that_a_process_leaves_behind_is_reported(sleeping: ChaosBench) -> None:
     sleeping.restart(Role.CAMERA, ["sh", "-c", "sleep 60 & exit 0"], ready=False)
     until(lambda: sleeping.children[Role.CAMERA].status == 0)
     sleeping.end()
@@ -172,7 +172,7 @@ def test_a_stall_is_compared_with_the_time_before_and_after(monkeypatch: pytest.
     timings, latency_us = bus.publisher(TIMING), {"now": 0}
 
     def pass_time(seconds: float) -> None:
-        """Frames of the present phase arrive; those of a short wait belong to none."""
+        """Publish frames with the latency of the phase; with 9 ms in the short waits between phases."""
         latency = latency_us["now"] if seconds > 1 else 9_000
         timings.put(wire.ControlTiming(frame_to_command_ns=[1000 * latency] * 3).SerializeToString())
 

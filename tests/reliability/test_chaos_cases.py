@@ -1,4 +1,4 @@
-"""Chaos cases in one process and in simulated time, judged by the rules that judge those on the real processes."""
+"""Chaos cases in one process and in simulated time, judged by the same rules as with real processes."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -24,7 +24,7 @@ JUNK = ("junk", "forged-commands", "forged-frames", "malformed-requests", "concu
 
 @pytest.fixture
 def in_simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every bench be a toy's, in whose time cases wait and intruders send."""
+    """Replace every bench by a `ToyBench`; cases wait and intruders send in its simulated time."""
 
     def begun(*arguments: Any) -> ToyBench:
         made = ToyBench(*arguments)

@@ -91,9 +91,9 @@ def test_too_few_samples_are_reported_as_too_short_to_judge() -> None:
     assert "p50 too short to judge; p99 too short to judge" in text
     assert text.endswith(f"too short to judge: {', '.join(short)}")
     latency = latency_statistics([(one, 500 + 8 * one / 3600, 900.0) for one in map(float, range(SECONDS))])
-    text = render(results | {"latency": latency, "why": ["the camera's memory grow"]})
+    text = render(results | {"latency": latency, "why": ["growth of the camera's memory"]})
     assert "p50 502 us, +8.0 +- 0.0 us per hour" in text
-    assert text.endswith("FAILED: the camera's memory grow")
+    assert text.endswith("FAILED: growth of the camera's memory")
 
 
 def test_latencies_are_those_of_the_controllers_timing_messages() -> None:
@@ -124,7 +124,7 @@ def test_a_slow_loop_has_time_to_settle() -> None:
     assert waited_s == [185.0]
 
 
-def test_a_soak_closes_the_loop_whatever_the_file_starts_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_soak_closes_the_loop_whatever_the_start_mode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     used: list[Configuration] = []
     monkeypatch.setattr(
         "lowfc.programs.reliability.soak.run.soak_loop",
@@ -177,7 +177,7 @@ def test_missing_messages_are_counted_within_logs_and_between_them(tmp_path: Pat
 
 
 def test_a_soak_finds_the_process_whose_memory_grows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In simulated time, with a toy's loop that loses nothing."""
+    """In simulated time, with a loop of the toy sensor that loses no message."""
 
     def begun(*arguments: Any) -> ToyBench:
         made = ToyBench(*arguments)

@@ -1,4 +1,4 @@
-"""A chaos bench in one process and in simulated time: real controller and mirror, the toy's frames, a real log."""
+"""A chaos bench in one process and in simulated time: real controller, mirror and log, frames of the toy sensor."""
 
 import random
 import signal
@@ -38,7 +38,7 @@ TOY_KEYS: dict[str, Any] = {
     "camera.rate_hz": 100.0,
     "realtime.cache_warmup": False,
 }
-"""Keys of the configuration of a toy's loop."""
+"""Configuration keys of a loop with the toy sensor."""
 DRIFT_NM, DRIFT_HZ = np.array([20.0, -12.0, 8.0]), 0.3
 """Amplitude and frequency of the disturbance of each mode."""
 TO_MODES = np.linalg.pinv(TOY.modes_to_actuators)
@@ -47,13 +47,13 @@ CAMERA_PID = 1
 PATIENCE_FRAMES = 3000
 
 
-class Answering(Controller):
+class ImmediateController(Controller):
     """A controller that answers a request at once, on the requester's thread."""
 
-    answering = threading.Lock()
+    _request_lock = threading.Lock()
 
     def _queue_query(self, query: Query) -> None:
-        with self.answering:
+        with self._request_lock:
             self._answer(query)
             self._update_latch()
 
@@ -63,10 +63,10 @@ class Recorder(MemoryBus):
 
     def __init__(self, hub: MemoryHub, clock: FakeClock, log: LogWriter) -> None:
         super().__init__(hub, Role.RECORDER, clock)
-        self._log, self._turn, self.messages = log, threading.Lock(), 0
+        self._log, self._log_lock, self.messages = log, threading.Lock(), 0
 
     def deliver(self, key: str, payload: bytes, envelope: Envelope) -> None:
-        with self._turn:
+        with self._log_lock:
             self.messages += 1
             self._log.write(Sample(key, payload, *envelope, self.clock.host_ns()))
 
@@ -100,7 +100,7 @@ class ToyBench(ChaosBench):
         return MemoryBus(self.hub, role, self.clock)
 
     def replace_time(self, module: ModuleType, patch: Callable[..., None]) -> None:
-        """Let a module wait in simulated time; other threads than the test's do not wait."""
+        """Let a module wait in simulated time; only the main thread waits, others continue at once."""
         patch(module, "time", SimpleNamespace(monotonic=lambda: self.clock.now_ns() * 1e-9, sleep=self._sleep))
 
     def begin(self) -> None:
@@ -138,7 +138,7 @@ class ToyBench(ChaosBench):
         self.outcome.ended.append(ProcessEnd(name, -signal.SIGKILL, 0.0, True))
 
     def restart(self, name: str, command: list[str] | None = None, *, ready: bool = True) -> None:
-        """Start a controller with the calibration file that its command ends with."""
+        """Start a controller; its calibration file is the last word of the command."""
         try:
             found = calibration_file.load(Path((command or self.children[Role.CONTROLLER].command)[-1]))
         except LowfcError as fault:
@@ -146,7 +146,7 @@ class ToyBench(ChaosBench):
             return
         service = self._service(name)
         self._latch = Latch([self.run.path / NAME], lambda why: service.event("LATCH_FAILED", why=why))
-        self._controller = Answering(self.config, service, found, "a test", self._latch)
+        self._controller = ImmediateController(self.config, service, found, "a test", self._latch)
         service.fill = self._controller.fill
         self._mirror._publish(self.clock.now_ns())  # the mirror's state, from which a controller starts
         self._controller._camera.await_first()

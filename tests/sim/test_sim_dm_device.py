@@ -20,7 +20,7 @@ MS = 1_000_000
 
 
 def mirror(**keys: object) -> Simulated:
-    """A mirror without settling; `keys` are others of [mirror]."""
+    """A mirror without settling time; `keys` are further keys of section [mirror]."""
     keys = {"rows": GRID[0], "columns": GRID[1], "settling_us": 0.0} | keys
     return Simulated(load(None, {f"mirror.{key}": value for key, value in keys.items()}))
 
@@ -317,7 +317,7 @@ def test_driver_step_too_coarse_for_the_slew_limit_is_refused() -> None:
         _ = MirrorProtection(GRID, Limits(750.0, 5.0, 500.0), 1500 / 2**8, flatten=True).tighter
 
 
-def test_the_mirror_of_a_configuration() -> None:
+def test_the_configuration_gives_the_mirrors_limits_and_faulty_actuators() -> None:
     keys = {"mirror.dead": [0, 35], "mirror.stuck_nm": {"35": 9.0, "40": -70.0}, "mirror.on_command_timeout": "hold"}
     made = Simulated(load(None, keys))
     assert made.protection == MirrorProtection((34, 34), LIMITS, STEP_NM, flatten=False)
