@@ -93,7 +93,7 @@ def test_a_run_that_cannot_be_joined_hides_no_other() -> None:
 
 @pytest.mark.usefixtures("toml")
 @pytest.mark.parametrize("words", [("record",), ("config", "zenoh", "--role", "camera"), ("sim-loop",)], ids=" ".join)
-def test_too_long_or_empty_a_name_of_a_run_is_refused(words: tuple[str, ...]) -> None:
+def test_a_name_of_a_run_that_is_too_long_or_empty_is_refused(words: tuple[str, ...]) -> None:
     for name in ("x" * 300, ""):
         fault = lowfc(*words, "--run", name).exception
         assert isinstance(fault, BusError)

@@ -139,7 +139,7 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(
 def test_an_invalid_value_is_reported_in_one_line_with_key_and_value(key: str, value: object) -> None:
     message = error_of(None, {key: value})
     assert message.startswith(key)
-    assert repr(value).strip("[]") in message  # of an item in a list, the item
+    assert f" = {repr(value).strip('[]')}: " in message  # of a list, its only item
     assert "\n" not in message
 
 

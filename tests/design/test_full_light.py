@@ -25,7 +25,7 @@ from lowfc.programs.design.full_light_request import Spot
 from tests.support.loops import json_of, refusal
 
 LIGHT_E = electrons(STAR, TABLE4_EXPOSURE_S)
-# Noise of 14 modes in nm, and the share of the quantum limit, from an independent calculation.
+# Noise of 14 modes in nm, and the share of the quantum limit, from an independent calculation; None: not compared.
 EXPECTED = {
     "sam": (None, 0.006),
     "sam18_sized": (None, 0.013),

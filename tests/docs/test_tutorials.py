@@ -26,7 +26,7 @@ _LIVE = re.compile(
     r"^lowfc (ctl|console|runs|chaos|validate|bench|view|config|camera|conformance|controller|record)\b|^sim-|^rerun|"
     r"--run |--web|--compare|^lowfc sim-loop --rate|--config lowfc|spc"
 )
-_ALONE = re.compile(r"lowfc (?!sim-loop)")
+_IN_THIS_PROCESS = re.compile(r"lowfc (?!sim-loop)")
 
 
 def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str]:
@@ -39,7 +39,7 @@ def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str
         line = found.split("  #")[0].strip()
         if not _LIVE.search(line):  # it ends by itself and needs no real-time loop
             short = line.replace("--duration 20", "--duration 0.5") if shorter else line
-            printed[line] = (output_of if _ALONE.match(line) else command)(folder, short)
+            printed[line] = (output_of if _IN_THIS_PROCESS.match(line) else command)(folder, short)
     return printed
 
 

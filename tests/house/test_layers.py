@@ -57,7 +57,7 @@ PURE_IMPORTS = (
 FROM_A_SEED = ("Generator", "default_rng", "SeedSequence", "SFC64", "PCG64")
 NUMPY_FILES = ("load", "loadtxt", "save", "savez", "savez_compressed", "savetxt", "fromfile", "memmap", "genfromtxt")
 FORBIDDEN_CALLS = ("open", "print", "input", "exec", "eval", "__import__", "breakpoint", "globals")
-LONGEST = 400
+MAX_LINES = 400
 MAX_MODULES = 16
 
 
@@ -150,7 +150,9 @@ def test_every_source_but_the_tests_is_type_checked() -> None:
 
 def test_no_file_is_too_long_or_vaguely_named() -> None:
     long = {module: len(path.read_text(encoding="utf-8").splitlines()) for module, path in FILES.items()}
-    assert {module: lines for module, lines in long.items() if lines > LONGEST and not inside(module, GENERATED)} == {}
+    assert {
+        module: lines for module, lines in long.items() if lines > MAX_LINES and not inside(module, GENERATED)
+    } == {}
     vague = {"utils", "util", "helpers", "common", "misc"}
     assert [module for module in FILES if vague & set(module.split("."))] == []
 

@@ -128,7 +128,7 @@ def test_the_part_of_a_dark_hole_that_the_loop_undoes_is_judged(undone, verdict,
 
 
 class Loops:
-    """Stand-in for the commands that run a loop and tune a law: the tilt has a line and noise, and is corrected."""
+    """Stand-in for the commands that run a loop and tune a law: tilt with a line and noise, and a given residual."""
 
     residual_mas = 0.3
 
