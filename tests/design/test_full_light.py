@@ -69,14 +69,14 @@ def test_cramer_rao_bound_of_every_sensor_exceeds_the_quantum_limit(name, modes)
         assert np.median(np.diag(limit) / np.diag(bound)) == pytest.approx(share, rel=0.1)
 
 
-def test_an_interferometer_of_two_holes_reaches_the_quantum_limit():
-    """For two small holes whose phases differ by a, the fringe at quadrature attains the quantum limit."""
+def test_quantum_information_of_two_holes_is_that_of_their_fringe_at_quadrature():
+    """N photons at quadrature give the information N (d phase difference / d mode)^2 = 4 N."""
     n, pupil = 64, np.zeros((64, 64))
     pupil[32, 8], pupil[32, 56] = 1.0, 1.0
     mode = np.zeros((1, n, n))
     mode[0, 32, 8], mode[0, 32, 56] = 1.0, -1.0
     found = quantum_information(pupil, mode, 2 * np.pi, light_e=n * n * np.pi / 4.0)  # 1 photon in each hole
-    assert found.item() == pytest.approx(4 * 2 * 1.0)  # N = 2, variance of the phase over them 1
+    assert found.item() == pytest.approx(4 * 2 * 1.0)  # N = 2, phases +1 and -1 per unit of the mode
 
 
 @pytest.mark.parametrize("name", ["zwfs_tuned", "clowfs_tuned"])

@@ -108,7 +108,7 @@ def test_curves_against_magnitude_approach_but_do_not_cross_the_quantum_limit(ta
         assert (np.diff(sensor.y) < 0).all() == limit_is_above
 
 
-def test_the_fourth_table_gives_the_rows_of_two_modes_with_the_papers_other_sensor(monkeypatch):
+def test_anchors_from_table_4_are_the_tilts_of_two_modes_with_the_published_values(monkeypatch):
     rows = [row for row in committed("anchors")["rows"] if "std of x tilt" in row["quantity"]]
     of_table4 = [Row(**row | {"paper": 0.36}) for row in rows if row["unit"]]
     others = [Row("sam", of_table4[0].quantity, "mas", 0.1, modes=14, estimator="weighted"), Row("sam", "other", "", 1)]

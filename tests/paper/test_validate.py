@@ -212,7 +212,7 @@ def test_user_errors_are_one_line(words, message):
     assert "\n" not in str(error)
 
 
-def test_a_sensor_that_cannot_tell_modes_apart_is_a_user_error_in_every_table():
+def test_a_sensor_that_cannot_tell_modes_apart_is_a_user_error_in_the_anchors():
     with pytest.raises(ConfigurationError, match="sensor open, 14 modes: the sensor cannot tell"):
         next(anchors._hundred_seconds(Context(), "open"))
 

@@ -102,7 +102,7 @@ def outcome(tmp_path: Path) -> Outcome:
     return found
 
 
-def broken(case: Case, outcome: Outcome, evidence: Evidence) -> dict[str, str]:
+def broken_rules(case: Case, outcome: Outcome, evidence: Evidence) -> dict[str, str]:
     return {one.rule: one.found for one in judge(case, outcome, evidence) if not one.held}
 
 
@@ -154,7 +154,7 @@ def test_a_fault_breaks_its_rule_and_no_other(
 ) -> None:
     assert [one.held for one in judge(CASE, outcome, evidence)] == [True] * 6
     inject(evidence, outcome)
-    found = broken(CASE, outcome, evidence)
+    found = broken_rules(CASE, outcome, evidence)
     assert set(found) == {rule}
     assert text in found[rule]
 
@@ -165,13 +165,13 @@ def test_losses_that_are_counted_and_refused_frames_that_hold_the_command_break_
     evidence.received[STEPS] = received(7, 8)
     evidence.lost = {STEP.key: 2}
     evidence.entries[COMMAND].append(shape(FRAMES + 1, 110))  # after a lost command, twice the slew limit is allowed
-    assert broken(CASE, outcome, evidence) == {}
+    assert broken_rules(CASE, outcome, evidence) == {}
     evidence.entries[STEP][500] = step(500, wire.REASON_DARK, used=False)
     for shapes in (evidence.entries[COMMAND], evidence.entries[MIRROR_STATE]):
         shapes[500] = shapes[500]._replace(actuators_nm=shapes[499].actuators_nm)
 
     def broken_with(bad: Callable[[int], bool]) -> dict[str, str]:
-        return broken(replace(CASE, bad=bad), outcome, evidence)
+        return broken_rules(replace(CASE, bad=bad), outcome, evidence)
 
     assert broken_with(lambda number: number == 500) == {}
     assert "bad frame 501 was used" in broken_with(lambda number: number == 501)["bad frames"]
@@ -180,18 +180,18 @@ def test_losses_that_are_counted_and_refused_frames_that_hold_the_command_break_
 
 def test_a_missing_expected_event_breaks_the_rule(outcome: Outcome, evidence: Evidence) -> None:
     case = replace(CASE, expected=("FRAMES_REFUSED frames refused: DARK",))
-    assert "no event" in broken(case, outcome, evidence)["events"]
+    assert "no event" in broken_rules(case, outcome, evidence)["events"]
     evidence.entries[EVENT].append(event(Level.WARNING, "FRAMES_REFUSED frames refused: DARK"))
-    assert broken(case, outcome, evidence) == {}
+    assert broken_rules(case, outcome, evidence) == {}
 
 
 def test_a_safe_case_requires_the_safe_mode_and_a_flat_mirror(outcome: Outcome, evidence: Evidence) -> None:
     case = replace(CASE, safe=True)
-    assert "closed" in broken(case, outcome, evidence)["recovery"]
+    assert "closed" in broken_rules(case, outcome, evidence)["recovery"]
     outcome.mode = wire.LOOP_MODE_SAFE
-    assert "nm of flat" in broken(case, outcome, evidence)["recovery"]
+    assert "nm of flat" in broken_rules(case, outcome, evidence)["recovery"]
     evidence.entries[MIRROR_STATE].append(shape(FRAMES))
-    assert broken(case, outcome, evidence) == {}
+    assert broken_rules(case, outcome, evidence) == {}
 
 
 def test_the_step_at_a_restart_is_the_largest_move_from_the_last_mirror_state(evidence: Evidence) -> None:

@@ -26,7 +26,7 @@ JUNK = ("junk", "forged-commands", "forged-frames", "malformed-requests", "concu
 def in_simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replace every bench by a `ToyBench`; cases wait and intruders send in its simulated time."""
 
-    def begun(*arguments: Any) -> ToyBench:
+    def new_bench(*arguments: Any) -> ToyBench:
         made = ToyBench(*arguments)
         for module in (control, junk, processes, console):
             made.replace_time(module, monkeypatch.setattr)
@@ -35,7 +35,7 @@ def in_simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(junk, "ZenohBus", lambda _, role, __: made.connection(role))
         return made
 
-    monkeypatch.setattr(bench, "ChaosBench", begun)
+    monkeypatch.setattr(bench, "ChaosBench", new_bench)
     monkeypatch.setattr(case, "WHILE_FRAMES", 100)
     monkeypatch.setattr(control, "WHILE_FRAMES", 100)
     monkeypatch.setattr(junk, "FLOOD_S", 0.3)

@@ -1,4 +1,4 @@
-"""Evaluation of a soak's samples: growth is detected, noise is not taken for growth, gaps are counted."""
+"""Evaluation of a soak's samples: growth is detected, noise is not, gaps are counted."""
 
 import json
 import signal
@@ -179,7 +179,7 @@ def test_missing_messages_are_counted_within_logs_and_between_them(tmp_path: Pat
 def test_a_soak_finds_the_process_whose_memory_grows(monkeypatch: pytest.MonkeyPatch) -> None:
     """In simulated time, with a loop of the toy sensor that loses no message."""
 
-    def begun(*arguments: Any) -> ToyBench:
+    def new_bench(*arguments: Any) -> ToyBench:
         made = ToyBench(*arguments)
         made.replace_time(run, monkeypatch.setattr)
         return made
@@ -191,7 +191,7 @@ def test_a_soak_finds_the_process_whose_memory_grows(monkeypatch: pytest.MonkeyP
         memory = SimpleNamespace(rss=10**8 + (pid == CAMERA_PID) * 10**6 * samples[pid])
         return SimpleNamespace(memory_info=lambda: memory, num_fds=lambda: 20, num_threads=lambda: 5)
 
-    monkeypatch.setattr(run, "ChaosBench", begun)
+    monkeypatch.setattr(run, "ChaosBench", new_bench)
     monkeypatch.setattr(run, "psutil", SimpleNamespace(Error=psutil.Error, Process=process))
     elapsed_s: list[float] = []
     config = load(None, FIXED_GAINS | TOY_KEYS | {"control.start_mode": "closed", "camera.rate_hz": 10.0})

@@ -51,7 +51,7 @@ def rms_nm(disturbance: Disturbance) -> np.ndarray:
 
 
 def check_order_and_block(name: str, first: int, count: int, cut: int) -> None:
-    """Compare `count` frames from `first` on with the same frames from `cut` on, one of them alone, and all anew."""
+    """Compare `count` frames from `first` on with those after `cut`, with one alone, and with all of a new object."""
     disturbance = preset(name, static_nm={4: 3.0})
     whole = modes_nm(disturbance, first, count, RATE_HZ)
     cut = min(cut, count - 1)
