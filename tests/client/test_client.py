@@ -352,7 +352,7 @@ def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., 
 
 
 def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With owner, process and, if readable, runtime directory; a user's own loop in this directory as starting."""
+    """With owner, process and, if readable, runtime directory; the user's own loop in this one is starting."""
     name = f"night-{os.getpid()}"
     words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", name]
     wrapped = ["/bin/sh", "-c", 'echo; read end; "$@"', *words[3:]]

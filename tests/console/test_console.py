@@ -129,6 +129,7 @@ BUTTONS: dict[str, tuple[tuple[str, ...], dict[str, object]]] = {
 }
 """Values typed for each button, and some fields of the request that the controller then publishes."""
 ORDER = ("open", *(name for name in BUTTONS if name not in ("open", "close", "pause")), "close", "pause")
+"""Buttons in an order in which the controller accepts every request."""
 TASKS = {
     "dark": "calibrate dark --star-blocked --frames 400 --out",
     "reference": "calibrate reference --frames 1000 --out",

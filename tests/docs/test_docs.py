@@ -82,9 +82,13 @@ def test_every_command_in_the_documentation_is_tested() -> None:
 
 
 def test_every_link_leads_to_a_file() -> None:
-    for document in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("deploy/*.md")):
-        for target in re.findall(r"\]\((?![a-z]+:|#)([^)#\s]+)", document.read_text()):
-            assert (document.parent / target).exists(), f"{document}: {target}"
+    links = [
+        document.parent / target
+        for document in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("deploy/*.md"))
+        for target in re.findall(r"\]\((?![a-z]+:|#)([^)#\s]+)", document.read_text())
+    ]
+    assert len(links) > 100
+    assert [str(link) for link in links if not link.exists()] == []
 
 
 def test_every_test_named_in_the_documentation_exists() -> None:

@@ -218,7 +218,7 @@ def signals() -> Iterator[None]:
 def test_the_command_serves_a_run_until_it_is_stopped(
     pvs: Variables, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The run starts again at once; `safe` does not wait for the end of a log; the first frame posted stops it all."""
+    """The run restarts at once; `safe` does not wait for the end of a log; the first posted frame stops the command."""
     buses: list[MemoryBus] = []
     hub, bench, plain, finished = MemoryHub(), list[Sample](), pvs.Shared.post, threading.Event()
     controller = MemoryBus(hub, "controller", HostClock())

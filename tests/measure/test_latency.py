@@ -292,7 +292,9 @@ def test_a_difference_is_compared_with_the_spread() -> None:
 
 def test_the_results_of_every_release_can_be_compared_with_present_ones() -> None:
     today = together([repeat(100), repeat(130)])
-    for file in HISTORY.glob("*.json"):
+    files = list(HISTORY.glob("*.json"))
+    assert files
+    for file in files:
         found = compare(json.loads(file.read_text()), today)
         compared_at = {(row["name"], row["at"]) for row in found["rows"]}
         assert compared_at >= {("frame_to_mirror", "p99"), ("over_echo_and_step", "p50")}

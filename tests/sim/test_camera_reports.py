@@ -66,9 +66,9 @@ def test_tilt_per_axis_is_that_of_the_axes_among_the_modes() -> None:
 def test_recent_statistics_cover_only_recent_frames() -> None:
     assert statistics(recent=100).recent() == {}
     run = statistics(*[50.0] * BLOCK, *[2.0] * 100, recent=100)
-    found, whole = run.recent(), run.wavefront()
+    found, overall = run.recent(), run.wavefront()
     assert (found["residual_rms_nm"], found["tilt_disturbance_mas"]) == pytest.approx((2.0, 4.0))
-    assert whole["residual_rms_nm"] > 40.0, "includes the frames before"
+    assert overall["residual_rms_nm"] > 40.0, "includes the frames before"
 
 
 @pytest.mark.parametrize("before", [0, 1, WINDOW, 3 * WINDOW + 7])

@@ -18,6 +18,7 @@ from sim_camera.wheel import HEIGHTS, ORDERS, SOFT_HZ, Wheel, walk, wheels
 
 FLAT = np.zeros((34, 34), np.float32)
 TIME_S = np.arange(0, 20, 1e-4)
+NM_PER_MAS = 2.424
 
 
 def quiet(**changed: Any) -> Configuration:
@@ -111,7 +112,9 @@ def test_sensor_sees_the_mean_of_fast_jitter_over_the_exposure(exposure: float) 
     config = quiet(disturbance__jitter_mas=2.0, camera__exposure_fraction=exposure)
     disturbance = disturbance_of(config)
     assert 500 < disturbance.frequency_hz.min() < disturbance.frequency_hz.max() < 1500
-    np.testing.assert_allclose(np.sqrt(variances_nm2(disturbance)[1].sum(axis=0))[:3] / 2.424, [2, 2, 0], rtol=1e-3)
+    np.testing.assert_allclose(
+        np.sqrt(variances_nm2(disturbance)[1].sum(axis=0))[:3] / NM_PER_MAS, [2, 2, 0], rtol=1e-3
+    )
     made, fine = scene(config), 2000
     for index in (0, 7, 8, 30):
         within = modes_nm(disturbance, index * fine, round(exposure * fine) + 1, 1000.0 * fine)
