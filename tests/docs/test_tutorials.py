@@ -22,7 +22,7 @@ LIVE = (
 )
 CHAOS = "lowfc chaos --case frames-dark --keep bad"
 BASLER = "lowfc conformance camera --run basler --config basler.toml"
-_LIVE = re.compile(
+NOT_FOLLOWED = re.compile(
     r"^lowfc (ctl|console|runs|chaos|validate|bench|view|config|camera|conformance|controller|record)\b|^sim-|^rerun|"
     r"--run |--web|--compare|^lowfc sim-loop --rate|--config lowfc|spc"
 )
@@ -37,7 +37,7 @@ def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str
     printed = {}
     for found in re.findall(r"^    (\S.*)$", text, re.MULTILINE):
         line = found.split("  #")[0].strip()
-        if not _LIVE.search(line):  # it ends by itself and needs no real-time loop
+        if not NOT_FOLLOWED.search(line):  # it ends by itself and needs no loop
             short = line.replace("--duration 20", "--duration 0.5") if shorter else line
             printed[line] = (output_of if _IN_THIS_PROCESS.match(line) else command)(folder, short)
     return printed

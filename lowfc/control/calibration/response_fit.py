@@ -68,7 +68,7 @@ class Sums(NamedTuple):
 
     Attributes:
         initial: R_a.
-        products: (cycles, modes, modes) R_a H of each cycle, without unit.
+        answers: (cycles, modes, modes) R_a H of each cycle, without unit; the name is that in files of 0.1.
         response: (pixels, modes) sum of H.
         reference: (pixels,) sum of I0 over `references` cycles.
         references: number of cycles with frames without a poke.
@@ -76,7 +76,7 @@ class Sums(NamedTuple):
     """
 
     initial: Initial
-    products: Array
+    answers: Array
     response: Array
     reference: Array
     references: int
@@ -91,13 +91,13 @@ class Sums(NamedTuple):
     @property
     def cycles(self) -> int:
         """Number of cycles."""
-        return len(self.products)
+        return len(self.answers)
 
     def plus(self, cycle: Cycle) -> "Sums":
         """Sums with one more cycle."""
         return Sums(
             self.initial,
-            np.concatenate([self.products, (self.initial.matrix @ cycle.response)[None]]),
+            np.concatenate([self.answers, (self.initial.matrix @ cycle.response)[None]]),
             self.response + cycle.response,
             self.reference + cycle.reference if cycle.reference is not None else self.reference,
             self.references + (cycle.reference is not None),
@@ -185,8 +185,8 @@ def fit_response(sums: Sums) -> Measured:
     n = sums.cycles
     if n < 1:
         raise ValueError("no cycle was measured")
-    response, kept = sums.response / n, without_outliers(sums.products)
-    mean = sums.products.mean(axis=0)
+    response, kept = sums.response / n, without_outliers(sums.answers)
+    mean = sums.answers.mean(axis=0)
     if np.linalg.cond(mean) < WORST_CONDITION:
         response = response @ np.linalg.solve(mean, kept.mean(axis=0))
     reference = sums.reference / sums.references if sums.references else None

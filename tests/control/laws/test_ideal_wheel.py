@@ -10,7 +10,7 @@ from lowfc.contract.envelope import count_of
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import highest_gain
-from lowfc.control.laws.tuning import best_gains, identified, tune_lqg
+from lowfc.control.laws.tuning import best_gains, identify_modes, tune_lqg
 from sim_camera.disturbance import Sampler
 from sim_camera.driver import disturbance_of
 from tools.law_bench import Bench, calibrated, configured
@@ -33,7 +33,7 @@ def residual_mas(bench: Bench, run: TimeSeries, timing: Timing, *, continuous: b
     """Continuous residual, or at the starts of exposures, with the law tuned from a run for a timing, mas."""
     rate_hz, none = bench.config.camera.rate_hz, np.zeros(2)
     gains = best_gains(run, rate_hz, timing, none)
-    bench.load(tune_lqg(run, identified(run, rate_hz), gains, (2, 3), none, timing).law)
+    bench.load(tune_lqg(run, identify_modes(run, rate_hz), gains, (2, 3), none, timing).law)
     bench.new_record()
     bench.run(SETTLE + MEASURE)
     return bench.tilt_mas(MEASURE, continuous=continuous)

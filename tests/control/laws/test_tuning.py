@@ -10,7 +10,7 @@ from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG, highest_gain
 from lowfc.control.laws.tuning import (
     best_gains,
-    identified,
+    identify_modes,
     simulated_residual_nm2,
     tune_integrator,
     tune_lqg,
@@ -78,7 +78,7 @@ def test_the_residual_of_a_leaky_integrator_follows_from_the_log(leak: float) ->
     )
     leaks = np.full(2, leak)
     gains = best_gains(pol, RATE_HZ, Timing.sampled(1.0), leaks)
-    best = tune_integrator(identified(pol, RATE_HZ), gains, NOLL, leaks, Timing.sampled(1.0))
+    best = tune_integrator(identify_modes(pol, RATE_HZ), gains, NOLL, leaks, Timing.sampled(1.0))
     residual_nm = np.sqrt(simulated_residual_nm2(best.law, pol, gains.noise_nm**2, Timing.sampled(1.0)))
     np.testing.assert_allclose(best.predicted_nm, residual_nm, rtol=0.5)
     np.testing.assert_allclose(gains.predicted_nm, residual_nm, rtol=0.5)
@@ -97,7 +97,7 @@ def test_laws_on_the_reaction_wheel_leave_the_predicted_residual(
     """LQG leaves less than a notch filter, which leaves less than the integrator."""
     pol, truth = wheel(10_000)
     later = TimeSeries((truth + 0.8 * np.random.default_rng(99).standard_normal(truth.shape),), 0)
-    models = identified(pol, RATE_HZ)
+    models = identify_modes(pol, RATE_HZ)
     timing = Timing.sampled(delay)
     gains = best_gains(pol, RATE_HZ, timing, NONE)
     residual_mas: dict[str, float] = {}
@@ -121,7 +121,7 @@ def test_white_noise_gets_a_law_with_a_small_residual() -> None:
     noise = np.random.default_rng(5).standard_normal((4096, 2))
     pol = TimeSeries((noise,), 0)
     gains = best_gains(pol, RATE_HZ, Timing.sampled(1.0), NONE)
-    best = tune_lqg(pol, identified(pol, RATE_HZ), gains, NOLL, NONE, Timing.sampled(1.0))
+    best = tune_lqg(pol, identify_modes(pol, RATE_HZ), gains, NOLL, NONE, Timing.sampled(1.0))
     assert set(best.kinds) <= {"integrator", "lqg"}
     assert (
         simulated_residual_nm2(best.law, pol, noise.var(axis=0), Timing.sampled(1.0)) < 0.05 * noise.var(axis=0)
@@ -134,7 +134,7 @@ def test_too_few_frames_are_refused() -> None:
     with pytest.raises(ValueError, match="at least 2048 frames in a row, the longest run has 500"):
         best_gains(pol, RATE_HZ, Timing.sampled(1.0), NONE)
     with pytest.raises(ValueError, match="at least 2048 frames in a row"):
-        identified(pol, RATE_HZ)
+        identify_modes(pol, RATE_HZ)
 
 
 @pytest.mark.slow
