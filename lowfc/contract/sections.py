@@ -175,8 +175,8 @@ class Camera(Section):
     noise: bool = True
     """Simulated camera: photon and read noise; off only for tests of the control law."""
     photon_noise: Literal["fast", "exact"] = "fast"
-    """Noise of the simulated camera. fast: faint pixels from a tabulated distribution, variance at most 6e-5 e-^2 too large;
-    exact: all electrons."""
+    """Noise of the simulated camera. fast: faint pixels from a tabulated distribution, variance at most 6e-5 e-^2 too
+    large; exact: all electrons."""
 
 
 class Disturbance(Section):
