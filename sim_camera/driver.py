@@ -106,7 +106,7 @@ def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scen
 
 
 def ignore(warning: str) -> None:
-    """Drop a warning of the optics: a launcher prints it."""
+    """Drop a warning of the optics, which `lowfc sim-loop` prints."""
 
 
 def _centred_region(name: str, size: int, of: int) -> tuple[int, int]:

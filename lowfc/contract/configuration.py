@@ -1,7 +1,7 @@
 """The configuration: every key with its unit, default and range.
 
 A file is TOML with the sections of `Configuration`; missing keys have their defaults. An unknown key is an error that
-names the nearest known one. `lowfc config show` prints all keys with their descriptions.
+names a similar known one. `lowfc config show` prints all keys with their descriptions.
 """
 
 import difflib

@@ -92,10 +92,10 @@ class CameraLoop:
             watch.returned()
             if exposure is None:
                 return None
-            if not (isinstance(exposure, Exposure) and isinstance(exposure.pixels, np.ndarray)):
-                raise TypeError(
-                    f"expose() returned {type(exposure).__name__}, expected Exposure with a numpy array, or None"
-                )
+            if not isinstance(exposure, Exposure):
+                raise TypeError(f"expose() returned {type(exposure).__name__}, expected Exposure or None")
+            if not isinstance(exposure.pixels, np.ndarray):
+                raise TypeError(f"pixels of Exposure are {type(exposure.pixels).__name__}, expected a numpy array")
             if exposure.pixels.shape != (settings.rows, settings.columns):
                 settings = self._publish_settings()  # the region changed during the exposure
             pixels = _checked(exposure.pixels, settings)

@@ -88,7 +88,7 @@ def camera_beside(driver: Camera, config: Configuration, service: Service) -> It
     Raises:
         BusError: the run has a camera already.
         ConfigurationError: the run is in lockstep.
-        LowfcError: the driver reported a fault that a user has to correct; raised after the block, as any other error.
+        LowfcError: the driver reported a fault that a user has to correct; raised after the block, as every error is.
     """
     if config.lockstep:
         raise ConfigurationError("in lockstep the camera is a process of its own: leave out --camera, or lockstep")

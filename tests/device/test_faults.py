@@ -76,7 +76,7 @@ def exposed(*exposures: Callable[[], Any], frames: int, settings: CameraSettings
         (good(lost=-1), "lost is -1"),
         (good(lost=1 << 32), "lost is 4294967296"),
         (lambda: "nothing", "expose() returned str"),
-        (good(pixels=GOOD.tolist()), "expected Exposure with a numpy array"),
+        (good(pixels=GOOD.tolist()), "pixels of Exposure are list"),
     ],
     ids=["raises", "shape", "NaN", "future", "past", "NaN time", "negative loss", "huge loss", "nonsense", "list"],
 )

@@ -36,7 +36,7 @@ def make_certificates(
     Args:
         folder: folder of the authority; created with access for this user only.
         roles: roles to make certificates for, including the router's.
-        addresses: names and IP addresses by which other hosts reach the router; empty: a renewal keeps those it has.
+        addresses: names and IP addresses by which other hosts reach the router; empty to renew the present ones.
         days: validity of the certificates, days.
         renew: also renew existing certificates, with their present keys; the authority is never renewed.
 

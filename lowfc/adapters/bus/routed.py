@@ -203,7 +203,7 @@ def require_certificate(network: Network, role: str) -> None:
 
 
 def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
-    """Warnings about certificates in this host's folder: absent, invalid, end within `WARN_DAYS`, key not secret."""
+    """Warnings about this host's certificates: absent, invalid, ending within `WARN_DAYS`, or with a readable key."""
     folder = user_path(network.certificates)
     roles = sorted(key.stem for key in folder.glob("*.key") if key.name != CA_KEY)
     warnings = [] if roles else [f"{folder} has no certificate with its key, ROLE.pem and ROLE.key"]

@@ -40,13 +40,13 @@ def keep_thread_state() -> None:
 
 
 def close_links_at_once(session: zenoh.Session) -> None:
-    """Let no dead link delay a process: sets options of its TCP sockets after each new link of a session.
+    """Set options of this process's TCP sockets after each new link of a session, so that no dead link delays it.
 
-    SO_LINGER off; zenoh sets 10 s. Closing the link of a process that is stopped would block the thread that receives,
-    and no request would be answered for as long. The kernel still sends what was written.
+    SO_LINGER is turned off; zenoh sets 10 s. Closing the link of a process that is stopped would block the thread that
+    receives, and no request would be answered for as long. The kernel still sends what was written.
 
-    Across hosts, TCP_USER_TIMEOUT is the lease. Otherwise a link that was cut while data waited in its buffer is not
-    closed until the network is back and the kernel sends again, up to two minutes later.
+    Across hosts, TCP_USER_TIMEOUT is set to the lease. Otherwise a link that was cut while data waited in its buffer is
+    not closed until the network is back and the kernel sends again, up to two minutes later.
     """
 
     def changed(event: zenoh.LinkEvent) -> None:

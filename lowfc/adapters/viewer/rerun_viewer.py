@@ -7,7 +7,8 @@ killed.
 Measured with rerun 0.41:
 
 - `RecordingStream.log` to a hanging viewer continues until about 100 MB are unsent (this process grows by 150 MB), then
-  blocks. To a dead viewer it neither grows nor blocks; a new stream with the same ids to a new viewer continues it.
+  blocks. To a dead viewer it neither grows nor blocks; a new stream with the same ids to a new viewer on the same port
+  continues the recording.
 - `disconnect`, `del`, and the end of the process block while the viewer hangs: call stop() first.
 - A browser's page must be reloaded after its server has restarted.
 - The memory limit applies to the data as counted by rerun: a viewer levelled off at 184 MB for "100MB", a headless one

@@ -75,7 +75,7 @@ def dither(columns: int, amplitude: float, frames: int, hold: int, seed: int) ->
     """Pseudo-random pushes and pulls of all modes at once, to be played in a closed loop.
 
     Columns are modes, the amplitude is in nm rms of wavefront, and signs may change every `hold` frames: with a hold of
-    1, the loop removes least of the pokes. Each piece has its own seed.
+    1, the loop removes the least of them. Each piece has its own seed.
     """
     rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, 7])))
     states = rng.integers(0, 2, (-(-frames // hold), columns)) * 2.0 - 1.0
@@ -123,7 +123,7 @@ def usable(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: 
         plan: The plan that was played.
         sequence: (exposures,) ascending, counted from the frame whose command had the first row.
         commanded: (exposures,) whether the frame led to a command.
-        lag: Integers frames from a row's frame to the exposure that sees it.
+        lag: Whole frames from a row's frame to the exposure that sees it.
     """
     place = sequence - lag
     within = (place >= 0) & (place < len(plan))

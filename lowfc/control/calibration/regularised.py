@@ -117,7 +117,7 @@ def advice(made: Reconstruction, noll: tuple[int, ...], limit_nm: float) -> str:
             "disturbance remains; the modes in them are measured too small"
         )
     if least <= 0.999:
-        return f"the worst-measured combination of modes is damped to {least:.0%}: its modes are measured too small"
+        return f"the worst-measured combination of modes is damped to {least:.1%}: its modes are measured too small"
     bad = np.flatnonzero(noise_nm > limit_nm)
     if bad.size == 0:
         return (

@@ -216,7 +216,7 @@ class GainBank:
         return found
 
     def _cross_talk_nm(self, tilts: list[Array]) -> list[Array]:
-        """Cross-talk (modes,) of tip and tilt over these blocks, if certain, and if suspected; otherwise 0."""
+        """Cross-talk of tip and tilt over these blocks, twice (modes,): where certain, where suspected; else 0."""
         found, error = self._cross_talk.mean_nm(np.mean(tilts, axis=0))
         accepted: list[Array] = [np.where(np.abs(found) > errors * error, found, 0) for errors in (SURE, SUSPECTED)]
         return [self._of_own @ one for one in accepted]

@@ -21,7 +21,7 @@ from lowfc.control.loop.state import ActiveLoop, Settings, Weighting
 from lowfc.control.loop.wording import AUTO, counted
 
 _MAX_PREPARED = 64
-"""Most leaks of a request whose limiting gains are cached; a request with more has more values than there are modes."""
+"""Most leaks of a request whose limiting gains are cached; one with more has more values than any calibration."""
 
 Changed = tuple[ActiveLoop, str, *tuple[PendingEvent, ...]]  # the loop after a request, its reply, events
 

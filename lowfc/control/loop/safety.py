@@ -123,8 +123,8 @@ def limit(limits: Limits, previous_nm: Single, requested_nm: Single) -> Limited:
     Both are (rows, columns) float32, nm of surface; the previous one is finite, as a result of this function. Stroke,
     then slew, clip each actuator separately; the neighbour limit shortens the whole move. For any `requested_nm`, the
     result is finite, no actuator moves further than the slew limit, and if `previous_nm` is within the stroke and
-    neighbour limits, so is the result; otherwise it returns to them at the slew limit. A requested
-    shape of another grid, or with a value that is not finite, leaves the previous command.
+    neighbour limits, so is the result; otherwise it returns to them at the slew limit. A requested shape of another
+    grid, or with a value that is not finite, leaves the previous command.
     """
     if requested_nm.shape != previous_nm.shape:
         return Limited(previous_nm, (Limit.WRONG_GRID,))
