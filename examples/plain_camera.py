@@ -2,7 +2,8 @@
 
 It publishes a numpy file of frames (frames, rows, columns) uint16 in a loop.
 
-Example: python examples/plain_camera.py camera.json5 frames.npy
+Example: lowfc config zenoh --run bench --role camera --make > camera.json5
+         python examples/plain_camera.py camera.json5 frames.npy
 """
 
 import json
@@ -20,7 +21,7 @@ from lowfc.contract.wire.lowfc_pb2 import CameraState, Health  # compiled by pro
 PERIOD_NS, EXPOSURE_NS, SETTINGS_PERIOD_NS = 4_000_000, 2_000_000, 500_000_000
 
 SESSION, FRAMES = Path(sys.argv[1]), np.load(sys.argv[2])
-# The host's time never steps: CLOCK_MONOTONIC plus an offset in a file shared by all processes of this boot.
+# The host's time never steps: CLOCK_MONOTONIC plus an offset in a file of this boot, shared by the user's processes.
 base = Path(json.loads(SESSION.read_text())["transport"]["auth"]["usrpwd"]["dictionary_file"]).parents[1]
 boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 OFFSET_NS = int((base / f"clock-{boot}").read_text())
@@ -42,7 +43,12 @@ class Publisher:
         self.key, self.count, self.last = key, 0, (b"", b"")
         self._publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
         if queryable:
-            session.declare_queryable(key, lambda query: query.reply(key, self.last[0], attachment=self.last[1]))
+            session.declare_queryable(key, self._reply)
+
+    def _reply(self, query: zenoh.Query) -> None:
+        payload, envelope = self.last
+        if envelope:  # not before the first message
+            query.reply(self.key, payload, attachment=envelope)
 
     def put(self, payload: bytes) -> None:
         """Send a message."""

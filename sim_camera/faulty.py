@@ -36,7 +36,7 @@ class FaultyFrames:
     def __init__(
         self, fault: Fault, publisher: Publisher, dark: float, highest: int, now_ns: Callable[[], int]
     ) -> None:
-        """Wrap the publisher of frames, with the detector's lowest and highest values in DN and the host's clock."""
+        """Wrap the publisher of frames; `dark` and `highest`: DN without light and at full well."""
         self._fault = fault
         self._publisher = publisher
         self._dark, self._highest = round(dark), highest

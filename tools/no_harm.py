@@ -73,7 +73,10 @@ def _closed_nm2(sensor: str, preset: str, magnitude: float, seed: int, gains: di
 
 
 def modal_case(case: tuple[str, str, float]) -> Results:
-    """Contrast that closing adds for a sensor, preset and star, by modal benches; for bright stars fixed gains too."""
+    """Contrast that closing adds for a sensor, preset and star, without terms between modes, by modal benches.
+
+    For bright stars, the residual with fixed gains too.
+    """
     sensor, preset, magnitude = case
     form, own = _contrast(sensor)
     try:
@@ -179,12 +182,12 @@ def render(results: Results) -> str:
         f"{columns(heads, table)}\nTrue wavefront, open to closed with automatic gains, nm rms over the second half "
         f"of {results['seconds']:g} s at {results['rate_hz']:g} Hz, mean of {results['seeds']} seeds. "
         f"Number of cases: {len(rows)} (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them "
-        "with every image simulated). A case counts as harmful if closing adds more contrast than "
-        f"{100 * TOLERATED:g} % of the dark zone's own plus three standard errors (`quiet`: "
-        f"{100 * TOLERATED:g} % alone). Harmful cases, with the ratio of added contrast to the dark zone's own: "
-        f"{names or 'none'}. On bright stars "
-        f"(V = {_magnitudes(bright)}) the residual with automatic gains is {min(compared):.2f} to {max(compared):.2f} "
-        "times that of the best fixed gains, chosen afterwards."
+        "with every image simulated). Added contrast is without the terms between modes. A case counts as harmful if "
+        f"closing adds more contrast than {100 * TOLERATED:g} % of the dark zone's own plus three standard errors "
+        f"(`quiet`: {100 * TOLERATED:g} % alone). Harmful cases, with the ratio of added contrast to the dark zone's "
+        f"own: {names or 'none'}. On bright stars (V = {_magnitudes(bright)}; without `quiet`; two seeds) "
+        f"the residual with automatic gains is {min(compared):.2f} to {max(compared):.2f} times that of the best fixed "
+        "gains, chosen afterwards."
     )
 
 

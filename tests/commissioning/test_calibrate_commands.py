@@ -239,10 +239,13 @@ def test_work_before_the_first_cycle_does_not_affect_the_time_to_go() -> None:
 def test_progress_of_several_tasks_in_turn_has_the_time_to_go_of_each() -> None:
     lines, times = list[str](), iter(np.arange(0.0, 100.0, 5.0))
     count = progress_lines(lines.append, lambda: float(next(times)))
-    for task in ("first", "second"):
-        for done in range(4):
+    for task, begin in (("first", 0), ("second", 0), ("third", 1)):
+        for done in range(begin, 4):
             count(task, done, 4)
-    assert lines == ["first: 50%, about 10 s to go", "second: 25%, about 15 s to go", "second: 75%, about 5 s to go"]
+    assert lines == [
+        *("first: 50%, about 10 s to go", "second: 25%, about 15 s to go", "second: 75%, about 5 s to go"),
+        "third: 50%, about 10 s to go",
+    ]
 
 
 def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:

@@ -42,8 +42,8 @@ def run(driver: Any, frames: int) -> tuple[Listener, list[int]]:
     hub = MemoryHub()
     listener = Listener(hub, HostClock(), FRAME, CAMERA_STATE)
     CameraLoop(driver, listener.service("camera"), frames).run()
-    samples = [sample.sequence & 0xFFFFFFFF for sample in listener.samples[FRAME]]
-    return listener, samples
+    counts = [sample.sequence & 0xFFFFFFFF for sample in listener.samples[FRAME]]
+    return listener, counts
 
 
 @pytest.mark.parametrize(("name", "package"), [("basler", "pypylon"), ("aravis", "gi")])
@@ -108,8 +108,8 @@ def test_gige_frame_numbers_wrap_to_one_and_buffers_are_returned() -> None:
     driver._aravis = SimpleNamespace(BufferStatus=SimpleNamespace(SUCCESS="whole"))
     driver._settings, driver._stream = GenicamOptions(rows=2, columns=3).settings(CONFIG), stream
     driver._camera = SimpleNamespace(start_acquisition=lambda: None, stop_acquisition=lambda: None)
-    listener, sequences = run(driver, 3)
-    assert sequences == [0, 1, 3], "one lost at the wrap: number 1"
+    listener, counts = run(driver, 3)
+    assert counts == [0, 1, 3], "one lost at the wrap: number 1"
     assert listener.messages(FRAME)[0].data == np.arange(6, dtype="<u2").tobytes()
     assert stream.pushed == 4
 
@@ -182,8 +182,8 @@ def test_a_basler_camera_is_configured_and_failed_buffers_count_as_lost_frames(e
         return exposure
 
     driver.expose = fail_later  # type: ignore[method-assign]
-    listener, sequences = run(driver, 60)
-    assert sequences[-1] - 59 >= 7, "those that failed at the start precede the first number"
+    listener, counts = run(driver, 60)
+    assert counts[-1] - 59 >= 7, "the seven that fail after number 20 are counted"
     assert "FRAMES_LOST" in listener.events()
     pixels = np.frombuffer(listener.messages(FRAME)[0].data, "<u2")
     assert pixels.size == 60 * 80
@@ -226,9 +226,9 @@ def test_an_aravis_camera_is_configured_and_incomplete_frames_count_as_lost(fake
     assert (region.x, region.y, region.width, region.height) == (32, 16, 80, 60)
     assert (driver.settings().exposure_ns, driver.settings().period_ns) == (500_000, 10_000_000)
     assert driver._camera.get_gain() == 2.0
-    listener, sequences = run(driver, 250)
-    assert sequences[-1] > 249, "some frames are incomplete"
-    assert sequences == sorted(set(sequences))
+    listener, counts = run(driver, 250)
+    assert counts[-1] > 249, "some frames are incomplete"
+    assert counts == sorted(set(counts))
     assert listener.events()[:1] == ["STARTED"]
     assert "FRAMES_LOST" in listener.events()
     assert not any(name.startswith("DRIVER") for name in listener.events())

@@ -286,7 +286,7 @@ def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
         commands += found["commands"]
     frames = night.results["frames_processed"]
     assert isinstance(frames, int)
-    assert commands > 0.6 * frames, "all but those before the second log's first state"
+    assert commands > 0.6 * frames, "all but those before the first state of each later log"
 
 
 @pytest.mark.slow

@@ -170,7 +170,8 @@ def damaged_in_the_middle(compress: Callable[[bytes], bytes]) -> bytes:
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        (npz(), "it is a zip archive, such as .npz"),
+        (npz(), "it is an archive, such as .npz"),
+        (b"\x1f\x9d\x90", "it is an archive, such as .npz or .Z"),
         (b"\x1f\x8b\x08" + bytes(7) + b"\xff" * 50, "invalid block type"),
         (damaged_in_the_middle(lzma.compress), "Internal error"),
         (damaged_in_the_middle(gzip.compress), "CRC check failed"),

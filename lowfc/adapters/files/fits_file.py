@@ -77,8 +77,8 @@ def opened(path: Path, content: bytes | None = None) -> Iterator[fits.HDUList]:
     ):
         warnings.simplefilter("error", AstropyWarning)  # astropy only warns of a truncated file
         magic = stream.read(2)
-        if magic == b"PK":  # astropy raises AttributeError
-            raise ValueError("it is a zip archive, such as .npz, and not a FITS file")
+        if magic in (b"PK", b"\x1f\x9d"):  # astropy raises AttributeError or ModuleNotFoundError
+            raise ValueError("it is an archive, such as .npz or .Z, and not a FITS file")
         stream.seek(0)
         if magic == b"\x1f\x8b":  # astropy does not read as far as the checksum
             with gzip.GzipFile(fileobj=stream) as unpacked:

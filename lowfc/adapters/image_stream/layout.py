@@ -94,9 +94,11 @@ class Layout(NamedTuple):
         in_time = int(header["kind"]) & _TIME_MASK == _TIME_AXIS
         columns, rows, planes = size[0], size[1], size[2] if axes == 3 else 1
         if planes > 1 and not in_time:
-            raise ValueError(f"is a cube of {planes} planes, expected images one after the other")
-        if header["location"] != -1 or header["shared"] != 1:
+            raise ValueError(f"is a cube of {planes} planes without a time axis, expected a circular buffer of images")
+        if header["location"] != -1:
             raise ValueError(f"is in the memory of graphics card {header['location']}, expected shared memory")
+        if header["shared"] != 1:
+            raise ValueError(f"is not in shared memory: shared is {header['shared']}, expected 1")
         elements, data_bytes = planes * rows * columns, planes * rows * columns * dtype.itemsize
         if int(header["elements"]) != elements or int(header["data_bytes"]) != data_bytes:
             raise ValueError(
@@ -136,7 +138,7 @@ class Layout(NamedTuple):
             "control": numbers,
             "status": numbers,
             "traces": 64 * traces,
-            "times": (8 * (-(-16 * shape[0] // 8)) * 2 + 8 * shape[0]) if in_time else 0,
+            "times": 40 * shape[0] if in_time else 0,  # of each plane: two times of 16 bytes and a count of 8
             "ring_headers": 48 * ring,
             "ring": data_bytes * ring,
         }

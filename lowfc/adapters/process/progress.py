@@ -50,21 +50,22 @@ def reading_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
 
 def progress_lines(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Counted:
     """Progress without a terminal: a line every 10 s with the estimated remaining time; `clock` is in seconds."""
-    before = -1
+    first = last = -1
     begun = written = -inf
 
     def count(what: str, done: int, total: int) -> None:
-        nonlocal before, begun, written
+        nonlocal first, last, begun, written
         now = clock()
-        if before < 0:
+        if last < 0:
             written = now
-        if before < 0 or done < before:  # the first task, or another one
-            before = done
-        if done == before:  # exclude the time before the first progress from the rate
+        if last < 0 or done < last:  # the first task, or another one
+            first = done
+        last = done
+        if done == first:  # exclude the time before the first progress from the rate
             begun = now
         elif now - written >= _EVERY_S:
             written = now
-            seconds = (now - begun) / (done - before) * (total - done)
+            seconds = (now - begun) / (done - first) * (total - done)
             write(f"{what}: {done / total:.0%}, about {seconds:.0f} s to go")
 
     return count

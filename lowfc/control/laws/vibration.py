@@ -85,10 +85,10 @@ class Model:
     def mean_over(self, start: float, length: float) -> Array:
         """Mean (states, states) of A^u over u in [start, start + length] frames, A as in `states`: predicts a mean."""
 
-        def mean_of(turned: complex) -> complex:
-            if not length or not turned:
-                return complex(np.exp(turned * start))
-            return complex(np.exp(turned * start) * np.expm1(turned * length) / (turned * length))
+        def mean_of(exponent: complex) -> complex:
+            if not length or not exponent:
+                return complex(np.exp(exponent * start))
+            return complex(np.exp(exponent * start) * np.expm1(exponent * length) / (exponent * length))
 
         blocks = [np.ones((1, 1))]
         if np.isfinite(self.cutoff_hz):
@@ -131,7 +131,7 @@ def resolution_hz(run: TimeSeries, rate_hz: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Whittle:
-    """A periodogram (frequencies,) without the lowest frequencies, and the number of averaged segments."""
+    """A periodogram (frequencies,) without its first three and last frequencies; the number of averaged segments."""
 
     omega: Array
     power: Array
@@ -152,7 +152,7 @@ class _Whittle:
                 values = piece[start : start + frames, 0]
                 found += np.abs(rfft(window * (values - values.mean()))) ** 2
                 segments += 1
-        keep = slice(3, -1)  # the window removes the lowest with the mean
+        keep = slice(3, -1)  # the window removes the lowest with the mean; half the frame rate has another distribution
         omega = 2 * np.pi * np.arange(found.size) / frames
         return cls(omega[keep], np.maximum(found[keep] / segments, 1e-300), segments, rate_hz)
 
@@ -183,8 +183,8 @@ class _Whittle:
         omega, power = (np.add.reduceat(each, starts) / counts for each in (self.omega, self.power))
         if robust:  # medians: unknown lines hardly affect them
             parts = np.split(self.power, starts[1:])
-            low = 1 if self.segments > 1 else np.log(2)
-            power = np.array([np.median(part) / low if part.size > 4 else np.nan for part in parts])
+            median = 1 if self.segments > 1 else np.log(2)  # of exponentially distributed power, over its mean
+            power = np.array([np.median(part) / median if part.size > 4 else np.nan for part in parts])
             there = np.isfinite(power)
             return omega[there], power[there], counts[there].astype(float)
         return omega, power, counts.astype(float)

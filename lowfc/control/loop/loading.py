@@ -1,4 +1,4 @@
-"""Changes of calibration, mirror, camera or loop mode; the mirror keeps its shape in each."""
+"""Changes of calibration, mirror, camera or loop mode; the mirror keeps its shape, but relaxes to flat in safe mode."""
 
 from dataclasses import replace
 
@@ -70,12 +70,12 @@ def loaded(
     elif before_mode is LoopMode.IDLE and mode is LoopMode.CLOSED and loop.automatic.any():
         mode, cause = LoopMode.OPEN, MEASURED_FIRST
     state = state._replace(loop=loop)
-    opening = tuple(one for one in state.conditions.acting if one.action is not Action.HOLD)  # which holds the loop
+    acting = tuple(one for one in state.conditions.acting if one.action is not Action.HOLD)  # HOLD lets a loop close
     if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
         mode, cause = LoopMode.IDLE, wrong
     elif mode is LoopMode.CLOSED and (wrong := misfit(state)):
         mode, cause = LoopMode.OPEN, f"{CAMERA_MISFIT}: {wrong}"
-    elif mode is LoopMode.CLOSED and (wrong := refusal(opening, "close")):
+    elif mode is LoopMode.CLOSED and (wrong := refusal(acting, "close")):
         mode, cause = LoopMode.OPEN, wrong
     if mode is not before_mode:
         events.append(mode_event(before_mode, mode, cause))
@@ -151,7 +151,7 @@ def bench_reported(settings: Settings, state: State, report: BenchReport) -> tup
 
 
 def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:
-    """Start from the mirror's shape, so that it does not jump; later shapes change nothing."""
+    """Start from the mirror's shape, so that it does not jump; after the first command, shapes change nothing."""
     if state.commanded:
         return state, Outputs()
     events: list[PendingEvent] = []
@@ -227,7 +227,7 @@ def end_probe(loop: ActiveLoop, sequence: int, why: str, events: list[PendingEve
 
 
 def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
-    """Store the camera's settings; open the loop if they no longer fit the calibration."""
+    """Store the camera's settings; open a closed loop that they do not fit; idle depends on the frame's size."""
     after = _with_camera(state, camera)
     if after is state:
         return state, Outputs()

@@ -38,13 +38,13 @@ def release(settings: Settings, state: State, request: Request) -> tuple[State, 
     """End a lease at its holder's request; another client's stays."""
     held = state.conditions.lease
     if held is None or held.ended or held.id != request.lease_id:
-        return state, "nothing was reserved"
+        return state, "this lease is not in force"
     after = _with(state, held._replace(ended="its holder released it"))
     return after, "released", PendingEvent("LEASE_RELEASED", {"holder": held.holder_name})
 
 
 def lease_checked(state: State, time_ns: int, frame_sequence: int) -> tuple[State, list[PendingEvent]]:
-    """End a lease that was not renewed by this time or frame; the state and the event."""
+    """End a lease that was not renewed by this time or frame (0: not compared); the state and the event."""
     held = state.conditions.lease
     if held is None or held.ended or not held.over(time_ns, frame_sequence):
         return state, []

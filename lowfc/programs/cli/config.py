@@ -84,10 +84,12 @@ def config_show(config: ConfigFile = None) -> None:
 def config_check(
     config: Annotated[Path, typer.Argument(help="Configuration file (TOML).")],
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration file of the run; default: one is computed, as the run would.")
+        Path | None, typer.Option(help="Calibration file to read; default: compute one, as a run does.")
     ] = None,
 ) -> None:
-    """Check a configuration file, the files it names and its calibration; on errors exit with status 2.
+    """Check a configuration file and the files it names, and compute or read a calibration.
+
+    On errors the exit status is 2, with one line per error.
 
     Example: lowfc config check lowfc.toml
     """

@@ -10,10 +10,11 @@ from lowfc.optics.chain.added_contrast import ModalContrast, by_group, costliest
 
 
 def added_contrast(contrast: ModalContrast | None, covariance_nm2: Mapping[str, Array | None]) -> dict[str, Any] | None:
-    """Contrast added by wavefronts with these covariances (modes, modes), by name; None for an unknown covariance.
+    """Contrast added by wavefronts with these covariances (modes, modes), by name; None where one is unknown.
 
     Further keys: `by_group`, the contribution of each group of modes; `beyond_quadratic`, the names for which full
-    images disagree with the quadratic form. None without a science image or known covariance, or for other modes.
+    images disagree with the quadratic form. The result is None without a science image, without a
+    known covariance, or if the number of modes differs.
     """
     known = {name: covariance for name, covariance in covariance_nm2.items() if covariance is not None}
     if contrast is None or not known or any(len(covariance) != len(contrast.noll) for covariance in known.values()):

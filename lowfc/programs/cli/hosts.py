@@ -55,7 +55,9 @@ def certs(
         list[str] | None, typer.Option(help="Name of a mirror; repeat. Default: those in the folder, or dm.")
     ] = None,
     days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificates are valid.")] = 825,
-    renew: Annotated[bool, typer.Option("--renew", help="Also renew existing certificates, with their keys.")] = False,
+    renew: Annotated[
+        bool, typer.Option("--renew", help="Also renew existing certificates; they keep their keys.")
+    ] = False,
 ) -> None:
     """Make a certificate for each role of a run on several hosts, and the authority that signs them.
 

@@ -46,7 +46,7 @@ class _Group:
     """Modes that are evaluated together: tip and tilt, or the others."""
 
     def __init__(self, mask: Mask, tilt: Mask | None, settings: Settings, loop: ActiveLoop, window_s: float) -> None:
-        """Evaluate the modes in `mask` (modes,); `tilt` (modes,) selects tip and tilt, whose squares look like them."""
+        """Evaluate the modes in `mask` (modes,); `tilt` (modes,): tip and tilt, if their squares look like these."""
         rate_hz = settings.rate_hz or 1.0
         frames = [max(round(seconds * rate_hz), MIN_FRAMES) for seconds in (FIRST_S, window_s)]
         self.mask, self.tilt = mask, tilt

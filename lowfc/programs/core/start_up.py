@@ -66,7 +66,8 @@ def law(config: Configuration) -> LinearLaw | None:
 def settings_under(latch: Latch, config: Configuration, event: Callable[..., None]) -> Settings:
     """The settings of a configuration with its kernel loaded; they start in safe mode if the latch is set.
 
-    If the latch cannot be stored, the loop starts open. An event reports a kernel other than numpy, or a missing one.
+    If the latch cannot be stored, the loop starts open until an operator closes it. An event reports a kernel other
+    than numpy, or a missing one.
     """
     configured = config.realtime.kernel
     settings = replace(factory.settings(config), kernel=compiled.kernel(configured, config.realtime.threads))

@@ -32,7 +32,7 @@ def protocol() -> Any:
 
 
 class EpicsGateway:
-    """Server of the variables, and PV monitors whose valid values are in `bench`; `changed` is set when it changes."""
+    """Server of the variables, and PV monitors whose valid values are in `bench`; each update sets `changed`."""
 
     def __init__(self, config: Gateway, variables: Sequence[Variable], ask: Ask) -> None:
         """Serve; BusError if it cannot listen."""

@@ -25,7 +25,7 @@ TURN_S = 0.002
 Show = Callable[[str], None]
 
 _PATTERN_SEED = 5
-_GENTLE = 0.05  # ordinary commands as a fraction of the smallest limit
+_GENTLE = 0.05  # ordinary commands as a fraction of the smallest of stroke, slew and half the neighbour limit
 _MAX_MOVES = 400  # to a distant shape
 
 

@@ -8,6 +8,7 @@ from google.protobuf.message import DecodeError
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import nearest
 from lowfc.contract.messages import EVENT, HEALTH, TOPICS, from_timestamp, topic_of, wire
+from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.line import NS, Collected
 
@@ -111,10 +112,9 @@ def _health(device: Collected) -> Check:
         return warning("topics[].published is missing", f"count the messages of every topic: {cost}")
     if not from_timestamp(last.timestamp):
         return warning("no timestamp", "set it: a silent process is recognised by it")
-    if failures := last.driver_failures - first.driver_failures:
-        return warning(
-            f"{failures} failures of its driver: {device.failing}", "correct that first: it fails others, too"
-        )
+    if last.driver_failures > first.driver_failures:
+        failures = counted(last.driver_failures - first.driver_failures, "failure")
+        return warning(f"{failures} of its driver: {device.failing}", "correct this first: other checks may fail by it")
     return ok(f"{len(payloads)} in {device.seconds:.1f} s, state {last.state!r}")
 
 

@@ -107,8 +107,8 @@ def _pointing(context: Context, name: str) -> list[Row]:
     rows: list[Row] = []
     nm_per_mas = tilt_nm_per_mas(2.0)
     made = partial(Row, name, unit="mas", modes=len(NOLLS_14))
-    with tempfile.TemporaryDirectory() as name_of_folder:
-        folder = Path(name_of_folder)
+    with tempfile.TemporaryDirectory() as path:
+        folder = Path(path)
         sensor = _sensor_toml(name)
         (folder / "gains.toml").write_text(f"{GAINS}{sensor}")
         for preset in ("reaction-wheel", "reaction-wheel-ideal"):
