@@ -36,7 +36,7 @@ COMMANDS = {
         Row(
             "what-if",
             "logs.what_if.command:what_if",
-            "Compute the residual of a log with other gains or another controller.",
+            "Compute the residual of a log with other gains or laws.",
         ),
         Row("publish", "logs.publish.command:publish", "Republish a log on a run's bus."),
         Row("export", "logs.export.command:export", "Write steps, calibration and frames of a log for other tools."),
