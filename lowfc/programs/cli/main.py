@@ -33,11 +33,7 @@ COMMANDS = {
         Row("info", "logs.info:info", "Summarise a log: what ran, when, and what was recorded."),
         Row("report", "logs.report.command:report", "Summarise a run from its log in one HTML page."),
         Row("replay", "logs.replay.command:replay_log", "Replay a log through the controller and compare."),
-        Row(
-            "what-if",
-            "logs.what_if.command:what_if",
-            "Compute the residual of a log with other gains or laws.",
-        ),
+        Row("what-if", "logs.what_if.command:what_if", "Compute the residual of a log with other gains or laws."),
         Row("publish", "logs.publish.command:publish", "Republish a log on a run's bus."),
         Row("export", "logs.export.command:export", "Write steps, calibration and frames of a log for other tools."),
         Row("recover", "logs.recover:recover", "Recover a truncated or damaged log."),

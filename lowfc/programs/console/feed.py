@@ -3,7 +3,6 @@
 import threading
 import time
 from collections import deque
-from importlib import import_module
 from math import nan
 from typing import NamedTuple
 
@@ -19,7 +18,7 @@ from lowfc.contract.errors import BadMessageError, LowfcError
 from lowfc.contract.messages import REQUEST, checked_time_ns, wire
 from lowfc.control.loop.wording import AUTO
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.view.monitor import Monitor
+from lowfc.programs.view.monitor import Monitor, import_late_modules
 from lowfc.programs.view.snapshot import Snapshot
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.tile import Verdict
@@ -29,8 +28,8 @@ DISCONNECTED_S = 1.5
 """Time without a message after which the console is disconnected: each process sends Health twice a second."""
 TREND_S = 34
 """Span of the sparklines, one column per second."""
-_PRELOADED, _PRELOAD_S = ("lowfc.control.laws.tuning", "scipy.signal"), 4.0
-"""Slow imports, done in a thread after this time: the first values do not need them, a later verdict does."""
+_IMPORT_AFTER_S = 4.0
+"""Time after which a thread does the slow imports: the first values do not need them."""
 _TREND_STEP_NS = 1_000_000_000
 _HIDDEN_REQUESTS = frozenset(("status", "configuration", "renew"))
 """Periodic requests that change nothing."""
@@ -81,9 +80,9 @@ class Feed(Monitor):
         self._point_ns = 0
         self._read_s = time.monotonic()
         self._query()
-        preload = threading.Timer(_PRELOAD_S, lambda: [import_module(name) for name in _PRELOADED])
-        preload.daemon = True
-        preload.start()
+        imports = threading.Timer(_IMPORT_AFTER_S, import_late_modules)
+        imports.daemon = True
+        imports.start()
 
     def read(self) -> Reading:
         """Process the messages received since the last call."""

@@ -20,6 +20,7 @@ from lowfc.programs.cli.status import json_object
 from lowfc.programs.gateway.epics import EpicsGateway, protocol
 from lowfc.programs.gateway.variables import Put, variables
 from lowfc.programs.gateway.watch import Watch
+from lowfc.programs.view.monitor import import_late_modules
 
 PERIOD_S = 0.1
 """Update period of the variables."""
@@ -36,11 +37,8 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
 
     Example: lowfc gateway epics --run bench
     """
-    import scipy.signal  # noqa: F401  # now: a later verdict uses both, and their slow import would delay all values
-
-    import lowfc.control.laws.tuning  # noqa: F401
-
     protocol()  # raises now if p4p is missing
+    import_late_modules()
     joined = open_run(the_run(run), ())
     run_id, of_run = joined.run_id, joined.path / "config.toml"
     known = configuration(config) if config is not None or not of_run.exists() else load(of_run)

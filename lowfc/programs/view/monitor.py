@@ -1,6 +1,7 @@
 """The newest messages of a run, read several times a second by a console or a gateway."""
 
 from collections import deque
+from importlib import import_module
 
 from lowfc.adapters.bus.bus import Bus, Sample, states
 from lowfc.adapters.process.clock import Clock
@@ -10,6 +11,12 @@ from lowfc.programs.view.verdicts.watcher import Watcher
 
 _RING_SIZES = {EVENT: 200, STEP: 4000, TRUTH: 200}  # messages; the newest 200 truths per reading suffice for an rms
 _QUERY_AGAIN_NS = 5_000_000_000  # until a controller that did not answer is queried again
+
+
+def import_late_modules() -> None:
+    """Import what only a later verdict uses: its slow import would delay all values of a reading."""
+    for name in ("lowfc.control.laws.tuning", "scipy.signal"):
+        import_module(name)
 
 
 class Monitor:
