@@ -114,6 +114,8 @@ def test_foreign_public_and_linked_directories_are_refused(own_runtime: Path, mo
     (own_runtime / "link").symlink_to(own_runtime / "real")
     with pytest.raises(DataFileError, match="mode 700"):
         own_directory(own_runtime / "link")
+    with pytest.raises(DataFileError, match="ended cannot be read: No such file or directory"):
+        own_directory(own_runtime / "ended")
 
 
 def test_an_invalid_runtime_directory_is_an_error(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -240,7 +240,10 @@ def runtime_base() -> Path:
 
 def own_directory(path: Path) -> Path:
     """Check that `path` is a directory of this user, closed to all others and not a link; otherwise DataFileError."""
-    found = path.lstat()
+    try:
+        found = path.lstat()
+    except OSError as fault:  # such as a run that ends at this moment
+        raise DataFileError(f"{path} cannot be read: {fault.strerror}") from fault
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
         raise DataFileError(
             f"{path} should be a directory of user {os.geteuid()} with mode 700, and is {stat.filemode(found.st_mode)} "

@@ -46,6 +46,8 @@ def doctor(
     if apply and undo:
         raise ConfigurationError("--apply and --undo exclude each other: use one")
     if setup or apply or undo:
+        if as_json:
+            raise ConfigurationError("--setup, --apply and --undo print plain text only: leave out --json")
         from lowfc.programs.commissioning.doctor import permissions
 
         root = Path("/")
