@@ -58,7 +58,7 @@ class Disturbance:
         static_nm: (modes,) constant wavefront.
         screen_nm: rms of a static Kolmogorov screen, 0 for none.
         lines: damped lines.
-        seed: seed of the damped lines.
+        seed: seed of the damped lines and of the sources that `with_sources` adds.
         wheels: reaction wheels, whose speeds may change.
         shear: shear of the beam on the sensor's masks as sine waves: Hz (waves,) and pupil diameters (waves, 2).
     """
@@ -217,7 +217,7 @@ def modes_nm(disturbance: Disturbance, first: int, count: int, rate_hz: float) -
 def _sum_of_waves(disturbance: Disturbance, time_s: Array) -> Array:
     """Modes (instants, modes) at these times, without the damped lines."""
     rotations = np.exp(2j * np.pi * np.outer(time_s - time_s[0], disturbance.frequency_hz))
-    waves = (rotations @ _turned(disturbance, time_s[0])).real
+    waves = (rotations @ _rotated(disturbance, time_s[0])).real
     found = waves + _square(time_s)[:, None] * disturbance.step_nm + disturbance.static_nm
     for wheel in disturbance.wheels:
         found += wheel.modes_nm(time_s)
@@ -314,8 +314,8 @@ class Sampler:
     def _block(self, first: int) -> Single:
         """Modes (frames, instants, modes) of the block that begins with frame `first`."""
         start_s = first / self._rate_hz
-        turned = _turned(self._disturbance, start_s)
-        found = self._waves @ np.vstack([turned.real, turned.imag]).astype(np.float32)
+        rotated = _rotated(self._disturbance, start_s)
+        found = self._waves @ np.vstack([rotated.real, rotated.imag]).astype(np.float32)
         square = _square(start_s + self._time_s)[:, None] * self._disturbance.step_nm
         found += (square + self._disturbance.static_nm).astype(np.float32)
         for wheel in self._disturbance.wheels:
@@ -339,7 +339,7 @@ def _between(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) -> C
     return np.array([before, after])
 
 
-def _turned(disturbance: Disturbance, time_s: float) -> Complex:
+def _rotated(disturbance: Disturbance, time_s: float) -> Complex:
     """Complex amplitudes (waves, modes) rotated to the phases at a time."""
     return np.asarray(disturbance.amplitude_nm * np.exp(2j * np.pi * disturbance.frequency_hz * time_s)[:, None])
 

@@ -198,7 +198,7 @@ class SimulatedCamera:
         return replace(self._settings, time_ns=self._start_ns() + self._config.exposure_ns if started else None)
 
     def expose(self) -> Exposure | None:
-        """Latch the mirror's shape at the start of the next exposure, and compute its frame before the end.
+        """Wait for the start of the next exposure, latch the mirror's shape, and compute the frame.
 
         None if the process is stopping, or if the exposure has not started after `MAX_WAIT_NS`.
         """
@@ -311,6 +311,8 @@ class SimulatedCamera:
                 state = wire.MirrorState.FromString(sample.payload)
             except DecodeError as error:
                 self._service.unreadable(sample.key, error)
+                continue
+            if not state.actuators:  # its driver failed: the shape is unknown
                 continue
             shape = actuators(state)
             if shape is None or shape.shape != self._latched.shape or not np.isfinite(shape).all():

@@ -170,24 +170,24 @@ class Scene:
         shapes_nm, weights = [actuators_nm], np.ones((len(self.instants), 1), np.float32)
         if path is not None and len(self.instants):
             shapes_nm, weights = [actuators_nm, *path[0]], np.hstack([0 * weights, path[1]])
-        rows = np.concatenate([modes[:1], modes[len(modes) - len(self.instants) :]])
+        disturbance = np.concatenate([modes[:1], modes[len(modes) - len(self.instants) :]])
         of_shapes = np.vstack([np.eye(1, len(shapes_nm), dtype=np.float32), weights])
-        opd_nm = rows @ self._basis
+        opd_nm = disturbance @ self._basis
         opd_nm += self._screen
         moved_nm = of_shapes @ np.array([self._mirror_nm(shape) for shape in shapes_nm])
-        rows = rows + self._screen_modes
-        residual = rows + of_shapes @ (np.array(shapes_nm).reshape(len(shapes_nm), -1) @ self._mirror_to_modes.T)
+        disturbance = disturbance + self._screen_modes
+        residual = disturbance + of_shapes @ (np.array(shapes_nm).reshape(len(shapes_nm), -1) @ self._mirror_to_modes.T)
         mean_squares_nm2 = self._mean_squares_nm2(opd_nm), self._mean_squares_nm2(opd_nm + moved_nm)
         disturbance_rms_nm, residual_rms_nm = (float(np.sqrt(each[0])) for each in mean_squares_nm2)
-        sampled = Wavefront(rows[0], residual[0], disturbance_rms_nm, residual_rms_nm)
+        sampled = Wavefront(disturbance[0], residual[0], disturbance_rms_nm, residual_rms_nm)
         speeds_and_shear = speeds_hz(self._disturbance, index / self._rate_hz), self._shear(index)
         if not len(self.instants):
-            return Truth(sampled, None, sampled.residual_nm, np.array([rows, residual]), *speeds_and_shear)
+            return Truth(sampled, None, sampled.residual_nm, np.array([disturbance, residual]), *speeds_and_shear)
         sensed_nm = self._image_weights @ modes[1 : 1 + self._image_weights.size] - modes[0] + residual[0]
-        modes_rms = (np.sqrt(np.square(each[1:]).mean(axis=0)) for each in (rows, residual))
+        modes_rms = (np.sqrt(np.square(each[1:]).mean(axis=0)) for each in (disturbance, residual))
         pupil_rms = (float(np.sqrt(each[1:].mean())) for each in mean_squares_nm2)
         continuous = Wavefront(*modes_rms, *pupil_rms)
-        return Truth(sampled, continuous, sensed_nm, np.array([rows[1:], residual[1:]]), *speeds_and_shear)
+        return Truth(sampled, continuous, sensed_nm, np.array([disturbance[1:], residual[1:]]), *speeds_and_shear)
 
     def _shear(self, index: int) -> Array:
         return shear_at(self._disturbance, (index + self._exposure / 2) / self._rate_hz)

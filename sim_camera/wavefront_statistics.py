@@ -93,5 +93,5 @@ class WavefrontAccumulator:
         rms = np.sqrt(squares.reshape(-1, 4) / divisors).ravel().tolist()
         found = dict(zip((*_RMS, *(f"continuous_{name}" for name in _RMS)), rms, strict=False))
         found |= {"instants": self._instants, "added_contrast_flat": float(flat), "added_contrast": float(added.sum())}
-        modes, share = costliest(by_group(self._noll, added)) if flat else ("", 0.0)
+        modes, share = costliest(by_group(self._noll, added)) if added.any() else ("", 0.0)
         return found | {"costliest_modes": modes, "costliest_share": share}

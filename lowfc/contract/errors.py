@@ -1,12 +1,12 @@
-"""The exceptions that a user may see.
+"""The exceptions that a user may see; a few modules add their own subclasses of LowfcError.
 
-    LowfcError              anything that the user can correct; one line, exit status 2 unless its class sets another
-    ├── ConfigurationError  a key, a value or a combination of values
-    ├── DataFileError       a file that is missing, damaged or of the wrong kind
-    ├── CalibrationError    a calibration that does not fit the instrument
-    ├── BusError            a port, a socket, or a peer that does not answer
-    │   └── BadMessageError     a message from the bus that violates the contract
-    └── RequestRefusedError    the controller refused the request, with the reason
+    LowfcError               anything that the user can correct; exit status 2 unless its class sets another
+    ├── ConfigurationError   a key, a value or a combination of values
+    ├── DataFileError        a file that is missing, damaged or of the wrong kind
+    ├── CalibrationError     a calibration that does not fit the instrument
+    ├── BusError             a port, a socket, or a peer that does not answer
+    │   └── BadMessageError  a message from the bus that violates the contract
+    └── RequestRefusedError  the controller refused the request, with the reason
 
 Numerical code raises ValueError; the adapters above it name the file or the key and re-raise one of these.
 """

@@ -14,7 +14,7 @@ KEYS = {
     "realtime.stay_awake": "realtime.disable_cpu_idle",
     "realtime.rehearse": "realtime.cache_warmup",
 }
-"""Configuration keys: name until version 0.1 to current name."""
+"""Current names of configuration keys, by their names until version 0.1."""
 
 FIELDS = {
     **{
@@ -38,10 +38,10 @@ FIELDS = {
     "Health.granted": "realtime_granted",
     "Health.refused": "realtime_refused",
 }
-"""Message fields: name until version 0.1 to current name; their numbers, types and labels never change."""
+"""Current names of message fields, by their names until version 0.1; numbers, types and labels never change."""
 
 VALUES = {"LOOP_MODE_SAFED": "LOOP_MODE_SAFE"}
-"""Values of enumerations: name until version 0.1 to current name."""
+"""Current names of enumeration values, by their names until version 0.1."""
 
 LAW_EXTENSIONS = {
     "TRANSITION": "FOLLOW",
@@ -50,7 +50,7 @@ LAW_EXTENSIONS = {
     "PREDICT_ONLY": "COAST",
     "OUTPUT": "OUTPUT",
 }
-"""Extensions of a law file: current name to name in files of kind "lowfc law 1"."""
+"""Extensions of a law file of kind "lowfc law 1", by their current names."""
 
 
 def renamed_keys(data: dict[str, Any]) -> list[str]:

@@ -1,4 +1,4 @@
-"""The sections of the configuration that describe the instrument: star, sensor, camera, disturbance, mirror."""
+"""Sections of the configuration: the instrument (star, sensor, camera, disturbance, mirror), interlocks, gateways."""
 
 from typing import Annotated, Any, Literal, get_args
 
@@ -175,8 +175,8 @@ class Camera(Section):
     noise: bool = True
     """Simulated camera: photon and read noise; off only for tests of the control law."""
     photon_noise: Literal["fast", "exact"] = "fast"
-    """Noise of the simulated camera. fast: faint pixels from a tabulated distribution, variance at most 6e-5 e-^2 too
-    large; exact: all electrons."""
+    """Noise of the simulated camera. fast: faint pixels are drawn from a tabulated distribution, whose variance is at
+    most 6e-5 e-^2 too large; exact: the electrons of every pixel are drawn."""
 
 
 class Disturbance(Section):
@@ -224,7 +224,7 @@ IMPERFECTIONS = (
     *("mirror.gain_error", "mirror.hysteresis", "mirror.creep"),
     *("camera.dark_current_e_s", "camera.hot_pixels", "camera.nonlinearity", "camera.nonuniformity"),
 )
-"""Keys of the simulated imperfections; each is off by default."""
+"""Keys of the simulated imperfections that a report lists; each is off by default."""
 
 
 class Mirror(Section):

@@ -119,7 +119,10 @@ class CameraLoop:
         self._service.work += 1
 
     def _end_ns(self, exposure: Exposure, settings: CameraSettings) -> int:
-        """End of an exposure by the run's clock; ValueError if it is in the future, or before 1970."""
+        """End of an exposure by the run's clock.
+
+        ValueError if the driver's time is over `AHEAD_NS` in the future, or before 1970, unless it is simulated.
+        """
         clock = self._service.clock
         if exposure.end_ns is None:
             return clock.now_ns()

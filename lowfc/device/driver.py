@@ -6,9 +6,9 @@ raises, and the loop counts the fault, reports it in an event and tries again. A
 `ConfigurationError`, is a fault that a user has to correct: the process ends with its message.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from math import isfinite
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Literal, NamedTuple, Protocol, get_args
 
 from lowfc.adapters.bus.bus import Publisher
@@ -129,15 +129,14 @@ def camera_state(settings: CameraSettings, time_ns: int) -> wire.CameraState:
     for name, least in _LEAST.items():
         if not isinstance(value := getattr(settings, name), Integral) or value < least:
             raise ValueError(f"{name} of the settings is {value!r}, expected a whole number of {least} or more")
+    if settings.saturation_dn is None:
+        settings = replace(settings, saturation_dn=2**settings.bit_depth - 1)
     for name in ("gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "em_gain"):
-        if (number := getattr(settings, name)) is not None and not isfinite(number):
+        if not isinstance(number := getattr(settings, name), Real) or not isfinite(number):
             raise ValueError(f"{name} of the settings is {number}, expected a finite number")
     if settings.clock not in get_args(Clock):
         raise ValueError(f"clock of the settings is {settings.clock!r}, expected {', '.join(get_args(Clock))}")
-    state = wire.CameraState(timestamp=timestamp(time_ns), **fields_of(settings, _PUBLISHED))
-    if settings.saturation_dn is None:
-        state.saturation_dn = 2**settings.bit_depth - 1
-    return state
+    return wire.CameraState(timestamp=timestamp(time_ns), **fields_of(settings, _PUBLISHED))
 
 
 class Exposure(NamedTuple):
@@ -249,7 +248,8 @@ class Mirror(Protocol):
     def apply(self, actuators_nm: Single) -> Single | None:
         """Move to (rows, columns) nm of surface from flat; return the actuators' positions, None if as commanded.
 
-        Do not keep or change the array. Called for every command on the receiving thread: be quick.
+        Do not keep or change the array. Called for every command on the receiving thread: be quick. Another thread
+        calls it, never at the same time, to relax the mirror to flat.
         """
         ...
 
@@ -277,9 +277,10 @@ class MirrorExtras:
         return None
 
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
-        """Replace `apply` in simulated mirrors: (rows, columns), nm of surface, and the run's time since the last call.
+        """Replace `apply` in simulated mirrors: (rows, columns), nm of surface; also called without a new command.
 
-        Also called without a new command.
+        `elapsed_ns` is the run's time since the last command, or without a new one since the last call; infinite at
+        first.
         """
         raise NotImplementedError
 

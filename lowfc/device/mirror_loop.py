@@ -40,7 +40,7 @@ IDLE_STATE_NS = 100_000_000
 """Period of the published state without commands; a restarted controller starts from it."""
 PICTURE_PIXELS = 64
 PATIENCE_S = 0.5
-"""Timeout of a move by the driver."""
+"""Timeout of a call of the driver."""
 
 
 class _LostError(Exception):
@@ -54,7 +54,8 @@ _NONE: Single = np.zeros(0, np.float32)
 def protection_of(driver: Mirror, config: Configuration) -> MirrorProtection:
     """Limits of a mirror: the tighter of its driver's and those of [mirror].
 
-    ConfigurationError if its grid is not that of [mirror], or if its steps are not below every limit.
+    ConfigurationError if its grid is not that of [mirror], or if its steps are not below every limit; ValueError if a
+    limit of the driver is impossible.
     """
     own, configured = driver.geometry, geometry(config)
     if (own.rows, own.columns) != (configured.rows, configured.columns):
@@ -220,9 +221,10 @@ class MirrorLoop:
         return None if position is None else self._call(position)
 
     def _call(self, method: Callable[..., Single | None], *arguments: object) -> Single | None:
-        """Call a method of the driver and return the mirror's positions.
+        """Call a method of the driver and return the shape that it returns, copied; None if it returns none.
 
-        _LostError if it failed or hung: the position is then unknown until the mirror is in its idle state.
+        _LostError if it failed or hung: the position is then unknown until the driver moves the mirror again.
+        LowfcError as raised by the driver.
         """
         self.watch.begin()
         try:

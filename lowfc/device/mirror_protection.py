@@ -25,7 +25,7 @@ AHEAD_NS = 1_000_000_000
 
 Move = Callable[[Single, float], Single]
 """Function that drives the actuators (rows, columns), nm of surface, and returns their positions; its second argument
-is the run's time since the last call, ns."""
+is the run's time, ns, since the last command, or without a new one since the last call; infinite at first."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,8 @@ class Status(NamedTuple):
     """State of the mirror.
 
     Attributes:
-        driven_nm: (rows, columns) as sent to the driver, before its rounding; always within the limits.
+        driven_nm: (rows, columns) as sent to the driver, before its rounding; within the limits, unless it was read
+            back from the driver.
         surface_nm: (rows, columns) positions of the actuators, nm of surface.
         channels: last shape (rows, columns) of each command channel, nm of surface; the mirror applies their sum.
         command_nm: modal command of the last command; empty if the mirror's own limits changed it.

@@ -28,7 +28,7 @@ def installed(kind: Kind) -> dict[str, EntryPoint]:
 
 
 def load(kind: Kind, name: str) -> Any:
-    """Import the class of a driver; ConfigurationError if there is none of that name or the import fails."""
+    """Import the class of a driver; ConfigurationError if there is none, the import fails or it is no such driver."""
     module, colon, attribute = name.rpartition(":")
     with opening(f"the driver {name!r} cannot be loaded"):
         if colon:
@@ -69,7 +69,7 @@ def section(name: str) -> str:
 def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = (), driver: Any = None) -> Any:
     """Open a driver with the options of the configuration, overridden by `words` ("--key", "value" or "--key=value").
 
-    `driver` is its class, if known.
+    `driver` is its class, if known. ConfigurationError if it cannot be loaded or opened, or an option is wrong.
     """
     driver = load(kind, name) if driver is None else driver
     values = options(driver, table(config, kind, name), words)
@@ -172,7 +172,7 @@ def _explained(fault: Any, model: type[DriverOptions]) -> str:
 
 
 def _parsed(words: Sequence[str]) -> dict[str, Any]:
-    """Parse a command line into values by field name; lists are written as in TOML."""
+    """Parse a command line into values by field name; lists and tables are written as in TOML."""
     found: dict[str, Any] = {}
     rest = list(words)
     while rest:

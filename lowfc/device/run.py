@@ -63,6 +63,7 @@ def run_camera(
 
     Raises:
         BusError: the run has a camera already, or one of `wait_for` did not appear.
+        LowfcError: the driver cannot be started, or reported a fault that a user has to correct.
     """
     with closed_on_fault(driver.close):
         service = join(config, run, Role.CAMERA, config.realtime.camera_cpus)
@@ -87,8 +88,8 @@ def camera_beside(driver: Camera, config: Configuration, service: Service) -> It
 
     Raises:
         BusError: the run has a camera already.
-        ConfigurationError: the run is in lockstep.
-        LowfcError: the driver reported a fault that a user has to correct; raised after the block, as every error is.
+        ConfigurationError: the run is in lockstep, or the driver cannot be started.
+        LowfcError: the driver reported a fault that a user has to correct; raised after the block.
     """
     if config.lockstep:
         raise ConfigurationError("in lockstep the camera is a process of its own: leave out --camera, or lockstep")
@@ -124,7 +125,8 @@ def run_mirror(driver: Mirror, config: Configuration, run: str) -> None:
 
     Raises:
         BusError: the run has this mirror already.
-        ConfigurationError: the driver's grid is not that of [mirror].
+        ConfigurationError: the driver's grid or limits do not fit [mirror], or it cannot be started.
+        LowfcError: the driver reported a fault that a user has to correct.
     """
     with closed_on_fault(driver.close):
         service = join(config, run, mirror_role(config.mirror.name), config.realtime.mirror_cpus)

@@ -36,7 +36,7 @@ class VoltMap:
         """Read the maps; `channels` is the number of channels of the electronics, if known.
 
         Raises:
-            ConfigurationError: a map cannot be read, does not fit the mirror, or its flat values are out of range.
+            ConfigurationError: a map cannot be read, does not fit the mirror, or has impossible values.
         """
         grid = (config.mirror.rows, config.mirror.columns)
 

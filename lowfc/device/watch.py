@@ -114,7 +114,10 @@ class DriverWatch:
             self._series, self._kind = 0, ""
 
     def call(self, method: Callable[..., None], *arguments: object) -> None:
-        """Call an optional method of the driver; a fault is counted and reported, and delays no other call."""
+        """Call an optional method of the driver; a fault is counted and reported, and delays no other call.
+
+        A `LowfcError` is raised again.
+        """
         try:
             method(*arguments)
         except Exception as fault:

@@ -3,6 +3,7 @@
 import io
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,20 +89,15 @@ def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
         load(tmp_path / "none.fits")
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"flux_dn": 2.0},
-        {"estimator": "pinv"},
-        {"noll": (2, 3, 5)},
-        {"dark": np.zeros(42, np.float32)},
-    ],
-)
-def test_the_identity_depends_on_every_field(change: dict[str, object]) -> None:
+def test_the_identity_depends_on_every_field() -> None:
     one = calibration()
     assert calibration_codec.identified(one).id == one.id
     assert len(one.id) == 64
-    assert calibration_codec.identified(replace(one, **change)).id != one.id
+    added: dict[str, Any] = {"camera": toy.CAMERA, "actuators_to_modes": np.zeros((3, 20), np.float32)}
+    for name in {part.name for part in fields(Calibration)} - {"id"}:
+        value = added.get(name, getattr(one, name))
+        other = value if name in added else value[::-1] if isinstance(value, str | tuple) else value + 1
+        assert calibration_codec.identified(replace(one, **{name: other})).id != one.id, name
 
 
 def test_actuators_to_modes_are_stored_and_optional(tmp_path: Path) -> None:

@@ -133,6 +133,7 @@ def test_a_close_that_hangs_is_reported() -> None:
         ({"period_ns": 1e9 / 250}, "period_ns of the settings is 4000000.0, expected a whole number"),
         ({"number_wrap": 0}, "number_wrap of the settings is 0, expected a whole number of 1 or more"),
         ({"read_noise_e": float("nan")}, "read_noise_e of the settings is nan, expected a finite number"),
+        ({"gain_e_per_dn": None}, "gain_e_per_dn of the settings is None, expected a finite number"),
         ({"clock": "Realtime"}, "clock of the settings is 'Realtime', expected monotonic, realtime, run"),
     ],
 )

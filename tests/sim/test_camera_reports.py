@@ -63,6 +63,13 @@ def test_tilt_per_axis_is_that_of_the_axes_among_the_modes() -> None:
     assert (found["tilt_disturbance_mas"], found["tilt_residual_mas"]) == pytest.approx((3.0, 1.5))
 
 
+def test_the_costliest_modes_are_named_without_a_disturbance() -> None:
+    still = Wavefront(np.zeros(3, np.float32), np.ones(3, np.float32), 0.0, 1.0)
+    run = statistics()
+    run.add(Truth(still, None, still.residual_nm, np.zeros((2, 1, 3)), np.zeros(0), np.zeros(0)), 0.0, np.arange(3))
+    assert (run.wavefront()["costliest_modes"], run.wavefront()["costliest_share"]) == ("focus", pytest.approx(2 / 3))
+
+
 def test_recent_statistics_cover_only_recent_frames() -> None:
     assert statistics(recent=100).recent() == {}
     run = statistics(*[50.0] * BLOCK, *[2.0] * 100, recent=100)
@@ -116,6 +123,9 @@ def test_camera_reports_each_change_of_habitual_lateness() -> None:
             camera._last_frame = sequence + late
             camera._published_ns[sequence % len(camera._published_ns)] = sequence, 0
             put(sequence)
+    states.put(wire.MirrorState(frame_sequence=sequence + 1).SerializeToString())  # its driver failed
+    camera._drain()
+    camera._service.beat()
     assert listener.events()[1:] == ["COMMANDS_LATE", "COMMANDS_IN_TIME", "COMMANDS_LATE"]
     assert camera._lateness.total == 4 * WINDOW
 

@@ -77,7 +77,7 @@ def test_modes_do_not_depend_on_order_or_block(name: str, first: int, count: int
     ],
 )
 def test_damped_lines_do_not_depend_on_order_or_block(first: int, count: int, cut: int) -> None:
-    """The frames are not drawn: damped lines need all frames before the first one, and 10^7 take minutes."""
+    """Chosen frames, not random ones as above: damped lines need all frames before the first, and 10^7 take minutes."""
     check_order_and_block(WHEEL, first, count, cut)
 
 

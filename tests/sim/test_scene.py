@@ -153,7 +153,7 @@ def test_image_is_the_mean_over_its_exposure(exposure: float) -> None:
 )
 @pytest.mark.parametrize("rate_hz", [100.0, 20.0])
 def test_vibrations_faster_than_the_exposure_are_averaged(keys: dict[str, object], rate_hz: float) -> None:
-    """The sensed wavefront is the mean over 1000 times, to 0.05 nm of lines of 5 nm and more."""
+    """The sensed wavefront is the mean over 1000 times, to 0.05 nm; the lines have 1 nm and more."""
     config = configured(camera__rate_hz=rate_hz, camera__exposure_fraction=1.0, **keys)
     truth = scene_of(config).truth(3, FLAT)
     expected = Sampler(disturbance_of(config), (np.arange(1000) + 0.5) / 1000, rate_hz).at(3).mean(axis=0)

@@ -246,8 +246,9 @@ def request(
     laws: Mapping[str, LinearLaw] = MappingProxyType({}),
     plays: Mapping[str, PlayTable] = MappingProxyType({}),
 ) -> Request:
-    """Request of a message; a logged one refers to its calibration, law and table, which are passed, by identity.
+    """Request of a message.
 
+    A logged message has only the identities of calibration, law and table: these are looked up in the mappings.
     ValueError if a part of it is incomplete or missing.
     """
     table, shapes_nm = floats(message.table, -1, message.columns or 1), floats(message.actuators, -1)
@@ -280,7 +281,8 @@ def request(
 def encode_request(request: Request, reply: Reply, input_number: int, state: wire.ControllerState | None) -> bytes:
     """Request with its reply; the input number is 0 if it could not be read.
 
-    A prepared request holds only the identities of its law and table: these are published on topics of their own.
+    Only the identity of a calibration is written, and of law and table if the request is prepared: they have topics of
+    their own. `state` is the answer to `status`.
     """
     played = request.played
     message = wire.Request(

@@ -177,15 +177,15 @@ def _put_guard(message: wire.Guard, guard: LawGuard) -> None:
 
 
 def _decode_guard(message: wire.Guard, law: LinearLaw, commands: int) -> LawGuard:
-    rest = LawGuard.of(law, [Group(**fields_of(group, Group._fields)) for group in message.groups])
-    found = rest._replace(
+    at_rest = LawGuard.of(law, [Group(**fields_of(group, Group._fields)) for group in message.groups])
+    found = at_rest._replace(
         **fields_of(message, ("frames", "void")),
-        sums_nm2=np.array(message.sums_nm2).reshape(rest.sums_nm2.shape),
+        sums_nm2=np.array(message.sums_nm2).reshape(at_rest.sums_nm2.shape),
         virtual_nm=tuple(np.array(message.virtual_nm, np.float32).reshape(-1, len(law.noll))),
         x=np.array(message.law_state, np.float32) if message.law_state else None,
     )
     if (
-        len(found.groups) != rest.sums_nm2.shape[1]
+        len(found.groups) != at_rest.sums_nm2.shape[1]
         or any(group.overruled and not group.takeovers for group in found.groups)
         or (found.virtual_nm and len(found.virtual_nm) != commands)
         or (found.x is not None and found.x.shape != linear_law.at_rest(law).shape)

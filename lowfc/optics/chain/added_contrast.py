@@ -1,9 +1,9 @@
 """Contrast that a small wavefront adds to a coronagraph's dark zone: a quadratic form of its modes.
 
 With the field E = E0 + i k sum a_j E_j - k^2 / 2 sum a_j a_l E_jl, the intensity's second order in a has two terms:
-the squared first-order field, and the product of the second-order field with E0. For a shaped pupil the second is as
-large as the first: without it, tilt would add 58 times too much. The first order averages to zero over a dark zone on
-both sides of the star.
+the squared first-order field, and the product of the second-order field with E0. For the shaped pupil the second
+nearly cancels the first for tilt: without it, tilt would add 60 (x) or 130 (y) times as much. The first order averages
+to zero over a dark zone on both sides of the star.
 """
 
 from collections.abc import Mapping, Sequence

@@ -12,7 +12,7 @@ from lowfc.optics.chain.zernike import zernikes
 
 _TIKHONOV = 1e-4
 """Regularisation relative to the mean influence: with 1e-6 the mean error of the fit would be 1.2 % too, but some edge
-actuators would need up to three times their stroke."""
+actuators would move up to three times as far."""
 
 
 @dataclass(frozen=True)

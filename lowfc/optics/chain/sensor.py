@@ -69,7 +69,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class LightBudget:
-    """Throughput of each element, as a fraction of the light that reaches it, and `total` and `peak`.
+    """Throughput of the elements; each attribute is a fraction of the light that its description names.
 
     Attributes:
         pupil: Fraction of the open circle's light that the pupil mask transmits.
@@ -158,7 +158,7 @@ def image(sensor: Sensor, opd_nm: NDArray[np.floating], band: Band | None = None
 
 
 def reference(sensor: Sensor, band: Band | None = None) -> Array:
-    """I0 (pixels, pixels): the image of a flat wavefront, eq. (6), in the units of `image`."""
+    """I0 (pixels, pixels): the image of a flat wavefront, eqs. (6) and (8), in the units of `image`."""
     return image(sensor, np.zeros(sensor.pupil.shape), band)
 
 

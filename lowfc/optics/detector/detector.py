@@ -23,7 +23,7 @@ class Detector:
         em_gain: Mean gain of the multiplication register; 1 for a detector without one.
         clock_induced_charge_e: Mean spurious electrons per pixel and frame, before the register.
         exact: Draw the electrons of every pixel from the Poisson distribution. If False, faint pixels are drawn from
-            a precomputed table, in a third of the time; see `expose`.
+            a precomputed table where one applies, in a third of the time; see `expose`.
     """
 
     gain_e_per_dn: float = 1.0
@@ -64,7 +64,7 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
     Electrons are drawn from the Poisson distribution. Multiplication draws from the gamma distribution of a long
     register, whose excess noise doubles the variance of the photons.
 
-    Unless the detector is `exact`, pixels below `FAINT_E` electrons are drawn from a table of the distribution of their
+    If `noise_table_of` returns a table, pixels below `FAINT_E` electrons are drawn from it: the distribution of their
     digital number. It is exact at multiples of 1/64 electron; between these the mean is exact and the variance too
     large by at most 6e-5 electrons squared, which a chi-square test of a million draws does not detect.
 

@@ -28,6 +28,9 @@ def prolates(samples: int, half_band: float, count: int) -> Array:
         samples: Samples of the axis.
         half_band: Half of the bandwidth, in cycles per sample.
         count: Number of functions, the best concentrated first.
+
+    Raises:
+        ValueError: More functions than samples.
     """
     import scipy.linalg  # slow to import, and most processes load a stored result
 
@@ -88,7 +91,7 @@ def field_operator(
         functions: (sensor samples, functions) from `sensor_functions`.
         y_factors: (n, p) factors of the functions along y at the pupil's samples.
         x_factors: (n, q) factors along x.
-        products: Flat indices (p, q) of the products to compute.
+        products: Flat indices into (p, q) of the products to compute.
         advance: Called after each of k / 2 steps, where k is the number of samples across the focal-plane mask.
     """
     samples = sensor.pupil.shape[0]
@@ -100,7 +103,8 @@ def field_operator(
     half, count = waves.shape[1], functions.shape[1]
     quarter = sensor.focal_mask[half:, half:].real
     kernels = _kernels(sensor, scale, functions)
-    relayed = (kernels[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)  # columns (parity, d, k)
+    # Columns (parity, focal column, function).
+    relayed = (kernels[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)
     total = np.zeros((count**2, products.size))
     for parity, c, columns, amplitudes in rows:
         left = ((kernels * waves[parity, c]) @ sensor.relay.transmission @ relayed).reshape(count, 2, half, count)
