@@ -18,9 +18,8 @@ def design(line_hz: float, rate_hz: float) -> Iterator[str]:
     frequency_hz = np.linspace(0.1, rate_hz / 2, 20_000)
     for delay in (1.0, 1.5, 2.0, 3.0):
         gain = highest_gain(delay)
-        rejection = np.abs(
-            1 / (1 + open_loop(2 * np.pi * frequency_hz / rate_hz, gain, 0.0, delay))
-        )  # as the sensor sees it
+        loop_gain = open_loop(2 * np.pi * frequency_hz / rate_hz, gain, 0.0, delay)
+        rejection = np.abs(1 / (1 + loop_gain))  # as the sensor sees it
         bandwidth_hz, of_line = frequency_hz[np.argmax(rejection > 1)], np.interp(line_hz, frequency_hz, rejection)
         yield f"{delay:13g}   {limiting_gain(delay):18.2f}   {gain:12.2f}   {of_line:16.2f}   {bandwidth_hz:13.1f}"
 

@@ -19,7 +19,7 @@ def camera(
     frames: Frames = None,
     wait_for: WaitFor = None,
 ) -> None:
-    """Publish simulated frames of a run: mirror shape from the bus, disturbance from the seed, full diffraction.
+    """Publish simulated frames of a run: mirror shape from the bus, disturbance from the seed, optics by digital twin.
 
     Example: sim-camera --run bench --wait-for controller --wait-for mirror-dm
     """

@@ -1,9 +1,9 @@
 """The wavefront's disturbance: a pure function of the seed, the frame rate and the frame's number.
 
 Every preset is a sum of sine waves with seeded phases (a spectral model of drift and jitter), damped lines, a square
-wave and a static screen; the spectrum of waves, lines and wheels is known exactly. A damped line is a rotating vector
-whose length and phase wander (an Ornstein-Uhlenbeck process). It is drawn frame by frame: a frame requires all frames
-before it.
+wave and a static screen. The spectrum of waves, lines and wheels of constant speed is known exactly. A damped line is a
+rotating vector whose length and phase wander (an Ornstein-Uhlenbeck process). It is drawn frame by frame: a frame
+requires all frames before it.
 """
 
 from dataclasses import dataclass, replace

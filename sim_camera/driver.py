@@ -251,7 +251,7 @@ class SimulatedCamera:
         self._measured = self._contrast.measure() if self._contrast is not None else {}
 
     def fill(self, health: wire.Health) -> None:
-        """Add latency and wavefront to a Health."""
+        """Add late commands, latency and wavefront to a Health."""
         health.commands_late = self._lateness.total
         if self._frame_to_mirror.count:
             health.frame_to_mirror.CopyFrom(latency(self._frame_to_mirror))
@@ -347,7 +347,7 @@ class SimulatedCamera:
         silent = [
             name
             for name, health in sorted(self._service.last_health.items())
-            if name != self._service.name and now_ns - health.timestamp.ToNanoseconds() > PATIENCE_S * 0.4e9
+            if now_ns - health.timestamp.ToNanoseconds() > PATIENCE_S * 0.4e9
         ]
         who = f"no Health from {', '.join(silent)}" if silent else "all processes are alive"
         return f"the mirror did not apply a command for frame {self._index - 1} within {PATIENCE_S:g} s: {who}"

@@ -110,17 +110,9 @@ class CameraSettings:
 
 _PUBLISHED = tuple(one.name for one in fields(CameraSettings) if one.name in wire.CameraState.DESCRIPTOR.fields_by_name)
 
-
-_LEAST = {
-    "rows": 1,
-    "columns": 1,
-    "exposure_ns": 0,
-    "period_ns": 1,
-    "bit_depth": 1,
-    "region_row": 0,
-    "region_column": 0,
-    "number_wrap": 1,
-}
+_LEAST = dict.fromkeys(("rows", "columns", "period_ns", "bit_depth", "number_wrap"), 1) | dict.fromkeys(
+    ("exposure_ns", "region_row", "region_column"), 0
+)
 """Whole numbers among the settings, with their lowest values."""
 
 

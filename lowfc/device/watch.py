@@ -114,10 +114,7 @@ class DriverWatch:
             self._series, self._kind = 0, ""
 
     def call(self, method: Callable[..., None], *arguments: object) -> None:
-        """Call an optional method of the driver; a fault is counted and reported, and delays no other call.
-
-        A `LowfcError` is raised again.
-        """
+        """Call an optional method; count and report a fault, raise a `LowfcError` again. No other call is delayed."""
         try:
             method(*arguments)
         except Exception as fault:

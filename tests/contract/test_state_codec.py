@@ -33,7 +33,7 @@ def test_a_state_with_the_wrong_calibration_is_refused() -> None:
         decode_state(message, CALIBRATION)
 
 
-@pytest.mark.parametrize("field", ["gain", "prior_nm2"])
+@pytest.mark.parametrize("field", ["gain", "prior_nm2", "automatic"])
 def test_a_state_with_too_few_modes_is_refused(field: str) -> None:
     calibration = identified(replace(CALIBRATION, camera=CAMERA))
     setup = settings(auto_gain=(True, True))

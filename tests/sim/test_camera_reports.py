@@ -20,23 +20,19 @@ from sim_camera.wavefront_statistics import BLOCK, MAX_BLOCKS, WavefrontAccumula
 NOLL = (2, 3, 4)
 
 
+def truth(residual_nm: float, noll: tuple[int, ...] = NOLL) -> Truth:
+    """A frame with this residual in every mode and over the pupil, and a disturbance twice as large."""
+    modes = np.full(len(noll), residual_nm, np.float32)
+    sampled = Wavefront(2 * modes, modes, 2 * residual_nm, residual_nm)
+    return Truth(sampled, None, modes, np.array([[2 * modes], [modes]]), np.zeros(0), np.zeros(0))
+
+
 def statistics(
     *residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1, noll: tuple[int, ...] = NOLL
 ) -> WavefrontAccumulator:
-    """Statistics of frames with this residual in every mode and over the pupil, and a disturbance twice as large."""
     found = WavefrontAccumulator(noll, nm_per_mas, recent)
     for residual_nm in residuals_nm:
-        modes = np.full(len(noll), residual_nm, np.float32)
-        found.add(
-            Truth(
-                Wavefront(2 * modes, modes, 2 * residual_nm, residual_nm),
-                None,
-                modes,
-                np.array([[2 * modes], [modes]]),
-                wheel_speed_hz=np.zeros(0),
-                shear=np.zeros(0),
-            )
-        )
+        found.add(truth(residual_nm, noll))
     return found
 
 
@@ -63,11 +59,10 @@ def test_tilt_per_axis_is_that_of_the_axes_among_the_modes() -> None:
     assert (found["tilt_disturbance_mas"], found["tilt_residual_mas"]) == pytest.approx((3.0, 1.5))
 
 
-def test_the_costliest_modes_are_named_without_a_disturbance() -> None:
-    still = Wavefront(np.zeros(3, np.float32), np.ones(3, np.float32), 0.0, 1.0)
+def test_the_costliest_modes_are_named_without_contrast_from_a_disturbance() -> None:
     run = statistics()
-    run.add(Truth(still, None, still.residual_nm, np.zeros((2, 1, 3)), np.zeros(0), np.zeros(0)), 0.0, np.arange(3))
-    assert (run.wavefront()["costliest_modes"], run.wavefront()["costliest_share"]) == ("focus", pytest.approx(2 / 3))
+    run.add(truth(1.0), 0.0, np.arange(3))
+    assert [*run.wavefront().values()][-2:] == ["focus", pytest.approx(2 / 3)]
 
 
 def test_recent_statistics_cover_only_recent_frames() -> None:

@@ -279,7 +279,7 @@ def request(
 
 
 def encode_request(request: Request, reply: Reply, input_number: int, state: wire.ControllerState | None) -> bytes:
-    """Request with its reply; the input number is 0 if it could not be read.
+    """Request with its reply; the input number is 0 if the controller did not act on it.
 
     Only the identity of a calibration is written, and of law and table if the request is prepared: they have topics of
     their own. `state` is the answer to `status`.

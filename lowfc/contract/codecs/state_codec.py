@@ -125,7 +125,7 @@ def decode_state(
         history = np.array(message.command_history_nm, np.float32).reshape(len(loop.history_nm), -1)
         actuators = floats(message.actuators, *calibration.grid)
         modes, prior_nm2 = len(calibration.noll), np.array(message.prior_nm2, np.float32)
-        if {law.gain.size, history.shape[1], prior_nm2.size or modes} != {modes}:
+        if {law.gain.size, history.shape[1], prior_nm2.size or modes, len(message.automatic) or modes} != {modes}:
             raise ValueError(f"the controller's state does not have {modes} modes")
         law_runner = None
         if message.HasField("law"):

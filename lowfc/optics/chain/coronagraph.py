@@ -147,13 +147,8 @@ def contrast_curve(
 ) -> Array:
     """Contrast (rings,) averaged in azimuth within a wedge's opening, Fig. 1(c); other arguments as for `contrast`.
 
-    Args:
-        coronagraph: The optics.
-        opd_nm: Wavefront.
-        wavelength_nm: The wavelength.
-        edges: (rings + 1,) radii between the rings, in lambda / D, spaced by at least one sample.
-        wedge: Only its opening is used.
-        samples_per: Samples per lambda / D.
+    `edges` (rings + 1,) are the radii between the rings, in lambda / D, spaced by at least one sample. Only the wedge's
+    opening is used.
     """
     sector = Wedge(0.0, float(edges[-1]), wedge.half_opening_deg)
     columns, rows = _extent(sector, samples_per)

@@ -22,15 +22,12 @@ _WIDEST = 0.49  # half bandwidth, cycles per sample; Nyquist is 0.5
 
 
 def prolates(samples: int, half_band: float, count: int) -> Array:
-    """Discrete prolate sequences (samples, count), even and odd in turn, orthonormal.
+    """Discrete prolate sequences (samples, count), even and odd in turn, orthonormal; ValueError if count > samples.
 
     Args:
         samples: Samples of the axis.
         half_band: Half of the bandwidth, in cycles per sample.
         count: Number of functions, the best concentrated first.
-
-    Raises:
-        ValueError: More functions than samples.
     """
     import scipy.linalg  # slow to import, and most processes load a stored result
 
