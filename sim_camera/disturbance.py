@@ -332,10 +332,15 @@ def _between(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) -> C
     """Weights (2, instants, lines) of a line's vectors at both ends of a period, for its conditional mean within."""
     omega = 2j * np.pi * np.array([line.frequency_hz for line in lines])
     damping = np.pi * np.array([line.width_hz for line in lines])
-    full = np.sinh(damping * period_s)
     time_s = time_s[:, None]
-    before = np.sinh(damping * (period_s - time_s)) / full * np.exp(omega * time_s)
-    after = np.sinh(damping * time_s) / full * np.exp(omega * (time_s - period_s))
+
+    def sinh_ratio(span_s: Array) -> Array:
+        """sinh(damping span_s) / sinh(damping period_s), without overflow."""
+        ratio = np.expm1(-2 * damping * span_s) / np.expm1(-2 * damping * period_s)
+        return np.asarray(ratio * np.exp(damping * (span_s - period_s)))
+
+    before = sinh_ratio(period_s - time_s) * np.exp(omega * time_s)
+    after = sinh_ratio(time_s) * np.exp(omega * (time_s - period_s))
     return np.array([before, after])
 
 

@@ -316,8 +316,7 @@ class SimulatedCamera:
                 continue
             shape = actuators(state)
             if shape is None or shape.shape != self._latched.shape or not np.isfinite(shape).all():
-                why = "it is not finite, or its grid not the configured mirror's"
-                self._service.unreadable(sample.key, why)
+                self._service.unreadable(sample.key, "the shape is not finite, or not of the configured mirror's grid")
                 continue
             self._latched = shape
             latest = self._exposed.frame + 1  # the next exposure starts with this shape, even after a stall of the host

@@ -129,9 +129,7 @@ def test_settings_come_from_options_keywords_and_configuration(folder: Path) -> 
         ({"bit_depth": 12, "saturation_dn": 3000}, 3000),
     ],
 )
-def test_the_default_saturation_is_at_most_the_end_of_the_converter(
-    folder: Path, options: dict[str, float], expected_dn: float
-) -> None:
+def test_saturation_is_at_most_the_converters_end(folder: Path, options: dict[str, float], expected_dn: float) -> None:
     PlainStream.make(folder / "camnsv.im.shm", COLUMNS, ROWS, UINT16)
     assert camera(**options)[0].settings().saturation_dn == expected_dn
 

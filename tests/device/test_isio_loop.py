@@ -149,14 +149,11 @@ def test_stream_faults_are_reported_and_recovered_from(folder: Path, loop: tuple
         until(lambda: bench.has_event("CAMERA_CHANGED") and bench.has_event("closed -> open"))
         bench.send("die")
         until(lambda: bench.has_event("STREAM_SILENT", "in the middle of an image"))
-        until(
-            lambda: bench.has_event("DRIVER_FAILED", f"'{TOTAL}' has not followed") and bench.has_event("MIRROR_LOST")
-        )
+        until(lambda: bench.has_event("DRIVER_FAILED", f"'{TOTAL}' has not followed"))
+        until(lambda: bench.has_event("MIRROR_LOST"))
         bench.process.communicate()
         bench.start()
-        until(
-            lambda: bench.has_event("FRAMES_BACK") and bench.has_event("DRIVER_BACK") and bench.has_event("MIRROR_BACK")
-        )
+        until(lambda: all(map(bench.has_event, ("FRAMES_BACK", "DRIVER_BACK", "MIRROR_BACK"))))
         with Client("bench") as client:
             until(lambda: not client.status().state.mirror_fault)
             client.close_loop()

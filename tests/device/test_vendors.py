@@ -200,9 +200,8 @@ def fake_camera(request: pytest.FixtureRequest) -> Iterator[None]:
         found = aravis._aravis()
     except ConfigurationError as fault:
         pytest.skip(str(fault))
-    with subprocess.Popen(
-        [program, "-i", "127.0.0.1", "-s", "LOWFC", "-r", str(getattr(request, "param", 5))]
-    ) as process:
+    words = [program, "-i", "127.0.0.1", "-s", "LOWFC", "-r", str(getattr(request, "param", 5))]
+    with subprocess.Popen(words) as process:
         try:
             for _ in range(50):
                 found.update_device_list()

@@ -157,9 +157,7 @@ def test_vibrations_faster_than_the_exposure_are_averaged(keys: dict[str, object
     config = configured(camera__rate_hz=rate_hz, camera__exposure_fraction=1.0, **keys)
     truth = scene_of(config).truth(3, FLAT)
     expected = Sampler(disturbance_of(config), (np.arange(1000) + 0.5) / 1000, rate_hz).at(3).mean(axis=0)
-    assert truth.sensed_nm - truth.sampled.residual_nm + truth.sampled.disturbance_nm == pytest.approx(
-        expected, abs=0.05
-    )
+    assert truth.sensed_nm == pytest.approx(expected, abs=0.05)
 
 
 def test_slow_vibrations_need_two_nodes_of_the_exposure() -> None:
@@ -233,7 +231,5 @@ def test_example_camera_refuses_a_mirror_with_another_grid() -> None:
     surface = np.zeros((24, 24), np.float32)
     state = wire.MirrorState(rows=24, columns=24, actuators=surface.tobytes())
     handlers[0](SimpleNamespace(payload=state.SerializeToString()))
-    with pytest.raises(
-        ConfigurationError, match=r"\(24, 24\) actuators, mirror.rows and mirror.columns say \(34, 34\)"
-    ):
+    with pytest.raises(ConfigurationError, match=r"\(24, 24\) actuators, .*columns say \(34, 34\)"):
         optics.expose()
