@@ -42,7 +42,7 @@ class FaultyFrames:
         self._dark, self._highest = round(dark), highest
         self._now_ns = now_ns
         self._before: Frame | None = None
-        self._made: deque[tuple[int, bytes, int]] = deque(maxlen=MAX_FRAMES_LATE + 1)
+        self._messages: deque[tuple[int, bytes, int]] = deque(maxlen=MAX_FRAMES_LATE + 1)
         self._index = self._start_s = 0
 
     def put(self, payload: bytes) -> Envelope:
@@ -53,14 +53,14 @@ class FaultyFrames:
         if not self._start_s:
             envelope = self._publisher.put(message)  # frame 0, which is always good
             self._start_s = start_of(envelope.sequence)
-            self._made.append((index, message, envelope.publish_time_ns))
+            self._messages.append((index, message, envelope.publish_time_ns))
             return envelope
-        self._made.append((index, message, now_ns))
-        made = {number: (body, time_ns) for number, body, time_ns in self._made}
+        self._messages.append((index, message, now_ns))
+        messages = {number: (body, time_ns) for number, body, time_ns in self._messages}
         for number in self._fault.sent(index):
-            if number in made:
+            if number in messages:
                 earlier = EARLIER_S if self._fault.kind_at(number) is Kind.OLD_SEQUENCE else 0
-                self._publisher.put(*made[number], sequence_of(self._start_s - earlier, number))
+                self._publisher.put(*messages[number], sequence_of(self._start_s - earlier, number))
         return Envelope(sequence_of(self._start_s, index), now_ns)
 
     def _message(self, index: int, good: RawImage) -> bytes:

@@ -29,7 +29,7 @@ from lowfc.client.requests import BY_NAME
 from lowfc.client.runs import absence, the_run
 from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step_of
 from lowfc.contract.codecs.calibration_codec import camera_settings, decode_calibration, encode_calibration
-from lowfc.contract.codecs.codec import most_bytes
+from lowfc.contract.codecs.codec import max_bytes
 from lowfc.contract.codecs.law_codec import wire_law
 from lowfc.contract.errors import BusError, LowfcError, RequestRefusedError
 from lowfc.contract.messages import (
@@ -356,9 +356,9 @@ class Client:
         if calibration is not None:
             message.calibration.MergeFromString(encode_calibration(calibration, 0))
         payload = message.SerializeToString()
-        if len(payload) > most_bytes(name):
+        if len(payload) > max_bytes(name):
             raise RequestRefusedError(
-                f"{name} refused: at most {most_bytes(name):,} bytes, got {len(payload):,}: send it in parts"
+                f"{name} refused: at most {max_bytes(name):,} bytes, got {len(payload):,}: send it in parts"
             )
         timeout_s = SLOW_ANSWER_S if len(payload) > LARGE_BYTES else ANSWER_S
         return self._answer(name, self._get(REQUEST_KEY.format(name=name), payload, timeout_s))

@@ -17,15 +17,15 @@ class CameraClock:
 
     def __init__(self) -> None:
         """Start without any frame."""
-        self._least_ns: list[int] = []
+        self._minima_ns: list[int] = []  # smallest offset in the previous and the present half window
         self._begun_ns = 0
 
     def monotonic_ns(self, stamp_ns: int, received_ns: int) -> int:
         """Convert the stamp of a received frame (end of the exposure, ns of the camera's clock)."""
         offset_ns = received_ns - stamp_ns
         age_ns = received_ns - self._begun_ns
-        if not self._least_ns or age_ns > WINDOW_NS // 2:
-            self._least_ns = [*self._least_ns[-1:], offset_ns] if age_ns < WINDOW_NS else [offset_ns]
+        if not self._minima_ns or age_ns > WINDOW_NS // 2:
+            self._minima_ns = [*self._minima_ns[-1:], offset_ns] if age_ns < WINDOW_NS else [offset_ns]
             self._begun_ns = received_ns
-        self._least_ns[-1] = min(self._least_ns[-1], offset_ns)
-        return stamp_ns + min(self._least_ns)
+        self._minima_ns[-1] = min(self._minima_ns[-1], offset_ns)
+        return stamp_ns + min(self._minima_ns)

@@ -150,8 +150,8 @@ class CameraLoop:
             step = (number - self._number) % settings.number_wrap
             if step == 0:
                 raise ValueError(f"it returned frame number {number} twice")
-            most = MAX_LOST_FRAMES + MAX_RATE_RATIO * (now_ns - self._number_ns) // settings.period_ns
-            if step > most:
+            max_step = MAX_LOST_FRAMES + MAX_RATE_RATIO * (now_ns - self._number_ns) // settings.period_ns
+            if step > max_step:
                 self._restart()
             else:
                 lost += step - 1

@@ -68,10 +68,10 @@ def protection_of(driver: Mirror, config: Configuration) -> MirrorProtection:
         min(own.slew_nm, configured.slew_nm),
         min(own.neighbour_nm, configured.neighbour_nm),
     )
-    least_nm = min(limits.stroke_nm, limits.slew_nm, limits.neighbour_nm) - 2 * limits.margin_nm
-    if not 0 <= own.step_nm < least_nm:
+    bound_nm = min(limits.stroke_nm, limits.slew_nm, limits.neighbour_nm) - 2 * limits.margin_nm
+    if not 0 <= own.step_nm < bound_nm:
         raise ConfigurationError(
-            f"the mirror's smallest step is {own.step_nm:g} nm, expected 0 or more and below {least_nm:g} nm, so that "
+            f"the mirror's smallest step is {own.step_nm:g} nm, expected 0 or more and below {bound_nm:g} nm, so that "
             "rounding stays within the stroke, slew and neighbour limits"
         )
     return MirrorProtection((own.rows, own.columns), limits, own.step_nm, config.mirror.on_command_timeout == "flat")

@@ -165,9 +165,9 @@ def tick(protection: MirrorProtection, status: Status, now_ns: int, move: Move) 
     if not status.following and protection.flatten and status.driven_nm.any():
         flat = limit(protection.tighter, status.driven_nm, np.zeros(protection.grid, np.float32)).actuators_nm
         status = status._replace(driven_nm=flat, limits_hit=(), command_nm=_NONE, channels={})
-    known = status.time_ns and status.time_ns - now_ns < AHEAD_NS
-    time_ns = max(now_ns, status.time_ns) if known else now_ns
-    elapsed_ns = time_ns - status.time_ns if known else np.inf
+    has_time = status.time_ns and status.time_ns - now_ns < AHEAD_NS
+    time_ns = max(now_ns, status.time_ns) if has_time else now_ns
+    elapsed_ns = time_ns - status.time_ns if has_time else np.inf
     return status._replace(surface_nm=move(status.driven_nm, elapsed_ns), time_ns=time_ns)
 
 

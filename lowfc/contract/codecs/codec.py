@@ -108,7 +108,7 @@ def actuators(message: wire.MirrorCommand | wire.MirrorState) -> Single | None:
 
 
 def decode_mirror(payload: bytes) -> MirrorShape | None:
-    """Shape of a MirrorState; None if it cannot be read, BadMessageError if its time is out of range."""
+    """Shape of a MirrorState; None if it cannot be read or has none, BadMessageError if its time is out of range."""
     try:
         state = wire.MirrorState.FromString(payload)
     except DecodeError:
@@ -214,7 +214,7 @@ _MAX_BYTES = {
 }
 
 
-def most_bytes(name: str) -> int:
+def max_bytes(name: str) -> int:
     """Largest size of a request of this name; a larger one is refused before it is decoded."""
     return _MAX_BYTES.get(name, _SMALL_BYTES)
 
@@ -229,8 +229,8 @@ def only_requester(payload: bytes) -> bytes:
 
 def decode_request(payload: bytes, name: str, time_ns: int) -> Request:
     """Request of this name; ValueError if it is too large, cannot be read, or a part of it is incomplete."""
-    if len(payload) > most_bytes(name):
-        raise ValueError(f"a request of this name holds at most {most_bytes(name)} bytes, got {len(payload)}")
+    if len(payload) > max_bytes(name):
+        raise ValueError(f"a request of this name holds at most {max_bytes(name)} bytes, got {len(payload)}")
     try:
         message = wire.Request.FromString(payload)
     except DecodeError:
