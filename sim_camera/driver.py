@@ -161,9 +161,8 @@ class SimulatedCamera:
         self._path = MirrorPath(flat, config.camera.delay_frames - 1, settling)
         self._index, self._origin_ns = 0, 0
         self._exposing = self._exposed = _Exposed(-1, 0, 0, 0, flat)
-        self._newest_state = 0
+        self._newest_state = self._last_frame = 0  # sequences
         self._published_ns = [(0, 0)] * _REMEMBERED  # (sequence, time) of the last frames
-        self._last_frame = 0
         self._lateness = Lateness()
         self._frame_to_mirror = Durations()
         recent = max(1, round(RECENT_S * config.camera.rate_hz))

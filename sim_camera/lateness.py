@@ -17,10 +17,9 @@ class Lateness:
     """
 
     def __init__(self) -> None:
-        self.total = 0
+        self.total = self._late = 0
         self.habitual = False
         self._last: deque[bool] = deque(maxlen=WINDOW)
-        self._late = 0
 
     @property
     def percent(self) -> float:

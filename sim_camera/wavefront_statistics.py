@@ -40,10 +40,9 @@ class WavefrontAccumulator:
         self._nm_per_mas = nm_per_mas
         self._blocks: list[list[float]] = []
         self._sums = [0.0] * self._values
-        self._count = 0
+        self._count = self._frames = 0
         self._block = BLOCK
         self._recent = np.zeros((recent, self._values))
-        self._frames = 0
 
     def add(self, truth: Truth, added_flat: float = 0.0, added: Single | None = None) -> None:
         """Add a frame's truth, the contrast added by its disturbance, and by each mode (modes,) of its residual."""

@@ -48,7 +48,7 @@ class CameraLoop:
         self._settings: CameraSettings | None = None
         self._due_ns = 0
         self._publish_settings()
-        self._due_ns = 0
+        self._due_ns = 0  # publish them again with the first frame
         service.fill = self._fill
         service.state = "ready"
 

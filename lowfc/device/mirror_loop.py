@@ -97,14 +97,12 @@ class MirrorLoop:
         self._last_payload: bytes | None = None
         self._pause = Mailbox()  # never receives a message; a signal ends a wait on it at any time
         service.on_stop(self._pause.wake)
-        self._applied_ns = 0
+        self._applied_ns = self._picture_due_ns = self._state_due_ns = 0
         self._states = service.publisher(MIRROR_STATE, name)
         self._surfaces = service.publisher(SURFACE, name)
         geometry, axis = true_mirror(config), pupil_axis(PICTURE_PIXELS)
         self._y_factors: Single = influence_factors(geometry, axis, geometry.rows).astype(np.float32)
         self._x_factors: Single = influence_factors(geometry, axis, geometry.columns).astype(np.float32)
-        self._picture_due_ns = 0
-        self._state_due_ns = 0
         self._refused: Reason | None = None
         self._start_check = StartCheck(
             service.clock,
@@ -196,13 +194,15 @@ class MirrorLoop:
                 self._service.event("LIMIT_HIT", reason=reason.name)
 
     def _warm_up(self) -> None:
-        """Repeat the last command without moving the mirror and discard the result; see `CacheWarmup`."""
-        with self._turn:
-            if self._last_payload is None:
-                return
+        """Repeat the last command without moving the mirror, unless a command is being applied; see `CacheWarmup`."""
+        if self._last_payload is None or not self._turn.acquire(blocking=False):
+            return
+        try:
             command, now_ns = command_of(self._last_payload, self._start_check), self._service.clock.now_ns()
             status, refused = apply_command(self._protection, self._status, command, now_ns, lambda same_nm, _: same_nm)
             state_of(status, now_ns, refused).SerializeToString()
+        finally:
+            self._turn.release()
 
     def _drive(self, actuators_nm: Single, elapsed_ns: float) -> Single:
         """Call the driver to move; a real mirror is called only with a new command."""

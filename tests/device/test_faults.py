@@ -1,6 +1,7 @@
 """Drivers in their loops; those that fail, hang or return invalid data are reported, counted and retried."""
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import count
 from typing import Any
@@ -262,6 +263,8 @@ def test_a_warm_up_of_the_mirror_neither_calls_its_driver_nor_changes_or_publish
     bench.loop._warm_up()
     assert bench.loop._status is before
     assert (mirror.heights_nm, len(bench.listener.messages(MIRROR_STATE))) == ([0.0, 20.0], published)
+    with bench.loop._turn, ThreadPoolExecutor(1) as thread:  # a hanging command must not stop Health
+        thread.submit(bench.loop._warm_up).result(5)
 
 
 @pytest.mark.parametrize(
