@@ -186,13 +186,14 @@ class Realtime(Section):
     """Threads of the fused step for large frames (R of 8 MB or more); each needs a processor of controller_cpus to
     itself."""
     camera_cpus: Cpus = Field(default_factory=list)
-    """Processors of the camera; empty for all. By default, sim-loop gives the controller a processor of its own."""
+    """Processors of the camera; empty for all. sim-loop sets this key and the next three unless the file does: with
+    three processors or more, the controller gets its own."""
     controller_cpus: Cpus = Field(default_factory=list)
     """Processors of the controller; empty for all."""
     mirror_cpus: Cpus = Field(default_factory=list)
     """Processors of the mirror; empty for all."""
     recorder_cpus: Cpus = Field(default_factory=list)
-    """Processors of the recorder; empty for all. sim-loop keeps it off the controller's."""
+    """Processors of the recorder; empty for all. With three or more, sim-loop keeps it off the controller's."""
 
 
 class Configuration(Section):

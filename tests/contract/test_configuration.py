@@ -35,7 +35,7 @@ def error_of(path: Path | None, overrides: dict[str, Any] | None = None) -> str:
     return str(caught.value)
 
 
-def test_the_defaults_are_valid_for_every_component() -> None:
+def test_the_defaults_are_valid_for_detector_mirror_and_controller() -> None:
     config = load(None)
     assert config == Configuration()
     detector(config)

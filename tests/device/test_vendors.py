@@ -1,4 +1,4 @@
-"""Drivers of vendors' cameras against the vendors' emulators: normal operation, lost frames, missing packages."""
+"""Drivers of vendors' cameras, on emulators and stand-ins: normal operation, lost frames, missing packages."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""The simulated mirror enforces its own limits, command timeout and checks for any commands."""
+"""The mirror's own protection, on the simulated mirror: limits, command timeout and checks hold for any commands."""
 
 import numpy as np
 import pytest
