@@ -90,7 +90,7 @@ class Control(Section):
     on_frame_timeout: Literal["hold", "flat"] = "hold"
     """Action after a frame timeout: hold the command, or relax the mirror to flat."""
     command_timeout_ms: float = Field(200.0, gt=0, le=1e9)
-    """Time without a new command after which the mirror's last command expires; 2 s at most take effect."""
+    """Time without a new command after which the mirror's last command expires; more than 2000 acts as 2000."""
     max_start_ahead_h: float = Field(24.0, ge=0)
     """Hours by which a start time in the sequence of a camera or controller may be ahead of this host's clock; 0: no
     limit, for a host whose clock is not set."""
@@ -99,8 +99,7 @@ class Control(Section):
     max_saturated_pixels: int = Field(8, ge=0)
     """Number of saturated pixels above which a frame is refused."""
     max_identical_frames: int = Field(3, ge=0)
-    """Consecutive frames that may be identical to the one before, as from a stuck camera; no limit if it is 0, or
-    without camera.noise."""
+    """Consecutive frames that may equal the one before, as from a stuck camera; 0, or camera.noise off: no limit."""
     law: str = ""
     """Law file (FITS) written by `lowfc tune`; empty for the integrator."""
     guard: bool = True

@@ -121,7 +121,7 @@ class CameraLoop:
     def _end_ns(self, exposure: Exposure, settings: CameraSettings) -> int:
         """End of an exposure by the run's clock.
 
-        ValueError if the driver's time is over `AHEAD_NS` in the future, or before 1970, unless it is simulated.
+        ValueError if the driver's time is more than `AHEAD_NS` in the future, or before 1970, unless it is simulated.
         """
         clock = self._service.clock
         if exposure.end_ns is None:

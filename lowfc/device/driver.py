@@ -271,7 +271,7 @@ class MirrorExtras:
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
         """Replace `apply` in simulated mirrors: (rows, columns), nm of surface; also called without a new command.
 
-        `elapsed_ns` is the run's time since the last command, or without a new one since the last call; infinite at
+        `elapsed_ns` is the run's time since the last command; without a new command, since the last call; infinite at
         first.
         """
         raise NotImplementedError

@@ -25,7 +25,7 @@ AHEAD_NS = 1_000_000_000
 
 Move = Callable[[Single, float], Single]
 """Function that drives the actuators (rows, columns), nm of surface, and returns their positions; its second argument
-is the run's time, ns, since the last command, or without a new one since the last call; infinite at first."""
+is the run's time, ns, since the last command; without a new command, since the last call; infinite at first."""
 
 
 @dataclass(frozen=True)

@@ -83,10 +83,9 @@ def test_an_existing_stream_is_adopted_unless_another_process_writes_it(folder: 
 
 @pytest.mark.parametrize("case", ["", "busy", "late", "again"])
 def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The bridge ends after ten rounds. In the fourth, the controller starts again; if late, it starts only then.
+    """The bridge ends after ten rounds. In the fourth, the controller starts again ("late": for the first time).
 
-    In the case "again" the whole run starts again in the fourth, and the bridge joins it. A busy controller answers
-    from the sixth on.
+    With "again" the run starts again instead, and the bridge joins it. A busy controller answers from the sixth on.
     """
     hub, clock, received = MemoryHub(), FakeClock(AT_NS), list[wire.Request]()
     controller = MemoryBus(hub, "controller", clock)

@@ -34,7 +34,7 @@ def encode_calibration(calibration: Calibration, time_ns: int) -> bytes:
 
 
 def identified(calibration: Calibration) -> Calibration:
-    """The calibration with its `id` set to its identity."""
+    """The calibration with its correct `id`, see `Calibration.identity`."""
     return replace(calibration, id=calibration.identity())
 
 

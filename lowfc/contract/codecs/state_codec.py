@@ -81,9 +81,8 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         if loop.weighting is not None:
             message.prior_nm2.extend(loop.weighting.prior_nm2.tolist())
             message.weighting_flux_dn = loop.weighting.flux_dn
-        message.gain.extend(loop.integrator.gain.tolist())
-        message.leak.extend(loop.integrator.leak.tolist())
-        message.limit_nm.extend(loop.integrator.limit_nm.tolist())
+        for name in _PAIRS:
+            getattr(message, name).extend(getattr(loop.integrator, name).tolist())
         message.command_history_nm.extend(np.concatenate(loop.history_nm).tolist())
         message.actuators = loop.actuators_nm.tobytes()
     return message
