@@ -43,7 +43,7 @@ class IsioMirror:
         nm_per_unit: float = Field(default=1000.0, gt=0)
         """Surface per unit of the stream, nm; CACAO's unit is the micrometre."""
         total: str | None = None
-        """Name of the stream with the sum of all channels; default: dm00disp for dm00disp03, read once it exists."""
+        """Stream with the sum of all channels; default: dm00disp for dm00disp03, read once it exists; empty: none."""
 
     def __init__(self, options: Options, config: Configuration) -> None:
         """Open the channel, or create it."""
