@@ -6,11 +6,12 @@ import numpy as np
 
 _MIN_NS = 1_000
 RATIO = 1.01  # upper over lower edge of a bin
+_BINS_PER_LOG = 1 / log(RATIO)
 _BINS = 2_000
 
 
 class Durations:
-    """Histogram of durations with bins of 1 %, from 1 us to 400 s; the largest duration is exact."""
+    """Histogram of durations with bins of 1 %, from 1 us to 430 s; the largest duration is exact."""
 
     def __init__(self) -> None:
         self._counts = [0] * _BINS
@@ -29,6 +30,3 @@ class Durations:
         indices = np.searchsorted(np.cumsum(self._counts), np.ceil(np.array(fractions) * self.count))
         edges_ns = [round(_MIN_NS * RATIO ** int(index)) if index < _BINS - 1 else self.max_ns for index in indices]
         return [min(edge_ns, self.max_ns) for edge_ns in edges_ns]
-
-
-_BINS_PER_LOG = 1 / log(RATIO)

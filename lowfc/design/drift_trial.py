@@ -10,7 +10,7 @@ from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, reference, response
 
-_NODES = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)])  # Gauss-Legendre, in exposure times
+_INSTANTS = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)])  # Gauss-Legendre, in exposure times
 _SAMPLE_TIMES = (np.arange(8) + 0.5) / 8  # times at which the residual is sampled, in periods
 _SETTLING_TIME_CONSTANTS = 8.0  # time constants of the slowest mode that are discarded
 
@@ -50,7 +50,7 @@ class DriftTrial:
             normalised_I0, normalised_H, good, self.light_e * float(I0.sum()), self.read_noise_e, "weighted"
         )
         evaluator, on_nodes = Evaluator(self.twin), basis.astype(np.float32)
-        times = np.concatenate([self.exposure * _NODES, _SAMPLE_TIMES, [1.0]])
+        times = np.concatenate([self.exposure * _INSTANTS, _SAMPLE_TIMES, [1.0]])
         order = np.argsort(times, kind="stable")
         lengths = np.diff(times[order], prepend=0.0)
         first = int(np.ceil(_SETTLING_TIME_CONSTANTS / gain[gain > 0].min()))
@@ -60,11 +60,11 @@ class DriftTrial:
             path = np.empty((len(times), len(gain)))
             path[order] = start + np.cumsum(moves * rng.standard_normal(path.shape), axis=0)
             residual = path + command
-            opds = residual[: len(_NODES)].astype(np.float32) @ on_nodes
+            opds = residual[: len(_INSTANTS)].astype(np.float32) @ on_nodes
             mean = np.mean([evaluator.image(opd).copy() for opd in opds], axis=0).ravel()  # the buffer is reused
             image = noisy_e(rng, mean * self.light_e, self.read_noise_e)
             if frame >= first:
-                squares += np.square(residual[len(_NODES) : -1]).mean(axis=0)
+                squares += np.square(residual[len(_INSTANTS) : -1]).mean(axis=0)
             command = command - gain * (R @ (image / image.sum() - normalised_I0))
             start = path[-1]
         return squares / frames

@@ -1,7 +1,7 @@
 """Predicted performance of sensors that use all light from the focal-plane mask (Zernike, CLOWFS), for a search.
 
-The fields on the focal-plane mask depend on neither the spot nor the defocus: they are propagated once, and from there
-for each candidate.
+The fields on the focal-plane mask depend on neither the spot nor the defocus: they are computed once, and propagated
+from there to the detector for each candidate.
 """
 
 from collections.abc import Callable
@@ -89,7 +89,7 @@ class FullLight:
         return self.focus.forms
 
     def central(self, row: str = "clowfs") -> Signal:
-        """I0 and H at the central wavelength."""
+        """I0 and H at the central wavelength, the same for every row."""
         return self._central
 
     def in_band(self) -> Signal:

@@ -34,7 +34,7 @@ class Goal:
             table3^(1 - weight) table4^weight. "contrast": contrast added to the dark zone by the noise of 14 modes in
             one exposure of Table 4's star.
         estimator: "pinv", or "weighted" for the Cramer-Rao bound.
-        modes: Number of modes in Table 3 and in the condition number.
+        modes: Number of modes in "table3", "pareto" and "condition".
         weight: Weight of Table 4 in "pareto" and "paper", 0 to 1. None: 1/2 in "paper"; in a "pareto" search each chain
             has its own weight.
     """
@@ -59,7 +59,7 @@ class Goal:
 
 
 def merit(candidate: Candidate, goal: Goal) -> float:
-    """The figure of merit to minimise, above 0; infinite if a mode has no signal."""
+    """The figure of merit to minimise, above 0; infinite if a mode has no signal. "pareto" needs a weight."""
     try:
         value = _merit(candidate, goal)
     except np.linalg.LinAlgError:
@@ -68,7 +68,7 @@ def merit(candidate: Candidate, goal: Goal) -> float:
 
 
 def paper_ratios(candidate: Candidate, estimator: str = "pinv") -> dict[str, float]:
-    """Ratio of the predicted value to the paper's for each row of Tables 3 and 4; below 1 is better than the paper."""
+    """Ratio of the predicted value to the paper's, by row of Table 3, and of Table 4 (1 mas); below 1 is better."""
     ratios = {}
     for name in candidate.paper_rows:
         for modes in MODES:

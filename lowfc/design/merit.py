@@ -32,7 +32,7 @@ class Signal:
         I0: (samples,) image of a flat wavefront, fraction of the open circle's light per pixel.
         H: (samples, modes) derivative of the image per nm rms of each mode.
         pixels_per_sample: Number of pixels that each sample represents.
-        peak: Largest value of a pixel of I0.
+        peak: Largest value of a pixel of I0; in a band, of a sample.
     """
 
     I0: Array
@@ -102,6 +102,7 @@ def covariance_nm2(signal: Signal, light_e: float, read_noise_e: float, modes: i
 
     Raises:
         ValueError: The estimator is not known.
+        numpy.linalg.LinAlgError: A mode has no signal.
     """
     H = signal.H[:, :modes] * light_e
     variance_e2 = (np.maximum(signal.I0, 0.0) * light_e + read_noise_e**2)[:, None]

@@ -120,7 +120,7 @@ def advance(optics: Optics, goal: Goal, bounds: Bounds, chain: Chain) -> Chain:
         changed = total if at is None else total - fields[at]
         changed = changed if field is None else changed + field
         value = merit(Mask(optics, changed), goal)
-        # on relative changes, so that a layout 1 % worse is accepted equally often at any merit
+        # The change is relative: a layout 1 % worse is accepted equally often at any merit.
         accepted = value < current or (value < inf and rng.random() < exp(-log(value / current) / temperature))
         if not accepted:
             continue
@@ -170,7 +170,7 @@ def _packed(rng: np.random.Generator, bounds: Bounds) -> tuple[Orbit, ...] | Non
 def _move(
     rng: np.random.Generator, bounds: Bounds, orbits: list[Orbit], done: float
 ) -> tuple[int | None, Orbit | None] | None:
-    """A random change within the bounds: index of the removed orbit, and the added orbit; None if none was found."""
+    """A random change: index of the removed orbit, and the added orbit, either or both; None if none was found."""
     at = int(rng.integers(len(orbits)))
     if bounds.count[0] < bounds.count[1] and rng.random() < 0.1:
         count = sum(len(images(orbit, bounds.symmetry)) for orbit in orbits)

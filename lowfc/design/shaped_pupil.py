@@ -4,8 +4,8 @@ The variables are the transmissions of the cells of one quadrant. A mask that is
 field, so that `|E| <= sqrt(contrast) E(0)` is two linear inequalities at every point. Less symmetry would gain nothing:
 the mean of any mask and its mirror images is as open, and as dark in a zone with the same symmetries.
 
-Between the points of a coarse grid the intensity is tens of times higher. Exchange: the maxima of the solution on a
-fine grid are added as points to the next program, until none exceeds the required contrast.
+Between the points of a coarse grid the intensity is tens of times higher than at the points. Exchange: the maxima of
+the solution on a fine grid are added as points to the next program, until none exceeds the required contrast.
 """
 
 from bisect import bisect_left
@@ -50,7 +50,7 @@ class Request:
         cells: Cells in half the diameter: 8, 16, 32, 64, 128 or 256.
         step: Spacing of the first grid of points, in lambda/D.
         symmetry: quarter: about both axes; octant: also about the diagonals, for the zone too; four times faster.
-        rounds: Most programs for each number of cells.
+        rounds: Largest number of programs for each number of cells.
     """
 
     inner: float = 4.0
@@ -238,7 +238,7 @@ def nearest_feasible(request: Request) -> tuple[float | None, float | None]:
 
 
 def is_feasible(request: Request) -> bool:
-    """Whether a mask that is not closed meets the contrast."""
+    """Whether a mask that meets the contrast and is not closed is found within the rounds."""
     return [found.contrast <= request.contrast for found in exchange(request)][-1]
 
 
@@ -287,7 +287,7 @@ def _waves(axis: Array, cells: int) -> Array:
 
 
 def _field_at(quarter: Array, points: Array) -> Array:
-    """Field E / E(0) of a mask (n,) at points (n, 2)."""
+    """Field E / E(0) (n,) of a mask at points (n, 2)."""
     along_x, along_y = (_waves(points[:, k], len(quarter)) for k in (0, 1))
     return np.asarray(((along_y @ quarter) * along_x).sum(axis=1) / quarter.sum())
 

@@ -1,7 +1,8 @@
 """Tolerances of drift and vibration lines, from theory: the size that a loop can correct to an allowed contrast.
 
-A mode drifts as a random walk of variance D per frame, and is measured with noise of variance n, averaged over an
-exposure of e frames; a command takes effect at the next frame. For the state r at the start of a frame,
+A mode drifts as a random walk of variance D per frame. Its mean over an exposure of e frames is measured with noise of
+variance n; a command takes effect at the next frame. For the residual r at the start of a frame, its change d over the
+frame, and the mean m of its change over the exposure,
 
     r' = r + d - g (r + m + noise),    var d = D, var m = D e / 3, cov(d, m) = D e / 2
 
@@ -104,7 +105,7 @@ def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> 
 
     if kind == "integrator":  # v = A line + B noise at each gain
         laws = [integrator([gain], [0.0], (2,), DELAY, rate_hz) for gain in np.append(_GAINS, highest_gain(DELAY))]
-        of_noise = np.array([0.0, *(float(noise_gain(law)[0]) for law in laws)])  # first without a loop
+        of_noise = np.array([0.0, *(float(noise_gain(law)[0]) for law in laws)])  # the first: without a loop
         of_line = np.array([1.0, *(residual(law, 1.0) for law in laws)]) - of_noise
         return lambda allowed: np.asarray(np.max((allowed[..., None] - of_noise) / of_line, axis=-1))
 

@@ -165,7 +165,7 @@ def is_running(pid):
         return False
 
 
-def test_workers_ignore_ctrl_c_and_their_death_is_no_error_in_the_search(tmp_path, monkeypatch):
+def test_workers_ignore_ctrl_c_and_their_death_is_told_from_an_error_in_the_search(tmp_path, monkeypatch):
     with open_executor(2, None) as executor:
         assert signal.SIGINT in executor.submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result()
         assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())

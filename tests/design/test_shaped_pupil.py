@@ -35,8 +35,8 @@ def last(request):
     return list(exchange(request))[-1]
 
 
-def image_of(quarter, samples_per, extent):
-    """Field by the sensor's transform, sampled at half-integer offsets and so never at a point of the fine grid."""
+def field_of(quarter, samples_per, extent):
+    """Field by the sensor's transform, at half-integer offsets: with 30 samples, at no point of the fine grid."""
     pupil = from_quarter(quarter, SAMPLES)
     axis = image_axis(2 * extent * samples_per, samples_per)
     return axis, to_image(pupil.astype(complex), axis.size, samples_per, 1.0) / pupil.mean()
@@ -53,7 +53,7 @@ def in_zone(request, axis, margin=0.0):
 
 def test_field_agrees_with_the_sensor_transform():
     quarter = np.random.default_rng(1).random((16, 16))
-    axis, field = image_of(quarter, 7, 9)
+    axis, field = field_of(quarter, 7, 9)
     np.testing.assert_allclose(relative_field(quarter, axis), field, atol=1e-12)
 
 
@@ -106,7 +106,7 @@ def test_command_writes_a_mask_that_meets_the_contrast_between_the_points(tmp_pa
         quarter = file["quarter"].astype(float)
     assert request == Request(outer=8.0, cells=64)
     assert properties(quarter, request).max_contrast == result["max_contrast"] <= request.contrast
-    axis, field = image_of(quarter, 30, 8)
+    axis, field = field_of(quarter, 30, 8)
     zone = in_zone(request, axis)
     assert (np.abs(field[zone]) ** 2).max() < 1.1 * request.contrast
     assert (np.abs(field[zone]) ** 2).mean() == pytest.approx(result["mean_contrast"], rel=0.05)

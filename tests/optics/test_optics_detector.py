@@ -115,6 +115,7 @@ def test_same_seed_gives_the_same_frame_and_input_is_unchanged():
 
 def test_negative_electrons_count_as_zero_and_nan_is_an_error():
     assert expose(QUIET, flat(-1e-9, 4), rng()).max() == 0
+    assert expose(Detector(), flat(-1.0), rng()).mean() == pytest.approx(100, abs=0.02)  # drawn from the table
     with pytest.raises(ValueError, match="finite number, got nan"):
         expose(QUIET, flat(np.nan, 4), rng())
 

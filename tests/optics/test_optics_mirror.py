@@ -61,7 +61,7 @@ def test_modes_to_actuators_gives_the_modes_with_half_the_surface():
     assert commands.shape == (34 * 34, 20)
     assert not commands[~active_actuators(MIRROR).ravel()].any()
     made, targets = wavefronts_and_modes(commands)
-    assert ((made - targets).std(axis=1) < 0.016).all()  # print-through: 1.1 %, 1.5 % for the worst mode
+    assert ((made - targets).std(axis=1) < 0.016).all()  # print-through: 1.3 %, 1.6 % for the worst mode
     assert (made * targets).sum(axis=1) / (targets**2).sum(axis=1) == pytest.approx(1.0, abs=2e-3)
 
 

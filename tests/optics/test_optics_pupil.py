@@ -65,14 +65,8 @@ def test_polynomials_continue_outside_the_circle():
 def test_mode_names_give_the_axis():
     names = {noll: mode_name(noll) for noll in range(1, 30)}
     assert len(set(names.values())) == 29
-    assert [names[noll] for noll in (2, 3, 4, 7, 8, 11)] == [
-        "tilt x",
-        "tilt y",
-        "focus",
-        "coma y",
-        "coma x",
-        "spherical",
-    ]
+    expected = {2: "tilt x", 3: "tilt y", 4: "focus", 7: "coma y", 8: "coma x", 11: "spherical"}
+    assert expected.items() <= names.items()
     for noll in (noll for noll, name in names.items() if name.endswith(" x")):  # odd in x and even in y
         assert zernike(noll, -0.3, 0.2) == pytest.approx(-zernike(noll, 0.3, 0.2))
         assert zernike(noll, 0.3, -0.2) == pytest.approx(zernike(noll, 0.3, 0.2))

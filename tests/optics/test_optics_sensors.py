@@ -283,7 +283,7 @@ def test_another_wavelength_is_equivalent_to_scaled_hardware(name):
     np.testing.assert_allclose(ours, reference(scaled), rtol=1e-9, atol=1e-15)
 
 
-def test_the_papers_defocus_gives_the_best_condition_number(modes):
+def test_the_papers_defocus_has_a_better_condition_number_than_a_third_or_twice_of_it(modes):
     def condition(defocus_mm):
         optics = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
         return np.linalg.cond(response(optics, modes[:14]))
@@ -305,7 +305,7 @@ def test_unresolved_defocus_is_refused():
 
 @pytest.mark.parametrize("name", ["sam", "bar", "lyot"])
 def test_behind_an_aperture_mask_modes_are_odd_and_shear_and_flux_even(name, modes):
-    """With symmetric real masks, phases change the image by odd functions, and amplitudes by even ones."""
+    """The focal-plane mask is real and symmetric: the field in the relay pupil is real, modes add imaginary parts."""
     optics = sensor_named(name)
     H, slopes = response(optics, modes[:14]), shear_response(optics)
     # Reversing the order of pixels is a point reflection through the centre.
@@ -326,7 +326,7 @@ def calibrated(**changed):
 
 @pytest.mark.parametrize(("name", "noise_factor"), [("clowfs", (3, 8)), ("zwfs", (1.2, 2))])
 def test_fitting_shear_and_background_removes_their_bias(name, noise_factor):
-    """Beam sheared by 0.002 D plus 10 % uniform light; the noise of tip, the mode most like shear, increases."""
+    """Beam sheared by 0.002 D plus 10 % uniform light; the noise of x tilt, the mode most like shear, increases."""
     optics = sensor_named(name)
     ramp = np.exp(-2j * np.pi * 0.002 * image_axis(64, 8))
     sheared = reference(replace(optics, focal_mask=optics.focal_mask * ramp)).ravel()

@@ -52,7 +52,7 @@ def default_images(sensor, modes, coefficients_nm):
 
 
 def worst_error(twin, coefficients_nm, images):
-    """Worst of the twin's images of the first wavefronts, as many as there are images of the full chain."""
+    """Worst error of the twin's images of the first wavefronts, of which `images` are those of the full chain."""
     evaluator, at_nodes = Evaluator(twin), zernikes(NOLLS_20, *node_radii(twin))
     return max(
         relative_l2(evaluator.image((each @ at_nodes).astype(np.float32)), full)
@@ -115,7 +115,7 @@ def test_defocused_twin_is_accurate_at_any_distance(defocus_mm, limit, modes, co
 def test_twin_of_an_annulus_thinner_than_a_sample_agrees_with_the_full_chain():
     """Some rows of samples, 0.125 lambda/D apart, have none in the annulus."""
     sensor = sensor_from(SensorSection(kind="clowfs", inner_radius=3.9))
-    assert relative_l2(twin_reference(build(sensor, FAST)), reference(sensor)) < 1e-3
+    assert relative_l2(twin_reference(build(sensor, FAST)), reference(sensor)) < 5e-4
 
 
 @pytest.mark.parametrize(("name", "limit"), [("fast", 3e-4), ("accurate", 1e-5)])

@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from subprocess import TimeoutExpired
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -58,29 +58,36 @@ class LoggedLoop(InProcessLoop):
 
 
 @pytest.mark.parametrize(
-    ("fault", "expected"),
+    ("fault", "on_interrupt", "patience_s", "expected", "message"),
     [
-        (RequestRefusedError("an actuator is too far from flat"), "too far from flat; output of the loop: begun"),
-        (KeyboardInterrupt(), None),
+        (RequestRefusedError("too far from flat"), "default_int_handler", 60, LowfcError, "flat; output.* loop: begun"),
+        (KeyboardInterrupt(), "default_int_handler", 60, KeyboardInterrupt, None),
+        (KeyboardInterrupt(), "SIG_IGN", 0.1, TimeoutExpired, None),
     ],
 )
 def test_a_refused_step_or_an_interrupt_ends_the_loop_with_its_output(
-    fault: BaseException, expected: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begin = "import os, pathlib, time; pathlib.Path('pid').write_text(str(os.getpid())); print('begun', flush=True)"
-    (tmp_path / "silent.py").write_text(f"{begin}\npathlib.Path('ready').touch(); time.sleep(20)\n")
+    fault, on_interrupt, patience_s, expected, message, tmp_path, monkeypatch
+):
+    begin = f"import os, signal, time; from pathlib import Path; signal.signal(signal.SIGINT, signal.{on_interrupt})"
+    record = "Path('pid').write_text(str(os.getpid())); print('begun', flush=True); Path('ready').touch()"
+    (tmp_path / "silent.py").write_text(f"{begin}\n{record}\ntime.sleep(600)\n")
+
+    def refuse(_):
+        monkeypatch.setattr(dark_hole, "PATIENCE_S", patience_s)
+        raise fault
+
     monkeypatch.setattr(dark_hole, "COMMAND", "silent")
     monkeypatch.setattr(dark_hole, "running", lambda: ["run"] * (tmp_path / "ready").exists())
     monkeypatch.setattr(dark_hole, "new_run_id", lambda: "run")
-    monkeypatch.setattr(dark_hole, "Client", Mock(side_effect=fault))
-    with pytest.raises(LowfcError if expected else KeyboardInterrupt, match=expected):
+    monkeypatch.setattr(dark_hole, "Client", refuse)
+    with pytest.raises(expected, match=message):
         dark_hole.dark_hole(tmp_path, 1.0)
     assert not Path("/proc", (tmp_path / "pid").read_text()).exists()
 
 
 def test_the_loop_undoes_only_the_steps_that_do_not_shift_its_zero_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, frames in (("STEPS", STEPS), ("STEPS_COMBINED", STEPS), ("SETTLE", 40), ("WINDOW", 40)):
-        monkeypatch.setattr(dark_hole, name, frames)
+    for name, value in (("STEPS", STEPS), ("STEPS_COMBINED", STEPS), ("SETTLE", 40), ("WINDOW", 40)):
+        monkeypatch.setattr(dark_hole, name, value)
     loop = LoggedLoop()
     marks, channel_nm = dark_hole.apply_steps(loop, 1.0, np.zeros(1))
     assert channel_nm.shape == (1 + STEPS, 4)

@@ -20,7 +20,7 @@ def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_
     `operator_hash` and `id` of the result are empty.
 
     Raises:
-        ValueError: the remaining pixels do not tell the modes apart.
+        ValueError: the remaining pixels have no light, or do not tell the modes apart.
     """
     kept = good * calibration.good
     I0, H = calibration.reference.astype(np.float64), calibration.response.astype(np.float64)
@@ -60,7 +60,7 @@ def with_reference(
 def _is_plain(calibration: Calibration) -> bool:
     """Whether R is plain: computed from I0 and H, without nuisance parameters and regularisation.
 
-    That of a measured H is not, since the noise of H must not enter it (see `regularised`).
+    The R of a measured H is not plain, since the noise of H must not enter it (see `regularised`).
     """
     estimator, *parts = calibration.estimator.split("+")
     return estimator in ESTIMATORS and all(part in ("aligned", "first") or part.startswith("at ") for part in parts)

@@ -19,7 +19,7 @@ _ANGLES = 72
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Position of a point of the computed image on the real sensor.
+    """Placement of the computed image on the real sensor.
 
     Attributes:
         scale: Real pixels per computed pixel.
@@ -90,7 +90,7 @@ def align(real: Array, computed: Array) -> Alignment:
     light = real - background
     if not light.sum() > 0:
         raise ValueError("the reference image has no light above its edge")
-    # 1: a detector region may cut off the image's wings.
+    # Scale 1 is tried as well: a detector region may cut off the image's wings, and so reduce its size.
     scales = {_size(light) / _size(np.asarray(computed, np.float64)), 1.0}
     spectrum = np.fft.rfft2(light, _doubled(light.shape))
     fits = []

@@ -1,4 +1,4 @@
-"""From reference image and response matrix to the reconstructor: flux normalisation, weights, condition."""
+"""The calibration; its reconstructor from reference image and response matrix: flux normalisation, weights, noise."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -111,7 +111,7 @@ def array_shapes(modes: int, shape: tuple[int, int], grid: tuple[int, int]) -> d
 
 
 def comparable(one: Calibration, other: Calibration) -> bool:
-    """Whether two calibrations have the same pixels and modes."""
+    """Whether two calibrations have frames of the same size and the same modes."""
     return one.shape == other.shape and one.noll == other.noll
 
 
@@ -164,7 +164,7 @@ def reconstructor(
             with the modes, so that they are not measured as modes, and not returned. Flux changes need none.
 
     Raises:
-        ValueError: unknown estimator, or modes that this sensor cannot tell apart.
+        ValueError: unknown estimator, or modes or nuisance parameters that this sensor cannot tell apart.
     """
     if estimator == "weighted":
         variance_e = np.maximum(reference, 0) * flux_e + read_noise_e**2

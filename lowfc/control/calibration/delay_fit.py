@@ -13,7 +13,7 @@ from lowfc.arrays import Array
 
 LAGS = 6
 """Number of frames in which a poke is searched for, from its own frame on."""
-MIN_FRAMES = 40 * LAGS  # consecutive ones from which a delay is measured
+MIN_FRAMES = 40 * LAGS  # fewest consecutive frames from which a delay is measured
 MIN_SNR = 10.0
 """Least signal-to-noise ratio of a detected poke; noise alone exceeds it with a probability below 1e-13."""
 
@@ -50,7 +50,7 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
         command: (frames,) the loop's own command of the same mode; None if the loop is open.
 
     Raises:
-        ValueError: there are too few frames, or the response is later than the longest lag.
+        ValueError: there are too few frames, or the response is spread over several or later than the longest lag.
         NotSeenError: the poke is not detected.
     """
     if len(fractions) < MIN_FRAMES:

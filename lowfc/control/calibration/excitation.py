@@ -11,7 +11,7 @@ from lowfc.arrays import Array, Integers, Single
 
 FEWEST_CYCLES = 3
 """Least cycles of the lowest line in a period; with fewer, it cannot be told from a drift of the mean."""
-_APART = 3  # least number of odd bins between lines of a mode: the noise is measured between them
+_APART = 3  # least distance of the lines of a mode, in odd bins: the noise is measured between them
 _DRAWS = 32  # random sets of phases; the one with the lowest peak is used
 
 

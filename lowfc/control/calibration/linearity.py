@@ -66,8 +66,8 @@ def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Integers, frames
     height = np.abs(levels_nm[:: len(_SIGNS)])
     amplitudes = np.unique(height)
     cycles = [per_cycle[height == amplitude] / amplitude for amplitude in amplitudes]
-    found = np.stack([of.mean(axis=0) for of in cycles])
-    uncertain = np.stack([of.std(axis=0, ddof=1) / np.sqrt(len(of)) for of in cycles])
+    found = np.stack([each.mean(axis=0) for each in cycles])
+    uncertain = np.stack([each.std(axis=0, ddof=1) / np.sqrt(len(each)) for each in cycles])
     return Gains(amplitudes, found, uncertain, mode)
 
 

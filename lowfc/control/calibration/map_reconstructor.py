@@ -10,7 +10,7 @@ from lowfc.control.loop.camera import CameraSettings
 def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: CameraSettings | None) -> Array | None:
     """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront rms, with the flux normalisation.
 
-    It includes photon noise of I0 and read noise; None if the camera's gain is unknown.
+    It includes photon noise of I0 and read noise; None if the camera's gain or the flux is unknown.
     """
     if camera is None or not camera.gain_e_per_dn > 0 or not flux_dn > 0:
         return None
@@ -34,7 +34,8 @@ def map_reconstructor(
         calibration: The calibration in use.
         prior_nm2: (modes,) mean square of an uncorrected mode; 0 for a corrected mode.
         flux_dn: Sum of the good pixels, for the weights.
-        camera: Camera settings; if they or their gain are unknown, the calibration's own R is returned.
+        camera: Camera settings; if they or their gain are unknown, or no mode or every mode is corrected, the
+            calibration's own R is returned.
     """
     R, prior_nm2 = calibration.reconstructor, np.asarray(prior_nm2, np.float64)
     uncorrected = prior_nm2 > 0

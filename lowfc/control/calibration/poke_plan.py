@@ -93,7 +93,7 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
 
     Args:
         table: A row for each frame from the first one of the sequence; before and after it, zeros.
-        weights: (lags,) fraction of the row of `lag` frames before that an exposure sees; sums to 1.
+        weights: (lags,) fraction that an exposure sees of the row 0, 1, ... frames before its own; sums to 1.
         sequence: (exposures,) ascending, counted from the frame whose command had the first row.
         commanded: (exposures,) whether the frame led to a command; if not, or if the frame is missing, the mirror kept
             the previous row.
@@ -117,7 +117,7 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
 
 
 def usable(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: int) -> Mask:
-    """Whether exposures (exposures,) see a row that may be used, and all commands that they see were sent.
+    """Whether exposures (exposures,) see a usable row, and every frame from the row before it on led to a command.
 
     Args:
         plan: The plan that was played.

@@ -185,12 +185,12 @@ def fit_response(sums: Sums) -> Measured:
     n = sums.cycles
     if n < 1:
         raise ValueError("no cycle was measured")
-    response, kept = sums.response / n, without_outliers(sums.answers)
+    response, clipped = sums.response / n, without_outliers(sums.answers)
     mean = sums.answers.mean(axis=0)
     if np.linalg.cond(mean) < WORST_CONDITION:
-        response = response @ np.linalg.solve(mean, kept.mean(axis=0))
+        response = response @ np.linalg.solve(mean, clipped.mean(axis=0))
     reference = sums.reference / sums.references if sums.references else None
-    return Measured(response, sums.initial, row_error(kept), reference, sums.flux_dn / n, n)
+    return Measured(response, sums.initial, row_error(clipped), reference, sums.flux_dn / n, n)
 
 
 def without_outliers(products: Array) -> Array:

@@ -115,12 +115,12 @@ def measure(
         reference_nm: (modes,) R I0.
         full_well: lowest count of a saturated pixel.
         dark_sum_dn: sum of the dark over the good pixels.
-        least_dn: flux that a normal frame exceeds.
+        least_dn: flux that the frame must exceed.
         error_nm: (modes,) the result, nm of wavefront rms.
 
     Returns:
-        The flux, DN, rounded to float32: the exact sum of the good pixels minus `dark_sum_dn`. 0 if the frame is not
-        normal: a good pixel is saturated, or the flux is low.
+        The flux, DN, rounded to float32: the exact sum of the good pixels minus `dark_sum_dn`. 0 if a good pixel is
+        saturated, or the flux is not above `least_dn`.
     """
     modes, blocks = error_nm.size, totals.shape[0]
     if pixels.size:

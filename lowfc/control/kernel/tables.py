@@ -15,7 +15,7 @@ FUSED: Final = "fused"
 BLOCK = 6400
 """Most pixels per block: 25.6 kB as float32, which fits into an L1 data cache of 32 to 48 kB."""
 DARK_MARGIN = 1e-3
-"""Margin of a normal frame over the lowest flux, as a fraction of the expected flux, against rounding."""
+"""Margin over the lowest flux, as a fraction of the expected flux, against rounding: below it numpy decides."""
 
 
 class Kernel(NamedTuple):
@@ -37,7 +37,7 @@ class Tables(NamedTuple):
 
     Attributes:
         full_well: lowest count of a saturated pixel; above all counts if no pixel can be saturated.
-        margin_dn: flux by which a normal frame exceeds the lowest flux.
+        margin_dn: flux by which a frame must exceed the lowest flux.
         shapes: (modes, actuators) nm of surface per nm of wavefront.
         no_modes: (modes,) zeros, like `no_states` (0,), `no_law` (0, 0) and `no_channels` (rows, columns).
     """
@@ -91,7 +91,7 @@ class Tables(NamedTuple):
         )
 
     def estimate(self, pixels: Pixels, min_flux_dn: float) -> tuple[Single, float] | None:
-        """Modal errors (modes,) and flux of a frame (pixels,); None if the frame is not normal."""
+        """Modal errors (modes,) and flux of a frame (pixels,), DN; None if a pixel is saturated or the flux is low."""
         error_nm = np.empty_like(self.reference_nm)
         least_dn = min_flux_dn + self.margin_dn
         scanned = pixels, self.good, self.dark, self.tiles, self.scratch, self.sums_nm, self.totals

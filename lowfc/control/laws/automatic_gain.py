@@ -9,7 +9,7 @@ from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.virtual import VirtualIntegrators, Weights
 
 MIN_GAIN = 1e-3
-"""Lower limit of the rows' gains: the highest gain that keeps the margins, halved repeatedly; one more row has 0."""
+"""Lower limit of the gains of a bank's rows: the highest gain within the margins, halved repeatedly. Row 0 has 0."""
 BLOCKS = 10
 """Blocks of a window, for the standard errors of its means."""
 CONFIDENCE = 2.0
@@ -20,14 +20,14 @@ GRANTED = 3.0
 """Standard errors of white noise by which a gain must beat the open loop in a first window, and for a mode at 0: on a
 faint star, a single gain granted because of noise may add as much contrast as the dark zone has."""
 EARLY = 5
-"""Blocks of a window after which a mode that is hardly corrected may get a gain before the window ends: a mode
-at 0 by `GRANTED`, one at the least gain after this many blocks in a row in its favour."""
+"""Blocks of a window after which a mode that is hardly corrected may get another gain before the window ends: a mode
+at 0 by `GRANTED`, one at the least gain after this many blocks in a row in favour of the other."""
 LONGEST = 16
 """Factor of its first length to which a window grows while it decides nothing."""
 FEW = 3
 """Number of modes below which each is judged by itself only; with more, the majority is evidence for each."""
 MIN_CORRECTED = 0.1
-"""Ratio of injected noise to correctable power below which the least gain is used if no gain is shown to be better."""
+"""Ratio of injected noise to correctable power below which a first window chooses the least gain instead of 0."""
 
 SURE = 4.0
 """Standard errors above which the cross-talk of tip and tilt into another mode counts as certain."""
@@ -71,7 +71,7 @@ class GainBank:
     """Virtual integrators of a group of modes, compared over windows of frames.
 
     The first window after `restart` may choose any gain; later ones move a gain by at most a factor of two, unless the
-    open loop is better than the current gain, or that is the least one.
+    open loop is better than the current gain, or the current gain is 0 or the least one.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class GainBank:
             kept: (modes,) 1 - leak.
             limit_nm: (modes,) largest command.
             weights: Which commands an exposure sees.
-            delay_frames: Of the loop.
+            delay_frames: The loop's delay.
             windows: Frames of the first window, and of each later one before it grows.
         """
         halvings = int(np.log2(highest_gain(delay_frames) / MIN_GAIN))
@@ -123,7 +123,8 @@ class GainBank:
     def add_frame(self, open_nm: Single, error_nm: Single, tilt_nm: Single | None = None, *, closed: bool) -> bool:
         """Add one frame: open-loop modes and the real loop's errors (modes,); return whether a block is complete.
 
-        A bank of modes other than tip and tilt also needs these two (2,), as the sensor saw them.
+        A bank of modes other than tip and tilt also needs these two (2,), as the sensor saw them. A window that is not
+        a first one begins anew when the loop opens or closes.
         """
         if closed is not self._closed and not self.first:
             self._add_up()
@@ -158,7 +159,7 @@ class GainBank:
     def early(self, gain: Single) -> Single:
         """Gains (modes,) before the window is complete.
 
-        Raised for modes at 0 or the least gain that have begun to wander, and 0 for those that prove to be cross-talk.
+        A better one for modes at 0 or the least gain (see `EARLY`), and 0 for modes that prove to be cross-talk.
         """
         if self.first or len(self._blocks) < EARLY:
             return gain
@@ -170,9 +171,9 @@ class GainBank:
         mean = np.where(now == 0, beyond.mean(axis=0), beyond[-EARLY:].mean(axis=0))
         shown = np.where(now == 0, self._beyond_noise(mean), (beyond[-EARLY:] < 0).all(axis=0))
         sure = np.where(shown, mean, np.inf)
-        grown = (now <= 1) & shown.any(axis=0)
+        changed = (now <= 1) & shown.any(axis=0)
         absent = (cross_talk_nm != 0) & (own[-EARLY:] > 0).all(axis=0)
-        gain = np.where(grown, self.rows[np.argmin(sure, axis=0)], gain)
+        gain = np.where(changed, self.rows[np.argmin(sure, axis=0)], gain)
         return np.where(absent, 0, gain).astype(np.float32)
 
     def held(self, frames: int) -> None:
@@ -182,7 +183,7 @@ class GainBank:
         self._cross_talk.held()
 
     def verdict(self, gain: Single, noise_nm2: Array | None) -> Verdict:
-        """Result of the window, at gains (modes,) and with the noise of one frame (modes,), None if unknown."""
+        """Result of the window at gains (modes,), with a frame's noise (modes,) or None; then begin anew, or grow."""
         means, power = (np.mean(values, axis=0, dtype=float) for values in (self._means, self._powers))
         cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts)
         power -= (2 * means - cross_talk_nm) * cross_talk_nm

@@ -47,7 +47,10 @@ class Timing(NamedTuple):
 
     @classmethod
     def measured(cls, delay: float, exposure: float, waited: float) -> "Timing":
-        """Timing in which a command is in force `waited` after its exposure's end; implausible times are ignored."""
+        """Timing in which commands are in force `waited` periods after the end of their exposures.
+
+        Whole periods follow from `delay`; the result is that of `of` for a fractional delay or an implausible time.
+        """
         after = exposure + waited
         if delay != round(delay) or not exposure < after <= _LONGEST:
             return cls.of(delay, exposure)
@@ -77,7 +80,7 @@ def residual_power(law: LinearLaw, omega: Array, timing: Timing) -> Array:
 
 
 def _residual(S: Complex, omega: Array, timing: Timing) -> Array:
-    if not timing.held:  # at an instant: the part of a command that an exposure sees
+    if not timing.held:  # at an instant, as an exposure sees the commands
         return np.asarray(np.abs(S) ** 2)
     command = _commanded(S, omega, timing.delay) * mean_over(omega, timing.exposure)[:, None]
     return np.asarray(
@@ -94,11 +97,11 @@ def residual_spectrum(law: LinearLaw, omega: Array, measured: Array, noise_nm2: 
     """Spectrum (frequencies, modes) of the residual, from the spectrum of the measurements.
 
     Args:
-        law: of the loop.
+        law: the loop's law.
         omega: (frequencies,) rad per frame, up to pi.
-        measured: (frequencies, modes) of pseudo-open-loop modes with their noise.
+        measured: (frequencies, modes) spectrum of pseudo-open-loop modes with their noise.
         noise_nm2: (modes,) variance of one frame's white noise.
-        timing: of the loop.
+        timing: the loop's timing.
     """
     S = sensitivity(law, omega, timing.delay)
     of_wave = _residual(S, omega, timing) / np.abs(mean_over(omega, timing.exposure))[:, None] ** 2
@@ -121,7 +124,7 @@ def means_while_applied(measured_nm: Array, timing: Timing) -> tuple[Array, Arra
 
     Args:
         measured_nm: (frames, modes), exposure by exposure.
-        timing: of the loop.
+        timing: the loop's timing.
 
     Returns:
         (frames, modes), NaN where there are too few neighbours; and the filter's response (frequencies,) at

@@ -127,7 +127,7 @@ def measurement_error(
     command in it, so it does not bias the fit; the noise that the fit explains by chance is subtracted.
 
     Args:
-        law: law of the loop, with the true delay.
+        law: the loop's law, with the true delay.
         error: modal error of each frame.
         residual: true residual of the same frames.
         seen: modal command seen in each of them.

@@ -7,7 +7,7 @@ import numpy as np
 from lowfc.arrays import Mask, Single, single
 
 TIP_TILT = (2, 3)
-"""Noll indices of tip and tilt, which have separate gains and are judged separately."""
+"""Noll indices of tip and tilt, whose gains are set and judged separately from those of the other modes."""
 RELAXING = np.float32(0.99)
 """Fraction of its command that a mode keeps from frame to frame while its automatic gain is 0, since nothing corrects
 what an earlier gain put on the mirror."""

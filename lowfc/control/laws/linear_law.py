@@ -15,7 +15,7 @@ Signal = Literal["error", "pol"]
 _LARGEST_POLE = 0.99
 """Largest pole of an integrator's prediction of pol during missing frames in an open loop: below 1, for stability."""
 MAX_STATES = 512
-"""Most states of a law: a step with this number takes a frame period at 1 kHz."""
+"""Most states of a law: a step with this number takes about 50 us."""
 SIGNALS: tuple[Signal, ...] = ("error", "pol")
 
 
@@ -154,8 +154,8 @@ def integrator_block(gain: float, leak: float, signal: Signal, delay_frames: flo
 
     For the latter, e[k] = pol[k] + sum_j w_j c[k-1-j], for which the block stores commands. During missing frames pol
     is predicted to cancel the stored commands, so that the command keeps its value, apart from the leak. Above a gain
-    of 0.99 / w_0 this prediction would be unstable in an open loop: it is damped, and the command changes, by up to 9 %
-    at the gains that keep the margins.
+    of 0.99 / w_0 this prediction would be unstable in an open loop: it is damped, and the command goes back, by up to a
+    quarter of its last change at the gains that keep the margins.
     """
     if signal == "error":
         return Block(np.zeros((1, 1)), np.array([-gain]), np.array([1 - leak]), np.zeros((1, 1)), np.ones(1))

@@ -13,7 +13,7 @@ MAX_INTERPOLATED_FRAMES = 3
 """Longest gap, in frames, that is interpolated; a longer one starts a new piece."""
 SHORTEST, LONGEST = 64, 2048
 """Shortest and longest segment of Welch's method, frames; with fewer than the shortest there is no spectrum."""
-_SEGMENT_SHARE = 4  # a segment is at most this part of the longest piece, which then has at least seven
+_SEGMENT_SHARE = 4  # the longest piece is at least this many segments long, unless a segment would be below `SHORTEST`
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +79,8 @@ def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSe
     """Time series of a run, split into evenly sampled pieces at long gaps.
 
     Args:
-        sequence: (rows,) sequence of each row's frame; rows that do not increase it are ignored, except for another
-            start of the camera, which may be lower after a clear.
+        sequence: (rows,) sequence of each row's frame; rows that do not increase it are ignored. A change of the
+            camera's start counts as an increase: the start may be lower after a clear.
         values: (rows, columns); a row with a NaN is a missing frame.
     """
     there = np.isfinite(values).all(axis=1)

@@ -27,7 +27,7 @@ class TwinSpec:
         nodes: Pupil nodes across the diameter.
         order: Points of the interpolation from the nodes, even.
         rank: Retained modes of the operator for a focal-plane mask with the area of a disk of radius 4 lambda0 / D and
-            an aperture mask. It increases with the area of the mask, and by a third without an aperture mask.
+            an aperture mask. `build` raises it for a larger mask, for a bright pupil, and without an aperture mask.
         guards: Prolate functions along each axis in addition to the field's bandwidth times the sensor's width.
     """
 
@@ -113,7 +113,7 @@ def reference(twin: Twin, opd_nm: Array | None = None) -> Array:
 def response(twin: Twin, basis: NDArray[np.floating], opd_nm: Array | None = None) -> Array:
     """H = dI/da (pixels squared, modes) in float64, per nm: 2 (2 pi / lambda) Re{E0 conj(i E_k)}, eq. (12) times 2.
 
-    For a reference wavefront phi that is not flat, the pupil fields of E0 and E_k are multiplied by exp(i phi).
+    For a reference wavefront of phase phi, the pupil fields of E0 and E_k are multiplied by exp(i phi).
 
     Args:
         twin: The twin.

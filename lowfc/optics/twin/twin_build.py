@@ -29,15 +29,15 @@ def build(
         sensor: The optics; the focal-plane mask must be symmetric about both axes.
         spec: Degree of compression.
         band: The passband; the central wavelength alone when None.
-        operator_hash: Digest of sensor, spec and band, see `twin_store`.
+        operator_hash: Digest of sensor, spec and band, see `lowfc.adapters.files.twin_cache`.
         progress: Called with the number of steps done and the total.
 
     Raises:
-        ValueError: The mask is not symmetric, or the specification cannot be met.
+        ValueError: The focal-plane mask is not symmetric, or complex with an aperture mask; or `spec` cannot be met.
     """
     mask = sensor.focal_mask
     if mask.shape[0] % 2 or not (np.array_equal(mask, mask[::-1]) and np.array_equal(mask, mask[:, ::-1])):
-        raise ValueError("the twin needs a focal-plane mask with even samples and symmetric about both axes")
+        raise ValueError("the twin needs a focal-plane mask of an even number of samples, symmetric about both axes")
     if isinstance(sensor.relay, ApertureMask) and np.iscomplexobj(mask):
         raise ValueError("the twin of an aperture mask needs a real focal-plane mask, got a complex one")
     band = monochromatic(sensor.wavelength_nm) if band is None else band

@@ -19,7 +19,7 @@ from lowfc.optics.twin.field_operator import field_operator, sensor_functions
 from lowfc.optics.twin.nodes import interpolation
 from lowfc.optics.twin.twin import Twin
 
-_MIN_WEIGHT = 0.01  # of the largest; excludes guard nodes that hardly affect the pupil
+_FIT_RCOND = 0.01  # least relative singular value of the fit; excludes guard nodes that hardly affect the pupil
 _MIN_SINGULAR_VALUE = 0.01  # of the largest; smaller ones do not reduce the correction's error
 
 
@@ -58,7 +58,7 @@ def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
     y_full = influence_factors(mirror, u, mirror.rows)
     x_full = influence_factors(mirror, u, mirror.columns)
     to_field = operator.modes.T @ field_operator(sensor, scale, functions, y_full, x_full, actuators)
-    fit = np.linalg.pinv(interpolation(u.size, twin.spec.nodes, twin.spec.order), _MIN_WEIGHT)
+    fit = np.linalg.pinv(interpolation(u.size, twin.spec.nodes, twin.spec.order), _FIT_RCOND)
     y_factors, x_factors = fit @ y_full, fit @ x_full
     sampled = _at_nodes(twin.used, y_factors, x_factors)
     left, values, right = np.linalg.svd(operator.to_modes, full_matrices=False)

@@ -89,7 +89,7 @@ def zwfs(request: Spot, out: Keys = Path("zwfs.toml"), plot: Plot = None, as_jso
 
     Example: lowfc design zwfs --merit contrast --out zwfs.toml
     """
-    _sized(request, out, plot, as_json=as_json)
+    _optimise(request, out, plot, as_json=as_json)
 
 
 @design_app.command()
@@ -99,10 +99,10 @@ def clowfs(request: Defocus, out: Keys = Path("clowfs.toml"), plot: Plot = None,
 
     Example: lowfc design clowfs --merit contrast --out clowfs.toml
     """
-    _sized(request, out, plot, as_json=as_json)
+    _optimise(request, out, plot, as_json=as_json)
 
 
-def _sized(request: Spot | Defocus, out: Path, plot: Path | None, *, as_json: bool) -> None:
+def _optimise(request: Spot | Defocus, out: Path, plot: Path | None, *, as_json: bool) -> None:
     from lowfc.programs.cli import result
     from lowfc.programs.design.full_light import design
 

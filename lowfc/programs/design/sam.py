@@ -26,14 +26,7 @@ from lowfc.design.sam_search import BLOCK, Chain, advance, holes, start
 from lowfc.optics.chain.sam import Layout
 from lowfc.programs.design.options import command_line
 from lowfc.programs.design.sam_executors import is_lost
-from lowfc.programs.design.sam_files import (
-    Point,
-    front,
-    write_front,
-    write_layouts,
-    write_plot,
-    write_state,
-)
+from lowfc.programs.design.sam_files import Point, front, write_front, write_layouts, write_plot, write_state
 from lowfc.programs.design.sam_request import Search
 
 STATE_PERIOD_S = 10.0
@@ -59,7 +52,8 @@ def design_sam(
 ) -> dict[str, Any]:
     """Search, write the best layout or the front, and return their predictions; Ctrl-C writes the best so far.
 
-    The chains are advanced in place, and stored in the file `state` until the end.
+    The chains are advanced in place, and stored in the file `state` until the end. LowfcError if the workers were lost;
+    KeyboardInterrupt if nothing was found before Ctrl-C.
     """
     console = Console(stderr=True) if console is None else console
     _one_thread()
@@ -214,7 +208,7 @@ def render(result: dict[str, Any]) -> str:
 
 @cache
 def _one_thread() -> None:
-    """Limit this process to one thread for good, so that sums round the same in every run."""
+    """Limit the linear algebra of this process to one thread for good, so that sums round the same in every run."""
     threadpool_limits(1)
 
 
@@ -225,7 +219,7 @@ def pupil_digest() -> str:
 
 
 _PUPIL_SAMPLES = 256
-"""One sample for each cell of the package's shaped pupil; the predictions for a mask agree with 512 samples to 1e-3."""
+"""One sample per cell of the package's shaped pupil; predictions agree with 512 samples to 4e-4, contrast to 2 %."""
 
 
 @lru_cache(maxsize=4)

@@ -34,15 +34,15 @@ class Point:
 
 
 def check_files(out: Path, resume: Path | None, *others: Path | None) -> Path:
-    """Check before the search that its files can be written.
+    """Check before the search that its files can be written, and return the state file.
 
     Args:
         out: Layout file.
-        resume: State file of the search to continue.
+        resume: State file of the search to continue; None for a new search.
         others: Other files to be written.
 
-    Returns:
-        The state file.
+    Raises:
+        ConfigurationError, DataFileError: A file cannot be written, or holds the state of an interrupted search.
     """
     if out.suffix != ".json":
         raise ConfigurationError(f"--out must end in .json, the only type read as a layout file; got {out}")
@@ -60,7 +60,7 @@ def write_state(path: Path, search: Search, pupil: str, chains: Sequence[Chain])
 
 
 def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
-    """Read the search and its chains from a file of `write_state`."""
+    """Read the search and its chains from a file of `write_state`; DataFileError if it is none, or of another pupil."""
     try:
         state = json.loads(input_file.read_whole(path, _MAX_BYTES))
         search = Search(**state["search"])

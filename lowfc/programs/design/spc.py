@@ -65,7 +65,7 @@ class ShapedPupil(Result):
 
 
 def design_spc(request: Request, out: Path, plot: Path | None, console: Console) -> ShapedPupil:
-    """Design a mask and write it.
+    """Design a mask and write it; ConfigurationError if the request is infeasible, or the rounds do not suffice.
 
     Args:
         request: Requirements on the mask.

@@ -45,7 +45,7 @@ class Prepared:
 
     @property
     def paper_name(self) -> str:
-        """Name of the paper's sensor to compare with, if there is one: "sam" for every layout, "bowtie" with any."""
+        """Key of the paper's values: "sam" for any layout, "bowtie" also for bowtie:LAYOUT, else the sensor's name."""
         kind = self.name.partition(":")[0]
         if kind not in SENSORS:
             return "sam"

@@ -26,7 +26,7 @@ def validate(
     tables: Annotated[
         list[str],
         typer.Argument(
-            help=f"Any of {', '.join(TABLES)}; all of these; or {', '.join(ADDITIONAL)}.",
+            help=f"Any of {', '.join(TABLES)}; all: all of these; or {', '.join(ADDITIONAL)}.",
             metavar="TABLE...",
             show_default=False,
         ),

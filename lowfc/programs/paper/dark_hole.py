@@ -100,7 +100,10 @@ def dark_hole(
             failure = f"{error}; "
         finally:
             process.send_signal(signal.SIGINT)
-            out, complaints = process.communicate(timeout=PATIENCE_S)
+            try:
+                out, complaints = process.communicate(timeout=PATIENCE_S)
+            finally:
+                process.kill()  # has no effect once it has ended
     if failure or process.returncode:
         raise LowfcError(f"{failure}output of the loop: {out}{complaints}")
     log = folder / json.loads(out)["log"]

@@ -138,11 +138,11 @@ def bars(heights: dict[str, Array], groups: Sequence[str], title: str, y_label: 
 
     def panel(_: "Figure", axes: "Axes") -> None:
         width = 0.8 / len(heights)
-        middle = np.arange(len(groups))
+        places = np.arange(len(groups))
         for i, (name, each) in enumerate(heights.items()):
-            left = middle + (i - (len(heights) - 1) / 2) * width
-            axes.bar(left, each, width, label=name, color=_COLOURS[1 + i], edgecolor="black", linewidth=0.4)
-        axes.set_xticks(middle, groups)
+            middles = places + (i - (len(heights) - 1) / 2) * width
+            axes.bar(middles, each, width, label=name, color=_COLOURS[1 + i], edgecolor="black", linewidth=0.4)
+        axes.set_xticks(places, groups)
         _label(axes, title, "", y_label)
         axes.axhline(0, color="black", linewidth=0.8)
         axes.grid(axis="y", alpha=0.3)

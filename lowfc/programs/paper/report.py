@@ -1,4 +1,4 @@
-"""Run tables and figures; results as text, as JSON, and as the document docs/measured/paper.md."""
+"""Run tables and figures; results as text, as JSON, and as pages of docs/measured: paper.md and the additional ones."""
 
 import json
 from collections.abc import Sequence

@@ -129,7 +129,7 @@ def plot_fig4(context: Context, path: Path) -> None:
 
 
 def _tilted_e(ready: Prepared, axis: int) -> tuple[Array, Array]:
-    """A short exposure, electrons (pixels,), and its change by 1 mas of tilt."""
+    """Electrons (pixels,) of a flat wavefront in Table 4's exposure, and their change by 1 mas of tilt."""
     light_e = electrons(STAR, TABLE4_EXPOSURE_S)
     return light_e * ready.band_I0, light_e * tilt_signal(ready, axis)
 

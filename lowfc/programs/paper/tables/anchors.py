@@ -27,7 +27,7 @@ from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.zernike import NOLLS_14, mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.paper.cases import Context, Row, prepared, section_of
-from lowfc.programs.paper.dark_hole import SHIFTED, STEPS, dark_hole
+from lowfc.programs.paper.dark_hole import GAINS, SHIFTED, STEPS, dark_hole
 from lowfc.programs.paper.plots import Line as Curve
 from lowfc.programs.paper.plots import curves, draw
 from lowfc.programs.paper.tables import pointing, tolerance
@@ -37,7 +37,6 @@ LOOP_SENSORS = ("sam", "zwfs_tuned")
 RATE_HZ, MAGNITUDE, EXPOSURE = 1000.0, 2.0, 0.5
 OBSERVED_S, CLOSED_S, MEAN_S = 10.0, 24.0, 2.0
 """Durations: of the loop from which a law is identified, of the loop that is judged, of a mean as in SCExAO."""
-GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
 ROMAN_MAS, SCEXAO_MAS = 0.4, {"laboratory": 0.02, "sky": 0.15}
 AVERAGED_S = 100.0
 DRIFT_PM = 20.0
@@ -96,7 +95,7 @@ def _with_verdict(row: Row, allowed: float | None = None) -> list[Row]:
     best, ours = row.paper if allowed is None else allowed, row.measured if row.predicted is None else row.predicted
     if best is None:
         return [row]
-    assert isinstance(ours, float)  # noqa: S101  # these are
+    assert isinstance(ours, float)  # noqa: S101  # compared values are numbers
     assert isinstance(best, float)  # noqa: S101
     verdict = Row(row.name, f"verdict, {row.quantity}", "", REACHED if ours <= best else NOT_REACHED)
     return [row, replace(verdict, modes=row.modes, estimator=row.estimator, assumption=row.assumption)]
@@ -244,21 +243,15 @@ def _against_magnitude(name: str) -> Iterator[Row]:
 
 
 def plot(context: Context, path: Path) -> None:
-    """Draw the added contrast against magnitude for every sensor and the quantum limit."""
+    """Draw the added contrast against magnitude for each sensor (aplc on request) and for the quantum limit."""
     magnitudes = np.arange(0.0, 10.5, 0.5)
     names = context.names(*(name for name in tolerance.SENSORS_COMPARED if name != "aplc"))
     lines = [
         Curve(name, magnitudes, np.array([added_contrast(name, V) for V in magnitudes.tolist()])) for name in names
     ]
     least = np.array([added_contrast(names[0], V, quantum=True) for V in magnitudes.tolist()])
-    panel = curves(
-        [*lines, Curve("quantum limit", magnitudes, least)],
-        "added contrast",
-        "V",
-        "contrast",
-        "log",
-        legend="upper left",
-    )
+    lines.append(Curve("quantum limit", magnitudes, least))
+    panel = curves(lines, "added contrast", "V", "contrast", "log", legend="upper left")
     draw(path, [panel], AGAINST_V, wide=True)
 
 

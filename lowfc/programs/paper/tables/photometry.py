@@ -186,8 +186,8 @@ def _defocus_contradiction(clowfs: Prepared) -> Iterator[Row]:
         "mm",
         float(found),
         section.defocus_mm,
-        assumption="The paper's 0.080 mas is reached only at this defocus or less, where 14 modes can no longer be "
-        "fitted: see clowfs:1 in Table 4. No defocus agrees with both of the paper's CLOWFS tables.",
+        assumption="With the paper's electrons, its 0.080 mas needs about this defocus, where a fit of 14 modes has "
+        "ten times the scatter: see clowfs:1 in Table 4. No defocus agrees with both of the paper's CLOWFS tables.",
     )
 
 

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from lowfc.arrays import Array
-from lowfc.design import trials as random
+from lowfc.design import trials
 from lowfc.design.estimators import KINDS, Fit, estimate, iterated
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.design.paper import MODES, PEAK_E, TABLE3_INPUT_WAVES, TABLE3_READ_NOISE_E, TABLE3_WAVES
@@ -54,9 +54,9 @@ class Input:
 
 def inputs(sensor: Prepared, modes: int, literal: bool) -> Iterator[Input]:
     """Interpretations of Sect. 3.1: the one that matches the input of Table 3, and if `literal` those of the text."""
-    low, high = random.LITERAL_WAVES
-    bounds = random.bounds_waves(NOLLS_20[:modes], low, high)
-    literal_rms = random.input_rms(sensor.gram[:modes, :modes], bounds)
+    low, high = trials.LITERAL_WAVES
+    bounds = trials.bounds_waves(NOLLS_20[:modes], low, high)
+    literal_rms = trials.input_rms(sensor.gram[:modes, :modes], bounds)
     scale = TABLE3_INPUT_WAVES[modes] / literal_rms
     yield Input(
         "matched",
@@ -112,19 +112,19 @@ def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisanc
     linear, light_e, wavelength_nm = fits(sensor, modes, nuisances), scale_e(sensor), sensor.sensor.wavelength_nm
     rng = context.rng("table3", modes, wavefronts.name)
     nolls = NOLLS_20[:modes]
-    truth_nm = wavelength_nm * random.random_wavefronts(rng, context.trials, nolls, wavefronts.low, wavefronts.high)
+    truth_nm = wavelength_nm * trials.random_wavefronts(rng, context.trials, nolls, wavefronts.low, wavefronts.high)
     sensor.model(np.zeros(modes))  # builds the twin before the threads use it
 
     def trial(i: int) -> dict[str, Array]:
         noise = context.rng("table3", name, modes, wavefronts.name, i)
-        image_e = random.noisy_e(noise, light_e * sensor.image(truth_nm[i]), TABLE3_READ_NOISE_E)
+        image_e = trials.noisy_e(noise, light_e * sensor.image(truth_nm[i]), TABLE3_READ_NOISE_E)
         found = {key: estimate(each, image_e) for key, each in linear.items()}
         steps_nm = iterated(linear["weighted"], image_e, sensor.model, ITERATIONS[-1])
         return found | {label("weighted", iterations): steps_nm[iterations] for iterations in ITERATIONS}
 
     results = context.map(f"table3 {name}, {modes} modes, {wavefronts.name}", trial, range(context.trials))
     H_e, variance = linear["weighted"].response_e, variance_e(linear["weighted"].reference_e, TABLE3_READ_NOISE_E)
-    bound_nm = random.expected_rms(sensor.gram[:modes, :modes], cramer_rao(H_e, variance))
+    bound_nm = trials.expected_rms(sensor.gram[:modes, :modes], cramer_rao(H_e, variance))
     return Ensemble(truth_nm, {key: np.stack([each[key] for each in results]) for key in results[0]}, bound_nm)
 
 
@@ -177,12 +177,12 @@ def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensem
 def _rms(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:
     """Rms over wavefronts and over the open pupil, and its standard error to first order, waves."""
     modes = coefficients_nm.shape[1]
-    values = random.residual_rms(sensor.gram[:modes, :modes], coefficients_nm) / sensor.sensor.wavelength_nm
+    values = trials.residual_rms(sensor.gram[:modes, :modes], coefficients_nm) / sensor.sensor.wavelength_nm
     mean, error = mean_and_error(values)
     rms = float(np.sqrt(np.mean(values**2)))
     return rms, error * mean / rms
 
 
 def _pv(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:
-    values = random.residual_pv(sensor.open_modes[: coefficients_nm.shape[1]], coefficients_nm)
+    values = trials.residual_pv(sensor.open_modes[: coefficients_nm.shape[1]], coefficients_nm)
     return mean_and_error(values / sensor.sensor.wavelength_nm)

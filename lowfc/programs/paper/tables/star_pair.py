@@ -71,13 +71,12 @@ def pair_rows(name: str) -> Iterator[Row]:
     maps, flat, zone = _maps()
     step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
     made = partial(Row, name, unit="", assumption=ASSUMPTION)
-    residual_nm2: dict[str, Array] = {}
+    gains, residual_nm2 = dict[str, Array](), dict[str, Array]()
     for star, (magnitude, _) in STARS.items():
         noise = np.diag(tolerance.frame_noise_nm2(name, magnitude)).tolist()
-        gains = np.array([best_gain(step, n, tolerance.EXPOSURE) for n in noise])
-        residual_nm2[star] = np.array(
-            [drift_residual_nm2(step, n, tolerance.EXPOSURE, g) for n, g in zip(noise, gains.tolist(), strict=True)]
-        )
+        best = [best_gain(step, n, tolerance.EXPOSURE) for n in noise]
+        residual = [drift_residual_nm2(step, n, tolerance.EXPOSURE, g) for n, g in zip(noise, best, strict=True)]
+        gains[star], residual_nm2[star] = np.array(best), np.array(residual)
         yield made(
             f"added contrast, {star}, V = {magnitude:g}",
             measured=float(tolerance.contrasts_of(name).form @ residual_nm2[star]),
@@ -96,7 +95,7 @@ def pair_rows(name: str) -> Iterator[Row]:
     form = tolerance.contrasts_of(name).form
 
     def decayed(frames: int) -> bool:
-        return float(ROLL_NM**2 * form @ (1.0 - gains) ** (2.0 * frames)) <= ROLLED
+        return float(ROLL_NM**2 * form @ (1.0 - gains["target"]) ** (2.0 * frames)) <= ROLLED
 
     yield made(
         f"time for a roll's step of {ROLL_NM:g} nm in every mode to decay to {ROLLED:g}, target",

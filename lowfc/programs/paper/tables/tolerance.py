@@ -210,7 +210,7 @@ def _checked(context: Context) -> list[Row]:
 
 
 def in_text(row: Mapping[str, Any]) -> bool:
-    """Whether a row is on the page; the JSON object has all."""
+    """Whether a row is on the page and in its JSON file; `--json` prints all rows."""
     what = row["quantity"]
     if not what.startswith(("drift", "line")):
         return True
@@ -219,7 +219,7 @@ def in_text(row: Mapping[str, Any]) -> bool:
 
 
 def plot(context: Context, path: Path) -> None:
-    """Draw the tolerated drift against magnitude for four modes."""
+    """Draw the tolerated drift of four modes against magnitude for each sensor (aplc on request)."""
     magnitudes = np.arange(0.0, 10.5, 0.5)
     names = context.names(*(name for name in SENSORS_COMPARED if name != "aplc"))
 

@@ -76,6 +76,8 @@ def test_operator_hash_depends_on_every_input(sensor):
         (replace(sensor, focal_mask=sensor.focal_mask[1:-1, 1:-1]), SMALL, band),
         (replace(sensor, wavelength_nm=551.0), SMALL, band),
         (replace(sensor, pixels=78), SMALL, band),
+        (replace(sensor, samples_per=9), SMALL, band),
+        (replace(sensor, binning=1), SMALL, band),
         (sensor, replace(SMALL, nodes=18), band),
         (sensor, replace(SMALL, order=6), band),
         (sensor, replace(SMALL, rank=41), band),
