@@ -3,6 +3,7 @@
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -125,13 +126,8 @@ def test_damaged_file_is_reported_and_rebuilt(sensor, stored, tmp_path):
     ):
         path.write_bytes(damaged)
         notices, steps = [], []
-        again = load_or_build(
-            sensor,
-            SMALL,
-            cache_dir=tmp_path,
-            notice=notices.append,
-            progress=lambda *step, steps=steps: steps.append(step),
-        )
+        count = partial(lambda steps, *step: steps.append(step), steps)
+        again = load_or_build(sensor, SMALL, progress=count, cache_dir=tmp_path, notice=notices.append)
         assert len(notices) == 1
         assert str(path) in notices[0]
         assert steps[-1] == (32, 32)

@@ -23,7 +23,7 @@ def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, hi
         modes: Number of modes that are excited at once.
         lines_per_mode: Number of lines of each mode.
         lowest: Frequency of the first line, cycles per frame.
-        highest: Highest frequency of a line, cycles per frame.
+        highest: Highest frequency of a line, cycles per frame; at 0.5, the last line is below.
 
     Returns:
         For each mode (lines,), cycles per period: odd, ascending, and used by no other mode.
@@ -39,14 +39,15 @@ def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, hi
             f"must be {FEWEST_CYCLES} or more"
         )
     first = int(np.ceil(lowest * period_frames)) | 1
+    last = min(highest * period_frames, period_frames // 2 - 1)  # below half of the rate, where a sine has no phase
     count = modes * lines_per_mode
     step = 2 * -(-_APART // modes)
-    places = (np.geomspace(first, highest * period_frames, count).astype(np.intp) - 1) | 1
+    places = (np.geomspace(first, last, count).astype(np.intp) - 1) | 1
     places[0] = first
     ahead = np.arange(count) * step
     places = np.maximum.accumulate(places - ahead) + ahead  # each at least a step above the one before
-    if places[-1] > highest * period_frames:
-        room = int((highest * period_frames - first) // step) + 1
+    if places[-1] > last:
+        room = int((last - first) // step) + 1
         raise ValueError(
             f"a period of {period_frames} frames has room for {room} lines, {count} are requested: use a longer one "
             "or fewer lines or modes"

@@ -218,6 +218,7 @@ def test_a_multisine_has_the_requested_rms_and_lines_and_a_low_crest() -> None:
     places = lines(4000, 4, 15, 0.001, 0.3)
     table = multisine(4000, places, 2.0, 5)
     assert np.std(table, axis=0) == pytest.approx(2.0, rel=1e-5)
+    assert np.std(multisine(1002, lines(1002, 1, 8, 0.004, 0.5), 2.0, 5)) == pytest.approx(2.0, rel=1e-5)
     assert (np.abs(table).max(axis=0) < 3.3 * 2.0).all()
     spectrum = np.abs(np.fft.rfft(table, axis=0))
     for mode, one in enumerate(places):
