@@ -65,7 +65,7 @@ class LoggedLoop(InProcessLoop):
         (KeyboardInterrupt(), "SIG_IGN", 0.1, TimeoutExpired, None),
     ],
 )
-def test_a_refused_step_or_an_interrupt_ends_the_loop_with_its_output(
+def test_a_refused_step_or_an_interrupt_ends_the_loop(
     fault, on_interrupt, patience_s, expected, message, tmp_path, monkeypatch
 ):
     begin = f"import os, signal, time; from pathlib import Path; signal.signal(signal.SIGINT, signal.{on_interrupt})"

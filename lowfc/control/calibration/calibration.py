@@ -1,4 +1,4 @@
-"""The calibration; its reconstructor from reference image and response matrix: flux normalisation, weights, noise."""
+"""The calibration, and its reconstructor from reference image and response matrix; flux normalisation and noise."""
 
 from dataclasses import dataclass, field
 from typing import Any

@@ -93,7 +93,7 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
 
     Args:
         table: A row for each frame from the first one of the sequence; before and after it, zeros.
-        weights: (lags,) fraction that an exposure sees of the row 0, 1, ... frames before its own; sums to 1.
+        weights: (lags,) fractions that an exposure sees of the rows 0, 1, ... frames before its own; they sum to 1.
         sequence: (exposures,) ascending, counted from the frame whose command had the first row.
         commanded: (exposures,) whether the frame led to a command; if not, or if the frame is missing, the mirror kept
             the previous row.

@@ -183,7 +183,7 @@ class GainBank:
         self._cross_talk.held()
 
     def verdict(self, gain: Single, noise_nm2: Array | None) -> Verdict:
-        """Result of the window at gains (modes,), with a frame's noise (modes,) or None; then begin anew, or grow."""
+        """Result of the window at gains (modes,), given a frame's noise (modes,) or None. It then restarts or grows."""
         means, power = (np.mean(values, axis=0, dtype=float) for values in (self._means, self._powers))
         cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts)
         power -= (2 * means - cross_talk_nm) * cross_talk_nm

@@ -27,7 +27,7 @@ class TwinSpec:
         nodes: Pupil nodes across the diameter.
         order: Points of the interpolation from the nodes, even.
         rank: Retained modes of the operator for a focal-plane mask with the area of a disk of radius 4 lambda0 / D and
-            an aperture mask. `build` raises it for a larger mask, for a bright pupil, and without an aperture mask.
+            an aperture mask. `build` increases it for a larger mask, for a bright pupil, and without an aperture mask.
         guards: Prolate functions along each axis in addition to the field's bandwidth times the sensor's width.
     """
 
