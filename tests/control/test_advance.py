@@ -1,4 +1,4 @@
-"""`advance`: refusals, frame timeouts, requests, no jumps, no wind-up, and purity."""
+"""`advance`: refusals, frame timeouts, requests, no jumps and no wind-up."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -279,7 +279,7 @@ def test_gain_and_leak_are_set_for_all_some_or_each_mode(name: str) -> None:
         (ask("gain", 2.0), "unstable"),
         (ask("gain", 0.1, 0.1, 2.5), "unstable"),
         (ask("leak", 1.5), "between 0 and 1"),
-        (ask("leak", -0.5), "between 0 and 1"),
+        (ask("leak", 0.5, -0.1, 0.2), "between 0 and 1, got -0.1"),
         (ask("leak", float("nan")), "finite"),
     ],
 )

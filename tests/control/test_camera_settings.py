@@ -1,4 +1,4 @@
-"""When the loop may close: not with a wrong or restarted camera, not without a calibration."""
+"""A loop with a wrong or restarted camera or without a calibration: when it may close, and what it does meanwhile."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from lowfc.contract.messages import wire
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings, changes
 from lowfc.control.loop.command_channels import MIRROR
-from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Outputs, Reply, Request, Tick
+from lowfc.control.loop.inputs import Frame, Input, Load, MirrorReport, MirrorShape, Outputs, Reply, Request, Tick
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.control.loop.state import State
 from lowfc.control.loop.wording import CAMERA_MISFIT
@@ -113,7 +113,7 @@ def test_only_differences_beyond_the_noise_count(now: CameraSettings, different:
 def test_after_a_camera_restart_frames_are_refused_until_its_settings_arrive() -> None:
     state, _ = feed(DEFAULTS, loaded(DEFAULTS), CAMERA, *(frame(count, (20, 0, 0)) for count in range(1, 6)))
     restarted = [frame(1, (20, 0, 0), sequence=frame_sequence(count, START + 9)) for count in range(4)]
-    before_nm = state.loop.history_nm[0] if state.loop is not None else None
+    before_nm = state.loop.history_nm[0]
     state, all_outputs = feed(DEFAULTS, state, *restarted)
     assert [outputs.step.reasons for outputs in all_outputs if outputs.step] == [(Rejection.CAMERA_UNKNOWN,)] * 4
     assert (state.loop.history_nm[0] == before_nm).all()
@@ -145,8 +145,8 @@ def test_clear_forgets_the_newest_frame() -> None:
     state, _ = feed(
         DEFAULTS, loaded(DEFAULTS), CAMERA, frame(1), frame(1, sequence=frame_sequence(1, START + 86_000)), CAMERA
     )
-    state, (late,) = feed(DEFAULTS, state, frame(2))
-    assert late.step.reasons == (Rejection.OUT_OF_ORDER,)
+    state, (outputs,) = feed(DEFAULTS, state, frame(2))
+    assert outputs.step.reasons == (Rejection.OUT_OF_ORDER,)
     state, _ = ask(state, "safe")
     state, reply = ask(state, "clear")
     assert reply.accepted
@@ -270,7 +270,7 @@ def test_safe_mode_from_before_the_start_remains() -> None:
 
 @pytest.mark.parametrize("begin", [idle, other_size])
 @pytest.mark.parametrize("name", ["close", "step"])
-def test_an_idle_loop_is_not_closed_with_a_reason(begin: object, name: str) -> None:
+def test_closing_an_idle_loop_is_refused_with_advice(begin: object, name: str) -> None:
     _, outputs = advance(DEFAULTS, begin(), Request(0, name, values=(3.0,) if name == "step" else ()))  # type: ignore[operator]
     check_reply(outputs, False, "lowfc commission")
 
@@ -316,6 +316,16 @@ def test_a_frame_timeout_ends_the_probe_sequence() -> None:
     state, all_outputs = feed(DEFAULTS, state, odd(4), Tick(0, DEFAULTS.frame_timeout_ns + 1))
     assert "PLAY_ENDED" in names(all_outputs)
     play(state, np.ones((5, 1), np.float32))
+
+
+@pytest.mark.parametrize(("rows", "request_", "events"), [(5, "status", 1), (5, "stop", 0), (1, "status", 0)])
+def test_the_early_end_of_a_probe_sequence_is_one_event(rows: int, request_: str, events: int) -> None:
+    restarted = frame(0, pixels=ODD, sequence=frame_sequence(0, START + 60))
+    ends = Tick(0, DEFAULTS.frame_timeout_ns + 1), MirrorReport(0, "does not answer"), restarted
+    state = play(idle(), np.ones((rows, 1), np.float32))
+    _, all_outputs = feed(DEFAULTS, state, odd(4), Request(0, request_), *ends)
+    assert "CAMERA_RESTARTED" in names(all_outputs)
+    assert names(all_outputs).count("PLAY_ENDED") == events
 
 
 def test_a_decoded_state_continues_identically() -> None:

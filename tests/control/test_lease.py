@@ -143,7 +143,7 @@ def test_a_lease_has_one_holder_who_alone_can_release_it() -> None:
         ({"lease_id": 0}, "identity"),
     ],
 )
-def test_an_incomplete_lease_is_refused(fields: dict[str, object], why: str) -> None:
+def test_an_invalid_lease_is_refused(fields: dict[str, object], why: str) -> None:
     request = Request(0, "lease", values=(5.0,), text=HOLDER, lease_id=MINE)
     _, outputs = applied(loaded(DEFAULTS), replace(request, **fields))  # type: ignore[arg-type]  # each of its own type
     check_reply(outputs, False, why)
@@ -194,7 +194,7 @@ def replied(
         ("gain", 0.5, ""),
         ("gain", 1.2, "margins are below the 1.8 in gain and 45 degrees in phase that `lowfc tune` keeps"),
         ("gain", 0.0, "a mode with a gain of 0 is not corrected"),
-        ("gain", float(np.float32(0.01)), ""),  # as it is in a request
+        ("gain", float(np.float32(0.01)), ""),  # values of a request are float32
         ("gain", 0.001, "below 0.01, the least that `lowfc tune` chooses"),
         ("limit", 100.0, ""),
         ("limit", 0.0, "a mode with a limit of 0 nm is not corrected"),

@@ -22,7 +22,7 @@ def running(count: int = 5) -> State:
 
 
 def test_a_lost_mirror_moves_the_command_back_to_its_last_shape() -> None:
-    """The error persists, since nothing corrects it: otherwise the integrator would run to its limits."""
+    """While the mirror does not follow, the error persists: without the move back the integrator would wind up."""
     last_seen = running(5)
     wound_up = feed(DEFAULTS, last_seen, *frames(*range(6, 30)))[0]
     assert np.abs(wound_up.loop.history_nm[0] - last_seen.loop.history_nm[0]).max() > 20

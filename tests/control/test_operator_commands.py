@@ -329,7 +329,7 @@ NAMES = [
 
 
 def test_random_inputs_are_handled_purely_and_within_the_limits() -> None:
-    """In these runs every request is accepted at least once, and most are also refused."""
+    """Each request but `configuration`, which the process answers, is accepted at least once; most are also refused."""
     rng = np.random.default_rng(6)
     counts: Counter[tuple[str, bool]] = Counter()
     for seed in range(24):

@@ -23,7 +23,7 @@ GRID = (4, 5)
 
 
 def boundary_values(bounds: tuple[float, ...]) -> list[float]:
-    """Values at each limit and one and two roundings to either side, with both signs."""
+    """Values at and next to each limit, the limit less 1e-3 nm, and half the limit; with both signs."""
     found = [0.0, 1e-40, -1e-45, 1e-3]
     for bound in bounds:
         for value in (np.float32(bound), np.float32(bound - 1e-3), np.float32(bound / 2)):
@@ -193,7 +193,7 @@ def test_a_mirror_pressed_against_the_neighbour_limit_stays_there(shape: Single,
 
 @pytest.mark.parametrize("name", ["stroke_nm", "slew_nm", "neighbour_nm"])
 @pytest.mark.parametrize("value", [0, -1, 1e-3, np.nan, np.inf])
-def test_limits_that_limit_nothing_are_refused(name: str, value: float) -> None:
+def test_impossible_limits_are_refused(name: str, value: float) -> None:
     good = {"stroke_nm": 700.0, "slew_nm": 100.0, "neighbour_nm": 400.0}
     with pytest.raises(ValueError, match=name):
         Limits(**(good | {name: value}))

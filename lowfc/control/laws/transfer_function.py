@@ -102,7 +102,7 @@ def measure_lines(error_nm: Array, added_nm: Array) -> Lines:
 
 
 def seen_of_mirror(played_nm: Array, weights: Array) -> Array:
-    """Modes (frames, modes) that exposures see of modes played periodically on the mirror."""
+    """Modes that each exposure sees while `played_nm` is repeated on the mirror, both (frames, modes)."""
     seen = np.zeros_like(played_nm)
     for lag, weight in enumerate(weights):
         seen += weight * np.roll(played_nm, 1 + lag, axis=0)

@@ -243,11 +243,11 @@ def frame_noise_nm2(models: Sequence[Model], noise_nm2: Array) -> Array:
 
 
 def simulated_residual_nm2(law: LinearLaw, run: TimeSeries, noise_nm2: Array, timing: Timing) -> Array:
-    """Mean square (modes,) of what a law leaves of each mode's mean over the period in which a command is in force.
+    """Mean square (modes,) of the residual, averaged over the period in which each command is in force.
 
     Changes within that period, which no law can remove, are not included. Each piece of the run, (frames, modes)
-    of pseudo-open-loop modes with noise (modes,), starts with a law at rest and a flat mirror; the frames until it has
-    settled do not count.
+    of pseudo-open-loop modes with noise (modes,), starts with a law at rest and a flat mirror; its first 5000 frames,
+    or its first third if that is shorter, do not count.
     """
     weights = delay_weights(timing.delay).astype(np.float32)
     squares, frames = np.zeros(len(law.noll)), 0
@@ -311,7 +311,7 @@ def within_margins(model: Model, timing: Timing) -> Block | None:
 
 
 def _sufficient(found: margins.Margins) -> bool:
-    """Whether a law other than an integrator has the gain margin of an integrator, and 0.7 of its phase margin."""
+    """Whether a law is stable, with the gain margin that integrators must keep and 0.7 of their phase margin."""
     return bool(
         found.stable
         and found.gain_margin.min() >= MIN_GAIN_MARGIN

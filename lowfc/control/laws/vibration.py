@@ -71,7 +71,7 @@ class Model:
         return found
 
     def states(self) -> tuple[Array, Array, Array]:
-        """A, Q, C of x[k] = A x[k-1] + q, disturbance[k] = C x[k], with Q the covariance of q."""
+        """A, Q (states, states), C (states,) of x[k] = A x[k-1] + q, disturbance[k] = C x[k]; Q the covariance of q."""
         step, seen = [1.0], [1.0]
         if np.isfinite(self.cutoff_hz):  # x0 the walk, x1 its low-pass
             step, seen = [1.0, 1 - _kept(self.cutoff_hz / self.rate_hz)], [0.0, 1.0]

@@ -7,7 +7,7 @@ import numpy as np
 from lowfc.arrays import Single
 
 Weights = tuple[tuple[int, np.float32], ...]
-"""Lag in frames, and the fraction of that command seen by an exposure."""
+"""(index in `history_nm`, fraction) of each command that an exposure sees."""
 
 
 class VirtualIntegrators(NamedTuple):

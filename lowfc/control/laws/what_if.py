@@ -112,7 +112,8 @@ def counterfactual(controller: Controller, weights: Single, pol_nm: Single, miss
 def delay_from_truth(true_nm: Single, command_nm: Single, missing: Integers) -> float | None:
     """Delay in frames at which the commands (steps, modes) best match the mirror's true motion (steps, modes).
 
-    The least-squares fit of `delay_weights`; `true_nm` may have rows of NaN. None if the commands hardly move.
+    The least-squares fit of `delay_weights`; `true_nm` may have rows of NaN. None if the commands hardly move, or if
+    fewer than 20 rows are finite.
     """
     rows = np.isfinite(true_nm).all(axis=1)
     if rows.sum() < _FEWEST:
@@ -143,7 +144,7 @@ def delay_from_times(
         applied_ns: (states,) time of the mirror's report.
 
     Returns:
-        The delay, or None if there are too few such pairs.
+        The delay; None if fewer than 20 commands have one from 1 to 10 frames.
     """
     commanding, first = np.unique(applied_sequence, return_index=True)  # a command may be applied repeatedly
     after = np.searchsorted(exposure_start_ns, applied_ns[first], side="right")
@@ -156,7 +157,7 @@ def delay_from_times(
 
 
 def frames_since(begins: Mask, running: Mask, missing: Integers) -> Integers:
-    """Frames (steps,) since the loop started to run or restarted; -1 where it does not run."""
+    """Frames (steps,) since the loop started to run, or since a step of `begins`; -1 where it does not run."""
     place = np.arange(len(running)) + np.cumsum(missing)
     started = running & (begins | ~np.concatenate([[False], running[:-1]]))
     return np.where(running, place - np.maximum.accumulate(np.where(started, place, 0)), -1)

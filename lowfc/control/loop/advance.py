@@ -1,8 +1,7 @@
 """The controller as one pure function, `advance(settings, state, input)`; a run is a fold of it over the inputs.
 
-The live loop, replay and the tests call it with frames, requests, mirror shapes, camera settings, calibrations and
-ticks, in order of input number. Nothing here reads a clock: each input carries its time and every value that depends
-on a clock (the age of a frame, the time without frames).
+The live loop, replay and the tests call it with each `Input` in order of input number. Nothing here reads a clock: each
+input carries its time and every value that depends on a clock (the age of a frame, the time without frames).
 """
 
 from collections.abc import Callable, Mapping
@@ -45,7 +44,7 @@ from lowfc.control.loop.safety import NOT_NEW, Limit, LoopMode, Reason, Rejectio
 from lowfc.control.loop.state import ActiveLoop, Settings, State
 
 UNMEASURED = frozenset({Rejection.NO_CALIBRATION, Rejection.WRONG_SIZE})
-"""Rejections after which channels and probe sequences move all the same, unless the loop is closed."""
+"""Rejections after which channels and probe sequences move all the same, in open and idle loops."""
 STEPPED = "its last step is done"
 
 
@@ -130,7 +129,7 @@ def _command_message(state: State, loop: ActiveLoop, command_nm: Single) -> Comm
 
 
 def _may_command(state: State) -> bool:
-    """Whether commands may be sent: before the mirror reports its shape it would jump, so only in safe mode."""
+    """Whether commands may be sent: not the first to a mirror with a fault, which might jump, except in safe mode."""
     return state.commanded or not state.conditions.mirror_fault or state.mode is LoopMode.SAFE
 
 
@@ -148,9 +147,8 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
         return state, loop
     if state.frame_sequence:
         events.append(PendingEvent("CAMERA_RESTARTED", {}))
-        if loop is not None and loop.play is not None:
-            loop = loop.stopped(0)  # its frames were counted by the previous start of the camera
-            events.append(PendingEvent("PLAY_ENDED", {"why": "the camera restarted"}))
+        if loop is not None:  # a probe sequence's rows are numbered from the previous start
+            loop = end_probe(loop, state.frame_sequence, "the camera restarted", events)
     return _camera_started(state, frame), loop
 
 
@@ -217,7 +215,7 @@ def _limit_cause(limits: tuple[Reason, ...]) -> str:
 def _refuse(
     settings: Settings, state: State, frame: Frame, reason: Rejection, events: list[PendingEvent]
 ) -> tuple[State, Outputs]:
-    """Hold the command: a refused frame still yields a step and a command."""
+    """Step and command of a refused frame: the command is held, except in safe mode and after `UNMEASURED`."""
     if reason is not state.refused:
         events.append(PendingEvent("FRAMES_REFUSED", {"reason": reason.name}))
     loop, returning_to_zero, hit = state.loop, state.returning_to_zero, state.limits_hit
@@ -255,7 +253,7 @@ def _refuse(
 
 
 def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]:
-    """Without frames: repeat the held command, so that it expires only if the controller dies."""
+    """Without frames, repeat the held command, so that it expires only if the controller dies; or relax to flat."""
     state, events = lease_checked(state, tick.time_ns, 0)
     lease_ended = bool(events)
     loop = state.loop

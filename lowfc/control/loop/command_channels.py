@@ -141,7 +141,7 @@ class CommandChannels(NamedTuple):
         return self.offset_nm if row is None else self.offset_nm + row
 
     def played_nm(self, sequence: int) -> Single | None:
-        """The shape (rows, columns) played for a frame, nm of surface."""
+        """The shape (rows, columns) played for a frame, nm of surface; None if none is."""
         row = self.play.row(sequence) if self.play is not None and self.play.target == MIRROR else None
         if row is None or self.play is None:
             return None
@@ -241,7 +241,7 @@ def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
     if target not in (MIRROR, OFFSET):
         raise ValueError(f"the target of a probe sequence is {MIRROR} or {OFFSET}, got {target!r}")
     if rows.ndim != 2 or not rows.size:
-        raise ValueError(f"the table of a probe sequence has a row per frame and a column per shape, got {rows.shape}")
+        raise ValueError(f"a probe sequence has a row per frame and a column per shape or mode, got {rows.shape}")
     columns = rows.shape[1]
     if target == MIRROR and (not basis.size or basis.size % columns):
         raise ValueError(

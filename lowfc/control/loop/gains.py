@@ -21,7 +21,7 @@ from lowfc.control.loop.state import ActiveLoop, Settings, Weighting
 from lowfc.control.loop.wording import AUTO, counted
 
 _MAX_PREPARED = 64
-"""Most leaks of a request whose limiting gains are cached; one with more has more values than any calibration."""
+"""Most leaks of a request whose limiting gains are cached; no calibration has more modes."""
 
 Changed = tuple[ActiveLoop, str, *tuple[PendingEvent, ...]]  # the loop after a request, its reply, events
 
@@ -60,7 +60,7 @@ def _automatic_gain(settings: Settings, loop: ActiveLoop, request: Request) -> C
     if prior_nm2.size and not (
         prior_nm2.shape == chosen.shape and np.isfinite(prior_nm2).all() and (prior_nm2 >= 0).all()
     ):
-        raise ValueError(f"the mean squares of the modes must be {chosen.size}, finite and at least 0 nm^2")
+        raise ValueError(f"the mean squares must be {chosen.size}, one per mode, finite and at least 0 nm^2")
     gain = np.where(chosen & loop.automatic, changed.gain, loop.integrator.gain)
     weighting = Weighting(prior_nm2, request.flux_dn) if prior_nm2.any() else None
     loop = loop.with_gains(replace(loop.integrator, gain=gain)).with_weighting(weighting)
@@ -108,7 +108,7 @@ def _changed(integrator: Integrator, noll: tuple[int, ...], delay_frames: float,
     values = per_mode(noll, request, getattr(integrator, attribute))
     lowest, highest = min(request.values), max(request.values)
     if request.name == "leak" and not (lowest >= 0 and highest <= 1):
-        raise ValueError(f"leak must be between 0 and 1, got {max(request.values, key=abs):g}")
+        raise ValueError(f"leak must be between 0 and 1, got {lowest if lowest < 0 else highest:g}")
     if request.name == "limit" and lowest < 0:
         raise ValueError(f"limit must be at least 0 nm, got {lowest:g}")
     chosen = np.isin(noll, _modes(noll, request))
@@ -156,7 +156,7 @@ def remark(settings: Settings, loop: ActiveLoop, request: Request) -> str:
                 f": above {recommended:.3g} the margins are below the {MIN_GAIN_MARGIN:g} in gain and "
                 f"{MIN_PHASE_MARGIN_DEG:g} degrees in phase that `lowfc tune` keeps, and the loop may ring"
             )
-        if 0 < lowest < np.float32(LOWEST_GAIN):  # as a request has it
+        if 0 < lowest < np.float32(LOWEST_GAIN):  # values of a request are float32
             return f": below {LOWEST_GAIN:g}, the least that `lowfc tune` chooses, next to nothing is corrected"
     if request.name in ("gain", "limit") and lowest == 0:
         unit = " nm" if request.name == "limit" else ""

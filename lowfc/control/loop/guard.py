@@ -102,7 +102,7 @@ class Group(NamedTuple):
             return after, ""
         takeovers, rival_nm2 = self.takeovers + 1, virtual_nm2
         what = "the integrator would leave"
-        if not worse:
+        if not worse:  # it amplifies: the takeover is final
             takeovers, rival_nm2, what = MAX_TAKEOVERS, self.usual_nm2, "without correction there would be"
         after = after._replace(overruled=True, takeovers=takeovers, blocks=0)
         return after, f"it leaves {error_nm2**0.5:.3g} nm rms, {what} {rival_nm2**0.5:.3g}"

@@ -41,7 +41,7 @@ class Request:
     Attributes:
         modes: Noll indices that the values are for; empty for all.
         values: one for all modes, or one for each; frames of a step, or duration of a lease or permit, s.
-        text: name of a channel, target of a probe sequence, or a note.
+        text: name of a channel, target of a probe sequence, holder of a lease, a note; or `AUTO`, for automatic gains.
         actuators_nm: one or more shapes of the mirror, one after the other, nm of surface.
         table: (frames, columns) of a probe sequence.
         law: the law to drive the mirror; None for the integrator.

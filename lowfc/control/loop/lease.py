@@ -2,8 +2,8 @@
 
 It separates cooperating programs and is no access control: its identity is in the controller's state, open to all.
 
-It ends when its holder releases it or does not renew it in time, and on `safe`, `open`, `pause` or `stop` from any
-other client.
+It ends when its holder releases it or does not renew it in time, on `safe` from any client, and on `open`, `pause` or
+`stop` from another client.
 """
 
 from math import ceil
@@ -18,7 +18,7 @@ MAX_HOLDER = 200
 """Most characters of the holder's description."""
 
 ENDED_BY = frozenset({"safe", "open", "pause", "stop"})
-"""Requests granted to every client, which end another client's lease."""
+"""Requests granted to every client, which end another client's lease; `safe` also ends the holder's own."""
 UNRELATED = frozenset({"status", "note", "lease", "renew", "release", "permit"})
 """Requests that do not change the loop, and the requests for leases themselves."""
 LEASE_OVER = "the lease ended: "
@@ -89,7 +89,7 @@ def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
 
 
 def asked_by(held: Lease | None, request: Request) -> str:
-    """Cause of a change of the loop: the request, and the purpose of its sender's reservation if it has one."""
+    """Cause of a change of the loop: the request and the purpose of its lease, or the text sent by automatic gains."""
     if request.text.startswith(f"{AUTO}: "):
         return request.text
     if held is not None and request.lease_id and request.lease_id == held.id:

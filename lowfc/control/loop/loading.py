@@ -29,7 +29,7 @@ def loaded(
 
     If the mirror has the same grid, it keeps its shape: the channels stay, the rest becomes a command of the new modes,
     and the part outside the modes becomes a channel (not in safe mode). A probe sequence ends, and the next command
-    removes its last shape; offset and law are kept only for the same modes.
+    removes its last shape; gains, offset and law are kept only for the same modes.
     """
     loop, before = ActiveLoop.at_rest(settings, calibration), state.loop
     details: dict[str, object] = {
@@ -70,7 +70,8 @@ def loaded(
     elif before_mode is LoopMode.IDLE and mode is LoopMode.CLOSED and loop.automatic.any():
         mode, cause = LoopMode.OPEN, MEASURED_FIRST
     state = state._replace(loop=loop)
-    acting = tuple(one for one in state.conditions.acting if one.action is not Action.HOLD)  # HOLD lets a loop close
+    # Under HOLD a loop may be closed here: it holds its command.
+    acting = tuple(one for one in state.conditions.acting if one.action is not Action.HOLD)
     if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
         mode, cause = LoopMode.IDLE, wrong
     elif mode is LoopMode.CLOSED and (wrong := misfit(state)):
@@ -92,7 +93,7 @@ def misfit(state: State) -> str:
 
 
 def uncalibrated(state: State) -> str:
-    """Why no mode can be measured: no calibration, or a computed one for another frame size; empty if they can."""
+    """Why no mode can be measured: no calibration, or a computed one for another frame size; empty otherwise."""
     loop, camera = state.loop, state.conditions.camera
     hint = ": `lowfc commission` measures one"
     if loop is None or not loop.calibration.noll:
@@ -177,7 +178,7 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
     if command_nm.any():
         events.append(PendingEvent("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
     if state.mode is not LoopMode.SAFE:  # in safe mode it relaxes to flat and stays there
-        channels = loop.command_channels  # a mirror that reported late has channels already
+        channels = loop.command_channels  # set before, if the mirror reports late
         loop, rest = adopted(loop, shape.actuators_nm if channels is None else shape.actuators_nm - channels.sum_nm)
         events += rest
     return state._replace(loop=loop), Outputs(events=events, changed=True)
@@ -219,15 +220,18 @@ def _step_back(settings: Settings, loop: ActiveLoop, shape_nm: Single) -> Active
 
 
 def end_probe(loop: ActiveLoop, sequence: int, why: str, events: list[PendingEvent]) -> ActiveLoop:
-    """End the probe sequence after this frame."""
-    if loop.play is None or loop.play.over(sequence):
+    """End the probe sequence after this frame, unless it has no further row."""
+    if loop.play is None or loop.play.over(sequence + 1):
         return loop
     events.append(PendingEvent("PLAY_ENDED", {"why": why}))
     return loop.stopped(sequence)
 
 
 def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
-    """Store the camera's settings; open a closed loop that they do not fit; idle depends on the frame's size."""
+    """Store the camera's settings, and open a closed loop that they do not fit.
+
+    A computed calibration for frames of another size makes a loop that has not used a frame idle, until frames fit.
+    """
     after = _with_camera(state, camera)
     if after is state:
         return state, Outputs()
@@ -288,7 +292,10 @@ def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[Pendin
 
 
 def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
-    """Change the loop mode; probe sequence, steps and return to zero of the previous mode end."""
+    """Change the loop mode; probe sequence, steps and return to zero of the previous mode end.
+
+    Safe mode removes the channels except the flat map and `EXTERNAL`; a law fades in when the loop closes.
+    """
     loop = state.loop
     if loop is not None and mode is not state.mode:
         loop = loop.stopped(state.frame_sequence)

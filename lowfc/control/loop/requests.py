@@ -52,7 +52,7 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
 
 
 def _handler(request: Request, lease_before: Lease | None) -> "Handler":
-    """Handler of a request; ValueError with the reason if it is refused in any state of the loop."""
+    """Handler of a request; ValueError with the reason if a lease or `prepared` refuses it, or its name is unknown."""
     if request.name not in _HANDLERS:
         raise ValueError(f"unknown request {request.name[:40]!r}; there are {', '.join(REQUESTS)}")
     refused = refusal(lease_before, request.name, request.lease_id, request.time_ns) or request.refusal
@@ -62,7 +62,7 @@ def _handler(request: Request, lease_before: Lease | None) -> "Handler":
 
 
 def prepared(settings: Settings, request: Request) -> Request:
-    """Do the slow checks of a request that need no state, on a thread that no frame waits for.
+    """Do the slow checks of a request that need no state; the process calls it where no frame waits for it.
 
     A fault becomes its `refusal`. A prepared request is returned unchanged.
     """
@@ -280,16 +280,17 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
             f"the calibration is for a mirror of {request.calibration.grid} actuators, this one has "
             f"{before.calibration.grid}"
         )
-    settings = replace(settings, start_mode=LoopMode.OPEN)  # an idle loop stays open
+    settings = replace(settings, start_mode=LoopMode.OPEN)  # an idle loop opens, whatever the configured mode
     after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
     others = (event for event in events if event.name != "MODE_CHANGED")  # `answer` adds it
     return after, f"calibration {request.calibration.id[:12]}", *others
 
 
 def _note(settings: Settings, state: State, request: Request) -> Handled:
-    if not 0 < len(request.text.strip()) <= MAX_NOTE_LENGTH:
-        raise ValueError(f"a note has 1 to {MAX_NOTE_LENGTH} characters, got {len(request.text)}")
-    return state, "noted", PendingEvent("NOTE", {"text": request.text.strip()})
+    text = request.text.strip()
+    if not 0 < len(text) <= MAX_NOTE_LENGTH:
+        raise ValueError(f"a note has 1 to {MAX_NOTE_LENGTH} characters, got {len(text)}")
+    return state, "noted", PendingEvent("NOTE", {"text": text})
 
 
 def _active_loop(state: State) -> ActiveLoop:
@@ -349,5 +350,5 @@ _HANDLERS: dict[str, Handler] = {
 }
 
 CONFIGURATION = "configuration"
-"""The only request that the process answers, because it has the configuration."""
+"""The only request that `answer` does not handle: the process, which has the configuration, replies to it."""
 REQUESTS = (*_HANDLERS, CONFIGURATION)

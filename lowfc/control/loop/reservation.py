@@ -12,7 +12,7 @@ def lease(settings: Settings, state: State, request: Request) -> tuple[State, st
     """Reserve the loop for the requesting client.
 
     Raises:
-        ValueError: another client holds it, the loop is in safe mode, or the request is incomplete.
+        ValueError: another client holds it, the loop is in safe mode, or the request is invalid.
     """
     before = state.conditions.lease
     if state.mode is LoopMode.SAFE:
@@ -24,7 +24,7 @@ def lease(settings: Settings, state: State, request: Request) -> tuple[State, st
 
 
 def renew(settings: Settings, state: State, request: Request) -> tuple[State, str]:
-    """Extend a lease that is in force; ValueError if it is not in force, with the cause of its end."""
+    """Extend a lease; ValueError if it is not in force, with the cause of its end, or if the request is invalid."""
     before = state.conditions.lease
     if before is None or before.id != request.lease_id:
         raise ValueError("this lease is not in force: the controller restarted, or another lease was granted")
@@ -65,7 +65,7 @@ def permit(settings: Settings, state: State, request: Request) -> tuple[State, s
     """Permit a move on the bench; with a duration, the loop is reserved and a closed one holds its command.
 
     Raises:
-        ValueError: the move is refused, with the reason; or the request is incomplete.
+        ValueError: the move is refused, with the reason; or the request is invalid.
     """
     before, loop, closed = state.conditions.lease, state.loop, state.mode is LoopMode.CLOSED
     if before is not None and not before.ended and before.id != request.lease_id:

@@ -80,7 +80,7 @@ def reason_of(number: int) -> Reason:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of the mirror, in nm of surface.
+    """Limits of the mirror, in nm of surface; ValueError unless each is finite and above twice the margin.
 
     Attributes:
         stroke_nm: largest deviation of an actuator from flat, either way.
@@ -118,7 +118,7 @@ class Limited(NamedTuple):
 
 
 def limit(limits: Limits, previous_nm: Single, requested_nm: Single) -> Limited:
-    """Return the command nearest to `requested_nm` that may follow `previous_nm`.
+    """Limit a command so that it may follow `previous_nm`.
 
     Both are (rows, columns) float32, nm of surface; the previous one is finite, as a result of this function. Stroke,
     then slew, clip each actuator separately; the neighbour limit shortens the whole move. For any `requested_nm`, the
@@ -197,7 +197,8 @@ def expired(age_ns: int, valid_for_ns: int) -> bool:
 def request_mode(mode: LoopMode, request: str, calibrated: bool) -> tuple[LoopMode, str]:
     """Mode after an operator's request, and why it was refused (empty if granted).
 
-    `safe` is always granted and latched; only `clear` leaves it, and never straight to closed.
+    `safe` is always granted and latched; only `clear` leaves it, and never straight to closed. ValueError for a request
+    other than open, close, safe and clear.
     """
     match request:
         case "safe":

@@ -28,7 +28,7 @@ SETTLING_FRAMES = 100
 FADING_FRAMES = 100
 """Frames of the cross-fade in which a law takes over."""
 MAX_PREDICTED_FRAMES = 100
-"""Frames missing in a row after which a law observes and fades in again."""
+"""Most frames missing at once that a law predicts; after more, it observes and fades in again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,11 +295,12 @@ class State(NamedTuple):
     """Everything the next command depends on.
 
     Attributes:
-        frame_sequence: sequence of the newest frame; its time is `frame_time_ns`.
+        frame_sequence: sequence of the newest frame, 0 before the first and after `clear`; its time is `frame_time_ns`.
         refused: why the last frame was refused, if it was, and how many in a row.
         limits_hit: limits that acted on the last command.
         frame_timeout: whether the frame timeout has been reported.
         commanded: whether a command has been sent, so that the mirror's shape is no longer adopted.
+        counts: number of frames, or of frame timeouts, for each reason.
         steps_left: used frames until the loop opens automatically; 0 for never.
         returning_to_zero: whether the modal command is returning to zero.
         estimate: the last measurement, and `identical_frames`, the number of consecutive equal ones before.

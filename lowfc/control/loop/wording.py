@@ -3,7 +3,7 @@
 PAUSED = "operator asked to pause"
 """Cause of the open mode of a loop that is paused."""
 AUTO = "auto"
-"""Text of a request for automatic gains, and beginning of the text of other requests that they make."""
+"""Text of a request for automatic gains, and beginning of the text of the requests that automatic gains send."""
 MEASURED_FIRST = "the gains are measured before the loop closes"
 """Cause of the open mode in which a loop with automatic gains begins."""
 CAMERA_MISFIT = "the camera does not fit the calibration"

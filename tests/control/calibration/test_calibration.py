@@ -206,7 +206,7 @@ def test_an_inconsistent_calibration_is_refused(change: dict[str, object], messa
 
 
 def computed() -> np.ndarray:
-    """An image that is unchanged by 180 degrees, like that of a flat wavefront, but not by a reflection."""
+    """An image unchanged by a rotation of 180 degrees, like that of a flat wavefront, but not by a reflection."""
     rng = np.random.default_rng(4)
     y, x = np.indices((64, 64)) - 31.5
     speckles = gaussian_filter(rng.standard_normal((64, 64)), 2.5)

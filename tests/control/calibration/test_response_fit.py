@@ -171,10 +171,10 @@ def test_the_noise_of_h_neither_biases_r_nor_adds_noise() -> None:
     """H is measured so briefly that the noise of its pixels is as strong as the modes."""
     found = calibrated(poke_patterns(MODES, 0.3), 10)
     variance = I0 / FLUX_E
-    without_outlier = reconstruct(I0, found.response, None, GOOD, FLUX_E, 0.0)
+    of_noisy_h = reconstruct(I0, found.response, None, GOOD, FLUX_E, 0.0)
     made = reconstruct(I0, found.response, found.initial.matrix, GOOD, FLUX_E, 0.0)
     least = np.sqrt(found.initial.matrix**2 @ variance)
-    assert np.diag(cross_talk(without_outlier.matrix, H)).mean() < -0.3
+    assert np.diag(cross_talk(of_noisy_h.matrix, H)).mean() < -0.3
     assert abs(np.diag(cross_talk(made.matrix, H)).mean()) < 3 * found.error.max() / np.sqrt(MODES)
     assert (np.sqrt(made.matrix**2 @ variance) / least).max() < 1 + 3 * found.error.max()
     # an initial reconstructor with wrong weights and mixed modes is unbiased too, with its own noise

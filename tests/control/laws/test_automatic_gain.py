@@ -58,7 +58,7 @@ def test_white_noise_gets_no_gain() -> None:
 
 @pytest.mark.parametrize(("step_nm", "delay_frames"), [(0.1, 1.0), (1.0, 1.0), (1.0, 2.0), (20.0, 1.0)])
 def test_a_drift_gets_nearly_the_best_gain(step_nm: float, delay_frames: float) -> None:
-    """Residual within 12 % of the best; for d = 1: drift s^2 / (g (2 - g)) plus noise n^2 g / (2 - g)."""
+    """For d = 1, the rms of drift, s^2 / (g (2 - g)), plus noise, n^2 g / (2 - g), is within 12 % of the least."""
     bank_ = bank(delay_frames, (1000, 2500))
     found = verdicts(bank_, drift(8500, step_nm, 10.0, 2), np.zeros(MODES, np.float32), 100.0)
     assert len(found) >= 3
@@ -143,7 +143,7 @@ def _vibrating(frames: int, seed: int) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_a_mode_with_only_tilt_cross_talk_gets_no_gain(closed: bool) -> None:
-    """Otherwise the loop would put their mean, 2.7 nm, on the mirror."""
+    """Otherwise the loop would put the mean of the cross-talk, 2.7 nm, on the mirror."""
     tilt_nm, modes_nm = _vibrating(1000, 12)
     assert verdicts(bank(), modes_nm, 0 * ONES, 1.0, tilt_nm, closed=closed)[0].gain[4] == 0
     assert verdicts(bank(), modes_nm, 0 * ONES, 1.0, closed=closed)[0].gain[4] > 0
@@ -186,7 +186,7 @@ def test_tilt_cross_talk_does_not_favour_a_gain() -> None:
 
 
 def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
-    """R for fewer modes subtracts twice the mode with the squares from another mode, which had none."""
+    """R for fewer modes subtracts twice the mode with the squares of tilt from another mode, which had none of them."""
     tilt_nm, modes_nm = _vibrating(5200, 22)
     of_own = np.eye(MODES)
     of_own[7, 4] = -2
@@ -255,13 +255,13 @@ def test_rows_of_corrected_modes_are_the_map_estimate() -> None:
     assert np.einsum("p,p,p", rows[0], 1 / W, rows[0]) < 0.7 * before[0]  # the mode that resembles an uncorrected one
 
 
-def test_without_uncorrected_modes_or_camera_settings_r_is_unchanged() -> None:
+def test_r_is_unchanged_if_all_or_no_modes_are_corrected_or_the_camera_is_unknown() -> None:
     calibration, camera = _calibration(measured=True)
     for prior, seen_by in ((np.zeros(5), camera), (np.ones(5), camera), (np.array([1.0, 0, 0, 0, 0]), None)):
         assert map_reconstructor(calibration, prior, 5e4, seen_by) is calibration.reconstructor
 
 
-def test_the_prior_of_uncorrected_modes_is_their_power_minus_noise() -> None:
+def test_the_prior_of_uncorrected_modes_is_their_power_minus_noise_plus_two_standard_errors() -> None:
     power, zero_gain = np.array([2.0, 1.0, 5.0]), np.zeros(3)
     found = uncorrected_prior_nm2(
         Verdict(zero_gain, power, np.ones(3), zero_gain, zero_gain, None, zero_gain, 5000),

@@ -130,7 +130,7 @@ def test_means_are_interpolated_from_measurements(timing: Timing) -> None:
 
 
 def test_the_continuous_residual_is_recovered_from_instants() -> None:
-    """For a wave and a mirror that holds; the residual at the instants alone is much smaller."""
+    """For a wave and a mirror that holds; the residual at the instants alone is smaller."""
     timing, law, k, omega = Timing.of(1, 0.0), steady(0.5, 1), np.arange(3000), 0.3
     wave = np.sqrt(2) * np.cos(omega * k + 1)
     mirror, c = np.zeros_like(wave), 0.0

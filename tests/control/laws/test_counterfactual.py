@@ -35,7 +35,7 @@ def weights(delay_frames: float) -> np.ndarray:
     return delay_weights(delay_frames).astype(np.float32)
 
 
-def used(setup: Settings, disturbance_nm: np.ndarray) -> list[Step]:
+def live_steps(setup: Settings, disturbance_nm: np.ndarray) -> list[Step]:
     """Steps of the live loop with missing and dark frames."""
     return run_toy(setup, disturbance_nm, missing=MISSING, dark=DARK)[0]
 
@@ -61,7 +61,7 @@ DARK = (45, 46, 100, 101, 102, 103)
 def test_the_logged_gains_reproduce_the_logged_run(delay: float) -> None:
     """Up to float32 rounding in pol = error - seen, with missing and refused frames and acting modal limits."""
     setup = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0), limit_nm=(12.0, 50.0))
-    error, pol, command, missing = columns(used(setup, walk(160)))
+    error, pol, command, missing = columns(live_steps(setup, walk(160)))
     assert missing.sum() == 9
     assert np.isnan(error).any(axis=1).sum() == len(DARK)
     assert (np.abs(command[:, 0]) == 12.0).any()
@@ -78,8 +78,8 @@ def test_other_gains_reproduce_a_run_with_these_gains(delay: float) -> None:
     before = settings(delay_frames=delay, gain=(0.3, 0.1), **WIDE)
     after = settings(delay_frames=delay, gain=(0.1, 0.25), leak=(0.02, 0.01), **WIDE)
     disturbance = walk(160)
-    _, pol, _, missing = columns(used(before, disturbance))
-    error, _, command, _ = columns(used(after, disturbance))
+    _, pol, _, missing = columns(live_steps(before, disturbance))
+    error, _, command, _ = columns(live_steps(after, disturbance))
     other_error, other_command = counterfactual(as_logged(after.integrator((2, 3, 4))), weights(delay), pol, missing)
     np.testing.assert_allclose(other_error, error, atol=0.05)
     np.testing.assert_allclose(other_command, command, atol=0.05)
@@ -112,11 +112,11 @@ def test_commands_seen_by_exposures() -> None:
     assert seen_nm(weights(1.5), command, missing, first)[:, 0].tolist() == [-1, 0, 2, 3]
 
 
-def test_repeated_and_late_frames_are_not_exposures() -> None:
+def test_repeated_and_older_frames_are_not_exposures() -> None:
     counts = [5, 6, 6, 4, 9, 8]
     sequence = np.array([*map(frame_sequence, counts), frame_sequence(1, 1_800_000_000)], np.uint64)
-    repeated, late = 1 << Rejection.REPEATED, 1 << Rejection.OUT_OF_ORDER
-    rows = exposed(np.array([0, 0, repeated, late, 0, late, 0]))
+    repeated, older = 1 << Rejection.REPEATED, 1 << Rejection.OUT_OF_ORDER
+    rows = exposed(np.array([0, 0, repeated, older, 0, older, 0]))
     assert rows.tolist() == [True, True, False, False, True, False, True]
     assert missing_before(sequence[rows]).tolist() == [0, 0, 2, 0]
 

@@ -111,7 +111,8 @@ def test_laws_on_the_reaction_wheel_leave_the_predicted_residual(
         assert residual_mas[one.law.name] == pytest.approx(predicted_mas, rel=0.05), one.law.name
         assert one.margins.stable
         assert one.margins.gain_margin.min() >= MIN_GAIN_MARGIN * 0.999
-    assert residual_mas["lqg"] < of_notch * residual_mas["pi-notch"] < residual_mas["integrator"]
+    assert residual_mas["lqg"] < of_notch * residual_mas["pi-notch"]
+    assert residual_mas["pi-notch"] < residual_mas["integrator"]
     assert all(residual_mas[name] > least for name, least in at_least_mas.items())
     assert all(residual_mas[name] < most for name, most in at_most_mas.items())
 
@@ -140,7 +141,7 @@ def test_too_few_frames_are_refused() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", [1.0, 2.0])
 def test_lqg_agrees_with_theory_and_adapts_to_shifted_lines(delay: float) -> None:
-    """Within 15 % of the law's theory and of the best LQG law; the same again with lines shifted by 2 %."""
+    """At most 15 % above the law's theory and the best LQG law; for shifted lines, a new law is as good within 15 %."""
     config = configured(delay_frames=delay)
     calibration = calibrated(config)
     bench = Bench(config, calibration)

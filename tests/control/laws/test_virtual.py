@@ -30,7 +30,7 @@ def test_each_row_equals_a_loop_with_its_gain() -> None:
 
 
 def test_differences_of_squared_errors_equal_those_of_true_residuals() -> None:
-    """For 20,000 frames of a slow drift with ten times stronger noise."""
+    """For 20,000 frames of a slow drift with several times stronger noise."""
     rng = np.random.default_rng(2)
     gain = np.array([0, 0.02, 0.5], np.float32)[:, None] * np.ones((1, 40), np.float32)
     ones = np.ones(40, np.float32)
