@@ -62,7 +62,7 @@ M = TypeVar("M", bound=Message)
 CONNECT_S = 1.0
 ANSWER_S = 2.0
 SLOW_ANSWER_S = 30.0
-"""Answer timeout for loading a calibration, a long probe sequence, or finishing a log."""
+"""Answer timeout for a large request, such as a calibration, and for the start and the end of a log."""
 LARGE_BYTES = 100_000
 """Size of a request above which the longer timeout applies."""
 
@@ -93,6 +93,7 @@ class Client:
 
         Raises:
             BusError: there is no such run, none at all, or more than one to choose from.
+            DataFileError: the run's directory is damaged.
         """
         self.run_id = the_run(run) if bus is None else run or DEFAULT_RUN
         self._requester = by_this_process(program_name())
@@ -197,7 +198,7 @@ class Client:
     def reserved(self, purpose: str, duration_s: float | None = None) -> Iterator[Lease]:
         """Reserve the loop: until the end of the block, other clients' requests that would change it are refused.
 
-        `safe`, `open`, `pause` and `stop` are always accepted and end the reservation: see `check_lease` and `Lease`.
+        `safe` from anyone, and `open`, `pause` or `stop` from another client, end the reservation: see `check_lease`.
         """
         lease = Lease(
             lambda name, lease_id, seconds, holder: self.ask(name, values=seconds, text=holder, lease_id=lease_id),
@@ -212,7 +213,7 @@ class Client:
             lease.release()
 
     def check_lease(self) -> None:
-        """Check that a reservation of the loop is still in force; CalibrationError with the reason if it ended."""
+        """Check that this client's reservation, if it has one, is in force; CalibrationError with the reason if not."""
         if self._lease is not None:
             self._lease.check()
 
@@ -301,7 +302,7 @@ class Client:
         return found
 
     def laws(self) -> dict[str, LinearLaw]:
-        """The control law loaded instead of the integrator, by its identity; empty if none has been loaded."""
+        """The control law loaded last, by its identity, whether or not it still drives; empty if none was loaded."""
         published = Published()
         for sample in self._bus.get(LAW.key, timeout_s=ANSWER_S):
             published.store(LAW, sample.payload)
@@ -364,7 +365,7 @@ class Client:
         return self._answer(name, self._get(REQUEST_KEY.format(name=name), payload, timeout_s))
 
     def _get(self, key: str, payload: bytes, answer_s: float, role: Role = Role.CONTROLLER) -> Sample:
-        """Query one process; retry for a second while a new link has not found it yet."""
+        """Query one process; retry for a second, as the links of a new client may not be complete yet."""
         deadline_s = time.monotonic() + CONNECT_S
         while True:
             begun_s = time.monotonic()

@@ -1,7 +1,7 @@
 """The table of requests: key, fields of `lowfc.v1.Request`, description and `lowfc ctl` command of each.
 
-The client's methods without arguments, the commands of `lowfc ctl` and the table in docs/reference/requests.md are made
-from it; a test compares it with the requests that the controller and the recorder accept.
+The client's methods without arguments, names and help of the commands of `lowfc ctl`, and the table in
+docs/reference/requests.md are made from it; a test compares it with the requests that controller and recorder accept.
 """
 
 from typing import NamedTuple
@@ -105,7 +105,7 @@ DECLARED: tuple[Declaration, ...] = (
     _declared(
         "lease",
         "Reserve the loop: until the reservation ends, other clients' requests that would change the loop are refused; "
-        "`safe`, `open`, `pause` and `stop` are accepted from everyone, and end it.",
+        "`safe` from anyone, and `open`, `pause` or `stop` from another client, are accepted and end it.",
         "",
         ("lease_id", "random number, sent with all requests of the holder"),
         ("values", "seconds in force without renewal, at most 60"),

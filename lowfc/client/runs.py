@@ -18,6 +18,7 @@ def the_run(name: str | None) -> str:
 
     Raises:
         BusError: there is no such run, none at all, or more than one to choose from.
+        DataFileError: the run's directory is damaged.
     """
     runs = live_runs(name)
     if name in runs:

@@ -63,7 +63,7 @@ class Stream(Generic[T]):
 
     @property
     def lost(self) -> int:
-        """Number of messages that were damaged, or lost because the reader was too slow."""
+        """Number of messages since the first that were damaged, or lost, as when the reader is too slow."""
         return self._damaged + sum(gaps.missing for gaps in self._gaps.values())
 
     def __iter__(self) -> "Stream[T]":

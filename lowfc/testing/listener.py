@@ -1,4 +1,4 @@
-"""Recorder of a process's messages and events, for tests."""
+"""Recorder of messages and events on an in-memory bus, for tests."""
 
 from typing import Any
 
@@ -32,5 +32,5 @@ class Listener:
         return [message.message.split()[0] for message in self.messages(EVENT)]
 
     def event_texts(self, start: str) -> list[str]:
-        """Texts of the events that begin with `start`."""
+        """Texts of the events whose text begins with `start`."""
         return [log.message for log in self.messages(EVENT) if log.message.startswith(start)]

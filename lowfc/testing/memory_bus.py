@@ -23,7 +23,7 @@ class MemoryHub:
     """Connects the buses of one test; `lose` decides whether a message to a role is lost."""
 
     buses: "list[MemoryBus]" = field(default_factory=list)
-    starts: dict[str, int] = field(default_factory=dict)
+    starts: dict[str, int] = field(default_factory=dict)  # of the newest bus of each role, s
     lose: Callable[[str, str, Envelope], bool] = lambda role, key, envelope: False
 
 
@@ -56,7 +56,7 @@ class MemoryPublisher:
 
 
 class MemoryRing:
-    """See `Ring`."""
+    """See `Ring`; but `receive_time_ns` is the time of the put."""
 
     def __init__(self, bus: "MemoryBus", topic: Topic, capacity: int) -> None:
         self.waiting: deque[Sample] = deque(maxlen=capacity)

@@ -352,7 +352,7 @@ def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., 
 
 
 def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With owner, process and, if readable, runtime directory; the user's own loop in this one is starting."""
+    """With owner, process and, if readable, runtime directory; the user's own loop in this directory is starting."""
     name = f"night-{os.getpid()}"
     words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", name]
     wrapped = ["/bin/sh", "-c", 'echo; read end; "$@"', *words[3:]]
@@ -650,7 +650,7 @@ def test_the_status_shows_the_whole_state() -> None:
         assert words in text(json_object(state))
     assert text(json_object(state)).splitlines()[-1].endswith("abc, provisional: from the first steps of commissioning")
     assert json_object(wire.ControllerState())["mode"] == "starting"
-    assert "without a verdict" not in text(json_object(wire.ControllerState(calibration_id="abc")))
+    assert "provisional" not in text(json_object(wire.ControllerState(calibration_id="abc")))
 
 
 # The recorder's switch.

@@ -48,11 +48,8 @@ class Bench:
     def __post_init__(self) -> None:
         rng = self.rng
         rows, columns, modes = rng.integers(8, 20), rng.integers(8, 20), int(rng.integers(1, 12))
-        self.shape, grid, pixels = (
-            (int(rows), int(columns)),
-            tuple(map(int, rng.integers(2, 9, 2))),
-            int(rows * columns),
-        )
+        self.shape, pixels = (int(rows), int(columns)), int(rows * columns)
+        grid = tuple(map(int, rng.integers(2, 9, 2)))
         self.noll = tuple(range(2, 2 + modes))
         good = (rng.random(pixels) > rng.choice([0.0, 0.1])).astype(float)
         I0, self.H = normalise_flux(rng.uniform(0.5, 1.5, pixels), rng.normal(0, 2e-3, (pixels, modes)), good)

@@ -23,8 +23,9 @@ _LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # never part of a run on sever
 class Grant:
     """Rights of a role, the common name of a certificate, as lists of keys.
 
-    It publishes and answers under its own names only. The keys under which others subscribe to and query it
-    (`subscribed`, `queried`), and the keys that it receives and queries, have "*" in place of a name.
+    It publishes Health under its role only; a mirror publishes, answers and receives under its own name only. All other
+    keys have "*" in place of a name, among them those under which others subscribe to and query it (`subscribed`,
+    `queried`).
     """
 
     role: str

@@ -1,6 +1,6 @@
 """Interface of the message bus: publish, subscribe, answer, query.
 
-`ZenohBus` carries messages between processes, `MemoryBus` within one process, for tests. Handlers run on the receive
+`ZenohBus` carries messages between processes, `MemoryBus` within one process, for tests. Handlers run on a receive
 thread, one message at a time: a slow handler delays the next message.
 """
 
@@ -70,7 +70,7 @@ class Publisher(Protocol):
     handed_ns: int
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
-        """Send `payload`, by default with the present time and the next sequence; never waits for a reader.
+        """Send `payload`, by default with the present time and the next sequence; it may wait briefly for slow readers.
 
         A caller that sets sequences (a replay sets those of the log) must set them in every call.
         """
@@ -112,7 +112,7 @@ class Bus(Protocol):
         ...
 
     def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
-        """Query a key and return the answers, none if no process answers; BusError if the bus was closed."""
+        """Query a key and return the answers, none if no process answers; BusError for an invalid key or closed bus."""
         ...
 
     def peers(self) -> int:

@@ -21,9 +21,8 @@ from lowfc.adapters.bus.routed import CA, CA_KEY
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.contract.errors import ConfigurationError, DataFileError
 
-CA_DAYS = 3650
-DAYS = 825
-"""Default validity of a role's certificate, days."""
+CA_DAYS, DAYS = 3650, 825
+"""Validity of the authority, and by default of a role's certificate, days."""
 
 _BACKDATED = datetime.timedelta(hours=1)  # hosts' clocks differ
 

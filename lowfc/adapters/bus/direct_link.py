@@ -20,7 +20,7 @@ from lowfc.contract.envelope import Envelope
 
 Handler = Callable[[Sample], None]
 
-_BUFFER_BYTES = 4 << 20  # some hundred frames, if the host allows it; the kernel allows twice as much
+_BUFFER_BYTES = 4 << 20  # some hundred frames, up to the host's limit; the kernel doubles it
 _RETRY_S = 0.1
 _RECENT = 1 << 13  # envelopes: more messages than a socket buffers while its reader is stopped
 _ENVELOPE_BYTES = len(Envelope(0, 0).encode())
@@ -143,7 +143,7 @@ class DirectReader:
         self._accepting.start()
 
     def take(self, envelope: bytes, payload: bytes, now_ns: int) -> None:
-        """Forward a message received at `now_ns`, on the calling thread: the socket's, or that of a writer here."""
+        """Forward a message received at `now_ns`; called on the socket's thread, or on a writer's in this process."""
         try:
             sample = Sample(self._key, payload, *Envelope.decode_checked(envelope), now_ns)
             with self._turn:

@@ -8,14 +8,14 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.sequence_gaps import Arrivals
 
 MAX_WAIT_S = 0.5
-"""Bound of one wait: a signal that arrives just before the wait begins is handled only after the wait."""
+"""Bound of one wait: Python handles a signal to the process that arrives just before the wait only after the wait."""
 
 
 class Mailbox(Arrivals):
     """Holds the newest message of one publisher; a newer one replaces it.
 
-    One thread puts and one takes. A bare lock serves as the signal: in CPython it is the cheapest way to wake a thread
-    that waits with a timeout.
+    One thread puts and one takes. A bare lock wakes the taking thread: in CPython it is the cheapest way to wake a
+    thread that waits with a timeout.
     """
 
     def __init__(self, key: str = "") -> None:
@@ -23,8 +23,8 @@ class Mailbox(Arrivals):
         self._taken = 0
         self._woken = False
         self._slot: deque[Sample] = deque(maxlen=1)
-        self._signal = threading.Lock()
-        self._signal.acquire()
+        self._available = threading.Lock()
+        self._available.acquire()
 
     @property
     def skipped(self) -> int:
@@ -40,7 +40,7 @@ class Mailbox(Arrivals):
         """Store a message; called on the bus's thread."""
         self.count(sample)
         self._slot.append(sample)
-        self._raise_signal()
+        self._notify()
 
     def take(self, timeout_s: float) -> Sample | None:
         """Remove and return the newest message; None after `timeout_s` without one, or after `wake`."""
@@ -53,7 +53,7 @@ class Mailbox(Arrivals):
                 if self._woken or left_s <= 0:
                     self._woken = False
                     return None
-                self._signal.acquire(timeout=min(left_s, MAX_WAIT_S))
+                self._available.acquire(timeout=min(left_s, MAX_WAIT_S))
             else:
                 self._taken += 1
                 return sample
@@ -61,10 +61,10 @@ class Mailbox(Arrivals):
     def wake(self) -> None:
         """End the present or next wait of `take`; callable from any thread and from a signal handler."""
         self._woken = True
-        self._raise_signal()
+        self._notify()
 
-    def _raise_signal(self) -> None:
+    def _notify(self) -> None:
         try:
-            self._signal.release()
-        except RuntimeError:  # already raised
+            self._available.release()
+        except RuntimeError:  # released already
             return

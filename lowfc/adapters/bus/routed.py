@@ -18,6 +18,7 @@ from lowfc.adapters.bus.zenoh_fault import plain
 from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.network import Network
+from lowfc.control.loop.wording import counted
 
 CA = "ca.pem"
 """File name of the authority's certificate in a folder of certificates."""
@@ -126,8 +127,8 @@ def router_trouble(network: Network, role: str) -> str:
         context = ssl.create_default_context(cafile=str(ca))
         context.load_cert_chain(certificate, key)
         with (
-            socket.create_connection((host, port), CONNECT_MS * 1e-3) as plain,
-            context.wrap_socket(plain, server_hostname=host) as link,
+            socket.create_connection((host, port), CONNECT_MS * 1e-3) as tcp,
+            context.wrap_socket(tcp, server_hostname=host) as link,
         ):
             link.settimeout(_ALERT_S)
             with contextlib.suppress(TimeoutError):
@@ -203,7 +204,7 @@ def require_certificate(network: Network, role: str) -> None:
 
 
 def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
-    """Warnings about this host's certificates: absent, invalid, ending within `WARN_DAYS`, or with a readable key."""
+    """Warnings about this host's certificates: absent, invalid, ending within `WARN_DAYS`, with a key open to all."""
     folder = user_path(network.certificates)
     roles = sorted(key.stem for key in folder.glob("*.key") if key.name != CA_KEY)
     warnings = [] if roles else [f"{folder} has no certificate with its key, ROLE.pem and ROLE.key"]
@@ -216,11 +217,9 @@ def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
         key = folder / f"{role}.key"
         if key.stat().st_mode & stat.S_IROTH:
             warnings.append(f"{key} can be read by every user of this host, who could then act as {role}: chmod o-rwx")
-        left = found.ends - now
-        if left < datetime.timedelta(days=WARN_DAYS):
-            warnings.append(
-                f"{role}'s certificate ends in {left.days} days, on {found.ends:%Y-%m-%d}: lowfc certs --renew"
-            )
+        if (left := found.ends - now) < datetime.timedelta(days=WARN_DAYS):
+            days = counted(left.days, "day")
+            warnings.append(f"{role}'s certificate ends in {days}, on {found.ends:%Y-%m-%d}: lowfc certs --renew")
     return warnings
 
 

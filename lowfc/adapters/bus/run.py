@@ -67,7 +67,7 @@ class Links:
         return secret
 
     def socket(self, role: str) -> Path | None:
-        """Unix socket of a role, in addition to its port; None if the directory's name is too long for one."""
+        """Unix socket of a role with a port; None without a port, or if the directory's name is too long for one."""
         return self._socket_path(f"{role}.sock") if role in self.ports else None
 
     def direct_link(self, role: str) -> Path | None:
@@ -201,7 +201,7 @@ def open_run(
 
 
 def run_path(run_id: str, base: Path | None = None) -> Path:
-    """Directory of a run below `base`, which may not exist; BusError if the name is invalid. See `open_run`."""
+    """Directory of a run below `base`, whether or not it exists; BusError if the name is invalid. See `open_run`."""
     if not _RUN_ID.fullmatch(run_id):
         raise BusError(
             "a run's name is up to 48 of a-z, 0-9, '.', '_', '-' and begins with a letter or digit; got "
@@ -309,10 +309,10 @@ def _read(path: Path) -> Links:
 
 
 def free_ports(count: int) -> list[int]:
-    """Return unused loopback TCP ports below the host's ephemeral range, or in it if there is no room below.
+    """Return unused loopback TCP ports below the host's ephemeral range, or in it if it begins at 15000 or below.
 
-    An ephemeral port may be taken by any outgoing connection before its role listens; a connection retried to such a
-    port without a listener may even be assigned the port itself and connect to itself.
+    BusError if too few are free. Any outgoing connection may take an ephemeral port before its role listens; one
+    retried to such a port without a listener may even be assigned the port itself and connect to itself.
     """
     candidates = range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))
     chooser = random.SystemRandom()

@@ -1,6 +1,6 @@
 """The bus between processes: zenoh peers over loopback TCP, each connected to all others of its run.
 
-Monitors connect by Unix socket instead and get images at a lower rate. `zenoh_session` explains each setting.
+Monitors connect by Unix socket and get `latest_only` topics at a lower rate. `zenoh_session` explains each setting.
 """
 
 import contextlib
@@ -73,7 +73,7 @@ class ZenohPublisher:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
-        """Send `payload`; a slow reader delays this by at most 1 ms and loses it; in lockstep put waits for it."""
+        """Send `payload`; a slow reader delays this by at most 1 ms, then loses the message; in lockstep put waits."""
         envelope = Envelope(
             sequence_of(self._bus.start_s, self.published) if sequence is None else sequence,
             self._host_ns() if publish_time_ns is None else publish_time_ns,
@@ -162,7 +162,7 @@ class ZenohBus:
         Raises:
             BusError: the role's port is in use, or the role runs on another host; zenoh refuses the configuration, or
                 the router refuses the certificate.
-            DataFileError: across hosts, the role has no certificate.
+            DataFileError: the run's secret is missing or damaged; across hosts, the role has no valid certificate.
         """
         self.role = role
         self._links = links
@@ -324,7 +324,7 @@ class ZenohBus:
             publisher.published = publisher.skipped = 0
 
     def close(self) -> None:
-        """Leave the run once all published messages have been received or the peers have timed out.
+        """Leave the run; a role with a port first waits until its messages have been received, or the peers time out.
 
         A closing zenoh session interrupts the write of a message; a slow reader then gets half a message and loses the
         rest of the stream. A query of the lowest priority is sent last: its answer shows that all was sent.
@@ -367,7 +367,7 @@ class ZenohBus:
 
 
 def _reader(topic: Topic, name: str) -> str | None:
-    """Role of the direct subscriber of a topic."""
+    """Role of the direct subscriber of a topic; None if it has none."""
     return mirror_role(name) if topic.direct_subscriber is Role.MIRROR else topic.direct_subscriber
 
 

@@ -50,7 +50,7 @@ def close_links_at_once(session: zenoh.Session) -> None:
     """
 
     def changed(event: zenoh.LinkEvent) -> None:
-        if event.kind != zenoh.SampleKind.PUT or event.link.src.startswith(_SOCKET):  # closed without a wait
+        if event.kind != zenoh.SampleKind.PUT or event.link.src.startswith(_SOCKET):  # a Unix socket closes at once
             return
         far = event.link.dst.rpartition(":")[2] if event.link.dst.startswith("tls/") else ""
         for descriptor in (int(path.name) for path in Path("/proc/self/fd").iterdir()):
@@ -120,7 +120,7 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
             # No gain at these sizes, and a receiver descheduled for 100 ms loses messages silently.
             "shared_memory": {"enabled": False},
         },
-        # Monitors connect by socket and get no more images than they display: sending them costs the loop time.
+        # Monitors connect by socket and get no more of these messages than they display: sending costs the loop time.
         "downsampling": [
             {"id": "glances", "flows": ["egress"], "messages": ["put"], "link_protocols": [_SOCKET], "rules": throttled}
         ],

@@ -12,7 +12,7 @@ from lowfc.control.loop.camera import CameraSettings
 
 KIND = "lowfc calibration 1"
 
-# Extension, attribute of Calibration, unit.
+# Extension, attribute of Calibration, unit, description.
 _EXTENSIONS = (
     ("REFERENCE", "reference", "", "reference image I0, fraction of the flux"),
     ("RESPONSE", "response", "nm-1", "response matrix H, fraction of the flux per nm rms of wavefront"),

@@ -70,8 +70,7 @@ def loaded(
     elif before_mode is LoopMode.IDLE and mode is LoopMode.CLOSED and loop.automatic.any():
         mode, cause = LoopMode.OPEN, MEASURED_FIRST
     state = state._replace(loop=loop)
-    # Under HOLD a loop may be closed here: it holds its command.
-    acting = tuple(one for one in state.conditions.acting if one.action is not Action.HOLD)
+    acting = tuple(one for one in state.conditions.acting if one.action is not Action.HOLD)  # a closed loop holds
     if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
         mode, cause = LoopMode.IDLE, wrong
     elif mode is LoopMode.CLOSED and (wrong := misfit(state)):
@@ -228,10 +227,7 @@ def end_probe(loop: ActiveLoop, sequence: int, why: str, events: list[PendingEve
 
 
 def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
-    """Store the camera's settings, and open a closed loop that they do not fit.
-
-    A computed calibration for frames of another size makes a loop that has not used a frame idle, until frames fit.
-    """
+    """Store the camera's settings; open a closed loop that they do not fit; `uncalibrated` decides on the idle mode."""
     after = _with_camera(state, camera)
     if after is state:
         return state, Outputs()
@@ -292,10 +288,7 @@ def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[Pendin
 
 
 def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
-    """Change the loop mode; probe sequence, steps and return to zero of the previous mode end.
-
-    Safe mode removes the channels except the flat map and `EXTERNAL`; a law fades in when the loop closes.
-    """
+    """Change the loop mode; probe sequence, steps and return to zero of the previous mode end."""
     loop = state.loop
     if loop is not None and mode is not state.mode:
         loop = loop.stopped(state.frame_sequence)
