@@ -302,7 +302,7 @@ class Client:
         return found
 
     def laws(self) -> dict[str, LinearLaw]:
-        """The control law loaded last, by its identity, whether or not it still drives; empty if none was loaded."""
+        """The control law published last, by its identity, whether or not it drives the mirror; empty before any."""
         published = Published()
         for sample in self._bus.get(LAW.key, timeout_s=ANSWER_S):
             published.store(LAW, sample.payload)

@@ -35,7 +35,7 @@ class Lease:
         """Reserve the loop for a purpose such as "lowfc calibrate", with its duration if known.
 
         Raises:
-            RequestRefusedError: another client has reserved it.
+            RequestRefusedError: another client has reserved it, or it is in safe mode.
             BusError: no controller is running.
         """
         self.id = new_identity()

@@ -181,9 +181,7 @@ def test_a_lease_keeps_its_number_of_frames_when_the_camera_starts(frames: int) 
     assert "LEASE_ENDED" in names(feed(DEFAULTS, state, last)[1])
 
 
-def replied(
-    state: State, name: str, *values: float, modes: tuple[int, ...] = (), text: str = ""
-) -> tuple[State, Reply]:
+def answer(state: State, name: str, *values: float, modes: tuple[int, ...] = (), text: str = "") -> tuple[State, Reply]:
     after, outputs = applied(state, Request(1, name, modes, values, text))
     return after, outputs.reply
 
@@ -203,7 +201,7 @@ def replied(
     ],
 )
 def test_an_unwise_value_is_granted_with_a_remark(name: str, value: float, remark: str) -> None:
-    after, reply = replied(loaded(DEFAULTS), name, value, modes=(3,))
+    after, reply = answer(loaded(DEFAULTS), name, value, modes=(3,))
     assert reply.accepted
     attribute = {"gain": "gain", "limit": "limit_nm", "leak": "leak"}[name]
     assert getattr(after.loop.integrator, attribute)[NOLL.index(3)] == np.float32(value)
@@ -216,14 +214,14 @@ def test_the_remark_on_limits_names_the_mode_that_the_stroke_limits_first() -> N
     state = loaded(DEFAULTS)
     twice = state.loop.to_actuators * np.float32([1, 2, 1])
     reach_nm = DEFAULTS.limits.stroke_nm / np.abs(twice[:, 1]).max()
-    _, reply = replied(state._replace(loop=state.loop._replace(to_actuators=twice)), "limit", 1e9)
+    _, reply = answer(state._replace(loop=state.loop._replace(to_actuators=twice)), "limit", 1e9)
     assert reply.text.endswith(f": above {reach_nm:.3g} nm the stroke of 700 nm limits mode 3 first")
 
 
 def test_an_offset_of_a_mode_without_gain_has_a_remark() -> None:
-    state, _ = replied(loaded(DEFAULTS), "gain", 0.0, modes=(3,))
+    state, _ = answer(loaded(DEFAULTS), "gain", 0.0, modes=(3,))
     for mode, remark in ((3, "Z3 would not follow at a gain of 0"), (4, "")):
-        _, reply = replied(state, "offset", 5.0, modes=(mode,))
+        _, reply = answer(state, "offset", 5.0, modes=(mode,))
         assert reply.accepted
         assert remark in reply.text
         assert (":" in reply.text) == bool(remark)
@@ -231,24 +229,24 @@ def test_an_offset_of_a_mode_without_gain_has_a_remark() -> None:
 
 def test_the_remark_on_gains_begins_above_the_highest_gain() -> None:
     highest = highest_gain(DEFAULTS.delay_frames)
-    texts = [replied(loaded(DEFAULTS), "gain", factor * highest)[1].text for factor in (0.999, 1.001)]
+    texts = [answer(loaded(DEFAULTS), "gain", factor * highest)[1].text for factor in (0.999, 1.001)]
     assert ["lowfc tune" in text for text in texts] == [False, True]
 
 
 def test_removing_a_channel_and_a_missing_one() -> None:
     state = loaded(DEFAULTS)
-    after, reply = replied(state, "channel", text="dark-hole")
+    after, reply = answer(state, "channel", text="dark-hole")
     assert (reply.accepted, reply.text) == (False, "there is no channel 'dark-hole' to remove; there are none")
     assert after.loop.command_channels is None
     shape = Request(1, "channel", text="dark-hole", actuators_nm=np.full(GRID, 2.0, np.float32).reshape(-1))
     state, _ = advance(DEFAULTS, state, shape)
-    assert replied(state, "channel", text="hole")[1].text == "there is no channel 'hole' to remove; there are dark-hole"
-    assert replied(state, "channel", text="dark-hole")[1].text == "channel dark-hole: 0 nm rms of surface"
-    assert "letter first" in replied(state, "channel", text="Dark Hole")[1].text
+    assert answer(state, "channel", text="hole")[1].text == "there is no channel 'hole' to remove; there are dark-hole"
+    assert answer(state, "channel", text="dark-hole")[1].text == "channel dark-hole: 0 nm rms of surface"
+    assert "letter first" in answer(state, "channel", text="Dark Hole")[1].text
 
 
 def test_the_refusal_of_an_offset_names_its_mode() -> None:
-    _, reply = replied(loaded(DEFAULTS), "offset", 80.0, modes=(4,))
+    _, reply = answer(loaded(DEFAULTS), "offset", 80.0, modes=(4,))
     assert (reply.accepted, reply.text) == (False, "offset of mode 4: at most its limit, 50 nm; asked for 80 nm")
 
 

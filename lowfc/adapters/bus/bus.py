@@ -1,7 +1,7 @@
 """Interface of the message bus: publish, subscribe, answer, query.
 
-`ZenohBus` carries messages between processes, `MemoryBus` within one process, for tests. Handlers run on a receive
-thread, one message at a time: a slow handler delays the next message.
+`ZenohBus` carries messages between processes, `MemoryBus` within one process, for tests. Handlers run on receive
+threads: a slow handler delays the next message of the same publisher, and may run for another publisher meanwhile.
 """
 
 import sys

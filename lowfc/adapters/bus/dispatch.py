@@ -56,7 +56,7 @@ class Dispatch(Arrivals):
         return self._skipped
 
     def put(self, sample: Sample) -> None:
-        """Dispatch or skip a message; called on the receive threads, one at a time."""
+        """Dispatch or skip a message, one at a time; callable from any receive thread."""
         with self._turn:
             handler: Callable[[Sample], None] | None = self._handler
             if self._period_ns is not None:

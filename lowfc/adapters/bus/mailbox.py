@@ -14,8 +14,8 @@ MAX_WAIT_S = 0.5
 class Mailbox(Arrivals):
     """Holds the newest message of one publisher; a newer one replaces it.
 
-    One thread puts and one takes. A bare lock wakes the taking thread: in CPython it is the cheapest way to wake a
-    thread that waits with a timeout.
+    One thread takes. A bare lock wakes it: in CPython this is the cheapest way to wake a thread that waits with a
+    timeout.
     """
 
     def __init__(self, key: str = "") -> None:
@@ -37,7 +37,7 @@ class Mailbox(Arrivals):
         return bool(self._slot)
 
     def put(self, sample: Sample) -> None:
-        """Store a message; called on the bus's thread."""
+        """Store a message, usually on the bus's thread."""
         self.count(sample)
         self._slot.append(sample)
         self._notify()

@@ -1,6 +1,7 @@
 """The bus between processes: zenoh peers over loopback TCP, each connected to all others of its run.
 
-Monitors connect by Unix socket and get `latest_only` topics at a lower rate. `zenoh_session` explains each setting.
+Monitors connect by Unix socket and get `latest_only` topics at a lower rate; across hosts, all connect to a router.
+`zenoh_session` and `routed` explain each setting.
 """
 
 import contextlib
@@ -224,7 +225,7 @@ class ZenohBus:
         return publisher
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
-        """See `Bus.subscribe`; `handler` runs on a receive thread, one call at a time."""
+        """See `Bus.subscribe`; `handler` runs on receive threads, over a direct link one call at a time."""
         if _reader(topic, name) != self.role or (path := self._direct_link(topic, name)) is None:
             return self._subscribe(topic, handler, name)
         key = topic.at(name)

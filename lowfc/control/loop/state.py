@@ -89,7 +89,7 @@ class LawRunner(NamedTuple):
     """A running linear law: its state x (states,), and the number of frames that it has processed.
 
     It observes for `SETTLING_FRAMES`; over the next `FADING_FRAMES` it takes over from the integrator in a cross-fade,
-    so that the mirror does not jump. A `guard` compares it with the integrator throughout.
+    so that the mirror does not jump. Once it drives alone, a `guard` compares it with the integrator.
     """
 
     law: LinearLaw

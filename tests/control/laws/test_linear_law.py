@@ -185,9 +185,7 @@ def test_a_law_with_inconsistent_fields_is_refused(change: dict[str, object], me
 def test_a_law_computes_in_single_precision() -> None:
     law = LAWS["notch"]
     x = predict_and_update(law, at_rest(law), np.ones(3, np.float32), np.zeros(3, np.float32))
-    assert {law.transition.dtype, x.dtype, respond(law, x).dtype, predict(law, x, x[:3]).dtype} == {
-        np.dtype(np.float32)
-    }
+    assert {each.dtype for each in (law.transition, x, respond(law, x), predict(law, x, x[:3]))} == {np.dtype("f4")}
 
 
 @pytest.mark.parametrize("notch", [Notch(0, 1, 5), Notch(600, 1, 5), Notch(20, 0, 5), Notch(20, 1, 1)])
@@ -268,10 +266,8 @@ def test_rejection_equals_the_residual_of_a_line() -> None:
 
 
 def test_a_notch_has_the_requested_depth_and_width() -> None:
-    made = pi_notch(
-        (4,), np.array([0.3]), np.zeros(1), np.zeros(1), [(Notch(frequency_hz=60, width_hz=6, depth=10),)], 1.0, RATE_HZ
-    )
-    bare = pi_notch((4,), np.array([0.3]), np.zeros(1), np.zeros(1), [()], 1.0, RATE_HZ)
+    notch, zero = Notch(frequency_hz=60, width_hz=6, depth=10), np.zeros(1)
+    made, bare = (pi_notch((4,), zero + 0.3, zero, zero, [notches], 1.0, RATE_HZ) for notches in ((notch,), ()))
     at = np.array([57.0, 60.0, 63.0])
     ratio = (rejection(made, at, 1.0) / rejection(bare, at, 1.0))[:, 0]
     assert ratio[1] == pytest.approx(0.1, rel=0.01)

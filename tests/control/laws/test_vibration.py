@@ -125,10 +125,8 @@ def minimum_variance_nm2(spectrum_nm2: Array, noise_nm2: float, whole_frames: in
 @pytest.mark.parametrize("delay", [1, 2, 3])
 def test_three_predictions_of_the_residual_agree(delay: int) -> None:
     """Riccati's covariance, the law's own transfer functions, and the factor of the spectrum."""
-    riccati = residual_nm2(MODEL, delay)
-    assert predicted_nm(lqg([MODEL], (2,), Timing.sampled(delay)), [MODEL], Timing.sampled(delay))[
-        0
-    ] ** 2 == pytest.approx(riccati, rel=0.01)
+    riccati, timing = residual_nm2(MODEL, delay), Timing.sampled(delay)
+    assert predicted_nm(lqg([MODEL], (2,), timing), [MODEL], timing)[0] ** 2 == pytest.approx(riccati, rel=0.01)
     omega = np.linspace(0, np.pi, (1 << 18) + 1)
     spectrum = MODEL.spectrum_nm2(np.maximum(omega, omega[1] / 2))
     assert minimum_variance_nm2(spectrum, MODEL.noise_nm2, delay) == pytest.approx(riccati, rel=0.02)
