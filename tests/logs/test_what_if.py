@@ -22,7 +22,7 @@ from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFile
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import reconstructor
 from lowfc.control.laws.stability import delay_weights, limiting_gain
-from lowfc.control.laws.what_if import as_logged, counterfactual, rms
+from lowfc.control.laws.what_if import counterfactual, limited_integrator, rms
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.optics.chain.added_contrast import contrast_form
 from lowfc.optics.chain.coronagraph import Coronagraph
@@ -70,7 +70,7 @@ def as_if(run: SimpleNamespace, config: Configuration) -> np.ndarray:
     weights = delay_weights(settings.delay_frames).astype(np.float32)
     pol_nm = run.pol_nm.astype(np.float32)
     law = settings.integrator(config.noll)
-    return counterfactual(as_logged(law), weights, pol_nm, np.zeros(len(pol_nm), np.int64))[0]
+    return counterfactual(limited_integrator(law), weights, pol_nm, np.zeros(len(pol_nm), np.int64))[0]
 
 
 BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}

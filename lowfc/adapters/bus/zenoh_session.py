@@ -122,7 +122,7 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
         },
         # Monitors connect by socket and get no more of these messages than they display: sending costs the loop time.
         "downsampling": [
-            {"id": "glances", "flows": ["egress"], "messages": ["put"], "link_protocols": [_SOCKET], "rules": throttled}
+            {"id": "monitor", "flows": ["egress"], "messages": ["put"], "link_protocols": [_SOCKET], "rules": throttled}
         ],
     }
 

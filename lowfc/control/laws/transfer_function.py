@@ -79,26 +79,26 @@ def measure_lines(error_nm: Array, added_nm: Array) -> Lines:
     response, added = _hann(error_nm), _hann(added_nm)
     found: list[tuple[Integers, Integers, Complex, Array]] = []
     for mode in range(error_nm.shape[1]):
-        plain = np.abs(np.fft.rfft(added_nm[:, mode])) / frames
-        places = np.flatnonzero(plain[1:-1] > _FAINTEST * plain[1:-1].max(initial=0.0)) + 1
-        if not places.size:
+        amplitude = np.abs(np.fft.rfft(added_nm[:, mode])) / frames
+        bins = np.flatnonzero(amplitude[1:-1] > _FAINTEST * amplitude[1:-1].max(initial=0.0)) + 1
+        if not bins.size:
             continue
-        own = np.zeros(len(plain), bool)
-        own[:2] = own[-2:] = True
+        excluded = np.zeros(len(amplitude), bool)
+        excluded[:2] = excluded[-2:] = True
         for near in (-1, 0, 1):
-            own[np.clip(places + near, 0, len(plain) - 1)] = True
-        adjacent = np.clip(places[:, None] + _ADJACENT, 0, len(plain) - 1)
-        power = np.where(own[adjacent], np.nan, np.abs(response[adjacent, mode]) ** 2)
+            excluded[np.clip(bins + near, 0, len(amplitude) - 1)] = True
+        adjacent = np.clip(bins[:, None] + _ADJACENT, 0, len(amplitude) - 1)
+        adjacent_power = np.where(excluded[adjacent], np.nan, np.abs(response[adjacent, mode]) ** 2)
         # A vibration on the line itself shows only in the adjacent bins, after subtraction of the line.
-        flanks = response[places[:, None] + np.array([-1, 1]), mode] + response[places, mode][:, None] / 2
-        nearest = _OF_FLANKS * np.mean(np.abs(flanks) ** 2, axis=1)
-        noise = np.sqrt(np.maximum(np.nanmean(power, axis=1), nearest) / 2)
-        S = response[places, mode] / added[places, mode]
-        found.append((np.full(places.size, mode), places, S, noise / np.abs(added[places, mode])))
+        flanks = response[bins[:, None] + np.array([-1, 1]), mode] + response[bins, mode][:, None] / 2
+        flank_power = _OF_FLANKS * np.mean(np.abs(flanks) ** 2, axis=1)
+        noise = np.sqrt(np.maximum(np.nanmean(adjacent_power, axis=1), flank_power) / 2)
+        S = response[bins, mode] / added[bins, mode]
+        found.append((np.full(bins.size, mode), bins, S, noise / np.abs(added[bins, mode])))
     if not found:
         raise ValueError("nothing was added to the loop's input: there is nothing to measure")
-    modes, places, S, error = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return Lines(modes, places / frames, S, error)
+    modes, bins, S, error = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return Lines(modes, bins / frames, S, error)
 
 
 def seen_of_mirror(played_nm: Array, weights: Array) -> Array:

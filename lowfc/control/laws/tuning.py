@@ -93,21 +93,21 @@ def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> 
     omega = 2 * np.pi * fine.frequency_hz[1:] / rate_hz  # an integrator without leak has no value at 0 Hz
     gains, residual_nm2, sensed_nm2 = np.zeros(len(leak)), np.zeros(len(leak)), np.zeros(len(leak))
     longest_nm = max(run.values, key=len)
-    for mode, lost in enumerate(leak.tolist()):
+    for mode, mode_leak in enumerate(leak.tolist()):
         steady_nm2 = float(longest_nm[:, mode].mean()) ** 2  # a leak leaves a fraction of it: |S| at 0 Hz
         measured = fine.power_nm2_hz[1:, mode : mode + 1] * rate_hz / 2
 
-        def law_of(gain: float, lost: float = lost) -> LinearLaw:
-            return integrator([gain], [lost], (2,), timing.delay, rate_hz)  # the mode does not matter
+        def law_of(gain: float, mode_leak: float = mode_leak) -> LinearLaw:
+            return integrator([gain], [mode_leak], (2,), timing.delay, rate_hz)  # the mode does not matter
 
-        def steady_residual_nm2(gain: float, lost: float = lost, steady_nm2: float = steady_nm2) -> float:
-            return steady_nm2 * (lost / (lost + gain)) ** 2
+        def steady_residual_nm2(gain: float, mode_leak: float = mode_leak, steady_nm2: float = steady_nm2) -> float:
+            return steady_nm2 * (mode_leak / (mode_leak + gain)) ** 2
 
-        def residual(gain: float, measured: Array = measured, mode: int = mode, lost: float = lost) -> float:
-            power = residual_spectrum(law_of(gain, lost), omega, measured, noise_nm2[mode : mode + 1], timing)
+        def residual(gain: float, measured: Array = measured, mode: int = mode, mode_leak: float = mode_leak) -> float:
+            power = residual_spectrum(law_of(gain, mode_leak), omega, measured, noise_nm2[mode : mode + 1], timing)
             return float(power.sum()) * fine.spacing_hz * 2 / rate_hz + steady_residual_nm2(gain)
 
-        bounds = (LOWEST_GAIN, highest_gain(timing.delay, lost))
+        bounds = (LOWEST_GAIN, highest_gain(timing.delay, mode_leak))
         found = minimize_scalar(residual, bounds=bounds, method="bounded", options={"xatol": 1e-3})
         gains[mode], residual_nm2[mode] = found.x, found.fun
         error = np.abs(sensitivity(law_of(found.x), omega, timing.delay)) ** 2 * measured
@@ -158,15 +158,15 @@ def tune_lqg(
 
     scaled = ([_scaled(model, factor, finest_hz) for model in models] for factor in (*_NARROWER, *_WIDER))
     tried = [models, *scaled]
-    steady = [integrator_block(g, lost, "pol", timing.delay) for g, lost in zip(gains.gain, leak, strict=True)]
+    integrators = [integrator_block(*each, "pol", timing.delay) for each in zip(gains.gain, leak, strict=True)]
     filters = [[within_margins(model, timing) for model in candidates] for candidates in tried]
-    robust = [[block or rest for block, rest in zip(blocks, steady, strict=True)] for blocks in filters]
+    robust = [[block or other for block, other in zip(blocks, integrators, strict=True)] for blocks in filters]
     residual_nm2 = np.nan_to_num([residual(blocks) for blocks in robust], nan=np.inf)
     best = residual_nm2.argmin(axis=0)
     modes = range(len(noll))
-    wins = residual_nm2.min(axis=0) < residual(steady)  # integrators do not beat themselves
+    wins = residual_nm2.min(axis=0) < residual(integrators)  # integrators do not beat themselves
     chosen = [tried[best[mode]][mode] for mode in modes]
-    law = law_of([robust[best[mode]][mode] if wins[mode] else steady[mode] for mode in modes])
+    law = law_of([robust[best[mode]][mode] if wins[mode] else integrators[mode] for mode in modes])
     return _tuned(law, timing, ["lqg" if better else "integrator" for better in wins], chosen)
 
 

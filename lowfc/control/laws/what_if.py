@@ -41,7 +41,7 @@ def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
     return step
 
 
-def as_logged(law: Integrator) -> Controller:
+def limited_integrator(law: Integrator) -> Controller:
     """The live loop's integrator with its limits."""
     noll = tuple(range(2, 2 + law.gain.size))  # these, delay and rate are not used
     return driven_by(integrator(law.gain, law.leak, noll, 1.0, 1.0), law.limit_nm)

@@ -223,15 +223,14 @@ class LawGuard(NamedTuple):
                 other_nm = other_nm + (virtual_nm[lag] if weight == 1 else weight * virtual_nm[lag])
             command_nm, _ = integrate(integrator, virtual_nm[0], other_nm)
             if overruled:
-                out: Mask = self.weight < 1
+                integrated: Mask = self.weight < 1  # modes that the integrator drives
                 virtual_x = x
                 if self.x is not None:
-                    y = pol_nm if law.signal == "pol" else np.where(out, other_nm, error_nm)
-                    virtual_x = linear_law.predict_and_update(
-                        law, self.x, y, np.where(out, virtual_nm[0], history_nm[0])
-                    )
+                    y = pol_nm if law.signal == "pol" else np.where(integrated, other_nm, error_nm)
+                    last_nm = np.where(integrated, virtual_nm[0], history_nm[0])
+                    virtual_x = linear_law.predict_and_update(law, self.x, y, last_nm)
                 law_nm = np.clip(linear_law.respond(law, virtual_x), -integrator.limit_nm, integrator.limit_nm)
-                command_nm = np.where(out, law_nm, command_nm)
+                command_nm = np.where(integrated, law_nm, command_nm)
             virtual_nm, squares[1] = (command_nm, *virtual_nm[:-1]), other_nm
         np.square(squares, out=squares)
         frames, sums_nm2, void = self.frames + 1, self.sums_nm2 + squares.dot(self.members), self.void or limited

@@ -5,12 +5,12 @@ import pytest
 
 from lowfc.control.laws.stability import delay_weights, settling_frames
 from lowfc.control.laws.what_if import (
-    as_logged,
     counterfactual,
     delay_from_times,
     delay_from_truth,
     exposed,
     frames_since,
+    limited_integrator,
     missing_before,
     seen_nm,
 )
@@ -23,7 +23,7 @@ from tests.support.toy import frame_sequence, run_toy, settings
 WIDE = {"limits": Limits(7000.0, 7000.0, 7000.0), "limit_nm": (5000.0, 5000.0)}
 DELAYS = [1.0, 1.4, 2.0, 3.0]
 NOTHING_MISSING = np.zeros(12, np.int64)
-HALF = as_logged(law_of(modes=1))
+HALF = limited_integrator(law_of(modes=1))
 
 
 def single(*values: float) -> np.ndarray:
@@ -65,9 +65,8 @@ def test_the_logged_gains_reproduce_the_logged_run(delay: float) -> None:
     assert missing.sum() == 9
     assert np.isnan(error).any(axis=1).sum() == len(DARK)
     assert (np.abs(command[:, 0]) == 12.0).any()
-    replayed_error, replayed_command = counterfactual(
-        as_logged(setup.integrator((2, 3, 4))), weights(delay), pol, missing
-    )
+    law = limited_integrator(setup.integrator((2, 3, 4)))
+    replayed_error, replayed_command = counterfactual(law, weights(delay), pol, missing)
     np.testing.assert_allclose(replayed_error, error, atol=2e-5, rtol=0)
     np.testing.assert_allclose(replayed_command, command, atol=2e-5, rtol=0)
 
@@ -80,7 +79,8 @@ def test_other_gains_reproduce_a_run_with_these_gains(delay: float) -> None:
     disturbance = walk(160)
     _, pol, _, missing = columns(live_steps(before, disturbance))
     error, _, command, _ = columns(live_steps(after, disturbance))
-    other_error, other_command = counterfactual(as_logged(after.integrator((2, 3, 4))), weights(delay), pol, missing)
+    law = limited_integrator(after.integrator((2, 3, 4)))
+    other_error, other_command = counterfactual(law, weights(delay), pol, missing)
     np.testing.assert_allclose(other_error, error, atol=0.05)
     np.testing.assert_allclose(other_command, command, atol=0.05)
     assert np.nanmax(np.abs(other_error - pol)) > 5

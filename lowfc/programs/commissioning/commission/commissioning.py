@@ -21,7 +21,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay
 from lowfc.control.laws import margins
 from lowfc.control.laws.stability import delay_weights, settling_frames
-from lowfc.control.laws.what_if import Controller, as_logged, counterfactual, driven_by, missing_before, rms
+from lowfc.control.laws.what_if import Controller, counterfactual, driven_by, limited_integrator, missing_before, rms
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
@@ -266,7 +266,7 @@ class Commissioning:
         automatic = np.array(state.automatic or [False] * len(noll), bool)
         integrator = replace(integrator, gain=np.where(automatic, np.float32(CHECK_GAIN), integrator.gain))
         settling = settling_frames(integrator.gain, integrator.leak, self._config.camera.rate_hz)
-        return as_logged(integrator), settling, np.array(noll)[automatic].tolist()
+        return limited_integrator(integrator), settling, np.array(noll)[automatic].tolist()
 
     @contextlib.contextmanager
     def _fixed_gains(self, modes: list[int]) -> Iterator[None]:

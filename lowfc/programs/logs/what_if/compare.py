@@ -16,7 +16,7 @@ from lowfc.control.calibration.calibration import ESTIMATORS, Calibration, recon
 from lowfc.control.laws.continuous import continuous_residual_nm2
 from lowfc.control.laws.integrator import TIP_TILT, Integrator
 from lowfc.control.laws.stability import limiting_gain
-from lowfc.control.laws.what_if import as_logged, counterfactual, rms
+from lowfc.control.laws.what_if import counterfactual, limited_integrator, rms
 from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
@@ -61,7 +61,7 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
         error_nm = run.measured_again(calibration)
         seen_nm = _in_other_modes(run.calibration, calibration, seen_nm)
     pol_nm = error_nm - seen_nm
-    what_if_nm, command_nm = counterfactual(user_step or as_logged(new_law), run.weights, pol_nm, run.missing)
+    what_if_nm, command_nm = counterfactual(user_step or limited_integrator(new_law), run.weights, pol_nm, run.missing)
 
     usable = run.used & np.isfinite(what_if_nm).all(axis=1)
     lost = np.count_nonzero(run.used & ~usable)
