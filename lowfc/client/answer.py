@@ -11,7 +11,7 @@ class Answer(NamedTuple):
 
     Attributes:
         accepted: always true.
-        reply: one sentence: what was done.
+        reply: what was done, or the configuration as TOML (`configuration` only).
         frame_sequence: sequence of the first frame for which the request is in force.
         text: path of the log (`record`); for other requests the text that was sent.
         state: the controller's state (`status` only).

@@ -16,7 +16,7 @@ class Declaration(NamedTuple):
         key: key of the query.
         fields: fields of the message, with their content.
         description: what it does.
-        example: an example command line; empty if the request has no command.
+        example: an example of its command, as after `lowfc ctl`; empty if it has none.
     """
 
     key: str

@@ -47,9 +47,9 @@ class Stream(Generic[T]):
     def __init__(
         self, ring: Ring, decode: Callable[[Sample], T | None], what: str, count: int | None, patience_s: float
     ) -> None:
-        """Subscribe, for `count` messages or without end; BusError if none arrives.
+        """Wait for the first of `count` messages, or of an endless stream, in `ring`; BusError if none arrives.
 
-        `decode` returns None for an invalid message; `what` names the messages in errors.
+        `decode` returns None for an invalid message; `what` names the messages in errors; `patience_s` is the timeout.
         """
         self._ring = ring
         self._decode = decode

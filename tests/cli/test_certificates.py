@@ -143,6 +143,9 @@ def test_a_certificate_is_checked_as_its_peers_check_it(tmp_path: Path) -> None:
     ):
         with pytest.raises(DataFileError, match=r"camera\.pem is not a valid certificate of .* signed by"):
             read_certificate(*wrong)
+    (tmp_path / "own.key").write_text("-----BEGIN ENCRYPTED PRIVATE KEY-----")
+    with pytest.raises(DataFileError, match="the key is encrypted"):
+        read_certificate(tmp_path / "ca.pem", camera[0], tmp_path / "own.key")
 
 
 def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:

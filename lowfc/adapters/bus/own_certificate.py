@@ -23,11 +23,14 @@ class OwnCertificate(NamedTuple):
 def read_certificate(authority: Path, certificate: Path, key: Path, *, server: bool = False) -> OwnCertificate:
     """Read a certificate and check it as a peer does: signed by `authority`, matching `key`, a router's if `server`.
 
-    DataFileError if a file cannot be read, the three do not match, or the certificate is not valid now.
+    DataFileError if a file cannot be read, the key is encrypted, the three do not match, or the certificate is not
+    valid now.
     """
     import ssl  # slow to import, and only loops on several hosts need it
 
     try:
+        if b"ENCRYPTED" in key.read_bytes():  # ssl would ask for its password on the terminal
+            raise ValueError("the key is encrypted, and zenoh needs a plain one")
         listening, connecting = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         connecting.check_hostname = False
         connecting.verify_mode = ssl.CERT_NONE

@@ -25,7 +25,7 @@ _SHARE = 0.3  # of the largest gain in likelihood, which a narrower line must re
 _HANN = 1.5  # neighbours are correlated: three count as two
 _LOBE = 12  # frequencies on either side of a line into which the window spreads it
 _FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
-_PER_DECADE = 48
+_PER_DECADE = 48  # groups of averaged frequencies
 _MIN_DRIFT = 1e-8  # variance of its step per variance of noise: a constant is followed in 10^4 frames
 _MIN_NOISE = 1e-3  # of the level at high frequencies, which drift may explain entirely: a filter needs some noise
 
@@ -238,7 +238,7 @@ class _Whittle:
         largest = max(gain for gain, _, _ in found)
         if largest < _PENALTY * np.log(ratio.size):
             return None
-        # The narrowest that explains most of the power: a wide one could be two separate lines.
+        # The narrowest with a fair share of the gain: a wide one could be two separate lines.
         place, scale = next((place, scale) for gain, place, scale in found if gain >= _SHARE * largest)
         if scale == _SCALES[0]:  # of its three frequencies, the one of the highest power
             place += int(np.argmax(self.power[place - 1 : place + 2])) - 1

@@ -21,7 +21,7 @@ from lowfc.control.loop.safety import Limits, LoopMode, Rejection, neighbour_dif
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
 from lowfc.control.loop.wording import MAX_NOTE_LENGTH, MEASURED_FIRST, PAUSED, counted
 
-MAX_STEPS = 1 << 32  # frames of a request for steps
+MAX_STEPS = 1 << 32  # most frames of a request `step`
 MAX_REPLY_LENGTH = 1000
 """Most characters of a reply."""
 
