@@ -316,7 +316,7 @@ def test_gain_and_leak_are_refused_if_unstable_together() -> None:
 def test_a_request_with_more_leaks_than_modes_is_refused_without_computing_their_gains() -> None:
     before = limiting_gain.cache_info().misses
     _, outputs = feed(DEFAULTS, loaded(DEFAULTS), ask("leak", *np.linspace(0.01, 0.9, 900).tolist()))
-    check_reply(outputs[0], False, "give one value, or one for each of the 3 modes; got 900")
+    check_reply(outputs[0], False, "give one value, or one per mode (3 modes); got 900")
     assert limiting_gain.cache_info().misses == before
 
 

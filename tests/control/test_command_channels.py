@@ -223,7 +223,7 @@ def test_events_that_end_a_probe_sequence(end: str) -> None:
     [
         ({"text": "nothing"}, "target"),
         ({"text": MIRROR, "table": np.ones((3, 1), np.float32)}, "actuators"),
-        ({"text": MIRROR, "table": np.ones((3, 2), np.float32), "actuators_nm": np.ones(ACTUATORS)}, "columns"),
+        ({"text": MIRROR, "table": np.ones((3, 2), np.float32), "actuators_nm": np.ones(ACTUATORS)}, "per column"),
         ({"text": MIRROR, "table": np.zeros((0, 1), np.float32), "actuators_nm": np.ones(ACTUATORS)}, "row"),
         ({"text": MIRROR, "table": np.full((3, 1), 1e3), "actuators_nm": np.ones(ACTUATORS)}, "stroke"),
         ({"text": MIRROR, "table": np.full((3, 1), np.nan), "actuators_nm": np.ones(ACTUATORS)}, "finite"),

@@ -11,6 +11,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Single
 from lowfc.control.identity import identity
+from lowfc.control.loop.wording import counted
 
 FLAT = "flat"
 """Channel of the mirror's flat map: the reference image includes it, so it shifts nothing."""
@@ -244,9 +245,7 @@ def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
         raise ValueError(f"a probe sequence has a row per frame and a column per shape or mode, got {rows.shape}")
     columns = rows.shape[1]
     if target == MIRROR and (not basis.size or basis.size % columns):
-        raise ValueError(
-            f"a probe sequence on the mirror needs a shape for each of {columns} columns, got {basis.size} actuators"
-        )
+        raise ValueError(f"a probe sequence on a mirror needs {counted(columns, 'shape')}, got {basis.size} actuators")
     if max(rows.size, basis.size) > MAX_PROBE_NUMBERS:
         raise ValueError(
             f"a probe sequence has at most {MAX_PROBE_NUMBERS} numbers, {MAX_PROBE_NUMBERS // columns} rows of "

@@ -94,7 +94,7 @@ def per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
     """
     modes = _modes(noll, request)
     if len(request.values) not in (1, len(modes)):
-        raise ValueError(f"give one value, or one for each of the {len(modes)} modes; got {len(request.values)}")
+        raise ValueError(f"give one value, or one per mode ({counted(len(modes), 'mode')}); got {len(request.values)}")
     if not np.isfinite(request.values).all():
         raise ValueError(f"{request.name} must be finite, got {' '.join(map('{:g}'.format, request.values))}")
     array = before.copy()

@@ -70,7 +70,7 @@ def loaded(
     elif before_mode is LoopMode.IDLE and mode is LoopMode.CLOSED and loop.automatic.any():
         mode, cause = LoopMode.OPEN, MEASURED_FIRST
     state = state._replace(loop=loop)
-    acting = tuple(one for one in state.conditions.acting if one.action is not Action.HOLD)  # a closed loop holds
+    acting = tuple(one for one in state.conditions.acting if one.action is not Action.HOLD)  # a held loop stays closed
     if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
         mode, cause = LoopMode.IDLE, wrong
     elif mode is LoopMode.CLOSED and (wrong := misfit(state)):

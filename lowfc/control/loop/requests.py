@@ -230,10 +230,8 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
     if table.target == MIRROR:
         grid = loop.calibration.grid
         if table.basis.shape[1] != grid[0] * grid[1]:
-            raise ValueError(
-                f"a probe sequence needs {grid[0]} x {grid[1]} actuators for each of {len(table.largest)} columns, "
-                f"got {table.basis.shape[1]} actuators for each"
-            )
+            actuators = f"{grid[0]} x {grid[1]} actuators per column of its table"
+            raise ValueError(f"a probe sequence needs {actuators}, got {table.basis.shape[1]}")
         if table.reach_nm > settings.limits.stroke_nm:
             raise ValueError(f"the probe sequence may exceed the stroke of {settings.limits.stroke_nm:g} nm")
     else:
