@@ -24,8 +24,7 @@ class Grant:
     """Rights of a role, the common name of a certificate, as lists of keys.
 
     It publishes Health under its role only; a mirror publishes, answers and receives under its own name only. All other
-    keys have "*" in place of a name, among them those under which others subscribe to and query it (`subscribed`,
-    `queried`).
+    keys have "*" in place of a name, also those that others subscribe to and query (`subscribed`, `queried`).
     """
 
     role: str

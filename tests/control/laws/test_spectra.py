@@ -220,9 +220,9 @@ def test_a_multisine_has_the_requested_rms_and_lines_and_a_low_crest() -> None:
     assert np.std(table, axis=0) == pytest.approx(2.0, rel=1e-5)
     assert np.std(multisine(1002, lines(1002, 1, 8, 0.004, 0.5), 2.0, 5)) == pytest.approx(2.0, rel=1e-5)
     assert (np.abs(table).max(axis=0) < 3.3 * 2.0).all()
-    spectrum = np.abs(np.fft.rfft(table, axis=0))
-    for mode, one in enumerate(places):
-        assert np.array_equal(np.flatnonzero(spectrum[:, mode] > 1e-3 * spectrum[:, mode].max()), one)
+    amplitude = np.abs(np.fft.rfft(table, axis=0))
+    for mode, bins in enumerate(places):
+        assert np.array_equal(np.flatnonzero(amplitude[:, mode] > 1e-3 * amplitude[:, mode].max()), bins)
     with_lead = with_lead_in(table, 4500)
     assert np.array_equal(with_lead[500:4500], table)
     assert np.array_equal(with_lead[4500:], table)
