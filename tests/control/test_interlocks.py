@@ -63,7 +63,7 @@ def test_conditions_of_an_interlock(test: str, value: Value, input_: Value | Non
 
 
 def test_an_interlock_holds_and_releases_the_command_at_the_next_frame() -> None:
-    """At random times; all inputs are encoded as in a log, and their replay gives the same bytes."""
+    """At random times; bench reports are encoded as in a log, and the replay of all inputs gives the same steps."""
     setup, rng = under(Action.HOLD), np.random.default_rng(5)
     state = running(setup)
     count, acting, flips, logged = 5, False, 0, []

@@ -212,7 +212,7 @@ def serialised(input_: Input, outputs: Outputs, state: State) -> bytes:
 
 
 def checked_advance(setup: Settings, state: State, input_: Input) -> tuple[State, Outputs]:
-    """Process an input with read-only arrays; check purity, limits, and that a refused request changes nothing."""
+    """Process an input, its image read-only; check purity, limits, and that a refused request changes nothing."""
     if isinstance(input_, Frame) and input_.pixels is not None:
         input_.pixels.flags.writeable = False
     before = controller_state(state, setup, 0)
