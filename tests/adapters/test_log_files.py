@@ -201,7 +201,11 @@ def test_a_damaged_chunk_header_loses_only_its_chunk(tmp_path: Path, at: int, ne
     if not finished:
         path.write_bytes(path.read_bytes()[: chunks[-1][1]])
     cut = tmp_path / "cut.mcap"
-    before, after = (cut.write_bytes(path.read_bytes()[:end]) and len(list(LogReader(cut))) for end in chunks[3])
+    counts = []
+    for end in chunks[3]:
+        cut.write_bytes(path.read_bytes()[:end])
+        counts.append(len(list(LogReader(cut))))
+    before, after = counts
     changed(path, chunks[3][0] + at, new)
     with pytest.raises(DataFileError, match=rf"is damaged at byte {chunks[3][0]} "):
         list(LogReader(path))

@@ -10,14 +10,7 @@ from lowfc.adapters.bus.start_check import StartCheck
 from lowfc.adapters.process.clock import SIMULATED_START_NS
 from lowfc.contract.envelope import Envelope, count_of, sequence_of, start_of
 from lowfc.contract.errors import BadMessageError, BusError
-from lowfc.contract.messages import (
-    FRAME,
-    HEALTH,
-    MIRROR_STATE,
-    Role,
-    topic_of,
-    wire,
-)
+from lowfc.contract.messages import FRAME, HEALTH, MIRROR_STATE, Role, topic_of, wire
 from lowfc.programs.launch.watch import Watch
 from lowfc.programs.view.snapshot import Accumulator
 from lowfc.testing.clock import FakeClock

@@ -163,10 +163,9 @@ lowfc.adapters.process.realtime._LATENCY_DEVICE = "/no/such/device"
 
 
 def report(call: str, limits: str = "") -> dict[str, object]:
-    done = subprocess.run(
-        [sys.executable, "-c", REPORT.format(call=call, limits=limits)], capture_output=True, text=True, check=True
-    )
-    return json.loads(done.stdout)
+    words = [sys.executable, "-c", REPORT.format(call=call, limits=limits)]
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    return json.loads(subprocess.run(words, env=environment, capture_output=True, text=True, check=True).stdout)
 
 
 def test_set_up_changes_only_blas_threads_and_garbage_collection_by_default() -> None:

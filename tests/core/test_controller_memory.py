@@ -78,7 +78,7 @@ GRID = CONFIG.mirror.rows, CONFIG.mirror.columns
 
 
 class Rig:
-    """A run in one process: controller and mirror in threads, and every message they published."""
+    """A run in one process: controller and mirror in threads, and the messages that they published."""
 
     def __init__(self, config: Configuration, calibration: Calibration, scene: Scene) -> None:
         self.config, self.calibration, self.scene, self.hub = config, calibration, scene, MemoryHub()
@@ -285,10 +285,8 @@ def test_a_camera_that_changes_opens_the_loop(rig: Rig) -> None:
     assert rig.steps(1)[0].mode == wire.LOOP_MODE_OPEN
 
 
-def test_frames_with_wrong_times_are_late_and_do_not_stop_the_controller(
-    calibration: Calibration, scene: Scene
-) -> None:
-    """Durations of years are clipped in the timing columns; without frames the command is repeated."""
+def test_frames_with_wrong_times_do_not_stop_the_controller(calibration: Calibration, scene: Scene) -> None:
+    """A frame of 1970 is late, one of the future is used, durations are clipped; without frames the command repeats."""
     with running(configured(lockstep=False), calibration, scene) as rig:
         pixels = scene.expose(0, rig.offset_nm)
         rig.put(pixels, publish_time_ns=1)

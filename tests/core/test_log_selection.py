@@ -191,13 +191,7 @@ def test_an_export_contains_the_frames_of_a_smaller_copy(small: Path, tmp_path: 
     assert len(np.load(out.with_suffix(".frames.npy"))) == FRAMES // EVERY
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--to", "csv", "--decimate", "3"],
-        ["--topics", FRAME.key],
-    ],
-)
+@pytest.mark.parametrize("words", [["--to", "csv", "--decimate", "3"], ["--topics", FRAME.key]])
 def test_contradictory_export_options_are_refused(whole: Path, words: list[str]) -> None:
     assert "use one" in refusal("export", whole, *words, kind=ConfigurationError)
 
@@ -214,6 +208,11 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     more = bytes_per_s(config, configured_selection(config), camera) - growth
     assert more == pytest.approx((160 * 120 - 80 * 80) * 2 * 0.6 * 250)
     assert estimate(config, wire.CameraState()) == estimate(config)
+    assert estimate(load(None, keys | {"sensor.kind": "zwfs"})).endswith(" 40 x 40 pixels, the simulated camera's")
+    fields = *wire.ControlStep.DESCRIPTOR.fields, *wire.Truth.DESCRIPTOR.fields
+    modal = sum(field.is_repeated and field.name.endswith("_nm") for field in fields)
+    more = bytes_per_s(load(None, keys | {"sensor.modes": 35}), EVERYTHING) - growth
+    assert more == pytest.approx(modal * (35 - 14) * 4 * 250)
     assert bytes_per_s(load(None, keys | {"camera.rate_hz": 500.0}), EVERYTHING) > 1.8 * growth
     fewer = load(None, keys | {"recorder.every": 10, "recorder.topics": [FRAME.key, "lowfc/mirror/{name}/state"]})
     assert bytes_per_s(fewer, configured_selection(fewer)) < 0.5 * growth

@@ -1,4 +1,4 @@
-"""Every reader of external bytes, with damaged inputs: it raises its errors, and does not crash, hang or use memory."""
+"""Every reader of external bytes, with damaged inputs: it raises its errors; it does not crash, hang or grow."""
 
 import pytest
 

@@ -1,6 +1,6 @@
 """Factory of the instrument's parts from the configuration: optics, star, detector, mirror, calibration.
 
-Camera, mirror and launcher all use it, so that they interpret the keys in the same way.
+The processes and commands all use it, so that they interpret the keys in the same way.
 """
 
 from collections.abc import Callable
@@ -66,7 +66,7 @@ def twin(config: Configuration, progress: Progress | None, warn: Callable[[str],
 
 
 def contrast_of(config: Configuration) -> ModalContrast:
-    """Contrast that the modes add in the dark zone. Takes 0.1 s to compute, with a Lyot stop 0.5 s, then is cached."""
+    """Contrast that the modes add in the dark zone; takes 0.1 s, 0.5 s with a Lyot stop; cached if no file is read."""
     key = config.sensor, config.noll, config.star.wavelength_nm
     return _contrast_of(*key) if config.sensor.pupil.endswith(".npz") else _cached_contrast_of(*key)  # files change
 
@@ -167,9 +167,9 @@ def settings(config: Configuration) -> Settings:
     )
 
 
-def _interlock(one: InterlockSection) -> Interlock:
-    max_age_ns, acts_when_old = round(one.max_age_s * 1e9), one.when_old == "acts"
-    return Interlock(one.name, one.test, one.value, Action(one.action), max_age_ns, acts_when_old)
+def _interlock(section: InterlockSection) -> Interlock:
+    max_age_ns, acts_when_old = round(section.max_age_s * 1e9), section.when_old == "acts"
+    return Interlock(section.name, section.test, section.value, Action(section.action), max_age_ns, acts_when_old)
 
 
 def analytic_calibration(
@@ -178,7 +178,7 @@ def analytic_calibration(
     """I0 and H from the camera's own operator, eqs. (6) to (12), R from them, and the mirror's modes.
 
     The modes are fitted to the influence functions, then mixed slightly so that the sensor measures each modal command
-    as itself: through the shaped pupil, 2 to 6 % of the mirror's print-through looks like low orders.
+    as itself: through the shaped pupil, the mirror's print-through looks like low orders, up to 0.3 % of a command.
 
     Inactive actuators are in no mode, and the sensor's response to them is set to 0.
 
@@ -191,7 +191,7 @@ def analytic_calibration(
     Raises:
         CalibrationError: the sensor cannot distinguish the modes, the star saturates it, or shear is a fitted
             nuisance at a wavefront that is not flat.
-        ConfigurationError: the map of active actuators cannot be used.
+        ConfigurationError: the map of active actuators cannot be used, or there are fewer actuators than modes.
     """
     if opd_nm is not None and "shear" in config.control.nuisance:
         raise CalibrationError(
@@ -293,7 +293,7 @@ def _check_exposure(config: Configuration, light: Array) -> None:
 
 
 def _nuisance(config: Configuration, light: Array, good: Array) -> Array | None:
-    """Slopes (pixels, any) of the normalised image along the fitted nuisance parameters; None without any."""
+    """Slopes (pixels, parameters) of the normalised image along the fitted nuisance parameters; None without one."""
     columns = []
     for name in config.control.nuisance:
         if name == "background":
@@ -315,7 +315,8 @@ def _dark_dn(camera: Detector) -> float:
 def equivalent_read_noise_e(camera: Detector) -> float:
     """Read noise equivalent to all noise except photon noise, in electrons before multiplication, for the weights.
 
-    The register doubles the photons' variance, to 2 (I0 + read_noise^2 / (2 gain^2)); spurious charge counts as light.
+    The variance is 2 (I0 + read_noise^2 / (2 gain^2)): the register doubles that of the photons. Charge without light
+    counts as light.
     """
     read_noise_e = camera.read_noise_e
     if camera.em_gain > 1:

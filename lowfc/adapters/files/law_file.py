@@ -60,8 +60,8 @@ def load(path: Path) -> LinearLaw:
     return law
 
 
-def _read(units: fits.HDUList) -> tuple[LinearLaw, str]:
-    header = units[0].header
+def _read(hdus: fits.HDUList) -> tuple[LinearLaw, str]:
+    header = hdus[0].header
     former = LAW_EXTENSIONS if header["KIND"] == FORMER_KIND else {}
     law = LinearLaw(
         signal=cast("Signal", str(header["SIGNAL"])),  # LinearLaw refuses any other
@@ -69,6 +69,6 @@ def _read(units: fits.HDUList) -> tuple[LinearLaw, str]:
         noll=tuple(int(index) for index in str(header["NOLL"]).split()),
         delay_frames=float(header["DELAY"]),
         rate_hz=float(header["RATE"]),
-        **{attribute: fits_file.single(units, former.get(name, name)) for name, attribute, _ in _EXTENSIONS},
+        **{attribute: fits_file.single(hdus, former.get(name, name)) for name, attribute, _ in _EXTENSIONS},
     )
     return law, str(header["LAWID"])

@@ -30,7 +30,7 @@ def load_layout(name: str) -> sams.Layout:
             diameters; a hole [x, y, diameter] has its own size. A single layout may stand alone, without "layouts".
 
     Raises:
-        ConfigurationError: No layout has that name.
+        ConfigurationError: No layout has that name, or the file holds several and none is named.
         DataFileError: The file is missing, damaged, or its holes overlap or leave the pupil.
     """
     in_file = re.fullmatch(r"(.*\.json)(?::(.*))?", name)

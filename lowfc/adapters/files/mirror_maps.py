@@ -28,7 +28,7 @@ def active_actuators(config: Configuration) -> Mask | None:
     """Read the map of active actuators (rows, columns) of `mirror.active`; None if all are active.
 
     Raises:
-        ConfigurationError: the file is missing, damaged or does not fit the mirror.
+        ConfigurationError: the file is missing, damaged or does not fit the mirror, or marks no active actuators.
     """
     if not config.mirror.active:
         return None
@@ -44,7 +44,7 @@ def flat_nm(config: Configuration) -> Single | None:
     """Read the flat map (rows, columns) of `mirror.flat`, nm of surface, 0 at inactive actuators; None without one.
 
     Raises:
-        ConfigurationError: the file is missing, damaged or does not fit the mirror.
+        ConfigurationError: the file, or that of `mirror.active`, is missing, damaged or does not fit the mirror.
     """
     if not config.mirror.flat:
         return None

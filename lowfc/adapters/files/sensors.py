@@ -1,4 +1,4 @@
-"""Load pupils from files, and build a sensor from the names of its masks."""
+"""Load pupils from files; build sensors and coronagraphs from their section of the configuration."""
 
 import contextlib
 import json
@@ -26,6 +26,8 @@ from lowfc.optics.chain.sensor import Sensor
 
 _DATA = resources.files("lowfc") / "data"
 _MAX_BYTES = 1 << 30
+PUPIL_IMAGE_PIXELS = 40
+"""Pixels across the image of a Zernike sensor."""
 _WITH_LYOT_STOP = ("circle", "prolate")
 _LYOT_OUTER = 12.0
 """Outer radius of the annular dark zone with a Lyot stop, lambda / D; the inner radius is the mask's edge."""
@@ -33,15 +35,15 @@ _log = logging.getLogger(__name__)
 
 
 def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter128.npz") -> Array:
-    """Load the shaped pupil (samples, samples): 1e-9 between 4 and 20 lambda/D within 42.5 degrees of the x axis.
+    """Load a pupil (samples, samples), by default the shaped pupil, made for 1e-9 contrast in `DARK_ZONE`.
 
     Args:
-        samples: Samples across the diameter, a multiple of 256.
+        samples: Samples across the diameter, a multiple of twice those of the quadrant; of 256 for the package's.
         file: An npz file whose array `quarter` is the quadrant x >= 0, y >= 0.
 
     Raises:
         DataFileError: The file is missing, damaged or holds no such quadrant.
-        ConfigurationError: The quadrant does not divide `samples`.
+        ConfigurationError: `samples` is not such a multiple.
     """
     with _opened(file) as arrays:
         quarter = np.asarray(arrays["quarter"])
@@ -56,7 +58,7 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
 
 
 def load_dark_zone(file: Traversable) -> Wedge:
-    """Load the dark zone for which `lowfc design spc` made a pupil file; without `made_by`, the packaged pupil's.
+    """Load the dark zone for which `lowfc design spc` made a pupil; `DARK_ZONE` if the file has no array `made_by`.
 
     Raises:
         DataFileError: The file is missing or damaged, or its request has no such zone.
@@ -80,7 +82,7 @@ def load_dark_zone(file: Traversable) -> Wedge:
 def sensor_from(
     section: SensorSection | None = None, wavelength_nm: float = 550.0, warn: Callable[[str], None] = _log.warning
 ) -> Sensor:
-    """Build the optics described by [sensor], at the sampling of Table 1 of the paper.
+    """Build the optics described by [sensor], sampled as in Table 1 of the paper; but for a pupil image's pixels.
 
     Args:
         section: Section of the configuration; all defaults when None.
@@ -99,7 +101,7 @@ def sensor_from(
             case "clowfs":
                 relay: Relay = Defocus(fresnel_distance(section.defocus_mm, section.focal_ratio, wavelength_nm))
             case "zwfs":
-                return Sensor(pupil, focal_mask, PupilImage(), wavelength_nm, pixels=40)
+                return Sensor(pupil, focal_mask, PupilImage(), wavelength_nm, pixels=PUPIL_IMAGE_PIXELS)
             case "bar":
                 relay = ApertureMask(circle_with_bar(len(pupil), section.bar_width, section.bar_angle_deg))
             case "open":

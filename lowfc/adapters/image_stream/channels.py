@@ -35,7 +35,7 @@ class OtherChannels:
     """Sum of a mirror's channels except one, in the unit of the streams.
 
     Unusable channels are left out: another grid, another layout, or a value that is not finite. A channel that is being
-    written, or whose writer died meanwhile, counts with its last complete shape.
+    written, or whose writer died meanwhile, counts with its last complete shape, or as found if none was read before.
     """
 
     def __init__(self, names: Iterable[str], grid: tuple[int, int]) -> None:
@@ -61,7 +61,7 @@ class OtherChannels:
         return self._misfits + [f"stream {name!r} has values that are not finite" for name in not_finite]
 
     def sum(self) -> Single:
-        """Sum of the channels (rows, columns); the same array object until a channel is written."""
+        """Sum of the channels (rows, columns); the same array object until one is written, appears or disappears."""
         now_s = time.monotonic()
         current = {path: stream for path, stream in self._streams.items() if stream.current()}
         if len(current) < len(self._streams) or now_s - self._searched_s >= _SEARCH_S:
@@ -105,7 +105,7 @@ def fits(stream: Stream, grid: tuple[int, int]) -> bool:
 
 
 def _complete_count(stream: Stream) -> int:
-    """Number of images written; -1 while one is being written, whose shape is read once it is complete."""
+    """Number of images written; -1 while one is being written: `sum` reads it once it is complete."""
     count = stream.count
     return -1 if stream.writing else count
 
@@ -125,7 +125,7 @@ def complete_shape(stream: Stream, otherwise: Single | None = None) -> Single | 
 
 
 def channel_of(name: str, grid: tuple[int, int]) -> Stream:
-    """Open a channel for writing, or create it with zeros.
+    """Open a channel for writing; create it with zeros if it does not exist.
 
     StreamError if it has another grid, another process writes it, or another program does not finish creating it.
     """

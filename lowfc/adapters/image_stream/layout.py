@@ -145,5 +145,5 @@ class Layout(NamedTuple):
         starts, end = {}, 0
         for name, length in parts.items():
             starts[name] = end
-            end += -(-length // 8) * 8
+            end += (length + 7) // 8 * 8  # rounded up to 8 bytes
         return cls(dtype, shape, keywords, semaphores, ring, starts, end)

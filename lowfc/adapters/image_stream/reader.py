@@ -44,7 +44,7 @@ class StreamReader:
         self._open()
 
     def next(self, timeout_s: float) -> StreamImage | None:
-        """Newest image not yet returned; None if none arrived in time. StreamError as at the start."""
+        """Newest image not yet returned; None if none arrived in time. StreamError as for the constructor."""
         end_s = time.monotonic() + timeout_s
         mapped = self._open()
         while True:
@@ -92,7 +92,7 @@ class StreamReader:
         return True
 
     def _image(self) -> StreamImage | None:
-        """Newest image if it is complete and new; an image being written posts the semaphore on completion."""
+        """Newest image if it is complete and new; its writer posts the semaphore once it is complete."""
         stream = self.stream
         assert stream is not None  # noqa: S101
         for _ in range(_ATTEMPTS):

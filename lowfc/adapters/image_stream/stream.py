@@ -44,9 +44,10 @@ class StreamAbsentError(StreamError):
 
 
 def stream_path(name: str) -> Path:
-    """File of a stream in the first existing folder of $MILK_SHM_DIR, /milk/shm and /tmp."""
+    """File of a stream in the first existing of $MILK_SHM_DIR, /milk/shm and /tmp; StreamError for an invalid name."""
     if not 0 < len(name) <= _MAX_NAME_LENGTH or not name.isprintable() or "/" in name:
-        raise StreamError(f"a stream's name has 1 to {_MAX_NAME_LENGTH} characters without '/', got {name!r}")
+        limit = f"1 to {_MAX_NAME_LENGTH} characters without '/', all printable"
+        raise StreamError(f"a stream's name has {limit}; got {name!r}")
     folders = (Path(one) for one in (os.environ.get("MILK_SHM_DIR"), "/milk/shm", "/tmp") if one)  # noqa: S108
     return next(one for one in folders if one.is_dir() or one == Path("/tmp")) / f"{name}.im.shm"  # noqa: S108
 
@@ -196,9 +197,11 @@ class Stream:
         return found
 
     def put(self, image: npt.NDArray[np.generic], acquired_ns: int | None = None) -> None:
-        """Write an image (rows, columns) of the stream's type to the first plane, and post the semaphores."""
+        """Write an image (rows, columns) to the first plane, and post the semaphores; TypeError if it does not fit."""
+        if (image.dtype, image.shape) != (self.layout.dtype, self.layout.shape[1:]):
+            raise TypeError(f"stream {self.name!r} does not hold images of {image.shape} {image.dtype}")
         self._write[0] = 1
-        np.copyto(self.data[0], image, casting="no")
+        self.data[0] = image
         if self.layout.ring:
             self._put_in_ring()
         now = _now()

@@ -80,6 +80,7 @@ def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
 
     Raises:
         UnsoundError: the chunk is damaged.
+        CompressionError: its compression is not supported.
     """
     try:
         _, _, size, crc, named = _FIXED.unpack_from(body)

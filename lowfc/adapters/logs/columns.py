@@ -147,7 +147,7 @@ T = TypeVar("T")
 
 
 class _Rows(Generic[T]):
-    """Columns of `T` from messages with a fixed number of modes; fields have the names of the message's."""
+    """Columns of `T` from messages with a fixed number of modes; `T` and message use the same names of fields."""
 
     def __init__(self, made: type[T], wide: Iterable[str], modes: int) -> None:
         self.modes = modes
@@ -163,7 +163,7 @@ class _Rows(Generic[T]):
         """Add a message; False if it has another number of modes.
 
         Raises:
-            OverflowError: a value is out of range, as the loop never sends it.
+            OverflowError: a value is out of range; the loop never sends such a value.
         """
         special = self._special(message)
         row = {name: getattr(message, name) for name in self._same_name if name not in special} | special
@@ -174,7 +174,7 @@ class _Rows(Generic[T]):
         return {}
 
     def values(self) -> T:
-        """Return the rows as arrays, without those with an infinite value, as the loop never sends it."""
+        """Return the rows as arrays, without those with an infinite value, which the loop never sends."""
         columns = {name: self._columns.values(name) for name in self._made.__annotations__}
         rows = np.ones(len(self), np.bool_)
         for values in columns.values():

@@ -1,6 +1,6 @@
-"""History of a run as columns: all content of a log except the images, for reports, exports and what-ifs.
+"""History of a run for reports, exports and what-ifs: columns of its frequent messages, and its rare messages.
 
-The columns of a topic have one row per message; `History.reader` reads the images.
+It omits control inputs, bench values, offloads, images and shapes of commands; `History.reader` reads these.
 """
 
 import contextlib
@@ -93,7 +93,7 @@ class MirrorStates:
 
 @dataclass
 class History:
-    """Content of a run's log, without the images.
+    """History of a run, read from its log.
 
     Attributes:
         log: reader, read to its end: metadata, attachments, whether the log is complete.
@@ -101,7 +101,7 @@ class History:
         remarks: sentences on parts of the configuration that this version cannot use, and on the calibration if its
             message is lost; each names the log.
         calibration: the last one; if its message is lost, the attached one, if a controller reported to use it.
-        controllers: states of the controllers, in order.
+        controllers, camera: states of the controllers, in order; last state of the camera.
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
         command_publish_ns: publish time of every mirror command in the log.
         stepped_sequence: frame sequence of every step in the log, also of those that `steps` leaves out.
@@ -257,7 +257,7 @@ class _HistoryBuilder:
         try:
             self._decode(message)
         except (KeyError, DecodeError):
-            return  # unreadable for the loop as well
+            return  # an unknown topic or a damaged message: the loop ignores it as well
         except OverflowError:  # valid in protobuf, but never sent by the loop
             history.excluded_messages += 1
 
@@ -325,7 +325,7 @@ class _HistoryBuilder:
         self._set_modes(len(calibration.noll))
 
     def _set_modes(self, modes: int) -> None:
-        """Leave out the rows so far if they have another number of modes."""
+        """Set the number of modes; leave out the rows so far if they have another."""
         if modes != self._steps.modes:
             self._history.excluded_messages += len(self._steps)
             self._steps, self._truths = StepRows(modes), TruthRows(modes)

@@ -27,8 +27,8 @@ class _Tally:
         published: number published according to its last Health; a message sent twice counts twice.
         recorded: number recorded.
         twice: number of those recorded that were duplicates.
-        never: number it never sent, according to its Health: frames lost by a camera, without `before`.
-        before: number it had never sent before the first recorded message; None until its first Health.
+        never: frames that a camera lost and never sent, according to its Health, less `before`.
+        before: frames that it had lost at its first Health, assumed to precede the first message; None until then.
         unconfirmed: number lost at the last call of `newly_lost`.
         flushed: `recorded` and `twice` at the last flush.
         reported: number reported as lost by `newly_lost`.
@@ -82,7 +82,7 @@ class LossAccount:
     """
 
     def __init__(self, selection: Selection = EVERYTHING) -> None:
-        """Start an empty account; topics thinned by `selection` are not counted."""
+        """Start an empty account; topics that `selection` thins or excludes are not counted."""
         self._selection = selection
         self.names = Names()
         self.starts = 0
@@ -101,7 +101,7 @@ class LossAccount:
         tally.enter(count, recorded=recorded or unwanted, unwanted=unwanted)
 
     def reconcile(self, sample: Sample, health: wire.Health) -> None:
-        """Use a publisher's own counts from its Health; messages sent before its first one arrived are not lost.
+        """Use a publisher's own counts from its Health; messages sent before its first Health or message are not lost.
 
         Raises:
             BadMessageError: the Health has too many names; its remaining counts are ignored.
@@ -140,7 +140,7 @@ class LossAccount:
         return self._sum(lambda tally: tally.lost)
 
     def newly_lost(self) -> dict[str, int]:
-        """Number of messages lost since the last call, by key; late messages are not subtracted again."""
+        """Number of messages lost since the last call, by key; one that arrives later is not subtracted again."""
         found = self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():
             tally.reported = max(tally.reported, tally.confirmed)
@@ -186,7 +186,7 @@ class LossAccount:
 
 
 def _published(process: str, key: str) -> Topic | None:
-    """Topic of a count in a process's Health if the process publishes it; None if it receives it."""
+    """Topic of a count in a process's Health if the process publishes it; None otherwise, and for an unknown topic."""
     try:
         topic = topic_of(key)
     except KeyError:

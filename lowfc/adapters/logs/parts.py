@@ -33,7 +33,7 @@ _NAMED = re.compile(r"(\d{8}T\d{6}Z)(?:-(\d+))?(-[a-z].*)?\.mcap(\.part)?", re.A
 class Repeated:
     """Detects messages that a file of a log repeats from the previous one at its start: calibrations and states.
 
-    A lockstep run has the sequences of another one, but publishes them later.
+    Two lockstep runs may have the same sequences, so times of publication are compared too.
     """
 
     def __init__(self) -> None:
@@ -157,7 +157,7 @@ def named_log(names: Sequence[Path]) -> Parts:
 
 
 def named_files(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Path]:
-    """Files of consecutive logs in the order named, files of a recording in their order; see `named_logs`."""
+    """Files of all named logs: logs in the order named, files of a recording in their own order; see `named_logs`."""
     files = [path for parts in named_logs(names) for path in parts]
     _refuse_several([(path,) for path in files], out, as_json=as_json)
     return files
@@ -236,7 +236,7 @@ def _time(path: Path) -> str:
 
 
 def _place(path: Path) -> tuple[tuple[str, ...], int]:
-    """Recording of a file (none in files of version 0.1), and the file's number in it."""
+    """Recording of a file, and the file's number in it; () and 1 if it is unreadable or of version 0.1."""
     try:
         metadata = metadata_at_start(path)
     except DataFileError:

@@ -17,7 +17,7 @@ from lowfc.contract.envelope import COUNT_BITS, sequence_of, start_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Topic
 
-_PREFIX_BYTES = 64  # of a chunk, with its first message's times: a 32-bit CRC alone is too short for a night's chunks
+_PREFIX_BYTES = 64  # of a chunk, compared besides its CRC: among a night's chunks, two may have the same 32-bit CRC
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, count, log time, publish time
 
 
@@ -31,12 +31,12 @@ class LogReader:
         paths: files of the log; here only `path`.
         size: size of the log when reading began, bytes.
         position: number of bytes read so far.
-        records: metadata and attachments read so far, in order; with the first message, those at the start.
+        records: metadata and attachments read so far, in order; those at the start are read before any message.
         schemas: schemas declared so far, by id.
         channels: channels declared so far, by key and start of the publisher.
         damage: damaged stretches that were left out.
         unreadable: number of messages left out because their declaration was damaged.
-        finished: whether the log ends as a finished one; False if its recorder died.
+        finished: whether the log ends as a finished one; False during recording, or if its recorder died.
         complete: whether the end was reached with a valid summary; False while reading.
         progress: function called at intervals with the bytes read and their total.
     """
@@ -126,13 +126,13 @@ class LogReader:
                         self.records.append(part)
             self.position = self.size
             self.complete = file.complete
-        if file.unread and not self._has_chunks:
+        if file.unsupported_compression and not self._has_chunks:
             raise self._error(0, "")
         if self.damage and not (self.damage[0].position or self.records or self._chunks):
             raise DataFileError(f"{self.path} is not an MCAP file")
 
     def _needs(self, end_ns: int, channels: Collection[int]) -> bool:
-        """Whether a chunk with these channels is needed; a channel not declared yet is declared in the chunk."""
+        """Whether a chunk with these channels is needed; a channel not declared yet may be declared in it."""
         if any(number not in self._delivered for number in channels):
             return True
         if end_ns < self._from_ns:
@@ -223,10 +223,10 @@ class LogReader:
         self.damage.append(damage)
 
     def _error(self, position: int, why: str) -> DataFileError:
-        if self._file.unread and not self._has_chunks:
+        if self._file.unsupported_compression and not self._has_chunks:
             return DataFileError(
-                f"{self.path} is compressed with {self._file.unread!r}; lz4, zstd and none are supported: "
-                "compress it again with `mcap compress --compression zstd`"
+                f"{self.path} is compressed with {self._file.unsupported_compression!r}; lz4, zstd and none are "
+                "supported: compress it again with `mcap compress --compression zstd`"
             )
         if position == 0:
             return DataFileError(f"{self.path} is not an MCAP file; if it was one, `lowfc recover` saves intact parts")

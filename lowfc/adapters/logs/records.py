@@ -66,14 +66,14 @@ class LogFile:
         size: size of the file when opened, bytes.
         finished: whether it ends as a finished log.
         complete: whether it is finished and was read up to a valid summary; known at the end of `parts`.
-        unread: name of an unsupported compression of a chunk; empty for none.
+        unsupported_compression: name of an unsupported compression of a chunk; empty for none.
     """
 
     def __init__(self, path: Path) -> None:
         """Open the log at `path`; DataFileError if the file cannot be read."""
         self.path = path
         self.complete = False
-        self.unread = ""
+        self.unsupported_compression = ""
         try:
             self._file = input_file.opened(path, input_file.UNBOUNDED)
             self.size = self._file.seek(0, io.SEEK_END)
@@ -113,8 +113,8 @@ class LogFile:
     ) -> Iterator[Chunk | Metadata | Attachment | Damage]:
         """Content of the file, in order.
 
-        `needed` is called with the end (log time) of each chunk and the ids of its channels; if it returns False, the
-        chunk is skipped unread.
+        `needed` is called with the end (log time) of each indexed chunk and the ids of its channels; if it returns
+        False, the chunk is skipped unread.
 
         Raises:
             DataFileError: the file cannot be read.
@@ -254,7 +254,7 @@ class LogFile:
                 try:
                     return read_chunk(body, at, may_lack_crc=not self._by_lowfc)
                 except CompressionError as fault:
-                    self.unread = fault.name
+                    self.unsupported_compression = fault.name
                     raise
             case Opcode.ATTACHMENT:
                 crc = int.from_bytes(body[-4:], "little")
@@ -275,7 +275,7 @@ class LogFile:
         return None
 
     def _is_by_lowfc(self) -> bool:
-        """Whether lowfc wrote this file, and so with all checksums, according to the header."""
+        """Whether lowfc wrote this file, and so with all checksums, by its header; True if the header is damaged."""
         head = self._read(len(MAGIC), HEAD.size)
         opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
         if opcode != Opcode.HEADER or length > _BLOCK_BYTES:
@@ -293,7 +293,7 @@ class LogFile:
         return not self._by_lowfc or any(not one.chunk_count for one in statistics)
 
     def _unchunked_records(self, at: int) -> bytes:
-        """Intact records from `at` on of the kinds that are usually in chunks."""
+        """Complete records from `at` on of the kinds that are usually in chunks, up to the one that exceeds 1 MB."""
         end = at
         while end - at < _BLOCK_BYTES and len(head := self._read(end, HEAD.size)) == HEAD.size:
             opcode, length = HEAD.unpack(head)

@@ -75,7 +75,7 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
         progress: function called with the bytes read and their total.
 
     Raises:
-        DataFileError: `source` is not a log or is being recorded, `out` exists, or it cannot be written.
+        DataFileError: `source` is no log, has no intact part or is being recorded; `out` exists or cannot be written.
     """
     if source.exists() and being_recorded(source):
         raise DataFileError(f"{source} is being recorded, and nothing is lost: `lowfc ctl record stop` finishes it")

@@ -28,7 +28,7 @@ def thin(
     """Write a thinned log from all files of a log, with its selection in the metadata; return the results for JSON.
 
     Raises:
-        DataFileError: a file is not a log, or has no messages, `out` exists already, or it cannot be written.
+        DataFileError: a file is not a log, none has messages, `out` exists already, or it cannot be written.
     """
     combined = requested.within(Selection.of(metadata_at_start(log[0])))
     reader = WholeLog(log, skip_damaged=True)
@@ -41,7 +41,7 @@ def thin(
         return True
 
     def include_record(record: Metadata | Attachment) -> bool:
-        """Whether to copy a record; of a later file only its account, which replaces the previous one."""
+        """Whether to copy a record: the first of its name; each "recording" and "recovery", as the last one counts."""
         known = record.name in copied_names and record.name not in ("recording", RECOVERY)
         copied_names.add(record.name)
         return not known

@@ -39,7 +39,7 @@ UNFINISHED = ".part"
 FILE_MODE = 0o640
 """Default permissions of a log, further reduced by the umask: notes and frames are not public."""
 
-CHUNK_BYTES = 240 * 1024  # closes a chunk once exceeded; with a further frame it stays below 256 KiB
+CHUNK_BYTES = 240 * 1024  # closes a chunk once exceeded: below 256 KiB with a further frame of up to 15 KiB
 PART = "part"
 """Name of the metadata with a log's recording and its number in it."""
 

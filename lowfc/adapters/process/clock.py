@@ -26,7 +26,7 @@ class HostClock:
 
     Attributes:
         lockstep: whether the time is simulated and set explicitly.
-        start_s: Unix time of the process's start, s; the upper half of its sequences.
+        start_s: Unix time (in lockstep simulated) of the process's start, s; the upper half of its sequences.
         offset_ns: offset to add to CLOCK_MONOTONIC for time since the epoch.
     """
 
@@ -38,7 +38,7 @@ class HostClock:
         self.start_s = self.now_ns() // _NS
 
     def host_ns(self) -> int:
-        """Time of the host, for envelopes and durations; the same as `now_ns`, that of the run, unless in lockstep."""
+        """Time of the host, for envelopes and durations; `now_ns`, the run's time, differs from it only in lockstep."""
         return time.monotonic_ns() + self.offset_ns
 
     now_ns = host_ns

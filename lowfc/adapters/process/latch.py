@@ -37,15 +37,15 @@ def latch_files(run: Run) -> tuple[Path, ...]:
 
 
 class Latch:
-    """State of safe mode, stored in files."""
+    """State of safe mode, stored in files.
+
+    Attributes:
+        safe: whether, at the start, a file existed or could not be checked.
+        writable: whether, at the start, at least one file could be written.
+    """
 
     def __init__(self, files: Sequence[Path], failed: Callable[[str], None] = lambda why: None) -> None:
-        """Read the files; `failed` is called once with the reason when a file cannot be read or written.
-
-        Attributes:
-            safe: whether a file exists or cannot be checked.
-            writable: whether at least one file can be written.
-        """
+        """Read the files; `failed` is called with the reason if a file cannot be read or written, once until it can."""
         self._files = tuple(files)
         self._failed = failed
         self._reported: set[Path] = set()

@@ -46,8 +46,8 @@ def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, di
     """Prepare this process for the loop.
 
     Args:
-        priority: priority of SCHED_FIFO, 1 to 99; None: normal scheduling class.
-        cpus: processors to run on; None: all.
+        priority: priority of SCHED_FIFO, 1 to 99; None: the scheduling class does not change.
+        cpus: processors to run on; None: they do not change.
         lock_memory: whether to lock all pages in memory.
         disable_cpu_idle: whether to disable CPU idle states of the host while this process lives.
 
@@ -175,7 +175,7 @@ def _disable_cpu_idle() -> None:
 def _lock_memory() -> None:
     """Lock present pages, other pages once touched, and all pages of mapped files now, as reading them is slow.
 
-    Locking all reserved memory would allocate it: most of it are buffers and thread stacks that BLAS does not use.
+    Locking all reserved memory would allocate it: most of it is buffers and thread stacks that BLAS does not use.
     Under a memory-lock limit nothing is locked, as later allocations would fail.
     """
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]

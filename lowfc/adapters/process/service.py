@@ -32,7 +32,7 @@ WAITING_NS = 2_000_000_000
 PRINTED, PRINTED_NS = 10, 10_000_000_000
 """Most warnings of one kind on standard error in this time; all are in the log."""
 WORK: dict[str, str] = {Role.CAMERA: "frame", Role.CONTROLLER: "frame", Role.MIRROR: "command"}
-"""Counters of the processes of the loop; other processes have their own summary."""
+"""What `Service.work` counts in the processes of the loop; other processes have their own summary."""
 ProcessState = Literal["starting", "ready", "running", "stopping", "stopped"]
 
 _POLL_S = 0.02

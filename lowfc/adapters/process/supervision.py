@@ -16,7 +16,7 @@ from lowfc.control.loop.safety import LoopMode
 class Supervisor:
     """The service manager, if any.
 
-    The watchdog timeout is twice `period_ns`; None without a watchdog.
+    `period_ns` is the period of watchdog signals, half the watchdog's timeout; None without a watchdog.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:

@@ -23,7 +23,7 @@ class Trial(NamedTuple):
 
     Attributes:
         refused: refused ones among `priority`, `lock_memory` and `disable_cpu_idle`, each with its cost.
-        cpus: processors available to the process.
+        cpus: processors that the process may use, also beyond the caller's.
         normal_ns: lateness of each wake-up in the normal scheduling class, ns.
         fifo_ns: lateness of each wake-up under SCHED_FIFO, ns; empty if not requested or refused.
     """
@@ -37,7 +37,7 @@ class Trial(NamedTuple):
 def try_out(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
     """Request the measures of a process of the loop, and time 1000 wake-ups per second in each scheduling class.
 
-    It runs on these processors (all when empty). OSError if the trial's process cannot be started, or fails.
+    It runs on `cpus`, or on the caller's if none of them can be used. OSError if its process cannot start, or fails.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         try:

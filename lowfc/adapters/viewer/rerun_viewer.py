@@ -167,10 +167,10 @@ class RerunViewer:
         self._stderr.close()
 
     def screenshot(self, path: Path | None = None, timeout_s: float = 20.0) -> bytes:
-        """PNG of the whole viewer once it has loaded and its image is constant, or after the timeout of either.
+        """PNG of the whole viewer once it has loaded and its image is constant; a changing image after another timeout.
 
         Raises:
-            ViewerError: the viewer does not answer, or has loaded nothing.
+            ViewerError: the viewer does not answer, or has not loaded everything within the timeout.
             DataFileError: the file cannot be written.
         """
         deadline_s = time.monotonic() + timeout_s

@@ -265,7 +265,7 @@ class Controller:
     def _carry_out(
         self, request: Request, lock: AbstractContextManager[object] | None = None
     ) -> tuple[Reply, State, int]:
-        """Carry out a request; its reply, the state after it, and its input number (0 for `configuration`)."""
+        """Carry out a request; return its reply, the state after it, and its input number (0 for `configuration`)."""
         if request.name == CONFIGURATION:
             return Reply(True, self._configuration, self._state.frame_sequence + 1), self._state, 0
         self._arrays.publish(request)

@@ -29,7 +29,7 @@ MIN_FLAT_SHARE = 0.5
 
 
 def check_files(config: Configuration) -> None:
-    """Open every file that a configuration names, and check its gains; ConfigurationError has one line per fault."""
+    """Open the files of [sensor], [mirror] and [control], and check the gains; ConfigurationError: a line per fault."""
     checks: tuple[Callable[[Configuration], object], ...] = (
         lambda config: factory.sensor(config, lambda _: None),
         active_actuators,

@@ -12,7 +12,6 @@ from lowfc.adapters.process.join import clock_of
 from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.realtime import set_up_below_loop
 from lowfc.contract.codecs import input_file
-from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.events import Level
@@ -34,7 +33,7 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
     """
     log, realtime = config.recorder, config.realtime
     limits, selection = log_limits(config), configured_selection(config)
-    if short := shortage(user_path(log.folder), limits.min_free_bytes):
+    if short := shortage(input_file.user_path(log.folder), limits.min_free_bytes):
         raise DataFileError(short)
 
     def announced_bytes_per_s(camera: wire.CameraState | None) -> float:
@@ -55,7 +54,7 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
             bus,
             clock,
             run.run_id,
-            user_path(log.folder),
+            input_file.user_path(log.folder),
             metadata={"lowfc": origin},
             attachments=attachments,
             limits=limits,

@@ -1,4 +1,4 @@
-"""The recorder: writes every message of a run into one log and counts those that it did not receive.
+"""The recorder: writes the messages of a run into logs and counts those that it did not receive.
 
 The bus's threads only append to a bounded queue, which the recorder's own loop empties: a slow disk costs messages,
 which are counted, but never delays the control loop. A disk error ends the recording and nothing else.

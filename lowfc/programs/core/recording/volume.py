@@ -3,6 +3,7 @@
 import shutil
 from pathlib import Path
 
+from lowfc.adapters.files.sensors import PUPIL_IMAGE_PIXELS
 from lowfc.adapters.logs.selection import Selection, selection
 from lowfc.adapters.logs.series import existing
 from lowfc.contract.codecs.input_file import user_path
@@ -18,19 +19,19 @@ _COMPRESSED_FRACTION = {FRAME: 0.6, COMMAND: 0.9, MIRROR_STATE: 0.55}
 
 
 def payload_bytes(config: Configuration, camera: wire.CameraState | None = None) -> dict[Topic, int]:
-    """Array bytes in one message of each large topic, from the sizes of camera and mirror.
+    """Bytes of the large arrays in one message of each large topic, from the sizes of camera and mirror.
 
     Without the camera's state, frames are those of the simulated camera.
     """
-    pixels = _frame_pixels(camera) or Sensor.pixels**2
+    rows, columns, _ = _frame_size(config, camera)
     actuators, modes = config.mirror.rows * config.mirror.columns, config.sensor.modes
     return {
-        FRAME: pixels * _COUNT_BYTES,
+        FRAME: rows * columns * _COUNT_BYTES,
         COMMAND: actuators * _FLOAT_BYTES,
         MIRROR_STATE: actuators * _FLOAT_BYTES,
         SURFACE: _SURFACE_SIDE**2 * _FLOAT_BYTES,
         STEP: 3 * modes * _FLOAT_BYTES,
-        TRUTH: 2 * modes * _FLOAT_BYTES,
+        TRUTH: (5 if config.camera.instants > 1 else 2) * modes * _FLOAT_BYTES,
     }
 
 
@@ -52,9 +53,8 @@ def estimate(config: Configuration, camera: wire.CameraState | None = None) -> s
     recorded = configured_selection(config)
     min_free_bytes = config.recorder.min_free_mb * 1e6
     growth = growth_in_words(bytes_per_s(config, recorded, camera), user_path(config.recorder.folder), min_free_bytes)
-    size = f"{Sensor.pixels} x {Sensor.pixels} pixels, the simulated camera's"
-    if camera is not None and _frame_pixels(camera):
-        size = f"{camera.rows} x {camera.columns} pixels"
+    rows, columns, whose = _frame_size(config, camera)
+    size = f"{rows} x {columns} pixels{whose}"
     return f"recording into {config.recorder.folder}: {growth}, at {config.camera.rate_hz:g} Hz and {size}" + (
         f" ({recorded.description})" if recorded.description else ""
     )
@@ -67,9 +67,12 @@ def growth_in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: flo
     return f"about {_size(growth_bytes_per_s * 3600)} an hour; {_size(free_bytes)} free, enough for {lasts_h:.1f} h"
 
 
-def _frame_pixels(camera: wire.CameraState | None) -> int:
-    """Pixels of a frame; 0 if not known."""
-    return camera.rows * camera.columns if camera is not None else 0
+def _frame_size(config: Configuration, camera: wire.CameraState | None) -> tuple[int, int, str]:
+    """Rows and columns of a frame, and whose they are in words: if not known, those of the simulated camera."""
+    if camera is not None and camera.rows and camera.columns:
+        return camera.rows, camera.columns, ""
+    side = PUPIL_IMAGE_PIXELS if config.sensor.kind == "zwfs" else Sensor.pixels
+    return side, side, ", the simulated camera's"
 
 
 def _rate_hz(topic: Topic, config: Configuration, recorded: Selection) -> float:
