@@ -30,8 +30,8 @@ ADVICE: dict[str, Advice] = {
     ),
     "KERNEL": Advice("`realtime.kernel` selects this implementation of the control step.", _NOTHING),
     "KERNEL_MISSING": Advice(
-        "`realtime.kernel` selects the fused step, but numba is not installed.",
-        "install the extra `fast`; without it the results are the same, but each frame takes longer.",
+        "`realtime.kernel` selects the fused step, but numba is missing or cannot be used here.",
+        "do what the event says; until then the results are the same, but each frame takes longer.",
     ),
     "CALIBRATION_LOADED": Advice("a calibration is in use, at the start or after `load`.", _NOTHING),
     "NOT_CALIBRATED": Advice(

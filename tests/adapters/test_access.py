@@ -261,9 +261,8 @@ def test_there_is_no_wait_for_an_unreachable_router_or_after_a_repeated_refusal(
 
 
 def test_a_roles_certificate_is_not_accepted_as_the_routers(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "lowfc.adapters.bus.zenoh_bus.require_certificate", lambda *_: None
-    )  # as in somebody else's router
+    # As in a router of another program, which does not check its own certificate.
+    monkeypatch.setattr("lowfc.adapters.bus.zenoh_bus.require_certificate", lambda *_: None)
     folder = hosts.folder / "false"
     folder.mkdir()
     for name, source in (("ca.pem", "ca.pem"), ("router.pem", "camera.pem"), ("router.key", "camera.key")):

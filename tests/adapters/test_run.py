@@ -126,9 +126,8 @@ def test_an_invalid_runtime_directory_is_an_error(own_runtime: Path, monkeypatch
     with pytest.raises(DataFileError, match="XDG_RUNTIME_DIR"):
         runtime_base()
     monkeypatch.delenv("XDG_RUNTIME_DIR")
-    monkeypatch.setattr(
-        os, "geteuid", lambda: 4_000_000_000
-    )  # an unused user id: the created directory belongs to another user
+    # An unused user id: the created directory belongs to another user.
+    monkeypatch.setattr(os, "geteuid", lambda: 4_000_000_000)
     shared = Path("/tmp/lowfc-4000000000")  # noqa: S108  # the path under test
     try:
         with pytest.raises(DataFileError, match="of user 4000000000"):

@@ -128,9 +128,8 @@ def test_processes_are_connected_when_each_has_received_the_others_health(hub: M
     assert camera.wait_for(["controller", "mirror-dm"], 0.0) == ("controller", "mirror-dm")
     camera.state = controller.state = "ready"  # controller received camera's Health before publishing its own
     assert camera.wait_for(["controller"], 0.0) == ()
-    assert controller.wait_for(["camera"], 0.0) == (
-        "camera",
-    )  # camera's Health was published before it received controller's
+    # The camera's Health was published before it received the controller's.
+    assert controller.wait_for(["camera"], 0.0) == ("camera",)
     camera.beat()
     assert controller.wait_for(["camera"], 0.0) == ()
     mirror = service(hub, clock, "mirror-dm")

@@ -288,7 +288,7 @@ def test_a_harmful_loop_opens_if_configured() -> None:
 
 
 def harmful() -> ModalBench:
-    """A closed loop that increases the residual; three windows end after 1150 frames."""
+    """A closed loop that increases the residual; three windows end after 1000 frames."""
     config = configuration(6.5, **FIXED_GAINS | {"control.on_harm": "integrator"})
     return ModalBench(config, factory.frame_noise_nm2(config, calibration(6.5, "sam")))
 

@@ -28,7 +28,7 @@ def png(figure: Any, dpi: int = 120) -> bytes:
 
 
 def lay_out(figure: Any, canvas: Any, dpi: float) -> None:
-    """Place everything on a figure for a canvas. Without this, `savefig` draws the figure twice."""
+    """Lay a figure out for a class of canvases; otherwise `savefig` draws the figure twice."""
     engine = figure.get_layout_engine()
     if engine is None:
         return

@@ -158,9 +158,8 @@ def settings(config: Configuration) -> Settings:
         auto_gain=(control.tilt_gain == "auto", control.gain == "auto"),
         leak=(control.tilt_leak, control.leak),
         limit_nm=(control.tilt_limit_nm, control.limit_nm),
-        max_identical_frames=control.max_identical_frames
-        if config.camera.noise
-        else 0,  # images without noise are identical
+        # Images without noise are identical.
+        max_identical_frames=control.max_identical_frames if config.camera.noise else 0,
         rate_hz=config.camera.rate_hz,
         guard=control.guard,
         interlocks=tuple(map(_interlock, config.interlocks)),

@@ -44,7 +44,7 @@ def primary_hdu(kind: str) -> fits.PrimaryHDU:
 
 
 def number(keyword: str, value: float, description: str) -> fits.Card:
-    """Make a card of a number that reads back unchanged; astropy shortens it to 20 characters."""
+    """Make a card of a number that reads back unchanged; astropy would shorten it to 20 characters."""
     card = fits.Card(keyword, value, description)
     if fits.Card.fromstring(str(card)).value == value:
         return card

@@ -13,7 +13,7 @@ _NM = ("nm", "nanometer", "nanometers")
 
 
 def read_shape(path: Path, units: tuple[str, ...] = _NM) -> Single:
-    """Read the shape of a mirror (rows, columns), nm of surface: the first image of a FITS file, or a .npy file.
+    """Read a mirror's shape (rows, columns), in the first of `units`: the first image of a FITS file, or a .npy file.
 
     Raises:
         DataFileError: the file is missing, damaged or holds something else.

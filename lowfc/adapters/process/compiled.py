@@ -21,15 +21,20 @@ SHARED_BYTES = 8 << 20
 
 
 def available() -> bool:
-    """Whether the fused step can be compiled on this host."""
+    """Whether numba, which compiles the fused step, is installed."""
     return importlib.util.find_spec("numba") is not None
 
 
 def missing() -> str:
     """Advice if the fused step cannot be compiled."""
-    if available():
-        return "this host forbids compiling at run time: allow memory that is writable and executable"
-    return f"the fused step needs numba: {install_advice('fast')}"
+    if not available():
+        return f"the fused step needs numba: {install_advice('fast')}"
+    try:
+        importlib.import_module("numba")
+    except ImportError as fault:  # it may be too old for numpy
+        advice = install_advice("fast").replace("install ", "install --upgrade ")
+        return f"numba cannot be imported ({fault}); upgrade it: {advice}"
+    return "this host forbids compiling at run time: allow memory that is writable and executable"
 
 
 @cache
@@ -43,7 +48,7 @@ def kernel(name: str, threads: int = 1) -> Kernel:
         return NUMPY
     try:
         measure, respond, measure_blocks = _compiled()
-    except PermissionError:  # of SELinux, or of a unit with MemoryDenyWriteExecute
+    except (ImportError, PermissionError):  # the second of SELinux, or of a unit with MemoryDenyWriteExecute
         return NUMPY
     return Kernel(FUSED, measure if threads == 1 else Pool(measure, measure_blocks, threads).measure, respond)
 

@@ -84,9 +84,8 @@ class Host:
     def stolen_share(self) -> float:
         """Fraction of all processor time since boot that the hypervisor gave to other guests."""
         times = psutil.cpu_times()
-        return float(
-            times.steal / (sum(times) - times.guest - times.guest_nice)
-        )  # guest time is included in user and nice
+        total_s = sum(times) - times.guest - times.guest_nice  # guest time is included in user and nice
+        return float(times.steal / total_s)
 
     def load(self) -> float:
         """Load average of one minute."""

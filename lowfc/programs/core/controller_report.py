@@ -1,4 +1,4 @@
-"""Reports of the controller besides its steps: stage durations, mean commands to offload, time not closed."""
+"""Reports of the controller besides its steps: durations, offload, the last second, arrays, time not closed."""
 
 import threading
 from collections import Counter
