@@ -7,6 +7,7 @@ import struct
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from mcap.data_stream import RecordBuilder
@@ -184,6 +185,17 @@ def test_a_channel_that_another_tool_added_without_a_schema_is_read_and_copied(t
         (message,) = (reader := LogReader(log))
         assert (message.key, message.payload, reader.schema_of(message)) == ("diagnostics", b"{}", "")
     assert survey(copied)["state"] == "complete"
+
+
+def test_a_log_is_recovered_on_a_file_system_without_permissions(
+    tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.truncate(source, source.stat().st_size - 1)
+    out, chmod = tmp_path / "recovered.mcap", Path.chmod
+    refused = Mock(side_effect=PermissionError(1, "Operation not permitted"))
+    monkeypatch.setattr(Path, "chmod", lambda path, mode: (refused if path == out else chmod)(path, mode))
+    assert recover(source, out).messages == len(SENT)
+    assert refused.called
 
 
 @pytest.mark.parametrize("compression", CompressionType)

@@ -14,7 +14,7 @@ from lowfc.adapters.bus.access import ROUTER, roles
 from lowfc.adapters.bus.run import open_run, runtime_base
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
-from lowfc.adapters.process.clock_offset import AT_ONCE, PERIOD_S, RECENT
+from lowfc.adapters.process.clock_offset import FIRST_EXCHANGES, PERIOD_S, RECENT
 from lowfc.contract.configuration import Network
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import Role
@@ -124,7 +124,7 @@ def test_the_numbers_of_the_document_are_those_of_the_code() -> None:
         f"Certificates are valid for {certificates.DAYS} days",
         f"A link that is silent for {routed.LEASE_MS / 1000:g} s is closed, and",
         "reconnection is tried at least every second",
-        f"{AT_ONCE} times before its first message and then {1 / PERIOD_S:g} times a second",
+        f"{FIRST_EXCHANGES} times before its first message and then {1 / PERIOD_S:g} times a second",
         f"the shortest round trip of the last {RECENT}:",
         f"shifted by {', '.join(shifts[:-1])} and {shifts[-1]}",
         f"with clocks {max(SHIFTS_NS.values()) / 1e9:g} s apart",

@@ -355,7 +355,7 @@ def test_a_watchdog_of_another_process_and_a_missing_manager_are_ignored(tmp_pat
         unsupervised.ready()
         unsupervised.alive(0)
         unsupervised.stopping()
-        unsupervised.tell(wire.Health())
+        unsupervised.send_status(wire.Health())
 
 
 def test_the_loop_does_not_wait_for_a_manager_that_does_not_read() -> None:

@@ -38,7 +38,7 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
     """Load a pupil (samples, samples), by default the shaped pupil, made for 1e-9 contrast in `DARK_ZONE`.
 
     Args:
-        samples: Samples across the diameter, a multiple of twice those of the quadrant; of 256 for the package's.
+        samples: Samples across the diameter, a multiple of twice the quadrant's samples (256 for the shaped pupil).
         file: An npz file whose array `quarter` is the quadrant x >= 0, y >= 0.
 
     Raises:
@@ -82,7 +82,7 @@ def load_dark_zone(file: Traversable) -> Wedge:
 def sensor_from(
     section: SensorSection | None = None, wavelength_nm: float = 550.0, warn: Callable[[str], None] = _log.warning
 ) -> Sensor:
-    """Build the optics described by [sensor], sampled as in Table 1 of the paper; but for a pupil image's pixels.
+    """Build the optics of [sensor], at the sampling of Table 1 of the paper; a Zernike sensor has 40 x 40 pixels.
 
     Args:
         section: Section of the configuration; all defaults when None.

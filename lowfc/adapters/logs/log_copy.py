@@ -115,4 +115,5 @@ def new_log(path: Path, source: Path) -> Iterator[IO[bytes]]:
         file.flush()
         os.fsync(file.fileno())
         refuse_existing(path)  # created by another process meanwhile
-    path.chmod(source.stat().st_mode & 0o666)
+    with contextlib.suppress(OSError):  # not every file system has permissions
+        path.chmod(source.stat().st_mode & 0o666)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 RECENT = 16
 """Number of compared exchanges: 8 s, in which two clocks drift apart by at most about 0.1 ms."""
-AT_ONCE = 8
+FIRST_EXCHANGES = 8
 """Number of exchanges before the first message is sent."""
 PERIOD_S = 0.5
 
@@ -60,7 +60,7 @@ class ClockAsker:
         self._ask = ask
         self._host_ns = host_ns
         self._ended = threading.Event()
-        for _ in range(AT_ONCE):
+        for _ in range(FIRST_EXCHANGES):
             if not self._exchange():
                 break
         self._thread = threading.Thread(target=self._run, name="clock-offset", daemon=True)

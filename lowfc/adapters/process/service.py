@@ -323,7 +323,7 @@ class Service:
         message = self.health()
         self._beaten_ns, self._worked = now_ns, self.work
         self._health.put(message.SerializeToString())
-        self._supervisor.tell(message)
+        self._supervisor.send_status(message)
 
     def _received_health(self, sample: Sample) -> None:
         name, health = self._names.health(sample.key, sample.payload)

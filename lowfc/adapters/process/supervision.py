@@ -45,7 +45,7 @@ class Supervisor:
             self._due_ns = now_ns + self.period_ns
             self._send("WATCHDOG=1")
 
-    def tell(self, health: wire.Health) -> None:
+    def send_status(self, health: wire.Health) -> None:
         """Send the process's status line for `systemctl status`."""
         if self._address:
             self._send(f"STATUS={status_line(health)}")

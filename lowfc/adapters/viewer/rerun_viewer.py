@@ -107,7 +107,7 @@ class RerunViewer:
         try:
             self._child.environment = _environment(show)
             self._child.command = [str(viewer_binary()), "--bind", HOST, "--port", str(self.port)]
-            self._child.command += _words(show, memory_limit, size_px, self._source_port)
+            self._child.command += _arguments(show, memory_limit, size_px, self._source_port)
             self._start()
             if self.web_port:
                 self._page = ViewerPage(HOST, self.web_port, self._source_port, self.port)
@@ -321,12 +321,12 @@ def viewer_binary() -> Path:
     return binary
 
 
-def _words(show: Show, memory_limit: str, size_px: tuple[int, int], source_port: int) -> list[str]:
+def _arguments(show: Show, memory_limit: str, size_px: tuple[int, int], source_port: int) -> list[str]:
     if show is Show.WEB:
         return ["--serve-web", "--web-viewer-port", str(source_port), "--server-memory-limit", memory_limit]
-    words = ["--memory-limit", memory_limit, "--server-memory-limit", "0B"]
-    words += ["--hide-welcome-screen", "--expect-data-soon"]
-    return [*words, "--headless", "--window-size", f"{size_px[0]}x{size_px[1]}"] if show is Show.HEADLESS else words
+    headless = ["--headless", "--window-size", f"{size_px[0]}x{size_px[1]}"] if show is Show.HEADLESS else []
+    limits = ["--memory-limit", memory_limit, "--server-memory-limit", "0B"]
+    return [*limits, "--hide-welcome-screen", "--expect-data-soon", *headless]
 
 
 def _environment(show: Show) -> dict[str, str]:
