@@ -84,7 +84,6 @@ def test_a_put_reaches_every_subscriber_of_its_key(pair: tuple[Bus, Bus]) -> Non
 def test_no_link_blocks_its_process_while_it_is_closed(run: Run, join: Join) -> None:
     buses = [join(run, role) for role in ("controller", "camera")]
     until(lambda: all(bus.peers() for bus in buses))
-
     until(lambda: not any(socket_options(socket.SOL_SOCKET, socket.SO_LINGER)))
 
 

@@ -187,9 +187,8 @@ def test_a_channel_that_another_tool_added_without_a_schema_is_read_and_copied(t
     assert survey(copied)["state"] == "complete"
 
 
-def test_a_log_is_recovered_on_a_file_system_without_permissions(
-    tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_is_recovered_without_permissions(tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file system such as FAT has none."""
     os.truncate(source, source.stat().st_size - 1)
     out, chmod = tmp_path / "recovered.mcap", Path.chmod
     refused = Mock(side_effect=PermissionError(1, "Operation not permitted"))

@@ -77,11 +77,7 @@ def test_every_topic_is_decodable_by_other_readers_without_lowfc(tmp_path: Path)
         summary = reader.get_summary()
     assert summary.statistics.message_count == len(messages)
     command = next(c for c in summary.channels.values() if c.topic == "/" + COMMAND.at("dm"))
-    assert command.metadata == {
-        "description": COMMAND.description,
-        "publisher": "controller",
-        "start_s": str(START_S),
-    }
+    assert command.metadata == {"description": COMMAND.description, "publisher": "controller", "start_s": str(START_S)}
     assert all(schema.encoding == "protobuf" and schema.data for schema in summary.schemas.values())
 
 
@@ -367,11 +363,7 @@ def test_a_log_is_never_overwritten(tmp_path: Path) -> None:
     for _ in range(3):
         paths.append(log_path(tmp_path, START_NS))
         written(paths[-1], [])
-    assert [path.name for path in paths] == [
-        "20260101T000000Z.mcap",
-        "20260101T000000Z-2.mcap",
-        "20260101T000000Z-3.mcap",
-    ]
+    assert [path.name for path in paths] == [f"20260101T000000Z{number}.mcap" for number in ("", "-2", "-3")]
     LogWriter(tmp_path / "b.mcap", START_NS, {}).abandon()
     for name in (paths[0].name, "b.mcap"):
         with pytest.raises(DataFileError, match="never overwritten"):

@@ -52,11 +52,8 @@ def test_health_is_published_when_due_with_all_fields(hub: MemoryHub, clock: Fak
     first, second = listener.messages(HEALTH)
     assert (first.state, first.rate_hz, second.rate_hz) == ("starting", 0.0, 10.0)
     assert (second.process, second.run_id, second.pid, second.version) == ("camera", "night", os.getpid(), __version__)
-    assert (second.commands_late, second.uptime_ns, second.realtime_granted) == (
-        3,
-        HEALTH_PERIOD_NS,
-        ["one BLAS thread"],
-    )
+    assert (second.commands_late, second.uptime_ns) == (3, HEALTH_PERIOD_NS)
+    assert second.realtime_granted == ["one BLAS thread"]
     assert from_timestamp(second.timestamp) == clock.now_ns()
     assert 1 << 20 < second.memory_bytes < 1 << 36
     assert {count.topic: count.published for count in second.topics} == {

@@ -174,7 +174,7 @@ def _interlock(section: InterlockSection) -> Interlock:
 def analytic_calibration(
     config: Configuration, optics: Twin, on_nodes: TwinMirror, opd_nm: Array | None = None
 ) -> Calibration:
-    """I0 and H from the camera's own operator, eqs. (6) to (12), R from them, and the mirror's modes.
+    """Calibration from the sensor's digital twin: I0 and H, eqs. (6) to (12), R from them, and the mirror's modes.
 
     The modes are fitted to the influence functions, then mixed slightly so that the sensor measures each modal command
     as itself: through the shaped pupil, the mirror's print-through looks like low orders, up to 0.3 % of a command.
@@ -293,12 +293,9 @@ def _check_exposure(config: Configuration, light: Array) -> None:
 
 def _nuisance(config: Configuration, light: Array, good: Array) -> Array | None:
     """Slopes (pixels, parameters) of the normalised image along the fitted nuisance parameters; None without one."""
-    columns = []
-    for name in config.control.nuisance:
-        if name == "background":
-            columns.append(np.ones((light.size, 1)))
-        else:
-            columns.append(shear_slopes(config))
+    columns = [
+        np.ones((light.size, 1)) if name == "background" else shear_slopes(config) for name in config.control.nuisance
+    ]
     return normalise_flux(light, np.hstack(columns), good)[1] if columns else None
 
 

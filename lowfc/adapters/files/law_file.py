@@ -33,13 +33,8 @@ def to_bytes(law: LinearLaw) -> bytes:
     header["NOLL"] = (" ".join(map(str, law.noll)), "Noll index of each mode")
     header.append(fits_file.number("DELAY", law.delay_frames, "[frames] delay it was made for"))
     header.append(fits_file.number("RATE", law.rate_hz, "[Hz] frame rate it was made for"))
-    return fits_file.to_bytes(
-        primary,
-        [
-            fits_file.extension(name, getattr(law, attribute), description)
-            for name, attribute, description in _EXTENSIONS
-        ],
-    )
+    extensions = [fits_file.extension(name, getattr(law, attribute), text) for name, attribute, text in _EXTENSIONS]
+    return fits_file.to_bytes(primary, extensions)
 
 
 def save(law: LinearLaw, path: Path) -> None:

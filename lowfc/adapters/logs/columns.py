@@ -1,4 +1,4 @@
-"""Messages of the loop as columns with one row per message, for reports, exports, tuning and views."""
+"""Messages of the loop as columns, for reports, exports, tuning and views."""
 
 from array import array
 from collections.abc import Iterable, Mapping

@@ -105,6 +105,7 @@ class History:
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
         command_publish_ns: publish time of every mirror command in the log.
         stepped_sequence: frame sequence of every step in the log, also of those that `steps` leaves out.
+        steps, truths: those with the number of modes of the last calibration.
         stages_ns: (timed steps,) durations of each of `STAGES`, for the frames of `timed_sequence`.
         excluded_messages: number of steps with another number of modes than the last calibration, and of messages with
             impossible values.

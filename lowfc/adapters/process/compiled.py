@@ -93,7 +93,7 @@ class Pool:
         self._measure_blocks(pixels, good, dark, tiles, scratch, first, last, sums_nm, totals)
         for _, done in self._turns:
             done.acquire()
-        return self._measure(pixels[:0], *scanned[1:], *rest)
+        return self._measure(pixels[:0], *scanned[1:], *rest)  # no pixels: it uses the sums computed above
 
     def _divide(self, block: int, blocks: int) -> None:
         """Divide the blocks among the threads, and allocate their arrays."""
