@@ -30,6 +30,7 @@ from lowfc.contract.messages import (
     CONTROLLER_STATE,
     EVENT,
     FRAME,
+    HEALTH,
     LAW,
     MIRROR_STATE,
     PLAY,
@@ -47,6 +48,7 @@ from lowfc.control import cache_warmup
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.state import State
 from lowfc.device import DriverOptions
 from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.device.mirror_loop import MirrorLoop
@@ -338,7 +340,7 @@ def test_oversized_requests_are_refused_before_decoding(rig: Rig) -> None:
 
 
 def test_states_refer_to_law_and_probe_sequence_by_identity(rig: Rig) -> None:
-    """Their arrays are published once, as separate messages, and can be queried."""
+    """Their arrays are separate messages, which can be queried."""
     rig.expose(1)
     settings = factory.settings(rig.config)
     noll = rig.calibration.noll
@@ -365,7 +367,7 @@ def test_states_refer_to_law_and_probe_sequence_by_identity(rig: Rig) -> None:
 
 
 def test_safe_mode_outlives_the_controller(calibration: Calibration, tmp_path: Path) -> None:
-    """The latch is a file of the run: only the request `clear` removes it."""
+    """The latch is a file."""
     file = tmp_path / "safe"
 
     def mode() -> LoopMode:
@@ -387,6 +389,18 @@ def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration:
     MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(small.SerializeToString())
     with pytest.raises(CalibrationError, match="20, 20"):
         controller.run()
+
+
+def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: Calibration, tmp_path: Path) -> None:
+    hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
+    mirror, shape = MemoryBus(hub, "mirror-dm", HostClock()), wire.MirrorState(rows=1, columns=1, actuators=bytes(4))
+    mirror.publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
+    assert controller._mirror.first() is not None
+    healths = mirror.publisher(HEALTH, "mirror-dm")
+    for _ in range(2):
+        healths.put(wire.Health(command_refused=99).SerializeToString())
+        fault = controller._mirror.fault(State(commanded=True))
+    assert fault == "refuses commands: 99"
 
 
 def test_a_warm_up_changes_no_state_publishes_nothing_and_loses_no_settings(

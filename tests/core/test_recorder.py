@@ -220,9 +220,7 @@ def test_duplicates_neither_count_as_losses_nor_hide_them() -> None:
     account.revert()
     for published, lost in ((7, 1), (8, 1), (9, 2)):
         reconcile(account, published, "stopped")
-        assert account.lost() == {FRAME.key: lost}, (
-            "frame 3 was not received; more than seven published are further losses"
-        )
+        assert account.lost() == {FRAME.key: lost}, "frame 3 was not received; above seven, more was published"
     assert account.recorded() == {FRAME.key: 7}
 
 

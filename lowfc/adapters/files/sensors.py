@@ -26,8 +26,7 @@ from lowfc.optics.chain.sensor import Sensor
 
 _DATA = resources.files("lowfc") / "data"
 _MAX_BYTES = 1 << 30
-PUPIL_IMAGE_PIXELS = 40
-"""Pixels across the image of a Zernike sensor."""
+PUPIL_IMAGE_PIXELS = 40  # across the image of a Zernike sensor
 _WITH_LYOT_STOP = ("circle", "prolate")
 _LYOT_OUTER = 12.0
 """Outer radius of the annular dark zone with a Lyot stop, lambda / D; the inner radius is the mask's edge."""

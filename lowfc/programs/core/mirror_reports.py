@@ -1,5 +1,6 @@
 """Liveness of the mirror from its Health: receiving its states would cost time in every frame."""
 
+import contextlib
 from collections import deque
 
 from google.protobuf.message import DecodeError
@@ -12,6 +13,7 @@ from lowfc.contract.codecs import codec
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import HEALTH, MIRROR_STATE, wire
 from lowfc.control.loop.inputs import MirrorShape
+from lowfc.control.loop.safety import REASONS
 from lowfc.control.loop.state import State
 
 CHECK_PERIOD_NS = 100_000_000
@@ -85,13 +87,11 @@ class MirrorReports:
             self._unsubscribe_states()
 
     def _received(self, sample: Sample) -> None:
-        try:
+        with contextlib.suppress(DecodeError):
             self._reports.append(wire.Health.FromString(sample.payload))
-        except DecodeError:
-            return
 
 
 def _fault_in(health: wire.Health) -> str:
-    if health.command_refused:
-        return f"refuses commands: {wire.Reason.Name(health.command_refused).removeprefix('REASON_')}"
+    if number := health.command_refused:  # a mirror of another version may have other reasons
+        return f"refuses commands: {next((reason.name for reason in REASONS if reason == number), number)}"
     return "gets no commands" if health.command_expired else ""

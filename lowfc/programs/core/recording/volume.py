@@ -54,10 +54,9 @@ def estimate(config: Configuration, camera: wire.CameraState | None = None) -> s
     min_free_bytes = config.recorder.min_free_mb * 1e6
     growth = growth_in_words(bytes_per_s(config, recorded, camera), user_path(config.recorder.folder), min_free_bytes)
     rows, columns, whose = _frame_size(config, camera)
-    size = f"{rows} x {columns} pixels{whose}"
-    return f"recording into {config.recorder.folder}: {growth}, at {config.camera.rate_hz:g} Hz and {size}" + (
-        f" ({recorded.description})" if recorded.description else ""
-    )
+    chosen = f" ({recorded.description})" if recorded.description else ""
+    size = f"{rows} x {columns} pixels{whose}{chosen}"
+    return f"recording into {config.recorder.folder}: {growth}, at {config.camera.rate_hz:g} Hz and {size}"
 
 
 def growth_in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: float) -> str:
