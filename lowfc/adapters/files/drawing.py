@@ -1,4 +1,4 @@
-"""Plots as PNG files; matplotlib is imported only when needed."""
+"""Plots with matplotlib, which is imported only when needed."""
 
 import io
 from typing import Any

@@ -43,7 +43,7 @@ def write_whole(path: Path, content: bytes, source: Path | None = None, mode: in
     """Write a temporary file, then rename it, so that no process ever reads a partial file; see `being_written`.
 
     Raises:
-        DataFileError: The file cannot be written.
+        DataFileError: The file cannot be written, or is a log.
     """
     with being_written(path, source, mode) as part:
         part.write_bytes(content)

@@ -20,7 +20,7 @@ _POLL_S = 0.001
 
 
 def sum_name(channel: str) -> str:
-    """Name of the sum that contains a channel; empty if its name is not CACAO's."""
+    """Name of the sum that contains a channel; empty if the channel's name is not CACAO's."""
     found = re.fullmatch(r"(dm\d\ddisp)\d\d", channel)
     return found[1] if found else ""
 

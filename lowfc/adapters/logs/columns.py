@@ -121,7 +121,7 @@ class Columns:
                 if type(value) is int or type(value) is float:
                     columns[name].append(value)
                 else:
-                    columns[name].extend(value)  # type: ignore[arg-type]  # the numbers are above
+                    columns[name].extend(value)  # type: ignore[arg-type]  # not a number here
         except OverflowError:
             self._truncate()
             raise

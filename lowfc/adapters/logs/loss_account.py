@@ -50,7 +50,7 @@ class _Tally:
 
     @property
     def confirmed(self) -> int:
-        """Number lost; for a camera that loses frames, lost also at the last call, as its Health follows the frames."""
+        """Number lost; if the camera loses frames, only those lost at the last call too, as its Health follows them."""
         return min(self.lost, self.unconfirmed) if self.never else self.lost
 
     @property
@@ -140,7 +140,7 @@ class LossAccount:
         return self._sum(lambda tally: tally.lost)
 
     def newly_lost(self) -> dict[str, int]:
-        """Number of messages lost since the last call, by key; one that arrives later is not subtracted again."""
+        """Messages lost since the last call, by key; one that arrives after its report offsets a later one."""
         found = self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():
             tally.reported = max(tally.reported, tally.confirmed)

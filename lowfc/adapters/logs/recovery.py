@@ -67,7 +67,7 @@ def recovered_path(source: Path) -> Path:
 def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None = None) -> Recovery:
     """Write the intact parts of `source` to `out`; nothing if `source` is intact.
 
-    Messages, channels, schemas, attachments and metadata are copied unchanged; a metadata record "recovery" is added.
+    Messages with their channels and schemas, attachments and metadata are copied; metadata "recovery" are added.
 
     Args:
         source: a log, finished or not.

@@ -147,7 +147,7 @@ class LogSeries:
         return shortage(self._folder, self._limits.min_free_bytes)
 
     def end(self, totals: Mapping[str, str], *, wait: bool = True) -> None:
-        """Finish the open file, with `totals` as its "recording" metadata; without `wait`, on the separate thread.
+        """Finish the file, with `totals` as its "recording" metadata; without `wait`, return before it is finished.
 
         Raises:
             DataFileError: the disk refuses; see `give_up`.

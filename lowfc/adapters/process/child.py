@@ -45,7 +45,7 @@ class Child:
         It ends with the thread that calls this method: for the kernel that thread is the parent.
 
         Raises:
-            OSError: the program does not exist.
+            OSError: the program does not exist, or a file cannot be written.
         """
         if shutil.which(self.command[0], path=(self.environment or os.environ).get("PATH")) is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self.command[0])

@@ -144,7 +144,10 @@ class Counters:
     """Reads the `Counts` of a thread; the files stay open, so that a reading takes about 20 us."""
 
     def __init__(self, process: int, thread: int, cpus: Collection[int]) -> None:
-        """Open the files of a thread; OSError if there is none. Stolen time is of a single one in `cpus`, or of all."""
+        """Open the files of a thread; OSError if there is none.
+
+        Stolen time is that of the processor in `cpus`, or of all processors if it does not hold exactly one.
+        """
         folder = f"/proc/{process}/task/{thread}"
         self._cpu = f"cpu{next(iter(cpus))} " if len(cpus) == 1 else "cpu "
         self._stat_bytes = _STAT.read_text().index(self._cpu) + _MOST

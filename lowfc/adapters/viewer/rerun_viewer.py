@@ -73,7 +73,7 @@ class Show(StrEnum):
 class RerunViewer:
     """One viewer, running from construction until stop() or the end of its `with` block.
 
-    A RecordingStream connects to its `url`, a browser to its `web_address`, which is None for another `show`.
+    A RecordingStream connects to its `url`, a browser to its `web_address`, which is None unless `show` is WEB.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ class RerunViewer:
         self._stderr.close()
 
     def screenshot(self, path: Path | None = None, timeout_s: float = 20.0) -> bytes:
-        """PNG of the whole viewer once it has loaded and its image is constant; a changing image after another timeout.
+        """PNG of the whole viewer once it has loaded and its image is constant, or has changed for `timeout_s`.
 
         Raises:
             ViewerError: the viewer does not answer, or has not loaded everything within the timeout.

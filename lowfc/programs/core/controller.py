@@ -70,10 +70,7 @@ class Controller:
     def __init__(
         self, config: Configuration, service: Service, calibration: Calibration | None, source: str, latch: Latch
     ) -> None:
-        """Join the bus and load the calibration, named `source` in events; without one, the loop is idle.
-
-        LowfcError if a file of the configuration cannot be used.
-        """
+        """Join the bus; load the calibration (None: idle), named `source` in events; LowfcError for an invalid file."""
         name = config.mirror.name
         self._service = service
         self._latch = latch

@@ -1,4 +1,4 @@
-"""Automatic gains: requests optimal gains from measurements, and reports if the closed loop does harm."""
+"""Automatic gains: requests optimal gains from measurements; reports a closed loop that does harm, and may open it."""
 
 from typing import NamedTuple
 
@@ -98,7 +98,7 @@ class GainWatch:
             return NOTHING
         self._newest = newest
         same_camera = newest >> COUNT_BITS == before >> COUNT_BITS
-        held = newest - before - 1 if same_camera and newest > before else 0  # lower after a clear
+        held = newest - before - 1 if same_camera and newest > before else 0  # it may be lower after a clear
         added = loop.command_channels
         playing = added is not None and added.play is not None
         if (
