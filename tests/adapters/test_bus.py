@@ -282,7 +282,7 @@ def test_a_monitor_receives_every_row_and_images_at_display_rate(run: Run, join:
     assert 5 < len(drained[FRAME]) - first[FRAME] < 125
 
 
-# A recorder that drains on request: prints the number of messages, of complete ones, and of the last one.
+# A recorder that drains on request: prints how many messages and complete ones it has, and the last one's number.
 READER = """
 import sys
 from lowfc.adapters.bus.run import open_run

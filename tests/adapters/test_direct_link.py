@@ -1,4 +1,4 @@
-"""The direct link in parallel with the bus: each message once and in order, despite restarts, stalls and large ones."""
+"""The direct link in parallel with the bus: each message once and in order, despite restarts and stalls."""
 
 import socket
 import threading
@@ -115,7 +115,7 @@ def test_switching_to_the_direct_link_loses_and_repeats_nothing(ends: Ends) -> N
 
 
 class ReaderOnTwoPaths:
-    """A reader whose messages the test brings by socket and bus, and what it forwarded."""
+    """A reader to which the test passes messages by socket and bus, and the sequences that it delivered."""
 
     def __init__(self, path: Path) -> None:
         self.got: list[int] = []

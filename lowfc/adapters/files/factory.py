@@ -1,6 +1,6 @@
 """Factory of the instrument's parts from the configuration: optics, star, detector, mirror, calibration.
 
-The processes and commands all use it, so that they interpret the keys in the same way.
+Processes and commands use it, so that all of them interpret the keys in the same way.
 """
 
 from collections.abc import Callable

@@ -16,7 +16,7 @@ from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import REASONS, LoopMode, Reason
 
 STAGES = ("transport", "wakeup", "compute", "publish", "frame_to_command")
-"""Durations of the controller, as in ControlTiming."""
+"""Stages of the controller, whose durations are in ControlTiming."""
 
 _KINDS = {"sequence": "Q", "time_ns": "q", "mode": "B", "reasons": "q", "saturated_pixels": "q", "instants": "q"}
 _BITS = 63  # of an integer column, without the sign
@@ -34,7 +34,7 @@ class Steps:
         error_nm: measured modal error, nm rms of wavefront; NaN if the frame was refused.
         pol_nm: pseudo-open-loop modes, nm rms of wavefront; NaN if the frame was refused.
         command_nm: modal command after the step, nm rms of wavefront.
-        flux_dn: sum of the good pixels, DN.
+        flux_dn: sum of the good pixels, dark subtracted, DN.
         saturated_pixels: number of saturated pixels.
     """
 

@@ -1,4 +1,4 @@
-"""Time: nanoseconds since the epoch, without steps, the same for all processes of a host.
+"""Time: nanoseconds since the epoch, without steps, the same for all processes of a user on a host.
 
 The host's clock is CLOCK_MONOTONIC plus an offset that the first process after a boot fixes and stores in the user's
 runtime directory, in a file named after the boot. In lockstep the time of messages is simulated; envelopes keep the

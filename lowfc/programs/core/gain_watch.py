@@ -1,4 +1,4 @@
-"""Automatic gains: requests optimal gains from measurements; reports a closed loop that does harm, and may open it."""
+"""Automatic gains: requests optimal gains from measurements, and reports and reacts to a closed loop that does harm."""
 
 from typing import NamedTuple
 

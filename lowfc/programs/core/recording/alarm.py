@@ -1,7 +1,7 @@
 """Runs the command of `recorder.on_event` when an event of its level or above occurs.
 
-The recorder runs it, because each run has one, it receives every event, and it is not in the loop; a console may be
-closed, or open twice. A thread in the normal scheduling class starts the command, which inherits that class. Events
+The recorder runs it, because a run has at most one, which receives every event and is not in the loop; a console may
+be closed, or open twice. A thread in the normal scheduling class starts the command, which inherits that class. Events
 during the command, and for `recorder.on_event_every_s` after it, wait; then it is run once, for the worst of them.
 """
 
