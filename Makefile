@@ -1,4 +1,4 @@
-# One command runs the loop, one passes the tests: `make sim-loop`, `make test`. `make help` lists the rest.
+# `make sim-loop` runs the simulated loop, `make test` the tests; `make help` lists all targets.
 PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
 VENV := .venv

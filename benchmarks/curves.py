@@ -113,7 +113,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, default=RATE_HZ, help="frames per second of the loop (%(default)g)")
     parser.add_argument("--loop", action=argparse.BooleanOptionalAction, default=True, help="measure the loop too")
     for name, (sizes, _, what) in AXES.items():
-        known = f"{what}; none: no such curve (default: {' '.join(map(str, sizes))})"
+        known = f"{what}; without a number, this curve is left out (default: {' '.join(map(str, sizes))})"
         parser.add_argument(f"--{name}", type=int, nargs="*", default=sizes, metavar="N", help=known)
 
 

@@ -28,7 +28,7 @@ LOOP = {"camera", "controller", "mirror"}
 
 _EVERY_S = 0.2
 _PART = 0.8
-_START_S, _SLOWEST = 60.0, 12.0
+_START_S, _TIMEOUT_RATIO = 60.0, 12.0
 
 
 class Used(NamedTuple):
@@ -52,11 +52,11 @@ def watched() -> Iterator[list[Moment]]:
     moments: list[Moment] = []
     ended = threading.Event()
 
-    def look() -> None:
+    def sample() -> None:
         while not ended.wait(_EVERY_S):
             moments.append(_moment())
 
-    thread = threading.Thread(target=look, daemon=True)
+    thread = threading.Thread(target=sample, daemon=True)
     thread.start()
     try:
         yield moments
@@ -79,7 +79,7 @@ def _moment() -> Moment:
 def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
     """Use by each role over the last four fifths of `seconds` of frames, before the processes ended.
 
-    share is of one processor, all threads; empty if fewer than two samples fall into that time.
+    `share`: processor time of all threads, as a fraction of one processor. Empty with fewer than two such samples.
     """
     complete = [moment for moment in moments if moment.roles.keys() >= LOOP][:-1]
     inside = [moment for moment in complete if moment.at_s >= complete[-1].at_s - _PART * seconds]
@@ -106,7 +106,7 @@ def role_of(words: Sequence[str]) -> str | None:
 def run_lowfc(words: Sequence[str], seconds: float) -> dict[str, Any]:
     """JSON of `lowfc` with these arguments, and usage (`shares`); or failure: its last stderr line, or the timeout."""
     command = [sys.executable, "-P", "-m", "lowfc", *words, "--duration", f"{seconds:g}", "--json"]
-    timeout_s = _START_S + _SLOWEST * seconds
+    timeout_s = _START_S + _TIMEOUT_RATIO * seconds
     with tempfile.TemporaryDirectory() as folder, watched() as moments:
         where: dict[str, Any] = {"cwd": folder, "env": os.environ | {"XDG_RUNTIME_DIR": folder}}
         try:

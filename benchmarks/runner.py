@@ -71,7 +71,7 @@ def add_times(parser: argparse.ArgumentParser, seconds: float, repeats: int | No
 
 
 def us(value: float) -> str:
-    """Microseconds, three digits or more."""
+    """Microseconds as text; one decimal below 100."""
     return f"{value:.{1 if value < 100 else 0}f}"
 
 

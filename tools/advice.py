@@ -181,7 +181,7 @@ ADVICE: dict[str, Advice] = {
         "give the recorder its own processor or a faster disk; `replay` names the steps that it cannot check.",
     ),
     "RECORDING_FAILED": Advice(
-        "the disk is full, a write failed, or the folder is gone. The log up to then is complete.",
+        "the disk is nearly full, a write failed, or the folder is gone. The log up to then is readable, if it exists.",
         "free some space, then `lowfc ctl record start`; the loop continues without a log.",
     ),
     "DISK_SLOW": Advice("one write took long; messages waited in memory.", "use a faster or less busy disk."),

@@ -64,8 +64,8 @@ DEFINITIONS = {
     "clock": "CLOCK_MONOTONIC, one host",
     "pacing": "the source sleeps until absolute times; a late frame is sent at once, and its t0 is the actual time of "
     "sending; no frame is skipped",
-    "cells": "t1 - t0 (p50 to max) or the time to the mirror, us, median (lowest to highest) over the turns; in every "
-    "turn each implementation runs once, and every other turn in the opposite order",
+    "cells": "t1 - t0 (p50 to max) or the time to the mirror, us, median (lowest to highest) over the turns; each turn "
+    "runs every implementation once, every other turn in the opposite order",
     "without a command": "measured frames that led to no command, in all turns",
     "pinning": "source and mirror on the first processor, all else on the second; with three or more processors "
     "lowfc's mirror on the third",

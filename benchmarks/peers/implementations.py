@@ -24,7 +24,7 @@ _LIMIT_ONLY = "limit of each mode"
 
 
 class ComparisonError(Exception):
-    """An implementation did not start or did not end."""
+    """An implementation did not start, did not end or sent no command."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Implementation:
 
 def _pyrtcao(name: str, description: str, safety: str, *roles: str) -> Implementation:
     log = "its streams keep the newest frame; its telemetry recorder reads them"
-    return Implementation(f"pyrtcao, {name}", description, log, safety, "no; commanded from elsewhere", roles, PYRTCAO)
+    return Implementation(f"pyrtcao, {name}", description, log, safety, "no; can be commanded remotely", roles, PYRTCAO)
 
 
 def _lowfc(kernel: str) -> Implementation:
@@ -74,7 +74,7 @@ IMPLEMENTATIONS = (
     ),
     Implementation(
         "zenoh",
-        "zenoh with default settings, in sessions set up as lowfc's; the step in numpy, in the subscriber's callback",
+        "zenoh, with sessions and publishers set up as lowfc's; the step in numpy, in the subscriber's callback",
         "any process may subscribe",
         _LIMIT_ONLY,
         "yes",

@@ -201,9 +201,12 @@ def test_a_note_announces_the_probe_sequences_of_a_test_in_a_log() -> None:
         recorded("play", "offset"),
         recorded("note", 'acceptance {"test": "rejection", "period_frames": 10, "frames": 12}'),
         recorded("play", "mirror", accepted=False),
+        recorded("play", "mirror"),
+        recorded("note", 'acceptance {"test": "rejection", "period_frames": 10, "frames": 12}'),
         recorded("play", "offset"),
-        recorded("play", "offset"),
+        recorded("play", "mirror"),
         recorded("note", 'acceptance {"test": "noise-floor", "loop": "open", "frames": 9}'),
+        recorded("play", "mirror"),
     ]
     assert [(settings, request.text) for settings, request in _announced(requests, "rejection")] == [
         ({"period_frames": 10, "frames": 12}, "offset")

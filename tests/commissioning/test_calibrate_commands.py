@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -456,6 +457,13 @@ def test_a_mirror_shape_for_at_equals_the_wavefront_it_makes(
     assert np.abs(there.actuators_to_modes @ there.modes_to_actuators - identity).max() < 1e-4
     changed = there.response - flat.response
     assert np.linalg.norm(shaped.response - there.response) < 0.1 * np.linalg.norm(changed)
+
+
+def test_the_noise_of_a_mode_is_compared_with_its_own_limit(config: Configuration) -> None:
+    control = config.control.model_copy(update={"tilt_limit_nm": 1e-3, "limit_nm": 1e3})
+    printed = StringIO()
+    analytic(config.model_copy(update={"control": control}), Console(file=printed))
+    assert "more than its modal limit of 0.001 nm" in printed.getvalue()
 
 
 def test_a_loop_with_such_a_calibration_converges_to_that_wavefront() -> None:

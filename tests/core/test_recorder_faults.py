@@ -167,7 +167,7 @@ def test_messages_lost_while_the_disk_stalls_are_counted(bench: Bench, monkeypat
 
 
 def slow_disk(monkeypatch: pytest.MonkeyPatch, *, refuses: bool) -> tuple[threading.Event, threading.Event]:
-    """Block the flush of a log: events that report that it was reached, and that release it."""
+    """Block the flush of a log; return the events that report that it began, and that release it."""
     reached, release, sync = threading.Event(), threading.Event(), os.fsync
 
     def slow(descriptor: int) -> None:
@@ -244,7 +244,7 @@ def test_a_stop_requested_while_the_recorder_ends_is_answered_with_the_complete_
         if not recorder.service.running and queries:
             recorder._queries.append(queries.pop())
 
-    monkeypatch.setattr(recorder, "_drain", lambda: None)  # the request arrives after it
+    monkeypatch.setattr(recorder, "_drain", lambda: None)  # the request arrives after the last drain
     monkeypatch.setattr(recorder, "_report_losses", report_and_ask)
     _, release = slow_disk(monkeypatch, refuses=False)
     threading.Timer(0.2, release.set).start()
@@ -300,24 +300,24 @@ def test_each_log_of_a_run_can_be_read_alone(bench: Bench) -> None:
         assert (second in bodies_of(messages, CALIBRATION)) == (number > 0)
 
 
-def waiting(topic: Topic, size: int) -> tuple[Topic, Sample]:
+def message(topic: Topic, size: int) -> tuple[Topic, Sample]:
     return topic, Sample(topic.key, bytes(size), 0, 0, 0)
 
 
 def test_the_backlog_is_bounded_by_number_and_size() -> None:
     backlog = Backlog(max_messages=3, max_bytes=1000)
     for size in (400, 400, 400, 200, 0):
-        backlog.put(*waiting(FRAME, size))
+        backlog.put(*message(FRAME, size))
     assert [len(backlog.take()[1].payload) for _ in range(len(backlog))] == [400, 400, 200]
     for _ in range(9):
-        backlog.put(*waiting(STEP, 1))
+        backlog.put(*message(STEP, 1))
     assert len(backlog) == 3
     for topic in (HEALTH, EVENT):  # never dropped: rare, and needed to account for the others
-        backlog.put(*waiting(topic, 5000))
+        backlog.put(*message(topic, 5000))
     assert len(backlog) == 5
     for _ in range(5):
         backlog.take()
-    backlog.put(*waiting(FRAME, 1000))
+    backlog.put(*message(FRAME, 1000))
     assert len(backlog) == 1
 
 

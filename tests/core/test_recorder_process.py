@@ -92,7 +92,7 @@ def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
 
 
 @pytest.mark.parametrize("signals", [(signal.SIGHUP,), (signal.SIGINT, signal.SIGTERM), (signal.SIGKILL,)])
-def test_the_log_is_complete_after_any_signal(bench: Bench, signals: tuple[signal.Signals, ...]) -> None:
+def test_the_log_has_every_message_after_any_signal(bench: Bench, signals: tuple[signal.Signals, ...]) -> None:
     bench.put_many(50)
     killed = signal.SIGKILL in signals
     if killed:

@@ -1,4 +1,4 @@
-"""`lowfc gateway epics`: a real IOC drives an interlock, and a scan changes a gain and reads the residual."""
+"""`lowfc gateway epics`: its variables, and a real IOC and a scan that drive an interlock and a gain."""
 
 import json
 import os
@@ -84,7 +84,7 @@ max_age_s = 2.0
 
 
 class Text(str):
-    """A text as p4p has it."""
+    """Like a string of p4p: `str()` puts a time before it."""
 
     def __str__(self) -> str:
         return f"Thu Jan  1 00:00:00 1970 {self!r}"
@@ -123,7 +123,7 @@ def test_missing_p4p_is_reported_with_install_advice(monkeypatch: pytest.MonkeyP
 
 
 class DeafBus(MemoryBus):
-    """A bus whose queries time out at first."""
+    """A bus whose queries time out while it is deaf."""
 
     deaf = True
 

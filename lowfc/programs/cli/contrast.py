@@ -49,7 +49,7 @@ def contrast_cases(added: Mapping[str, float]) -> dict[str, float | None]:
 def contrast_in_words(
     added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = ()
 ) -> str:
-    """The added contrast of each case, and the modes that contribute most to the last one."""
+    """The added contrast of each case, and the modes that contribute most to the last case."""
     cases = ", ".join(f"{name} {value:+.1e}" for name, value in added.items() if value is not None)
     largest = "" if most is None else f"; {most[0]} contributes most ({100 * most[1]:.0f} %)"
     caveat = f"; full images differ from the quadratic form by more than 10 %: {', '.join(beyond)}" if beyond else ""

@@ -6,6 +6,7 @@ import re
 import sys
 import tempfile
 import time
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -94,8 +95,6 @@ def router(
 
     Example: lowfc router --config lowfc.toml --run bench
     """
-    from contextlib import closing
-
     from lowfc.adapters.bus.access import ROUTER
     from lowfc.adapters.bus.run import open_run
     from lowfc.adapters.bus.zenoh_session import session_config
@@ -126,17 +125,11 @@ def router(
         service.finish()
 
 
-def hosts(
-    config: ConfigFile = None,
-    run: AnyRun = None,
-    as_json: Json = False,
-) -> None:
+def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) -> None:
     """List the processes of a run, and the clock offsets of their hosts from the router.
 
     Example: lowfc hosts --config lowfc.toml --run bench
     """
-    from contextlib import ExitStack
-
     from lowfc.adapters.bus.routed import ending_certificates
     from lowfc.adapters.bus.run import open_run, run_path
     from lowfc.adapters.bus.zenoh_bus import ZenohBus

@@ -26,7 +26,7 @@ class Commands(Mapping[str, Any]):
     """Commands by name; a command is imported when it is looked up."""
 
     def __init__(self, rows: Sequence[Row], parts: Sequence[Row]) -> None:
-        """Take the rows of the commands, and the rows of the commands in groups."""
+        """`rows` are the commands and groups; `parts` are the commands of the groups, named "GROUP COMMAND"."""
         self._rows, self._parts = {row.name: row for row in rows}, parts
 
     def __getitem__(self, name: str) -> Any:

@@ -132,7 +132,7 @@ def record(
     settings = configuration(run_config if config is None and run_config.exists() else config, overrides)
     joined = open_run(run, (settings.mirror.name,), network=settings.network)
     if config is not None and Role.LAUNCHER not in joined.links.ports:
-        write_whole(run_config, load(config).to_toml().encode())  # for the others, without this recording's options
+        write_whole(run_config, load(config).to_toml().encode())  # for other processes: without this call's options
     if not joined.links.network.router and (waiting := waiting_message(run)):
         typer.echo(f"recorder: {waiting}", err=True)
     summary = run_recorder(joined, settings, calibration)

@@ -34,12 +34,12 @@ def analytic(config: Configuration, console: Console, at: WavefrontFunction | No
         optics = factory.twin(config, lambda done, total: count("building the optical model", done, total), warn)
     on_nodes = factory.mirror_on_twin(config, optics, lambda _: None)
     calibration = factory.analytic_calibration(config, optics, on_nodes, None if at is None else at(optics, on_nodes))
-    noise = factory.frame_noise_nm(config, calibration)
-    worst = int(np.argmax(noise))
-    if noise[worst] > config.control.limit_nm:
+    noise_nm = factory.frame_noise_nm(config, calibration)
+    limit_nm = factory.settings(config).integrator(calibration.noll).limit_nm
+    worst = int(np.argmax(noise_nm - limit_nm))
+    if noise_nm[worst] > limit_nm[worst]:
         warn(
-            f"Z{calibration.noll[worst]}: measurement noise is {noise[worst]:.0f} nm rms per frame, more than its "
-            f"modal limit of {config.control.limit_nm:g} nm: "
-            "the star is too faint, or the mask cannot distinguish so many modes"
+            f"Z{calibration.noll[worst]}: noise is {noise_nm[worst]:.0f} nm rms per frame, more than its modal "
+            f"limit of {limit_nm[worst]:g} nm: the star is too faint, or the mask cannot distinguish so many modes"
         )
     return calibration

@@ -28,7 +28,7 @@ _SPARE_FRAMES = 2  # skipped in addition to the delay, while the mirror settles
 
 
 class Level(Result):
-    """Gain of a mode and its largest cross-talk at one amplitude."""
+    """Gain of a mode and its largest cross-talk at one amplitude; `within` is None if too noisy to judge."""
 
     amplitude_nm: float = result_field()
     gain: float = result_field()
@@ -65,7 +65,7 @@ class LinearityResult(AcceptanceResult):
 
     def remarks(self) -> Sequence[str]:
         """Explain the marks; the verdict."""
-        key = f"amplitude, nm: gain - 1 (largest cross-talk); tolerance: plus {SURE:g} standard errors"
+        key = f"amplitude, nm: gain - 1 (largest cross-talk); !: beyond the requirement by {SURE:g} standard errors"
         unsure = any(row.within is None for mode in self.modes for row in mode.levels)
         noisy = ["?: too noisy to judge; use more cycles or longer levels"] if unsure else []
         return [key, *noisy, *super().remarks()]

@@ -107,7 +107,7 @@ class ProbeResponse:
 
     Attributes:
         what: parameters from the announcing note.
-        target: channel that the probe was added to; empty without a probe.
+        target: `mirror` or `offset`, which the probe was added to; empty without a probe.
         table: probe amplitudes (frames, columns); (frames, 0) without a probe.
         basis: probe shapes (columns, actuators), nm of surface.
         error_nm: modal error (frames, modes), NaN where a frame is missing or was refused; pol_nm likewise.
@@ -208,31 +208,25 @@ def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[
     found: list[tuple[dict[str, Any], wire.Request]] = []
     what: dict[str, Any] | None = None
     for request in requests:
-        if not request.accepted:
-            continue
-        if request.name == "note" and request.text.startswith(ANNOUNCEMENT):
+        if request.name == "note" and request.accepted and request.text.startswith(ANNOUNCEMENT):
             try:
                 what = json.loads(request.text.removeprefix(ANNOUNCEMENT))
             except (ValueError, RecursionError):
                 what = None  # another note that starts with the same word
             if not isinstance(what, dict) or what.pop("test", None) != kind or not isinstance(what.get("frames"), int):
                 what = None
-            elif kind == "noise-floor":
+            elif kind == "noise-floor":  # it has no probe sequence
                 found.append((what, request))
+                what = None
         elif request.name == "play" and what is not None:
-            found.append((what, request))
+            if request.accepted:
+                found.append((what, request))
             what = None
     return found
 
 
 def probe_response(
-    what: dict[str, Any],
-    loop: Loop,
-    target: str,
-    table: Single,
-    basis: Single,
-    first: int,
-    steps: Steps,
+    what: dict[str, Any], loop: Loop, target: str, table: Single, basis: Single, first: int, steps: Steps
 ) -> ProbeResponse:
     """The steps of a probe sequence from frame `first` on, one row per frame; the rate is measured from these steps."""
     frames = len(table)

@@ -83,7 +83,7 @@ def on_sensor(
 ) -> Calibration:
     """The computed calibration on the pixels of a real sensor, with the dark and mask of the calibration in use.
 
-    `flux_dn` is the sum of the good pixels without the dark, DN.
+    `flux_dn` is the sum of the good pixels without the dark, DN. CalibrationError if they see too little of the image.
     """
     own, pixels = (*computed.shape, -1), before.good.size
     I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, before.shape).reshape(-1)

@@ -19,7 +19,7 @@ Out = Annotated[Path, typer.Option("--out", help="Output file (FITS).")]
 Load = Annotated[bool, typer.Option("--load", help="Load the result into the loop, which must be open.")]
 Snr = Annotated[float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")]
 Cycles = Annotated[
-    int | None, typer.Option(min=MIN_CYCLES, help="Number of cycles; --snr (then 20 by default) is required of them.")
+    int | None, typer.Option(min=MIN_CYCLES, help="Number of cycles; R is then judged by --snr, 20 by default.")
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted calibration.")]
 Frames = Annotated[int, typer.Option(min=16, max=100_000, help="Number of frames to average.")]
@@ -37,7 +37,7 @@ def calibrate(
         float | None,
         typer.Option(
             min=0.01,
-            help="Poke amplitude, nm rms of wavefront; default: 8 poke, 3 hadamard, 2 in-loop, half above --snr 70.",
+            help="Poke amplitude, nm rms of wavefront; default: 8 poke, 3 hadamard, 2 in-loop, less above --snr 70.",
         ),
     ] = None,
     cycles: Cycles = None,

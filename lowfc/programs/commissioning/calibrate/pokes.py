@@ -105,7 +105,7 @@ class Pokes:
         return max(-(-frames // self.cycle(0).per_column), MIN_CYCLES)
 
     def more_cycles(self, cycles: int, error: float) -> int:
-        """Number of cycles required, given the error after `cycles`; `cycles` if they suffice or it is too many."""
+        """Cycles required, given the error after `cycles`; `cycles` itself if they suffice or too many are required."""
         needed = cycles_for(self._request.snr, cycles, error)
         allowed = max(MAX_CYCLES_RATIO * self.cycles(), ALWAYS_ALLOWED_CYCLES)
         reachable = self._request.cycles is None and needed <= allowed
