@@ -1,10 +1,10 @@
 """Time for each frame against the numbers of pixels, modes and actuators: the control step alone, and the loop.
 
-The calibration of each size is random numbers in arrays of its shape, with noisy frames to match. The step is timed
-back to back in this process, from the bytes of a frame to the bytes of a command. The loop is the real one: frame
-source, controller and mirror are processes connected by zenoh. The frames are prepared, so that any size is possible
-without an optical model. For comparison, two lower bounds are timed: one read of every byte of the step's matrices and
-vectors (the memory limit), and its two matrix-vector products.
+Each size has a calibration of random numbers, and noisy frames to match. The step is timed back to back in this
+process, from the bytes of a frame to the bytes of a command. The loop is the real one: frame source, controller and
+mirror are processes connected by zenoh. The frames are prepared, so that any size is possible without an optical model.
+For comparison, two lower bounds are timed: one read of every byte of the step's matrices and vectors (the memory
+limit), and its two matrix-vector products.
 
 Example:
     python -m benchmarks curves

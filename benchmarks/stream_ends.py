@@ -1,4 +1,4 @@
-"""Writer and reader of a camera's stream: prepared frames, and a driver that records when each was written.
+"""Ends of a camera's stream: a program that writes prepared frames, and a driver that records when each was written.
 
 Example: python -m benchmarks.stream_ends FOLDER STREAM FRAMES, with the folder of a run
 """
@@ -74,7 +74,7 @@ class TimedCamera(IsioCamera):
 def main() -> None:
     """Write every frame at its scheduled time, or at once if late.
 
-    A camera's program is in C. To be about as fast, this one writes to another stream just before (cache warm-up).
+    A real camera's program is in C; to be about as fast, this one writes each frame to another stream just before.
     """
     folder, name, count = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
     config, frames, path = load(folder / "config.toml"), np.load(folder / FRAMES_FILE), stream_path(name)

@@ -72,7 +72,7 @@ def _publish(name: str) -> None:
     with Client(name) as loop:
         until(lambda: _has_frames(loop), 60)
         loop.bench("shutter", "open")
-        for number in range(FLIPS):  # some fall between the same two frames
+        for number in range(FLIPS):  # some values fall between the same two frames
             for acts in (True, False):
                 time.sleep(rng.uniform(0, 7.5 / RATE_HZ))
                 if number % 5:

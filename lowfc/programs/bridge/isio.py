@@ -26,13 +26,13 @@ from lowfc.contract.messages import CONTROLLER_STATE, STEP, Role, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.command_channels import EXTERNAL
 
-WAITING = 2000
+RING_STEPS = 2000
 """Length of the ring buffer of steps: two seconds at 1 kHz."""
 _POLL_S = 0.005
 _REQUESTS_S = 0.1
 """Shortest time between two requests for a channel that changes continuously."""
 _REFUSED_S = 2.0
-"""Time from a refusal to the next request: each one is in the log."""
+"""Time from a refusal to the next request: each refused request is in the log."""
 
 
 def bridge_isio(
@@ -83,7 +83,7 @@ class StepStreams:
         StreamError if these cannot be names of streams.
         """
         stream_path(f"{prefix}_residual")  # the longest name
-        self._ring = bus.ring(STEP, WAITING)
+        self._ring = bus.ring(STEP, RING_STEPS)
         self._clock = clock
         self._prefix = prefix
         self._streams: dict[str, Stream] = {}

@@ -22,9 +22,7 @@ _NO_PROCESSES: Mapping[str, wire.Health] = MappingProxyType({})
 
 
 def json_object(
-    state: wire.ControllerState,
-    processes: Mapping[str, wire.Health] = _NO_PROCESSES,
-    run: str = "",
+    state: wire.ControllerState, processes: Mapping[str, wire.Health] = _NO_PROCESSES, run: str = ""
 ) -> dict[str, Any]:
     """The state as `lowfc ctl status --json` prints it; modes in the calibration's order, nm rms of wavefront."""
     playing = None
@@ -162,8 +160,8 @@ def text(known: dict[str, Any]) -> str:
 def _contrast_row(known: dict[str, Any]) -> dict[str, str]:
     if known["added_contrast"] is None:
         return {}
-    of = ", estimated from the sensor" if known["added_contrast_estimated"] else ""
-    return {"contrast": contrast_in_words(contrast_cases(known["added_contrast"]), costliest_modes(known)) + of}
+    source = ", estimated from the sensor" if known["added_contrast_estimated"] else ""
+    return {"contrast": contrast_in_words(contrast_cases(known["added_contrast"]), costliest_modes(known)) + source}
 
 
 def law_in_words(known: dict[str, Any]) -> str:

@@ -228,17 +228,18 @@ def draw(found: dict[str, Any], figure: Any) -> None:
     axes[1].legend(fontsize=6, ncols=2)
 
 
-def _comparison(of: Departure, rows: Integers, frequency_hz: Array) -> Comparison:
-    judged = rows[of.judged[rows]]
-    worst = float(of.db[judged][np.argmax(np.abs(of.db[judged]))]) if judged.size else None
+def _comparison(departures: Departure, rows: Integers, frequency_hz: Array) -> Comparison:
+    judged = rows[departures.judged[rows]]
+    db = departures.db[judged]
+    worst = float(db[np.argmax(np.abs(db))]) if judged.size else None
     return Comparison(
-        within=bool(of.within[judged].all()),
+        within=bool(departures.within[judged].all()),
         lines=int(rows.size),
         judged=int(judged.size),
         largest_departure_db=worst,
-        unsure_hz=frequency_hz[rows[~of.judged[rows]]].tolist(),
+        unsure_hz=frequency_hz[rows[~departures.judged[rows]]].tolist(),
     )
 
 
-def _largest(of: Departure) -> float | None:
-    return float(np.abs(of.db[of.judged]).max()) if of.judged.any() else None
+def _largest(departures: Departure) -> float | None:
+    return float(np.abs(departures.db[departures.judged]).max()) if departures.judged.any() else None

@@ -85,9 +85,9 @@ def on_sensor(
 
     `flux_dn` is the sum of the good pixels without the dark, DN. CalibrationError if they see too little of the image.
     """
-    own, pixels = (*computed.shape, -1), before.good.size
+    shape, pixels = (*computed.shape, -1), before.good.size  # shape: rows, columns, modes
     I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, before.shape).reshape(-1)
-    H = onto(computed.response.astype(np.float64).reshape(own), geometry, before.shape).reshape(pixels, -1)
+    H = onto(computed.response.astype(np.float64).reshape(shape), geometry, before.shape).reshape(pixels, -1)
     good = before.good.astype(np.float64)
     try:
         I0, H = normalise_flux(np.maximum(I0, 0), H, good)
