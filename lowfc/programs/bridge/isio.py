@@ -42,7 +42,7 @@ def bridge_isio(
         str, typer.Option(help="Channel that the loop writes; the loop does not undo this mirror's other channels.")
     ] = "",
     external: Annotated[list[str] | None, typer.Option(help="Channel that the loop must not undo; repeat.")] = None,
-    nm_per_unit: Annotated[float, typer.Option(min=1e-9, help="Surface per unit of a channel, nm.")] = 1000.0,
+    nm_per_unit: Annotated[float, typer.Option(min=1e-9, max=1e9, help="Surface per unit of a channel, nm.")] = 1000.0,
 ) -> None:
     """Publish modal error, command, residual and flux as ImageStreamIO streams, until Ctrl-C.
 

@@ -21,7 +21,7 @@ from lowfc.contract.network import Section
 
 _HEADER = (
     "# Keys after a # have their defaults; remove the # to set a value. For keys that are not set, a command may use",
-    "# another default: sim-loop starts with the loop closed and gives the controller a processor of its own.",
+    "# another default: sim-loop starts with the loop closed and distributes the processors.",
     "",
 )
 
