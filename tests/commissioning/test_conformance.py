@@ -522,5 +522,5 @@ def test_a_line_receives_messages_without_an_envelope_and_queries() -> None:
 @pytest.mark.usefixtures("own_runtime")
 def test_only_one_process_may_have_the_role_controller() -> None:
     links = open_run("bench").links
-    with closing(Line(links, Role.CONTROLLER)), pytest.raises(BusError, match="is one running"):
+    with closing(Line(links, Role.CONTROLLER)), pytest.raises(BusError, match="does another process have this role"):
         Line(links, Role.CONTROLLER)

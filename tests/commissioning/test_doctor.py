@@ -438,9 +438,10 @@ def test_real_time_rights_are_shown_applied_and_removed(tmp_path: Path, monkeypa
     permissions.undo(tmp_path)
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != device]
     assert device.stat().st_mode & 0o777 == 0o600
-    (tmp_path / next(iter(permissions.FILES))).write_text("somebody's own\n")
-    with pytest.raises(ConfigurationError, match="own"):
-        permissions.apply(tmp_path, "me")
+    for other in (b"somebody's own\n", b"\xff"):
+        (tmp_path / next(iter(permissions.FILES))).write_bytes(other)
+        with pytest.raises(ConfigurationError, match="own"):
+            permissions.apply(tmp_path, "me")
     for fault in (OSError("Read-only file system: '/etc'"), LookupError("no such group: 'lowfc'")):
         monkeypatch.setattr(permissions, "apply", Mock(side_effect=fault))
         failed = lowfc("doctor", "--apply").exception

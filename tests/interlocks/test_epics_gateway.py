@@ -187,6 +187,7 @@ def test_a_put_is_a_request_and_fails_with_its_refusal(pvs: Variables) -> None:
         (received(np.nan), None),
         (received([1, 2]), None),
         (received(2.0, severity=3), None),
+        (SimpleNamespace(getID=lambda: "epics:nt/NTTable:1.0"), None),
         (TimeoutError("disconnected"), None),
     ],
 )

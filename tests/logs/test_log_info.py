@@ -11,6 +11,8 @@ from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, Message, wire
+from lowfc.programs.logs.info import render
+from lowfc.programs.logs.survey import survey
 from tests.support.loops import json_of, lowfc
 from tests.support.mutated_logs import flipped
 
@@ -102,6 +104,15 @@ def test_info_reports_what_was_written(log: Path) -> None:
         "attachments": {"config.toml": 7},
         "remarks": [f"{log}: its config.toml: unknown key 'loop'; it is ignored"],
     }
+
+
+@pytest.mark.parametrize(("lockstep", "remark"), [(True, False), (False, True), (None, False)])
+def test_the_digest_has_a_remark_if_the_run_is_known_not_to_be_lockstep(
+    log: Path, lockstep: bool | None, remark: bool
+) -> None:
+    text = render(survey(log, digest=True) | {"lockstep": lockstep})
+    assert "digest" in text
+    assert ("not a lockstep run" in text) is remark
 
 
 def test_the_text_has_the_same_numbers(log: Path) -> None:

@@ -378,6 +378,13 @@ def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -
     assert found["verdict"]["checks"][2]["text"] == why
 
 
+def test_a_loop_closed_under_an_earlier_calibration_has_a_known_law(tmp_path: Path) -> None:
+    night = SyntheticLog().frames(100)
+    night.load(identified(replace(TOYS, reconstructor=0.9 * TOYS.reconstructor)))
+    why = results(night.write(tmp_path / "x.mcap"))["spectra"]["why_not"]
+    assert why == "the loop was closed only under an earlier calibration than the last one of this log"
+
+
 def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
     found = results(SyntheticLog().frames(200, dark=range(200)).write(tmp_path / "x.mcap"))
     assert found["closed_stretch"]["frames"] == 0

@@ -406,12 +406,15 @@ def test_the_log_of_the_run_gives_the_same_latencies(measured: tuple[dict[str, A
 def test_files_that_are_no_results_or_logs_are_errors(tmp_path: Path) -> None:
     other = tmp_path / "other.json"
     listed = '{"latency_us": [1], "ratio": null, "repeats": []}'
+    ranges = {"x": {at: [1, 2, 3] for at in ("p50", "p99", "p99_9")}}
+    ranged = json.dumps({"latency_us": ranges, "spread_us": ranges, "ratio": None, "repeats": [1, 2]})
     for content, expected in (
         ("{", "not JSON"),
         ("[]", "no latency_us"),
         ("[" * 100_000, "not JSON"),
         ('{"latency_us": {}}', "ratio"),
         (listed, "at least one is not"),
+        (ranged, "at least one is not"),
     ):
         other.write_text(content)
         assert expected in refusal("latency", "--compare", other, other, kind=DataFileError)

@@ -87,7 +87,7 @@ class Table(Generic[S]):
     def check(
         self, name: str, expected: str = "", advice: str = "", cost: str = ""
     ) -> Callable[[Callable[[S], Check | None]], Callable[[S], object]]:
-        """Register a check function; it returns None if the check does not apply.
+        """Register a check function, which returns None if the check does not apply.
 
         Args:
             name: Name of the check.

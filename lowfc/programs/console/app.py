@@ -120,8 +120,8 @@ class Console(OrderedKeys):
             bus: bus of the run, joined as a monitor.
             run_id: name of the run.
             clock: clock of the run.
-            restarted: whether the run restarted, so that its links are others.
-            terminal_gone: whether the terminal was closed.
+            restarted: returns whether the run restarted, which changes its links.
+            terminal_gone: returns whether the terminal was closed.
         """
         super().__init__()
         self._bus, self._run_id, self._restarted = bus, run_id, restarted
@@ -166,7 +166,7 @@ class Console(OrderedKeys):
         return isinstance(screen, Form) and screen.focused is None
 
     def action_press(self, name: str) -> None:
-        """Do what a button does: at once, or with a form first."""
+        """Carry out the action of a button: at once, or after its form."""
         action = ALL_ACTIONS[name]
         if action.fields or action.confirm:
             self.push_screen(Form(action))
@@ -208,7 +208,7 @@ class Console(OrderedKeys):
 
     @on(Form.Filled)
     def _filled(self, event: Form.Filled) -> None:
-        self._do(event.form.button, event.values, event.form)
+        self._do(event.form.action, event.values, event.form)
 
     @on(Gains.Turned)
     def _turned(self, event: Gains.Turned) -> None:
@@ -216,7 +216,7 @@ class Console(OrderedKeys):
         self._do(ALL_ACTIONS["gain"], {"modes": modes, "values": values or AUTO})
 
     def _do(self, action: Action, values: Values, form: Form | None = None) -> None:
-        """Start a task, or send a request in its own thread.
+        """Start a task, or send a request, in a new thread.
 
         Requests of the same button wait for each other's answers, except those of SAFE.
         """

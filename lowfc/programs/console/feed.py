@@ -43,7 +43,7 @@ class Reading(NamedTuple):
         state: state of the run, from which the verdict is made.
         verdict: verdict, tiles and facts of the view.
         frame: newest frame; None before the first.
-        command_nm: modal command of the last step, (modes,).
+        command_nm: modal command of the last step, (modes,); empty before the first.
         requests: requests received since the previous reading, without those that are not shown.
         residual_nm: residual, nm rms of wavefront, one value per second; NaN if unknown.
         light: flux over that of the calibration, one value per second; NaN if unknown.

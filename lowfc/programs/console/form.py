@@ -33,21 +33,21 @@ class Form(ModalScreen[None]):
     BINDINGS: ClassVar[list[BindingType]] = [("escape", "dismiss", "leave")]
 
     class Filled(Message):
-        """The operator pressed OK."""
+        """The operator sent the form, by OK or Enter."""
 
         def __init__(self, form: "Form", values: dict[str, str]) -> None:
             super().__init__()
             self.form, self.values = form, values
 
-    def __init__(self, button: Action) -> None:
+    def __init__(self, action: Action) -> None:
         super().__init__()
-        self.button = button
+        self.action = action
 
     def compose(self) -> ComposeResult:
         """Lay out the form."""
         with Vertical():
-            yield Static(self.button.confirm or f"{self.button.name}: {self.button.description}", markup=False)
-            for field in self.button.fields:
+            yield Static(self.action.confirm or f"{self.action.name}: {self.action.description}", markup=False)
+            for field in self.action.fields:
                 yield Label(field.label, markup=False)
                 yield Input(field.default(), name=field.name, compact=True)
             yield Static("", id="refusal", markup=False)

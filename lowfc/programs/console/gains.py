@@ -15,7 +15,7 @@ from lowfc.programs.console.lines import Lines
 from lowfc.programs.console.panels import BOLD, DIM, style
 from lowfc.programs.view.draw.colours import BLUE, GREY
 
-HIGHEST = 1.5
+HIGHEST = 1.5  # gain at the right end of a knob's bar
 STEP, FINE_STEP = 0.05, 0.01
 FINE_BELOW = 0.1
 """Knobs below this gain are turned in fine steps."""

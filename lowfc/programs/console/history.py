@@ -11,7 +11,7 @@ from lowfc.programs.console import panels
 _LINES = 200
 _REPEAT_S = 10.0
 """An event repeated within this time is shown once, with its count."""
-_SEARCHED = 8  # last lines in which a repeated event is searched
+_SEARCHED = 8  # number of last lines that are searched for a repeated event
 _DIGITS = re.compile(r"\d+")
 
 
@@ -32,7 +32,7 @@ class History:
         self._lines.append((one, times))
 
     def last(self, count: int) -> Text:
-        """The newest lines."""
+        """The newest `count` lines."""
         shown = list(self._lines)[-max(1, count) :]
         return Text("\n").join(
             panels.request_line(one) if isinstance(one, wire.Request) else panels.event_line(one, times)

@@ -42,7 +42,7 @@ DIM, WARNED, WRONG, BOLD = style(GREY), style(YELLOW), style(RED, bold=True), st
 
 
 def verdict(reading: Reading, run: str) -> tuple[Level, str]:
-    """Text of the verdict, or of a lost connection."""
+    """Level and text of the verdict, or of a lost connection."""
     if reading.silent_s is None:
         return Level.WARNING, f"NOT CONNECTED  no message of run {run} yet"
     if not reading.connected and reading.state.controller.life is Liveness.STOPPED:
@@ -92,7 +92,7 @@ def pictures(reading: Reading) -> list[Text]:
 
 
 def reduced(array: Array) -> Array:
-    """Means of an image over at most `_PIXELS` x `_PIXELS` parts."""
+    """Means of an image over `_PIXELS` x `_PIXELS` parts."""
     for axis in (0, 1):
         edges = np.linspace(0, array.shape[axis], _PIXELS + 1).astype(int)[:-1]
         sizes = np.diff([*edges, array.shape[axis]])
@@ -102,7 +102,7 @@ def reduced(array: Array) -> Array:
 
 
 def halves(colours: Rgb) -> list[Text]:
-    """Lines of text whose cells are two pixels, one above the other, (rows, columns, 3)."""
+    """Lines of text in which each cell shows two pixels of an image (rows, columns, 3), one above the other."""
     lines = []
     for upper, lower in zip(colours[0::2].tolist(), colours[1::2].tolist(), strict=True):
         line = Text()
@@ -126,7 +126,7 @@ def sparks(reading: Reading) -> list[Text]:
 
 
 def sparkline(values: Sequence[float], width: int) -> str:
-    """The last values as bars from zero to the largest, the lowest bar below zero; a space where there is none."""
+    """The last values as bars from zero to the largest; a negative value has the lowest bar, NaN a space."""
     last = np.array(values[-width:])
     largest = max(np.nanmax(last, initial=0.0), 1e-9) if last.size else 1.0
     return "".join(" " if np.isnan(one) else _SPARKS[min(int(max(one, 0.0) / largest * 8), 7)] for one in last)

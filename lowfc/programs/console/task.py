@@ -49,6 +49,7 @@ class Task:
         return f"{self.name} failed: {wrong.removeprefix('error: ')} (full output: {self.output})"
 
     def _tail(self) -> str:
-        with self.output.open("rb") as stream:
-            stream.seek(max(0, self.output.stat().st_size - _TAIL_BYTES))
-            return stream.read().decode(errors="replace")
+        try:
+            return self.output.read_bytes()[-_TAIL_BYTES:].decode(errors="replace")
+        except OSError:  # the file was removed, such as by a cleaner of temporary files
+            return ""

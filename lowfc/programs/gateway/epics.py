@@ -130,7 +130,7 @@ class _PutHandler:
 
 def _value_of(value: Any) -> Value | None:
     """The bench value of a monitor's update; None if the PV is disconnected, invalid, not a scalar or too long."""
-    if isinstance(value, Exception) or getattr(value, "severity", 0) >= _INVALID:
+    if not hasattr(value, "raw") or value.severity >= _INVALID:  # an Exception, or a structure such as a table
         return None
     raw: Any = value.raw
     plain: Any

@@ -1,6 +1,7 @@
 """Process variables of a gateway, independent of its protocol: readings, and writable variables that send requests.
 
-A declared request is offered if its only arguments are numbers or one text.
+A request with a `lowfc ctl` command is offered if it changes something and its arguments are numbers or one text; where
+it has modes, it applies to all of them.
 """
 
 from collections.abc import Callable, Iterator

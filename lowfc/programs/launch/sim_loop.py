@@ -47,7 +47,8 @@ def sim_loop(
 ) -> dict[str, Any]:
     """Run the simulated loop for a time, or until Ctrl-C; return the summary that `--json` prints.
 
-    The loop continues if the view ends. ProcessDiedError: another process ended; the error quotes its output.
+    The loop continues if the view ends. ProcessDiedError if another process ended, with the end of its output; BusError
+    if the run is in use.
     """
     console = Console(stderr=True)
     require_screen(show)
@@ -100,7 +101,7 @@ def prepare(config: Configuration, run: Run, console: Console) -> None:
 
 
 def children_of(config: Configuration, run: Run, duration_s: float | None, record: bool) -> list[Child]:
-    """The processes in the order in which they are stopped, which is that of the data flow."""
+    """The processes in the order of the data flow, in which they are stopped; the camera ends by itself."""
     shared = ["--run", run.run_id, "--config", str(run.path / "config.toml")]
     calibration = ["--calibration", str(run.path / "calibration.fits")]
     mirror = mirror_role(config.mirror.name)
@@ -131,11 +132,7 @@ def _view(run: Run, show: Show, console: Console) -> Child:
 
 
 def _supervise(
-    config: Configuration,
-    children: list[Child],
-    watch: Watch,
-    console: Console,
-    duration_s: float | None,
+    config: Configuration, children: list[Child], watch: Watch, console: Console, duration_s: float | None
 ) -> None:
     camera = children[0]
     view = next((child for child in children if child.name == Role.VIEWER), None)

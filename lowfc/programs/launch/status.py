@@ -43,10 +43,10 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     table.add_row("recorder", recording(recorder))
     for log in watch.events[-_EVENTS_SHOWN:]:
         table.add_row(Text(printable(log.name)), Text(printable(log.message), style=_STYLES.get(log.level, "")))
-    left = f" of {duration_s:g} s" if duration_s is not None else ", Ctrl-C ends it"
+    end = f" of {duration_s:g} s" if duration_s is not None else ", Ctrl-C ends it"
     sensor = config.sensor.sam if config.sensor.kind == "sam" else config.sensor.kind
     scene = f"{config.disturbance.preset}, V = {config.star.magnitude:g}, {sensor}"
-    return Panel(Group(table), title="lowfc", subtitle=f"{scene}; {elapsed_s:.0f} s{left}", expand=False)
+    return Panel(Group(table), title="lowfc", subtitle=f"{scene}; {elapsed_s:.0f} s{end}", expand=False)
 
 
 def status_line(watch: Watch, elapsed_s: float) -> str:

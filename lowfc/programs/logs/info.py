@@ -98,6 +98,6 @@ def _summary(contents: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _digest(contents: Mapping[str, Any]) -> str:
-    """Digest, with a remark unless the run was a lockstep run."""
-    digest = str(contents.get("digest", ""))
-    return digest if not digest or contents["lockstep"] else f"{digest} (not a lockstep run: cannot be reproduced)"
+    """Digest, with a remark if the run was not a lockstep run; empty if not requested."""
+    digest, remark = str(contents.get("digest", "")), " (not a lockstep run: cannot be reproduced)"
+    return f"{digest}{remark}" if digest and contents["lockstep"] is False else digest

@@ -173,7 +173,7 @@ class _Account:
 def survey(
     log: LogFiles, progress: Callable[[int, int], None] | None = None, *, digest: bool = False
 ) -> dict[str, Any]:
-    """Summary of a log, complete or not, from all of its messages; with `digest`, those of the log and of each key."""
+    """Summary of a log, complete or not, from all of its messages; `digest` adds digests of the log and of each key."""
     reader, account, digests = WholeLog(log, skip_damaged=True), _Account(), Digest()
     reader.progress = progress
     for number, message in enumerate(reader):

@@ -1,7 +1,8 @@
 """An idle loop beside a process of the control loop: a delay of both is caused by the host.
 
-It runs on the processor of that process with a higher priority, so that no process of lowfc can delay it. Halfway
-between two frames it wakes, records how late it is, and reads the kernel's counters of the processor and the process.
+It runs on the processors of that process; with real-time scheduling it has a higher priority, so that no process of
+lowfc can delay it. Halfway between two frames it wakes, records how late it is, and reads the kernel's counters of the
+processor and the process.
 """
 
 import json
@@ -49,7 +50,7 @@ def bare_loop(
     role: Annotated[Role, typer.Argument(help="Process beside which it runs.")],
     run: RunId = DEFAULT_RUN,
     config: ConfigFile = None,
-    seconds: Annotated[float, typer.Option(help="Duration of the frames.")] = 10.0,
+    seconds: Annotated[float, typer.Option(help="Seconds for which frames are sent.")] = 10.0,
 ) -> None:
     """Wake once between two frames, as long as frames are sent, and record the kernel's counters."""
     settings = configuration(config)

@@ -25,9 +25,9 @@ Report = Callable[[str], None]
 T = TypeVar("T")
 
 AFTERWARDS = 8
-"""Frames recorded after the end of a probe sequence: the longest delay that can be measured."""
+"""Frames recorded after the end of a probe sequence, more than the longest delay that can be measured."""
 MAX_FRAMES_BEHIND = 100
-"""Frames by which the mirror's reports may lag behind the controller's steps; beyond it the mirror is dead."""
+"""Frames by which the mirror's reports may lag behind the controller's steps; beyond it the sequence is repeated."""
 LEASE_CHECK_FRAMES = 100
 """Frames between two checks that the lease is still in force."""
 MAX_REFUSED_FRAMES = 50
@@ -35,8 +35,8 @@ MAX_REFUSED_FRAMES = 50
 ATTEMPTS = 5
 """Attempts at a sequence if frames are lost or a device restarts."""
 DITHER_SLOWEST = 1 / 16
-"""Cycles per frame below which a dither is not used."""
-_LIMITS = frozenset(Limit) - {Limit.MODAL_LIMIT, Limit.LAW_OVERRULED}
+"""Lowest frequency of a dither that is used, cycles per frame; most of the disturbance is below it."""
+_LIMITS = frozenset(Limit) - {Limit.MODAL_LIMIT, Limit.LAW_OVERRULED}  # those that end a probe sequence
 
 
 class PlayInterruptedError(CalibrationError):
@@ -51,10 +51,10 @@ class Recording(NamedTuple):
     """Frames of a probe sequence; number 0 is the first frame whose command had a row of the table.
 
     Attributes:
-        sequence: frame numbers (frames,), increasing; lost frames are missing.
+        sequence: frame numbers (frames,), increasing; lost frames, and those without a step, are missing.
         pixels: pixels (frames, pixels), uint16, DN.
-        steps: frame numbers (steps,) of the controller's steps, of which there may be more.
-        commanded: whether the frame of each step was used for a command (steps,).
+        steps: frame numbers (steps,) of the controller's steps, also of those whose frame was lost.
+        commanded: whether each step sent the next row of the table to the mirror (steps,).
         command_nm: the loop's own modal command (steps, modes).
     """
 
@@ -71,7 +71,8 @@ class Recording(NamedTuple):
     def commands(self, delay_frames: float) -> Array:
         """The loop's own command as seen by each exposure (frames, modes)."""
         frames = np.arange(self.steps[-1] + 1)
-        newest = np.searchsorted(self.steps, frames, side="right") - 1  # for a missing step, the command before it
+        # a missing step has the command before it; those before the first step, whose exposures are not usable, its own
+        newest = np.maximum(np.searchsorted(self.steps, frames, side="right") - 1, 0)
         all_of_them = np.ones(len(self.steps), np.bool_)
         return seen(self.command_nm[newest], _weights(delay_frames), self.steps, all_of_them)[self._steps_of_frames]
 
@@ -101,6 +102,10 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
         loop: A connection to the controller.
         basis_nm: Shapes (shapes, actuators), nm of surface.
         table: Amplitude of each shape (frames, shapes).
+
+    Raises:
+        PlayInterruptedError: the camera or the mirror restarted or stalled.
+        CalibrationError: the sequence was ended by a limit, a change of mode or refused frames; or no frame came.
     """
     loop.check_lease()
     with _streams(loop) as (frames, steps):
@@ -137,7 +142,7 @@ def next_frames(loop: Client, count: int) -> Pixels:
 
 
 def check_size(shape: tuple[int, ...], before: Calibration) -> None:
-    """Compare the size of the frames with that of the calibration in use."""
+    """CalibrationError unless the frames have the size (rows, columns) of the calibration in use."""
     if shape != before.shape:
         raise CalibrationError(
             f"the frames have {shape[0]} x {shape[1]} pixels and are refused as WRONG_SIZE: the calibration in use, "
@@ -176,7 +181,7 @@ def _check(loop: Client, step: Step, before: LoopMode | None, *, over: bool) -> 
 
 
 def _commanded(step: Step) -> bool:
-    """Whether the mirror received the next row with this step; in open loop, also if the frame was not measured."""
+    """Whether the mirror received the next row with this step; unless closed, also if the frame was not measured."""
     return step.error_nm is not None or (step.mode is not LoopMode.CLOSED and step.reasons[0] in UNMEASURED)
 
 

@@ -15,6 +15,7 @@ from lowfc.contract.errors import CalibrationError
 from lowfc.control.calibration.calibration import Calibration, comparable
 from lowfc.control.calibration.regularised import Reconstruction, advice, reconstruct
 from lowfc.control.calibration.response_fit import MAX_ELEMENT, MAX_ELEMENT_RMS, Check, Measured, cross_talk
+from lowfc.control.loop.wording import counted
 from lowfc.optics.twin.twin import reference as twin_reference
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cycles_for
@@ -118,7 +119,7 @@ def finish_calibration(
     configured = configured_delay(config)
     if abs(data.delay.delay_frames - configured) > DELAY_TOLERANCE_FRAMES:
         result.advice.append(
-            f"warning: the configured delay is {configured:g} frames: set control.delay_frames = "
+            f"warning: the configured delay is {counted(float(configured), 'frame')}: set control.delay_frames = "
             f"{max(data.delay.delay_frames, 1):.2f}"
         )
     return calibration, result
@@ -288,7 +289,7 @@ def comparison(one: Calibration, other: Calibration) -> Comparison:
 
 
 def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array) -> Array:
-    """Modes (modes, actuators) seen of each actuator: measured for modal shapes, modelled for others."""
+    """Modes (modes, actuators) that the sensor measures of each actuator: modal shapes measured, others modelled."""
     commands = before.modes_to_actuators.astype(np.float64)
     measured = np.asarray(np.linalg.pinv(commands))  # without a model: other shapes are projected onto the modal shapes
     optics = factory.twin(config, None, lambda _: None)

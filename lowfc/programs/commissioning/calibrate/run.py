@@ -159,7 +159,7 @@ class Calibrator:
         return int(np.where(tilt & ~tilt.all(), np.inf, self.noise_nm).argmin())
 
     def delay(self) -> Delay:
-        """Measure the delay from poke to image with the mode of lowest noise."""
+        """Measure the delay from a poke of the quietest mode to its image; warn if it is not the expected image."""
         mode = self._quietest_mode
         plan = self.pokes.delay(mode)
         self._show("detecting pokes", max(self.pokes.cycles(), self.completed), self.completed)
@@ -269,7 +269,7 @@ def resumed(path: Path, what: dict[str, Any]) -> Sums:
 
 
 def stored_cycles(path: Path) -> tuple[dict[str, Any], Sums]:
-    """Read the completed cycles, with the method, amplitude and calibration that they are of."""
+    """Read the completed cycles, with their method, amplitude and calibration; DataFileError as in `resumed`."""
     if not path.is_file():
         raise DataFileError(f"nothing to resume: there is no {path}; omit --resume")
     try:

@@ -31,12 +31,7 @@ from lowfc.programs.commissioning.calibrate.result import finish_calibration
 from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of, stored_cycles
 from lowfc.programs.commissioning.calibrate.tasks import images
 from lowfc.programs.commissioning.commission.first_calibration import aligned, first_delay, linear_nm, poked
-from lowfc.programs.commissioning.commission.first_light import (
-    camera_fits,
-    darkened,
-    referenced,
-    without_dark,
-)
+from lowfc.programs.commissioning.commission.first_light import camera_fits, darkened, referenced, without_dark
 
 METHOD = "hadamard"
 DEFAULT_SNR = 50.0
@@ -51,7 +46,7 @@ It is stable at any usual delay; with a wrong sign the error grows tenfold in 25
 MAX_OF_PREDICTED = 1.5
 """Largest ratio of measured to predicted error in the closed loop."""
 MIN_PREDICTED = 1000
-"""Least frames, after settling, for the prediction of the residual, and for its measurement."""
+"""Smallest number of frames, after settling, for the prediction of the residual and for its measurement."""
 STEPS = (
     *("camera", "dark and bad pixels", "reference image", "delay", "orientation and sign", "poke amplitude"),
     *("response", "verdict", "prediction", "closed loop"),
@@ -96,7 +91,7 @@ class Commissioning:
         self._results: dict[str, Any] = {}
         self._delay: Delay | None = None
         self._kept: Path | None = None  # file of the provisional calibration, once that is in use
-        self._advice = ""  # after an early end, once the calibration is loaded
+        self._advice = ""  # text after an early end, once the calibration is loaded
 
     def run(self) -> tuple[dict[str, Any], str]:
         """Carry out all steps; return the results, and the text for people."""
@@ -187,7 +182,7 @@ class Commissioning:
         self._report(f"[{STEPS.index(name) + 1}/{len(STEPS)}] {name}")
 
     def _open(self) -> Calibration | None:
-        """Check the mirror and open the loop unless idle; return the calibration in use, if any."""
+        """Check mode and mirror, and open a closed loop; return the calibration in use, if any."""
         state = self._state()
         if state.mode == wire.LOOP_MODE_SAFE:
             raise CalibrationError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
@@ -287,7 +282,7 @@ class Commissioning:
                 )
 
     def _measured_nm(self, frames: int, settling: int, predicted: float) -> float:
-        """Close the loop and measure its error, nm rms; after any failure the loop is open."""
+        """Close the loop and measure its error, nm rms; a failure opens it, unless another operator ended the lease."""
         self._loop.close_loop()
         try:
             closed = self._steps(frames, LoopMode.CLOSED)

@@ -21,14 +21,15 @@ from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 
 FIRST_NM = AMPLITUDE_NM["poke"]
 MAX_FIRST_NM = 32.0
-"""Amplitude up to which that of the first pokes is doubled until they are detected, nm rms of wavefront."""
+"""Largest amplitude of the first pokes, which is doubled until they are detected, nm rms of wavefront."""
 MAX_MISFIT = 0.35
 """Largest residual of the image after the fit of the computed one; above it the sensor is not the configured one."""
 MIN_LIKENESS = 0.5
 """Smallest correlation of a poke's image with the computed one; below it the sensor is not the configured one."""
 CYCLES = 12
+"""Number of poke cycles from which the response is measured without an optical model."""
 MAX_NOT_LINEAR = 0.1
-"""Largest relative change of the gain between full and half amplitude."""
+"""Largest relative difference of the gains at full and half amplitude; `_SURE` standard errors are added to it."""
 _SURE = 3.0  # standard errors
 
 
@@ -124,7 +125,7 @@ def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: f
             plan = _poke_cycle(modes, amplitude_nm, again)
             gains[level, again] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
     off = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
-    # variance of a mean of two gains, for both amplitudes; at least the average over modes (tip and tilt scatter more)
+    # variance of the difference of both mean gains, from two values each: at least its average over modes
     squares = np.square(np.diff(gains, axis=1)).mean(axis=(0, 1)) / 2
     error = np.sqrt(np.maximum(squares, squares.mean()))
     worst = int((off - _SURE * error).argmax())

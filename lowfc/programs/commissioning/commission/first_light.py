@@ -45,7 +45,7 @@ class Sensor(NamedTuple):
 def camera_fits(
     config: Configuration, state: wire.CameraState, images: Sequence[Frame], report: Report
 ) -> CameraSettings:
-    """The camera's settings, after a check that frames and configuration agree with them."""
+    """The camera's settings; CalibrationError if frames or configuration do not agree with them."""
     checks = list(agreement_checks(config, state))
     faults = [
         f"{check.name}: the camera has {check.got}, expected {check.expected}; {check.advice}"
@@ -67,7 +67,7 @@ def camera_fits(
     if brightest > _FULL * state.saturation_dn:
         faults.append(
             f"light: the brightest pixel is at {brightest} of {state.saturation_dn:g} DN; shorten the exposure until "
-            "it is below half of that"
+            "it is below half of full well"
         )
     if faults:
         raise CalibrationError("the camera cannot be used:\n" + "\n".join(f"  {fault}" for fault in faults))

@@ -20,7 +20,10 @@ PICTURES = 50
 
 
 class Picture(NamedTuple):
-    """A frame without its pixels; `highest` is its brightest pixel, None if its size is wrong."""
+    """A frame without its pixels; `size` (bytes) and `checksum` (CRC-32) are those of its data.
+
+    `put_ns`: publish time, 0 without a valid envelope; `highest`: brightest pixel, DN, None if the size is wrong.
+    """
 
     receive_time_ns: int
     put_ns: int
@@ -102,7 +105,7 @@ class Camera(Collected):
 
     @cached_property
     def put_times_ns(self) -> list[int]:
-        """Publish time of each frame, or its arrival time if the envelopes' times are wrong."""
+        """Publish times of the frames, or their arrival times if any publish time is wrong."""
         puts, arrivals = [frame.put_ns for frame in self.frames], [frame.receive_time_ns for frame in self.frames]
         near = all(abs(arrival - put) <= LATE_NS for put, arrival in zip(puts, arrivals, strict=True))
         return puts if near and all(later > earlier for earlier, later in pairwise(puts)) else arrivals

@@ -170,7 +170,7 @@ class Dialogue(Collected):
         """Send a command and wait for the state that answers it.
 
         Returns:
-            The state, None without an answer; the command's time; and the time until the answer, ns.
+            The state, None without an answer; the command's time; and the time until the answer, ns, 0 without one.
         """
         self._commanded_nm, before = surface_nm, len(self.states)
         sequence, sent_ns = self.put(surface_nm, valid_ns=valid_ns)
@@ -183,7 +183,7 @@ class Dialogue(Collected):
         return None, sent_ns, 0
 
     def go(self, surface_nm: Single) -> wire.MirrorState | None:
-        """Move to a shape in steps of half the slew limit; return the last answer, None if one was missing."""
+        """Move to a shape in steps of at most half the slew limit; return the last answer, None if one was missing."""
         start_nm, state = self.where_nm, None
         count = max(1, int(np.ceil(float(np.abs(surface_nm - start_nm).max()) / self.expected.move_nm)))
         for index in range(1, count + 1):

@@ -7,6 +7,7 @@ import numpy as np
 
 from lowfc.arrays import Pixels
 from lowfc.contract.messages import FRAME, MONO16, wire
+from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.camera import Camera
 from lowfc.programs.commissioning.conformance.line import NS
@@ -17,9 +18,9 @@ _SILENT_PERIODS = 5  # longest wait between frames that is not reported
 _JITTER = 0.1  # of the period
 _SMOOTHER = 2.0  # ratio of roughness at which bytes count as swapped
 _READOUT_NS = 50_000_000  # longest plausible time from end of exposure to publication
-_FULL = 0.01  # fraction of saturated pixels that is reported
-_STOPPED_NS = 300_000_000  # a shorter silence at either end does not count
-_VARIED = 8  # different values needed to judge the alignment of bits
+_FULL = 0.01  # fraction of saturated pixels above which they are reported
+_STOPPED_NS = 300_000_000  # shorter silences, before the first frame and after the last together, do not count
+_VARIED = 8  # with more different values than these, the alignment of bits is judged
 _AGE_NS = 1_000_000  # tolerance of times
 _OWN_WAIT_NS = 10_000_000  # shorter waits may be caused by this host, not by the camera
 
@@ -58,10 +59,10 @@ def _frames(camera: Camera) -> Check:
 def _frame_time(camera: Camera) -> Check:
     times = [frame.time_ns for frame in camera.frames]
     if not all(times):
-        return wrong(f"{times.count(0)} frames without a timestamp", "set it in every frame")
+        return wrong(f"{counted(times.count(0), 'frame')} without a timestamp", "set it in every frame")
     back = sum(later <= earlier for earlier, later in pairwise(times))
     if back:
-        got = f"not later than the previous one, {back} times of {len(times)}"
+        got = f"not later than the previous one, {back} times of {len(times) - 1}"
         return wrong(got, "read the time for every exposure, from a clock that never steps")
     age_ns = int(np.median(np.subtract(camera.put_times_ns, times)))
     exposure_ns = 0 if camera.settings is None else camera.settings.exposure_ns
@@ -151,7 +152,7 @@ def _light(camera: Camera) -> Check | None:
         got = f"brightest pixel {highest} DN, bias {state.bias_dn:g} DN"
         return warning(got, "no light: is the shutter open and the star on the sensor?")
     full = np.mean([np.mean(one >= highest) for one in camera.pixels])
-    if highest <= state.saturation_dn < highest + 1 and full > _FULL:
+    if 0 <= state.saturation_dn - highest < 1 and full > _FULL:
         got = f"{100 * full:.0f} % of the pixels at {highest} DN"
         return warning(got, "shorten the exposure: saturated pixels measure nothing")
     return ok(f"brightest pixel {highest} DN")

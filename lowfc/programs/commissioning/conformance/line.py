@@ -54,7 +54,7 @@ class Line:
     """
 
     def __init__(self, links: Links, role: str) -> None:
-        """Join a run as `role`; BusError if another process has this role."""
+        """Join a run as `role`; BusError if that fails, as when another process has this role."""
         self._clock = HostClock()
         self.offset_ns = self._clock.offset_ns
         self._start_s = links.claim_start(role, self._clock.start_s)
@@ -64,7 +64,7 @@ class Line:
             self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, role))))
         except zenoh.ZError as fault:
             raise BusError(
-                f"cannot join run {links.run_id!r} as {role}: is one running? Stop it first "
+                f"cannot join run {links.run_id!r} as {role}: does another process have this role? Stop it first "
                 f"(zenoh says: {str(fault).splitlines()[0][:200]})"
             ) from fault
         self._session.declare_subscriber(EVERYTHING, Callback(self._append, indirect=False))

@@ -15,12 +15,14 @@ from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHE
 
 IDLE_S = 1.0
 EXPIRES_NS = 300_000_000
+"""Validity of the command that is left to expire."""
 SLACK_NS = 400_000_000
+"""Time by which the mirror may report the timeout late."""
 
 _FOLLOWING, _EXPIRED = wire.MIRROR_STATUS_FOLLOWING, wire.MIRROR_STATUS_EXPIRED
 _LONG_NS = 60 * NS
 _REFUSED_EVERY_NS = 50_000_000  # between refused commands
-_RAISED_NM = 10.0  # height above the shape to which the mirror relaxes
+_RAISED_NM = 10.0  # height by which the mirror is raised before the command timeout
 _REFUSAL_S = 0.15  # time in which a command would show in the states
 _NEAR, _BEYOND, _FAR = 0.9, 1.05, 2.0  # multiples of a limit
 _SETTLE_S = 0.05  # for drivers that report measured actuator heights, not the targets
@@ -39,7 +41,7 @@ def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool 
         if not _bad(found, "grid", "state"):
             mirror.begin(base_nm, 0 if last is None else last.frame_sequence)
             show("ordinary commands")
-            found += _next_command(mirror, base_nm, seconds)
+            found += _ordinary_commands(mirror, base_nm, seconds)
         if not _bad(found, "grid", "state", "answers"):
             show("commands that must be refused")
             found += _refusals(mirror, base_nm)
@@ -73,7 +75,7 @@ def _idle(mirror: Dialogue) -> Iterator[Check]:
         return
     if states and (sequence := states[-1].frame_sequence) >= SEQUENCE_BOUND:
         advice = "report the frame_sequence of the applied command, 0 before the first one"
-        yield wrong(f"frame_sequence {sequence}", advice)._replace(name="state", expected=expected)
+        yield wrong(f"frame_sequence {sequence}", advice)._replace(name="state", expected="a valid frame_sequence")
     check, rate_hz = ok(f"{len(states) / IDLE_S:.0f} a second"), len(states) / IDLE_S
     if not states:
         advice = "publish it: a starting controller waits one second for the mirror's shape, then assumes flat"
@@ -102,7 +104,8 @@ def _grid(mirror: Dialogue, state: wire.MirrorState) -> Check:
     return ok(got)
 
 
-def _next_command(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator[Check]:
+def _ordinary_commands(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator[Check]:
+    """Send small shapes with alternating sign, one per period, and check the answers; give up after three without."""
     line, period_ns = mirror.line, mirror.expected.period_ns
     answers: list[wire.MirrorState] = []
     commanded_nm = base_nm
@@ -133,10 +136,10 @@ def _next_command(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator
     names = {number: name.removeprefix("MIRROR_STATUS_") for name, number in wire.MirrorStatus.items()}
     got, advice = names.get(last.status, str(last.status)), "report FOLLOWING while a command is in force"
     yield judged("status", "FOLLOWING", last.status == _FOLLOWING, got, advice)
-    others, expected = len(answers) - same_time, "timestamp of the applied command"
+    different, expected = len(answers) - same_time, "timestamp of the applied command"
     age_ms, advice = (from_timestamp(last.timestamp) - line.now_ns()) / 1e6, "copy the command's timestamp: it joins "
-    got = f"{others} of {len(answers)} differ, the last {age_ms:.3g} ms from now"
-    yield judged("time", expected, not others, "the same", f"{advice}commands and states in logs", got, warning)
+    got = f"{different} of {len(answers)} differ, the last {age_ms:.3g} ms from now"
+    yield judged("time", expected, not different, "the same", f"{advice}commands and states in logs", got, warning)
     got, expected = f"{len(last.command_nm)} values", "command_nm of the applied command"
     advice = "copy it, or omit it if your limits changed the command: a restarted controller continues from it"
     yield judged("modal command", expected, tuple(last.command_nm) == MODAL_NM, got, advice, severity=warning)
@@ -222,7 +225,7 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
     ):
         expected = f"a command with {what} changes nothing, and the next valid one is applied"
         state, _, _ = mirror.ask(base_nm)
-        if state is None:  # once is no fault: after a stall of the host a mirror skips a command
+        if state is None:  # one missing answer is no fault: after a stall of the host a mirror skips a command
             state, _, _ = mirror.ask(base_nm)
         before_nm = mirror.surface_nm(state)
         if state is None or before_nm is None:
@@ -250,6 +253,7 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
 
 
 def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator[Check]:
+    """Raise the mirror, let the command expire while refused ones arrive, then let one of long validity expire."""
     raised_nm = base_nm + np.float32(raised_by_nm)
     mirror.ask(raised_nm, EXPIRES_NS)
     sent_ns = mirror.line.now_ns()
@@ -284,7 +288,7 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
     yield judged("longest command", expected, bounded, "EXPIRED", advice, late, warning)
     arrivals = [message.receive_time_ns for message, _ in mirror.since(sent_ns)]
     longest_s = max((later - earlier for earlier, later in pairwise(arrivals)), default=MAX_VALID_NS) / 1e9
-    expected, got = ("ten states a second also without commands", f"longest time without one {longest_s:.2g} s")
+    expected, got = "ten states a second also without commands", f"longest time without one {longest_s:.2g} s"
     advice, severity = "publish the state ten times a second, also when idle", wrong if longest_s > 1.0 else warning
     yield judged("silence", expected, longest_s <= 0.25, got, advice, severity=severity)
 
@@ -297,14 +301,14 @@ def _expired_ns(mirror: Dialogue, since_ns: int) -> int | None:
 def _limit_checks(mirror: Dialogue) -> Iterator[Check]:
     """Test stroke and slew limits with all actuators, the neighbour limit with one; the mirror ends flat."""
     limits, flat_nm = mirror.expected.limits, np.zeros(mirror.expected.grid, np.float32)
-    even = np.ones_like(flat_nm)
-    peak, among = _peak(mirror.expected.moving)
+    uniform = np.ones_like(flat_nm)
+    peak, neighbours = _peak(mirror.expected.moving)
     stroke_nm, slew_nm, apart_nm = limits.stroke_nm, limits.slew_nm, limits.neighbour_nm
     too_far_nm = min(_FAR * slew_nm, _NEAR * stroke_nm)
     fits = _BEYOND * apart_nm / 2 <= _NEAR * stroke_nm and mirror.reachable(_BEYOND * apart_nm)
     for name, words, reason, limit_nm, asked_nm, shape, possible in (
-        ("stroke", "no actuator above", wire.REASON_STROKE, stroke_nm, _BEYOND * stroke_nm, even, _rises(mirror)),
-        ("slew", "no move above", wire.REASON_SLEW, slew_nm, too_far_nm, even, too_far_nm >= _BEYOND * slew_nm),
+        ("stroke", "no actuator above", wire.REASON_STROKE, stroke_nm, _BEYOND * stroke_nm, uniform, _rises(mirror)),
+        ("slew", "no move above", wire.REASON_SLEW, slew_nm, too_far_nm, uniform, too_far_nm >= _BEYOND * slew_nm),
         ("neighbours", "no step above", wire.REASON_NEIGHBOUR, apart_nm, _BEYOND * apart_nm, peak, fits),
     ):
         expected = f"{words} {limit_nm:g} nm, with {asked_nm:.4g} nm commanded"
@@ -316,7 +320,7 @@ def _limit_checks(mirror: Dialogue) -> Iterator[Check]:
             if state is None or where_nm is None:
                 check = wrong("no answer", "apply the command as far as the limits allow: a refusal stops the loop")
             else:
-                found_nm = _highest_nm(mirror, where_nm) if shape is even else float(np.ptp(where_nm[among]))
+                found_nm = _highest_nm(mirror, where_nm) if shape is uniform else float(np.ptp(where_nm[neighbours]))
                 check = _within_limit(state, reason, found_nm, limit_nm + mirror.expected.tolerance_nm)
         yield check._replace(name=name, expected=expected)
         mirror.go(flat_nm)
@@ -345,7 +349,7 @@ def _rises(mirror: Dialogue) -> bool:
 def _peak(moving: Mask) -> tuple[Single, tuple[int, list[int]]]:
     """A shape with one actuator at 0.5 and all others at -0.5; row and columns of that one and its two neighbours.
 
-    All three move; the actuator is the nearest such to the centre.
+    The actuator is the nearest to the centre of those that move with both neighbours; of all if there are none.
     """
     good = np.zeros_like(moving)
     good[:, 1:-1] = moving[:, 1:-1] & moving[:, :-2] & moving[:, 2:]

@@ -56,7 +56,7 @@ def _sequence(device: Collected) -> Check | None:
         got = f"not above the previous one, {back} times of {len(steps)}"
         return wrong(got, "count every message of this topic, in one thread; such messages are refused")
     if gaps:
-        got = f"{sum(gaps)} missing, in {len(gaps)} gaps of {len(steps)} steps"
+        got = f"{sum(gaps)} missing, in {counted(len(gaps), 'gap')} among {len(sequences)} messages"
         if len(gaps) > len(steps) // 10:
             return wrong(
                 got, "count only the messages of this topic; if FRAMES_LOST reports lost frames, find their cause"
@@ -75,7 +75,8 @@ def _put_time(device: Collected) -> Check | None:
     arrivals = [message.receive_time_ns for message in device.published]
     lag_ns = int(np.median([arrival - time for arrival, time in zip(arrivals, times, strict=True)]))
     if not -_AHEAD_NS <= lag_ns <= LATE_NS:
-        got = f"{lag_ns / 1e6:.3g} ms before the arrival" if abs(lag_ns) < 3600 * NS else f"{times[-1]} ns"
+        side = "before" if lag_ns > 0 else "after"
+        got = f"{abs(lag_ns) / 1e6:.3g} ms {side} the arrival" if abs(lag_ns) < 3600 * NS else f"{times[-1]} ns"
         return wrong(got, _clock_advice(times[-1], arrivals[-1], device.line.offset_ns))
     back = sum(later <= earlier for earlier, later in pairwise(times))
     if back:

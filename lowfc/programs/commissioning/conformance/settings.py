@@ -9,6 +9,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import CAMERA_STATE, from_timestamp, wire
+from lowfc.control.loop.wording import counted
 from lowfc.device import CameraSettings
 from lowfc.programs.commissioning.checks import Check, Table, judged, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.camera import Camera
@@ -35,7 +36,9 @@ def _settings(camera: Camera) -> Check:
     return ok(f"{count} in {camera.seconds:g} s")
 
 
-@SETTINGS.check("settings' values", "a timestamp; period, gain, saturation, rows, columns and bit depth above 0")
+@SETTINGS.check(
+    "settings' values", "a timestamp; exposure, period, gain, saturation, rows, columns and bit depth above 0"
+)
 def _values(camera: Camera) -> Check | None:
     if (state := camera.settings) is None:
         return None
@@ -129,15 +132,15 @@ def _on_request(camera: Camera) -> Check | None:
             wire.CameraState.FromString(answer.payload)
         except DecodeError:
             return wrong("an answer that is not a lowfc.v1.CameraState", "answer with the last payload")
-    return ok(f"{len(camera.answers)} answer")
+    return ok(counted(len(camera.answers), "answer"))
 
 
 class Agreement(NamedTuple):
-    """One value that is both in the camera's settings and in the configuration.
+    """One of the camera's settings that the configuration also determines.
 
     Attributes:
         field: field of lowfc.v1.CameraState.
-        key: configuration key of the same value.
+        key: configuration key that determines it.
         unit: unit in which both are printed.
         tolerance: largest difference, relative to the configured value.
         needed: whether a difference is wrong for the loop, or only for computed values (a warning).
@@ -182,12 +185,7 @@ def agreement_checks(config: Configuration, state: wire.CameraState) -> Iterator
         advice = f"set {one.key}, or the camera; {advice}"
         yield judged(f"{one.field} and {one.key}", expected, agree, got, advice, severity=severity)
     frame_timeout_ms, period_ms = config.frame_timeout_ns * 1e-6, state.period_ns * 1e-6
-    enough, expected = (
-        frame_timeout_ms >= PERIODS_OF_TIMEOUT * period_ms,
-        f"at least {PERIODS_OF_TIMEOUT:g} frame periods",
-    )
-    got, advice = (
-        f"{frame_timeout_ms:g} ms, the period is {period_ms:g} ms",
-        "omit the key: its default follows camera.rate_hz",
-    )
+    enough, got = frame_timeout_ms >= PERIODS_OF_TIMEOUT * period_ms, f"{frame_timeout_ms:g} ms"
+    expected = f"at least {PERIODS_OF_TIMEOUT:g} frame periods of {period_ms:g} ms"
+    advice = "omit the key: its default follows camera.rate_hz"
     yield judged("control.frame_timeout_ms", expected, enough, got, advice)

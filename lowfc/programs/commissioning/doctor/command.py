@@ -53,13 +53,10 @@ def doctor(
         root = Path("/")
         user = os.environ.get("SUDO_USER", "")
         try:
-            done = (
-                permissions.undo(root)
-                if undo
-                else permissions.apply(root, user)
-                if apply
-                else [permissions.shown(root)]
-            )
+            if undo:
+                done = permissions.undo(root)
+            else:
+                done = permissions.apply(root, user) if apply else [permissions.shown(root)]
         except (OSError, LookupError) as fault:  # such as a read-only folder, or a user unknown to usermod
             raise DataFileError(f"the settings cannot be changed completely: {fault}") from fault
         sys.stdout.write("\n".join(done) + "\n")

@@ -17,7 +17,7 @@ class Facts:
     Attributes:
         host: the host, as reported by its kernel.
         config: configuration of the loop.
-        trial: granted real-time measures and wake-up latencies, or the error if the trial failed.
+        trial: refused real-time measures and wake-up latencies, or the error if the trial failed.
         busy: other processes during the measurement, as from `Host.busy`.
     """
 
@@ -28,7 +28,7 @@ class Facts:
 
     @property
     def tried(self) -> Trial:
-        """Granted real-time measures and wake-up latencies; OSError if the trial failed."""
+        """Refused real-time measures and wake-up latencies; OSError if the trial failed."""
         if isinstance(self.trial, OSError):
             raise self.trial
         return self.trial
@@ -49,7 +49,7 @@ class Facts:
 def gather(host: Host, config: Configuration, seconds: float) -> Facts:
     """Request the loop's real-time measures, measure wake-ups in each class, and note other busy processes."""
     facts = Facts(host, config, OSError("not tried"), ())
-    host.busy()
+    host.busy()  # the next call reports the load since this one
     trial: Trial | OSError
     try:
         trial = try_out(config.realtime, facts.named_cpus, seconds)

@@ -27,7 +27,7 @@ def shown(root: Path) -> str:
 
 
 def apply(root: Path, user: str) -> list[str]:
-    """Write the files, create the group with this user, and give it access to the device; return the actions.
+    """Write the files, create the group with this user, and give the group access to the device; return the actions.
 
     Raises:
         ConfigurationError: not root, or a file is not lowfc's.
@@ -37,7 +37,7 @@ def apply(root: Path, user: str) -> list[str]:
     _require_root("--apply")
     for name, text in FILES.items():
         file = root / name
-        if file.exists() and file.read_text(encoding="utf-8") != text:
+        if file.exists() and file.read_bytes() != text.encode():
             raise ConfigurationError(f"{file} is not lowfc's own: move it away, or add its lines by hand")
     done = []
     for name, text in FILES.items():
@@ -56,12 +56,12 @@ def apply(root: Path, user: str) -> list[str]:
 
 
 def undo(root: Path) -> list[str]:
-    """Remove files, group and access to the device; return the actions. ConfigurationError if not root."""
+    """Remove files, group and access to the device; return the actions. ConfigurationError if not root, or OSError."""
     _require_root("--undo")
     done = []
     for name, text in FILES.items():
         file = root / name
-        if file.exists() and file.read_text(encoding="utf-8") == text:
+        if file.exists() and file.read_bytes() == text.encode():
             file.unlink()
             done.append(f"removed {file}")
     if (root / DEVICE).exists():
@@ -80,7 +80,7 @@ def _require_root(option: str) -> None:
 
 
 def _run(*words: str) -> str:
-    """Run a command of the host and return it; OSError if there is none, or it failed."""
+    """Run a command of the host; return its text. OSError if it does not exist or fails."""
     program = shutil.which(words[0], path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin") or words[0]
     run = subprocess.run([program, *words[1:]], capture_output=True, text=True, check=False)  # noqa: S603  # as shown
     if run.returncode:

@@ -19,7 +19,7 @@ CHECKS: Table[Facts] = Table()
 
 _STALL_S = 0.1  # stall of a reader that socket buffers should outlast
 _OPEN_FILES = 256  # needed by a process
-_LIMITS = "`lowfc doctor --setup` (memlock unlimited in /etc/security/limits.d), or the service LimitMEMLOCK=infinity"
+_LIMITS = "`lowfc doctor --setup` (memlock unlimited in limits.d), or the service's LimitMEMLOCK=infinity"
 
 
 @CHECKS.check("locked memory")

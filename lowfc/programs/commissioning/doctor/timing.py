@@ -36,7 +36,7 @@ def _scheduling_class(facts: Facts) -> Check:
         return note("the configuration requests normal scheduling: realtime.priority = 0")
     if refused := facts.tried.refused.get("priority"):
         what, cost = refused
-        advice = f"`lowfc doctor --setup` (rtprio {priority} in limits.d), or the service LimitRTPRIO={priority}"
+        advice = f"`lowfc doctor --setup` (rtprio {priority} in limits.d), or the service's LimitRTPRIO={priority}"
         return warning(f"refused: {what}", advice, cost)
     return ok(f"SCHED_FIFO priority {priority} is granted")
 
@@ -64,7 +64,7 @@ def _processors(facts: Facts) -> Check:
     usable, online = facts.host.usable_cpus(), facts.host.cpus("online")
     detail = f"{len(usable)} usable ({ranges(usable)}) of {len(online)}"
     named = facts.named_cpus
-    if missing := named and named - facts.tried.cpus:
+    if named and (missing := named - facts.tried.cpus):
         return warning(
             f"{detail}; the configuration names {ranges(missing)}",
             "correct realtime.camera_cpus, controller_cpus, mirror_cpus and recorder_cpus",
@@ -252,7 +252,7 @@ def _boot_clock(facts: Facts) -> Check:
     cost="every frame waits this long before processing, however fast the loop computes",
 )
 def _wake_up(facts: Facts) -> Check:
-    """Lateness of a timer wake-up, 1000 times in one second, in both scheduling classes."""
+    """Lateness of a timer wake-up, 1000 times in one second, in normal scheduling and, if granted, SCHED_FIFO."""
     wake_up = wake_up_us(facts.tried)
     detail = "; ".join(
         f"{name}: p50 {one['p50']:.0f} us, p99 {one['p99']:.0f} us, max {one['max']:.0f} us"

@@ -32,7 +32,7 @@ from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.what_if.run import LoggedRun, SeenCommands, during_probe
 
 _SETTLING_S = 0.5  # time excluded after the loop was closed
-_POLLED = 100  # frames between two requests for the state of a running loop
+_POLL_FRAMES = 100  # between two requests for the state of a running loop
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,8 @@ class Telemetry:
 def telemetry_from_log(log: LogReader) -> Telemetry:
     """The used closed-loop frames of a log; all used frames if there are too few of them.
 
-    Frames with a probe sequence, as in an acceptance test, are excluded: a law must not learn from them.
+    Frames with a probe sequence, as in an acceptance test, are excluded: a law must not learn from them. DataFileError
+    if too few remain.
     """
     history = read_history(log)
     run = LoggedRun(history)
@@ -104,8 +105,8 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
 def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
     """The steps of a running loop in the next `seconds`.
 
-    Frames with a probe sequence are excluded. The state is requested every `_POLLED` frames: a shorter sequence may not
-    be noticed.
+    Frames with a probe sequence are excluded. The state is requested every `_POLL_FRAMES` frames: a shorter sequence
+    may not be noticed. DataFileError without a calibration, if `seconds` are too few, or if no frame was used.
     """
     states = [_state(loop)]
     calibration = loop.calibration()
@@ -123,7 +124,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
     for step in stream:
         received.append(step)
         passed_s = time.monotonic() - begun_s
-        if len(received) % _POLLED == 0:
+        if len(received) % _POLL_FRAMES == 0:
             states.append(_state(loop))
             if progress is not None:
                 progress(passed_s)
@@ -179,7 +180,7 @@ def _from_first_used(run_id: str, steps: Steps) -> Steps:
 def _without_probes(steps: Steps, seen: SeenCommands, assumed: float, played: Mask) -> tuple[Steps, Mask]:
     """The steps with pseudo-open-loop modes for the measured delay, and the usable ones (steps,).
 
-    The loop is not closed in those with a probe sequence (`played`), so that it also settles after one.
+    Steps with a probe sequence (`played`) get the mode 0, which is not closed: the time to settle after it is excluded.
     """
     pol_nm = steps.pol_nm if seen.delay_frames == assumed else steps.error_nm - seen.seen_nm
     usable = np.isfinite(pol_nm).all(axis=1) & ~seen.torn & ~played & (steps.saturated_pixels == 0)

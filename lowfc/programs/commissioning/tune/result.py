@@ -128,7 +128,7 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
     achieved_nm = _achieved_nm(run, gains.noise_nm)
     has_truth = run.true_nm2 is not None or run.continuous_rms_nm is not None
     if achieved_nm is not None and now_nm is not None and run.continuous_rms_nm is None:
-        # The frames give the residual of what the exposures see; theory adds the rest.
+        # The frames give the residual at one instant per frame; theory adds that between these instants.
         sampled_nm = predicted_nm(now, best.models, Timing.sampled(run.timing.delay))
         achieved_nm = np.sqrt(np.maximum(achieved_nm**2 + now_nm**2 - sampled_nm**2, 0.0))
     columns = {

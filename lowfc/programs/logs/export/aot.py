@@ -59,7 +59,7 @@ _NM = 1e-9
 
 
 def write_aot(files: list[Path], history: History, *, with_frames: bool) -> None:
-    """Write a run as AOT; `aotpy` reads the file back and checks it."""
+    """Write a run as AOT; `aotpy` checks the file, before commands and frames replace its empty images."""
     step_columns(history)  # raises DataFileError without steps
     path = files[0]
     if history.calibration is None:

@@ -17,11 +17,11 @@ from lowfc.control.loop.safety import REASONS
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One quantity of every step, or one array of the calibration.
+    """One quantity of every step or frame, or one array of the calibration.
 
     Attributes:
         name: name; ends in the unit if there is one.
-        values: array (steps,) or (steps, modes); any shape for a calibration.
+        values: array (rows,) or (rows, modes); any shape for a calibration.
         unit: unit in FITS notation; empty for none.
         description: description of the quantity.
     """

@@ -63,7 +63,10 @@ def write_npz(files: list[Path], history: History) -> None:
 
 
 def write_fits(files: list[Path], history: History, *, with_frames: bool) -> None:
-    """Write the steps as binary table STEPS, each array of the calibration as an image, the frames as cube FRAMES."""
+    """Write the steps as binary table STEPS, each array of the calibration as an image, the frames as cube FRAMES.
+
+    Table FRAME_TIMES has the sequences and times of the frames.
+    """
     arrays = calibration_columns(history.calibration) if history.calibration is not None else ()
     units = [
         _primary(history),
@@ -120,7 +123,7 @@ def _table(name: str, columns: list[Column]) -> fits.BinTableHDU:
         if values.dtype.kind == "M":
             values = np.datetime_as_string(values)
         elif values.dtype == np.uint64:
-            values = values.astype(np.int64)  # FITS has no uint64; a start in seconds << 32 fits in int64
+            values = values.astype(np.int64)  # FITS has no uint64; a start in seconds << 32 fits in int64 until 2038
         rows[column.name] = TableColumn(values, unit=column.unit or None)
     unit = fits.table_to_hdu(rows)
     unit.name = name

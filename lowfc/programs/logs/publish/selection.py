@@ -53,7 +53,7 @@ class Selection:
             role = role_of(key)
             if role in self.live and (role != Role.CONTROLLER or key in self._patterns):
                 raise BusError(
-                    f"{role} of {run} is live and publishes {key} itself; stop it, replay into another run (--run), "
+                    f"{role} of {run} is live and publishes {key} itself; stop it, publish in another run (--run), "
                     "or choose topics that it does not publish (--topics)"
                 )
         roles = [role_of(key) for key in selected if not self.exclusion_reason(key)]

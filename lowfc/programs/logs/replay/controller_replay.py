@@ -70,7 +70,7 @@ class Context:
     Attributes:
         tolerance_nm: largest difference to ignore.
         kernel: name of the kernel; empty for the log's own.
-        former: fields to compare in a log of another version; set before the first message.
+        former: fields to compare in a file of another version, None in one of this version; set for each file.
     """
 
     tolerance_nm: float = 0.0

@@ -9,8 +9,8 @@ from google.protobuf.message import Message
 
 from lowfc.arrays import Array
 
-_FLOAT32_FIELDS = ("actuators", "offset")
-"""Bytes that hold little-endian float32, nm."""
+_FLOAT32_FIELD = "actuators"
+"""Field whose bytes hold little-endian float32, nm."""
 _IN_NM = ("_nm", "actuators", "law_state")
 """Endings of the names of fields in nm; a law's state has the unit of its author, nm for lowfc's own laws."""
 _MAX_SHOWN = 4
@@ -79,7 +79,7 @@ def _compare(found: Difference, prefix: str, logged: Message, replayed: Message)
 def _numbers(descriptor: Any, value: Any) -> Array | None:
     """Numbers of a field as an array; None if it has no numbers or they are not finite."""
     found = None
-    if descriptor.name in _FLOAT32_FIELDS:
+    if descriptor.name == _FLOAT32_FIELD:
         found = np.frombuffer(value, "<f4").astype(float) if len(value) % 4 == 0 else None
     elif descriptor.type in (FieldDescriptor.TYPE_FLOAT, FieldDescriptor.TYPE_DOUBLE):
         found = np.atleast_1d(np.array(value, float))

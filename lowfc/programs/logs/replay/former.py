@@ -50,7 +50,8 @@ class FormerVersion:
 
     def _known(self, name: str) -> set[int] | None:
         """Numbers of the fields of a message; None if the log does not declare it."""
-        for number in self._schemas.keys() - self._read if name not in self._fields else ():
+        unread = set[int]() if name in self._fields else self._schemas.keys() - self._read
+        for number in unread:
             self._read.add(number)
             with contextlib.suppress(DecodeError):
                 for file in FileDescriptorSet.FromString(self._schemas[number].data).file:

@@ -22,7 +22,7 @@ from lowfc.programs.logs.report.source import InForce, Results, Run
 MAX_STEPS = 200_000
 """Only the last steps of a longer stretch are used, to bound the memory."""
 BANDS_HZ = (1.0, 10.0, 100.0, 1000.0)
-"""Upper ends of the frequency bands, above the resolution."""
+"""Edges between the frequency bands; only those between the resolution and the highest frequency are used."""
 
 _TIP, _TILT = 2, 3
 
@@ -103,8 +103,11 @@ def longest_stretch(run: Run) -> Stretch | None:
 
 def why_none(run: Run) -> str:
     """The reason if there is no stretch."""
-    if (run.history.steps.mode == LoopMode.CLOSED).any():
+    closed = run.history.steps.mode == LoopMode.CLOSED
+    if (closed & run.history.under_calibration).any():
         return "this log does not contain the law with which the loop was closed"
+    if closed.any():
+        return "the loop was closed only under an earlier calibration than the last one of this log"
     return "the loop was not closed in this log"
 
 

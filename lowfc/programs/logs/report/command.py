@@ -1,4 +1,4 @@
-"""The command `lowfc report`: arguments only."""
+"""The command `lowfc report`."""
 
 import sys
 from functools import partial

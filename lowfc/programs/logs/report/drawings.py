@@ -98,13 +98,13 @@ def _intervals(figure: "Figure", report: Report) -> bool:
         for (name, values), colour, style in zip(found.items(), (INK, COLOURS["other"]), ("-", "--"), strict=False):
             counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
             left.stairs(counts, edges, label=name, color=colour, linestyle=style, linewidth=1.2)
-        left.set(yscale="log", xlabel="interval, µs (first and last bin: and beyond)", ylabel="number")
+        left.set(yscale="log", xlabel="interval, µs (first and last bin: with all beyond)", ylabel="number")
         left.legend()
     colours = (COLOURS["other"], COLOURS["another"], FAINT, COLOURS["error"], INK, INK)
     styles = ("-", "--", "-.", ":", "-", "--")
     for (name, values), colour, style in zip(stages.items(), colours, styles, strict=False):
         ordered = np.sort(values)
-        keep = np.unique(np.append(_spread(ordered.size), ordered.size - 1))
+        keep = _spread(ordered.size)
         beyond = 1 - keep / ordered.size
         right.plot(np.maximum(ordered[keep], 0.1), beyond, label=name.replace("_", " "), color=colour, linestyle=style)
     if stages:
@@ -114,8 +114,8 @@ def _intervals(figure: "Figure", report: Report) -> bool:
 
 
 def _spread(size: int, most: int = 400) -> Long:
-    """Indices into a sorted column, denser towards its end."""
-    return size - 1 - np.unique(np.geomspace(1, size, min(most, size)).astype(np.int64) - 1)
+    """Ascending indices into a sorted column, denser towards its end, which is included."""
+    return size - np.unique(np.geomspace(1, size, min(most, size)).astype(np.int64))[::-1]
 
 
 def _residual(figure: "Figure", report: Report) -> bool:
@@ -262,7 +262,8 @@ def _timeline(figure: "Figure", report: Report) -> bool:
     levels = ("request", "info", "warning", "error")
     looks = {"info": ("o", INK, "none"), "warning": ("^", INK, OPEN), "error": ("X", INK, COLOURS["error"])}
     for level, (marker, edge, face) in looks.items():
-        found = [e["time_s"] for e in events if e["level"] == level or (level, e["level"]) == ("error", "fatal")]
+        included = (level, "fatal") if level == "error" else (level,)
+        found = [event["time_s"] for event in events if event["level"] in included]
         times_s = np.array(found)[bin_starts(len(found), _MAX_MARKS)]
         place = np.full(times_s.size, levels.index(level))
         axes.plot(times_s, place, marker, markeredgecolor=edge, markerfacecolor=face, markersize=7, linestyle="none")

@@ -21,7 +21,7 @@ from lowfc.programs.logs.report.timing import timing_results
 from lowfc.programs.logs.report.verdict import verdict
 from lowfc.programs.logs.survey import recovery_in_words
 
-_OTHER_KEYS = ("host", "kernel", "processor", "processors", "cpu_features", "blas", "run", "seed", "git")
+_NOT_VERSIONS = ("host", "kernel", "processor", "processors", "cpu_features", "blas", "run", "seed", "git")
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +102,8 @@ def _run(run: Run) -> Results:
         if configuration is not None and history.truths.sequence.size
         else {},
         "lockstep": configuration.lockstep if configuration is not None else None,
-        **{key: about.get(key) for key in _OTHER_KEYS},
-        "versions": {name: value for name, value in about.items() if name not in _OTHER_KEYS},
+        **{key: about.get(key) for key in _NOT_VERSIONS},
+        "versions": {name: value for name, value in about.items() if name not in _NOT_VERSIONS},
         "calibration": None
         if calibration is None
         else {

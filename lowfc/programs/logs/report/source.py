@@ -25,7 +25,7 @@ class InForce:
     """A control law in force: gain and leak (modes,) of the integrator, delay, and the linear law used instead.
 
     Attributes:
-        first: step from which on it is in force; comparisons ignore it.
+        first: step from which on it is in force; comparisons ignore it and `linear`.
         law_id, law_name: identity and name of the linear law; without one, empty and "integrator".
         overruled: groups of modes that the integrator drives instead of the law.
         linear: the linear law; None for the integrator, if it is not in the log, or if it is overruled.

@@ -6,7 +6,7 @@ from lowfc.adapters.logs.columns import STAGES, rows_of
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long
 from lowfc.contract.envelope import start_of
-from lowfc.contract.messages import FRAME, Role
+from lowfc.contract.messages import FRAME, Role, wire
 from lowfc.programs.logs.report.source import Results, Run
 
 _END_NS = 50_000_000
@@ -33,10 +33,11 @@ def intervals_ns(run: Run) -> dict[str, Long]:
     Intervals between frames are omitted if the log does not have every frame.
     """
     history = run.history
-    published = history.frame_publish_ns[: None if history.log.selection.has_every_frame else 0]
-    starts = history.frame_sequence[: published.size] >> np.uint64(32)
-    frames = np.diff(published)[np.diff(starts) == 0] if published.size else published
-    return {"frames": frames, "commands": np.diff(run.history.command_publish_ns)}
+    frames = np.zeros(0, np.int64)
+    if history.log.selection.has_every_frame:
+        same_start = np.diff(history.frame_sequence >> np.uint64(32)) == 0
+        frames = np.diff(history.frame_publish_ns)[same_start]
+    return {"frames": frames, "commands": np.diff(history.command_publish_ns)}
 
 
 def latencies_ns(history: History) -> dict[str, Long]:
@@ -73,18 +74,14 @@ def frame_counts(history: History) -> Results:
     if not without.all():
         published_ns = history.frame_publish_ns[rows]
         at_the_end = (frames > history.stepped_sequence.max()) & (published_ns > published_ns[-1] - _END_NS)
-    counted: dict[str, int | None] = {"skipped": None, "missing": None}
-    controller = history.health.get(Role.CONTROLLER)
-    if controller is not None:
-        for topic in controller.topics:
-            if topic.topic == FRAME.key:
-                counted = {"skipped": topic.skipped, "missing": topic.missing}
+    controller = history.health.get(Role.CONTROLLER, wire.Health())
+    counts = next((topic for topic in controller.topics if topic.topic == FRAME.key), None)
     return {
         "recorded": int(frames.size),
         "without_command": int((without & ~at_the_end).sum()),
         "at_the_end": int(at_the_end.sum()),
-        "skipped_by_controller": counted["skipped"],
-        "missing_at_controller": counted["missing"],
+        "skipped_by_controller": None if counts is None else counts.skipped,
+        "missing_at_controller": None if counts is None else counts.missing,
         "commands_late": history.commands_late if history.truths.sequence.size else None,
         "camera_starts": len({start_of(int(sequence)) for sequence in frames}),
     }

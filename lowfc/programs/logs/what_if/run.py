@@ -89,7 +89,7 @@ class LoggedRun:
         controller_delay: delay assumed by the controller, frames; `measured_delay`, from `measured_from`, is None if
             it cannot be measured; the comparison uses `delay_frames`, with `weights`.
         played: (steps,) True during a probe sequence, which moves the mirror in addition to the commands.
-        seen: commands seen by the exposures; `seen_nm` and `torn` are its own.
+        seen: commands seen by the exposures; `delay_frames`, `weights`, `seen_nm` and `torn` are those of `seen`.
     """
 
     def __init__(self, history: History) -> None:

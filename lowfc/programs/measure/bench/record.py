@@ -24,13 +24,7 @@ _POLL_S = 0.5
 _WARM_UP_S = 0.5
 _COPY_S = 0.5
 _COPY_BYTES = 256 * 1024
-_RECORDER_KEYS = (
-    "messages_recorded",
-    "messages_lost",
-    "longest_wait_ms",
-    "longest_unflushed_ms",
-    "longest_write_ms",
-)
+_RECORDER_KEYS = ("messages_recorded", "messages_lost", "longest_wait_ms", "longest_unflushed_ms", "longest_write_ms")
 """Values that the recorder prints at its end."""
 
 

@@ -182,7 +182,7 @@ def _compare(files: tuple[Path, Path]) -> dict[str, Any]:
 
     try:
         found = compare(*(_result(file) for file in files))
-    except (LookupError, TypeError, AttributeError) as fault:
+    except (LookupError, TypeError, ValueError, AttributeError) as fault:
         raise DataFileError(
             f"{files[0]} and {files[1]} must be results of `lowfc latency --json`, but at least one is not: {fault!r}"
         ) from None

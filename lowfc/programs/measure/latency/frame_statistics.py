@@ -44,7 +44,7 @@ ALONE = {
 }
 """Names and labels of the host's reference times."""
 RATIOS = {"ratio": ("step_us", ""), "ratio_hot": ("hot_step_us", " of those back to back")}
-"""Ratios of frame to command, over half an echo plus the step named here; and what is added to the step's label."""
+"""By ratio of frame to command to half an echo plus a step: the name of that step, and the end of the ratio's label."""
 RATIOS_AT = ("p50", "p99")
 COUNTS = {
     "frames": "frames",
@@ -123,7 +123,7 @@ def join(
 
 
 def percentiles(values: npt.NDArray[Any]) -> dict[str, float] | None:
-    """Percentiles at these fractions (each is one of the values); None without values."""
+    """The `PERCENTILES` of the finite values, each one of these values; None without any."""
     known = np.sort(values[np.isfinite(values)])
     if not known.size:
         return None
