@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from lowfc.adapters.files import calibration_file, law_file
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer
 from lowfc.contract.codecs.calibration_codec import identified
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, REQUEST, wire
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
@@ -32,10 +33,11 @@ from lowfc.programs.console.history import History
 from lowfc.programs.console.panels import _PIXELS, halves, reduced, sparkline
 from lowfc.programs.console.phrases import phrased
 from lowfc.programs.console.task import Task
+from lowfc.programs.view import monitor
 from lowfc.programs.view.verdicts.run_state import Liveness
 from lowfc.programs.view.verdicts.tile import Level
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from tests.console.live_run import RUN, LiveRun
+from tests.console.live_run import CONFIG, RUN, LiveRun
 from tests.support.loops import until
 from tests.support.stage import Stage
 from tests.support.toy import GRID, NOLL, calibration
@@ -393,6 +395,16 @@ def test_a_task_runs_in_its_own_session_and_reports_its_end() -> None:
         assert task.status_line.startswith(status_line)
         task.output.unlink()
         assert task.status_line.startswith(status_line[:8]), "a cleaner of temporary files may remove the output"
+
+
+def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[object] = []
+    monkeypatch.setattr(feed, "configuration_of", lambda _: found[0] if found else Mock(side_effect=BusError)())
+    monkeypatch.setattr(monitor, "_QUERY_AGAIN_NS", 100_000_000)
+    screen = feed.Feed(run.bus("operator"), RUN, run.clock)
+    until(lambda: len(screen.read().state.snapshot.health) == 3 and screen.read().state.snapshot.calibration)
+    found.append(CONFIG)
+    until(lambda: screen.read() and screen._config is CONFIG)
 
 
 def test_a_request_is_in_the_log_of_every_console(run: LiveRun) -> None:

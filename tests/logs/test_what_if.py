@@ -454,6 +454,13 @@ def test_warnings_name_what_makes_the_results_doubtful() -> None:
         assert words in warnings
 
 
+def test_a_loop_closed_on_refused_frames_only_is_not_called_never_closed() -> None:
+    closed, error_nm = np.arange(40) >= 20, np.full((40, 3), 4.0, np.float32)
+    error_nm[closed] = np.nan
+    run = LoggedRun(history(error_nm=error_nm, mode=np.where(closed, LoopMode.CLOSED, LoopMode.OPEN).astype(np.uint8)))
+    assert run.rows_to_compare([run.law], run.used)[2] == "no usable frame in closed loop"
+
+
 def test_an_open_loop_beyond_the_linear_range_gives_warnings() -> None:
     far = np.full((40, 3), [20.0, -30.0, 12.0], np.float32)
     run = LoggedRun(history(error_nm=far, pol_nm=far.copy(), mode=np.full(40, LoopMode.OPEN, np.uint8)))

@@ -13,7 +13,7 @@ from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.line import NS, Collected
 
 LATE_NS = 20_000_000
-"""Clock difference above which every frame is refused as late by default (`control.max_frame_age_ms`)."""
+"""Clock difference above which every frame of a camera with 100 Hz or more is refused as late by default."""
 
 _AHEAD_NS = 1_000_000
 _DECADE_S = 10 * 365 * 86_400
@@ -125,7 +125,7 @@ def _topics(device: Collected) -> Check:
     unknown = sorted(key for key in keys if not _known(key))
     if not unknown:
         return ok(f"{len(keys)} keys")
-    known = [topic.key for topic in TOPICS if topic is not EVENT]
+    known = [topic.key for topic in TOPICS if topic is not EVENT]  # a short key, near to many unknown ones
     got = ", ".join(f"{key}{nearest(key, known)}" for key in unknown)
     return wrong(got, "publish under the keys of the table; no process subscribes to others")
 

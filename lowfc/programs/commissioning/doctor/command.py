@@ -90,7 +90,4 @@ def measured(facts: "Facts") -> dict[str, Any]:
     from lowfc.adapters.process.provenance import provenance
     from lowfc.programs.commissioning.doctor.timing import wake_up_us
 
-    return {
-        "wake_up_us": {} if isinstance(facts.trial, OSError) else wake_up_us(facts.trial),
-        "host": provenance(),
-    }
+    return {"wake_up_us": {} if isinstance(facts.trial, OSError) else wake_up_us(facts.trial), "host": provenance()}

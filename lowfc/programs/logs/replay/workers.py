@@ -96,11 +96,7 @@ def _replay_segment(
     """Replay a segment, on one thread like the live loop: several threads sum in another order."""
     run = Replay(tolerance_nm, segment, kernel)
     log = WholeLog(
-        paths,
-        skip_damaged=True,
-        topics=TOPICS,
-        from_ns=max(0, segment.from_ns - PATIENCE_NS),
-        always=published.TOPICS,
+        paths, skip_damaged=True, topics=TOPICS, from_ns=max(0, segment.from_ns - PATIENCE_NS), always=published.TOPICS
     )
     part = None
     gc.disable()

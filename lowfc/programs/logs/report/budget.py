@@ -6,16 +6,7 @@ import numpy as np
 
 from lowfc.arrays import Mask
 from lowfc.control.laws.error_budget import SensorNoise, Term, lag, lag_under_noise, measurement_error, white_noise
-from lowfc.programs.logs.report.closed_loop import (
-    DISTURBANCE,
-    ERROR,
-    POL,
-    SENSED,
-    Spectra,
-    Stretch,
-    noise_of,
-    why_none,
-)
+from lowfc.programs.logs.report.closed_loop import DISTURBANCE, ERROR, POL, SENSED, Spectra, Stretch, noise_of, why_none
 from lowfc.programs.logs.report.source import Results, Run
 
 Masks = dict[str, Mask]

@@ -46,9 +46,9 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
 
     The what-if loop is closed throughout, starts from a flat mirror, and corrects the pseudo-open-loop modes of every
     used frame; it holds on a refused or missing frame, as the live loop does. Its modal limits act, actuator limits do
-    not. All results are over the same frames: those with the logged loop closed and both loops settled (all frames, if
-    it was never closed), without saturated pixels. If the log has truth, the true residual is given too, because the
-    measured one is mostly noise for a faint star. For another reconstructor the frames are read in a second pass.
+    not. All results are over the same frames: those with the logged loop closed and both loops settled (if none with a
+    closed loop is usable, all), without saturated pixels. If the log has truth, the true residual is given too, because
+    the measured one is mostly noise for a faint star. For another reconstructor the frames are read in a second pass.
     """
     user_step, noll = what.step, run.calibration.noll
     new_law = law(what, noll, run.law)

@@ -44,10 +44,7 @@ class WhatIf:
 
 
 def requested(
-    text: str | None = None,
-    config: Path | None = None,
-    calibration: Path | None = None,
-    controller: str | None = None,
+    text: str | None = None, config: Path | None = None, calibration: Path | None = None, controller: str | None = None
 ) -> WhatIf:
     """Parse the options of the command line.
 

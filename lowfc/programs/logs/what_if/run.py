@@ -147,7 +147,8 @@ class LoggedRun:
         steps, missing = self.steps, self.missing
         closed, over = steps.mode == LoopMode.CLOSED, "closed loop"
         if not (closed & usable).any():
-            closed, over = np.ones_like(closed), "the loop was never closed"
+            over = "no usable frame in closed loop" if closed.any() else "the loop was never closed"
+            closed = np.ones_like(closed)
         since = frames_since(self.torn, closed, missing)
         settling = max(settling_frames(law.gain, law.leak, self.history.rate_hz) for law in laws)
         settling = min(settling, int(since.max()) // 2)

@@ -35,16 +35,15 @@ def bench_record(
         typer.Option(min=10, max=20_000, help="Frames per second; repeat. Default: 1000, 2000 and 5000."),
     ] = None,
     folder: Annotated[
-        Path | None,
-        typer.Option(help="Folder on the disk to measure; default: the system's temporary folder."),
+        Path | None, typer.Option(help="Folder on the disk to measure; default: the system's temporary folder.")
     ] = None,
     as_json: Json = False,
 ) -> None:
     """Measure the cost of recording: processor time, losses and stalls of a recorder with the traffic of a loop.
 
-    Another process sends the messages of camera, controller and mirror for every frame (frame of 80 x 80, command,
-    step, mirror state, truth) with timing and health over the real bus. The processor share is compared with that of
-    copying the same payloads to the same disk.
+    The recorder is a separate process; it receives the messages of camera, controller and mirror for every frame (frame
+    of 80 x 80, command, step, mirror state, truth), with timing and health, over the real bus. Its processor share is
+    compared with that of copying the same payloads to the same disk.
 
     Example: lowfc bench record --seconds 5 --json
     """

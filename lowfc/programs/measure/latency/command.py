@@ -51,8 +51,7 @@ def latency(
     record: Annotated[bool, typer.Option("--record/--no-record", help="Run the recorder, too.")] = False,
     view: Annotated[bool, typer.Option("--view/--no-view", help="Run a view for a browser, too.")] = False,
     plain_scheduling: Annotated[
-        bool,
-        typer.Option("--plain-scheduling", help="Without SCHED_FIFO, pinned processors, locked memory."),
+        bool, typer.Option("--plain-scheduling", help="Without SCHED_FIFO, pinned processors, locked memory.")
     ] = False,
     kernel: Annotated[
         Kernels | None, typer.Option(help="Implementation of the control step; default: as configured.")
