@@ -188,6 +188,7 @@ def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame
     begun = wire.Health(mode=wire.LOOP_MODE_CLOSED, topics=[received], not_closed_ns=2 * SECOND)
     early = Watch(watch.health | {"controller": begun}, [])
     assert "closed for 1.6 s     250 Hz" in status_line(early, 5.0), "the residual includes open-loop frames"
+    assert "closed for 2.0 s     250 Hz" in status_line(early, 5.0, 225.0), "simulated time in lockstep"
     with Console(width=120, file=io.StringIO(), record=True) as console:
         console.print(screen(watch, Configuration(), None, 10.0))
     assert "residual 2.20 of 30.00 nm rms" in console.export_text()

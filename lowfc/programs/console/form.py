@@ -21,7 +21,6 @@ HELP = (
     "refused. When the console ends, the loop and commands started here go on."
 )
 
-
 _CLAUSE_END = re.compile(r"\. |; |, (?:and|whatever)|: it ")
 """Where the help cuts off a description."""
 

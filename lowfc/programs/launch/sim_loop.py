@@ -217,6 +217,7 @@ def _display(console: Console) -> Iterator[Callable[..., None]]:
         def line(watch: Watch, config: Configuration, duration_s: float | None, elapsed_s: float) -> None:
             if elapsed_s >= due_s[0]:
                 due_s[0] += LINE_PERIOD_S
-                sys.stderr.write(status_line(watch, elapsed_s) + "\n")
+                lockstep_hz = config.camera.rate_hz if config.lockstep else None
+                sys.stderr.write(status_line(watch, elapsed_s, lockstep_hz) + "\n")
 
         yield line

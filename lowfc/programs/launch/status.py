@@ -49,17 +49,20 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     return Panel(Group(table), title="lowfc", subtitle=f"{scene}; {elapsed_s:.0f} s{end}", expand=False)
 
 
-def status_line(watch: Watch, elapsed_s: float) -> str:
-    """The status in one line, for output that is not a terminal."""
+def status_line(watch: Watch, elapsed_s: float, lockstep_hz: float | None = None) -> str:
+    """The status in one line, for output that is not a terminal; `lockstep_hz` as in `summary`."""
     camera, controller = watch.health_of(Role.CAMERA), watch.health_of(Role.CONTROLLER)
     if not camera.HasField("recent_wavefront"):
         return f"{elapsed_s:5.0f} s  no frame yet"
     if silent := _silence_notice(watch):
         return f"{elapsed_s:5.0f} s  {mode(controller)}  {silent}"
     frames, recent = topic_count(controller, FRAME.key), wavefront(camera.recent_wavefront)
+    added = recent["added_contrast"]
+    contrast = "" if added is None else f"contrast {added['closed']:+.1e} of {added['open']:+.1e}  "
+    just_closed = _closed_for(controller, lockstep_hz or camera.rate_hz)
     return (
-        f"{elapsed_s:5.0f} s  {mode(controller)}{_closed_for(controller, camera.rate_hz)}  {camera.rate_hz:6.0f} Hz  "
-        f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms  {_contrast(recent)}"
+        f"{elapsed_s:5.0f} s  {mode(controller)}{just_closed}  {camera.rate_hz:6.0f} Hz  "
+        f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms  {contrast}"
         f"frame to command {latency(controller.frame_to_command)}  "
         f"skipped {frames.skipped} missing {frames.missing}  {recording(watch.health_of(Role.RECORDER))}"
     )
@@ -78,11 +81,6 @@ def _silence_notice(watch: Watch) -> str:
     silent_s = watch.silent_s(Role.CAMERA)
     reported = bool(watch.health_of(Role.CAMERA).process)
     return f"the camera has been silent for {silent_s:.0f} s" if reported and silent_s > SILENT_S else ""
-
-
-def _contrast(recent: dict[str, Any]) -> str:
-    added = recent["added_contrast"]
-    return "" if added is None else f"contrast {added['closed']:+.1e} of {added['open']:+.1e}  "
 
 
 def _wavefront_in_words(camera: wire.Health) -> str:

@@ -67,6 +67,9 @@ def _summary(contents: Mapping[str, Any]) -> dict[str, str]:
     from lowfc.programs.logs.survey import recovery_in_words
 
     metadata, recording = contents["metadata"], contents["metadata"].get("recording", {})
+    digest = contents.get("digest", "")
+    if digest and contents["lockstep"] is False:  # None: unknown
+        digest += " (not a lockstep run: cannot be reproduced)"
     damage = [f"byte {one['position']}, {one['length']} bytes: {one['why']}" for one in contents["damage"]]
     lost = [f"{contents['messages_missing']} missing by their sequence numbers"]
     if "messages_lost" in recording:
@@ -76,7 +79,7 @@ def _summary(contents: Mapping[str, Any]) -> dict[str, str]:
         lost.append(f"{contents['unreadable']} unreadable, because their channel record was damaged")
     lines = {
         "log": f"{', '.join(contents['files'])}, {contents['bytes'] / 1e6:.1f} MB",
-        "digest": _digest(contents),
+        "digest": digest,
         "selection": contents["selection"],
         "state": _STATES[contents["state"]],
         "stopped": f"recording stopped: {recording['stopped']}" if recording.get("stopped") else "",
@@ -95,9 +98,3 @@ def _summary(contents: Mapping[str, Any]) -> dict[str, str]:
         },
     }
     return {name: value for name, value in lines.items() if value}
-
-
-def _digest(contents: Mapping[str, Any]) -> str:
-    """Digest, with a remark if the run was not a lockstep run; empty if not requested."""
-    digest, remark = str(contents.get("digest", "")), " (not a lockstep run: cannot be reproduced)"
-    return f"{digest}{remark}" if digest and contents["lockstep"] is False else digest

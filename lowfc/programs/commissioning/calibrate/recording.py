@@ -103,9 +103,7 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
         basis_nm: Shapes (shapes, actuators), nm of surface.
         table: Amplitude of each shape (frames, shapes).
 
-    Raises:
-        PlayInterruptedError: the camera or the mirror restarted or stalled.
-        CalibrationError: the sequence was ended by a limit, a change of mode or refused frames; or no frame came.
+    CalibrationError if the sequence was ended, and as PlayInterruptedError if camera or mirror restarted or stalled.
     """
     loop.check_lease()
     with _streams(loop) as (frames, steps):

@@ -63,7 +63,7 @@ class ReferenceResult(Result):
 
 
 def calibrate_with_pokes(request: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:
-    """Calibrate a running loop with pokes; write the file at the end."""
+    """Calibrate a running loop with pokes; write the file at the end, and with `load` use it if it is recommended."""
     require_folder(request.out)
     console = Console(stderr=True)
     report = reporter(console)
@@ -96,7 +96,7 @@ def calibrate_with_pokes(request: CalibrationRequest, run: str | None, *, load: 
 def compute_calibration(
     file: Path | None, request: CalibrationRequest, at: str | None, run: str | None, *, load: bool
 ) -> CalibrationResult:
-    """Compute a calibration from a configuration, flat or at a wavefront, and write the file."""
+    """Compute a calibration from a configuration, flat or at a wavefront; write the file, and with `load` use it."""
     require_folder(request.out)
     config = configuration(file)
     name, wavefront = ("", None) if at is None else zero_point(config, at)

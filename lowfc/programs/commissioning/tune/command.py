@@ -13,7 +13,6 @@ from lowfc.programs.cli.result import print_result
 if TYPE_CHECKING:
     from lowfc.client import Answer, Client
 
-
 Kind = Literal["integrator", "pi-notch", "lqg"]
 
 

@@ -1,5 +1,6 @@
 """Data for tuning: pseudo-open-loop modes of a log or of a running loop."""
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -117,7 +118,9 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
             f"run {loop.run_id!r}: tuning requires at least {FEWEST} consecutive frames, {needed_s:.3g} s at "
             f"{config.camera.rate_hz:g} Hz, but got {seconds:g} s: use --live {np.ceil(1.2 * needed_s):.0f}"
         )
-    watch = _watched(loop)
+    watch: MirrorWatch | None = None
+    with contextlib.suppress(BusError):  # reports of a user's mirror are optional
+        watch = loop.mirror_watch()
     begun_s = time.monotonic()
     received: list[Step] = []
     stream = loop.steps()
@@ -202,13 +205,6 @@ def _measured_delay(steps: Steps, watch: MirrorWatch | None, config: Configurati
         return None
     applied, applied_ns = np.array(watch.applied, np.int64).T
     return delay_from_times(steps.sequence, steps.time_ns - config.exposure_ns, applied.astype(np.uint64), applied_ns)
-
-
-def _watched(loop: Client) -> MirrorWatch | None:
-    try:
-        return loop.mirror_watch()
-    except BusError:  # reports of a user's mirror are optional
-        return None
 
 
 def _timing(delay: float, exposure: float, steps: Steps, watch: MirrorWatch | None, rate_hz: float) -> Timing:

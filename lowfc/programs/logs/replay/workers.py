@@ -38,7 +38,8 @@ def replay_files(
 ) -> Account:
     """Replay consecutive logs in at most `jobs` processes, 0 for one per processor.
 
-    `progress` is called with the bytes replayed so far.
+    `progress` is called with the bytes replayed so far. ConfigurationError if a log is named twice or begins before the
+    previous one ends, DataFileError if one cannot be replayed.
     """
     chunk_ends_ns = [_chunk_ends_ns(path) for path in paths]
     ends_ns = [end_ns for ends in chunk_ends_ns for end_ns in ends]

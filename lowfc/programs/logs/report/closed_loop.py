@@ -163,11 +163,12 @@ def spectra_results(run: Run, stretch: Stretch | None, found: Spectra | None) ->
         return {"why_not": f"the longest gap-free stretch has {longest} frames, but a spectrum requires {SHORTEST}"}
     calibration = run.history.calibration
     groups = groups_of(calibration.noll if calibration is not None else ())
-    noise = _noise_floor(run, stretch)
+    noise = noise_of(run.history, stretch.rows)
+    noise_nm2_hz = None if noise is None else 2 * noise.total_nm**2 / stretch.law.rate_hz
     return {
         "segments": found[ERROR].segments,
         "resolution_hz": found[ERROR].spacing_hz,
-        "groups": [_group(name, mask, stretch.law, found, noise) for name, mask in groups.items()],
+        "groups": [_group(name, mask, stretch.law, found, noise_nm2_hz) for name, mask in groups.items()],
     }
 
 
@@ -256,8 +257,3 @@ def noise_of(history: History, rows: slice) -> SensorNoise | None:
         float(np.sqrt(readout_e2 / em_gain**2 + excess * charge_e)),
         excess,
     )
-
-
-def _noise_floor(run: Run, stretch: Stretch) -> Array | None:
-    noise = noise_of(run.history, stretch.rows)
-    return None if noise is None else 2 * noise.total_nm**2 / stretch.law.rate_hz

@@ -254,12 +254,10 @@ def _log_warnings(run: LoggedRun) -> list[str]:
         found.append(f"limits acted in the logged run ({', '.join(acted)}); in the what-if only modal limits act")
     count = np.count_nonzero(run.history.mirror.limits)
     if count:
-        few = (
-            "" if log.selection.records_all(MIRROR_STATE) else f" (recorded mirror states: {log.selection.description})"
-        )
+        recorded = "" if log.selection.records_all(MIRROR_STATE) else f" (recorded: {log.selection.description})"
         found.append(
-            f"the mirror's own limits acted on {counted(int(count), 'command')}{few}: pseudo-open-loop modes are wrong "
-            "there"
+            f"the mirror's own limits acted on {counted(int(count), 'command')}{recorded}: pseudo-open-loop modes are "
+            "wrong there"
         )
     changes = sum(one.accepted and one.name in LAW_KEYS for one in run.history.requests)
     if changes:

@@ -9,7 +9,7 @@ from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
 from lowfc.adapters.logs.recovery import missing_parts
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import HEALTH, Role, wire
+from lowfc.contract.messages import HEALTH, TIMING, Role, wire
 from lowfc.programs.measure.latency.frame_statistics import controller_counts, join, repeat_statistics
 
 _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
@@ -29,7 +29,7 @@ def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tup
     statistics = repeat_statistics(join(history.frame_sequence, history.frame_publish_ns, None, timing, mirror))
     if "frame_to_command" not in statistics["latency_us"]:
         raise DataFileError(
-            f"{log.path} has no controller timing after its first 0.5 s: it is too short, or not the log of a loop"
+            f"{log.path} has no {TIMING.key} after its first 0.5 s: it is short, lacks this topic, or is not of a loop"
         )
     controller = history.health.get(Role.CONTROLLER, wire.Health())
     host: dict[str, Any] = dict(log.metadata.get("lowfc", {}))
