@@ -245,7 +245,7 @@ def test_the_check_of_the_disk_uses_the_recorders_volume(tmp_path: Path, monkeyp
         found = examine(of_disk)["disk"]
         assert found.status == status
         assert found.got.startswith(f"{Path.home()}/not/yet: ")
-        assert (f"1.0 h of {growth * 3600 / 1e9:.1f} GB an hour at 1000 Hz" in found.got) == (free > 10**9)
+        assert (f"enough for 1.0 h at 1000 Hz, {growth * 3600 / 1e9:.1f} GB an hour" in found.got) == (free > 10**9)
     monkeypatch.setattr(host_module.os, "access", lambda path, mode: False)
     usage.free = an_hour
     assert "not writable" in examine(of_disk)["disk"].got

@@ -62,7 +62,7 @@ def _frame_time(camera: Camera) -> Check:
         return wrong(f"{counted(times.count(0), 'frame')} without a timestamp", "set it in every frame")
     back = sum(later <= earlier for earlier, later in pairwise(times))
     if back:
-        got = f"not later than the previous one, {back} times of {len(times) - 1}"
+        got = f"not later than the previous one, {counted(back, 'time')} of {len(times) - 1}"
         return wrong(got, "read the time for every exposure, from a clock that never steps")
     age_ns = int(np.median(np.subtract(camera.put_times_ns, times)))
     exposure_ns = 0 if camera.settings is None else camera.settings.exposure_ns

@@ -53,7 +53,7 @@ def _sequence(device: Collected) -> Check | None:
     steps = [later - earlier for earlier, later in pairwise(sequences) if start_of(earlier) == start_of(later)]
     back, gaps = sum(step <= 0 for step in steps), [step - 1 for step in steps if step > 1]
     if back:
-        got = f"not above the previous one, {back} times of {len(steps)}"
+        got = f"not above the previous one, {counted(back, 'time')} of {len(steps)}"
         return wrong(got, "count every message of this topic, in one thread; such messages are refused")
     if gaps:
         got = f"{sum(gaps)} missing, in {counted(len(gaps), 'gap')} among {len(sequences)} messages"
@@ -80,7 +80,7 @@ def _put_time(device: Collected) -> Check | None:
         return wrong(got, _clock_advice(times[-1], arrivals[-1], device.line.offset_ns))
     back = sum(later <= earlier for earlier, later in pairwise(times))
     if back:
-        got = f"not later than the previous one, {back} times of {len(times) - 1}"
+        got = f"not later than the previous one, {counted(back, 'time')} of {len(times) - 1}"
         return wrong(got, "read the time for every message, from a clock that never steps")
     return ok(f"{lag_ns / 1e3:.0f} us before the arrival, median of {len(times)}")
 

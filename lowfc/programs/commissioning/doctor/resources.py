@@ -10,6 +10,7 @@ from lowfc.adapters.bus.routed import ending_certificates
 from lowfc.adapters.process import compiled
 from lowfc.contract.codecs.input_file import user_path
 from lowfc.control.kernel.tables import FUSED
+from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
 from lowfc.programs.commissioning.doctor.facts import Facts
 from lowfc.programs.core.recording.volume import bytes_per_s, configured_selection
@@ -68,7 +69,7 @@ def _huge_pages(facts: Facts) -> Check:
 )
 def _blas(facts: Facts) -> Check:
     """Linear algebra of numpy, and whether it can be limited to one thread, as in the loop."""
-    names = ", ".join(f"{name}, {threads} threads" for name, threads in sorted(_blas_threads().items()))
+    names = ", ".join(f"{name}, {counted(threads, 'thread')}" for name, threads in sorted(_blas_threads().items()))
     with threadpool_limits(limits=1):
         limited = _blas_threads()
     if limited and max(limited.values()) == 1:
@@ -118,8 +119,8 @@ def _disk(facts: Facts) -> Check:
     growth = bytes_per_s(facts.config, configured_selection(facts.config))
     lasts_s = max(0.0, free_bytes - section.min_free_mb * 1e6) / growth
     detail = (
-        f"{folder.absolute()}: {free_bytes / 1e9:.1f} GB free, {lasts_s / 3600:.1f} h of "
-        f"{growth * 3.6e-6:.1f} GB an hour at {rate_hz:g} Hz"
+        f"{folder.absolute()}: {free_bytes / 1e9:.1f} GB free, enough for {lasts_s / 3600:.1f} h at {rate_hz:g} Hz, "
+        f"{growth * 3.6e-6:.1f} GB an hour"
     )
     if not writable:
         return warning(f"{detail}; not writable", "set recorder.folder to a writable folder", "nothing is recorded")
