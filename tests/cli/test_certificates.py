@@ -17,7 +17,8 @@ from lowfc.contract.configuration import Network
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from tests.support.loops import lowfc, refusal
 
-make = pytest.importorskip("lowfc.adapters.bus.certificates", reason="needs the package cryptography").make_certificates
+certificates = pytest.importorskip("lowfc.adapters.bus.certificates", reason="needs the package cryptography")
+make, CA_DAYS = certificates.make_certificates, certificates.CA_DAYS
 
 
 def handshake(server: Path, client: Path, role: str, name: str = "localhost") -> None:
@@ -80,7 +81,7 @@ def test_existing_certificates_are_kept_unless_renewed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("gone", [(), ("camera.key",), ("camera.pem",), ("camera.key", "camera.pem")])
 @pytest.mark.parametrize("file", ["camera.key", "camera.pem", "viewer.pem"])
-def test_an_interruption_leaves_no_certificate_without_its_key(
+def test_an_interruption_leaves_no_certificate_with_another_key(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, gone: tuple[str, ...]
 ) -> None:
     roles = (ROUTER, "camera", "viewer")
@@ -152,14 +153,14 @@ def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
     now, day = datetime.datetime.now(datetime.UTC), datetime.timedelta(days=1)
     network = Network(router="tls/localhost:7447", certificates=str(tmp_path))
     make(tmp_path, (ROUTER, "camera"), ["localhost"], 100)
-    make(tmp_path, ("viewer",), [], 300)
+    make(tmp_path, ("viewer",), [], CA_DAYS + 100)
     assert ending_certificates(network, now + (99 - WARN_DAYS) * day) == []
     date = now + 100 * day
     assert ending_certificates(network, now + (100.5 - WARN_DAYS) * day) == [
         f"{role}'s certificate ends in {WARN_DAYS - 1} days, on {date:%Y-%m-%d}: lowfc certs --renew"
         for role in ("camera", "router")
     ]
-    assert len(ending_certificates(network, now + (3650 - WARN_DAYS + 1) * day)) == 3, "including that of the authority"
+    assert len(ending_certificates(network, now + (CA_DAYS - WARN_DAYS + 1) * day)) == 3, "the authority ends first"
     (tmp_path / "viewer.key").chmod(0o644)
     (warning,) = ending_certificates(network, now)
     assert "viewer.key can be read by every user" in warning

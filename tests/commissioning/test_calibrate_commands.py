@@ -393,7 +393,7 @@ def test_fewer_cycles_than_their_scatter_needs_are_refused() -> None:
     assert "--cycles" in CliRunner().invoke(calibrate_app, ["--cycles", "3"]).stderr
 
 
-def test_a_comparison_of_different_sensors_is_refused(loop: InProcessLoop) -> None:
+def test_a_comparison_of_different_sensors_and_a_missing_directory_are_refused(loop: InProcessLoop) -> None:
     one = loop.calibration()
     calibration_file.save(one, Path("one.fits"))
     other = replace(
@@ -411,7 +411,7 @@ def test_a_comparison_of_different_sensors_is_refused(loop: InProcessLoop) -> No
         json_of("--method", "hadamard", "--out", "nowhere/night.fits")
 
 
-THERE = "4=20,7=-20"
+ZERO_POINT = "4=20,7=-20"
 SILENT = Console(quiet=True)
 
 
@@ -426,8 +426,8 @@ def optics(config: Configuration) -> Twin:
 
 
 @pytest.fixture(scope="module")
-def there(config: Configuration) -> Calibration:
-    return analytic(config, SILENT, zero_point(config, THERE)[1])
+def at_zero_point(config: Configuration) -> Calibration:
+    return analytic(config, SILENT, zero_point(config, ZERO_POINT)[1])
 
 
 def test_the_response_is_the_derivative_of_the_image(optics: Twin) -> None:
@@ -442,21 +442,21 @@ def test_the_response_is_the_derivative_of_the_image(optics: Twin) -> None:
 
 
 def test_a_mirror_shape_for_at_equals_the_wavefront_it_makes(
-    config: Configuration, there: Calibration, tmp_path: Path
+    config: Configuration, at_zero_point: Calibration, tmp_path: Path
 ) -> None:
     flat = analytic(config, SILENT)
     command_nm = np.zeros(len(flat.noll))
     command_nm[[flat.noll.index(4), flat.noll.index(7)]] = 20.0, -20.0
     np.save(tmp_path / "shape.npy", (flat.modes_to_actuators @ command_nm).reshape(flat.grid))
     shaped = analytic(config, SILENT, zero_point(config, str(tmp_path / "shape.npy"))[1])
-    moved = there.reference - flat.reference
-    assert np.linalg.norm(shaped.reference - there.reference) < 0.1 * np.linalg.norm(moved)
-    assert there.id != flat.id
-    assert there.operator_hash == flat.operator_hash
+    moved = at_zero_point.reference - flat.reference
+    assert np.linalg.norm(shaped.reference - at_zero_point.reference) < 0.1 * np.linalg.norm(moved)
+    assert at_zero_point.id != flat.id
+    assert at_zero_point.operator_hash == flat.operator_hash
     identity = np.eye(len(flat.noll))
-    assert np.abs(there.actuators_to_modes @ there.modes_to_actuators - identity).max() < 1e-4
-    changed = there.response - flat.response
-    assert np.linalg.norm(shaped.response - there.response) < 0.1 * np.linalg.norm(changed)
+    assert np.abs(at_zero_point.actuators_to_modes @ at_zero_point.modes_to_actuators - identity).max() < 1e-4
+    changed = at_zero_point.response - flat.response
+    assert np.linalg.norm(shaped.response - at_zero_point.response) < 0.1 * np.linalg.norm(changed)
 
 
 def test_the_noise_of_a_mode_is_compared_with_its_own_limit(config: Configuration) -> None:
@@ -466,7 +466,7 @@ def test_the_noise_of_a_mode_is_compared_with_its_own_limit(config: Configuratio
     assert "more than its modal limit of 0.001 nm" in printed.getvalue()
 
 
-def test_a_loop_with_such_a_calibration_converges_to_that_wavefront() -> None:
+def test_a_loop_with_a_calibration_at_a_wavefront_converges_to_it() -> None:
     few = load(None, BRIGHT | {"sensor.modes": 6})
     world = load(None, BRIGHT | {"sensor.modes": 6, "disturbance.static_nm": {"4": 35.0, "6": 20.0}})
     made = analytic(few, SILENT, zero_point(few, "4=15,7=-10")[1])
@@ -496,4 +496,4 @@ def test_an_invalid_wavefront_for_at_is_an_error(config: Configuration, tmp_path
         zero_point(config, str(tmp_path / "small.npy"))
     sheared = load(None, BRIGHT | {"control.nuisance": ["shear"]})
     with pytest.raises(CalibrationError, match="known at a flat wavefront only"):
-        analytic(sheared, SILENT, zero_point(config, THERE)[1])
+        analytic(sheared, SILENT, zero_point(config, ZERO_POINT)[1])

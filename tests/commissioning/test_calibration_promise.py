@@ -41,7 +41,7 @@ class Outcome(NamedTuple):
 
 
 def true_response(loop: InProcessLoop, first: int, *, closed: bool) -> np.ndarray:
-    """The analytic H (pixels, modes) of the commands, averaged over the wavefront since frame `first` without pokes."""
+    """Computed H (pixels, modes) at the mirror's mean shape since frame `first`; averaged over the run in open loop."""
     before, config, scene = loop.calibration(), loop.config, loop.scene
     optics = factory.twin(config, None, lambda _: None)
     mirror = factory.mirror_on_twin(config, optics, lambda _: None)

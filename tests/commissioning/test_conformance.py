@@ -507,7 +507,7 @@ def test_an_absent_camera_fails_the_check_of_frames(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.usefixtures("own_runtime")
-def test_a_line_receives_messages_without_an_envelope_and_queries() -> None:
+def test_a_line_queries_and_receives_messages_without_an_envelope() -> None:
     links = open_run("bench").links
     with zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, Role.CAMERA)))) as session:
         session.declare_queryable(CAMERA_STATE.key, lambda query: query.reply(CAMERA_STATE.key, b"settings"))

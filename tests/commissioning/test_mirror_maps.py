@@ -188,14 +188,11 @@ def begun(config: Configuration, calibration: Calibration, shape: MirrorShape | 
 
 def commands(config: Configuration, state: State, frames: int) -> tuple[list[Single], list[str]]:
     """Commands over some frames of uniform light in open loop, and the names of the channels at their end."""
-    settings, shape = (
-        replace(factory.settings(config), min_flux_fraction=0.0, max_identical_frames=0),
-        state.loop.calibration.shape,
-    )
-    dark = np.rint(state.loop.calibration.dark + 100).reshape(shape).astype(np.uint16)
-    sent = []
+    settings = replace(factory.settings(config), min_flux_fraction=0.0, max_identical_frames=0)
+    calibration, sent = state.loop.calibration, []
+    pixels = np.rint(calibration.dark + 100).reshape(calibration.shape).astype(np.uint16)
     for index in range(frames):
-        state, outputs = advance(settings, state, Frame(1 + index, index, 0, dark))
+        state, outputs = advance(settings, state, Frame(1 + index, index, 0, pixels))
         sent.append(outputs.command.actuators_nm)
     return sent, [one.name for one in state.loop.channels_or_empty().channels]
 

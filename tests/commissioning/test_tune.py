@@ -200,9 +200,9 @@ PROBE = wire.Play(first_sequence=frame_sequence(3050), frames=100, id="probe")
 
 
 class SteppedLoop(StreamedLoop):
-    """A loop with these steps, whose mirror reports each command so many periods after the end of the exposure.
+    """A loop with these steps, whose mirror reports each command `report_periods` after the end of the exposure.
 
-    Its state has the probe sequence once, when it is requested after 3100 steps, and from then on other gains.
+    If `probed`, the state has the probe sequence once, at the request after 3100 steps, and from then on other gains.
     """
 
     def __init__(self, steps: list[Step], report_periods: float = 0.2, *, probed: bool = False) -> None:

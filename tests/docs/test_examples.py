@@ -1,4 +1,4 @@
-"""Example scripts on numerical code and on logs, run as in their docstrings."""
+"""Example scripts on numerical code and on logs, run as in their docstrings; the names that the package exports."""
 
 import re
 import runpy
@@ -31,7 +31,7 @@ def test_photon_budget(run: Callable[..., list[str]]) -> None:
     (magnitude, light_e, tilt_mas, _), (fainter, less_e, more_mas, _) = rows
     assert (magnitude, fainter) == (2, 5)
     assert light_e / less_e == pytest.approx(10**1.2, rel=0.02)
-    assert 3 < more_mas / tilt_mas < 10  # between photon noise and read noise
+    assert 10**0.6 < more_mas / tilt_mas < 10**1.2  # between photon noise alone and read noise alone
 
 
 def test_loop_design(run: Callable[..., list[str]]) -> None:
@@ -67,13 +67,5 @@ def test_the_package_imports_its_exported_names_on_first_use() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == [
-        "Calibration",
-        "Client",
-        "Configuration",
-        "LogReader",
-        "load",
-        "load",
-        "read_history",
-        "running",
-    ]
+    names = "Calibration Client Configuration LogReader load load read_history running"  # two modules have a load
+    assert done.stdout.strip() == names

@@ -1,6 +1,6 @@
-"""Tutorials: every command of each page in order. The short form of the first page and the bad night are fast.
+"""Tutorials: the commands of each page in order, except real-time loops and views.
 
-The tests named in `test_docs` run the commands of real-time loops and of views.
+The last tests and `test_docs` run those. Only the short form of the first page and the bad night are fast.
 """
 
 import re
@@ -100,8 +100,8 @@ def test_tuned_law_with_a_real_time_loop(tmp_path: Path, own_runtime: Path) -> N
         until(lambda: recorded_bytes(tmp_path) > 4e6)
         printed = [command(tmp_path, line) for line in LIVE[1:]]
     finally:
-        _, complaints = interrupt(loop)
-    assert loop.returncode == 0, complaints
+        _, stderr = interrupt(loop)
+    assert loop.returncode == 0, stderr
     assert "good" in printed[0]
     assert "loop closed" in printed[-1]
 

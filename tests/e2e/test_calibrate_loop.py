@@ -93,12 +93,12 @@ lowest_hz = 1.5
 def test_rejection_of_a_running_loop_and_of_its_log(tmp_path: Path) -> None:
     (tmp_path / "loop.toml").write_text(TOML)
     words = ("--duration", "4", "--lines", "8", "--json", "--plot", "live.png")
-    running = start(tmp_path, "sim-loop", "--config", "loop.toml", "--lockstep")  # nothing is late on a busy host
+    loop = start(tmp_path, "sim-loop", "--config", "loop.toml", "--lockstep")  # nothing is late on a busy host
     try:
         until(lambda: recorded_bytes(tmp_path) > 4_000_000)
         done = run(tmp_path, "acceptance", "rejection", *words)
     finally:
-        _, stderr = interrupt(running)
+        _, stderr = interrupt(loop)
     assert done.returncode == 0, done.stdout + done.stderr + stderr
     live = json.loads(done.stdout)
     assert live["passed"]

@@ -302,7 +302,7 @@ session.close()
 
 
 def forge(host: Host, certificate: Path | None, protocol: str = "tls") -> str:
-    """Publish forged commands by a session of its own; returns the topics received and the queries answered."""
+    """Publish forged commands in a separate session; return received topics and answered queries, or `refused`."""
     tls = {"root_ca_certificate": str(host.folder / "certs" / "ca.pem"), "enable_mtls": True}
     if certificate is not None:
         tls |= {
@@ -324,7 +324,7 @@ def forge(host: Host, certificate: Path | None, protocol: str = "tls") -> str:
 
 
 def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(bench: Bench) -> None:
-    """Only the certificate keeps a forger out, not its message: the next test can fail."""
+    """The forged message itself is accepted, so the next test would detect a forger that gets in."""
     bench.wait_until_settled()
     copy_certificates(bench.lab["desk"], bench.authority, "controller")
     before = bench.events("mirror-dm COMMAND_REFUSED")

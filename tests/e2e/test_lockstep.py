@@ -1,4 +1,4 @@
-"""Lockstep over the real bus: the same seed gives the same bytes, and each sensor leaves the predicted residual."""
+"""Lockstep over the real bus: the same bytes from one seed, the predicted residual, a static wavefront removed."""
 
 import json
 import os
@@ -86,10 +86,10 @@ def test_a_lockstep_run_ends_and_names_a_stopped_process(tmp_path: Path) -> None
     process = start(tmp_path, "sim-loop", "--lockstep", "--duration", "600")
     until(lambda: recorded_bytes(tmp_path) > 4e6)
     os.kill(children(process.pid)["controller"], signal.SIGSTOP)
-    _, complaints = process.communicate(timeout=40)
+    _, stderr = process.communicate(timeout=40)
     assert process.returncode == 1
-    assert "no Health from controller" in complaints
-    assert "Traceback" not in complaints
+    assert "no Health from controller" in stderr
+    assert "Traceback" not in stderr
 
 
 STATIC_NM = dict(zip(range(2, 16), (12, -9, 8, -7, 6, 5, -5, 4, -4, 3, -3, 3, -3, 3), strict=True))

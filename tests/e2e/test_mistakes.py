@@ -1,4 +1,4 @@
-"""A user's mistakes: one clear message, exit status 2, nothing half done; most by the command line in this process."""
+"""A user's mistakes: one clear message, exit status 2, nothing half done. Most commands run in this process."""
 
 import contextlib
 import json
@@ -139,8 +139,8 @@ def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path) -> None:
     process = subprocess.Popen([*LOWFC, "config", "show"], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     until(lambda: "pydantic_core" in Path(f"/proc/{process.pid}/maps").read_text(), 20)  # in the middle of the imports
     process.send_signal(signal.SIGINT)
-    _, complaints = process.communicate(timeout=20)
-    assert "Traceback" not in complaints
+    _, stderr = process.communicate(timeout=20)
+    assert "Traceback" not in stderr
 
 
 @pytest.mark.parametrize(

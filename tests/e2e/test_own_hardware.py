@@ -1,4 +1,4 @@
-"""The examples of hardware.md and commissioning.md in docs/howto as real processes: devices of a user."""
+"""A user's devices as real processes: the examples of hardware.md, commissioning.md and the tutorial your_camera.md."""
 
 import json
 import re
@@ -90,8 +90,8 @@ def conformance(folder: Path, *commands: str) -> None:
     """Check all devices at the same time; none may fail a check."""
     checking = [started(folder, f"{line} --json --duration 0.6") for line in commands]
     for line, process in zip(commands, checking, strict=True):
-        out, complaints = process.communicate(timeout=60)
-        assert process.returncode == 0, f"{line}: {out} {complaints}"
+        out, stderr = process.communicate(timeout=60)
+        assert process.returncode == 0, f"{line}: {out} {stderr}"
         results = json.loads(out)
         assert f"--run {results['run']}" in line
         assert results["device"] in line or results["device"] == "mirror-dm"

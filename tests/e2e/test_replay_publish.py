@@ -41,10 +41,8 @@ pytestmark = pytest.mark.exclusive
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path: Path = loop(tmp_path_factory.mktemp("night"), "--lockstep", "--rate", "100", "--duration", "1", config=FIXED)[
-        "log"
-    ]
-    return path
+    words = ("--lockstep", "--rate", "100", "--duration", "1")
+    return Path(loop(tmp_path_factory.mktemp("night"), *words, config=FIXED)["log"])
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +77,8 @@ def start(log: Path, run: Run, *options: str) -> "subprocess.Popen[str]":
 
 
 def results_of(process: "subprocess.Popen[str]", status: int = 0) -> dict[str, Any]:
-    output, complaints = process.communicate(timeout=60)
-    assert process.returncode == status, complaints
+    output, stderr = process.communicate(timeout=60)
+    assert process.returncode == status, stderr
     results: dict[str, Any] = json.loads(output)
     assert render(results)
     return results

@@ -88,7 +88,7 @@ def good_entries() -> dict[Topic, tuple[Entry, ...]]:
 @pytest.fixture
 def evidence(good_entries: dict[Topic, tuple[Entry, ...]]) -> Evidence:
     """Logs of a loop without a fault, four seconds long."""
-    found = Evidence(messages=5 * FRAMES, last_ns=[(ns(FRAMES), True)])
+    found = Evidence(messages=5 * FRAMES, log_ends=[(ns(FRAMES), True)])
     for topic, entries in good_entries.items():
         found.entries[topic] = list(entries)
     found.received = {(0, key, START_S): received() for key in (FRAME.key, STEP.key)}
@@ -108,7 +108,7 @@ def broken_rules(case: Case, outcome: Outcome, evidence: Evidence) -> dict[str, 
 
 def unflushed(evidence: Evidence, outcome: Outcome) -> None:
     outcome.killed_ns.append(ns(FRAMES))
-    evidence.last_ns.append((ns(500), False))
+    evidence.log_ends.append((ns(500), False))
 
 
 def ended(name: str, *how: object) -> Callable[[Evidence, Outcome], None]:
@@ -235,7 +235,7 @@ def test_logs_are_read_with_their_losses_and_what_cannot_be_read(tmp_path: Path)
     found = read(tmp_path)
     assert [len(found.entries[topic]) for topic in (COMMAND, STEP, TRUTH)] == [0, 1, 1]  # the command has no actuators
     assert found.lost == {STEP.key: 6}
-    assert [finished for _, finished in found.last_ns] == [True, True, False, False]
+    assert [finished for _, finished in found.log_ends] == [True, True, False, False]
     assert found.messages == 4
     undecodable, damaged = found.unreadable
     assert TRUTH.key in undecodable
@@ -346,6 +346,12 @@ def test_the_reason_why_a_command_fails_is_given() -> None:
     assert lacking("requires it", "ls", "/not/there").startswith("requires it (ls: ")
     assert lacking("requires it", "false") == "requires it (false ended with 1)"
     assert lacking("requires it", "/not/there") == "requires it (/not/there: No such file or directory)"
+
+
+def test_a_shifted_clock_is_tried_with_the_shift_of_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel refuses a monotonic clock below zero: an hour behind needs a host that has been up for an hour."""
+    monkeypatch.setattr("lowfc.programs.reliability.chaos.case.lacking", lambda *words: " ".join(words[-2:]))
+    assert [CASES[f"clock-{kind}"].lacks() for kind in ("ahead", "behind")] == ["3600 true", "-3600 true"]
 
 
 @pytest.mark.usefixtures("without_loop")

@@ -33,7 +33,7 @@ from lowfc.optics.chain.zernike import mode_name, zernikes
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.view.draw.pictures import Scale
 from lowfc.programs.view.draw.plots import BOX_HEIGHT, Plot
-from lowfc.programs.view.panels import latency, loop, mirror, science, sensor, spectra, wavefront
+from lowfc.programs.view.panels import latency, loop, mirror, pointing, science, sensor, spectra, wavefront
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.renderer import RETRY_NS, Renderer
 from lowfc.programs.view.snapshot import Accumulator, LastHealth, Snapshot
@@ -362,6 +362,13 @@ def test_a_brighter_dark_zone_is_brighter_in_the_picture() -> None:
     assert len(tape.rows[science.CONTRAST.path]) == 1
 
 
+def test_the_trail_has_at_most_400_points_the_last_of_which_is_the_newest() -> None:
+    tape, residual_nm = Tape(), np.outer(np.arange(1.0, 800.0), np.ones(MODES))
+    drawn(pointing.Pointing(1.0), tape, 0, truths=truths(residual_nm, residual_nm))
+    points = values_of(tape.last(f"{pointing.TRAIL}/points").positions)
+    assert (len(points), points[-1]) == (400, pytest.approx([0.799, -0.799]))  # of the outer ring, 1000 mas
+
+
 TONE_HZ, TONE_NM = 20.0, 3.0
 LAW = LawInForce((0.4,) * MODES, (0.01,) * MODES, 2.0, "")
 CAMERA = wire.CameraState(period_ns=round(1e9 / RATE_HZ))
@@ -428,6 +435,12 @@ def test_a_constant_wavefront_has_no_spectrum() -> None:
     tape, constant = Tape(), np.zeros((2000, MODES))
     drawn(spectra.Spectra(), tape, 0, steps=steps(0, constant, constant))
     assert not values_of(tape.last(f"{spectra.OTHERS}/curves").strips)
+
+
+def test_spectra_of_a_loop_of_tip_and_tilt_alone_state_that_it_has_no_other_modes() -> None:
+    tape, tilts = Tape(), dataclasses.replace(CALIBRATION, noll=(2, 3, 3))
+    drawn(spectra.Spectra(), tape, 0, steps=steps(0, *np.ones((2, 9, MODES))), calibration=tilts)
+    assert values_of(tape.last(f"{spectra.OTHERS}/state").labels) == ["loop closed: no such modes"]
 
 
 def test_memory_of_the_spectra_is_bounded() -> None:

@@ -192,7 +192,7 @@ def test_a_loop_that_holds_raises_no_second_alarm_about_its_frames(verdicts: dic
     assert frames.detail.endswith("frames refused in the last 5 s")
 
 
-@pytest.mark.parametrize("name", ["open", "safe", "controller dead", "star gone", "ended"])
+@pytest.mark.parametrize("name", ["open", "safe", "idle, other size", "controller dead", "star gone", "ended"])
 def test_the_wavefront_is_called_not_corrected_only_if_no_loop_corrects_it(
     verdicts: dict[str, Verdict], name: str
 ) -> None:

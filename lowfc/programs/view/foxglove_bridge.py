@@ -103,7 +103,7 @@ class FoxgloveBridge:
             self._server.stop()
 
     def on_subscribe(self, client: "Client", channel: "ChannelView") -> None:
-        """Send a client the state in force; called by the server."""
+        """Send the state in force again, for a new subscriber; called by the server."""
         self.subscriptions.add((client.id, channel.topic))
         last = self.last_states.get(channel.topic.removeprefix("/"))
         if last is not None:

@@ -33,7 +33,7 @@ _PICTURES: dict[str, tuple[str, rrb.VisualBounds2D | None]] = {
     sensor.DIFFERENCE: ("I - I0, DN", None),
     sensor.REFERENCE: ("Reference I0, DN", None),
     sensor.RAW: ("Raw frame, DN", None),
-    mirror.COMMAND: ("Mirror, nm (ring: at limit)", None),
+    mirror.COMMAND: ("Mirror, nm (yellow: at limit)", None),
     mirror.SURFACE: ("Mirror over the pupil, nm", None),
     pointing.TRAIL: ("Residual pointing, mas", pointing.BOUNDS),
     science.IMAGE: ("Science camera: contrast, mean over 2 λ/D from the mask's edge", science.BOUNDS),
@@ -68,7 +68,7 @@ def layout(
         _set_time_range(tabs.values(), absolute(nanos=span_ns[0]), absolute(nanos=span_ns[1]))
     return rrb.Blueprint(
         rrb.Tabs(*tabs.values(), active_tab=list(tabs).index(active)),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),  # at the end of a log
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),  # a log is shown at its end
         rrb.TopPanel(state="collapsed"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
@@ -82,16 +82,16 @@ def _operator() -> rrb.Container:
         *map(_picture, (sensor.FRAME, sensor.DIFFERENCE, mirror.COMMAND, pointing.TRAIL, science.IMAGE)),
         column_shares=[1, 1, 1, 1, 2],
     )
-    courses = rrb.Horizontal(_picture(trend.TREND), wavefront.RMS.view(), wavefront.TILT.view(), _CONTRAST())
+    curves = rrb.Horizontal(_picture(trend.TREND), wavefront.RMS.view(), wavefront.TILT.view(), _CONTRAST())
     below = rrb.Horizontal(_MODE(), latency.TOTAL.view(), _events(), column_shares=[2, 3, 4])
-    return rrb.Vertical(_picture(tiles.TILES), pictures, courses, below, row_shares=[10, 9, 9, 7], name=Tab.OPERATOR)
+    return rrb.Vertical(_picture(tiles.TILES), pictures, curves, below, row_shares=[10, 9, 9, 7], name=Tab.OPERATOR)
 
 
 def _whole_log() -> rrb.Container:
-    courses = rrb.Horizontal(_picture(trend.TREND), wavefront.TILT.view(), _CONTRAST())
+    curves = rrb.Horizontal(_picture(trend.TREND), wavefront.TILT.view(), _CONTRAST())
     rates = rrb.Horizontal(loop.FLUX.view(), mirror.STROKE.view(), latency.TOTAL.view(), latency.COUNTS.view())
-    below = rrb.Horizontal(_MODE(), _events(worst=True), column_shares=[3, 5])
-    return rrb.Vertical(_picture(tiles.TILES), courses, rates, below, row_shares=[11, 10, 8, 9], name=Tab.OPERATOR)
+    below = rrb.Horizontal(_MODE(), _events(problems=True), column_shares=[3, 5])
+    return rrb.Vertical(_picture(tiles.TILES), curves, rates, below, row_shares=[11, 10, 8, 9], name=Tab.OPERATOR)
 
 
 def _optics() -> rrb.Container:
@@ -127,12 +127,12 @@ def _picture(path: str) -> rrb.View:
     return rrb.Spatial2DView(origin=path, name=title, visual_bounds=shown)
 
 
-def _events(*, worst: bool = False) -> rrb.View:
+def _events(*, problems: bool = False) -> rrb.View:
     shown = [rr.TextLogLevel.WARN, rr.TextLogLevel.ERROR, rr.TextLogLevel.CRITICAL]
     return rrb.TextLogView(
         origin=loop.LOG,
-        name="Warnings and errors" if worst else "Events",
-        rows=rrb.TextLogRows(filter_by_log_level=shown) if worst else None,
+        name="Warnings and errors" if problems else "Events",
+        rows=rrb.TextLogRows(filter_by_log_level=shown) if problems else None,
         columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"]),
     )
 

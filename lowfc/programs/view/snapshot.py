@@ -54,8 +54,9 @@ _UNREADABLE = (BadMessageError, DecodeError, KeyError, OverflowError, ValueError
 class Wavefronts(NamedTuple):
     """The wavefront of some frames, nm: `residual`, and `open`, as it would be with a flat mirror.
 
-    The modes (frames, modes) are values at one instant of each frame, and rms over each frame if known. `rms_nm`
-    (frames, 2): residual and open, of all modes or over the open pupil.
+    `residual_nm` and `open_nm` (frames, modes) are values at one instant of each frame; `residual_rms_nm` and
+    `open_rms_nm` are rms over each frame if known. `rms_nm` (frames, 2): residual and open, of all modes or over the
+    open pupil.
     """
 
     sequence: Sequences
@@ -307,7 +308,7 @@ class Accumulator:
     def _newest_of(self, topic: Topic, decode: Callable[[bytes], Any], *, complete: bool) -> Any:
         """The newest message of a topic, decoded; None without a new one that can be read.
 
-        Between two complete snapshots a slow camera may send a single frame: the second one has it again.
+        A slow camera may send one frame between two complete snapshots: the second of these has it again.
         """
         found = None
         if (payload := self._newest.pop(topic, None)) is not None:

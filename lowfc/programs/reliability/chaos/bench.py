@@ -33,7 +33,7 @@ _POLL_S = 0.02
 _QUIET_FRAMES = 250
 _LAST_HEALTH_S = 0.2
 SETTLED_FRAMES = 500
-"""Frames after a fault: two seconds at the default rate, of which the last is judged."""
+"""Frames after a fault: two seconds at the default rate; the last second is judged."""
 PATIENCE_S = 5.0
 """Time that a process may take to exit after the signal to stop."""
 START_S = 240.0
@@ -52,7 +52,7 @@ class ProcessEnd:
         name: name of the process.
         status: exit status; negative for a signal.
         after_s: time from the request to its end.
-        requested: whether the case ended it.
+        requested: whether the case ended it, or waited for its end.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Outcome:
         mode: last loop mode.
         lost: messages that the last recorder reports as lost, by key.
         failure: why the recording failed; empty if it did not.
-        residuals_nm: true residuals of the last second, nm rms of wavefront.
+        residuals_nm: true residuals of the last 250 frames, nm rms of wavefront.
         measurements: values measured by the case, for `--json`.
         notes: errors while the case ran.
     """

@@ -24,7 +24,7 @@ class Case:
         name: name for `--case`.
         description: description of the fault.
         act: function that injects the fault.
-        fault: kind of the fault of the camera's frames, present from the start of the camera.
+        fault: kind of the fault that the camera is started with; empty for none.
         config: keys that differ from those of other cases.
         expected: beginnings of the events that must be in the log.
         allowed: names of events of the level ERROR that may be in the log.
@@ -70,15 +70,15 @@ def case(name: str, description: str, **more: Any) -> Callable[[Act], Act]:
     return register
 
 
-def no_other_clock() -> str:
-    """Why a process cannot have its own clock on this host; empty if it can."""
-    return lacking("requires a time namespace", "unshare", "--time", "--monotonic", "1", "true")
+def no_other_clock(shift_s: int) -> str:
+    """Why a process cannot have a clock shifted by this time on this host; empty if it can."""
+    return lacking(f"requires a clock shifted by {shift_s} s", "unshare", "--time", "--monotonic", str(shift_s), "true")
 
 
 def no_mounts() -> str:
     """Why this process cannot mount on this host; empty if it can."""
     mount = ("mount", "-t", "tmpfs", "-o", "ro,size=1m", "tmpfs", tempfile.gettempdir())
-    return lacking("requires a mount namespace", "unshare", "--mount", *mount)
+    return lacking("requires the right to mount", "unshare", "--mount", *mount)
 
 
 def lacking(requirement: str, *command: str) -> str:

@@ -39,8 +39,8 @@ def chaos(
     """Inject faults into a simulated loop, case by case, and check its log; exit status 1 if a case failed.
 
     Without a case, the cases are listed. Each case injects a fault into frames, processes, bus, mirror, disk or
-    operator requests. The mirror must stay within its limits, the loop must recover, and the log must name and count
-    every fault. A case that this host cannot run is skipped, with the reason.
+    operator requests. The mirror must stay within its limits, the loop must recover, and the log must have the events
+    of the case and account for lost messages. A case that this host cannot run is skipped, with the reason.
 
     Example: lowfc chaos --case frames-dark --case kill-controller --seed 3
     """

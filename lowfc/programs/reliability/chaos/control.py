@@ -201,10 +201,10 @@ no_latch_case(
 )(partial(_safe_while, read_only))
 
 
-def _other_clock(bench: ChaosBench, seconds: int) -> None:
+def _other_clock(bench: ChaosBench, shift_s: int) -> None:
     """Replace the camera by one with a shifted clock, then by one with the host's clock."""
     normal = bench.children[Role.CAMERA].command
-    for command in (["unshare", "--time", "--monotonic", str(seconds), *normal], normal):
+    for command in (["unshare", "--time", "--monotonic", str(shift_s), *normal], normal):
         bench.kill(Role.CAMERA)
         bench.restart(Role.CAMERA, command)
         if command is not normal:
@@ -216,11 +216,11 @@ case(
     "a camera whose clock is an hour ahead replaces the camera for a while",
     expected=("CAMERA_RESTARTED",),
     allowed=LOST,
-    lacks=no_other_clock,
-)(partial(_other_clock, seconds=3600))
+    lacks=partial(no_other_clock, 3600),
+)(partial(_other_clock, shift_s=3600))
 case(
     "clock-behind",
     "a camera whose clock is an hour behind replaces the camera for a while",
     allowed=LOST,
-    lacks=no_other_clock,
-)(partial(_other_clock, seconds=-3600))
+    lacks=partial(no_other_clock, -3600),
+)(partial(_other_clock, shift_s=-3600))

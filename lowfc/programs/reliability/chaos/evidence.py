@@ -55,7 +55,7 @@ class Evidence:
         sent: messages that each publisher reported at its end as sent, by the same keys as `received`.
         lost: messages that the recorders report as lost, by key.
         unreadable: errors of logs and messages that cannot be read.
-        last_ns: time of the last message of each log, and whether the log was finished.
+        log_ends: time of the last message of each log, ns, and whether the log was finished.
         messages: number of messages.
     """
 
@@ -64,7 +64,7 @@ class Evidence:
     sent: dict[tuple[int, str, int], int] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     unreadable: list[str] = field(default_factory=list)
-    last_ns: list[tuple[int, bool]] = field(default_factory=list)
+    log_ends: list[tuple[int, bool]] = field(default_factory=list)
     messages: int = 0
 
     def residuals_nm(self) -> tuple[Long, Array]:
@@ -91,7 +91,7 @@ def read(folder: Path) -> Evidence:
                 _add(found, message, number if reader.finished else None)
         except DataFileError as fault:
             found.unreadable.append(str(fault))
-        found.last_ns.append((last_ns, reader.finished))
+        found.log_ends.append((last_ns, reader.finished))
         for name, value in reader.metadata.get("recording", {}).items():
             word, _, key = name.partition(" ")
             if word == "lost":

@@ -207,7 +207,7 @@ def _account(outcome: Outcome, evidence: Evidence) -> Finding:
         for key, count in missing.items()
         if count > counted.get(key, 0)
     ]
-    unfinished = [last_ns for last_ns, finished in evidence.last_ns if not finished]
+    unfinished = [last_ns for last_ns, finished in evidence.log_ends if not finished]
     wrong += [
         f"nothing was flushed within {FLUSHED_S:g} s before the recorder was killed"
         for killed_ns in outcome.killed_ns

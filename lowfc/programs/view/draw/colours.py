@@ -49,7 +49,7 @@ def diverging(values: npt.NDArray[np.floating]) -> Rgb:
 
 
 def distinct(count: int) -> list[Colour]:
-    """Colours for `count` lines in one plot; from the eighth on, lighter and darker shades of the first seven."""
+    """Colours for `count` lines in one plot: seven, lighter and darker shades of these; then the shades repeat."""
     return [_shaded(_OKABE_ITO[number % 7], number // 7) for number in range(count)]
 
 

@@ -17,7 +17,7 @@ TIMELINE = "time"
 BOX_HEIGHT = 90.0
 """Height of a plot with custom axes."""
 LABEL = 5.0
-"""Distance by which the viewer draws a label below its position, in a box of this height."""
+"""Distance by which the viewer draws a label below its position, in a box of `BOX_HEIGHT`."""
 
 Ticks = Sequence[tuple[float, str]]
 """Values and their labels."""
@@ -37,7 +37,7 @@ def labels(positions: npt.ArrayLike, texts: Sequence[str], colours: Sequence[Col
 class Plot:
     """Curves against time: `curves` has the name and colour of each, the last one on top.
 
-    It is empty if the curves depend on the run. If `legend` is None, the viewer chooses its position.
+    `curves` is empty if the names depend on the run. If `legend` is None, the viewer chooses its position.
     """
 
     path: str
@@ -58,7 +58,7 @@ class Plot:
         stream.log(self.path, style, static=True)
 
     def add(self, stream: rr.RecordingStream, times_ns: Long, values: npt.NDArray[np.floating]) -> None:
-        """Add (rows,) or (rows, curves) values in one message; rows that are not finite become one row, a gap."""
+        """Add values (rows,) or (rows, curves) in one message; consecutive rows not finite become one row, a gap."""
         if not len(times_ns):
             return
         columns = values.reshape(len(times_ns), -1)

@@ -23,7 +23,7 @@ MODE_COLOURS: dict[LoopMode, Colour] = {
     LoopMode.CLOSED: GREEN,
     LoopMode.SAFE: RED,
 }
-MODE_NAMES = {mode: "safe" if mode is LoopMode.SAFE else mode.name.lower() for mode in MODE_COLOURS}
+MODE_NAMES = {mode: mode.name.lower() for mode in MODE_COLOURS}
 _NAMES = {mode.value: mode.name for mode in LoopMode}
 _LEVELS: dict[int, rr.TextLogLevel] = {
     Level.DEBUG: rr.TextLogLevel.DEBUG,
@@ -67,9 +67,7 @@ class Loop(Panel):
                 plot.add(stream, steps.time_ns, np.where(used, values, np.nan))
         for event in snapshot.events:
             time_ns = from_timestamp(event.timestamp)
-            clock = datetime.fromtimestamp(time_ns * 1e-9, UTC).strftime(
-                "%H:%M:%S"
-            )  # rerun truncates its own time column
+            clock = f"{datetime.fromtimestamp(time_ns * 1e-9, UTC):%H:%M:%S}"  # rerun truncates its own time column
             at(stream, time_ns)
             level = _LEVELS.get(event.level, rr.TextLogLevel.INFO)
             name, message = printable(event.name), printable(event.message)

@@ -1,4 +1,4 @@
-"""Mirror panel: the surface at each actuator with marks at those at a limit, and the surface over the pupil."""
+"""Mirror panel: the surface at each actuator, with marks on those at the stroke limit, and over the pupil."""
 
 import numpy as np
 import rerun as rr
@@ -14,7 +14,7 @@ from lowfc.programs.view.snapshot import Snapshot
 COMMAND, SURFACE = "mirror/command", "mirror/surface"
 STROKE = Plot("mirror/stroke", "Mirror: stroke used, %", {"largest stroke used, % of the limit": YELLOW}, legend=None)
 _NEAR = 0.995
-"""Fraction of the stroke at which an actuator counts as limited, below 1 for the margin and the driver's rounding."""
+"""Fraction of the stroke at which an actuator counts as limited: the controller keeps a margin, the driver rounds."""
 
 
 class Mirror(Panel):

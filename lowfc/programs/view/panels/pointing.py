@@ -1,6 +1,7 @@
 """Pointing panel: residual tip against tilt of the last two seconds, in mas, with rings."""
 
 from collections import deque
+from math import ceil
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,7 @@ from lowfc.programs.view.snapshot import Snapshot
 TRAIL = "pointing/trail"
 BOUNDS = rrb.VisualBounds2D(x_range=[-1.15, 1.15], y_range=[-1.15, 1.15])
 _MAX_POINTS = 400
-"""Points of the trail; for a fast loop not every frame has one."""
+"""Largest number of points of the trail; for a fast loop not every frame has one."""
 _TRAIL_NS = 2_000_000_000
 _RINGS = (0.25, 0.5, 1.0)
 _MIN_MAS = 0.5
@@ -48,9 +49,9 @@ class Pointing(Panel):
         while self._pieces and self._pieces[0][0].max(initial=0) < snapshot.time_ns - _TRAIL_NS:
             self._pieces.popleft()
         mas = np.concatenate([piece for _, piece in self._pieces] or [mas[:0]])
-        mas = mas[:: max(1, len(mas) // _MAX_POINTS)]
         if not len(mas):
             return
+        mas = mas[:: -ceil(len(mas) / _MAX_POINTS)][::-1]  # with the newest
         at(stream, snapshot.time_ns)
         if self._scale.fit(mas, snapshot.time_ns):
             self._draw_rings(stream)

@@ -60,7 +60,7 @@ class Spectra(Panel):
         at(stream, snapshot.time_ns)
         for axes, modes in zip(self._axes, (noll <= _HIGHEST_TILT, noll > _HIGHEST_TILT), strict=True):
             frequency_hz, powers = np.zeros(0), list[Array]()
-            state = ": too few frames yet"
+            state = ": too few frames yet" if modes.any() else ": no such modes"
             if found is not None and modes.any():
                 state = f", last {run.frames / rate_hz:.1f} s"
                 frequency_hz, powers = power_curves(found, modes, law, rate_hz)

@@ -69,7 +69,7 @@ def _nm_ticks(least: float, most: float) -> list[tuple[float, str]]:
 
 
 def _clock_ticks(begin_ns: int, span_s: float) -> Ticks:
-    """Ticks at round times of day or, of a longer trend, on days, UTC, in seconds since `begin_ns`."""
+    """Ticks at round times of day, or at midnights for a trend of days, UTC, in seconds since `begin_ns`."""
     step_s = next((one for one in _TICKS_S if span_s / one <= (_MAX_TICKS if one >= 60 else 3)), _TICKS_S[-1])
     form = "%m-%d" if step_s >= 86_400 else "%H:%M" if step_s >= 60 else "%H:%M:%S"
     first_s = -(-begin_ns // (step_s * 10**9)) * step_s

@@ -66,7 +66,7 @@ class LogVerdict:
         return Verdict(f"{headline}.{advice}", level, tiles, facts(state))
 
     def _add_modes(self, steps: Steps, period_ns: int) -> None:
-        """Add the time from step to step; a gap as long as in the live view counts as time without frames."""
+        """Add the time from step to step; a gap that the live view reports counts as time without frames."""
         time_ns = steps.time_ns
         if not time_ns.size:
             return

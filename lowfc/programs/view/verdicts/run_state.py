@@ -29,7 +29,7 @@ class Liveness(Enum):
     STARTING = auto()
     RUNNING = auto()
     STOPPED = auto()  # on request
-    SILENT = auto()  # no message for longer than it can be: hung or killed
+    SILENT = auto()  # no message for 2 s or ten frame periods: hung or killed
 
 
 class Process(NamedTuple):

@@ -58,7 +58,7 @@ class SpanMeans:
         return _means(self._sums[:, _LIGHT])[:, 0]
 
     def add(self, time_ns: Long, where: slice, values: npt.NDArray[np.floating]) -> None:
-        """Add rows (rows, columns) at their times to some of the sums."""
+        """Add rows (rows, columns) at their times to the sums in the columns `where`, and count them."""
         if self.begin_ns is None and time_ns.size:
             self.begin_ns = int(time_ns.min())
         after_ns = time_ns - (self.begin_ns or 0)

@@ -16,7 +16,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.view.snapshot import Snapshot
 
 FRAMES = 6144
-"""Frames kept, for spectra of eleven segments of 1024."""
+"""Frames kept, for spectra of eleven half-overlapping segments of 1024."""
 
 
 class LawInForce(NamedTuple):
@@ -83,7 +83,7 @@ class ResidualComparison(NamedTuple):
 def compare_with_best_gains(
     steady: Steady, rate_hz: float, camera: wire.CameraState | None
 ) -> ResidualComparison | None:
-    """Evaluate the last frames; None if the loop is open, its law unknown, or one law has too few frames."""
+    """Evaluate the last frames; None if the loop is not closed, its law unknown, or too few frames are consecutive."""
     law, modes = steady.law, len(steady.law.gain) if steady.law is not None else 0
     if law is None or steady.mode != LoopMode.CLOSED or not rate_hz:
         return None

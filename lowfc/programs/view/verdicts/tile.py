@@ -63,7 +63,7 @@ def worst_of(tiles: Sequence[Tile]) -> Tile:
 
 
 def rounded(value: float) -> str:
-    """Text of a number with two or three digits, readable at a glance."""
+    """Text of a number with at most two decimals, readable at a glance."""
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 
 

@@ -19,7 +19,7 @@ NEAR_BEST = 1.3
 """Residual over that of the best gains above which the gains are worth tuning."""
 NOISE_FLOOR = 0.2
 """Uncertainty of a residual whose noise was subtracted, as a fraction of the sensor's noise."""
-UNCORRECTED = ("OPEN", "SAFE", "DEAD")
+UNCORRECTED = ("OPEN", "SAFE", "IDLE", "WAITING", "DEAD", "NO CONTROLLER")
 """Values of the tile LOOP for which nothing is corrected."""
 
 
