@@ -115,6 +115,10 @@ def ended(name: str, *how: object) -> Callable[[Evidence, Outcome], None]:
     return lambda _, outcome: outcome.ended.append(ProcessEnd(name, *how))
 
 
+def refused(reason: int) -> Callable[[Evidence, Outcome], None]:
+    return lambda evidence, _: evidence.entries[STEP].__setitem__(500, step(500, reason, used=False))
+
+
 LARGE_RESIDUALS = [truth(FRAMES - 1, 5 * (MAX_RATIO * 2 + FLOOR_NM))] * 100
 STEPS = (0, STEP.key, START_S)
 FAULTS: list[tuple[str, str, Callable[[Evidence, Outcome], object]]] = [
@@ -124,11 +128,8 @@ FAULTS: list[tuple[str, str, Callable[[Evidence, Outcome], object]]] = [
     ("limits", "mirror: slew", lambda e, _: e.entries[MIRROR_STATE].append(shape(FRAMES, 160))),
     ("limits", "restarted", lambda e, _: e.entries[COMMAND].append(shape(FRAMES, 120, START_S + 5))),
     ("limits", "0 states", lambda e, _: e.entries[MIRROR_STATE].clear()),
-    (
-        "bad frames",
-        "500, which was refused",
-        lambda e, _: e.entries[STEP].__setitem__(500, step(500, wire.REASON_DARK, used=False)),
-    ),
+    ("bad frames", "500, which was refused", refused(wire.REASON_DARK)),
+    ("bad frames", "500, which was refused", refused(wire.REASON_AHEAD)),
     ("bad frames", "twice", lambda e, _: e.entries[STEP].insert(500, step(500))),
     ("recovery", "closed", lambda e, _: e.entries[TRUTH].extend(LARGE_RESIDUALS)),
     ("recovery", "open", lambda _, outcome: setattr(outcome, "mode", wire.LOOP_MODE_OPEN)),

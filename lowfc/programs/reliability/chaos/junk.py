@@ -105,7 +105,7 @@ def _forged_commands(bench: ChaosBench) -> None:
             time.sleep(_POLL_S)
 
 
-@case("forged-frames", "frames with past sequence numbers", allowed=LOST, noisy=True)
+@case("forged-frames", "frames with past sequence numbers", allowed=LOST)
 def _forged_frames(bench: ChaosBench) -> None:
     with Intruder(bench) as intruder:
         for _ in range(FORGED):

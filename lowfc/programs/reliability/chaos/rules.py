@@ -11,7 +11,7 @@ from lowfc.adapters.files.factory import mirror_limits, settings
 from lowfc.arrays import Mask
 from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, Role, wire
-from lowfc.control.loop.safety import Limits
+from lowfc.control.loop.safety import Limits, Rejection
 from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Outcome
 from lowfc.programs.reliability.chaos.case import Case
 from lowfc.programs.reliability.chaos.evidence import Entry, Evidence
@@ -26,7 +26,8 @@ SPAN_NS = 1_000_000_000
 RMS_FRAMES = 50
 ROUNDING_NM = 0.03
 """Largest difference of a mirror state from its command: the driver rounds to 0.023 nm."""
-REFUSALS = frozenset({*range(wire.REASON_NO_CALIBRATION, wire.REASON_STUCK + 1), wire.REASON_HELD})
+HOLDING = frozenset(Rejection) - {Rejection.NO_MIRROR}
+"""Reasons with which a refused frame holds the command; with `NO_MIRROR` it returns to the mirror's last shape."""
 
 
 class Finding(NamedTuple):
@@ -135,7 +136,7 @@ def _bad_frames(case: Case, evidence: Evidence) -> Finding:
     """A refused frame holds the command; bad frames are refused; no frame is used twice or after a newer one."""
     commands, steps = evidence.entries[COMMAND], evidence.entries[STEP]
     at = {(command.start_s, command.message.input_number): number for number, command in enumerate(commands)}
-    refused = [step for step in steps if REFUSALS.intersection(step.message.reasons)]
+    refused = [step for step in steps if HOLDING.intersection(step.message.reasons)]
     wrong = []
     for step in refused:
         number = at.get((step.start_s, step.message.input_number), 0)
