@@ -66,6 +66,7 @@ def test_commands_contain_the_flat_map_and_leave_dead_actuators_at_zero(logged: 
     expected = flat_nm().reshape(-1)
     expected[list(DEAD)] = 0
     messages = [wire.MirrorCommand.FromString(body) for body in logged[f"/{COMMAND.at('dm')}"][:300]]
+    assert len(messages) == 300
     for message in messages:
         beside = np.frombuffer(message.actuators, "<f4") - calibration.modes_to_actuators @ message.command_nm
         assert not np.frombuffer(message.actuators, "<f4")[list(DEAD)].any()

@@ -12,11 +12,12 @@ import psutil
 import pytest
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.selection import EVERYTHING, Selection
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.envelope import sequence_of
-from lowfc.contract.messages import STEP, TIMING, TRUTH, wire
+from lowfc.contract.messages import FRAME, STEP, TIMING, TRUTH, wire
 from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.processes import CommandTimes
 from lowfc.programs.reliability.soak import run
@@ -157,8 +158,8 @@ def test_an_interrupted_soak_has_the_results_so_far(tmp_path: Path, monkeypatch:
     assert len(ended) == 1
 
 
-def log(folder: Path, name: str, counts: dict[str, list[int]]) -> None:
-    writer = LogWriter(folder / f"{name}.mcap", 0, {})
+def log(folder: Path, name: str, counts: dict[str, list[int]], selection: Selection = EVERYTHING) -> None:
+    writer = LogWriter(folder / f"{name}.mcap", 0, selection.metadata)
     for key, numbers in counts.items():
         for number in numbers:
             writer.write(Sample(key, b"", sequence_of(START_S, number), number, number))
@@ -174,6 +175,9 @@ def test_missing_messages_are_counted_within_logs_and_between_them(tmp_path: Pat
     log(tmp_path, "2", {STEP.key: [4, 5], TRUTH.key: [9]})
     checker.check()
     assert (checker.logs, checker.messages, checker.gaps) == (2, 8, 3)
+    log(tmp_path, "3", {FRAME.key: [10, 20]}, Selection(10))  # recorder.every = 10
+    checker.check()
+    assert (checker.messages, checker.gaps) == (10, 3)
 
 
 def test_a_soak_finds_the_process_whose_memory_grows(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,10 +56,10 @@ class Traffic:
             mirror.publisher(MIRROR_STATE, _MIRROR),
             camera.publisher(TRUTH),
         )
-        self._loop: list[list[tuple[Publisher, bytes]]] = [
+        self._by_frame: list[list[tuple[Publisher, bytes]]] = [
             list(zip(publishers, payloads, strict=True)) for payloads in frame_payloads()
         ]
-        self._timings = controller.publisher(TIMING)
+        self._timing_publisher = controller.publisher(TIMING)
         self._timing_frames = max(1, round(rate_hz / _TIMING_HZ))
         self._timing = _timing(self._timing_frames)
         for service in self._services:
@@ -97,11 +97,11 @@ class Traffic:
             service.bus.close()
 
     def _send(self) -> None:
-        for publisher, payload in self._loop[self.frames % _VARIETY]:
+        for publisher, payload in self._by_frame[self.frames % _VARIETY]:
             publisher.put(payload)
         self.frames += 1
         if self.frames % self._timing_frames == 0:
-            self._timings.put(self._timing)
+            self._timing_publisher.put(self._timing)
         if self.frames % _BEAT_FRAMES == 0:
             for service in self._services:
                 service.beat()

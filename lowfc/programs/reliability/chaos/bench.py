@@ -98,7 +98,7 @@ class ChaosBench:
     """A simulated loop with injected faults; `children` and `health` are those of the present process of each role."""
 
     def __init__(self, config: Configuration, folder: Path, rng: random.Random, fault: dict[str, Any] | None) -> None:
-        """Open a run with its own folder; `fault` is injected into the camera's frames."""
+        """Open a run whose logs go to `folder`; `fault`, if any, is injected into the camera's frames."""
         self.config = config
         self.folder = folder
         self.rng = rng

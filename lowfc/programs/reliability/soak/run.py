@@ -11,10 +11,11 @@ from typing import Any
 import psutil
 
 from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.selection import EVERYTHING
 from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import count_of, start_of
-from lowfc.contract.messages import EVENT, FRAME, Role, wire
+from lowfc.contract.messages import EVENT, FRAME, Role, topic_of, wire
 from lowfc.programs.launch.sim_loop import check, deferred_signals
 from lowfc.programs.launch.watch import topic_count
 from lowfc.programs.reliability.chaos.bench import ChaosBench
@@ -35,22 +36,26 @@ class LogChecker:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self._selection = EVERYTHING
         self._received: dict[tuple[str, int], Gaps] = {}
         self.logs = self.messages = 0
 
     @property
     def gaps(self) -> int:
-        """Messages missing in the logs between others of the same publisher."""
-        return sum(one.missing for one in self._received.values())
+        """Messages missing in the logs between others of the same publisher, of topics that are recorded completely."""
+        received = self._received.items()
+        return sum(one.missing for (key, _), one in received if self._selection.records_all(topic_of(key)))
 
     def check(self) -> None:
         """Check and remove the finished logs."""
         for path in sorted(self._folder.glob("*.mcap"), key=lambda one: (one.stat().st_mtime_ns, one.name)):
-            for message in LogReader(path):
+            reader = LogReader(path)
+            for message in reader:
                 self.messages += 1
                 if message.key != EVENT.key:  # all processes publish events: the publisher is ambiguous
                     count = count_of(message.sequence)
                     self._received.setdefault((message.key, start_of(message.sequence)), Gaps(count)).add(count)
+            self._selection = reader.selection
             self.logs += 1
             path.unlink()
 

@@ -91,7 +91,7 @@ def tile_boxes(tiles: int) -> list[Box]:
 
 
 def png(image: Image.Image) -> bytes:
-    """Encode as PNG, a thirtieth of the size: the viewer keeps every picture of a night."""
+    """Encode as PNG, less than a tenth of the size: the viewer keeps every picture of a night."""
     content = io.BytesIO()
     image.save(content, "PNG", compress_level=1)
     return content.getvalue()
