@@ -1,4 +1,4 @@
-"""`lowfc hosts` and `lowfc router --show` create no run; the figures in docs/howto/hosts.md are those of the code."""
+"""`lowfc hosts` and `lowfc router --show` create no run; the numbers in docs/howto/hosts.md are those of the code."""
 
 import inspect
 import json

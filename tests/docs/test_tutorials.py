@@ -30,7 +30,7 @@ _IN_THIS_PROCESS = re.compile(r"lowfc (?!sim-loop)")
 
 
 def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str]:
-    """Output of each command of a page, run in order in this folder; only loops are separate processes."""
+    """Output of each command of a page except those of `NOT_FOLLOWED`, in order; only loops are separate processes."""
     text = (PAGES / f"{page}.md").read_text()
     for name, content in re.findall(r"Save this as `(\S+)`.*?```\w+\n(.*?)```", text, re.DOTALL):
         (folder / name).write_text(content)

@@ -117,7 +117,7 @@ def _program(night: Night, program: str) -> str:
 
 
 def _requests_beyond_the_document(night: Night) -> None:
-    """Requests that the document has no command for: probe sequences, refusals, JSON, and commands as processes."""
+    """Requests without a command in the document: probe sequences, refusals, a lease; commands with other options."""
     with Client(night.name) as loop:
         grid = loop.calibration().grid
         loop.open_loop()

@@ -24,7 +24,7 @@ _KINDS = (
     ("saturated", "all pixels at full well", "SATURATED", 0, False),
     ("dark", "the star vanishes and returns", "DARK", 0, False),
     ("hot-pixels", "a tenth of the pixels at full well", "SATURATED", 0, False),
-    ("cosmic-rays", "a track of six pixels at full well in every fifth frame", "", FAULTY_FRAMES, False),
+    ("cosmic-rays", "a track of six pixels at full well in a fifth of the frames", "", FAULTY_FRAMES, False),
     ("stuck", "the same image repeated as new frames", "STUCK", Control().max_identical_frames, False),
 )
 
