@@ -46,11 +46,8 @@ def true_response(loop: InProcessLoop, first: int, *, closed: bool) -> np.ndarra
     optics = factory.twin(config, None, lambda _: None)
     mirror = factory.mirror_on_twin(config, optics, lambda _: None)
     static_nm = scene._screen + wavefront_nm(mirror, np.mean(loop.surfaces_nm[first:], axis=0).astype(np.float32))
-    moving_nm = (
-        [0.0]
-        if closed
-        else [scene._sampler.at(i)[0] @ scene._basis for i in np.linspace(0, len(loop.surfaces_nm), 32).astype(int)]
-    )
+    frames = () if closed else np.linspace(0, len(loop.surfaces_nm), 32).astype(int)
+    moving_nm = [scene._sampler.at(frame)[0] @ scene._basis for frame in frames] or [0.0]
     shapes = np.array(
         [wavefront_nm(mirror, each.reshape(before.grid)) for each in before.modes_to_actuators.T], dtype=np.float64
     )

@@ -90,7 +90,7 @@ def test_an_invalid_map_gives_an_error_of_one_line(tmp_path: Path) -> None:
     np.save(tmp_path / "pickle.npy", np.array([[{}]], dtype=object))
     for file, why in {
         **dict.fromkeys(("short.fits", "archive.npy", "pickle.npy"), "neither"),
-        **dict.fromkeys(("line.npy", "words.npy", "nothing.npy"), ""),
+        **dict.fromkeys(("line.npy", "words.npy", "nothing.npy"), "is an array"),
         "cube.npy": r"\(2, 3, 4\) of float64",
         "none.fits": "there is no such file",
         "empty.fits": "there is no image",

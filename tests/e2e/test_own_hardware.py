@@ -60,7 +60,7 @@ SIMULATED = ("sim-camera --run bench --config bench.toml", "sim-dm --run bench -
 
 
 @pytest.fixture
-def bench(tmp_path: Path, own_runtime: Path) -> Path:
+def folder(tmp_path: Path, own_runtime: Path) -> Path:
     """A folder with the examples, and a private runtime directory."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     (tmp_path / "bench.toml").write_text(BENCH)
@@ -100,10 +100,10 @@ def conformance(folder: Path, *commands: str) -> None:
         assert results["counts"]["ok"] >= len(results["checks"]) - 5  # warnings of a busy host
 
 
-def test_the_loop_closes_with_a_users_camera_and_mirror(bench: Path) -> None:
-    with in_background(bench, *DEVICES), listening() as bus:
+def test_the_loop_closes_with_a_users_camera_and_mirror(folder: Path) -> None:
+    with in_background(folder, *DEVICES), listening() as bus:
         wait_for_devices(bus)
-        conformance(bench, *CONFORMANCE)
+        conformance(folder, *CONFORMANCE)
         errors_nm: list[list[float]] = []
 
         def note(sample: Sample) -> None:
@@ -115,10 +115,10 @@ def test_the_loop_closes_with_a_users_camera_and_mirror(bench: Path) -> None:
             return float(np.linalg.norm(np.mean(measured, axis=0))) if len(measured) == 100 else np.nan
 
         bus.subscribe(STEP, note)
-        with in_background(bench, LOOP[0]):
+        with in_background(folder, LOOP[0]):
             until(lambda: np.isfinite(rms_nm()))
             before_nm = rms_nm()
-            assert "loop closed" in command(bench, LOOP[1])
+            assert "loop closed" in command(folder, LOOP[1])
             until(lambda: rms_nm() < 0.1 * before_nm)
         states: list[wire.MirrorState] = []
         bus.subscribe(MIRROR_STATE, lambda sample: states.append(wire.MirrorState.FromString(sample.payload)))
@@ -128,25 +128,25 @@ def test_the_loop_closes_with_a_users_camera_and_mirror(bench: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_simulated_devices_and_a_camera_in_plain_zenoh_pass_conformance(bench: Path) -> None:
+def test_the_simulated_devices_and_a_camera_in_plain_zenoh_pass_conformance(folder: Path) -> None:
     y, x = np.mgrid[:80, :80]
     spot = 100 + 2000 * np.exp(-((y - 40) ** 2 + (x - 30) ** 2) / 50)
-    np.save(bench / "frames.npy", np.random.default_rng(1).poisson(spot, (50, 80, 80)).astype(np.uint16))
+    np.save(folder / "frames.npy", np.random.default_rng(1).poisson(spot, (50, 80, 80)).astype(np.uint16))
     HostClock()  # creates this boot's clock, which the program below only reads
-    command(bench, PLAIN[0].replace("bench", "plain"))
-    with in_background(bench, *SIMULATED, PLAIN[1]):
+    command(folder, PLAIN[0].replace("bench", "plain"))
+    with in_background(folder, *SIMULATED, PLAIN[1]):
         with listening() as bus:
             wait_for_devices(bus)
-        conformance(bench, *CONFORMANCE, CONFORMANCE[0].partition(" --config")[0].replace("bench", "plain"))
+        conformance(folder, *CONFORMANCE, CONFORMANCE[0].partition(" --config")[0].replace("bench", "plain"))
 
 
 @pytest.mark.slow
-def test_the_camera_of_the_tutorial_passes_conformance(bench: Path, own_runtime: Path) -> None:
-    (bench / "counting.py").write_text(block("python", (ROOT / "docs/tutorials/your_camera.md").read_text()))
-    with in_background(bench, COUNTING[0]):
+def test_the_camera_of_the_tutorial_passes_conformance(folder: Path, own_runtime: Path) -> None:
+    (folder / "counting.py").write_text(block("python", (ROOT / "docs/tutorials/your_camera.md").read_text()))
+    with in_background(folder, COUNTING[0]):
         until(lambda: (own_runtime / "lowfc/counting").exists())
-        conformance(bench, COUNTING[1])
-    assert "2 ok" in command(bench, DOCTOR)
+        conformance(folder, COUNTING[1])
+    assert "2 ok" in command(folder, DOCTOR)
 
 
 TEXT = (ROOT / "docs/howto/commissioning.md").read_text()
@@ -184,21 +184,21 @@ class SmallCamera(MyCamera):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("own", [False, True])
-def test_a_loop_with_a_camera_of_another_size_is_commissioned(bench: Path, own: bool) -> None:
+def test_a_loop_with_a_camera_of_another_size_is_commissioned(folder: Path, own: bool) -> None:
     """docs/howto/commissioning.md, as written, and with a user's drivers: 64 x 64 pixels, 100 Hz, 14 bits."""
     assert len(COMMISSIONING) == 5
-    (bench / "bench.toml").write_text(block("toml"))
+    (folder / "bench.toml").write_text(block("toml"))
     devices = PAGE_DEVICES
     if own:
-        (bench / "examples/small_camera.py").write_text(OWN_CAMERA)
+        (folder / "examples/small_camera.py").write_text(OWN_CAMERA)
         sim = "lowfc mirror sim", "lowfc camera sim --rows 64 --columns 64"
         drivers = "lowfc mirror examples/mirror.py:MyMirror", "lowfc camera examples/small_camera.py:SmallCamera"
         devices = [line.replace(a, b) for line, a, b in zip(devices, sim, drivers, strict=True)]
         assert not any(" sim " in line for line in devices)
-    with in_background(bench, *devices, CONTROLLER):
+    with in_background(folder, *devices, CONTROLLER):
         with listening() as bus:
             wait_for_devices(bus)
-        process = started(bench, f"{COMMISSION} --json")
+        process = started(folder, f"{COMMISSION} --json")
         out, shown = process.communicate(timeout=400)
         assert process.returncode == 0, shown
         for number in range(1, 11):
@@ -210,6 +210,6 @@ def test_a_loop_with_a_camera_of_another_size_is_commissioned(bench: Path, own: 
         with Client("bench") as client:
             state = client.status().state
             assert state.mode_cause == "asked to close for lowfc commission"
-        assert calibration_file.load(bench / "calibration.fits").shape == (64, 64)
-    with in_background(bench, *devices, LATER):
-        until(lambda: closed(bench), 60)
+        assert calibration_file.load(folder / "calibration.fits").shape == (64, 64)
+    with in_background(folder, *devices, LATER):
+        until(lambda: closed(folder), 60)

@@ -150,6 +150,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "late commands": (health("camera", commands_late=80), "LATENCY 80 LATE WARNING", "80 commands, "),
     "slow": (setting(latency_us=30_000), "LATENCY 30000 us WARNING", "longer than a frame"),
     "recorder failed": (recording(failure="no space left"), "RECORDER FAILED BAD", "no space left"),
+    "control characters": (recording(failure="\x1b[2J"), "RECORDER FAILED BAD", "goes on: \\x1b[2J."),
     "recording stopped": (recording(file="a", stopped=True), "RECORDER STOPPED WARNING", "stopped by an operator"),
     "recorder stopped": (stop("recorder"), "RECORDER STOPPED WARNING", "The recorder was stopped"),
     "recorder losing": (recording(file="a", lost=5), "RECORDER LOSING BAD", "lost 5 messages"),

@@ -111,7 +111,7 @@ def _held(state: wire.ControllerState | None) -> str:
     if state is None:
         return ""
     if state.mirror_fault:
-        return f"the mirror {state.mirror_fault}"
+        return f"the mirror {short(printable(state.mirror_fault))}"
     if state.lease.holds and not state.lease.ended:
         return f"reserved for {short(printable(state.lease.holder))}"
     return next((short(printable(one.why)) for one in state.interlocks_acting if one.action == "hold"), "")
@@ -215,10 +215,10 @@ def _recorder(state: RunState) -> Tile:
     if last is None:
         return tile("NONE", "there is no recorder: nothing is recorded")
     done = last.health.recording
-    log = short(PurePath(done.file).stem)
-    if done.failure:
-        advice = f"Recording failed, the loop goes on: {short(done.failure)}. Free disk space, restart `lowfc record`."
-        return tile("FAILED", short(done.failure), Level.BAD, advice)
+    log, failure = (short(printable(text)) for text in (PurePath(done.file).stem, done.failure))
+    if failure:
+        advice = f"Recording failed, the loop goes on: {failure}. Free disk space, restart `lowfc record`."
+        return tile("FAILED", failure, Level.BAD, advice)
     gone = absent("RECORDER", "recorder", recorder, state.running_s, "nothing is recorded, the loop goes on")
     if gone is not None and recorder.life is Liveness.SILENT:
         return gone

@@ -4,10 +4,11 @@ from functools import partial
 from math import hypot, sqrt
 
 from lowfc.contract.messages import wire
+from lowfc.contract.printable import printable
 from lowfc.control.loop.command_channels import FLAT
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.steady import ResidualComparison
-from lowfc.programs.view.verdicts.tile import Level, Tile, rounded
+from lowfc.programs.view.verdicts.tile import Level, Tile, rounded, short
 
 WORSE = 1.1
 """Residual over open wavefront above which a closed loop does harm; the rms of a second scatters less."""
@@ -57,7 +58,7 @@ def contrast(known: wire.WavefrontFigures, *, now: bool) -> Tile:
     """Tile CONTRAST: what the wavefront adds to the contrast of the dark zone; it has no threshold."""
     if not now:
         return Tile("CONTRAST", "?", "not measured now")
-    share = f"{known.costliest_modes} contributes most ({100 * known.costliest_share:.0f} %)"
+    share = f"{short(printable(known.costliest_modes))} contributes most ({100 * known.costliest_share:.0f} %)"
     flat = f"added to the dark zone; {known.added_contrast_flat:.1e} with a flat mirror"
     return Tile("CONTRAST", f"{known.added_contrast:+.1e}", f"{flat}; {share}")
 
