@@ -18,10 +18,10 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files import calibration_file, law_file
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.events import EVENTS
-from lowfc.contract.messages import EVENT, REQUEST, wire
+from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, HEALTH, REQUEST, wire
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.programs.console import app as application
 from lowfc.programs.console import feed, panels
@@ -494,6 +494,20 @@ def test_pictures_and_sparklines_have_a_fixed_size() -> None:
         assert np.allclose(small, 4.0)
     lines = halves(np.zeros((4, 3, 3), np.uint8))
     assert [line.plain for line in lines] == ["▀▀▀"] * 2
+
+
+def test_a_configuration_that_was_not_received_is_queried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    queries: list[object] = []
+    monkeypatch.setattr(feed.Feed, "_query", lambda self: queries.append(self))
+    hub, clock = MemoryHub(), HostClock()
+    reader = feed.Feed(MemoryBus(hub, "operator", clock), RUN, clock)
+    controller = MemoryBus(hub, "controller", clock)
+    controller.publisher(HEALTH, "controller").put(wire.Health(process="controller").SerializeToString())
+    controller.publisher(CALIBRATION).put(encode_calibration(identified(calibration()), 1))
+    controller.publisher(CONTROLLER_STATE).put(wire.ControllerState().SerializeToString())
+    for seconds, expected in ((0, 2), (1, 2), (6, 3)):  # at the start, for the new controller, and after five seconds
+        reader.snapshot(clock.now_ns() + seconds * 10**9)
+        assert len(queries) == expected
 
 
 @pytest.mark.parametrize(("seconds", "shown"), [(1_800_000_000, True), (10**12, False)])

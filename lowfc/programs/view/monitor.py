@@ -62,7 +62,7 @@ class Monitor:
         return found
 
     def _complete(self, found: Snapshot) -> bool:
-        """Whether all that `_query` asks of the controller is known; overridden by the console."""
+        """Whether everything that is queried of the controller is known; subclasses may query more."""
         return None not in (found.calibration, found.controller)
 
     def _query(self) -> None:

@@ -201,7 +201,7 @@ class ChaosBench:
         self._start(Child(name, command or self.children[name].command, stderr), ready=ready)
 
     def await_end(self, name: str, status: int) -> str:
-        """Wait until a process ends by itself with the expected exit status; return the end of its stderr."""
+        """Wait until a process has ended with the expected exit status; return the end of its stderr."""
         child, begun_s = self.children[name], time.monotonic()
         self.wait(lambda: child.status is not None, f"the end of {name}")
         self._record_end(child, time.monotonic() - begun_s, requested=True)
