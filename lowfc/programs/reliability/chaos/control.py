@@ -128,12 +128,7 @@ def _damaged_calibration(bench: ChaosBench) -> None:
     bench.restart(Role.CONTROLLER, good)
 
 
-@case(
-    "safed-restart",
-    "safe mode, then the controller is killed and restarted",
-    expected=("SAFED",),
-    safe=True,
-)
+@case("safed-restart", "safe mode, then the controller is killed and restarted", expected=("SAFED",), safe=True)
 def _restart_in_safe_mode(bench: ChaosBench) -> None:
     bench.client().safe()
     bench.frames(WHILE_FRAMES)

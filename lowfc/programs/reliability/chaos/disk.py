@@ -36,12 +36,7 @@ main()
 """
 
 
-@case(
-    "disk-full",
-    "the disk fills up",
-    allowed=("RECORDING_FAILED", "MESSAGES_LOST"),
-    statuses={Role.RECORDER: 1},
-)
+@case("disk-full", "the disk fills up", allowed=("RECORDING_FAILED", "MESSAGES_LOST"), statuses={Role.RECORDER: 1})
 def _full(bench: ChaosBench) -> None:
     """Limit the size of the recorder's files: writes beyond it fail as on a full disk."""
     process = bench.children[Role.RECORDER].process

@@ -10,17 +10,7 @@ from lowfc.adapters.bus.run import mirror_role
 from lowfc.adapters.logs.columns import count_reasons, frame_rate_hz
 from lowfc.arrays import Array, Long, Sequences
 from lowfc.contract.envelope import start_of
-from lowfc.contract.messages import (
-    CONTROLLER_STATE,
-    FRAME,
-    MIRROR_STATE,
-    STEP,
-    Log,
-    Role,
-    Topic,
-    from_timestamp,
-    wire,
-)
+from lowfc.contract.messages import CONTROLLER_STATE, FRAME, MIRROR_STATE, STEP, Log, Role, Topic, from_timestamp, wire
 from lowfc.contract.printable import printable
 from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.loop.estimator import saturated_pixels
