@@ -61,8 +61,7 @@ def _read_only(bench: ChaosBench) -> None:
         stderr_tail = bench.await_end(Role.RECORDER, 2)
         if "error:" not in stderr_tail or "Traceback" in stderr_tail:
             raise CaseFailedError(f"the recorder should have named what is wrong in one line, got: {stderr_tail}")
-    # The folder is given, because the failed recorder set its own as that of the run.
-    bench.restart(Role.RECORDER, [*normal, "--folder", str(bench.folder)])
+    bench.restart(Role.RECORDER, normal)
 
 
 @case("disk-slow", "two writes take 3 s each", expected=("DISK_SLOW",), allowed=LOST)

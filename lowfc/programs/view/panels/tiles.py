@@ -44,7 +44,7 @@ Shades = npt.NDArray[np.uint8]
 
 
 class Tiles(Panel):
-    """Draws the verdict on the run when it changes; at the end of a log, the verdict on all of it."""
+    """Draws the verdict on the run when its words change and once a second; at the end of a log, that on all of it."""
 
     def __init__(self, nm_per_mas: float | None = None) -> None:
         """`nm_per_mas`: wavefront rms of a tilt of 1 mas, if the telescope is known."""
