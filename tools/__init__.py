@@ -1,1 +1,1 @@
-"""What makes the documentation's tables, pictures and layouts: `python -m tools.measure`."""
+"""Tables, pictures and layouts of the documentation (`python -m tools.measure`); benches of the simulated loop."""

@@ -31,11 +31,12 @@ ADVICE: dict[str, Advice] = {
     "KERNEL": Advice("`realtime.kernel` selects this implementation of the control step.", _NOTHING),
     "KERNEL_MISSING": Advice(
         "`realtime.kernel` selects the fused step, but numba is missing or cannot be used here.",
-        "do what the event says; until then the results are the same, but each frame takes longer.",
+        "follow the event's advice; until then numpy computes the same results except for rounding, but each frame "
+        "takes longer.",
     ),
     "CALIBRATION_LOADED": Advice("a calibration is in use, at the start or after `load`.", _NOTHING),
     "NOT_CALIBRATED": Advice(
-        "there is no calibration, or its size differs from the camera's frames.",
+        "the controller started without a calibration.",
         "`lowfc ctl load FILE`, `lowfc calibrate` or `lowfc commission`; frames are not used until then.",
     ),
     "CAMERA_CHANGED": Advice(
@@ -44,7 +45,8 @@ ADVICE: dict[str, Advice] = {
     ),
     "MODE_CHANGED": Advice("the loop mode changed, for the named reason.", "nothing, if the reason is a request."),
     "SAFED": Advice(
-        "an operator, an interlock, SIGUSR1 or an earlier latch put the loop in safe mode; the mirror goes to zero.",
+        "an operator, an interlock or SIGUSR1 put the loop in safe mode, or it was so before the controller restarted; "
+        "the mirror relaxes to flat.",
         "remove the cause, then `lowfc ctl clear`; the loop is open afterwards, and `lowfc ctl close` closes it.",
     ),
     "FRAMES_REFUSED": Advice(
@@ -59,7 +61,7 @@ ADVICE: dict[str, Advice] = {
     ),
     "FRAMES_BACK": Advice("frames arrive again after a frame timeout.", _NOTHING),
     "FRAMES_MISSING": Advice(
-        "frames were lost in transport, or the controller was delayed and skipped them.",
+        "frames were lost in the camera or in transport, or the controller was delayed and skipped them.",
         "if frequent: `lowfc doctor`, a lower `camera.rate_hz`, dedicated processors for camera and controller.",
     ),
     "STREAM_SILENT": Advice(
@@ -89,7 +91,7 @@ ADVICE: dict[str, Advice] = {
     "LAW_BACK": Advice("the law's virtual residual was far smaller for some time; the law is active again.", _NOTHING),
     "NOTE": Advice("an operator wrote a note.", _NOTHING),
     "CLOSING_HARMS": Advice(
-        "at these gains, the noise added to some modes exceeds their disturbance.",
+        "at these gains, closing adds more noise to some modes than it removes of their disturbance.",
         "`lowfc ctl gain auto`, or lower gains of the modes that the event names.",
     ),
     "GAINS_CHANGED": Advice("automatic gains changed.", _NOTHING),
@@ -104,7 +106,8 @@ ADVICE: dict[str, Advice] = {
         "open the loop by itself.",
     ),
     "PLAY_ENDED": Advice(
-        "a probe sequence ended early: a restart, a frame timeout, a limit, or an operator.",
+        "a probe sequence ended early: the camera restarted, the mirror was lost, a calibration was loaded, no frame "
+        "came in time, or a limit acted.",
         "remove the cause, and run the calibration or test again (with `--resume` if available).",
     ),
     "LEASE_TAKEN": Advice("a program reserved the loop.", "wait, or `lowfc ctl open`, which ends the reservation."),
@@ -144,8 +147,10 @@ ADVICE: dict[str, Advice] = {
     ),
     "COMMAND_BACK": Advice("the mirror follows commands again.", _NOTHING),
     "COMMAND_REFUSED": Advice(
-        "a command was not finite, of another grid, out of order, or on an unusable channel.",
-        "find out which process commands this mirror (`lowfc hosts`): only one controller may.",
+        "a command was not finite, of another grid, out of order, ahead of the clock, or on an unusable channel, or "
+        "the driver had failed.",
+        "see the table of reasons; if commands are out of order, find out which process commands this mirror "
+        "(`lowfc hosts`): only one controller may.",
     ),
     "START_AHEAD": Advice(
         "the clock of the sender's host is ahead by more than `control.max_start_ahead_h`.",
@@ -181,7 +186,7 @@ ADVICE: dict[str, Advice] = {
         "give the recorder its own processor or a faster disk; `replay` names the steps that it cannot check.",
     ),
     "RECORDING_FAILED": Advice(
-        "the disk is nearly full, a write failed, or the folder is gone. The log up to then is readable, if it exists.",
+        "the disk is nearly full, a write failed, or the folder is gone. A log is readable up to its last flush.",
         "free some space, then `lowfc ctl record start`; the loop continues without a log.",
     ),
     "DISK_SLOW": Advice("one write took long; messages waited in memory.", "use a faster or less busy disk."),
@@ -216,7 +221,7 @@ REASONS: dict[str, Advice] = {
     ),
     "NO_FRAME": Advice("no frame in time", "as for NO_FRAMES"),
     "STUCK": Advice("the same image repeatedly", "restart the camera"),
-    "AHEAD": Advice("the camera process reports a start time ahead of this host's clock", "as for START_AHEAD"),
+    "AHEAD": Advice("the sender's start time is too far ahead of this host's clock", "as for START_AHEAD"),
     "CAMERA_UNKNOWN": Advice(
         "the camera restarted and its settings have not arrived", "nothing; they are sent twice a second"
     ),

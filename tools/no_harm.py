@@ -95,10 +95,8 @@ def modal_case(case: tuple[str, str, float]) -> Results:
                 for gain in GAINS
             ]
         )
-        tilt = fixed[:, :2].sum(axis=1).min()
-        best = tilt + fixed[:, 2:].sum(axis=1).min()
+        best = fixed[:, :2].sum(axis=1).min() + fixed[:, 2:].sum(axis=1).min()  # tip and tilt; other modes
         found["of_best"] = float(np.sqrt(residual_nm2[: len(seeds)].sum(axis=1).mean() / best))
-        found["of_best_tilt"] = float(np.sqrt(residual_nm2[: len(seeds), :2].sum(axis=1).mean() / tilt))
     return found
 
 
@@ -147,11 +145,11 @@ def measure(
     sensors: Sequence[str] = MODAL, magnitudes: Sequence[float] = MAGNITUDES, imaged: Sequence[str] = IMAGED
 ) -> Results:
     """All cases."""
-    modes = [(one, preset, star) for one in sensors for preset in PRESETS for star in magnitudes]
-    images = [(one, preset, star) for one in imaged for preset in PRESETS for star in IMAGED_MAGNITUDES]
+    modal_cases = [(one, preset, star) for one in sensors for preset in PRESETS for star in magnitudes]
+    imaged_cases = [(one, preset, star) for one in imaged for preset in PRESETS for star in IMAGED_MAGNITUDES]
     with threadpool_limits(1), ProcessPoolExecutor(initializer=threadpool_limits, initargs=(1,)) as pool:
-        rows = list(track(pool.map(modal_case, modes), "modes", total=len(modes)))
-        rows += list(track(pool.map(imaged_case, images), "images", total=len(images)))
+        rows = list(track(pool.map(modal_case, modal_cases), "modes", total=len(modal_cases)))
+        rows += list(track(pool.map(imaged_case, imaged_cases), "images", total=len(imaged_cases)))
     return {"rows": rows, "seeds": len(SEEDS), "rate_hz": RATE_HZ, "seconds": SECONDS}
 
 

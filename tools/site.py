@@ -68,7 +68,7 @@ def _keys(heading: str, about: str, section: type[Section], prefix: str) -> str:
         if isinstance(info.default, Section):
             continue
         default = "required" if info.is_required() else f"`{info.get_default(call_default_factory=True)!r}`"
-        values = [f"`{one}`" for one in get_args(info.annotation) if isinstance(one, str)]
+        values = [f"`{one}`" for one in get_args(info.annotation) if isinstance(one, str | int)]
         values += [_bound(str(one)) for one in info.metadata if hasattr(one, "__dataclass_fields__")]
         rows.append((f"`{prefix}{key}`", default, ", ".join(values), one_line(descriptions[key])))
     return f"## {heading}\n\n{about}\n\n{markdown(('key', 'default', 'values', ''), rows)}"
@@ -107,8 +107,10 @@ def json_objects() -> str:
     """Every typed `--json` object."""
     rows = []
     for one in sorted(_subclasses(Result), key=lambda each: f"{each.__module__}.{each.__name__}"):
-        command = " ".join(one.__module__.removeprefix("lowfc.programs.").split(".")[-2:])
-        rows.append(f"### {one.__name__}\n\n{one_line(one.__doc__)}. Printed by `{command}`.\n\n{_field_table(one)}")
+        *_, package, module = one.__module__.split(".")
+        command = module if package == "cli" else package  # every other command is a package
+        about = f"{one_line(one.__doc__)}. Printed by `lowfc {command}`."
+        rows.append(f"### {one.__name__}\n\n{about}\n\n{_field_table(one)}")
     return "\n".join(rows)
 
 

@@ -75,3 +75,8 @@ def test_the_site_has_every_page_and_every_declared_name(
     for page, words in declared.items():
         text = unescape((site / f"{page}.html").read_text())
         assert [word for word in words if word not in text] == []
+
+
+def test_typed_json_objects_name_the_commands_that_print_them() -> None:
+    named = set(re.findall(r"Printed by `lowfc (\S+)`", BUILT["json"]()))
+    assert {"hosts", "replay"} <= named <= {row.name for row in sum(COMMANDS.values(), ())}

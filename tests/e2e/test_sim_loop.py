@@ -59,7 +59,7 @@ def test_the_loop_halves_the_residual_and_counts_every_frame(live: dict[str, Any
         assert 0 < values["p50"] <= values["p99"] <= values["p99_9"] <= values["max"]
 
 
-def test_the_log_holds_every_topic_and_lost_messages_are_counted(
+def test_the_log_holds_the_topics_of_a_loop_without_requests_and_lost_messages_are_counted(
     live: dict[str, Any], topics: dict[str, list[bytes]]
 ) -> None:
     recorded = sum(map(len, topics.values()))
@@ -68,6 +68,7 @@ def test_the_log_holds_every_topic_and_lost_messages_are_counted(
         "lowfc/camera/frame",
         "lowfc/camera/state",
         "lowfc/control/step",
+        "lowfc/control/input",
         "lowfc/control/timing",
         "lowfc/control/state",
         "lowfc/mirror/{name}/command",
@@ -92,7 +93,7 @@ def test_the_log_grows_at_the_estimated_rate(live: dict[str, Any]) -> None:
 
 
 def test_frame_step_command_and_state_join(topics: dict[str, list[bytes]]) -> None:
-    """Each carries the frame's time and sequence, so that the path of one frame can be followed."""
+    """Each carries the frame's sequence, steps and commands also its time: the path of one frame can be followed."""
     frames = {from_timestamp(RawImage.FromString(payload).timestamp) for payload in topics["/lowfc/camera/frame"]}
     steps = [wire.ControlStep.FromString(payload) for payload in topics["/lowfc/control/step"]]
     commands = {
@@ -138,13 +139,13 @@ def test_a_signal_makes_the_loop_safe_and_a_process_that_dies_is_named(tmp_path:
     os.kill(controller, signal.SIGUSR1)
     until(lambda: "in safe mode" in lowfc("ctl", "status").stdout)
     os.kill(children(process.pid)["sim_dm"], signal.SIGKILL)
-    stdout, complaints = process.communicate(timeout=30)
+    stdout, stderr = process.communicate(timeout=30)
     assert process.returncode == 1
     assert not stdout
-    assert "mirror-dm was killed by SIGKILL" in complaints
-    assert "Traceback" not in complaints
+    assert "mirror-dm was killed by SIGKILL" in stderr
+    assert "Traceback" not in stderr
     (log,) = (tmp_path / "logs").glob("*.mcap")  # it is finished nevertheless
-    assert complaints.endswith(f"recorded until then: logs/{log.name}\n")
+    assert stderr.endswith(f"recorded until then: logs/{log.name}\n")
     recorded = payloads(log)
     assert recorded["/lowfc/camera/frame"]
     requests = [wire.Request.FromString(payload) for payload in recorded["/lowfc/control/request"]]
@@ -160,8 +161,8 @@ def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
         first, "sim-loop", "--rate", "100", "--duration", "4", "--seed", "1", "--json", "--disturbance", "quiet"
     )
     results = loop(second, "--rate", "100", "--duration", "4", "--seed", "2", "--disturbance", "quiet")
-    stdout, complaints = other.communicate(timeout=60)
-    assert other.returncode == 0, complaints
+    stdout, stderr = other.communicate(timeout=60)
+    assert other.returncode == 0, stderr
     assert results["frames_published"] == 400
     assert len(payloads(results["log"])["/lowfc/camera/frame"]) <= 400
     assert '"frames_published": 400' in stdout

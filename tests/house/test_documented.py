@@ -1,4 +1,4 @@
-"""Required documentation: every public name, with shapes and units of array arguments; advice on every event."""
+"""Required documentation: public names of five packages, shapes and units of array arguments, advice on events."""
 
 import ast
 import re
@@ -54,7 +54,8 @@ def test_functions_of_arrays_document_shapes_and_units(package: str) -> None:
     lacking = []
     for name, one, text, above in names(package):
         if isinstance(one, ast.FunctionDef):
-            annotated = [argument for argument in one.args.args if argument.annotation is not None]
+            listed = (*one.args.args, *one.args.kwonlyargs)
+            annotated = [argument for argument in listed if argument.annotation is not None]
             arrays = [each for each in annotated if ARRAYS.search(ast.unparse(each.annotation))]
             words = f"{text} {above} {' '.join(each.arg.rpartition('_')[2] for each in arrays)}"
             if arrays and not (SHAPE.search(words) and UNIT.search(words)):

@@ -18,7 +18,7 @@ IDENTIFIERS = {
     *("late_ms", "hold_ms", "valid_ms", "most_alike", "most_saturated", "least_flux", "PixelLaws", "pixel_laws"),
 }
 WORD = re.compile(rf"\b(?:{'|'.join(IDENTIFIERS)})\b")
-"""A former name anywhere, also in a text or a comment: only sources that have one are parsed."""
+"""A former name anywhere, also in texts and comments; only sources with a match are parsed."""
 FOLDERS = ("lowfc", "sim_camera", "sim_dm", "tests", "benchmarks", "tools", "examples")
 SOURCES = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if path != Path(__file__)]
 

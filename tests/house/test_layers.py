@@ -1,4 +1,4 @@
-"""Imports point downward, numerical modules are pure, and no file or folder is too large."""
+"""Imports point downward, numerical modules are pure, and no product module and no folder is too large."""
 
 import ast
 import tomllib
@@ -86,7 +86,7 @@ def is_pure(module: str) -> bool:
 
 
 def layer_faults(module: str, source: str) -> list[str]:
-    """Imports that point upward or sideways."""
+    """Imports that point upward or sideways, and relative ones."""
     own, faults = layer_of(module), []
     for name in imports_of(ast.parse(source)):
         if name.startswith("."):
@@ -148,7 +148,7 @@ def test_every_source_but_the_tests_is_type_checked() -> None:
     assert mypy["strict"]
 
 
-def test_no_file_is_too_long_or_vaguely_named() -> None:
+def test_no_product_module_is_too_long_or_vaguely_named() -> None:
     long = {module: len(path.read_text(encoding="utf-8").splitlines()) for module, path in FILES.items()}
     assert {
         module: lines for module, lines in long.items() if lines > MAX_LINES and not inside(module, GENERATED)

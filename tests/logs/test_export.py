@@ -146,15 +146,15 @@ def test_npz(log: Path, tmp_path: Path) -> None:
 
 def test_fits(log: Path, tmp_path: Path) -> None:
     export_log(log, Format.FITS, tmp_path / "out.fits", frames=True, console=QUIET)
-    with fits.open(tmp_path / "out.fits", checksum=True) as units:
-        units.verify("exception")
-        assert units[0].header["RATE"] == 1000
-        assert "lowfc: run = night" in list(units[0].header["COMMENT"])
-        np.testing.assert_array_equal(units["FRAMES"].data, FRAMES)
-        np.testing.assert_array_equal(units["FRAME_TIMES"].data["sequence"], SEQUENCES)
-        np.testing.assert_array_equal(units["FRAME_TIMES"].data["time_ns"], TIMES_NS)
-        assert units["RECONSTRUCTOR_NM"].header["BUNIT"] == "nm"
-        np.testing.assert_array_equal(units["RECONSTRUCTOR_NM"].data[2].ravel(), CALIBRATED.reconstructor[2])
+    with fits.open(tmp_path / "out.fits", checksum=True) as hdus:
+        hdus.verify("exception")
+        assert hdus[0].header["RATE"] == 1000
+        assert "lowfc: run = night" in list(hdus[0].header["COMMENT"])
+        np.testing.assert_array_equal(hdus["FRAMES"].data, FRAMES)
+        np.testing.assert_array_equal(hdus["FRAME_TIMES"].data["sequence"], SEQUENCES)
+        np.testing.assert_array_equal(hdus["FRAME_TIMES"].data["time_ns"], TIMES_NS)
+        assert hdus["RECONSTRUCTOR_NM"].header["BUNIT"] == "nm"
+        np.testing.assert_array_equal(hdus["RECONSTRUCTOR_NM"].data[2].ravel(), CALIBRATED.reconstructor[2])
     table = Table.read(tmp_path / "out.fits", hdu="STEPS", mask_invalid=False)
     units_of = {name: str(table[name].unit or "") for name in ("error_nm", "time_ns", "compute_us", "flux_dn")}
     assert units_of == {"error_nm": "nm", "time_ns": "ns", "compute_us": "us", "flux_dn": "adu"}

@@ -15,6 +15,7 @@ from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.contract import configuration, former_names
 from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.messages import CONTROL_INPUT, wire
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Load, Request
 from lowfc.control.loop.state import State
@@ -97,12 +98,14 @@ def test_a_log_of_0_1_is_drawn(tmp_path: Path) -> None:
         (["acceptance", "linearity", NIGHT], "no `lowfc acceptance"),
     ],
 )
-def test_commands_that_need_a_longer_log_say_so(words: list[object], message: str) -> None:
+def test_commands_that_need_another_log_say_so(words: list[object], message: str) -> None:
     assert message in refusal(*words)
 
 
 def test_the_log_of_0_1_has_every_kind_of_input() -> None:
     history = read_history(LogReader(NIGHT, skip_damaged=True))
+    inputs = [wire.ControlInput.FromString(one.payload) for one in LogReader(NIGHT, topics=[CONTROL_INPUT])]
+    assert {one.WhichOneof("input") for one in inputs} == {"load", "mirror", "camera", "tick"}
     names = {request.name for request in history.requests}
     assert {"law", "channel", "play", "offset", "load", "safe", "clear", "step", "reset", "note"} <= names
     assert any(not request.accepted for request in history.requests)
@@ -117,14 +120,15 @@ def test_identities_of_calibration_and_law_are_unchanged() -> None:
 
 def test_messages_and_enumerations_of_0_1_are_unchanged_except_for_names() -> None:
     """No field of 0.1 has changed its number, type or label; only the names in the table have changed."""
-    former, now = ({}, {})
-    for names, folder in ((former, FOLDER), (now, WIRE)):
+    former, now = {}, {}
+    for declared, folder in ((former, FOLDER), (now, WIRE)):
         for file in FileDescriptorSet.FromString((folder / "lowfc.desc").read_bytes()).file:
             if file.package == "lowfc.v1":
                 for message in file.message_type:
-                    names |= {(message.name, one.number): (one.type, one.label, one.name) for one in message.field}
+                    for one in message.field:
+                        declared[message.name, one.number] = one.type, one.type_name, one.label, one.name
                 for enum in file.enum_type:
-                    names |= {(enum.name, value.number): (value.name,) for value in enum.value}
+                    declared |= {(enum.name, value.number): (value.name,) for value in enum.value}
     renamed = {
         (kind, number): (*shape, former_names.FIELDS.get(f"{kind}.{name}", former_names.VALUES.get(name, name)))
         for (kind, number), (*shape, name) in former.items()

@@ -1,4 +1,4 @@
-"""Histories of logs with values that protobuf allows but the loop never sends."""
+"""Histories of logs with values that the loop never sends, with lost messages and with restarts."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`last`, and several files of one recording as one log, in every command that reads logs."""
+"""`last`, and several files of one recording as one log, in commands that read logs."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -166,7 +166,7 @@ def ten_files_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sa
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_every_command_gives_the_same_results_for_ten_files_as_for_one(
+def test_a_command_gives_the_same_results_for_ten_files_as_for_one(
     ten_files_and_one: Callable[[bool], Path], monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
     monkeypatch.chdir(ten_files_and_one(words[0] == "tune"))  # which needs some two thousand frames

@@ -189,9 +189,9 @@ def frames(count: int, first: int = 0) -> list[Input]:
 @effort(deadline=None, max_examples=EXAMPLES)
 @given(*[inputs()] * 2, *map(st.sampled_from, (["hold", "flat"], [1.0, 2.5], ["numpy", "fused"])))
 def test_any_sequence_of_inputs_is_replayed_bit_by_bit(
-    before: list[Input], after: list[Input], silence: str, delay_frames: float, kernel: str
+    before: list[Input], after: list[Input], on_frame_timeout: str, delay_frames: float, kernel: str
 ) -> None:
-    made = night(before, on_frame_timeout=silence, delay_frames=delay_frames, kernel=compiled.kernel(kernel))
+    made = night(before, on_frame_timeout=on_frame_timeout, delay_frames=delay_frames, kernel=compiled.kernel(kernel))
     made.restart()
     for one in after_camera_restart(after):
         made.apply(one)
@@ -240,11 +240,11 @@ def test_lost_messages_are_never_a_difference_and_every_step_is_accounted_for(
 @given(inputs(), st.randoms(use_true_random=False))
 def test_the_order_between_publishers_does_not_matter(input_list: list[Input], random: st.DataObject) -> None:
     made = night([*input_list, *frames(20, 5000)])
-    late_ns = {True: random.randrange(PATIENCE_NS // 2), False: random.randrange(PATIENCE_NS // 2)}  # type: ignore[attr-defined]
-    late = [
-        message._replace(receive_time_ns=message.receive_time_ns + late_ns[message.key == FRAME.key])
-        for message in made.messages
-    ]
+    frames_late_ns, others_late_ns = (random.randrange(PATIENCE_NS // 2) for _ in range(2))  # type: ignore[attr-defined]
+    late = []
+    for message in made.messages:
+        late_ns = frames_late_ns if message.key == FRAME.key else others_late_ns
+        late.append(message._replace(receive_time_ns=message.receive_time_ns + late_ns))
     shuffled = sorted(late, key=lambda message: message.receive_time_ns)
     account = replay(shuffled)
     assert account.identical

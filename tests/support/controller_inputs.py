@@ -22,6 +22,7 @@ TIGHT = {
     "interlocks": INTERLOCKS,
 }
 """Settings under which limits and interlocks often act."""
+_KINDS = (*["frame"] * 5, "bad", "late", "tick", "request", "mirror", "camera", "close", "bench", "permit")
 
 
 @st.composite
@@ -29,38 +30,38 @@ def inputs(draw: st.DrawFn) -> list[Input]:
     """Draw good and bad frames, gaps, ticks, requests, states of devices and bench values."""
     drawn: list[Input] = []
     count = 0
-    for kind in draw(st.lists(st.sampled_from("fffffbltrmcsvp"), min_size=1, max_size=40)):
+    for kind in draw(st.lists(st.sampled_from(_KINDS), min_size=1, max_size=40)):
         seed = draw(st.integers(0, 1 << 16))
         rng = np.random.default_rng(seed)
         match kind:
-            case "f":
+            case "frame":
                 count += 1 + (seed % 7 == 0) * 3
                 drawn.append(frame(count, rng.normal(0, 20, len(NOLL))))
-            case "b":
+            case "bad":
                 bad: dict[str, object] = {"pixels": None} if seed % 2 else {"sequence": 5}
                 count += 1
                 drawn.append(frame(count, **bad))
-            case "l":
+            case "late":
                 count += 1
                 drawn.append(frame(count, age_ns=10**9))
-            case "t":
+            case "tick":
                 drawn.append(Tick(seed, seed * 2_000))
-            case "r":
+            case "request":
                 name = ("gain", "leak", "status", "open", "safe", "clear", "nonsense")[seed % 7]
                 drawn.append(Request(seed, name, (), (float(np.float32(rng.uniform(0, 1))),)))
-            case "m":
+            case "mirror":
                 shape = rng.normal(0, 30, CALIBRATION.grid).astype(np.float32)
                 drawn.append(MirrorShape(seed, shape, rng.normal(0, 5, 3).astype(np.float32)))
-            case "c":
+            case "camera":
                 drawn.append(CameraSettings(seed, CALIBRATION.shape, 7.0, CALIBRATION.saturation_dn))
-            case "v":
+            case "bench":
                 value = (True, False, "parked", "away", None)[seed % 5]
                 drawn.append(BenchReport(seed, "mask", value, 0 if value is None else seed % 3000))
                 if seed % 11 == 0:
                     drawn.append(BenchReport(seed, "pressure", seed / 10_000))
-            case "p":
+            case "permit":
                 text, values = "moving the mask", (2**-8,) if seed % 2 else ()
                 drawn.append(Request(seed, "permit", (), values, text, lease_id=1 + seed % 3))
-            case "s":
+            case "close":
                 drawn += [Request(seed, "clear"), Request(seed, "close")]
     return drawn

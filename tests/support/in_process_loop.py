@@ -31,7 +31,7 @@ from tools.law_bench import Bench, calibrated
 
 FIRST = 1 << 32
 SMALL_MIRROR = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 10}
-"""For tests that do not depend on the number of actuators: computes a calibration ten times as fast."""
+"""For tests that do not depend on the number of actuators: a calibration is computed several times as fast."""
 
 BRIGHT = (
     FIXED_GAINS
@@ -97,10 +97,10 @@ class InProcessLoop(Client):
         self.config, self.run_id = config, "folded"
         self._cut = cut or 0
         grid = (config.mirror.rows, config.mirror.columns)
-        none = MirrorShape(0, np.zeros(grid, np.float32), np.zeros(0, np.float32))
+        flat = MirrorShape(0, np.zeros(grid, np.float32), np.zeros(0, np.float32))
         if cut is None and calibration is None:
             calibration = computed(config.to_toml())
-        self._bench = Bench(config, none if calibration is None else calibration, world=world)
+        self._bench = Bench(config, flat if calibration is None else calibration, world=world)
         self.scene = self._bench.scene
         self.hub = MemoryHub()
         self._operator = OperatorBus(self)

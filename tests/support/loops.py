@@ -109,7 +109,7 @@ def payloads(log: Path) -> dict[str, list[bytes]]:
 
 
 def children(launcher: int) -> dict[str, int]:
-    """Process ids of a launcher's processes, by a word of their command line."""
+    """Process ids of a launcher's processes, by subcommand of `lowfc` or by module."""
     found = {}
     listed = Path(f"/proc/{launcher}/task/{launcher}/children").read_text().split()
     for pid in map(int, listed):
@@ -149,7 +149,7 @@ def command(folder: Path, line: str, timeout_s: float = 120, good: tuple[int, ..
 
 @contextlib.contextmanager
 def in_background(folder: Path, *lines: str) -> Iterator[list[str]]:
-    """Run documented commands in the background, then stop them; yields the list of their standard errors."""
+    """Run documented commands in the background, then stop them; the yielded list then has their standard errors."""
     processes = [
         subprocess.Popen([PROGRAMS / program, *rest], cwd=folder, stderr=subprocess.PIPE, text=True)
         for program, *rest in map(shlex.split, lines)

@@ -26,7 +26,7 @@ ATTACHMENTS = (
 )
 MUTATIONS = 1000
 MISPLACED = ("shuffled", "repeated", "removed", "swapped", "doubled")
-"""Kinds of damage that move whole records; without a summary a missing one cannot be detected."""
+"""Kinds of damage that move, repeat or remove whole records; without a summary a missing one cannot be detected."""
 
 
 def small_samples(frames: int = 40) -> list[Sample]:
@@ -48,7 +48,7 @@ def small_samples(frames: int = 40) -> list[Sample]:
 
 
 def small_log(path: Path, *, finished: bool = True) -> Path:
-    """A log of about 130 kB in twelve chunks."""
+    """A log of 180 kB, unfinished 156 kB, in twelve chunks."""
     log = LogWriter(path, START_NS, METADATA, ATTACHMENTS)
     for number, sample in enumerate(small_samples()):
         log.write(sample)

@@ -35,7 +35,6 @@ class Host:
         self.name = name
         self.address = address
         self.folder = folder / name
-        self.shift_ns = clock_shift_ns
         hold = ["unshare", "--net", "sh", "-c", "echo && exec cat"]
         self.holder = subprocess.Popen(hold, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
         assert self.holder.stdout.readline(), "no namespace was created"  # before it, commands would run in our own

@@ -58,7 +58,7 @@ class SyntheticLog:
         """Start a loop with `changes` to its settings."""
         self.samples: list[Sample] = []
         self.truth = truth
-        self.instants = 0  # of a period, at which the continuous truth, twice that at the exposure's start, was sampled
+        self.instants = 0  # of a period, in each truth; then its continuous values are twice the sampled ones
         self.now_ns = START * 10**9
         self.calibration = calibration
         self.settings = settings(**({"gain": (0.4, 0.2)} | changes))
@@ -85,12 +85,12 @@ class SyntheticLog:
         self.event("STARTED", process="controller", version="0.1.0")
         self.put(CALIBRATION, encode_calibration(self.calibration, self.now_ns))
         self._state = State()
-        self._take(advance(self.settings, self._state, Load(self.now_ns, self.calibration, "test")))
+        self._publish(advance(self.settings, self._state, Load(self.now_ns, self.calibration, "test")))
 
     def load(self, calibration: Calibration) -> None:
         """Load another calibration; the pixels remain those of the first one."""
         self.put(CALIBRATION, encode_calibration(calibration, self.now_ns))
-        self._take(advance(self.settings, self._state, Load(self.now_ns, calibration, "test")))
+        self._publish(advance(self.settings, self._state, Load(self.now_ns, calibration, "test")))
 
     def start_camera(self) -> None:
         self._camera_start += 60
@@ -124,7 +124,7 @@ class SyntheticLog:
                 self.put(TRUTH, truth)
             if index not in lost:
                 exposed = Frame(sequence, self.now_ns, 100_000, frame)
-                self._take(advance(self.settings, self._state, exposed), DELAY_NS + 1000 * (self._count % 50))
+                self._publish(advance(self.settings, self._state, exposed), DELAY_NS + 1000 * (self._count % 50))
         return self
 
     def request(self, name: str, values: tuple[float, ...] = (), modes: tuple[int, ...] = (), **fields: Any) -> Self:
@@ -133,7 +133,7 @@ class SyntheticLog:
         after, outputs = advance(self.settings, before, request)
         assert outputs.reply is not None
         self.put(REQUEST, codec.encode_request(request, outputs.reply, after.input_number, None))
-        self._take((after, outputs))
+        self._publish((after, outputs))
         return self
 
     def law(self, gain: float, *, logged: bool = True) -> None:
@@ -188,7 +188,8 @@ class SyntheticLog:
         log.abandon()
         return log.part
 
-    def _take(self, advanced: tuple[State, Outputs], late_ns: int = 0) -> None:
+    def _publish(self, advanced: tuple[State, Outputs], late_ns: int = 0) -> None:
+        """Append the messages of a step of the controller, and of the mirror that follows it."""
         self._state, outputs = advanced
         for raised in outputs.events:
             self.event(raised.name, **raised.details)

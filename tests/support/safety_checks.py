@@ -119,7 +119,7 @@ def check_kept(limit: Callable[[Limits, Single, Single], Limited], case: Case) -
 
 
 class Simulated:
-    """The simulated mirror of a configuration behind its protection, of which `changes` are other values.
+    """The simulated mirror of a configuration behind its protection; `changes` replace values of the protection.
 
     Attributes:
         initial: status before the first command.

@@ -1,4 +1,4 @@
-"""Fuzzing targets: all readers of external data, each with valid inputs to start from and its permitted errors."""
+"""Fuzzing targets: readers of external data, each with valid inputs to start from and its permitted errors."""
 
 import json
 import tempfile

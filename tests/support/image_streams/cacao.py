@@ -65,15 +65,15 @@ class Comb:
             if time.monotonic() - searched_s > 0.2:
                 self.find_channels()
                 searched_s = time.monotonic()
-            newest = max(self.channels.values(), key=lambda one: one.count)  # the loop's, which is written most often
-            newest.wait(0, 0.01)
+            busiest = max(self.channels.values(), key=lambda one: one.count)  # the loop's
+            busiest.wait(0, 0.01)
             counts = {name: one.count for name, one in self.channels.items()}
             if counts != self.counts:
                 self.counts = counts
                 total = np.sum([one.pixels[0] for one in self.channels.values()], axis=0)
                 total -= total.mean()
                 self.total.write(total)
-                self.publish(total * 1000)
+                self.publish(total * 1000)  # channels are in um
 
 
 def main() -> None:
@@ -105,6 +105,7 @@ def main() -> None:
         exposure = driver.expose()
         clock.sleep_until_ns(exposure.end_ns)
         stream.begin(exposure.pixels[:rows])
+        # The stream's times are TAI.
         ahead_ns = round(clock.ahead_ns() - (time.clock_gettime(time.CLOCK_TAI) - time.time()) * 1e9)
         stream.end(exposure.end_ns - ahead_ns)
         let_send()  # lets the loop's processes run before the truth is computed

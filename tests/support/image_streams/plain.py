@@ -115,7 +115,7 @@ class PlainStream:
         self.pack("<Q", 272, plane)
 
     def end(self, acquired_ns: int | None = None) -> None:
-        """Finish the image: times, counter, flag, and post the semaphores below ten."""
+        """Finish the image: times, counter, flag, and post the semaphores whose value is below ten."""
         now_ns = time.clock_gettime_ns(time.CLOCK_TAI)
         self.pack("<qq", 184, *divmod(now_ns if acquired_ns is None else acquired_ns, 10**9))
         self.pack("<qq", 200, *divmod(now_ns, 10**9))
