@@ -116,7 +116,7 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
 
     Args:
         config: the loop.
-        calibration: its noise.
+        calibration: that of the loop, for the noise of a frame.
         robust: keep the margins that `lowfc tune` requires.
 
     Raises:

@@ -29,7 +29,7 @@ LOG_COMMANDS = (*(f"{RECORDED} {seconds}" for seconds in RECORDED_S), "lowfc rep
 
 
 def measure() -> Results:
-    """Run the loop once at each rate and in each scheduling class."""
+    """Run the loop once for each of `RUNS`."""
     runs = {}
     for name, rate_hz, more, toml in RUNS:
         with tempfile.TemporaryDirectory() as folder:

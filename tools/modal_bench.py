@@ -17,10 +17,10 @@ from lowfc.control.loop.inputs import Frame, Load
 from lowfc.programs.core.gain_watch import GainWatch
 from sim_camera.disturbance import BLOCK, Disturbance, Sampler
 from sim_camera.driver import disturbance_of
+from sim_camera.scene import GAUSS_LEGENDRE
 from tools.law_bench import Bench, with_lines_moved
 
 _LEVEL_DN, _DN_PER_NM = 32_000.0, 80.0
-_GAUSS_LEGENDRE_NODES = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 _TRUTH_SAMPLES = (np.arange(8) + 0.5) / 8
 _NOISE_BLOCK = 1024
 
@@ -88,7 +88,7 @@ class ModalBench(Bench):
         self._squares: list[Single] = []
 
     def _sampled(self) -> Sampler:
-        instants = np.concatenate([self.config.camera.exposure_fraction * _GAUSS_LEGENDRE_NODES, _TRUTH_SAMPLES])
+        instants = np.concatenate([self.config.camera.exposure_fraction * GAUSS_LEGENDRE, _TRUTH_SAMPLES])
         return Sampler(self._disturbance, instants, self.config.camera.rate_hz)
 
     def move_lines(self, factor: float) -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lowfc.adapters.files import factory
+from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.contract.configuration import Configuration
 from lowfc.control.laws.continuous import Timing, residual_power
 from lowfc.control.laws.linear_law import integrator
@@ -10,7 +10,8 @@ from lowfc.control.laws.margins import noise_gain
 from lowfc.control.laws.stability import highest_gain
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import variances_nm2
-from sim_camera.driver import disturbance_of, ignore
+from sim_camera.driver import disturbance_of
+from tools.law_bench import calibrated
 
 
 def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:
@@ -26,8 +27,6 @@ def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:
     frequency_hz, variance_nm2 = variances_nm2(disturbance)
     transmitted = residual_power(law, 2 * np.pi * frequency_hz / config.camera.rate_hz, timing)
     residual_nm2 = np.sum(variance_nm2[:, :2] * transmitted, axis=0)
-    optics = factory.twin(config, None, ignore)
-    calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, ignore))
-    noise_nm2 = factory.frame_noise_nm(config, calibration)[:2] ** 2
+    noise_nm2 = frame_noise_nm(config, calibrated(config))[:2] ** 2
     total_nm2 = residual_nm2 + noise_nm2 * noise_gain(law)
     return float(np.sqrt(np.mean(total_nm2)) / tilt_nm_per_mas(config.star.diameter_m))

@@ -20,6 +20,7 @@ from lowfc.optics.chain.sensor import light_budget, pupil_radii, reference, resp
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.optics.twin.twin import Evaluator
+from tools.law_bench import calibrated
 from tools.shared import Results, json_of, markdown
 
 LAYOUTS = ("sam18_sized", "sam27d07_bal14", "sam27d10_bal14", "sam27_crb20")
@@ -51,7 +52,7 @@ def measure() -> Results:
 def alone(name: str) -> Results:
     """Light, condition and noise of a sensor, and the speed of its twin."""
     config = configured(name)
-    optics = factory.sensor(config, sys.exit)
+    optics = factory.sensor(config, sys.exit)  # a warning ends the measurement
     modes = zernikes(config.noll, *pupil_radii(optics))
     budget = light_budget(optics)
     twin = factory.twin(config, None, sys.exit)
@@ -76,9 +77,7 @@ def alone(name: str) -> Results:
             beside_shear, factory.analytic_calibration(beside_shear, twin, on_nodes)
         )
         in_band = configured(name, **{"sensor.wavelengths": 4})
-        band_twin = factory.twin(in_band, None, sys.exit)
-        of_band = factory.analytic_calibration(in_band, band_twin, factory.mirror_on_twin(in_band, band_twin, sys.exit))
-        results["noise_in_band_mas"] = tilt_noise_mas(in_band, of_band)
+        results["noise_in_band_mas"] = tilt_noise_mas(in_band, calibrated(in_band))
         light = reference(optics).ravel()
         bound = cramer_rao(response(optics, modes), variance_e(light, 0.0))
         limit = np.linalg.inv(quantum_information(optics.pupil, modes, optics.wavelength_nm))

@@ -24,6 +24,7 @@ def host() -> dict[str, Any]:
         "processors": int(known["processors"]),
         "kernel": known["kernel"],
         "python": known["python"],
+        "virtual": "hypervisor" in Path("/proc/cpuinfo").read_text(),
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "load_before": round(os.getloadavg()[0], 2),
     }
@@ -70,7 +71,8 @@ def where(name: str, results: Results) -> str:
 
 def host_in_words(about: Results) -> str:
     """Date and host, from the result of `host`."""
+    virtual = "a virtual machine, " if about.get("virtual", True) else ""  # older results are of virtual machines
     return (
-        f"{about['date']} on {about['processors']} cores of {about['processor']} (a virtual machine, Linux "
+        f"{about['date']} on {about['processors']} cores of {about['processor']} ({virtual}Linux "
         f"{about['kernel']}, Python {about['python']}, load before: {about['load_before']})"
     )

@@ -1,4 +1,4 @@
-"""The live view of a real loop: real processes, the real viewer and a real browser, judged by their pixels."""
+"""The view with real processes, the real viewer and a real browser, judged by their pixels; its files and errors."""
 
 import json
 import os
@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-import rerun.blueprint as rrb
 from rich.console import Console
 
 from lowfc.adapters.bus.run import open_run
@@ -33,7 +32,7 @@ from lowfc.programs.view.target import Target
 from lowfc.programs.view.verdicts.tile import Level
 from tests.support.loops import FIXED, LOWFC, children, interrupt, run, start, until
 from tests.support.report_log import SyntheticLog
-from tests.support.viewers import browser_screenshot, complaints, needs_chromium, on_screen, pixels, share_of
+from tests.support.viewers import browser_screenshot, complaints, needs_chromium, on_screen, pixels, share_of, views
 
 MIN_SHADES = 8  # colours in a panel with content, below its title; an empty one has its background only
 TITLE_ROWS = 30
@@ -140,7 +139,7 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
             stream.disconnect()
             picture = viewer.screenshot(artefacts / f"live-{tab}.png", timeout_s=6)
             assert pixels(picture).shape == (1000, 1600, 3)
-            shown = {view.name: _shades(viewer, view.id) for view in _views(blueprint.root_container.contents[number])}
+            shown = {view.name: _shades(viewer, view.id) for view in views(blueprint.root_container.contents[number])}
             assert len(shown) > 4
             assert {name: shades for name, shades in shown.items() if shades < MIN_SHADES} == {}, tab
         assert complaints(viewer) == []
@@ -167,14 +166,8 @@ def test_the_web_view_shows_the_live_loop_and_fetches_from_this_host_only(live: 
 
 
 def _shades(viewer: RerunViewer, view_id: object) -> int:
-    """Different colours in a panel, below its title."""
+    """Number of different colours in a panel, below its title."""
     from rerun.experimental import ViewerClient
 
     shown = pixels(ViewerClient.connect(viewer.url).take_screenshot(view_id))[TITLE_ROWS:]  # type: ignore[arg-type]
     return len(np.unique(shown.reshape(-1, 3), axis=0))
-
-
-def _views(part: rrb.Container | rrb.View) -> list[rrb.View]:
-    if isinstance(part, rrb.View):
-        return [part]
-    return [view for one in part.contents for view in _views(one)]

@@ -40,6 +40,7 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.driver import scene
 from sim_dm.driver import SimulatedMirror
 from tests.support.loops import until
+from tools.law_bench import calibrated
 
 ROOT = Path(__file__).parents[2]
 START_NS = 1_767_225_600_000_000_000
@@ -171,9 +172,7 @@ def main(folder: Path) -> None:
     """Write all golden files."""
     folder.mkdir(parents=True)
     config = load(None, CONFIGURATION)
-    optics = factory.twin(config, None, print)
-    calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, print))
-    made = law(config)
+    calibration, made = calibrated(config), law(config)
     calibration_file.save(calibration, folder / "calibration.fits")
     law_file.save(made, folder / "law.fits")
     (folder / "lowfc.toml").write_text(config.to_toml())

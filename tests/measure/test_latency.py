@@ -55,8 +55,9 @@ def frames(
     *,
     scheduled: bool = True,
 ) -> Frames:
-    """Frames published at `put_ns` (an integer: their number, 1 ms apart), commanded after `command_us` (NaN: never),
-    and applied by the mirror 50 us later.
+    """Frames published at `put_ns` (an integer: their number, 1 ms apart), `late_us` after they were due.
+
+    They are commanded after `command_us` (NaN: never) and applied 50 us later, except those in `mirror_lost`.
     """
     put_ns = np.arange(put_ns) * MS if isinstance(put_ns, int) else put_ns
     sequence = START + np.arange(put_ns.size, dtype=np.uint64)

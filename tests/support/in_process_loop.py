@@ -92,7 +92,7 @@ class InProcessLoop(Client):
     ) -> None:
         """Start a loop with `config`, in a simulated `world` that may differ; frames selected by `lose` do not arrive.
 
-        With `cut`, frames lack that many pixels at each edge, and the loop starts without a calibration.
+        With `cut`, frames lack that many pixels at each edge, and no calibration is computed.
         """
         self.config, self.run_id = config, "folded"
         self._cut = cut or 0

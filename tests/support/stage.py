@@ -91,7 +91,7 @@ class Stage:
         self.send(CAMERA_STATE, wire.CameraState(period_ns=20_000_000))
 
     def run(self, seconds: float) -> Verdict:
-        """Frames at 50 Hz, Health at 2 Hz, snapshots at 10 Hz."""
+        """Send frames at 50 Hz and Health at 2 Hz, with a snapshot at 10 Hz; the verdict at the end."""
         for _ in range(round(seconds * 50)):
             self.host_ns += 20_000_000
             self.data_ns += 20_000_000

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import psutil
 import pytest
+import rerun.blueprint as rrb
 from PIL import Image
 from rerun.experimental import ViewerClient
 from websockets.sync.client import ClientConnection, connect
@@ -52,6 +53,11 @@ def pixels(png: bytes) -> Pixels:
 def share_of(picture: Pixels, colour: tuple[int, int, int], tolerance: int = 12) -> float:
     """Fraction of an image with a colour, 0 to 1."""
     return float(np.all(np.abs(picture.astype(int) - colour) <= tolerance, axis=2).mean())
+
+
+def views(part: rrb.Container | rrb.View) -> list[rrb.View]:
+    """Views of a layout or of a part of it."""
+    return [part] if isinstance(part, rrb.View) else [view for one in part.contents for view in views(one)]
 
 
 def complaints(viewer: RerunViewer) -> list[str]:

@@ -171,7 +171,7 @@ def test_without_a_recorder_a_line_reports_that_earlier_events_are_missing(
 ) -> None:
     monkeypatch.setattr(live_view, "_RECORDER_S", 0.0)
     scene = scenes()
-    until(lambda: scene.viewers[0].tape.logged["log/view"])
+    until(lambda: any("there is no recorder" in text for text in scene.viewers[0].tape.texts("log/view")))
 
 
 def viewer_dies(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

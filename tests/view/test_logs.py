@@ -39,6 +39,7 @@ from tests.support import report_log
 from tests.support.mutated_logs import chunks_of, flipped
 from tests.support.report_log import SyntheticLog
 from tests.support.stage import Tape, accumulated, snapshot_of, tile, values_of
+from tests.support.viewers import views
 
 Shown = list[Verdict]
 
@@ -240,10 +241,6 @@ def test_every_view_of_the_layout_has_data_and_the_plots_span_the_whole_log(tmp_
     assert len(ranges) > 4
     assert all(str(end_ns) in one for one in ranges)
     assert not {sensor.FRAME, mirror.COMMAND, pointing.TRAIL} & {str(view.origin) for view in operator}
-
-
-def views(part: rrb.Container | rrb.View) -> list[rrb.View]:
-    return [part] if isinstance(part, rrb.View) else [view for one in part.contents for view in views(one)]
 
 
 def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_the_lost_time(
