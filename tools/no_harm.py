@@ -165,7 +165,7 @@ def render(results: Results) -> str:
                 {"sensor": sensor, "magnitude": magnitude}
                 | {preset: "{open_nm:.2f} to {closed_nm:.2f}".format(**row) for preset, row in mine.items()}
             )
-    harmful = [row for row in rows if harms(row)]
+    harmful, saturated = [row for row in rows if harms(row)], len(results["rows"]) - len(rows)
     stars = _magnitudes(modal)
     bright = [row for row in rows if "of_best" in row]
     compared = [row["of_best"] for row in bright]
@@ -180,7 +180,8 @@ def render(results: Results) -> str:
         f"{columns(heads, table)}\nTrue wavefront, open to closed with automatic gains, nm rms over the second half "
         f"of {results['seconds']:g} s at {results['rate_hz']:g} Hz, mean of {results['seeds']} seeds. "
         f"Number of cases: {len(rows)} (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them "
-        "with every image simulated). Added contrast is without the terms between modes. A case counts as harmful if "
+        f"with every image simulated), without {saturated} in which the star saturates the detector. Added contrast is "
+        "without the terms between modes. A case counts as harmful if "
         f"closing adds more contrast than {100 * TOLERATED:g} % of the dark zone's own plus three standard errors "
         f"(`quiet`: {100 * TOLERATED:g} % alone). Harmful cases, with the ratio of added contrast to the dark zone's "
         f"own: {names or 'none'}. On bright stars (V = {_magnitudes(bright)}; without `quiet`; two seeds) "

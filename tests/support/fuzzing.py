@@ -94,6 +94,8 @@ def main() -> int:
     begun_s = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         all_targets = [one for one in targets(Path(folder)) if not options.only or options.only in one.name]
+        if not all_targets:
+            parser.error(f"no target's name contains {options.only!r}")
         counts = shares(all_targets, options.inputs)
         results = []
         for target in all_targets:

@@ -303,10 +303,10 @@ def steps(first: int, error_nm: Any, pol_nm: Any, mode: int = LoopMode.CLOSED) -
 
 def truths(residual_nm: Any, disturbance_nm: Any) -> Truths:
     rows = len(residual_nm)
-    modes = [np.asarray(one, np.float32) for one in (disturbance_nm, residual_nm)]
-    none, zeros = np.zeros(rows, np.int64), [np.zeros(rows, np.float32)] * 5
-    each = *modes, modes[1], *map(np.abs, modes), *zeros[:3], none, *zeros[3:]
-    return Truths(np.arange(rows, dtype=np.uint64), np.full(rows, START_NS), *each)
+    disturbance, residual = (np.asarray(one, np.float32) for one in (disturbance_nm, residual_nm))
+    modes = disturbance, residual, residual, np.abs(disturbance), np.abs(residual)  # the third as sensed
+    zero, instants = np.zeros(rows, np.float32), np.zeros(rows, np.int64)
+    return Truths(np.arange(rows, dtype=np.uint64), np.full(rows, START_NS), *modes, *[zero] * 3, instants, zero, zero)
 
 
 def drawn(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:
@@ -317,7 +317,7 @@ def drawn(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:
     panel.draw(tape, dataclasses.replace(empty, **fields))
 
 
-def mean_of(pupil: Any, modes_nm: Any) -> float:
+def contrast_of(pupil: Any, modes_nm: Any) -> float:
     radii = 2 * pupil_axis(len(pupil))
     opd_nm = np.tensordot(modes_nm, zernikes(NOLL, radii, radii[:, None]), 1)
     return mean_contrast(Coronagraph(pupil), opd_nm, NM, Wedge(4.0, 6.0))
@@ -337,10 +337,10 @@ def test_contrast_is_the_mean_over_the_newest_wavefronts() -> None:
     drawn(panel, tape, science.Science.period_ns, truths=truths(residual_nm[3:4], open_nm[3:4]))
     times_ns, found = tape.column(science.CONTRAST.path)
     np.testing.assert_array_equal(times_ns - START_NS, [0, science.Science.period_ns])
-    flat = mean_of(pupil, np.zeros(MODES))
+    flat = contrast_of(pupil, np.zeros(MODES))
     expected = [
-        [mean_of(pupil, open_nm[1]), mean_of(pupil, residual_nm[1]), flat],  # the last row was refused
-        [*(np.mean([mean_of(pupil, modes_nm[row]) for row in (2, 3)]) for modes_nm in (open_nm, residual_nm)), flat],
+        [contrast_of(pupil, open_nm[1]), contrast_of(pupil, residual_nm[1]), flat],  # the last row was refused
+        [*(np.mean([contrast_of(pupil, each_nm[row]) for row in (2, 3)]) for each_nm in (open_nm, residual_nm)), flat],
     ]
     np.testing.assert_allclose(10**found, expected, rtol=3e-3)
     assert np.ptp(np.unique(found)) > 1
