@@ -58,7 +58,7 @@ class SyntheticLog:
         """Start a loop with `changes` to its settings."""
         self.samples: list[Sample] = []
         self.truth = truth
-        self.instants = 0  # of a period, in each truth; then its continuous values are twice the sampled ones
+        self.instants = 0  # of a period, in each truth; if not 0, its continuous modes are twice the sampled ones
         self.now_ns = START * 10**9
         self.calibration = calibration
         self.settings = settings(**({"gain": (0.4, 0.2)} | changes))
@@ -189,7 +189,7 @@ class SyntheticLog:
         return log.part
 
     def _publish(self, advanced: tuple[State, Outputs], late_ns: int = 0) -> None:
-        """Append the messages of a step of the controller, and of the mirror that follows it."""
+        """Append the messages of the controller's outputs, and of the mirror that follows its command."""
         self._state, outputs = advanced
         for raised in outputs.events:
             self.event(raised.name, **raised.details)

@@ -76,7 +76,7 @@ class Target:
     cost: int = 1
 
     def input(self, number: int) -> bytes:
-        """Input `number`, reproducible from its number."""
+        """Input `number`; it depends only on this number and the corpus."""
         rng = Random(f"{self.name} {number}")  # noqa: S311
         data = rng.choice(self.corpus)
         if self.message is not None and rng.random() < 0.5:
@@ -179,32 +179,20 @@ def _messages() -> list[Target]:
     modes = np.ones(len(NOLL), np.float32)
     loading, mirror = Load(0, CALIBRATION, "x"), MirrorShape(0, shape, modes)
     inputs = (loading, mirror, CameraSettings(0, (6, 7), 100.0, 6e4), Tick(0, 5), BenchReport(0, "mask", 2.5))
-    sent = wire.MirrorCommand(frame_sequence=5, channel="lowfc", valid_for_ns=10**8, rows=4, columns=5)
-    sent.actuators, sent.command_nm[:] = shape.tobytes(), modes.tolist()
+    command = wire.MirrorCommand(frame_sequence=5, channel="lowfc", valid_for_ns=10**8, rows=4, columns=5)
+    command.actuators, command.command_nm[:] = shape.tobytes(), modes.tolist()
     mirror_state = wire.MirrorState(rows=4, columns=5, actuators=shape.tobytes(), command_nm=modes.tolist())
     camera = wire.CameraState(rows=6, columns=7, bias_dn=100, saturation_dn=6e4)
+    frame_bytes = image(pixels, 5, "sensor").SerializeToString()
+    command_bytes, mirror_bytes, camera_bytes = (one.SerializeToString() for one in (command, mirror_state, camera))
     return [
         Target("envelope", (ENVELOPE,), Envelope.decode, (LowfcError,)),
-        Target(
-            "frame", (ENVELOPE + image(pixels, 5, "sensor").SerializeToString(),), loop.frame, (LowfcError,), cost=3
-        ),
-        Target(
-            "camera to controller",
-            (image(pixels, 5, "sensor").SerializeToString(),),
-            processes.frame,
-            message=codec.RawImage,
-            cost=10,
-        ),
-        Target(
-            "controller to mirror", (sent.SerializeToString(),), processes.command, message=wire.MirrorCommand, cost=10
-        ),
-        Target(
-            "camera's settings", (camera.SerializeToString(),), processes.settings, message=wire.CameraState, cost=10
-        ),
-        Target(
-            "mirror state", (mirror_state.SerializeToString(),), partial(_mirror, loop), (LowfcError,), wire.MirrorState
-        ),
-        Target("camera state", (camera.SerializeToString(),), partial(_camera, loop), (LowfcError,), wire.CameraState),
+        Target("frame", (ENVELOPE + frame_bytes,), loop.frame, (LowfcError,), cost=3),
+        Target("camera to controller", (frame_bytes,), processes.frame, message=codec.RawImage, cost=10),
+        Target("controller to mirror", (command_bytes,), processes.command, message=wire.MirrorCommand, cost=10),
+        Target("camera's settings", (camera_bytes,), processes.settings, message=wire.CameraState, cost=10),
+        Target("mirror state", (mirror_bytes,), partial(_mirror, loop), (LowfcError,), wire.MirrorState),
+        Target("camera state", (camera_bytes,), partial(_camera, loop), (LowfcError,), wire.CameraState),
         Target(
             "bench value",
             tuple(encode_bench_value(value, 5) for value in (True, 2.5, "parked")),
@@ -234,15 +222,8 @@ def _messages() -> list[Target]:
             wire.ControllerState,
             10,
         ),
-        Target(
-            "mirror command",
-            (sent.SerializeToString(),),
-            _apply,
-            (codec.DecodeError, LowfcError),
-            wire.MirrorCommand,
-            2,
-        ),
-        Target("a view's messages", (sent.SerializeToString(),), _shown, cost=10),
+        Target("mirror command", (command_bytes,), _apply, (codec.DecodeError, LowfcError), wire.MirrorCommand, 2),
+        Target("a view's messages", (command_bytes,), _shown, cost=10),
     ]
 
 
