@@ -45,8 +45,8 @@ ADVICE: dict[str, Advice] = {
     ),
     "MODE_CHANGED": Advice("the loop mode changed, for the named reason.", "nothing, if the reason is a request."),
     "SAFED": Advice(
-        "an operator, an interlock or SIGUSR1 requested safe mode, or the controller restarted in it; the mirror relaxes "
-        "to flat.",
+        "an operator, an interlock or SIGUSR1 requested safe mode, or the controller restarted in it; the mirror "
+        "relaxes to flat.",
         "remove the cause, then `lowfc ctl clear`; the loop is open afterwards, and `lowfc ctl close` closes it.",
     ),
     "FRAMES_REFUSED": Advice(

@@ -42,7 +42,7 @@ def make(folder: Path = LAYOUTS) -> None:
 
 
 def _of_messages() -> rrb.Blueprint:
-    """Views of a log's images, events and messages, with the names of the default's modes and mirror."""
+    """Views of a log's images, events and messages, with the default configuration's modes and mirror."""
     columns = rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"])
     states = rr.StateConfiguration(
         values=[wire.LoopMode.Name(wire_mode(mode)) for mode in MODE_COLOURS],

@@ -1,4 +1,4 @@
-"""Files of released versions stay readable, and a replay of their logs is identical."""
+"""Files of released versions stay readable; a replay of their logs differs only where a rule changed on purpose."""
 
 import json
 import os
@@ -48,7 +48,7 @@ def test_a_replay_is_identical_except_for_rules_that_changed_on_purpose(
 
 def test_another_blas_kernel_differs_only_by_rounding() -> None:
     words = [sys.executable, "-m", "lowfc", "replay", str(NIGHT), "--json", "--tolerance", "1e-3"]
-    environment = os.environ | {"OPENBLAS_CORETYPE": "Prescott"}  # SSE3: every processor has it
+    environment = os.environ | {"OPENBLAS_CORETYPE": "Prescott"}  # SSE3: every x86-64 processor has it
     done = subprocess.run(words, capture_output=True, text=True, env=environment, check=False)
     results = json.loads(done.stdout)
     assert (done.returncode, results["different"], results["first_difference"]) == (0, 0, None)

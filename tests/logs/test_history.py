@@ -84,7 +84,7 @@ def test_the_attached_calibration_replaces_a_lost_message(tmp_path: Path) -> Non
     assert history.calibration.id == whole.calibration.id
     np.testing.assert_equal(history.steps.error_nm, whole.steps.error_nm)
     assert history.remarks == [f"{history.log.path}: the message of its calibration is lost; the attached one is used"]
-    other = identified(calibration(NOLL, 2.0))  # no controller reported to use it
+    other = identified(calibration(NOLL, 2.0))  # no controller reported using it
     for name, attached in (("none", None), ("other", other)):
         history = read_history(LogReader(night.write(tmp_path / f"{name}.mcap", attached=attached)))
         assert history.calibration is None

@@ -29,7 +29,7 @@ TOML = [Attachment("config.toml", "application/toml", Configuration().to_toml().
 
 
 def recorded(folder: Path, samples: Sequence[Sample], files: int, *, finish: bool = True) -> list[Path]:
-    """Files of a recorder that starts new ones, each with the newest calibration and states at its beginning."""
+    """Files of one recording, each with the newest calibration and states at its beginning."""
     series = LogSeries(folder, HostClock(), METADATA, TOML, STANDARD)
     states: dict[str, Sample] = {}
     for number in range(files):
@@ -169,7 +169,7 @@ def ten_files_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sa
 def test_a_command_gives_the_same_results_for_ten_files_as_for_one(
     ten_files_and_one: Callable[[bool], Path], monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
-    monkeypatch.chdir(ten_files_and_one(words[0] == "tune"))  # which needs some two thousand frames
+    monkeypatch.chdir(ten_files_and_one(words[0] == "tune"))  # tuning needs some two thousand frames
     ten, one = (without_files(json_of(words[0], log, *words[1:])) for log in (LAST, f"one/{LAST}"))
     assert ten == one
 

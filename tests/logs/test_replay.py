@@ -82,7 +82,7 @@ class Night:
         self._start()
 
     def apply(self, input_: Input, logged: Request | None = None) -> None:
-        """Apply an input and log it; as a former version did with another rule if `logged` differs from it."""
+        """Apply an input and log it, or log `logged` in its place, as by a former version with another rule."""
         self.now_ns += 1_000_000
         if isinstance(input_, Frame):
             self._frame(input_)
@@ -140,7 +140,7 @@ class Night:
 def replay(
     messages: Iterable[Sample], tolerance_nm: float = 0.0, former: FormerVersion | None = None, **options: Any
 ) -> Account:
-    """Replay messages, those of a former version as its log does."""
+    """Replay messages; with `former`, as those of a log of a former version."""
     run = Replay(tolerance_nm, **options)
     run.context.former = former
     for message in messages:
@@ -200,7 +200,7 @@ def test_any_sequence_of_inputs_is_replayed_bit_by_bit(
     assert account.frames == sent[STEP.key]
     assert account.commands == sent[COMMAND.at("dm")]
     assert account.requests == sent[REQUEST.key]
-    assert account.states == sent[CONTROLLER_STATE.key] - 2  # each start of the controller is replayed from one
+    assert account.states == sent[CONTROLLER_STATE.key] - 2  # the replay begins with a state at each start
 
 
 def test_an_overruled_law_is_replayed_bit_by_bit_even_from_the_middle() -> None:
@@ -478,7 +478,7 @@ def test_logs_in_another_order_than_recorded_are_refused(
 def test_two_lockstep_runs_with_the_same_sequences_are_replayed_apart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other: str
 ) -> None:
-    """Also those of one name, `sim-loop --lockstep --run a`."""
+    """Also two runs of one name, `sim-loop --lockstep --run a`."""
     paths: list[Path] = []
     for run, gain in (("a", 0.1), (other, 0.2)):
         made = report_log.SyntheticLog().request("gain", (gain,)).frames(200)

@@ -122,7 +122,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoggedRun]:
     """A closed loop, and one with other gains whose controller has a wrong delay."""
     folder, made = tmp_path_factory.mktemp("logs"), {}
     other = {"gain": (0.2, 0.3), "leak": (0.01, 0.01), "delay_frames": 2.0}
-    toml = load(None, {"sensor.modes": 10}).to_toml()  # with 10 modes no contrast is computed, which is slow
+    toml = load(None, {"sensor.modes": 10}).to_toml()  # with 10 modes the contrast, which is slow, is not computed
     for name, changes in (("default", {}), ("other", other)):
         night = SyntheticLog(**changes).frames(FRAMES)
         made[name] = LoggedRun(read_history(LogReader(night.write(folder / f"{name}.mcap", toml=toml))))

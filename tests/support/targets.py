@@ -139,7 +139,7 @@ class Processes:
         self.commands = MemoryBus(self.hub, "somebody", self.clock).publisher(COMMAND, "dm")
 
     def frame(self, data: bytes) -> None:
-        """Publish a frame with extreme sequence and time, also in the envelope."""
+        """Publish a frame in an envelope with an extreme sequence and time."""
         self.number += 1
         rng = Random(self.number)  # noqa: S311
         self.frames.put(data, rng.choice(EXTREMES), rng.choice(EXTREMES))
