@@ -29,7 +29,7 @@ class SimulatedMirror:
         return self.settle(actuators_nm, np.inf)
 
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
-        """Positions of the actuators, `elapsed_ns` after the last call, by their first-order response."""
+        """Positions of the actuators after a first-order response over `elapsed_ns`; see `MirrorExtras.settle`."""
         step = np.float32(self.geometry.step_nm)
         reached_nm = actuators_nm / step
         np.rint(reached_nm, out=reached_nm)

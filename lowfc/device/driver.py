@@ -207,7 +207,7 @@ class Geometry:
         stroke_nm: largest deviation from flat, either way.
         slew_nm: largest change from one command to the next.
         neighbour_nm: largest difference between neighbours.
-        step_nm: smallest step of the driver, to which it rounds.
+        step_nm: smallest step of the driver, to which it rounds; 0 if it does not round.
     """
 
     rows: int
