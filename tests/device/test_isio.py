@@ -420,37 +420,37 @@ def test_a_prefix_that_gives_no_name_of_a_stream_is_refused_at_the_start(folder:
 def test_a_refused_report_of_other_channels_is_repeated_every_two_seconds(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked_s: list[float] = []
+    requested_s: list[float] = []
     refused_until_s = 5.0
 
-    def ask(name: str, shape_nm: np.ndarray) -> None:
-        asked_s.append(round(now_s, 1))
+    def request(name: str, shape_nm: np.ndarray) -> None:
+        requested_s.append(round(now_s, 1))
         assert (name, shape_nm.max()) == ("external", 40)
         if now_s < refused_until_s:
             raise RequestRefusedError("reserved by a calibration")
 
     now_s = 0.0
     monkeypatch.setattr(bridge, "time", SimpleNamespace(monotonic=lambda: now_s))
-    client: Any = SimpleNamespace(mirror_grid=lambda: GRID, channel=ask)
+    client: Any = SimpleNamespace(mirror_grid=lambda: GRID, channel=request)
     bus = MemoryBus(MemoryHub(), "operator", FakeClock())
     channel(folder, "dm00disp01", make=True).write(np.full(GRID, 0.04, np.float32))
     others = bridge.ExternalChannels(client, bus, ["dm00disp01"], 1000.0)
     for tick in range(100):
         now_s = tick * 0.1
         others.pass_on()
-    assert asked_s == [0.0, 2.0, 4.0, 6.0]
+    assert requested_s == [0.0, 2.0, 4.0, 6.0]
 
 
 def test_a_shape_of_other_channels_is_removed_only_if_the_controller_has_one(folder: Path) -> None:
-    asked: list[object] = []
-    client: Any = SimpleNamespace(mirror_grid=lambda: GRID, channel=lambda *arguments: asked.append(arguments))
+    requests: list[object] = []
+    client: Any = SimpleNamespace(mirror_grid=lambda: GRID, channel=lambda *arguments: requests.append(arguments))
     hub = MemoryHub()
     states = MemoryBus(hub, "controller", FakeClock()).publisher(CONTROLLER_STATE)
     channel(folder, "dm00disp01", make=True).write(np.zeros(GRID, np.float32))
     others = bridge.ExternalChannels(client, MemoryBus(hub, "operator", FakeClock()), ["dm00disp01"], 1000.0)
     others.pass_on()
-    assert asked == []
+    assert requests == []
     known = wire.Channel(name="external", actuators=np.ones(GRID, np.float32).tobytes())
     states.put(wire.ControllerState(channels=[known]).SerializeToString())
     others.pass_on()
-    assert asked == [("external", None)]
+    assert requests == [("external", None)]

@@ -60,7 +60,7 @@ def test_a_missing_package_gives_install_advice(monkeypatch: pytest.MonkeyPatch,
 
 
 @pytest.mark.parametrize("place", ["", " : OutOfRangeException thrown in node 'Gain' (file 'x.h', line 1)"])
-def test_the_reason_of_a_refusing_basler_camera_is_given(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reason_of_a_refusing_basler_camera_is_reported(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse() -> None:
         raise RuntimeError(f"Cannot set 'Gain'.{place}")
 

@@ -244,8 +244,8 @@ def test_channels_are_summed_and_the_sum_is_limited() -> None:
     device = mirror()
     status = device.initial
     for index, (channel, height_nm) in enumerate((("lowfc", 60), ("offset", -20), ("lowfc", 80)), start=1):
-        given = command(even(height_nm), index, channel=channel)
-        status, _ = device.apply_command(status, given, START_NS + index * MS)
+        sent = command(even(height_nm), index, channel=channel)
+        status, _ = device.apply_command(status, sent, START_NS + index * MS)
     assert status.surface_nm.max() == pytest.approx(60, abs=STEP_NM)
     assert sorted(status.channels) == ["lowfc", "offset"]
     status, _ = device.apply_command(status, command(even(3e38), 4, channel="lowfc"), START_NS + 4 * MS)
@@ -303,13 +303,13 @@ def test_apply_command_does_not_modify_its_arguments() -> None:
     device = mirror()
     status = follow(device, device.initial, 10)
     driven, surface, channels = status.driven_nm.copy(), status.surface_nm.copy(), dict(status.channels)
-    given = command(even(700), 2, channel="other")
-    device.apply_command(status, given, START_NS)
+    sent = command(even(700), 2, channel="other")
+    device.apply_command(status, sent, START_NS)
     device.tick(status, START_NS + 10_000 * MS)
     assert np.array_equal(status.driven_nm, driven)
     assert np.array_equal(status.surface_nm, surface)
     assert status.channels == channels
-    assert np.array_equal(given.actuators_nm, even(700))
+    assert np.array_equal(sent.actuators_nm, even(700))
 
 
 def test_driver_step_too_coarse_for_the_slew_limit_is_refused() -> None:

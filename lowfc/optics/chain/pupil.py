@@ -80,10 +80,10 @@ def from_quarter(quarter: ArrayLike, samples: int) -> Array:
         ValueError: The quadrant is not real and square, has values outside 0..1 or no light, or `samples` is not a
             multiple of twice its cells.
     """
-    given = np.asarray(quarter)
-    if given.dtype.kind not in "buif":
-        raise ValueError(f"a quadrant must be of real numbers, got {given.dtype}")
-    quarter = given.astype(np.float64)
+    array = np.asarray(quarter)
+    if array.dtype.kind not in "buif":
+        raise ValueError(f"a quadrant must be of real numbers, got {array.dtype}")
+    quarter = array.astype(np.float64)
     if quarter.ndim != 2 or quarter.shape[0] != quarter.shape[1] or not quarter.size:
         raise ValueError(f"a quadrant must be square, got shape {quarter.shape}")
     if not (np.isfinite(quarter).all() and quarter.min() >= 0 and quarter.max() <= 1):
