@@ -72,8 +72,9 @@ class CameraLoop:
                 if frame is not None:
                     self._publish(*frame)
                     self.watch.call(step)
-                elif service.clock.host_ns() < self.watch.retry_ns:
-                    service.clock.sleep_until_ns(min(self.watch.retry_ns, service.clock.now_ns() + REST_NS))
+                elif not service.clock.lockstep:  # there, a sleep would advance the simulated time
+                    left_ns = self.watch.retry_ns - service.clock.host_ns()
+                    service.clock.sleep_until_ns(service.clock.now_ns() + min(left_ns, REST_NS))
                 self._report_lost()
                 service.beat()
         self._lost_due_ns = 0  # those of the last half second, too

@@ -18,17 +18,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorP
 
 from lowfc.contract.codecs import codec
 from lowfc.contract.events import EVENTS, Level
-from lowfc.contract.messages import (
-    TOPICS,
-    Log,
-    RawImage,
-    Role,
-    from_timestamp,
-    image,
-    timestamp,
-    topic_of,
-    wire,
-)
+from lowfc.contract.messages import TOPICS, Log, RawImage, Role, from_timestamp, image, timestamp, topic_of, wire
 from lowfc.control.loop.inputs import Command, Reply, Request, Step
 from lowfc.control.loop.safety import REASONS, Limit, LoopMode
 

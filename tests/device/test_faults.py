@@ -4,12 +4,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import count
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
+from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.contract.codecs.codec import decode_mirror
 from lowfc.contract.configuration import load
 from lowfc.contract.envelope import count_of, start_of
@@ -96,6 +98,13 @@ def test_a_failing_camera_is_retried_after_increasing_pauses() -> None:
     bench.loop.run()
     assert bench.clock.now_ns() - begun_ns == pytest.approx(7.8e9 + 2 * 4e9, abs=0.1e9)
     assert bench.listener.events().count("DRIVER_FAILED") == 2  # repeated after 10 s
+
+
+def test_a_failing_camera_does_not_advance_simulated_time(tmp_path: Path) -> None:
+    clock, camera = SimulatedClock(base=tmp_path), Camera(Mock(), *[Mock(side_effect=OSError)] * 2, good())
+    begun_ns, service = clock.now_ns(), Listener(MemoryHub(), clock).service("camera")
+    CameraLoop(camera, service, 1).run()
+    assert (service.work, clock.now_ns()) == (1, begun_ns)
 
 
 def test_a_configuration_error_of_a_driver_ends_the_process() -> None:

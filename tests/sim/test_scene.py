@@ -147,9 +147,7 @@ def test_image_is_the_mean_over_its_exposure(exposure: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "keys",
-    [{"disturbance__preset": "reaction-wheel"}, {"disturbance__wheel_hz": 40.0}],
-    ids=["damped lines", "wheel"],
+    "keys", [{"disturbance__preset": "reaction-wheel"}, {"disturbance__wheel_hz": 40.0}], ids=["damped lines", "wheel"]
 )
 @pytest.mark.parametrize("rate_hz", [100.0, 20.0])
 def test_vibrations_faster_than_the_exposure_are_averaged(keys: dict[str, object], rate_hz: float) -> None:

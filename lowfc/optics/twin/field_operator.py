@@ -111,12 +111,7 @@ def field_operator(
 
 
 def _focal_rows(
-    sensor: Sensor,
-    waves: Array,
-    y_factors: Array,
-    x_factors: Array,
-    products: Integers,
-    advance: Callable[[], None],
+    sensor: Sensor, waves: Array, y_factors: Array, x_factors: Array, products: Integers, advance: Callable[[], None]
 ) -> Iterator[tuple[int, int, Integers, Array]]:
     """Focal-plane amplitudes row by row, for amplitudes in the pupil; arguments as for `field_operator`.
 
