@@ -45,7 +45,7 @@ _REMEMBERED = 256  # mirror states, and publication times of frames
 
 
 def disturbance_of(config: Configuration) -> Disturbance:
-    """The disturbance of a configuration."""
+    """The disturbance of a configuration; ConfigurationError if its modes or wheels are impossible."""
     section, nm_per_mas = config.disturbance, tilt_nm_per_mas(config.star.diameter_m)
     try:
         found = preset_disturbance(
@@ -140,7 +140,7 @@ class SimulatedCamera:
         """File (JSON) of a fault to inject into the frames; empty for none."""
 
     def __init__(self, options: Options, config: Configuration, optics: Scene | None = None) -> None:
-        """Build the optics, unless `optics` is given; ConfigurationError if the region is larger than the sensor."""
+        """Build the optics, unless `optics` is given; ConfigurationError if region, disturbance or fault is invalid."""
         self._config = config
         self._scene = scene(config) if optics is None else optics
         row, rows = _centred_region("rows", options.rows, self._scene.shape[0])

@@ -100,9 +100,9 @@ class MirrorLoop:
         self._applied_ns = self._picture_due_ns = self._state_due_ns = 0
         self._states = service.publisher(MIRROR_STATE, name)
         self._surfaces = service.publisher(SURFACE, name)
-        geometry, axis = true_mirror(config), pupil_axis(PICTURE_PIXELS)
-        self._y_factors: Single = influence_factors(geometry, axis, geometry.rows).astype(np.float32)
-        self._x_factors: Single = influence_factors(geometry, axis, geometry.columns).astype(np.float32)
+        mirror, axis = true_mirror(config), pupil_axis(PICTURE_PIXELS)
+        self._y_factors: Single = influence_factors(mirror, axis, mirror.rows).astype(np.float32)
+        self._x_factors: Single = influence_factors(mirror, axis, mirror.columns).astype(np.float32)
         self._refused: Reason | None = None
         self._start_check = StartCheck(
             service.clock,
