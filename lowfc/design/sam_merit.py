@@ -37,10 +37,9 @@ TABLE3_NONLINEARITY_WAVES = {14: 2.1e-4, 20: 3.1e-4}
 """Residual of the plain pseudo-inverse without noise, by number of modes: the second-order error for wavefronts matched
 to the paper's input, which adds to the noise in quadrature. A constant, so that a search does not compute it.
 
-Two sets of 60 and 100 wavefronts, with each packaged layout behind the disk and two behind the bowtie, gave means of
-1.9e-4 to 2.1e-4 with 14 modes and 3.0e-4 to 3.3e-4 with 20, root mean squares of 2.2e-4 to 2.6e-4 and 3.4e-4 to 3.9e-4,
-and up to 1.4e-3 for a single wavefront. The constants are within 12 % of the means, and 4 to 21 % below the root mean
-squares."""
+Four sets of 60 or 100 wavefronts, with each packaged layout behind the disk and two behind the bowtie, gave means of
+1.6e-4 to 2.1e-4 with 14 modes and 3.0e-4 to 3.8e-4 with 20, root mean squares of 2.0e-4 to 2.6e-4 and 3.4e-4 to 4.4e-4,
+and up to 1.2e-3 for a single wavefront. The constants are within 30 % of all means and root mean squares."""
 
 RELAY_SAMPLES = 128
 """Samples across the relay pupil."""

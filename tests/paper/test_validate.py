@@ -361,7 +361,7 @@ def test_order_of_sensors_in_the_committed_table3(committed, better, worse, mode
     assert good < bad
 
 
-def test_zernike_sensor_and_sized_holes_are_best_in_the_committed_table4(committed):
+def test_zernike_sensor_beats_sparse_apertures_and_sized_holes_beat_equal_ones_in_the_committed_table4(committed):
     def scatter(name, axis="x", kind="weighted"):
         return find(committed["table4"], name, f"std of {axis} tilt, 1 mas, {LIGHT[1]}", 2, kind)["predicted"]
 

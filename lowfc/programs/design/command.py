@@ -15,7 +15,7 @@ from lowfc.programs.design.full_light_request import Defocus, Spot
 from lowfc.programs.design.options import flag, with_options_of
 from lowfc.programs.design.sam_request import Search
 
-Keys = Annotated[Path, typer.Option(help="Configuration file.")]
+Keys = Annotated[Path, typer.Option(help="Configuration file to write.")]
 Plot = Annotated[Path | None, typer.Option(help="Plot the figures of merit against size (PNG).")]
 
 design_app = new_app("Design masks and sensors.\n\nExample: lowfc design spc --help")

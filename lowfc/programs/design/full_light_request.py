@@ -61,7 +61,7 @@ class Spot(_Request):
     """The options of `lowfc design zwfs`.
 
     Attributes:
-        spot: SMALLEST:LARGEST spot, lambda/D.
+        spot: SMALLEST:LARGEST spot diameter, lambda/D.
     """
 
     spot: str = "0.5:3"
