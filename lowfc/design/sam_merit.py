@@ -92,7 +92,7 @@ def build_optics(
     relay_samples: int = RELAY_SAMPLES,
     samples_per: int = SAMPLES_PER,
 ) -> Optics:
-    """Propagate the flat wavefront and the modes to the relay pupil, eqs. (4), (5) and (12).
+    """Propagate the flat wavefront and the modes to the relay pupil, eq. (4).
 
     With the default sampling every predicted value of a mask is within 2 % of that with the paper's sampling (Table 1).
 
@@ -135,7 +135,7 @@ def build_optics(
 
 
 def hole_fields(optics: Optics, hole: Hole) -> SingleComplex:
-    """Contribution of a hole (x, y, diameter) to the fields (fields, samples, samples) at the sensor, eqs. (2), (6).
+    """Fields (fields, samples, samples) that a hole (x, y, diameter) adds at the sensor, eqs. (2), (6) and (7).
 
     Samples on the rim are weighted by the fraction that the hole covers.
     """

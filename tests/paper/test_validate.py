@@ -224,7 +224,7 @@ def test_a_programming_error_is_not_reported_as_a_user_error(monkeypatch):
 
 
 def test_the_command_prints_a_table_and_warns_if_a_sensor_has_no_effect():
-    warning = "for the paper's own sensors only, --sensor has no effect there"
+    warning = "the sensors are fixed, --sensor has no effect there"
     assert lowfc("validate", "table1", "--sensor", SAM).stderr.startswith(f"table1: {warning}\n")
     done = lowfc("validate", "table1")
     assert warning not in done.stderr

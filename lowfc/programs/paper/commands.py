@@ -18,8 +18,8 @@ TABLES = (
 
 ADDITIONAL = ("anchors", "tolerance")
 """Additional tables that are not in the paper and not included in `all`."""
-OF_THE_PAPER = ("table1", "photometry")
-"""Tables and figures for the paper's own sensors only."""
+WITH_FIXED_SENSORS = ("table1", "photometry")
+"""Tables whose sensors are fixed: the paper's, and in photometry the Zernike sensor too."""
 
 
 def validate(
@@ -39,7 +39,7 @@ def validate(
     sensor: Annotated[
         list[str] | None,
         typer.Option(
-            help=f"Only this sensor, in all tables and figures but {' and '.join(OF_THE_PAPER)}: sam, bowtie, "
+            help=f"Only this sensor, in all tables and figures but {' and '.join(WITH_FIXED_SENSORS)}: sam, bowtie, "
             "bowtie:LAYOUT, clowfs, clowfs:MM (its defocus), clowfs_tuned, zwfs, zwfs_tuned, bar, open, lyot, aplc; or "
             "a layout, FILE.json or FILE.json:NAME. Repeat.",
             show_default=False,
@@ -78,9 +78,9 @@ def validate(
     from lowfc.programs.paper.report import PICTURES, run, to_json, to_text, write_document, write_page
 
     context = Context(trials, seed, jobs or len(os.sched_getaffinity(0)), tuple(dict.fromkeys(sensor or ())) or None)
-    fixed = [name for name in chosen if name in OF_THE_PAPER]
+    fixed = [name for name in chosen if name in WITH_FIXED_SENSORS]
     if sensor and fixed:
-        typer.echo(f"{', '.join(fixed)}: for the paper's own sensors only, --sensor has no effect there", err=True)
+        typer.echo(f"{', '.join(fixed)}: the sensors are fixed, --sensor has no effect there", err=True)
     found = run(chosen, context, plots if docs is None else docs / PICTURES)
     sys.stdout.write((to_json(found) if as_json else "\n\n".join(map(to_text, found))) + "\n")
     if docs is not None and pages:
