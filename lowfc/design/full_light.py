@@ -26,7 +26,7 @@ _SEED = 1
 
 
 @dataclass(frozen=True, eq=False)
-class Focus:
+class FocalLight:
     """Light on a focal-plane mask.
 
     Attributes:
@@ -44,7 +44,7 @@ class Focus:
     aberrated: dict[int, Complex]
 
     @classmethod
-    def of(cls, sensor: Sensor) -> "Focus":
+    def of(cls, sensor: Sensor) -> "FocalLight":
         """Propagate from the pupil of a sensor to its focal-plane mask."""
         modes = zernikes(NOLLS_20, *pupil_radii(sensor))
         forms, band = PupilForms.of(sensor.pupil, modes), uniform(WAVELENGTH_NM)
@@ -75,18 +75,18 @@ class FullLight:
 
     Attributes:
         sensor: The optics.
-        focus: Light on its focal-plane mask.
+        focal_light: Light on its focal-plane mask.
     """
 
     sensor: Sensor
-    focus: Focus
+    focal_light: FocalLight
     paper_rows = ("clowfs",)
     paper_tilt = "clowfs"
 
     @property
     def forms(self) -> PupilForms:
         """Quadratic forms of the pupil."""
-        return self.focus.forms
+        return self.focal_light.forms
 
     def central(self, row: str = "clowfs") -> Signal:
         """I0 and H at the central wavelength, the same for every row."""
@@ -102,7 +102,7 @@ class FullLight:
 
     @cached_property
     def _in_band(self) -> Signal:
-        return self._signal(self.focus.band)
+        return self._signal(self.focal_light.band)
 
     def nonlinearity_waves(self, modes: int) -> float:
         """Mean residual rms over the open pupil of random wavefronts without noise, by the plain pseudo-inverse."""
@@ -116,7 +116,7 @@ class FullLight:
         pixels = self.sensor.pixels**2
         I0, H = np.zeros(pixels), np.zeros((pixels, len(NOLLS_20)))
         for nm, weight in zip(band.wavelengths_nm, band.weights, strict=True):
-            flat, *modes = (self._on_sensor(field, nm) for field in self.focus.fields[nm])
+            flat, *modes = (self._on_sensor(field, nm) for field in self.focal_light.fields[nm])
             slopes = [(4.0 * np.pi / nm) * (flat * np.conj(1j * one)).real for one in modes]
             I0 += weight * self._intensity(flat)
             H += weight * np.array([pixel_sums(self.sensor, slope).ravel() for slope in slopes]).T
@@ -131,9 +131,9 @@ class FullLight:
 
 @lru_cache(maxsize=8)
 def _nonlinearity_waves(candidate: FullLight, modes: int) -> float:
-    signal, truth = candidate.central(), candidate.focus.wavefronts_nm[modes]
+    signal, truth = candidate.central(), candidate.focal_light.wavefronts_nm[modes]
     R = reconstructor(signal.I0, signal.H[:, :modes], np.ones_like(signal.I0), 1.0, 0.0, "pinv")
-    images = [candidate.image(field) for field in candidate.focus.aberrated[modes]]
+    images = [candidate.image(field) for field in candidate.focal_light.aberrated[modes]]
     residuals = truth - (np.array(images) - signal.I0) @ R.T
     return float(residual_rms(candidate.forms.gram[:modes, :modes], residuals).mean()) / WAVELENGTH_NM
 

@@ -11,7 +11,7 @@ from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.sections import SensorSection
 from lowfc.design.fisher import cramer_rao, quantum_information, variance_e
-from lowfc.design.full_light import Focus, FullLight, sweep
+from lowfc.design.full_light import FocalLight, FullLight, sweep
 from lowfc.design.goal import Goal, merit, predictions
 from lowfc.design.merit import contrast_noise
 from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S
@@ -46,8 +46,8 @@ SENSORS = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name 
 
 
 @pytest.fixture(scope="module")
-def focus():
-    return Focus.of(sensor_named("zwfs"))
+def focal_light():
+    return FocalLight.of(sensor_named("zwfs"))
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +80,9 @@ def test_quantum_information_of_two_holes_is_that_of_their_fringe_at_quadrature(
 
 
 @pytest.mark.parametrize("name", ["zwfs_tuned", "clowfs_tuned"])
-def test_prediction_of_a_candidate_agrees_with_the_full_chain(name, focus, modes):
+def test_prediction_of_a_candidate_agrees_with_the_full_chain(name, focal_light, modes):
     sensor = sensor_named(name)
-    one = FullLight(sensor, focus)
+    one = FullLight(sensor, focal_light)
     central = one.central()
     assert np.allclose(central.I0, reference(sensor).ravel(), rtol=1e-9, atol=1e-15)
     assert np.allclose(central.H[:, 7], response(sensor, modes[7:8])[:, 0], rtol=1e-9, atol=1e-15)
@@ -128,7 +128,7 @@ def test_the_command_writes_the_keys_of_the_best(tmp_path, monkeypatch):
     ],
 )
 def test_impossible_options_are_refused_before_the_search(words, message, monkeypatch):
-    monkeypatch.setattr("lowfc.programs.design.full_light.Focus", None)
+    monkeypatch.setattr("lowfc.programs.design.full_light.FocalLight", None)
     assert message in refusal("design", *words, kind=ConfigurationError)
 
 

@@ -11,7 +11,7 @@ from lowfc.adapters.files.sensors import sensor_from
 from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.contract.configuration import load
 from lowfc.contract.sections import SensorSection
-from lowfc.design.full_light import Focus, FullLight, sweep
+from lowfc.design.full_light import FocalLight, FullLight, sweep
 from lowfc.design.goal import Goal, merit, predictions
 from lowfc.design.merit import WAVELENGTH_NM
 from lowfc.programs.cli.result import Result, result_field
@@ -58,13 +58,13 @@ def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
 
     @cache
     def candidate(value: float) -> FullLight:
-        return FullLight(sensor_from(_section(sizes, value), WAVELENGTH_NM), focus)
+        return FullLight(sensor_from(_section(sizes, value), WAVELENGTH_NM), focal_light)
 
     def merit_of(value: float) -> float:
         return merit(candidate(value), goal)
 
     with threadpool_limits(1):
-        focus = Focus.of(sensor_from(_section(sizes, sizes.low), WAVELENGTH_NM))
+        focal_light = FocalLight.of(sensor_from(_section(sizes, sizes.low), WAVELENGTH_NM))
         values, best = sweep(merit_of, sizes.low, sizes.high, _POINTS)
         found = {value: predictions(candidate(value)) for value in sorted({*values.tolist(), best})}
         points = [_point(found[value], value, merit_of(value), goal) for value in found]
