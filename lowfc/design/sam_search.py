@@ -11,7 +11,7 @@ import numpy as np
 
 from lowfc.arrays import SingleComplex
 from lowfc.design.goal import Goal, merit
-from lowfc.design.sam_merit import RELAY_SAMPLES, Mask, Optics, hole_fields
+from lowfc.design.sam_merit import RELAY_SAMPLES, Optics, SamCandidate, hole_fields
 
 Orbit = tuple[int, int, int]
 """Centre x, y and diameter of a hole, in thousandths of the pupil's diameter."""
@@ -105,7 +105,7 @@ def advance(optics: Optics, goal: Goal, bounds: Bounds, chain: Chain) -> Chain:
     orbits, best, best_merit = list(chain.orbits), chain.best, chain.best_merit
     fields = [orbit_fields(optics, orbit, bounds.symmetry) for orbit in orbits]
     total = np.sum(fields, axis=0)
-    current = merit(Mask(optics, total), goal)
+    current = merit(SamCandidate(optics, total), goal)
     if current < best_merit:
         best, best_merit = tuple(orbits), current
     end = min(chain.step + BLOCK, chain.steps)
@@ -119,7 +119,7 @@ def advance(optics: Optics, goal: Goal, bounds: Bounds, chain: Chain) -> Chain:
         field = None if orbit is None else orbit_fields(optics, orbit, bounds.symmetry)
         changed = total if at is None else total - fields[at]
         changed = changed if field is None else changed + field
-        value = merit(Mask(optics, changed), goal)
+        value = merit(SamCandidate(optics, changed), goal)
         # The change is relative: a layout 1 % worse is accepted equally often at any merit.
         accepted = value < current or (value < inf and rng.random() < exp(-log(value / current) / temperature))
         if not accepted:

@@ -20,7 +20,7 @@ from rich.console import Console
 from lowfc.adapters.files.layouts import SHIPPED, load_layout
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.design.goal import merit
-from lowfc.design.sam_merit import Mask, hole_fields
+from lowfc.design.sam_merit import SamCandidate, hole_fields
 from lowfc.design.sam_search import BLOCK
 from lowfc.programs.design import sam as program
 from lowfc.programs.design import sam_executors as executors
@@ -322,6 +322,6 @@ def test_recorded_command_finds_a_layout_as_good_as_the_packaged_one(tmp_path, n
 
     def merit_of(layout: str) -> float:
         fields = [hole_fields(optics, hole) for hole in load_layout(layout).holes]
-        return merit(Mask(optics, np.sum(fields, axis=0)), search.goal)
+        return merit(SamCandidate(optics, np.sum(fields, axis=0)), search.goal)
 
     assert merit_of(f"{tmp_path / 'mask.json'}:{name}") == pytest.approx(merit_of(name), rel=0.01)

@@ -15,7 +15,7 @@ from lowfc.contract.sections import SensorSection
 from lowfc.design import sam_search
 from lowfc.design.goal import MERITS, Goal, merit, paper_ratios, predictions
 from lowfc.design.merit import contrast_noise, covariance_nm2, table3_waves
-from lowfc.design.sam_merit import TABLE3_NONLINEARITY_WAVES, Mask, build_optics, hole_fields
+from lowfc.design.sam_merit import TABLE3_NONLINEARITY_WAVES, SamCandidate, build_optics, hole_fields
 from lowfc.design.sam_search import BLOCK, Bounds, advance, holes, images, start
 from lowfc.optics.chain.band import monochromatic, uniform
 from lowfc.optics.chain.focal_mask import disk
@@ -94,7 +94,7 @@ def test_sum_over_holes_agrees_with_the_field_of_the_full_chain(pupil, modes):
 
 
 def test_predictions_agree_with_the_full_chain(pupil, modes, layout, fields, optics):
-    predicted = predictions(Mask(optics, fields))
+    predicted = predictions(SamCandidate(optics, fields))
     mask = transmission(layout, 512)
     I0, H = full_chain(pupil, modes, mask, 550.0)
     open_ = modes[:, pupil > 0.5]
@@ -118,7 +118,7 @@ def test_predictions_agree_with_the_full_chain(pupil, modes, layout, fields, opt
 
 
 def test_merits_agree_with_their_definitions(optics, fields):
-    mask = Mask(optics, fields)
+    mask = SamCandidate(optics, fields)
     predicted = predictions(mask)
     tilt = max(predicted["table4_mas"]["pinv"]["2"])
     expected = {
@@ -137,11 +137,11 @@ def test_merits_agree_with_their_definitions(optics, fields):
     ratios = paper_ratios(mask)
     assert ratios["table3 disk 14 modes"] == pytest.approx(predicted["table3_waves"]["pinv"]["14"] / 5.1e-4)
     assert ratios["table4"] == pytest.approx(tilt / 0.36)
-    assert merit(Mask(optics, np.zeros_like(fields)), Goal("table4")) == np.inf
+    assert merit(SamCandidate(optics, np.zeros_like(fields)), Goal("table4")) == np.inf
 
 
 def test_the_weighted_estimator_is_never_worse(optics, fields):
-    disk_signal = Mask(optics, fields).central("disk")
+    disk_signal = SamCandidate(optics, fields).central("disk")
     for count in (2, 14, 20):
         plain, weighted = (covariance_nm2(disk_signal, 1e6, 3.0, count, name) for name in ("pinv", "weighted"))
         assert np.linalg.eigvalsh(plain - weighted).min() > -1e-9 * np.trace(plain)
@@ -159,7 +159,7 @@ def test_prediction_of_table_3_agrees_with_the_measurement(optics, modes):
         == ("table3", "sam", modes, "pinv", "RMS residual, matched input")
     )
     default = load_layout(SensorSection().sam)
-    mask = Mask(optics, np.sum([hole_fields(optics, hole) for hole in default.holes], axis=0))
+    mask = SamCandidate(optics, np.sum([hole_fields(optics, hole) for hole in default.holes], axis=0))
     assert table3_waves(mask, "disk", modes, "pinv") == pytest.approx(measured, rel=0.1)
 
 
@@ -225,8 +225,8 @@ def test_search_improves_and_is_reproducible(optics):
     assert (first.step, second.step) == (BLOCK, 2 * BLOCK)
     assert advance(optics, goal, bounds, second) == second
     at_start = np.sum([sam_search.orbit_fields(optics, orbit, "none") for orbit in chain.orbits], axis=0)
-    assert second.best_merit <= first.best_merit < 0.7 * merit(Mask(optics, at_start), goal)
+    assert second.best_merit <= first.best_merit < 0.7 * merit(SamCandidate(optics, at_start), goal)
     best = np.sum([sam_search.orbit_fields(optics, orbit, "none") for orbit in second.best], axis=0)
-    assert merit(Mask(optics, best), goal) == pytest.approx(second.best_merit, rel=1e-4)
+    assert merit(SamCandidate(optics, best), goal) == pytest.approx(second.best_merit, rel=1e-4)
     assert advance(optics, goal, bounds, chain) == first
     assert advance(optics, goal, bounds, replace(chain, index=2)) != replace(first, index=2)

@@ -21,7 +21,7 @@ from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.control.loop.wording import counted
 from lowfc.design.goal import predictions
 from lowfc.design.paper import TABLE4_MODES
-from lowfc.design.sam_merit import FOCAL_MASKS, Hole, Mask, Optics, build_optics, hole_fields
+from lowfc.design.sam_merit import FOCAL_MASKS, Hole, Optics, SamCandidate, build_optics, hole_fields
 from lowfc.design.sam_search import BLOCK, Chain, advance, holes, start
 from lowfc.optics.chain.sam import Layout
 from lowfc.programs.design.options import command_line
@@ -231,7 +231,7 @@ def _optics(focal_masks: tuple[str, ...], band_modes: int = 2) -> Optics:
 def _predictions(focal_mask: str, holes_: tuple[Hole, ...]) -> dict[str, Any]:
     optics = _optics((focal_mask,), band_modes=14)
     fields = np.asarray(np.sum([hole_fields(optics, hole) for hole in holes_], axis=0))
-    return predictions(Mask(optics, fields))
+    return predictions(SamCandidate(optics, fields))
 
 
 def _described(found: Sequence[Hole]) -> str:
