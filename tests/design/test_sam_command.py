@@ -215,6 +215,9 @@ def test_state_files_are_read_or_refused(tmp_path):
     state.write_text('{"search": {}}')
     with pytest.raises(DataFileError, match="not the state of a search"):
         read_state(state, "pupil")
+    program.write_state(state, search, "pupil", [])
+    with pytest.raises(DataFileError, match="0 chains, expected 2"):
+        read_state(state, "pupil")
     program.write_state(state, search, "pupil", program.begin(search))
     assert read_state(state, "pupil") == (search, program.begin(search))
     with pytest.raises(DataFileError, match="another shaped pupil"):

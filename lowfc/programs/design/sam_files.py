@@ -66,6 +66,8 @@ def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
         search = Search(**state["search"])
         chains = [Chain(**{key: _as_tuple(value) for key, value in chain.items()}) for chain in state["chains"]]
         made_for = state["pupil"]
+        if len(chains) != search.chains:
+            raise ValueError(f"{len(chains)} chains, expected {search.chains}")
     except FileNotFoundError:
         raise DataFileError(f"there is no search to resume in {path}") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
