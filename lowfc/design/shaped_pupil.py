@@ -167,7 +167,7 @@ def exchange(request: Request) -> Iterator[Round]:
             found, found_signs = _maxima(quarter, request, level * (1 + 1e-6))
             points, signs = np.concatenate([points, found]), np.concatenate([signs, found_signs])
             multipliers = np.concatenate([multipliers, np.zeros(len(found))])
-        if is_open:  # with more cells the other sign of the field is hardly ever active at the same point
+        if is_open:  # with more cells, the limit on the other sign of the field is hardly ever active at a point
             relevant = (signs * _field_at(quarter, points) > 0) | (multipliers > 0)
             points, signs, multipliers = points[relevant], signs[relevant], multipliers[relevant]
 

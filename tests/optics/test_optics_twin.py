@@ -53,7 +53,7 @@ def default_images(sensor, modes, coefficients_nm):
 
 
 def worst_error(twin, coefficients_nm, images):
-    """Worst error of the twin's images of the first wavefronts, of which `images` are those of the full chain."""
+    """Worst error of the twin's images, relative to `images` of the first wavefronts by the full chain."""
     evaluator, at_nodes = Evaluator(twin), zernikes(NOLLS_20, *node_radii(twin))
     return max(
         relative_l2(evaluator.image((each @ at_nodes).astype(np.float32)), full)

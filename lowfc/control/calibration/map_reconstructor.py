@@ -1,4 +1,4 @@
-"""Maximum-a-posteriori (MAP) reconstructor of the corrected modes: the prior of the others is their mean square."""
+"""Maximum-a-posteriori (MAP) reconstructor of the corrected modes: the uncorrected ones have a prior mean square."""
 
 import numpy as np
 
@@ -25,7 +25,7 @@ def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: Camer
 def map_reconstructor(
     calibration: Calibration, prior_nm2: Array | Single, flux_dn: float, camera: CameraSettings | None
 ) -> Single:
-    """R (modes, pixels) with the rows of (H'WH + P^-1)^-1 H'W for the corrected modes, P the prior of the others.
+    """R (modes, pixels) with the rows of (H'WH + P^-1)^-1 H'W for corrected modes, P the prior of uncorrected modes.
 
     For corrected modes c and uncorrected modes u it is R_c - C_cu (C_uu + P_u)^-1 R_u, with C the noise covariance of
     the calibration's own R, which is unbiased for a measured or computed H. The rows R_u stay as they are, unbiased.

@@ -21,7 +21,7 @@ GRANTED = 3.0
 faint star, a single gain granted because of noise may add as much contrast as the dark zone has."""
 EARLY = 5
 """Blocks of a window after which a mode that is hardly corrected may get another gain before the window ends: a mode
-at 0 by `GRANTED`, one at the least gain after this many blocks in a row in favour of the other."""
+at 0 by `GRANTED`, one at the least gain after this many blocks in a row in favour of another gain."""
 LONGEST = 16
 """Factor of its first length to which a window grows while it decides nothing."""
 FEW = 3

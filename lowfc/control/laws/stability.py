@@ -13,7 +13,7 @@ from lowfc.arrays import Array, Complex, Single
 MIN_GAIN_MARGIN = 1.8
 MIN_PHASE_MARGIN_DEG = 45.0
 LOWEST_GAIN = 0.01
-"""Gain of a mode whose drift is below the noise of a log, which should follow nevertheless."""
+"""Gain of a mode whose drift does not show in the noise of a log, so that it is corrected nevertheless."""
 SETTLING = 5.0
 """Time constants of the slowest mode after which a loop counts as settled."""
 
