@@ -220,8 +220,9 @@ def test_the_remark_on_limits_names_the_mode_that_the_stroke_limits_first() -> N
 
 def test_an_offset_of_a_mode_without_gain_has_a_remark() -> None:
     state, _ = answer(loaded(DEFAULTS), "gain", 0.0, modes=(3,))
-    for mode, remark in ((3, "Z3 would not follow at a gain of 0"), (4, "")):
-        _, reply = answer(state, "offset", 5.0, modes=(mode,))
+    automatic, _ = answer(state, "gain", text="auto")
+    for before, mode, remark in ((state, 3, "Z3 would not follow at a gain of 0"), (state, 4, ""), (automatic, 3, "")):
+        _, reply = answer(before, "offset", 5.0, modes=(mode,))
         assert reply.accepted
         assert remark in reply.text
         assert (":" in reply.text) == bool(remark)

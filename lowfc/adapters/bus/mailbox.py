@@ -14,8 +14,7 @@ MAX_WAIT_S = 0.5
 class Mailbox(Arrivals):
     """Holds the newest message of one publisher; a newer one replaces it.
 
-    One thread takes. A bare lock wakes it: in CPython this is the cheapest way to wake a thread that waits with a
-    timeout.
+    One thread takes. A bare lock ends its wait: in CPython this is the cheapest wait with a timeout.
     """
 
     def __init__(self, key: str = "") -> None:
