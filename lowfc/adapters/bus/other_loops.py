@@ -1,4 +1,4 @@
-"""Find loops on this host whose runs are not in this user's runtime directory, by listing processes."""
+"""Find loops on this host by listing processes, for a user in whose runtime directory none is found."""
 
 import contextlib
 import itertools

@@ -83,7 +83,7 @@ class Model:
         return self.mean_over(1.0, 0.0), block_diag(*parts), np.array(seen)
 
     def mean_over(self, start: float, length: float) -> Array:
-        """Mean (states, states) of A^u over u in [start, start + length] frames, A as in `states`: predicts a mean."""
+        """Mean (states, states) of A^u, u from start to start + length frames, A as in `states`: predicts the mean."""
 
         def mean_of(exponent: complex) -> complex:
             if not length or not exponent:

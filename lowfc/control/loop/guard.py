@@ -62,7 +62,7 @@ class Group(NamedTuple):
     Attributes:
         overruled: whether the integrator drives it.
         faded: frames of the cross-fade to the integrator so far.
-        takeovers: number of takeovers by the integrator.
+        takeovers: number of takeovers by the integrator; `MAX_TAKEOVERS` after one from an amplifying loop.
         blocks: blocks in a row in favour of a change.
         usual_nm2: long-term sum of the mean squares of its pseudo-open-loop modes.
     """

@@ -118,7 +118,7 @@ class Limited(NamedTuple):
 
 
 def limit(limits: Limits, previous_nm: Single, requested_nm: Single) -> Limited:
-    """Limit a command so that it may follow `previous_nm`.
+    """Limit the command `requested_nm` so that it may follow `previous_nm`.
 
     Both are (rows, columns) float32, nm of surface; the previous one is finite, as a result of this function. Stroke,
     then slew, clip each actuator separately; the neighbour limit shortens the whole move. For any `requested_nm`, the
