@@ -207,7 +207,7 @@ def test_a_permit_can_be_released_and_ended_by_open() -> None:
     check_reply(outputs, True, "this ended the reservation for moving the mask")
 
 
-def test_a_permit_is_granted_unless_the_loop_is_closed() -> None:
+def test_a_permit_is_granted_while_the_loop_is_not_closed() -> None:
     setup = under(Action.WARN)
     for name in ("open", "safe"):
         state, _ = applied(setup, running(setup), name)

@@ -70,7 +70,7 @@ def test_the_holders_requests_are_granted() -> None:
 
 
 @pytest.mark.parametrize("name", ["safe", "open", "pause", "stop"])
-def test_safe_open_pause_and_stop_end_any_lease_and_its_probe_sequence(name: str) -> None:
+def test_safe_open_pause_and_stop_of_another_client_end_a_lease_and_its_probe_sequence(name: str) -> None:
     state, outputs = applied(played(held()), Request(S, name))
     check_reply(outputs, True)
     assert "LEASE_ENDED" in names([outputs])

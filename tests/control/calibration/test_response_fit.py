@@ -373,7 +373,7 @@ def test_a_new_dark_or_reference_keeps_a_fitted_background_and_a_truncation() ->
     masked, plain = (with_dark(known, np.zeros(good.size), good, 1.0, 1.0) for known in (fitted, before))
     background = normalise_flux(masked.reference.astype(float), np.ones((I0.size, 1)), good)[1]
     errors_nm = [np.abs(known.reconstructor @ background).max() for known in (masked, plain)]
-    assert errors_nm[0] < 0.3 * errors_nm[1]  # one pixel of 42
+    assert errors_nm[0] < 0.3 * errors_nm[1]  # one pixel of 42 is masked
 
 
 def test_r_of_a_measured_calibration_is_not_recomputed_from_noisy_h() -> None:

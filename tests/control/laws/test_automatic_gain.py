@@ -87,7 +87,7 @@ def test_modes_with_the_same_disturbance_get_similar_gains() -> None:
     assert np.ptp(np.log2(together)) < np.ptp(np.log2(alone[alone > 0]))
 
 
-def test_a_gain_changes_by_at_most_two_unless_open_loop_is_better() -> None:
+def test_a_gain_changes_by_at_most_a_factor_of_two_unless_open_loop_is_better() -> None:
     bank_ = bank()
     verdicts(bank_, drift(1000, 1.0, 10.0, 3), np.zeros(MODES, np.float32), 100.0)
     low, high = np.full(MODES, bank_.rows[3]), np.full(MODES, bank_.rows[-1])

@@ -47,9 +47,8 @@ def test_a_filter_keeps_the_margins_at_any_noise(noise_nm: float, width: float, 
     model = Model(0.02, 2.0, known, noise_nm**2, RATE_HZ)
     block = within_margins(model, timing)
     assert block is not None
-    law, free = (
-        law_from_blocks([one], "pol", "lqg", (2,), delay, RATE_HZ) for one in (block, lqg_block(model, timing))
-    )
+    blocks = block, lqg_block(model, timing)
+    law, free = (law_from_blocks([one], "pol", "lqg", (2,), delay, RATE_HZ) for one in blocks)
 
     def ratio(one: object) -> float:
         """Smallest ratio of a margin to its limit; for a filter the phase margin may be 0.7 times as large."""
@@ -82,5 +81,6 @@ def test_modal_simulation_agrees_with_images() -> None:
         found.append(tuned(pol, config)["lqg"])
     identified_nm = [np.sqrt([model.noise_nm2 for model in one.models]) for one in found]
     np.testing.assert_allclose(*identified_nm, rtol=0.1)
+    assert (np.array(identified_nm) < noise_nm).all()
     residual_mas = [float(np.hypot(*laws.theory_mas(config, calibration, one.law))) for one in found]
     assert residual_mas[0] == pytest.approx(residual_mas[1], rel=0.03)
