@@ -30,7 +30,7 @@ class Sample(NamedTuple):
         payload: protobuf bytes.
         sequence: sequence as in `Envelope`.
         publish_time_ns: time at which the publisher sent it, host clock.
-        receive_time_ns: time at which the receive thread had it, host clock.
+        receive_time_ns: time at which a receive thread had it, or a ring was drained; host clock.
     """
 
     key: str
@@ -70,7 +70,7 @@ class Publisher(Protocol):
     handed_ns: int
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
-        """Send `payload`, by default with the present time and the next sequence; it may wait briefly for slow readers.
+        """Send `payload`, by default with the present time and the next sequence; it may wait for slow readers.
 
         A caller that sets sequences (a replay sets those of the log) must set them in every call.
         """

@@ -116,7 +116,7 @@ class DirectReader:
         Args:
             path: path of the socket.
             key: key of the topic.
-            handler: called with each message, one at a time, on the bus's thread or on one of this reader's threads.
+            handler: called with each message, one at a time, on a thread of the bus, of this reader or of a writer.
             subscribe: subscribes a handler to the same topic on the bus; the function it returns unsubscribes.
             now_ns: the host's clock.
             failed: called with an exception of the handler.

@@ -204,7 +204,7 @@ def require_certificate(network: Network, role: str) -> None:
 
 
 def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
-    """Warnings about this host's certificates: absent, invalid, ending within `WARN_DAYS`, with a key open to all."""
+    """Warnings on this host's certificates: absent, invalid, ending within `WARN_DAYS`, or with a key open to all."""
     folder = user_path(network.certificates)
     roles = sorted(key.stem for key in folder.glob("*.key") if key.name != CA_KEY)
     warnings = [] if roles else [f"{folder} has no certificate with its key, ROLE.pem and ROLE.key"]

@@ -243,7 +243,7 @@ def frame_noise_nm2(models: Sequence[Model], noise_nm2: Array) -> Array:
 
 
 def simulated_residual_nm2(law: LinearLaw, run: TimeSeries, noise_nm2: Array, timing: Timing) -> Array:
-    """Mean square (modes,) of the residual, averaged over the period in which each command is in force.
+    """Mean square (modes,) of the mean residual over the period in which each command is in force.
 
     Changes within that period, which no law can remove, are not included. Each piece of the run, (frames, modes)
     of pseudo-open-loop modes with noise (modes,), starts with a law at rest and a flat mirror; its first 5000 frames,
