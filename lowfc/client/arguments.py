@@ -1,11 +1,14 @@
-"""Numbers of a request, from the arguments of a program."""
+"""Arguments of a request, as a program passes them."""
+
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Single
-from lowfc.contract.errors import RequestRefusedError
+from lowfc.contract.errors import RequestRefusedError, brief
 
+T = TypeVar("T")
 ARGUMENT_ERRORS = (ValueError, TypeError, OverflowError)
 """Errors of numpy and protobuf for an argument that is not of the required type."""
 
@@ -16,3 +19,10 @@ def floats(name: str, values: npt.ArrayLike) -> Single:
         return np.asarray(values, np.float32)
     except ARGUMENT_ERRORS as fault:
         raise RequestRefusedError(f"{name} refused: {fault}") from None
+
+
+def required(name: str, value: object, kind: type[T]) -> T:
+    """The value of a request's argument; RequestRefusedError if it is of another type, such as a file's name."""
+    if not isinstance(value, kind):
+        raise RequestRefusedError(f"{name} refused: it takes a {kind.__name__}, got {brief(value)}")
+    return value

@@ -21,7 +21,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.host import by_this_process, program_name
 from lowfc.arrays import Single
 from lowfc.client.answer import Answer
-from lowfc.client.arguments import ARGUMENT_ERRORS, floats
+from lowfc.client.arguments import ARGUMENT_ERRORS, floats, required
 from lowfc.client.bench import bench_message
 from lowfc.client.lease import Lease, new_identity
 from lowfc.client.mirror_watch import MirrorWatch
@@ -348,14 +348,14 @@ class Client:
                 actuators=b"" if actuators_nm is None else actuators_nm.tobytes(),
                 table=b"" if table is None else table.tobytes(),
                 columns=0 if table is None else table.shape[1],
-                law=None if law is None else wire_law(law),
+                law=None if law is None else wire_law(required(name, law, LinearLaw)),
                 lease_id=(self._lease.id if self._lease is not None else 0) if lease_id is None else lease_id,
                 requester=self._requester,
             )
         except ARGUMENT_ERRORS as fault:
             raise RequestRefusedError(f"{name} refused: {fault}") from None
         if calibration is not None:
-            message.calibration.MergeFromString(encode_calibration(calibration, 0))
+            message.calibration.MergeFromString(encode_calibration(required(name, calibration, Calibration), 0))
         payload = message.SerializeToString()
         if len(payload) > max_bytes(name):
             raise RequestRefusedError(

@@ -294,9 +294,8 @@ def test_a_bad_value_is_refused_and_changes_nothing(request_: Request, message: 
 @pytest.mark.parametrize("delay", [1.0, 1.5, 2.0, 3.0])
 def test_an_unstable_gain_is_refused_for_the_configured_delay(delay: float) -> None:
     setup, highest = settings(delay_frames=delay, gain=(0.1, 0.1)), limiting_gain(delay)
-    _, all_outputs = feed(
-        setup, loaded(setup), ask("gain", 0.999 * highest), ask("gain", highest), ask("gain", 1.001 * highest)
-    )
+    requests = (ask("gain", factor * highest) for factor in (0.999, 1, 1.001))
+    _, all_outputs = feed(setup, loaded(setup), *requests)
     assert [outputs.reply.accepted for outputs in all_outputs if outputs.reply] == [True, False, False]
 
 
@@ -322,9 +321,8 @@ def test_a_request_with_more_leaks_than_modes_is_refused_without_computing_their
 
 def test_a_mode_that_a_request_names_twice_has_one_value() -> None:
     for name in ("gain", "limit", "offset"):
-        _, (one, two) = feed(
-            DEFAULTS, loaded(DEFAULTS), ask(name, 0.1, modes=(2, 2)), ask(name, 0.1, 0.2, modes=(2, 2))
-        )
+        requests = ask(name, 0.1, modes=(2, 2)), ask(name, 0.1, 0.2, modes=(2, 2))
+        _, (one, two) = feed(DEFAULTS, loaded(DEFAULTS), *requests)
         assert one.reply.accepted
         check_reply(two, False, "got 2")
 

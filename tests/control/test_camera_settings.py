@@ -118,9 +118,8 @@ def test_after_a_camera_restart_frames_are_refused_until_its_settings_arrive() -
     assert [outputs.step.reasons for outputs in all_outputs if outputs.step] == [(Rejection.CAMERA_UNKNOWN,)] * 4
     assert (state.loop.history_nm[0] == before_nm).all()
     assert not ask(ask(state, "open")[0], "close")[1].accepted
-    state, all_outputs = feed(
-        DEFAULTS, state, replace(CAMERA, start_s=START + 9), frame(1, sequence=frame_sequence(9, START + 9))
-    )
+    known = replace(CAMERA, start_s=START + 9)
+    state, all_outputs = feed(DEFAULTS, state, known, frame(1, sequence=frame_sequence(9, START + 9)))
     assert all_outputs[-1].step.reasons == ()
 
 
@@ -142,9 +141,8 @@ def test_the_loop_is_not_closed_while_frames_are_refused() -> None:
 
 
 def test_clear_forgets_the_newest_frame() -> None:
-    state, _ = feed(
-        DEFAULTS, loaded(DEFAULTS), CAMERA, frame(1), frame(1, sequence=frame_sequence(1, START + 86_000)), CAMERA
-    )
+    newer = frame(1, sequence=frame_sequence(1, START + 86_000))
+    state, _ = feed(DEFAULTS, loaded(DEFAULTS), CAMERA, frame(1), newer, CAMERA)
     state, (outputs,) = feed(DEFAULTS, state, frame(2))
     assert outputs.step.reasons == (Rejection.OUT_OF_ORDER,)
     state, _ = ask(state, "safe")
@@ -166,13 +164,11 @@ def test_safe_mode_is_in_the_commands_and_restored_from_the_mirror() -> None:
     state, _ = ask(loaded(DEFAULTS), "safe")
     _, (outputs,) = feed(DEFAULTS, state, frame(1))
     assert outputs.command.safe
-    shape = outputs.command.actuators_nm
-    restarted, (adopted,) = feed(
-        DEFAULTS, loaded(DEFAULTS), MirrorShape(0, shape, outputs.command.command_nm, safe=True)
-    )
+    shape = MirrorShape(0, outputs.command.actuators_nm, outputs.command.command_nm, safe=True)
+    restarted, (adopted,) = feed(DEFAULTS, loaded(DEFAULTS), shape)
     assert restarted.mode is LoopMode.SAFE
     assert [event.name for event in adopted.events][:2] == ["MODE_CHANGED", "SAFED"]
-    restarted, _ = feed(DEFAULTS, loaded(DEFAULTS), MirrorShape(0, shape, outputs.command.command_nm))
+    restarted, _ = feed(DEFAULTS, loaded(DEFAULTS), replace(shape, safe=False))
     assert restarted.mode is LoopMode.CLOSED
 
 

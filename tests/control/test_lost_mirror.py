@@ -40,9 +40,8 @@ def test_a_lost_mirror_moves_the_command_back_to_its_last_shape() -> None:
         np.testing.assert_allclose(outputs.command.actuators_nm, last_seen.loop.actuators_nm, atol=1e-3)
     state, all_outputs = feed(DEFAULTS, state, BACK, *frames(60))
     assert names(all_outputs) == ["MIRROR_BACK", "FRAMES_ACCEPTED"]
-    np.testing.assert_allclose(
-        state.loop.history_nm[0], feed(DEFAULTS, last_seen, *frames(6))[0].loop.history_nm[0], atol=1e-3
-    )
+    expected_nm = feed(DEFAULTS, last_seen, *frames(6))[0].loop.history_nm[0]
+    np.testing.assert_allclose(state.loop.history_nm[0], expected_nm, atol=1e-3)
 
 
 def test_moving_back_keeps_the_slew_limit() -> None:
@@ -95,10 +94,8 @@ def test_safe_flattens_a_lost_mirror() -> None:
 
 def test_a_mirror_gets_no_command_before_it_reports_and_does_not_jump() -> None:
     shape = MirrorShape(0, np.full(GRID, 20, np.float32), np.zeros(0, np.float32))
-    timeout = Tick(0, DEFAULTS.frame_timeout_ns + 1)
-    state, all_outputs = feed(
-        DEFAULTS, loaded(DEFAULTS), MirrorReport(0, "has not reported yet"), *frames(1, 2), timeout
-    )
+    absent, timeout = MirrorReport(0, "has not reported yet"), Tick(0, DEFAULTS.frame_timeout_ns + 1)
+    state, all_outputs = feed(DEFAULTS, loaded(DEFAULTS), absent, *frames(1, 2), timeout)
     assert [outputs.command for outputs in all_outputs] == [None] * 4
     state, all_outputs = feed(DEFAULTS, state, shape, BACK, *frames(3))
     command = all_outputs[-1].command

@@ -23,8 +23,7 @@ class OwnCertificate(NamedTuple):
 def read_certificate(authority: Path, certificate: Path, key: Path, *, server: bool = False) -> OwnCertificate:
     """Read a certificate and check it as a peer does: signed by `authority`, matching `key`, a router's if `server`.
 
-    DataFileError if a file cannot be read, the key is encrypted, the three do not match, or the certificate is not
-    valid now.
+    DataFileError if a file cannot be read, the key is encrypted, the three do not match, or one is not valid now.
     """
     import ssl  # slow to import, and only loops on several hosts need it
 

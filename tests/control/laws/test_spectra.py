@@ -146,10 +146,8 @@ def through(setup: Settings, requests: Iterable[Request], frames: int) -> tuple[
     slow = 3 * np.sin(2e-4 * np.arange(frames))[:, None]
     noise = 0.3 * np.random.default_rng(3).standard_normal((frames, len(NOLL)))
     steps, _, state = run_toy(setup, slow + noise, state=state, first=2)
-    error_nm, command_nm = (
-        np.array([getattr(step, name) for step in steps], float) for name in ("error_nm", "command_nm")
-    )
-    return error_nm, command_nm, state
+    error_nm, command_nm = [step.error_nm for step in steps], [step.command_nm for step in steps]
+    return np.array(error_nm, float), np.array(command_nm, float), state
 
 
 @pytest.mark.parametrize(
