@@ -172,24 +172,20 @@ def open_run(
         BusError: the name is invalid, or the run exists without one of `mirrors`, or with another network.
         DataFileError: the run's directory is damaged, or cannot be made.
     """
-    path = run_path(run_id, base)
+    path, wanted = run_path(run_id, base), _absolute(network or Network())
     if not path.is_dir():
         try:
-            _make(path, mirrors, listeners, _absolute(network or Network()))
+            _make(path, mirrors, listeners, wanted)
         except OSError as fault:
             raise DataFileError(f"{path} cannot be made: {fault.strerror}") from fault
     own_directory(path)
     links = _read(path)
-    if (
-        network is not None
-        and network.router
-        and _absolute(network) != links.network
-        and Role.LAUNCHER not in links.ports
-    ):
-        existing = f"on {links.network.router}" if links.network.router else "on this host alone"
+    if wanted.router and wanted != links.network and Role.LAUNCHER not in links.ports:
+        known = links.network
+        where = f"on {known.router} with certificates {known.certificates!r}" if known.router else "on this host alone"
         raise BusError(
-            f"run {run_id!r} is {existing} with certificates {links.network.certificates!r}, and the configuration has "
-            f"{network.router} with {_absolute(network).certificates!r}; {_ADVICE} ({path}), or start another run"
+            f"run {run_id!r} is {where}, and the configuration has {wanted.router} with {wanted.certificates!r}; "
+            f"{_ADVICE} ({path}), or start another run"
         )
     for role in map(mirror_role, mirrors):
         if role not in links.ports:

@@ -57,9 +57,8 @@ def _automatic_gain(settings: Settings, loop: ActiveLoop, request: Request) -> C
         return loop, f"the gain of {names} is automatic"
     changed = _changed(loop.integrator, noll, settings.delay_frames, request)
     prior_nm2 = np.array(request.prior_nm2, np.float32)
-    if prior_nm2.size and not (
-        prior_nm2.shape == chosen.shape and np.isfinite(prior_nm2).all() and (prior_nm2 >= 0).all()
-    ):
+    valid = prior_nm2.shape == chosen.shape and (np.isfinite(prior_nm2) & (prior_nm2 >= 0)).all()
+    if prior_nm2.size and not valid:
         raise ValueError(f"the mean squares must be {chosen.size}, one per mode, finite and at least 0 nm^2")
     gain = np.where(chosen & loop.automatic, changed.gain, loop.integrator.gain)
     weighting = Weighting(prior_nm2, request.flux_dn) if prior_nm2.any() else None

@@ -114,8 +114,7 @@ def judged(interlocks: tuple[Interlock, ...], acting: tuple[Acting, ...], report
 
 def refusal(acting: tuple[Acting, ...], name: str) -> str:
     """Why acting interlocks refuse to `close` the loop or `clear` safe mode; empty if they do not."""
-    refusing = (Action.SAFE,) if name == "clear" else _AGAINST_CLOSING if name == "close" else ()
-    return "; ".join(f"an interlock acts: {one.why}" for one in acting if one.action in refusing)
+    return "; ".join(f"an interlock acts: {one.why}" for one in acting if one.action in _REFUSING.get(name, ()))
 
 
 def shown(value: Value) -> str:
@@ -130,6 +129,6 @@ def _by_value(why: str, report: BenchReport) -> bool:
     return why.startswith(f"{report.name} is ")
 
 
-_AGAINST_CLOSING = (Action.REFUSE_CLOSE, Action.HOLD, Action.OPEN, Action.SAFE)
+_REFUSING = {"clear": (Action.SAFE,), "close": (Action.REFUSE_CLOSE, Action.HOLD, Action.OPEN, Action.SAFE)}
 _BOUNDS = ("above", "below")
 _KINDS = {bool: "true or false", float: "a number", str: "a text"}

@@ -35,9 +35,8 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
         after, text, *events = _handler(request, lease_before)(settings, now, request)
     except ValueError as error:
         return state._replace(), Outputs(reply=Reply(False, _short(str(error)), state.frame_sequence + 1))
-    if request.name == "safe" or (
-        request.name in ENDED_BY and lease_before is not None and lease_before.id != request.lease_id
-    ):
+    by_another = lease_before is not None and lease_before.id != request.lease_id
+    if request.name == "safe" or (request.name in ENDED_BY and by_another):
         after, others = lease_ended(after, asked_by(lease_before, request))
         events += others
         text += "".join(f"; this ended the reservation for {event.details['holder']}" for event in others)
