@@ -28,7 +28,7 @@ def active_actuators(config: Configuration) -> Mask | None:
     """Read the map of active actuators (rows, columns) of `mirror.active`; None if all are active.
 
     Raises:
-        ConfigurationError: the file is missing, damaged or does not fit the mirror, or marks no active actuators.
+        ConfigurationError: the file is missing, damaged, does not fit the mirror, or holds not only 0 and 1, or no 1.
     """
     if not config.mirror.active:
         return None

@@ -213,12 +213,11 @@ def _newest(folder: Path) -> list[Path]:
         ) from None
     if not files:
         raise DataFileError(f"`{LAST}` is the newest log in {folder}, and there is none; {hint}")
+    order = {}
+    for path, match in files.items():
+        time, repeat, suffix, part = match.groups()
+        order[path] = time, int(repeat or 1), not (suffix or part), suffix == "-recovered", bool(part)
     # Of several files of one time prefer the recorded finished one, then a recovered one, then an unfinished one.
-    order = {
-        path: (time, int(number or 1), not (suffix or part), suffix == "-recovered", bool(part))
-        for path, match in files.items()
-        for time, number, suffix, part in [match.groups()]
-    }
     best = {order[path][:2]: path for path in sorted(files, key=order.__getitem__)}
     newest = best.pop(max(best))
     recording, number = _place(newest)

@@ -92,6 +92,6 @@ class MirrorReports:
 
 
 def _fault_in(health: wire.Health) -> str:
-    if number := health.command_refused:  # a mirror of another version may have other reasons
-        return f"refuses commands: {next((reason.name for reason in REASONS if int(reason) == number), number)}"
+    if number := int(health.command_refused):  # a mirror of another version may have other reasons
+        return f"refuses commands: {next((reason.name for reason in REASONS if reason == number), number)}"
     return "gets no commands" if health.command_expired else ""
