@@ -149,11 +149,11 @@ T = TypeVar("T")
 class _Rows(Generic[T]):
     """Columns of `T` from messages with a fixed number of modes; `T` and message use the same names of fields."""
 
-    def __init__(self, made: type[T], wide: Iterable[str], modes: int) -> None:
+    def __init__(self, result_type: type[T], per_mode: Iterable[str], modes: int) -> None:
         self.modes = modes
-        self._made = made
-        kinds = {name: _KINDS.get(name, "f") for name in made.__annotations__}
-        self._columns = Columns(dict.fromkeys(wide, modes), **kinds)
+        self._result_type = result_type
+        kinds = {name: _KINDS.get(name, "f") for name in result_type.__annotations__}
+        self._columns = Columns(dict.fromkeys(per_mode, modes), **kinds)
         self._same_name = [name for name in kinds if name not in ("sequence", "time_ns")]
 
     def __len__(self) -> int:
@@ -175,11 +175,11 @@ class _Rows(Generic[T]):
 
     def values(self) -> T:
         """Return the rows as arrays, without those with an infinite value, which the loop never sends."""
-        columns = {name: self._columns.values(name) for name in self._made.__annotations__}
+        columns = {name: self._columns.values(name) for name in self._result_type.__annotations__}
         rows = np.ones(len(self), np.bool_)
         for values in columns.values():
             rows &= ~np.isinf(values).any(axis=tuple(range(1, values.ndim)))
-        return self._made(**columns if rows.all() else {name: values[rows] for name, values in columns.items()})
+        return self._result_type(**columns if rows.all() else {name: values[rows] for name, values in columns.items()})
 
 
 class StepRows(_Rows[Steps]):
@@ -198,8 +198,8 @@ class TruthRows(_Rows[Truths]):
     """Truth of a simulation, with one number of modes."""
 
     def __init__(self, modes: int) -> None:
-        wide = ("disturbance_nm", "residual_nm", "sensed_nm", "modes_disturbance_rms_nm", "modes_residual_rms_nm")
-        super().__init__(Truths, wide, modes)
+        per_mode = ("disturbance_nm", "residual_nm", "sensed_nm", "modes_disturbance_rms_nm", "modes_residual_rms_nm")
+        super().__init__(Truths, per_mode, modes)
 
     def _special(self, message: wire.Truth) -> dict[str, Any]:
         if message.instants:

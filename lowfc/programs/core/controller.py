@@ -135,7 +135,7 @@ class Controller:
                 self._frame(self._first_frame)
         while self._service.running:
             wait_ns = None if self._warmup is None else self._warmup.wait_ns(self._service.clock.host_ns())
-            camera = self._camera.wait(min(TICK_NS if wait_ns is None else wait_ns, TICK_NS) * 1e-9)
+            camera = self._camera.wait((TICK_NS if wait_ns is None else min(wait_ns, TICK_NS)) * 1e-9)
             if camera is None and self._warmup is not None and self._warmup.due(self._service.clock.host_ns()):
                 self._warm_up()
                 continue  # everything else waits until after the frame

@@ -241,7 +241,8 @@ class Recorder:
             return
         queried = self._peers.already_received(sample)
         unwanted = self._paused or not self._selection.keeps(topic, sample.sequence, sample.payload)
-        recorded = not self._failure if queried else not unwanted and self._write(sample)
+        # A message that a query returned was written then.
+        recorded = not self._failure if queried else (not unwanted and self._write(sample))
         self._account.enter(topic, sample, recorded=recorded, unwanted=unwanted)
         if topic is HEALTH:
             self._note_health(topic, sample)
