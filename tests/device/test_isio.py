@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lowfc.adapters.image_stream.channels import OtherChannels, channel_names
+from lowfc.adapters.image_stream.channels import OtherChannels, other_channel_names
 from lowfc.adapters.image_stream.stream import StreamError
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, RequestRefusedError
@@ -316,7 +316,7 @@ def test_a_channel_whose_writer_died_meanwhile_stays_in_the_sum(folder: Path) ->
     dark_hole, turbulence, begun = (channel(folder, f"dm00disp0{index}", make=True) for index in range(3))
     dark_hole.write(shape_nm(1) / 1000)
     begun.begin(shape_nm(2) / 1000)
-    others = OtherChannels(channel_names("dm00disp03"), GRID)
+    others = OtherChannels(other_channel_names("dm00disp03"), GRID)
     assert np.allclose(1000 * others.sum(), shape_nm(1) + shape_nm(2), atol=1e-3)
     dark_hole.begin(shape_nm(3) / 1000)
     turbulence.write(shape_nm(4) / 1000)
@@ -327,7 +327,7 @@ def test_a_channel_whose_writer_died_meanwhile_stays_in_the_sum(folder: Path) ->
 
 def test_a_channel_read_between_its_counter_and_its_flag_is_read_again(folder: Path) -> None:
     dark_hole = channel(folder, "dm00disp00", make=True)
-    others = OtherChannels(channel_names("dm00disp03"), GRID)
+    others = OtherChannels(other_channel_names("dm00disp03"), GRID)
     assert not others.sum().any()
     dark_hole.begin(shape_nm(1) / 1000)
     dark_hole.pack("<Q", 264, dark_hole.count + 1)
@@ -341,7 +341,7 @@ def test_a_shrunk_channel_is_no_longer_read(folder: Path) -> None:
     driver, _ = mirror()
     dark_hole.write(shape_nm(1) / 1000)
     turbulence.write(shape_nm(2) / 1000)
-    others = OtherChannels(channel_names("dm00disp03"), GRID)
+    others = OtherChannels(other_channel_names("dm00disp03"), GRID)
     assert np.allclose(1000 * others.sum(), shape_nm(1) + shape_nm(2), atol=1e-3)
     os.truncate(folder / "dm00disp04.im.shm", 0)
     assert np.allclose(1000 * others.sum(), shape_nm(1), atol=1e-3)

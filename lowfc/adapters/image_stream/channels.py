@@ -25,7 +25,7 @@ def sum_name(channel: str) -> str:
     return found[1] if found else ""
 
 
-def channel_names(channel: str) -> tuple[str, ...]:
+def other_channel_names(channel: str) -> tuple[str, ...]:
     """Names of the other channels of the same mirror."""
     total = sum_name(channel)
     return tuple(one for one in (f"{total}{index:02d}" for index in range(CHANNELS)) if total and one != channel)
@@ -124,7 +124,7 @@ def complete_shape(stream: Stream, otherwise: Single | None = None) -> Single | 
     return shape if shape is not None and np.isfinite(shape).all() else None
 
 
-def channel_of(name: str, grid: tuple[int, int]) -> Stream:
+def open_channel(name: str, grid: tuple[int, int]) -> Stream:
     """Open a channel for writing; create it with zeros if it does not exist.
 
     StreamError if it has another grid, another process writes it, or another program does not finish creating it.

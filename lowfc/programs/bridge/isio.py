@@ -13,7 +13,7 @@ from google.protobuf.message import DecodeError
 from lowfc.adapters.bus.bus import Bus
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.image_stream.channels import OtherChannels, channel_names, fits
+from lowfc.adapters.image_stream.channels import OtherChannels, fits, other_channel_names
 from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, StreamError, stream_path
 from lowfc.adapters.process.clock import Clock, HostClock
 from lowfc.adapters.process.realtime import lower_priority
@@ -50,8 +50,8 @@ def bridge_isio(
 
     Example: lowfc bridge isio --run bench --beside dm00disp03
     """
-    names = (*(external or ()), *channel_names(beside))
-    if beside and not channel_names(beside):
+    names = (*(external or ()), *other_channel_names(beside))
+    if beside and not other_channel_names(beside):
         raise ConfigurationError(
             f"--beside must be a channel such as dm00disp03, got {beside!r}; give other channels with --external"
         )

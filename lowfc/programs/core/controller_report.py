@@ -88,7 +88,7 @@ class Offload:
                 frames=self._count,
             )
             self._publisher.put(message.SerializeToString())
-            self._sum_nm[:] = self._count = 0
+            self._sum_nm, self._count = np.zeros(len(noll)), 0
 
 
 class LastSecond:

@@ -89,7 +89,7 @@ class StartUp:
         _check_gains(config)
 
     def requests(self, state: State, time_ns: int) -> list[Request]:
-        """The requests, in this order, once the mirror's shape is known.
+        """The requests in the order to send them, once the mirror's shape is known.
 
         If the mirror already has the flat map, from an earlier controller, the flat map is subtracted from the adopted
         shape and added as a channel of its own, so that nothing moves.

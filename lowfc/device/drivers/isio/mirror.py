@@ -9,10 +9,10 @@ from pydantic import Field
 
 from lowfc.adapters.image_stream.channels import (
     OtherChannels,
-    channel_names,
-    channel_of,
     complete_shape,
+    open_channel,
     opened,
+    other_channel_names,
     sum_name,
 )
 from lowfc.adapters.image_stream.stream import Stream, StreamError, stream_path
@@ -50,9 +50,9 @@ class IsioMirror:
         self._options = options
         self.geometry: Geometry = geometry(config)
         self._grid = self.geometry.rows, self.geometry.columns
-        self._channel = channel_of(options.stream, self._grid)
+        self._channel = open_channel(options.stream, self._grid)
         self._count = self._channel.count
-        self._others = OtherChannels(channel_names(options.stream), self._grid)
+        self._others = OtherChannels(other_channel_names(options.stream), self._grid)
         self._total_name = sum_name(options.stream) if options.total is None else options.total
         self._beside: tuple[Single | None, Single] = None, np.zeros(self._grid, np.float32)
         self._total: Stream | None = None
@@ -103,7 +103,7 @@ class IsioMirror:
         if self._channel.current():
             return
         try:
-            self._channel = channel_of(self._options.stream, self._grid)
+            self._channel = open_channel(self._options.stream, self._grid)
         except StreamError as fault:  # a LowfcError ends the process; another exception is retried
             raise RuntimeError(str(fault)) from fault
         self._count = self._channel.count
