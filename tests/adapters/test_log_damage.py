@@ -244,7 +244,7 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
 def test_of_two_logs_in_one_file_the_first_is_read_and_the_second_reported(
     tmp_path: Path, source: Path, cuts: tuple[int, int]
 ) -> None:
-    """One that was cut, as of a recorder that was killed, is not read on with the channels of the other."""
+    """The second is not read with the channels of the first, even if this was cut off by the death of its recorder."""
     first = (whole := source.read_bytes())[: len(whole) - cuts[0]]
     second = rewritten(source, tmp_path / "second.mcap", {}).read_bytes()
     second = second[: len(second) - cuts[1]]
