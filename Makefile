@@ -33,7 +33,7 @@ test: $(VENV)/.tests lint  ## install, then lint, types and tests
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow and not basler and not aravis' -n auto --dist loadfile --no-loadscope-reorder && \
 	wait $$types
 
-test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and those that need node, chromium and a graphics driver too
+test-all: $(VENV)/.tests node lint types  ## lint, types and all tests, also slow ones and those that need node, chromium or a graphics driver
 	@ls /usr/share/vulkan/icd.d/*.json >/dev/null 2>&1 || { test "$$(id -u)" = 0 && apt-get install --yes mesa-vulkan-drivers libvulkan1; } || \
 		echo "no Vulkan driver: the viewer tests will skip. Debian: apt install mesa-vulkan-drivers libvulkan1" >&2
 	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && apt-get install --yes chromium; } || \
@@ -43,7 +43,7 @@ test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and thos
 	$(INSTALL) --editable '.[test,epics-test,basler]'
 	$(BIN)/python -m pytest
 
-bench: $(VENV)/.installed  ## time the loop beside the last release's results; STORE=1 keeps them as this release's
+bench: $(VENV)/.installed  ## time the loop and compare with the last release; STORE=1 stores the results as this release's
 	@today=$$(mktemp); stored=benchmarks/history/$$($(BIN)/lowfc --version).json; \
 	test -z "$(STORE)" -o ! -e $$stored || { echo "$$stored is there already: remove it first" >&2; exit 1; }; \
 	$(BIN)/lowfc latency --json >$$today && \
@@ -57,7 +57,7 @@ lint: $(VENV)/.tests  ## ruff
 types: $(VENV)/.tests  ## mypy, strict
 	$(BIN)/mypy
 
-format: $(VENV)/.tests  ## rewrite the sources as ruff likes them
+format: $(VENV)/.tests  ## format the sources with ruff
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 

@@ -35,5 +35,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that it stops its processes
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that a benchmark stops its processes
     sys.exit(main())

@@ -79,7 +79,7 @@ def _moment() -> Moment:
 def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
     """Use by each role over the last four fifths of `seconds` of frames, before the processes ended.
 
-    `share`: processor time of all threads, as a fraction of one processor. Empty with fewer than two such samples.
+    `share`: processor time of all threads over that of one processor. Empty with fewer than two samples in that time.
     """
     complete = [moment for moment in moments if moment.roles.keys() >= LOOP][:-1]
     inside = [moment for moment in complete if moment.at_s >= complete[-1].at_s - _PART * seconds]

@@ -37,8 +37,8 @@ _ROLES = ("camera", "controller", "mirror", "recorder")
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the grid of rates and the loops."""
     add_times(parser, seconds=10.0)
-    parser.add_argument("--lowest", type=float, default=500.0, help="rate of the grid, Hz (%(default)g)")
-    parser.add_argument("--highest", type=float, default=10_000.0, help="rate of the grid, Hz (%(default)g)")
+    parser.add_argument("--lowest", type=float, default=500.0, help="lowest rate of the grid, Hz (%(default)g)")
+    parser.add_argument("--highest", type=float, default=10_000.0, help="upper end of the grid, Hz (%(default)g)")
     parser.add_argument("--step", type=float, default=1.1, help="ratio of one rate to the one before (%(default)g)")
     parser.add_argument("--loop", action="append", choices=LOOPS, help="only this one; the option may be repeated")
 

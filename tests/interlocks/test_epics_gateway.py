@@ -36,6 +36,7 @@ class Variables(dict[str, "Variables.Shared"]):
     Attributes:
         monitors: callbacks by variable.
         closed: what was closed or stopped, in order.
+        conf: configuration of the server.
         busy: whether the port is in use.
     """
 
