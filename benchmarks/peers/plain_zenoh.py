@@ -57,12 +57,12 @@ def source(part: RoleProcess) -> None:
     received, published, now_ns = part.time_stamps("received"), part.time_stamps("published"), time.monotonic_ns
     last = part.last_actuators()
 
-    def back(number: int, payload: bytes) -> None:
+    def record_command(number: int, payload: bytes) -> None:
         received[number] = now_ns()
         last[:] = np.frombuffer(payload, np.float32)
 
     payloads = [pixels.tobytes() for pixels in RunData(part.folder).frames]
-    put = join(part, back)
+    put = join(part, record_command)
     for number in part.frames():
         published[number] = now_ns()
         put(number, payloads[number % len(payloads)])

@@ -72,24 +72,24 @@ def check_account(bench: Bench, summary: Summary, frames: Publisher) -> int:
     return lost
 
 
-def refuse(bench: Bench, descriptor: int) -> None:
+def refuse_writes(bench: Bench, descriptor: int) -> None:
     """Replace the log's file by one that refuses writes."""
     os.dup2(descriptor, bench.recorder._series._log._raw.fileno())
     os.close(descriptor)
 
 
-def lose_the_terminal(bench: Bench) -> None:
+def write_to_dead_terminal(bench: Bench) -> None:
     """Replace the log's file by a terminal without its other end: a write fails with EIO."""
     master, slave = os.openpty()
     os.close(master)
-    refuse(bench, slave)
+    refuse_writes(bench, slave)
 
 
 @pytest.mark.parametrize(
     ("fault", "why"),
     [
-        (lose_the_terminal, "Input/output error"),
-        (lambda bench: refuse(bench, os.open("/dev/full", os.O_WRONLY)), "No space left on device"),
+        (write_to_dead_terminal, "Input/output error"),
+        (lambda bench: refuse_writes(bench, os.open("/dev/full", os.O_WRONLY)), "No space left on device"),
         (lambda bench: shutil.rmtree(bench.folder), "the file was removed"),
     ],
 )
