@@ -117,12 +117,12 @@ class ExternalChannels:
     """Shapes of other programs on the mirror, reported to the loop on every change and to a starting controller."""
 
     def __init__(self, client: Client, bus: Bus, names: Sequence[str], nm_per_unit: float) -> None:
-        """Watch these channels of the mirror, with `nm_per_unit` nm of surface per unit."""
+        """Watch these channels, with `nm_per_unit` nm of surface per unit; StreamError for an impossible name."""
         self._client = client
         self._states = bus.ring(CONTROLLER_STATE, 1)
         self._nm_per_unit = np.float32(nm_per_unit)
         for name in names:
-            stream_path(name)  # StreamError if this cannot be a name
+            stream_path(name)
         self._names = names
         self._others: OtherChannels | None = None  # until a controller reports the grid
         self._known = b""  # shape of the channel at the controller, as last reported or requested

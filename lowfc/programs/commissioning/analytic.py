@@ -19,7 +19,7 @@ WavefrontFunction = Callable[[Twin, TwinMirror], Array]
 
 
 def analytic(config: Configuration, console: Console, at: WavefrontFunction | None = None) -> Calibration:
-    """Compute I0, H and R from the paper's equations; the optical model is cached for the simulated camera.
+    """Compute I0, H and R, eqs. (6) to (12), and cache the optical model; errors as `factory.analytic_calibration`.
 
     Args:
         config: Configuration of the instrument.

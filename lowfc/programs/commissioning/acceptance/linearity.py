@@ -72,7 +72,7 @@ class LinearityResult(AcceptanceResult):
 
 
 def play(live: Live, *, hold_frames: int, cycles: int, modes: Sequence[int]) -> list[ProbeResponse]:
-    """Play a staircase of each mode on the mirror, with the loop open.
+    """Play a staircase of each mode on the mirror, with the loop open; AcceptanceError if its levels are too short.
 
     Args:
         live: The loop, and the requirements in its configuration.

@@ -95,7 +95,8 @@ class Live:
     ) -> ProbeResponse:
         """Play a table and return the loop's response; without shapes in `basis` the table is added to the offset.
 
-        With a table without columns no probe is added: only the steps are recorded.
+        With a table without columns no probe is added: only the steps are recorded. AcceptanceError if gains or law
+        changed, or the mirror or the camera failed.
         """
         modes = len(self.calibration.noll)
         basis = np.zeros((modes, 0), np.float32) if basis is None else basis

@@ -62,7 +62,7 @@ def play(live: Live, *, duration_s: float) -> list[ProbeResponse]:
 
 
 def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> NoiseResult:
-    """Evaluate the noise of the open-loop and of the closed-loop recording."""
+    """Evaluate the noise of both recordings; AcceptanceError if one is missing, too short, or was disturbed."""
     by_loop = {response.what["loop"]: response for response in responses}
     if set(by_loop) != set(_LOOPS):
         raise AcceptanceError(

@@ -94,7 +94,7 @@ class RejectionResult(AcceptanceResult):
 def play(
     live: Live, *, duration_s: float, rms_nm: float, lines_per_mode: int, modes: Sequence[int], seed: int
 ) -> list[ProbeResponse]:
-    """Play a multisine in closed loop.
+    """Play a multisine in closed loop; AcceptanceError if its lines do not fit into the duration.
 
     It is added to the loop's offset. With a law on pseudo-open-loop modes it is added to the mirror, because such a law
     responds to an offset differently than to a disturbance.

@@ -45,7 +45,7 @@ class AlignResult(Result):
 
 
 def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResult:
-    """Fit the sensor's geometry, resample the computed calibration to its pixels and write the file."""
+    """Fit the sensor's geometry and write the computed calibration for its pixels; CalibrationError if none fits."""
     require_folder(out)
     console = Console(stderr=True)
     with Client(run) as loop, loop.reserved("lowfc calibrate align"):

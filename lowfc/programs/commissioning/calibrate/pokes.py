@@ -77,7 +77,7 @@ class Pokes:
     def __init__(
         self, config: Configuration, calibration: Calibration, noise_nm: Array, request: CalibrationRequest
     ) -> None:
-        """Choose the amplitude; `noise_nm` (modes,) is the noise of one frame."""
+        """Choose the amplitude, CalibrationError if too much is requested; `noise_nm` (modes,): noise of one frame."""
         self._request = request
         self._noise_nm = noise_nm
         self._modes = len(calibration.noll)
