@@ -40,9 +40,9 @@ from lowfc.programs.commissioning.checks import Check, print_report
 from lowfc.programs.commissioning.conformance import command as conformance
 from lowfc.programs.commissioning.conformance.camera import watch
 from lowfc.programs.commissioning.conformance.command import FIELDS, STATUSES
+from lowfc.programs.commissioning.conformance.connection import Connection, Received
 from lowfc.programs.commissioning.conformance.dialogue import Dialogue, Expected
 from lowfc.programs.commissioning.conformance.frames import camera_checks
-from lowfc.programs.commissioning.conformance.line import Line, Received
 from lowfc.programs.commissioning.conformance.mirror import mirror_checks
 from lowfc.testing.clock import FakeClock
 from tests.support.loops import json_of, refusal, until
@@ -61,7 +61,7 @@ def envelope(sequence: int, time_ns: int) -> bytes | None:
 
 
 class Device:
-    """A simulated device that is also its own line; correct except for `changes`, functions or values by name.
+    """A simulated device that is also its own connection; correct except for `changes`, functions or values by name.
 
     Time advances in milliseconds, and only in `wait`.
     """
@@ -507,20 +507,23 @@ def test_an_absent_camera_fails_the_check_of_frames(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.usefixtures("own_runtime")
-def test_a_line_queries_and_receives_messages_without_an_envelope() -> None:
+def test_a_connection_queries_and_receives_messages_without_an_envelope() -> None:
     links = open_run("bench").links
     with zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, Role.CAMERA)))) as session:
         session.declare_queryable(CAMERA_STATE.key, lambda query: query.reply(CAMERA_STATE.key, b"settings"))
-        with closing(Line(links, Role.OPERATOR)) as line:
-            until(line.peers)
-            until(lambda: [one.payload for one in line.ask(CAMERA_STATE.key)] == [b"settings"])
+        with closing(Connection(links, Role.OPERATOR)) as connection:
+            until(connection.peers)
+            until(lambda: [one.payload for one in connection.ask(CAMERA_STATE.key)] == [b"settings"])
             got: list[Received] = []
-            until(lambda: got.extend(line.received()) or got, each=lambda: session.put(FRAME.key, b"frame"))
+            until(lambda: got.extend(connection.received()) or got, each=lambda: session.put(FRAME.key, b"frame"))
             assert got[0][:3] == (FRAME.key, b"frame", None)
 
 
 @pytest.mark.usefixtures("own_runtime")
 def test_only_one_process_may_have_the_role_controller() -> None:
     links = open_run("bench").links
-    with closing(Line(links, Role.CONTROLLER)), pytest.raises(BusError, match="does another process have this role"):
-        Line(links, Role.CONTROLLER)
+    with (
+        closing(Connection(links, Role.CONTROLLER)),
+        pytest.raises(BusError, match="does another process have this role"),
+    ):
+        Connection(links, Role.CONTROLLER)

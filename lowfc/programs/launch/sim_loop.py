@@ -161,7 +161,7 @@ def _supervise(
             continue
         if child.name == Role.RECORDER and watch.health_of(Role.RECORDER).recording.failure:
             continue  # the loop ended normally without it; the summary gives the reason
-        if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # stopped before it was ready: no failure
+        if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # the last two: stopped before it was ready
             raise died(child)
 
 

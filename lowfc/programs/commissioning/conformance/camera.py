@@ -11,7 +11,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.arrays import Pixels
 from lowfc.contract.messages import CAMERA_STATE, FRAME, RawImage, Role, from_timestamp, wire
-from lowfc.programs.commissioning.conformance.line import NS, Collected, Line, Received
+from lowfc.programs.commissioning.conformance.connection import NS, Collected, Connection, Received
 from lowfc.programs.commissioning.conformance.publisher import LATE_NS
 
 TURN_S = 0.02
@@ -54,8 +54,8 @@ class Camera(Collected):
         answers: replies to a query for the settings.
     """
 
-    def __init__(self, line: Line) -> None:
-        super().__init__(line, FRAME.key, Role.CAMERA)
+    def __init__(self, connection: Connection) -> None:
+        super().__init__(connection, FRAME.key, Role.CAMERA)
         self.frames: list[Picture] = []
         self.unreadable = 0
         self.pixels: list[Pixels] = []
@@ -111,12 +111,12 @@ class Camera(Collected):
         return puts if near and all(later > earlier for earlier, later in pairwise(puts)) else arrivals
 
 
-def watch(line: Line, seconds: float, advance: Callable[[float], None]) -> Camera:
+def watch(connection: Connection, seconds: float, advance: Callable[[float], None]) -> Camera:
     """Observe a camera for `seconds`; `advance` is called with the elapsed time."""
-    camera, begun_ns = Camera(line), line.now_ns()
-    while (elapsed_s := (line.now_ns() - begun_ns) / NS) < seconds:
+    camera, begun_ns = Camera(connection), connection.now_ns()
+    while (elapsed_s := (connection.now_ns() - begun_ns) / NS) < seconds:
         advance(elapsed_s)
         camera.collect(min(TURN_S, seconds - elapsed_s))
     camera.seconds = seconds
-    camera.answers = line.ask(CAMERA_STATE.key)
+    camera.answers = connection.ask(CAMERA_STATE.key)
     return camera

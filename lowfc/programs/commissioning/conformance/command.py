@@ -11,7 +11,7 @@ from lowfc.programs.commissioning.checks import Check, Status, print_report
 
 if TYPE_CHECKING:
     from lowfc.adapters.bus.run import Run
-    from lowfc.programs.commissioning.conformance.line import Line
+    from lowfc.programs.commissioning.conformance.connection import Connection
 
 CONNECT_S = 3.0
 """Time to wait for a device."""
@@ -52,9 +52,9 @@ def camera(
 
     settings = None if config is None else configuration(config)
     found = _run_with(Role.CAMERA, run)
-    with _line(found, Role.OPERATOR) as line, passing_bar(Console(stderr=True)) as bar:
+    with _connection(found, Role.OPERATOR) as connection, passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task(f"observing the camera for {duration:g} s", total=duration)
-        observed = watch(line, duration, lambda done_s: bar.update(task, completed=done_s))
+        observed = watch(connection, duration, lambda done_s: bar.update(task, completed=done_s))
     checks = list(camera_checks(observed))
     if settings is not None and observed.settings is not None:
         checks += agreement_checks(settings, observed.settings)
@@ -92,8 +92,8 @@ def mirror(
     found = _run_with(mirror_role(settings.mirror.name), run)
     if Role.CONTROLLER in found.links.live():
         raise BusError(f"run {found.run_id!r} has a controller, but only one process may command the mirror: stop it")
-    with _line(found, Role.CONTROLLER) as line, passing_bar(Console(stderr=True)) as bar:
-        task, dialogue = bar.add_task("the mirror", total=None), Dialogue(line, Expected(settings))
+    with _connection(found, Role.CONTROLLER) as connection, passing_bar(Console(stderr=True)) as bar:
+        task, dialogue = bar.add_task("the mirror", total=None), Dialogue(connection, Expected(settings))
         checks = mirror_checks(dialogue, duration, lambda what: bar.update(task, description=what), gentle=gentle)
     _end(f"mirror-{settings.mirror.name}", found.run_id, checks, as_json)
 
@@ -124,19 +124,19 @@ def _run_with(role: str, name: str | None) -> "Run":
 
 
 @contextmanager
-def _line(run: "Run", role: str) -> "Iterator[Line]":
+def _connection(run: "Run", role: str) -> "Iterator[Connection]":
     import time
 
-    from lowfc.programs.commissioning.conformance.line import Line
+    from lowfc.programs.commissioning.conformance.connection import Connection
 
-    line = Line(run.links, role)
+    connection = Connection(run.links, role)
     try:
         deadline_s = time.monotonic() + CONNECT_S
-        while not line.peers() and time.monotonic() < deadline_s:
+        while not connection.peers() and time.monotonic() < deadline_s:
             time.sleep(0.02)
-        yield line
+        yield connection
     finally:
-        line.close()
+        connection.close()
 
 
 def _end(device: str, run_id: str, checks: list[Check], as_json: bool) -> None:

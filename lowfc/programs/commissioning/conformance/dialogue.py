@@ -11,7 +11,7 @@ from lowfc.arrays import Mask, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import COMMAND, MIRROR_STATE, timestamp, wire
-from lowfc.programs.commissioning.conformance.line import NS, Collected, Line, Received
+from lowfc.programs.commissioning.conformance.connection import NS, Collected, Connection, Received
 
 ANSWER_S = 0.5
 """Timeout for an answer; a slower mirror cannot be used in a loop."""
@@ -76,8 +76,8 @@ class Dialogue(Collected):
         unreadable: number of states that could not be decoded.
     """
 
-    def __init__(self, line: Line, expected: Expected) -> None:
-        super().__init__(line, MIRROR_STATE.at(expected.name), mirror_role(expected.name))
+    def __init__(self, connection: Connection, expected: Expected) -> None:
+        super().__init__(connection, MIRROR_STATE.at(expected.name), mirror_role(expected.name))
         self.expected = expected
         self.states: list[tuple[Received, wire.MirrorState]] = []
         self.unreadable = 0
@@ -122,8 +122,8 @@ class Dialogue(Collected):
 
     def listen(self, seconds: float) -> list[wire.MirrorState]:
         """States received in the next `seconds`."""
-        before, end_ns = len(self.states), self.line.now_ns() + round(seconds * NS)
-        while (remaining_ns := end_ns - self.line.now_ns()) > 0:
+        before, end_ns = len(self.states), self.connection.now_ns() + round(seconds * NS)
+        while (remaining_ns := end_ns - self.connection.now_ns()) > 0:
             self.collect(min(TURN_S, remaining_ns / NS))
         return [state for _, state in self.states[before:]]
 
@@ -151,7 +151,7 @@ class Dialogue(Collected):
         """
         if sequence is None:
             sequence, self._next = self._next, self._next + 1
-        data, time_ns = surface_nm.astype("<f4").tobytes(), self.line.now_ns()
+        data, time_ns = surface_nm.astype("<f4").tobytes(), self.connection.now_ns()
         command = wire.MirrorCommand(
             timestamp=timestamp(time_ns),
             frame_sequence=sequence,
@@ -163,7 +163,7 @@ class Dialogue(Collected):
             command_nm=MODAL_NM,
             clear_id=clear_id,
         )
-        self.line.put(COMMAND, self.expected.name, command.SerializeToString())
+        self.connection.put(COMMAND, self.expected.name, command.SerializeToString())
         return sequence, time_ns
 
     def ask(self, surface_nm: Single, valid_ns: int = VALID_NS) -> tuple[wire.MirrorState | None, int, int]:
@@ -174,8 +174,8 @@ class Dialogue(Collected):
         """
         self._commanded_nm, before = surface_nm, len(self.states)
         sequence, sent_ns = self.put(surface_nm, valid_ns=valid_ns)
-        end_ns = self.line.now_ns() + round(ANSWER_S * NS)
-        while self.line.now_ns() < end_ns:
+        end_ns = self.connection.now_ns() + round(ANSWER_S * NS)
+        while self.connection.now_ns() < end_ns:
             for message, state in self.states[before:]:
                 if state.frame_sequence == sequence:
                     return state, sent_ns, message.receive_time_ns - sent_ns

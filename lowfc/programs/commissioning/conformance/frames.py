@@ -10,7 +10,7 @@ from lowfc.contract.messages import FRAME, MONO16, wire
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.camera import Camera
-from lowfc.programs.commissioning.conformance.line import NS
+from lowfc.programs.commissioning.conformance.connection import NS
 from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
 from lowfc.programs.commissioning.conformance.settings import SETTINGS
 

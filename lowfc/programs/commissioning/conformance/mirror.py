@@ -9,8 +9,8 @@ from lowfc.arrays import Mask, Single
 from lowfc.contract.messages import SEQUENCE_BOUND, from_timestamp, wire
 from lowfc.device.mirror_protection import MAX_VALID_NS
 from lowfc.programs.commissioning.checks import Check, Status, judged, ok, warning, wrong
+from lowfc.programs.commissioning.conformance.connection import NS
 from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Show
-from lowfc.programs.commissioning.conformance.line import NS
 from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
 
 IDLE_S = 1.0
@@ -32,7 +32,7 @@ def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool 
     """All checks of a mirror; at the end it returns to its shape."""
     found: list[Check] = []
     base_nm = np.zeros(mirror.expected.grid, np.float32)
-    begun_ns = mirror.line.now_ns()
+    begun_ns = mirror.connection.now_ns()
     try:
         show("idle")
         found += _idle(mirror)
@@ -58,7 +58,7 @@ def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool 
     finally:
         if mirror.states and not _bad(found, "grid", "state"):
             mirror.go(base_nm)
-    mirror.seconds = (mirror.line.now_ns() - begun_ns) / NS
+    mirror.seconds = (mirror.connection.now_ns() - begun_ns) / NS
     return [*found, *PUBLISHER.run(mirror), *PROCESS.run(mirror)]
 
 
@@ -106,13 +106,13 @@ def _grid(mirror: Dialogue, state: wire.MirrorState) -> Check:
 
 def _ordinary_commands(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator[Check]:
     """Send small shapes with alternating sign, one per period, and check the answers; give up after three without."""
-    line, period_ns = mirror.line, mirror.expected.period_ns
+    connection, period_ns = mirror.connection, mirror.expected.period_ns
     answers: list[wire.MirrorState] = []
     commanded_nm = base_nm
     durations_ns: list[int] = []
     same_time = unanswered = 0
-    end_ns, sign = line.now_ns() + round(seconds * NS), 1
-    while line.now_ns() < end_ns and (answers or unanswered < 3):
+    end_ns, sign = connection.now_ns() + round(seconds * NS), 1
+    while connection.now_ns() < end_ns and (answers or unanswered < 3):
         sign = -sign
         target_nm = base_nm + np.float32(sign) * mirror.expected.pattern_nm
         state, sent_ns, duration_ns = mirror.ask(target_nm)
@@ -123,7 +123,7 @@ def _ordinary_commands(mirror: Dialogue, base_nm: Single, seconds: float) -> Ite
         commanded_nm = target_nm
         durations_ns.append(duration_ns)
         same_time += from_timestamp(state.timestamp) == sent_ns
-        line.wait(max(0.0, (sent_ns + period_ns - line.now_ns()) / NS))
+        connection.wait(max(0.0, (sent_ns + period_ns - connection.now_ns()) / NS))
     expected = f"a state with each command's frame_sequence within {ANSWER_S * 1e3:.0f} ms"
     yield _answers(mirror, durations_ns, unanswered)._replace(name="answers", expected=expected)
     if not answers:
@@ -137,9 +137,10 @@ def _ordinary_commands(mirror: Dialogue, base_nm: Single, seconds: float) -> Ite
     got, advice = names.get(last.status, str(last.status)), "report FOLLOWING while a command is in force"
     yield judged("status", "FOLLOWING", last.status == _FOLLOWING, got, advice)
     different, expected = len(answers) - same_time, "timestamp of the applied command"
-    age_ms, advice = (from_timestamp(last.timestamp) - line.now_ns()) / 1e6, "copy the command's timestamp: it joins "
+    age_ms = (from_timestamp(last.timestamp) - connection.now_ns()) / 1e6
     got = f"{different} of {len(answers)} differ, the last {age_ms:.3g} ms from now"
-    yield judged("time", expected, not different, "the same", f"{advice}commands and states in logs", got, warning)
+    advice = "copy the command's timestamp: it joins commands and states in logs"
+    yield judged("time", expected, not different, "the same", advice, got, warning)
     got, expected = f"{len(last.command_nm)} values", "command_nm of the applied command"
     advice = "copy it, or omit it if your limits changed the command: a restarted controller continues from it"
     yield judged("modal command", expected, tuple(last.command_nm) == MODAL_NM, got, advice, severity=warning)
@@ -245,7 +246,7 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
         yield judged("after bad commands", expected, False, "no more answers", advice)
         return
     mirror.listen(_SETTLE_S)
-    sequence, _ = mirror.put(base_nm, sequence=max(0, state.frame_sequence - 1), clear_id=mirror.line.now_ns())
+    sequence, _ = mirror.put(base_nm, sequence=max(0, state.frame_sequence - 1), clear_id=mirror.connection.now_ns())
     followed = any(one.frame_sequence == sequence for one in mirror.listen(_REFUSAL_S))
     expected = "a command with a new clear_id is applied, although its frame_sequence is below the last"
     advice = "reset the newest frame_sequence on a new clear_id: otherwise an operator's clear has no effect"
@@ -256,7 +257,7 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
     """Raise the mirror, let the command expire while refused ones arrive, then let one of long validity expire."""
     raised_nm = base_nm + np.float32(raised_by_nm)
     mirror.ask(raised_nm, EXPIRES_NS)
-    sent_ns = mirror.line.now_ns()
+    sent_ns = mirror.connection.now_ns()
     mirror.listen(EXPIRES_NS / 2e9)
     nan_nm = np.full(mirror.expected.grid, np.nan, np.float32)
     for _ in range(round((EXPIRES_NS / 2 + SLACK_NS) / _REFUSED_EVERY_NS)):
@@ -278,7 +279,7 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
     yield judged("relaxing", expected, empty, got, advice, "command_nm is set while the mirror relaxes")
     mirror.go(base_nm)
     state, _, _ = mirror.ask(base_nm, _LONG_NS)
-    sent_ns, applied = mirror.line.now_ns(), state is not None and state.status != _EXPIRED
+    sent_ns, applied = mirror.connection.now_ns(), state is not None and state.status != _EXPIRED
     expected, advice = "a valid command is applied again", "apply a new command after the timeout"
     yield judged("after the dead-man", expected, applied, "applied", advice, "not applied")
     mirror.listen((MAX_VALID_NS + SLACK_NS) / NS)

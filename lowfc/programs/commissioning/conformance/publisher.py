@@ -10,7 +10,7 @@ from lowfc.contract.errors import nearest
 from lowfc.contract.messages import EVENT, HEALTH, TOPICS, from_timestamp, topic_of, wire
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
-from lowfc.programs.commissioning.conformance.line import NS, Collected
+from lowfc.programs.commissioning.conformance.connection import NS, Collected
 
 LATE_NS = 20_000_000
 """Clock difference above which every frame of a camera with 100 Hz or more is refused as late by default."""
@@ -77,7 +77,7 @@ def _put_time(device: Collected) -> Check | None:
     if not -_AHEAD_NS <= lag_ns <= LATE_NS:
         side = "before" if lag_ns > 0 else "after"
         got = f"{abs(lag_ns) / 1e6:.3g} ms {side} the arrival" if abs(lag_ns) < 3600 * NS else f"{times[-1]} ns"
-        return wrong(got, _clock_advice(times[-1], arrivals[-1], device.line.offset_ns))
+        return wrong(got, _clock_advice(times[-1], arrivals[-1], device.connection.offset_ns))
     back = sum(later <= earlier for earlier, later in pairwise(times))
     if back:
         got = f"not later than the previous one, {counted(back, 'time')} of {len(times) - 1}"

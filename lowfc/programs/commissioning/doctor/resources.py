@@ -1,4 +1,4 @@
-"""Checks of resources: memory, sockets, files, disk, libraries, the viewer."""
+"""Checks of resources: memory, libraries, sockets, disk, files, certificates."""
 
 import datetime
 

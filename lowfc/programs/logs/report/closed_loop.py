@@ -65,7 +65,7 @@ ERROR, POL, DISTURBANCE, RESIDUAL, SENSED = range(5)
 
 
 def longest_stretch(run: Run) -> Stretch | None:
-    """The longest stretch; None if the loop was never closed, or the log does not contain the law."""
+    """The longest stretch; None if there is none, for the reasons of `why_none`."""
     history, laws = run.history, run.law_rows()
     steps = history.steps
     known = np.array([*(law.known for law in run.laws), False])  # the last for steps before the first law

@@ -123,7 +123,7 @@ def actuator_extremes_nm(history: History) -> Single:
 
 
 def _limits(reasons: Long) -> dict[str, int]:
-    """Limits of the mirror, without LAW_OVERRULED, which is an event."""
+    """Number of times that each limit acted; LAW_OVERRULED is none."""
     counts = count_reasons(reasons).items()
     return {
         reason.name.lower(): count

@@ -173,7 +173,7 @@ def repeat_statistics(frames: Frames) -> dict[str, Any]:
 
 
 def controller_counts(health: wire.Health) -> dict[str, Any]:
-    """The controller's counts of the whole run: frames_skipped, frames_missing, and frames by reason of refusal."""
+    """The controller's counts of the whole run: frames_skipped, frames_missing, and frames by refusal or limit."""
     frames = topic_count(health, FRAME.key)
     reasons = {reason_of(one.reason): one.count for one in health.counts}
     return {

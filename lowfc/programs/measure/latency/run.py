@@ -178,7 +178,7 @@ def _children(options: LatencyOptions, run: Run) -> list[Child]:
     awaited += [str(Role.RECORDER)] * options.record + [str(Role.VIEWER)] * options.view
     waits = [word for name in awaited for word in ("--wait-for", name)]
     if options.simulated:
-        children[0].command += waits[-2:] if options.view else []  # it already waits for the others
+        children[0].command += waits[-2:] if options.view else []  # it waits for the others already
     else:
         arguments = ["-m", "lowfc.programs.measure.frame_source", *_options(run), "--seconds", str(seconds), *waits]
         children[0] = program(str(Role.CAMERA), arguments, run.path / f"{Role.CAMERA}.stderr")

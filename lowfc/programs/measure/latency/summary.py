@@ -91,10 +91,10 @@ def compare(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, An
     """Two results side by side.
 
     Returns:
-        rows, one for each span and percentile that both have, and for each ratio to the references: name, at, unit (us,
-        or empty for a ratio), a, b, ratio (b over a), better ("a", "b" or "same"), difference (b minus a), spread (the
-        larger of both ranges over the repeats; None for a single one) and beyond_spread. counts: a and b for each of
-        `COUNTS` that both have.
+        rows, one for each span that both have at each of `COMPARED`, and for `ratio` at `RATIOS_AT`: name, at, unit
+        (us, or empty for the ratio), a, b, ratio (b over a), better ("a", "b" or "same"), difference (b minus a),
+        spread (the larger of both ranges over the repeats; None if one has a single repeat) and beyond_spread. counts:
+        a and b for each of `COUNTS` that both have.
     """
     both = (before, after)
     pairs = [

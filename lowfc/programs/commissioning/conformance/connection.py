@@ -46,7 +46,7 @@ class Received(NamedTuple):
             return None
 
 
-class Line:
+class Connection:
     """A session that receives every message of a run; `ZenohBus` would refuse messages without an envelope.
 
     Attributes:
@@ -114,23 +114,23 @@ class Collected:
     """Messages of a device, in the order of arrival.
 
     Attributes:
-        line: connection to the device.
+        connection: connection to the device.
         key: key of its main topic.
         process: name under which it publishes its Health.
         messages: all messages.
         seconds: duration of the check; set at the end.
     """
 
-    def __init__(self, line: Line, key: str, process: str) -> None:
+    def __init__(self, connection: Connection, key: str, process: str) -> None:
         """Start to collect; no message is stored before `collect`."""
-        self.line, self.key, self.process = line, key, process
+        self.connection, self.key, self.process = connection, key, process
         self.messages: list[Received] = []
         self.seconds = 0.0
 
     def collect(self, seconds: float) -> None:
         """Wait, then store the messages that have arrived."""
-        self.line.wait(seconds)
-        for message in self.line.received():
+        self.connection.wait(seconds)
+        for message in self.connection.received():
             self.take(message)
 
     def take(self, message: Received) -> None:
