@@ -1,7 +1,6 @@
 """Process variables of a gateway, independent of its protocol: readings, and writable variables that send requests.
 
-A request with a `lowfc ctl` command is offered if it changes something and its arguments are numbers or one text; where
-it has modes, it applies to all of them.
+A request with a `lowfc ctl` command that changes something is offered if it takes numbers or one text, for all modes.
 """
 
 from collections.abc import Callable, Iterator

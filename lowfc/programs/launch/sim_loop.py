@@ -47,8 +47,7 @@ def sim_loop(
 ) -> dict[str, Any]:
     """Run the simulated loop for a time, or until Ctrl-C; return the summary that `--json` prints.
 
-    The loop continues if the view ends. ProcessDiedError if another process ended, with the end of its output; BusError
-    if the run is in use.
+    The loop continues if the view ends. ProcessDiedError if another process ended, BusError if the run is in use.
     """
     console = Console(stderr=True)
     require_screen(show)

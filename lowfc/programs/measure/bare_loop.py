@@ -1,8 +1,7 @@
 """An idle loop beside a process of the control loop: a delay of both is caused by the host.
 
-It runs on the processors of that process; with real-time scheduling it has a higher priority, so that no process of
-lowfc can delay it. Halfway between two frames it wakes, records how late it is, and reads the kernel's counters of the
-processor and the process.
+It runs on the processors of that process, in real-time scheduling at a higher priority, so that lowfc does not delay
+it. Halfway between two frames it wakes, notes how late it is, and reads the kernel's counters of processor and process.
 """
 
 import json

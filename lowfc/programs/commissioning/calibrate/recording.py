@@ -71,8 +71,7 @@ class Recording(NamedTuple):
     def commands(self, delay_frames: float) -> Array:
         """The loop's own command as seen by each exposure (frames, modes)."""
         frames = np.arange(self.steps[-1] + 1)
-        # a missing step has the command before it; exposures before the first step are not usable
-        newest = np.maximum(np.searchsorted(self.steps, frames, side="right") - 1, 0)
+        newest = np.maximum(np.searchsorted(self.steps, frames, "right") - 1, 0)  # for a missing step, the one before
         all_of_them = np.ones(len(self.steps), np.bool_)
         return seen(self.command_nm[newest], _weights(delay_frames), self.steps, all_of_them)[self._steps_of_frames]
 

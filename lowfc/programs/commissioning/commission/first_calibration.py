@@ -26,8 +26,7 @@ MAX_MISFIT = 0.35
 """Largest residual of the image after the fit of the computed one; above it the sensor is not the configured one."""
 MIN_LIKENESS = 0.5
 """Smallest correlation of a poke's image with the computed one; below it the sensor is not the configured one."""
-CYCLES = 12
-"""Number of poke cycles from which the response is measured without an optical model."""
+CYCLES = 12  # of pokes, from which the response is measured without an optical model
 MAX_NOT_LINEAR = 0.1
 """Largest relative difference of the gains at full and half amplitude; `_SURE` standard errors are added to it."""
 _SURE = 3.0  # standard errors

@@ -20,10 +20,7 @@ PICTURES = 50
 
 
 class Picture(NamedTuple):
-    """A frame without its pixels; `size` (bytes) and `checksum` (CRC-32) are those of its data.
-
-    `put_ns`: publish time, 0 without a valid envelope; `highest`: brightest pixel, DN, None if the size is wrong.
-    """
+    """A frame without its pixels; `put_ns` is 0 without a valid envelope, `highest` (DN) None if the size is wrong."""
 
     receive_time_ns: int
     put_ns: int

@@ -14,10 +14,8 @@ from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM
 from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
 
 IDLE_S = 1.0
-EXPIRES_NS = 300_000_000
-"""Validity of the command that is left to expire."""
-SLACK_NS = 400_000_000
-"""Time by which the mirror may report the timeout late."""
+EXPIRES_NS = 300_000_000  # validity of the command that is left to expire
+SLACK_NS = 400_000_000  # time by which the mirror may report the timeout late
 
 _FOLLOWING, _EXPIRED = wire.MIRROR_STATUS_FOLLOWING, wire.MIRROR_STATUS_EXPIRED
 _LONG_NS = 60 * NS

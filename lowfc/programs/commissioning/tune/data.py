@@ -76,8 +76,7 @@ class Telemetry:
 def telemetry_from_log(log: LogReader) -> Telemetry:
     """The used closed-loop frames of a log; all used frames if there are too few of them.
 
-    Frames with a probe sequence, as in an acceptance test, are excluded: a law must not learn from them. DataFileError
-    if too few remain.
+    Frames with a probe sequence, as in an acceptance test, are excluded: a law must not learn from them.
     """
     history = read_history(log)
     run = LoggedRun(history)

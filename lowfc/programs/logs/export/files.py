@@ -63,10 +63,7 @@ def write_npz(files: list[Path], history: History) -> None:
 
 
 def write_fits(files: list[Path], history: History, *, with_frames: bool) -> None:
-    """Write the steps as binary table STEPS, each array of the calibration as an image, the frames as cube FRAMES.
-
-    Table FRAME_TIMES has the sequences and times of the frames.
-    """
+    """Write the steps as table STEPS, each array of the calibration as an image, frames as FRAMES and FRAME_TIMES."""
     arrays = calibration_columns(history.calibration) if history.calibration is not None else ()
     units = [
         _primary(history),

@@ -140,10 +140,6 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
         if recorder.status:
             raise BusError(f"the recorder failed: {recorder.exit_description()}; {recorder.stderr_tail()}")
     done = json.loads(recorder.stdout_path.read_bytes())
-    logs = [Path(log) for log in done["logs"]]
-    log_bytes = sum(log.stat().st_size for log in logs)
-    for log in logs:
-        log.unlink()
     return {
         "rate_hz": rate_hz,
         "offered_hz": (traffic.frames - first_frame) / elapsed_s,
@@ -151,9 +147,17 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
         "cpu_share": (after.user + after.system - before.user - before.system) / elapsed_s,
         "publisher_cpu_share": own_s / elapsed_s,
         "messages_published": traffic.messages,
-        "log_bytes": log_bytes,
+        "log_bytes": _remove([Path(log) for log in done["logs"]]),
         **{name: done[name] for name in _RECORDER_KEYS},
     }
+
+
+def _remove(logs: list[Path]) -> int:
+    """Remove the logs of a recording, which may be several; return their total size, bytes."""
+    size = sum(log.stat().st_size for log in logs)
+    for log in logs:
+        log.unlink()
+    return size
 
 
 def _copy_cost(folder: Path) -> tuple[float, float]:

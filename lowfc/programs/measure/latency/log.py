@@ -18,8 +18,7 @@ _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
 def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Latency statistics of a log, as of one repeat of a benchmark, and its path, missing parts and host.
 
-    For a loop on several hosts, `clock_error_us` is the largest error of a latency between two hosts. DataFileError if
-    the log has no timing of the controller.
+    `clock_error_us`: largest error of a latency between two hosts, if there are several. DataFileError without timing.
     """
     log = WholeLog(files, skip_damaged=True)
     log.progress = progress
