@@ -190,13 +190,13 @@ def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single) -> str:
         "with columns reversed": got[:, ::-1],
         "rotated by 180 degrees": got[::-1, ::-1],
     }
-    alike = {
+    similarity = {
         how: float((commanded * one).sum() / max(np.linalg.norm(commanded) * np.linalg.norm(one), 1e-30))
         for how, one in turns.items()
         if one.shape == commanded.shape
     }
-    how = max(alike, key=lambda one: abs(alike[one]))
-    if abs(alike[how]) < 0.9:
+    how = max(similarity, key=lambda one: abs(similarity[one]))
+    if abs(similarity[how]) < 0.9:
         return "the shapes are unrelated: check the driver's order of the actuators"
     scale = float((commanded * turns[how]).sum() / (commanded**2).sum())
     advice = f"the commanded shape {how}, times {scale:.3g}"
@@ -305,15 +305,15 @@ def _limit_checks(mirror: Dialogue) -> Iterator[Check]:
     stroke_nm, slew_nm, apart_nm = limits.stroke_nm, limits.slew_nm, limits.neighbour_nm
     too_far_nm = min(_FAR * slew_nm, _NEAR * stroke_nm)
     fits = _BEYOND * apart_nm / 2 <= _NEAR * stroke_nm and mirror.reachable(_BEYOND * apart_nm)
-    for name, words, reason, limit_nm, asked_nm, shape, possible in (
+    for name, words, reason, limit_nm, commanded_nm, shape, possible in (
         ("stroke", "no actuator above", wire.REASON_STROKE, stroke_nm, _BEYOND * stroke_nm, uniform, _rises(mirror)),
         ("slew", "no move above", wire.REASON_SLEW, slew_nm, too_far_nm, uniform, too_far_nm >= _BEYOND * slew_nm),
         ("neighbours", "no step above", wire.REASON_NEIGHBOUR, apart_nm, _BEYOND * apart_nm, peak, fits),
     ):
-        expected = f"{words} {limit_nm:g} nm, with {asked_nm:.4g} nm commanded"
+        expected = f"{words} {limit_nm:g} nm, with {commanded_nm:.4g} nm commanded"
         check = warning("not tested: out of reach", "do mirror.stroke_nm (full range) and the limits match the mirror?")
         if possible:
-            target_nm = np.float32(asked_nm) * shape
+            target_nm = np.float32(commanded_nm) * shape
             state = mirror.ask(target_nm)[0] if name == "slew" else mirror.go(target_nm)
             where_nm = mirror.surface_nm(state)
             if state is None or where_nm is None:

@@ -222,9 +222,9 @@ def _clock_source(facts: Facts) -> Check:
 )
 def _synchronisation(facts: Facts) -> Check:
     """Whether a daemon synchronises CLOCK_REALTIME, and the error that the kernel reports."""
-    kept = facts.host.synchronisation()
-    if kept.synchronised:
-        return ok(f"synchronised; {kept.offset_s * 1e6:.0f} us to correct, error at most {kept.error_s * 1e3:.1f} ms")
+    clock = facts.host.synchronisation()
+    if clock.synchronised:
+        return ok(f"synchronised; {clock.offset_s * 1e6:.0f} us to correct, error at most {clock.error_s * 1e3:.1f} ms")
     return warning("not synchronised: CLOCK_REALTIME may be wrong, and steps when it is set")
 
 

@@ -9,7 +9,7 @@ AOT describes a telescope with a Shack-Hartmann or pyramid sensor. A log is mapp
                         is a subaperture with one signal; n_sides is 1 because there is one image
       measurements        not in the file; they are (frame - dark) / flux - reference over the good pixels
       ref_measurements    I0, fraction of the flux
-    Detector            the camera: dark, bad pixels, exposure, and the frames if asked for
+    Detector            the camera: dark, bad pixels, exposure, and the frames if requested
     DeformableMirror    the mirror; actuator positions in m across the pupil, row by row; stroke in each direction
     ControlLoop         one row for each step, in the log's order
       time                end of the exposure, and frame count
