@@ -13,6 +13,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from textual.events import Key
+from textual.geometry import Size
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files import calibration_file, law_file
@@ -300,7 +301,7 @@ def test_a_gain_knob_scales_the_gains_of_all_modes_or_of_one_radial_order(run: L
     operate(run, scenario)
 
 
-def test_a_calibration_with_fewer_modes_leaves_a_knob_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_knob_is_chosen_and_shown_whatever_the_number_of_modes(monkeypatch: pytest.MonkeyPatch) -> None:
     turned: list[Gains.Turned] = []
     knobs = Gains()
     monkeypatch.setattr(knobs, "post_message", turned.append)
@@ -315,6 +316,11 @@ def test_a_calibration_with_fewer_modes_leaves_a_knob_chosen(monkeypatch: pytest
     knobs.turn(1)
     knobs.automatic()
     assert [one.modes for one in turned] == [(2, 3), (2, 3)]
+    monkeypatch.setattr(Gains, "size", Size(60, 5))
+    update(*range(2, 37))
+    for _ in range(8):
+        knobs.choose(1)
+        assert any(line.plain.startswith("▸") for line in knobs._lines[:5]), "scrolled to the chosen one"
 
 
 def test_keys_typed_while_a_form_opens_are_entered_in_it(run: LiveRun) -> None:

@@ -11,8 +11,7 @@ from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, Message, wire
-from lowfc.programs.logs.info import render
-from lowfc.programs.logs.survey import survey
+from lowfc.programs.logs import info, survey
 from tests.support.loops import json_of, lowfc
 from tests.support.mutated_logs import flipped
 
@@ -107,8 +106,8 @@ def test_info_reports_what_was_written(log: Path) -> None:
 
 
 def test_only_the_digest_of_a_run_known_not_to_be_lockstep_has_a_remark(log: Path) -> None:
-    contents = survey(log, digest=True)
-    texts = [render(contents | {"lockstep": lockstep}) for lockstep in (True, None, False)]
+    contents = survey.survey(log, digest=True)
+    texts = [info.render(contents | {"lockstep": lockstep}) for lockstep in (True, None, False)]
     assert ["(not a lockstep run" in text for text in texts] == [False, False, True]
 
 

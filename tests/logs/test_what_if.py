@@ -455,9 +455,8 @@ def test_warnings_name_what_makes_the_results_doubtful() -> None:
 
 
 def test_a_loop_closed_on_refused_frames_only_is_not_called_never_closed() -> None:
-    closed, error_nm = np.arange(40) >= 20, np.full((40, 3), 4.0, np.float32)
-    error_nm[closed] = np.nan
-    run = LoggedRun(history(error_nm=error_nm, mode=np.where(closed, LoopMode.CLOSED, LoopMode.OPEN).astype(np.uint8)))
+    modes = np.repeat(np.array([LoopMode.OPEN, LoopMode.CLOSED], np.uint8), 20)
+    run = LoggedRun(history(error_nm=np.repeat(np.float32([[4] * 3, [np.nan] * 3]), 20, axis=0), mode=modes))
     assert run.rows_to_compare([run.law], run.used)[2] == "no usable frame in closed loop"
 
 

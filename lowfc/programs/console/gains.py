@@ -25,7 +25,7 @@ _PENDING_S = 1.0  # until the controller's state has the requested gain
 
 
 class Gains(Lines):
-    """The knobs. Keys or a click on a bar turn the chosen one; its modes keep their ratios."""
+    """The knobs, scrolled to the chosen one. Keys or a click on a bar turn it; its modes keep their ratios."""
 
     class Turned(Message):
         """A knob was turned: gains requested for these modes; no values request automatic gains."""
@@ -36,7 +36,7 @@ class Gains(Lines):
 
     def __init__(self) -> None:
         super().__init__("gains")
-        self._chosen = 0
+        self._chosen = self._top = 0  # of all knobs; the first one shown
         self._noll: tuple[int, ...] = ()
         self._gain = np.zeros(0, np.float32)
         self._automatic: Mask = np.zeros(0, bool)
@@ -76,8 +76,8 @@ class Gains(Lines):
 
     def on_click(self, event: events.Click) -> None:
         """Choose a knob, and turn it to where its bar was clicked."""
-        if 0 <= event.y < len(groups(self._noll)):
-            self._chosen = event.y
+        if 0 <= event.y < len(groups(self._noll)) - self._top:
+            self._chosen = self._top + event.y
             if _BEFORE <= event.x <= _BEFORE + _BAR:
                 self._request(self._chosen, (event.x - _BEFORE) / _BAR * HIGHEST)
             self._draw()
@@ -115,7 +115,9 @@ class Gains(Lines):
                     (" auto" if self._automatic[indices].all() else "", DIM),
                 )
             )
-        self.show(lines or [Text("gains are not known yet", DIM)])
+        height = self.size.height or len(lines)
+        self._top = min(max(self._top, self._chosen + 1 - height), self._chosen, max(0, len(lines) - height))
+        self.show(lines[self._top :] or [Text("gains are not known yet", DIM)])
 
 
 def groups(noll: Sequence[int]) -> list[tuple[str, tuple[int, ...]]]:

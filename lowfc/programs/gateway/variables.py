@@ -32,8 +32,7 @@ Put = Callable[[Client, Any], Answer]
 class Variable(NamedTuple):
     """A variable; its name, in lower case, follows the gateway's prefix.
 
-    `read` is None for a write-only variable, a request without a reading of its name; `put` is
-    None for a read-only one.
+    `read` is None for a request without a reading of its name, `put` for a reading without a request.
     """
 
     name: str

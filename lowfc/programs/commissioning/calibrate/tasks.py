@@ -85,9 +85,7 @@ def calibrate_with_pokes(request: CalibrationRequest, run: str | None, *, load: 
         except BaseException:
             if calibrator.completed and partial_of(request.out).is_file():
                 cycles = counted(calibrator.completed, "cycle")
-                report(
-                    f"kept in {partial_of(request.out)}: {cycles}; the same command with --resume continues with them"
-                )
+                report(f"kept in {partial_of(request.out)}: {cycles}; the same command with --resume continues")
             raise
     result.not_loaded = load and not result.recommended
     return result

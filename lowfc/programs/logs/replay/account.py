@@ -113,9 +113,8 @@ class Account(Result):
         elif self.other_kernel:
             verdict = f"{frames}, computed by {self.other_kernel}: not the same kernel as the log's"
         elif self.identical:
-            verdict = f"{frames}, commands identical" + (
-                f" within {self.tolerance_nm:g} nm" if self.tolerance_nm else ""
-            )
+            within = f" within {self.tolerance_nm:g} nm" if self.tolerance_nm else ""
+            verdict = f"{frames}, commands identical{within}"
         elif not self.different:
             verdict = f"{frames}, steps identical, but no command is in the log"
         else:

@@ -89,7 +89,7 @@ def _number(text: str) -> int | None:
 def _run(run: Run) -> Results:
     history = run.history
     about = history.log.metadata.get("lowfc", {})
-    first_ns, last_ns = history.span_ns
+    (first_ns, last_ns), simulated = history.span_ns, bool(history.truths.sequence.size)
     calibration, configuration, steps = history.calibration, history.configuration, history.steps
     began = datetime.fromtimestamp(first_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     return {
@@ -97,10 +97,8 @@ def _run(run: Run) -> Results:
         "recorded_s": (last_ns - first_ns) * 1e-9,
         "steps": int(steps.sequence.size),
         "steps_s": float(run.step_s[-1]) if steps.sequence.size else 0.0,
-        "simulated": bool(history.truths.sequence.size),
-        "imperfections": configuration.imperfections
-        if configuration is not None and history.truths.sequence.size
-        else {},
+        "simulated": simulated,
+        "imperfections": configuration.imperfections if configuration is not None and simulated else {},
         "lockstep": configuration.lockstep if configuration is not None else None,
         **{key: about.get(key) for key in _NOT_VERSIONS},
         "versions": {name: value for name, value in about.items() if name not in _NOT_VERSIONS},
