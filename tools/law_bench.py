@@ -225,12 +225,12 @@ def timing_of(config: Configuration) -> Timing:
 def tuned(run: TimeSeries, config: Configuration, kinds: Sequence[str] = ("lqg",)) -> dict[str, Tuned]:
     """Laws of these kinds for pseudo-open-loop modes (frames, modes), all or the first few."""
     noll = config.noll[: run.values[0].shape[1]]
-    rate_hz, none = config.camera.rate_hz, np.zeros(len(noll))
+    rate_hz, leak = config.camera.rate_hz, np.zeros(len(noll))
     timing = timing_of(config)
-    gains, models = best_gains(run, rate_hz, timing, none), identify_modes(run, rate_hz)
+    gains, models = best_gains(run, rate_hz, timing, leak), identify_modes(run, rate_hz)
     makers: dict[str, Callable[[], Tuned]] = {
-        "integrator": lambda: tune_integrator(models, gains, noll, none, timing),
-        "pi-notch": lambda: tune_pi_notch(models, gains, noll, none, timing),
-        "lqg": lambda: tune_lqg(run, models, gains, noll, none, timing),
+        "integrator": lambda: tune_integrator(models, gains, noll, leak, timing),
+        "pi-notch": lambda: tune_pi_notch(models, gains, noll, leak, timing),
+        "lqg": lambda: tune_lqg(run, models, gains, noll, leak, timing),
     }
     return {kind: makers[kind]() for kind in kinds}

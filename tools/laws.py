@@ -70,12 +70,12 @@ def case(config: Configuration) -> Results:
         bench.load(one.law)
         bench.new_record()
         bench.run(SETTLE + MEASURE)
-        S, T = theory_mas(config, calibration, one.law)
+        disturbance_mas, noise_mas = theory_mas(config, calibration, one.law)
         results["laws"][kind] = {
             "got_mas": bench.tilt_mas(MEASURE),
             "predicted_mas": float(np.sqrt(np.mean(one.predicted_nm[:2] ** 2)) / bench.nm_per_mas),
-            "disturbance_mas": S,
-            "noise_mas": T,
+            "disturbance_mas": disturbance_mas,
+            "noise_mas": noise_mas,
             "gain_margin": float(one.margins.gain_margin[:2].min()),
             "phase_margin_deg": float(one.margins.phase_margin_deg[:2].min()),
         }

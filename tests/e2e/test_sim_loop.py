@@ -114,7 +114,7 @@ def test_frame_step_command_and_state_join(topics: dict[str, list[bytes]]) -> No
         assert step.timestamp == command.timestamp
         assert list(step.command_nm) == list(command.command_nm)
         expected, driven = (np.frombuffer(message.actuators, "<f4") for message in (command, state))
-        np.testing.assert_allclose(driven, expected, atol=0.02)  # the driver's steps
+        np.testing.assert_allclose(driven, expected, atol=0.02)  # the driver rounds to its steps
     assert joined > 0.8 * len(steps)
 
 

@@ -30,7 +30,7 @@ MISPLACED = ("shuffled", "repeated", "removed", "swapped", "doubled")
 
 
 def small_samples(frames: int = 40) -> list[Sample]:
-    """Messages of some topics from two starts of their publishers; surfaces and events are rare."""
+    """Messages of some topics from two starts of their publishers; surfaces, Health and events are rare."""
     rng = np.random.default_rng(1)
     made = []
     for number in range(frames):
@@ -155,7 +155,7 @@ _BITS = {
 
 
 def damaged(data: bytes, others: Sequence[bytes], rng: Random) -> bytes:
-    """Bytes with one to eight changes: flipped, overwritten, truncated, repeated, spliced with another input."""
+    """Bytes with one to eight changes: flipped, overwritten, inserted, deleted, repeated, cut off or spliced."""
     changed = bytearray(data)
     for _ in range(1 << rng.randrange(4)):
         at = rng.randrange(len(changed) + 1)
