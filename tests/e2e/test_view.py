@@ -1,4 +1,4 @@
-"""The view with real processes, the real viewer and a real browser, judged by their pixels; its files and errors."""
+"""The view of real processes, in the real viewer and a real browser, by their pixels; saved files, refused options."""
 
 import json
 import os
