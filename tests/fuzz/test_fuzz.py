@@ -1,5 +1,7 @@
 """Every reader of external bytes, with damaged inputs: it raises its errors; it does not crash, hang or grow."""
 
+from contextlib import suppress
+
 import pytest
 
 from tests.support.fuzzing import MAX_GROWTH_BYTES, fuzz, shares
@@ -44,8 +46,9 @@ def test_crashes_and_hangs_of_a_reader_are_found(monkeypatch: pytest.MonkeyPatch
     def read(data: bytes) -> None:
         if data.startswith(b"\xff"):
             raise KeyError(data)
-        while data.startswith(b"\0"):
-            pass
+        with suppress(Exception):  # of a reader that turns every error into an event
+            while data.startswith(b"\0"):
+                pass
 
     found = fuzz(Target("bad", (b"\xff" * 4, b"\0" * 4, b"good"), read), range(60))
     assert found["crashes"]

@@ -24,8 +24,8 @@ MAX_GROWTH_BYTES = 200_000_000
 """Largest permitted growth of the process by one target's inputs."""
 
 
-class HungError(Exception):
-    """An input took longer than `HANG_S`."""
+class HungError(BaseException):
+    """An input took longer than `HANG_S`; no reader catches it as an `Exception`."""
 
 
 def fuzz(target: Target, numbers: range) -> dict[str, Any]:
