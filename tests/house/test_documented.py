@@ -13,11 +13,11 @@ from tools.advice import ADVICE, REASONS
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("client", "device", "optics", "design", "control")
-ARRAYS = re.compile(r"\b(Array|Single|Complex|Integers|Long|Mask|Pixels|ArrayLike)\b")
+ARRAYS = re.compile(r"\b(Array|Single|SingleComplex|Complex|Integers|Long|Mask|Pixels|Sequences|ArrayLike|NDArray)\b")
 SHAPE = re.compile(r"\([\w+*/ .-]+,\)|\([\w+*/ .-]+(, ?[\w+*/ .-]+)+\)|shapes? as|any shape")
 UNIT = re.compile(
     r"\b(nm2?|um|mas|DN|electrons?|e-|ns|s|Hz|rad|deg|waves|frames|diameters|lambda0?|"
-    r"radii|(their|any) unit|without unit|variance|"
+    r"radii|(their|any) unit|without unit|variance|sequence|"
     r"fractions?|factors?|relative|transmissions?|weights|amplitudes?|indices|contrast|0 or 1|1 where|whether)\b"
 )
 
@@ -54,8 +54,7 @@ def test_functions_of_arrays_document_shapes_and_units(package: str) -> None:
     lacking = []
     for name, one, text, above in names(package):
         if isinstance(one, ast.FunctionDef):
-            listed = (*one.args.args, *one.args.kwonlyargs)
-            annotated = [argument for argument in listed if argument.annotation is not None]
+            annotated = [each for each in (*one.args.args, *one.args.kwonlyargs) if each.annotation is not None]
             arrays = [each for each in annotated if ARRAYS.search(ast.unparse(each.annotation))]
             words = f"{text} {above} {' '.join(each.arg.rpartition('_')[2] for each in arrays)}"
             if arrays and not (SHAPE.search(words) and UNIT.search(words)):

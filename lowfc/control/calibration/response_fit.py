@@ -242,13 +242,13 @@ def best_initial(candidates: list[Initial], response: Array, mode: int, variance
 
 
 def cross_talk(reconstructor: npt.NDArray[np.floating], response: npt.NDArray[np.floating]) -> Array:
-    """Cross-talk R H - I (modes, modes) of a reconstructor for a response matrix."""
+    """Cross-talk R H - I (modes, modes), without unit, of R (modes, pixels) and H (pixels, modes)."""
     product = np.asarray(reconstructor, np.float64) @ np.asarray(response, np.float64)
     return np.asarray(product - np.eye(len(product)))
 
 
 def correlation(response: npt.NDArray[np.floating], other: npt.NDArray[np.floating]) -> float:
-    """Correlation of the responses (pixels,) to two pokes: negative if their signs are opposite."""
+    """Correlation of the responses (pixels,), any unit, to two pokes: negative if their signs are opposite."""
     norms = float(np.linalg.norm(response) * np.linalg.norm(other))
     return float(response @ other) / max(norms, 1e-300)
 
