@@ -68,8 +68,11 @@ def _keys(heading: str, about: str, section: type[Section], prefix: str) -> str:
         if isinstance(info.default, Section):
             continue
         default = "required" if info.is_required() else f"`{info.get_default(call_default_factory=True)!r}`"
-        values = [f"`{one}`" for one in get_args(info.annotation) if isinstance(one, str | int)]
-        values += [_bound(str(one)) for one in info.metadata if hasattr(one, "__dataclass_fields__")]
+        kinds = (info.annotation, *get_args(info.annotation))  # a list or a union has further kinds
+        nested = [one for kind in kinds for one in get_args(kind)]
+        bounds = [*info.metadata, *(bound for one in nested for bound in getattr(one, "metadata", ()))]
+        values = [_bound(str(one)) for one in bounds if hasattr(one, "__dataclass_fields__")]
+        values += [f"`{one}`" for one in nested if isinstance(one, str | int)]
         rows.append((f"`{prefix}{key}`", default, ", ".join(values), one_line(descriptions[key])))
     return f"## {heading}\n\n{about}\n\n{markdown(('key', 'default', 'values', ''), rows)}"
 
@@ -155,14 +158,10 @@ def upgrade() -> str:
 def api(package: str) -> str:
     """A package of the Python API: its exported names or, without `__all__`, each of its modules."""
     top = import_module(package)
-    own = [top] if hasattr(top, "__all__") else [*_modules(top)]
-    return "\n".join(_module(module) for module in own)
-
-
-def _modules(package: ModuleType) -> Iterator[ModuleType]:
-    for found in walk_packages(package.__path__, f"{package.__name__}."):
-        if not found.ispkg:
-            yield import_module(found.name)
+    if hasattr(top, "__all__"):
+        return _module(top)
+    names = [found.name for found in walk_packages(top.__path__, f"{package}.") if not found.ispkg]
+    return "\n".join(_module(import_module(name)) for name in names)
 
 
 def _module(module: ModuleType) -> str:
