@@ -375,7 +375,8 @@ def test_an_interrupt_while_a_case_is_prepared_leaves_no_run(tmp_path: Path, mon
 
 
 def test_without_a_case_all_are_listed_and_the_error_of_an_unknown_one_suggests_a_name() -> None:
-    assert all(name in run() for name in CASES)
+    table = run()
+    assert all(name in table for name in CASES)
     assert [one["name"] for one in json.loads(run("--json"))["cases"]] == list(CASES)
     with pytest.raises(ConfigurationError, match="frames-dark"):
         run("--case", "frame-dark")
