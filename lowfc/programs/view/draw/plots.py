@@ -58,7 +58,7 @@ class Plot:
         stream.log(self.path, style, static=True)
 
     def add(self, stream: rr.RecordingStream, times_ns: Long, values: npt.NDArray[np.floating]) -> None:
-        """Add values (rows,) or (rows, curves) in one message; consecutive rows not finite become one row, a gap."""
+        """Add values (rows,) or (rows, curves) in one message; successive rows that are not finite become one gap."""
         if not len(times_ns):
             return
         columns = values.reshape(len(times_ns), -1)
