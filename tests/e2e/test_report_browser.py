@@ -1,4 +1,4 @@
-"""The report in a real browser: what the browser displays, complains of and fetches."""
+"""The report in a real browser: what the browser displays, logs as errors and fetches."""
 
 import json
 from collections.abc import Iterator

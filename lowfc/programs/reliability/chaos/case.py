@@ -13,6 +13,7 @@ from lowfc.programs.reliability.chaos.bench import ChaosBench
 Act = Callable[[ChaosBench], None]
 
 LOST = ("MESSAGES_LOST", "MIRROR_LOST")
+"""Events of the level ERROR that many faults may cause."""
 WHILE_FRAMES = 250  # frames that a state lasts
 
 
