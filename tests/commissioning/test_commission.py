@@ -254,9 +254,7 @@ def test_a_resumed_commissioning_continues_and_reports_an_operator_who_opens_the
     assert (state.mode, state.calibration_id) == (wire.LOOP_MODE_OPEN, calibration_file.load(bench.out).id)
 
 
-def test_a_failed_commissioning_restores_the_previous_calibration(
-    commissioned: tuple[Bench, dict[str, Any]],
-) -> None:
+def test_a_failed_commissioning_restores_the_previous_calibration(commissioned: tuple[Bench, dict[str, Any]]) -> None:
     bench, _ = commissioned
     before = bench.loop.calibration().id
     partial_of(bench.out).touch()

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from lowfc.contract.events import EVENTS
-from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, wire
+from lowfc.contract.messages import CAMERA_STATE, CONTROLLER_STATE, EVENT, FRAME, wire
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.control.loop.wording import CAMERA_MISFIT
 from lowfc.programs.view.panels.tiles import FILL, GROUND, HEIGHT, TILES, WIDTH, Tiles, picture, png, tile_boxes
@@ -226,6 +226,13 @@ def test_few_unused_frames_are_reported_for_five_seconds_without_a_warning() -> 
     assert verdict.headline.startswith("2 frames lost in the last 5 s")
     assert tile(stage.run(2.5), "FRAMES").value == "2 LOST"
     assert tile(stage.run(3), "FRAMES").detail == "none lost, none refused"
+
+
+def test_incidents_of_a_slow_camera_are_shown_for_ten_frame_periods() -> None:
+    stage = begun(3)
+    stage.send(CAMERA_STATE, wire.CameraState(period_ns=2_000_000_000))
+    counting(skipped=2)(stage)
+    assert tile(stage.run(8), "FRAMES").detail == "2 frames skipped in the last 20 s"
 
 
 def test_a_camera_restart_does_not_change_the_frame_rate() -> None:

@@ -25,11 +25,7 @@ STAGE_DURATIONS = Plot(
 COUNTS = Plot(
     "latency/frames",
     "Frames skipped and missing, messages lost, since the start",
-    {
-        "skipped: a newer one was waiting": ORANGE,
-        "missing: never arrived": RED,
-        "messages lost by the recorder": GREY,
-    },
+    {"skipped: a newer one was waiting": ORANGE, "missing: never arrived": RED, "messages lost by the recorder": GREY},
 )
 WINDOW_NS = 1_000_000_000
 BINS = 40

@@ -19,7 +19,6 @@ DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
 times larger; more than twice is not the calibrated star."""
 HEALTH_OVERDUE_S = 4.0
 """Time without a frame after which a camera is known to run unless it is silent: a dead one is silent by then."""
-LATELY = f"in the last {RECENT_S:g} s"
 
 REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.DARK: ("too dark", "the star is gone; check pointing, shutter and clouds"),
@@ -74,17 +73,17 @@ def _rate(state: RunState, nominal_hz: float) -> Tile:
     unused = {"skipped": state.recent["skipped"], "never arrived": state.recent["missing"]}
     unused["refused"] = sum(state.recent[reason] for reason in REFUSED)
     few = ", ".join(f"{counted(count, 'frame')} {what}" for what, count in unused.items() if count)
-    detail = f"{few} {LATELY}" if few else "none lost, none refused"
+    detail = f"{few} {state.lately}" if few else "none lost, none refused"
     return tile(value, f"{detail}{', simulated time' if state.simulated else ''}", Level.GOOD)
 
 
 def _lost(state: RunState, lost: int, due: float) -> Tile:
     kinds = {"skipped (controller busy)": state.recent["skipped"], "never arrived": state.recent["missing"]}
     named = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
-    advice = f"{counted(lost, 'frame')} lost {LATELY}, {100 * lost / due:.2g} %: {named}. "
+    advice = f"{counted(lost, 'frame')} lost {state.lately}, {100 * lost / due:.2g} %: {named}. "
     level = Level.BAD if lost > MANY_LOST * due else Level.WARNING if lost >= FEW * due else Level.NEUTRAL
     advice += "Free the host's processors or lower the rate."
-    return Tile("FRAMES", f"{lost} LOST", f"{named}, {LATELY}", level, advice)
+    return Tile("FRAMES", f"{lost} LOST", f"{named}, {state.lately}", level, advice)
 
 
 def _refused(state: RunState, due: float) -> Tile:
@@ -94,9 +93,11 @@ def _refused(state: RunState, due: float) -> Tile:
     if all_are:
         advice = f"Every frame is refused, {word}: {advised}. The mirror holds."
         return Tile("FRAMES", "REFUSED", f"all: {word}", Level.BAD, advice)
-    advice = f"{counted(refused, 'frame')} refused {LATELY}, {word}: {advised if state.now[most] else 'it has ended'}."
+    advice = (
+        f"{counted(refused, 'frame')} refused {state.lately}, {word}: {advised if state.now[most] else 'it has ended'}."
+    )
     level = Level.WARNING if refused >= FEW * due else Level.NEUTRAL
-    return Tile("FRAMES", f"{refused} REFUSED", f"{word}, {LATELY}", level, advice)
+    return Tile("FRAMES", f"{refused} REFUSED", f"{word}, {state.lately}", level, advice)
 
 
 def star(state: RunState) -> Tile:

@@ -14,6 +14,8 @@ NOW_S = 1.0
 """Length of "now": long enough for an rms of vibrations, short enough to show the effect of an operator's action."""
 RECENT_S = 5.0
 """Time for which an incident stays visible, so that an operator notices it."""
+PERIODS = 10
+"""Minimum length of each time span of the verdict, in frame periods, for slow cameras."""
 GRACE_S = 10.0
 """Time for processes to start, after which an absent one is reported."""
 OTHER_CLOCK_NS = 3_600_000_000_000
@@ -64,7 +66,7 @@ class RunState:
         controller, camera, mirror, recorder: liveness of the processes; with several mirrors that of the worst.
         frame_silent_s, step_silent_s: time without a frame or step; None up to 1 s, or ten frame periods if longer.
         recent, now, totals: counts of each reason, of "steps", and of "skipped", "missing", "late" and "lost", in
-            `RECENT_S`, in `NOW_S` and since the start.
+            `RECENT_S`, in `NOW_S` (both at least `PERIODS` frame periods) and since the start.
         flux: light on the newest frame as a fraction of the calibration's; None without both.
         saturated: number of good pixels at full well in the newest frame.
         wavefront: rms of the last second; once the controller was stopped, of its last second with a step. `latest` is
@@ -98,6 +100,11 @@ class RunState:
     latency_us: tuple[float, float] | None = None
     mirror_state: wire.MirrorState | None = None
     note: Log | None = None
+
+    @property
+    def lately(self) -> str:
+        """The time span of `recent` in words."""
+        return f"in the last {max(RECENT_S, PERIODS * self.snapshot.period_ns * 1e-9):g} s"
 
     @property
     def simulated(self) -> bool:

@@ -14,9 +14,9 @@ from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.safety import REASONS, Limit, LoopMode, Reason
 from lowfc.control.loop.wording import CAMERA_MISFIT, counted
-from lowfc.programs.view.verdicts.camera_verdict import LATELY, all_refused, frames, star
+from lowfc.programs.view.verdicts.camera_verdict import all_refused, frames, star
 from lowfc.programs.view.verdicts.facts import facts
-from lowfc.programs.view.verdicts.run_state import RECENT_S, Liveness, RunState
+from lowfc.programs.view.verdicts.run_state import Liveness, RunState
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, absent, duration, rounded, short, worst_of
 from lowfc.programs.view.verdicts.wavefront_verdict import WORSE, contrast, wavefront
 
@@ -160,7 +160,7 @@ def _mirror(state: RunState) -> Tile:
     own = [words for reason, words in LIMITS.items() if reason.value in reported.limits_hit]
     if acting or own:
         words = ", ".join(acting or own)
-        how = f"{counted(max(acting.values()), 'time')} {LATELY}" if acting else "by its own limits"
+        how = f"{counted(max(acting.values()), 'time')} {state.lately}" if acting else "by its own limits"
         often = max(state.now[reason] for reason in LIMITS) > LIMITED * max(1, state.now["steps"])
         advice = (
             f"The mirror is at a limit ({words}), {how}: the disturbance is too large or the gain too high. "
@@ -202,7 +202,7 @@ def _latency(state: RunState) -> Tile:
             f"{counted(late, 'command')}, {100 * share:.2g} %, came after the start of the next exposure: "
             "the delay is longer than the loop is tuned for. Free the host's processors or lower the rate."
         )
-        what = f"{'command' if late == 1 else 'commands'} in {RECENT_S:g} s; {value}, {detail}"
+        what = f"{'command' if late == 1 else 'commands'} {state.lately}; {value}, {detail}"
         return tile(f"{late} LATE", what, Level.WARNING, advice)
     if 0 < state.snapshot.period_ns < state.latency_us[1] * 1e3:
         advice = f"1 command in 100 takes over {p99} us, longer than a frame. Free the host or lower the rate."
@@ -232,8 +232,8 @@ def _recorder(state: RunState) -> Tile:
         return tile("STOPPED", f"not recording since {log} was finished", Level.WARNING, advice)
     if state.recent["lost"]:
         messages = counted(state.recent["lost"], "message")
-        advice = f"The recorder lost {messages} {LATELY}: disk or processor is too slow."
-        return tile("LOSING", f"{messages} in {RECENT_S:g} s, {done.lost} in all", Level.BAD, advice)
+        advice = f"The recorder lost {messages} {state.lately}: disk or processor is too slow."
+        return tile("LOSING", f"{messages} {state.lately}, {done.lost} in all", Level.BAD, advice)
     if not done.file:
         return tile("WAITING", "no log yet")
     losses = f"{counted(done.lost, 'message')} lost" if done.lost else "nothing lost"

@@ -17,7 +17,7 @@ from lowfc.control.loop.estimator import saturated_pixels
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.launch.watch import topic_count
 from lowfc.programs.view.snapshot import Accumulator, Snapshot, Wavefronts
-from lowfc.programs.view.verdicts.run_state import NOW_S, RECENT_S, Counts, Liveness, Process, Rms, RunState
+from lowfc.programs.view.verdicts.run_state import NOW_S, PERIODS, RECENT_S, Counts, Liveness, Process, Rms, RunState
 from lowfc.programs.view.verdicts.steady import ResidualComparison, Steady, compare_with_best_gains
 
 LATEST_S = 0.3
@@ -27,9 +27,6 @@ SILENT_S = 2.0
 """Time without a message after which a process counts as silent: four Healths, which are sent twice a second."""
 FRAMES_SILENT_S = 1.0
 """Time without a frame or a step after which it is reported as missing, but at least `PERIODS` frame periods."""
-PERIODS = 10
-"""Minimum length of the time spans above and of `NOW_S`, in frame periods, for slow cameras; samples are kept for
-`RECENT_S` and this number of periods."""
 COMPARISON_PERIOD_NS = 30_000_000_000
 """Time between two computations of the best gains, which take 0.3 s for 14 modes."""
 _SAMPLES = 1000
