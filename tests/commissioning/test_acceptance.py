@@ -161,7 +161,8 @@ def test_the_capture_range_ends_at_the_modal_limit_or_the_sensor_range(
     assert (mode.captured_nm, mode.lost_nm, mode.limits) == (captured_nm, lost_nm, limits)
     assert found.passed == (captured_nm >= tilt_nm)
     assert all(name in found.text() for name in limits)
-    assert lost_nm or drawn(capture, found).startswith(b"\x89PNG")
+    if lost_nm is None:
+        assert drawn(capture, found).startswith(b"\x89PNG")
     assert not capture.judge(trials[:1], config).passed
 
 

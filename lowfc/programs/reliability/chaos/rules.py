@@ -74,7 +74,7 @@ def _limits(outcome: Outcome, evidence: Evidence) -> Finding:
 
 
 def _violations(what: str, limits: Limits, shapes: list[Entry], moving: Mask) -> Iterator[str]:
-    """Limits that shapes violate, without fixed actuators; a gap of n in the sequence allows n + 1 slew steps."""
+    """Limits that shapes violate at the `moving` actuators; a gap of n in the sequence allows n + 1 slew steps."""
     if not shapes:
         return
     surface = np.array([shape.actuators_nm for shape in shapes], np.float64)
