@@ -27,16 +27,16 @@ def handshake(server: Path, client: Path, role: str, name: str = "localhost") ->
     Raises:
         ssl.SSLError: one of them does not accept the other.
     """
-    theirs, ours = (ssl.SSLContext(kind) for kind in (ssl.PROTOCOL_TLS_SERVER, ssl.PROTOCOL_TLS_CLIENT))
-    theirs.verify_mode = ssl.CERT_REQUIRED
-    theirs.load_verify_locations(server / "ca.pem")
-    theirs.load_cert_chain(server / "router.pem", server / "router.key")
-    ours.load_verify_locations(client / "ca.pem")
-    ours.load_cert_chain(client / f"{role}.pem", client / f"{role}.key")
+    server_context, client_context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    server_context.verify_mode = ssl.CERT_REQUIRED
+    server_context.load_verify_locations(server / "ca.pem")
+    server_context.load_cert_chain(server / "router.pem", server / "router.key")
+    client_context.load_verify_locations(client / "ca.pem")
+    client_context.load_cert_chain(client / f"{role}.pem", client / f"{role}.key")
     to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
     ends = [
-        theirs.wrap_bio(to_server, to_client, server_side=True),
-        ours.wrap_bio(to_client, to_server, server_hostname=name),
+        server_context.wrap_bio(to_server, to_client, server_side=True),
+        client_context.wrap_bio(to_client, to_server, server_hostname=name),
     ]
     for _ in range(10):
         for end in ends:

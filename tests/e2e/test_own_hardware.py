@@ -80,10 +80,10 @@ def listening() -> closing[ZenohBus]:
 
 def wait_for_devices(bus: ZenohBus) -> None:
     """Wait for the first frame and the first state of the mirror."""
-    there: set[str] = set()
+    received: set[str] = set()
     for topic in (FRAME, MIRROR_STATE):
-        bus.subscribe(topic, lambda sample: there.add(sample.key))
-    until(lambda: len(there) == 2)
+        bus.subscribe(topic, lambda sample: received.add(sample.key))
+    until(lambda: len(received) == 2)
 
 
 def conformance(folder: Path, *commands: str) -> None:

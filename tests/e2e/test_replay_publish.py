@@ -126,13 +126,13 @@ def test_a_truncated_log_is_published_faster_and_with_commands(log: Path, run: R
     cut = tmp_path / "cut.mcap.part"
     content = log.read_bytes()
     cut.write_bytes(content[: len(content) * 2 // 3])
-    there = defaultdict(list)
+    recorded = defaultdict(list)
     for message in LogReader(cut):
-        there[message.key].append(message.payload)
-    assert len(there[COMMAND.at("dm")]) > 20
+        recorded[message.key].append(message.payload)
+    assert len(recorded[COMMAND.at("dm")]) > 20
     results = results_of(start(cut, run, "--speed", "4", "--topics", "/lowfc/mirror/*", "--allow-commands"))
     for key in (COMMAND.at("dm"), MIRROR_STATE.at("dm")):
-        assert [sample.payload for sample in tool.received[key]] == there[key]
+        assert [sample.payload for sample in tool.received[key]] == recorded[key]
     others = {HEALTH.at("replay"), EVENT.key, COMMAND.at("dm"), MIRROR_STATE.at("dm")}
     assert {key for key in tool.received if tool.received[key]} <= others
     assert not results["finished"]

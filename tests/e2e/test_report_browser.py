@@ -115,8 +115,8 @@ def test_the_pictures_are_visible_in_light_and_dark_mode(
     assert shown.shape == (seen["height"], WIDTH, 3)
     paper = float(shown[2, 2].mean())
     assert (paper < 40) == (scheme == "dark")
-    for name, (left, top, width, tall) in seen["pictures"].items():
-        region = shown[int(top) : int(top + tall), int(left) : int(left + width)]
+    for name, (left, top, width, height) in seen["pictures"].items():
+        region = shown[int(top) : int(top + height), int(left) : int(left + width)]
         brightness = region.mean(axis=2, dtype=np.float32)
         # Lines and letters cover a part of the picture, in contrast to the background.
         drawn = np.abs(brightness - paper) > 60

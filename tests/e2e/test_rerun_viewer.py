@@ -77,9 +77,9 @@ def test_a_headless_viewer_is_reached_from_this_host_only(headless: RerunViewer)
 
 
 def test_a_page_is_reached_from_this_host_only(web: RerunViewer) -> None:
-    theirs = listening(web.pid)
-    assert {host for host, _ in theirs} == {"127.0.0.1"}
-    assert web.port in {port for _, port in theirs}
+    sockets = listening(web.pid)
+    assert {host for host, _ in sockets} == {"127.0.0.1"}
+    assert web.port in {port for _, port in sockets}
     assert ("127.0.0.1", web.web_port) in listening(os.getpid())
 
 

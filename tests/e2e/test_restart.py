@@ -39,7 +39,7 @@ class ManualRun:
         self.run = open_run(self.run_id)
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         self.steps = 0
-        self.closed = 0
+        self.good_frames = 0
         self.reasons: list[wire.Reason] = []
         self.shapes: list[np.ndarray] = []
         shared = ["--run", self.run_id, "--config", str(folder / "test.toml")]
@@ -57,7 +57,7 @@ class ManualRun:
         self.steps += 1
         self.reasons = list(step.reasons)
         good = step.mode == wire.LOOP_MODE_CLOSED and not step.reasons
-        self.closed = self.closed + 1 if good and np.abs(step.error_nm).max() < 3 else 0
+        self.good_frames = self.good_frames + 1 if good and np.abs(step.error_nm).max() < 3 else 0
 
     def _shape(self, sample: Sample) -> None:
         self.shapes.append(np.frombuffer(wire.MirrorState.FromString(sample.payload).actuators, "<f4"))
@@ -71,8 +71,8 @@ class ManualRun:
 
     def wait_until_settled(self) -> None:
         """Wait for more than 20 consecutive good frames: loop closed, no reason, error below 3 nm."""
-        self.closed = 0
-        until(lambda: self.closed > 20)
+        self.good_frames = 0
+        until(lambda: self.good_frames > 20)
 
     def stop(self) -> None:
         for process in self.running.values():

@@ -78,9 +78,9 @@ def chaos(
 
 def _require_writable(folder: Path) -> None:
     """Check before the first case that logs can be kept in a folder, which may not exist yet."""
-    there = existing(folder)
-    if not there.is_dir() or not os.access(there, os.W_OK):
-        raise DataFileError(f"no logs can be kept in {folder}: {there} is no writable folder; name another with --keep")
+    found = existing(folder)
+    if not found.is_dir() or not os.access(found, os.W_OK):
+        raise DataFileError(f"no logs can be kept in {folder}: {found} is no writable folder; name another with --keep")
 
 
 def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:

@@ -25,9 +25,9 @@ WHITE: Colour = (235, 235, 240)
 
 
 def _table(*anchors: Colour) -> Rgb:
-    places = np.linspace(0, 1, len(anchors))
+    positions = np.linspace(0, 1, len(anchors))
     levels = np.linspace(0, 1, _LEVELS)
-    return np.stack([np.interp(levels, places, channel) for channel in zip(*anchors, strict=True)], axis=1).astype(
+    return np.stack([np.interp(levels, positions, channel) for channel in zip(*anchors, strict=True)], axis=1).astype(
         np.uint8
     )
 

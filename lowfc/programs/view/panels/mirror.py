@@ -44,9 +44,9 @@ class Mirror(Panel):
         limited = largest >= _NEAR
         if limited or self._limited:
             rows, columns = np.nonzero(np.abs(surface_nm) >= _NEAR * stroke_nm)
-            places = np.stack([columns + 0.5, rows + 0.5], axis=1)
+            positions = np.stack([columns + 0.5, rows + 0.5], axis=1)
             at(stream, snapshot.time_ns)
-            stream.log(f"{COMMAND}/at_limit", rr.Points2D(places, radii=0.3, colors=[YELLOW]))
+            stream.log(f"{COMMAND}/at_limit", rr.Points2D(positions, radii=0.3, colors=[YELLOW]))
         self._limited = limited
         if snapshot.complete:
             STROKE.add_one(stream, snapshot.time_ns, 100 * largest)

@@ -66,8 +66,8 @@ class Science(Panel):
         outlines = rr.LineStrips2D(lines, colors=[GREY], radii=rr.Radius.ui_points(0.7))
         stream.log(f"{IMAGE}/outlines", outlines, static=True)
         decades = range(_DARKEST, _BRIGHTEST + 1)
-        places = [(_WIDTH + 12, _SAMPLES * (1 - float(_share(decade))) - _LABEL) for decade in decades]
-        stream.log(f"{IMAGE}/scale", labels(places, [f"1e{decade}" for decade in decades]), static=True)
+        positions = [(_WIDTH + 12, _SAMPLES * (1 - float(_share(decade))) - _LABEL) for decade in decades]
+        stream.log(f"{IMAGE}/scale", labels(positions, [f"1e{decade}" for decade in decades]), static=True)
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
         """Keep the newest wavefront; draw when due."""
@@ -101,8 +101,8 @@ class Science(Panel):
             CONTRAST.name(stream, dict(zip((*_NAMES[source], "flat wavefront"), (GREY, GREEN, BLUE), strict=True)))
         self._picture.show(stream, time_ns, _side_by_side(*images))
         captions = [f"{title}: {mean:.1e}" for title, mean in zip(("now", "flat mirror"), means, strict=True)]
-        places = [(start + _SAMPLES / 2, -_LABEL - _GAP) for start in (0, _SECOND)]
-        stream.log(f"{IMAGE}/captions", labels(places, captions))
+        positions = [(start + _SAMPLES / 2, -_LABEL - _GAP) for start in (0, _SECOND)]
+        stream.log(f"{IMAGE}/captions", labels(positions, captions))
         CONTRAST.add_one(stream, time_ns, *np.log10([*reversed(means), self._flat]))
 
 

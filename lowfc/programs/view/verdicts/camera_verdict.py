@@ -88,14 +88,13 @@ def _lost(state: RunState, lost: int, due: float) -> Tile:
 
 def _refused(state: RunState, due: float) -> Tile:
     all_are, refused = all_refused(state, _FRAME_REASONS), sum(state.recent[reason] for reason in _FRAME_REASONS)
-    most = max(_FRAME_REASONS, key=lambda reason: (state.now if all_are else state.recent)[reason])
-    word, advised = REFUSED[most]
+    commonest = max(_FRAME_REASONS, key=lambda reason: (state.now if all_are else state.recent)[reason])
+    word, advised = REFUSED[commonest]
     if all_are:
         advice = f"Every frame is refused, {word}: {advised}. The mirror holds."
         return Tile("FRAMES", "REFUSED", f"all: {word}", Level.BAD, advice)
-    advice = (
-        f"{counted(refused, 'frame')} refused {state.lately}, {word}: {advised if state.now[most] else 'it has ended'}."
-    )
+    remedy = advised if state.now[commonest] else "it has ended"
+    advice = f"{counted(refused, 'frame')} refused {state.lately}, {word}: {remedy}."
     level = Level.WARNING if refused >= FEW * due else Level.NEUTRAL
     return Tile("FRAMES", f"{refused} REFUSED", f"{word}, {state.lately}", level, advice)
 

@@ -48,9 +48,9 @@ def _run(snapshot: Snapshot) -> str:
 
 
 def _offset(values_nm: list[float], noll: tuple[int, ...]) -> str:
-    places = np.flatnonzero(values_nm)
-    if not places.size:
+    indices = np.flatnonzero(values_nm)
+    if not indices.size:
         return "no offset"
-    if len(noll) != len(values_nm) or len(places) > _MAX_NAMED:
-        return f"offset {np.linalg.norm(values_nm):.3g} nm rms, {counted(len(places), 'mode')}"
-    return f"offset {', '.join(f'{mode_name(noll[place])} {values_nm[place]:.3g}' for place in places)} nm"
+    if len(noll) != len(values_nm) or len(indices) > _MAX_NAMED:
+        return f"offset {np.linalg.norm(values_nm):.3g} nm rms, {counted(len(indices), 'mode')}"
+    return f"offset {', '.join(f'{mode_name(noll[index])} {values_nm[index]:.3g}' for index in indices)} nm"

@@ -122,8 +122,8 @@ class LogVerdict:
         if not self._latency.count:
             return Tile("LATENCY", "?", "not measured")
         tile, durations_ns = partial(Tile, "LATENCY"), self._latency.percentiles_ns(0.5, 0.99, 1.0)
-        p50, p99, most = (f"{rounded(ns / 1e3)} us" for ns in durations_ns)
-        detail = f"frame to command; 1 in 100 over {p99}, at most {most}"
+        p50, p99, largest = (f"{rounded(ns / 1e3)} us" for ns in durations_ns)
+        detail = f"frame to command; 1 in 100 over {p99}, at most {largest}"
         if state.simulated:
             return tile(p50, f"{detail}; without effect in simulated time")
         late, share = state.totals["late"], state.totals["late"] / max(1, state.totals["steps"])

@@ -263,7 +263,7 @@ def _squares(snapshot: Snapshot, wavefronts: Wavefronts) -> Array:
     Tip and tilt are 0 if the calibration's modes are not those of the rows.
     """
     noll = snapshot.noll if len(snapshot.noll) == wavefronts.residual_nm.shape[1] else ()
-    tilts = [place for place, index in enumerate(noll) if index in TIP_TILT]
+    tilts = [column for column, index in enumerate(noll) if index in TIP_TILT]
     tilt_nm2 = [
         np.square(one[:, tilts], dtype=float).sum() / max(1, len(tilts))
         for one in (wavefronts.residual_rms_nm, wavefronts.open_rms_nm)
