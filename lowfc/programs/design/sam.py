@@ -26,7 +26,7 @@ from lowfc.design.sam_search import BLOCK, Chain, advance, holes, start
 from lowfc.optics.chain.sam import Layout
 from lowfc.programs.design.options import command_line
 from lowfc.programs.design.sam_executors import is_lost
-from lowfc.programs.design.sam_files import Point, front, write_front, write_layouts, write_plot, write_state
+from lowfc.programs.design.sam_files import FoundLayout, front, write_front, write_layouts, write_plot, write_state
 from lowfc.programs.design.sam_request import Search
 
 STATE_PERIOD_S = 10.0
@@ -85,7 +85,7 @@ def design_sam(
                 console.print(_NOTHING, highlight=False)
             if not interrupted or advice == _NOTHING:
                 raise
-    points = [point_of(search, chain) for chain in chains if chain.step]
+    points = [found_layout(search, chain) for chain in chains if chain.step]
     best = front(points) if search.sweeps else [min(points, key=lambda point: point.merit)]
     command = command_line("lowfc design sam", search)
     write_layouts(out, best, search, command)
@@ -149,7 +149,7 @@ def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
     return advance(_optics(search.focal_masks), search.goal_of(chain.index), search.bounds, chain)
 
 
-def point_of(search: Search, chain: Chain) -> Point:
+def found_layout(search: Search, chain: Chain) -> FoundLayout:
     """The best layout of a chain, with its predictions."""
     found = holes(chain.best, search.bounds.symmetry)
     name = f"{search.name}_{chain.index}" if search.sweeps else search.name
@@ -158,7 +158,7 @@ def point_of(search: Search, chain: Chain) -> Point:
     masks = " and ".join(search.focal_masks)
     purpose = f"{_described(found)}: merit {goal.merit}{weight}, focal-plane mask {masks}"
     predicted = _predictions(search.focal_masks[0], found)
-    return Point(
+    return FoundLayout(
         Layout(name, purpose, found),
         chain.best_merit,
         predicted["table3_waves"][goal.estimator][str(goal.modes)],
@@ -167,7 +167,7 @@ def point_of(search: Search, chain: Chain) -> Point:
     )
 
 
-def summary(point: Point) -> dict[str, Any]:
+def summary(point: FoundLayout) -> dict[str, Any]:
     """A layout and its predictions, for JSON."""
     return {
         "name": point.layout.name,

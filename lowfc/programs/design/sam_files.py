@@ -23,8 +23,8 @@ UNITS = "pupil diameters, origin at the pupil centre, x to the right (columns), 
 
 
 @dataclass(frozen=True)
-class Point:
-    """A layout and its predictions for Tables 3 and 4."""
+class FoundLayout:
+    """A layout that a search found, with its merit, its predictions for Tables 3 and 4, and its throughput."""
 
     layout: Layout
     merit: float
@@ -77,7 +77,7 @@ def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
     return search, chains
 
 
-def write_layouts(path: Path, points: Sequence[Point], search: Search, command: str) -> None:
+def write_layouts(path: Path, points: Sequence[FoundLayout], search: Search, command: str) -> None:
     """Write layouts in the format that the loop reads, each with the command that found it."""
     entries = {point.layout.name: _entry(point, search, command) for point in points}
     content = json.dumps({"units": UNITS, "layouts": entries}, indent=1) + "\n"
@@ -86,7 +86,7 @@ def write_layouts(path: Path, points: Sequence[Point], search: Search, command: 
     write_whole(path, content.encode())
 
 
-def write_front(path: Path, points: Sequence[Point]) -> None:
+def write_front(path: Path, points: Sequence[FoundLayout]) -> None:
     """Write a table of the points (CSV); points on the front are marked."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -98,7 +98,7 @@ def write_front(path: Path, points: Sequence[Point]) -> None:
     write_whole(path, text.getvalue().encode())
 
 
-def write_plot(path: Path, points: Sequence[Point], search: Search) -> None:
+def write_plot(path: Path, points: Sequence[FoundLayout], search: Search) -> None:
     """Plot the points and the paper's result (PNG)."""
     figure = figure_class()(figsize=(6.4, 4.8), layout="constrained")
     axes = figure.subplots()
@@ -113,7 +113,7 @@ def write_plot(path: Path, points: Sequence[Point], search: Search) -> None:
     write_whole(path, png(figure, 150))
 
 
-def front(points: Sequence[Point]) -> list[Point]:
+def front(points: Sequence[FoundLayout]) -> list[FoundLayout]:
     """The Pareto front: all points but those beaten in one table by a point that is at least as good in the other."""
     return [
         point
@@ -132,7 +132,7 @@ def _as_tuple(value: Any) -> Any:
     return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
 
 
-def _entry(point: Point, search: Search, command: str) -> dict[str, Any]:
+def _entry(point: FoundLayout, search: Search, command: str) -> dict[str, Any]:
     layout = point.layout
     diameters = sorted({hole[2] for hole in layout.holes})
     entry: dict[str, Any] = {
