@@ -288,7 +288,10 @@ def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[Pendin
 
 
 def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
-    """Change the loop mode; probe sequence, steps and return to zero of the previous mode end."""
+    """Change the loop mode; probe sequence, steps and return to zero of the previous mode end.
+
+    Safe mode removes the channels except the flat map and `EXTERNAL`; a law fades in when the loop closes.
+    """
     loop = state.loop
     if loop is not None and mode is not state.mode:
         loop = loop.stopped(state.frame_sequence)
