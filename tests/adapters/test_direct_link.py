@@ -52,8 +52,7 @@ class Ends:
     def until_direct_only(self, publisher: ZenohPublisher) -> None:
         """Publish until messages arrive over the direct link only."""
         until(
-            lambda: self.threads[-5:] == ["direct-link"] * 5 and len(self.threads) > 20,
-            each=lambda: publisher.put(b""),
+            lambda: self.threads[-5:] == ["direct-link"] * 5 and len(self.threads) > 20, each=lambda: publisher.put(b"")
         )
         del self.received[:-1], self.threads[:], self.sizes[:]
 

@@ -133,13 +133,8 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
     assert "· not recording ·" in first(recorder=wire.Health(state="stopped"))
     assert first(controller=wire.Health()).startswith("closed · no frame used in the last second · 0 frames lost ·")
     assert first(camera=wire.Health(), recorder=wire.Health()).endswith(" · no warning")
-    for name, word in (
-        ("pause", "paused"),
-        ("open", "open"),
-        ("pause", "open"),  # it was open already
-        ("close", "closed"),
-        ("safe", "in safe mode"),
-    ):
+    words = ("paused", "open", "open", "closed", "in safe mode")  # a second `pause` finds the loop open already
+    for name, word in zip(("pause", "open", "pause", "close", "safe"), words, strict=True):
         state, (outputs,) = feed(USUAL, state, Request((START + 2) * SECOND, name))
         assert outputs.reply.accepted
         assert first().startswith(f"{word} ·")

@@ -56,11 +56,7 @@ def test_everything_is_recorded_verbatim(bench: Bench) -> None:
     final = [wire.Health.FromString(m.payload) for m in messages if m.key == HEALTH.at("camera")][-1]
     assert final.state == "stopped"
     assert bench.camera.last_health["recorder"].recording == wire.Recording(
-        file=str(path),
-        messages=len(messages),
-        bytes=path.stat().st_size,
-        files=[str(path)],
-        folder=str(Path.cwd()),
+        file=str(path), messages=len(messages), bytes=path.stat().st_size, files=[str(path)], folder=str(Path.cwd())
     )
 
 

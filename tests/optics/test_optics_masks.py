@@ -8,10 +8,12 @@ import pytest
 
 from lowfc.adapters.files.layouts import layout_names, layout_warnings, load_layout
 from lowfc.adapters.files.sensors import coronagraph_from, load_pupil, sensor_from
+from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.sections import SensorSection
 from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge
 from lowfc.optics.chain.sam import Layout, check, equal_holes, is_even_symmetric, transmission
+from lowfc.programs.core.start_up import check_files
 
 TWO = {"purpose": "two holes", "hole_diameter": 0.1, "holes": [[0.1, 0.2], [-0.3, 0.0]]}
 
@@ -119,13 +121,15 @@ def test_errors_of_damaged_layout_files_have_their_path(tmp_path, content, messa
     assert str(path) in str(caught.value)
 
 
-def test_missing_files_and_misspelt_names():
+def test_missing_files_misspelt_names_and_impossible_values():
     with pytest.raises(DataFileError, match=r"no layout file nowhere\.json"):
         load_layout("nowhere.json")
     with pytest.raises(ConfigurationError, match="did you mean 'sam27d07_bal14'"):
         load_layout("sam27d07_ball4")
     with pytest.raises(ConfigurationError, match="wavelength"):
         sensor_from(wavelength_nm=-1.0)
+    with pytest.raises(ConfigurationError, match=r"lyot_stop = 0\.001: no sample"):
+        check_files(load(None, {"sensor.pupil": "circle", "sensor.lyot_stop": 0.001}))
 
 
 def test_the_dark_zone_of_a_pupil_file_is_that_of_its_request(tmp_path):

@@ -163,6 +163,7 @@ def test_misspelt_sensor_name_gets_a_suggestion():
     ("keys", "complaint"),
     [
         ({"pupil": "prolat"}, "did you mean 'prolate'"),
+        ({"pupil": "prolate", "focal_radius": 7.5}, "at most 7 for a prolate pupil"),
         ({"kind": "clowfs", "inner_radius": 4.0}, r"inner_radius, 4\.0 lambda/D, must be below"),
         ({"kind": "clowfs", "inner_radius": 3.9999}, "thinner than the sampling"),
         ({"kind": "clowfs", "defocus_mm": 1.0, "focal_ratio": 100.0}, "increase the distance"),

@@ -346,6 +346,8 @@ def test_fitting_shear_and_background_removes_their_bias(name, noise_factor):
     assert noise_factor[0] < shear_noise_nm[0] / noise_nm[0] < noise_factor[1]
 
 
-def test_saturating_star_is_refused():
+def test_saturating_star_and_no_light_are_refused():
     with pytest.raises(CalibrationError, match=r"the star saturates the sensor: \d+ e- in the brightest pixel"):
         calibrated(sensor__kind="zwfs", star__magnitude=-1.0)
+    with pytest.raises(CalibrationError, match="no light reaches the sensor"):
+        calibrated(camera__exposure_fraction=1e-9)

@@ -188,7 +188,7 @@ def analytic_calibration(
         opd_nm: Wavefront at the twin's used nodes at which I0 and H are computed; flat when None.
 
     Raises:
-        CalibrationError: the sensor cannot distinguish the modes, the star saturates it, or shear is a fitted
+        CalibrationError: the sensor cannot distinguish the modes, gets no light or is saturated, or shear is a fitted
             nuisance at a wavefront that is not flat.
         ConfigurationError: the map of active actuators cannot be used, or there are fewer actuators than modes.
     """
@@ -204,6 +204,8 @@ def analytic_calibration(
     shape = I0.shape
     good = np.ones(I0.size)
     flux_e = electrons_per_exposure(config) * float(I0.sum())
+    if not flux_e > 0:
+        raise CalibrationError("no light reaches the sensor in an exposure: raise camera.exposure_fraction")
     light = I0.reshape(-1)
     I0, H = normalise_flux(light, H, good)
     nuisance = _nuisance(config, light, good)
@@ -223,7 +225,6 @@ def analytic_calibration(
         sensed[:, ~active.reshape(-1)] = 0
     commands = commands @ np.linalg.inv(sensed @ commands)
 
-    grid = (config.mirror.rows, config.mirror.columns)
     return identified(
         Calibration(
             noll=nolls,
@@ -234,7 +235,7 @@ def analytic_calibration(
             dark=np.full(I0.size, _dark_dn(camera), np.float32),
             modes_to_actuators=single(commands),
             shape=(shape[0], shape[1]),
-            grid=grid,
+            grid=(config.mirror.rows, config.mirror.columns),
             flux_dn=flux_e * camera.em_gain / camera.gain_e_per_dn,
             saturation_dn=highest_dn,
             estimator="+".join((config.control.estimator, *config.control.nuisance)),

@@ -27,6 +27,7 @@ from lowfc.optics.chain.sensor import Sensor
 _DATA = resources.files("lowfc") / "data"
 _MAX_BYTES = 1 << 30
 PUPIL_IMAGE_PIXELS = 40  # across the image of a Zernike sensor
+_MAX_PROLATE_RADIUS = 7.0  # lambda / D; beyond, double precision confuses the prolate function with the next ones
 _WITH_LYOT_STOP = ("circle", "prolate")
 _LYOT_OUTER = 12.0
 """Outer radius of the annular dark zone with a Lyot stop, lambda / D; the inner radius is the mask's edge."""
@@ -124,7 +125,7 @@ def coronagraph_from(section: SensorSection) -> Coronagraph:
     """Build the coronagraph of the science image: with a shaped pupil, or with a Lyot stop.
 
     Raises:
-        ConfigurationError: There is no such pupil.
+        ConfigurationError: There is no such pupil, or the Lyot stop is too small.
         DataFileError: Its file is missing or damaged.
     """
     pupil = _pupil(section)
@@ -134,6 +135,8 @@ def coronagraph_from(section: SensorSection) -> Coronagraph:
         )
     u = pupil_axis(len(pupil))
     stop = (np.hypot(u[:, None], u) <= section.lyot_stop / 2.0).astype(np.float64)
+    if not stop.any():
+        raise ConfigurationError(f"sensor.lyot_stop = {section.lyot_stop:g}: no sample of the pupil is in the stop")
     zone = Wedge(section.focal_radius, _LYOT_OUTER, 90.0)
     return Coronagraph(pupil, zone, LyotStop(disk(radius=section.focal_radius), stop))
 
@@ -170,14 +173,14 @@ def _pupil(section: SensorSection) -> Array:
             return load_pupil()
         case "circle":
             return circle(SAMPLES)
-        case "prolate":
+        case "prolate" if section.focal_radius <= _MAX_PROLATE_RADIUS:
             return prolate(SAMPLES, section.focal_radius)
+        case "prolate":
+            raise ConfigurationError(f"sensor.focal_radius must be at most {_MAX_PROLATE_RADIUS:g} for a prolate pupil")
     if section.pupil.endswith(".npz"):
         return load_pupil(file=input_file.user_path(section.pupil))
     slip = nearest(section.pupil, ("shaped", "circle", "prolate"))
-    raise ConfigurationError(
-        f"sensor.pupil = {section.pupil!r}: no such pupil{slip}; shaped, circle, prolate, or FILE.npz"
-    )
+    raise ConfigurationError(f"sensor.pupil = {section.pupil!r}: no such pupil{slip}: shaped, circle, prolate, *.npz")
 
 
 def _focal_mask(section: SensorSection) -> NDArray[np.inexact]:

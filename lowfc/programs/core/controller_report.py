@@ -21,8 +21,7 @@ SECOND_NS = 1_000_000_000
 CAUSES_NAMED = 4
 """Number of causes that are listed with their counts, the most frequent first."""
 MAX_CAUSES = 20
-"""Largest number of different causes counted. Without it their number would have no limit, because a cause may contain
-values."""
+"""Largest number of different causes counted: a cause may contain values, so that their number has no limit."""
 
 
 class StageTiming:

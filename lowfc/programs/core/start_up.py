@@ -8,6 +8,7 @@ import numpy as np
 
 from lowfc.adapters.files import factory, law_file
 from lowfc.adapters.files.mirror_maps import active_actuators, flat_nm
+from lowfc.adapters.files.sensors import coronagraph_from
 from lowfc.adapters.process import compiled
 from lowfc.adapters.process.latch import Latch
 from lowfc.arrays import Single
@@ -32,6 +33,7 @@ def check_files(config: Configuration) -> None:
     """Open the files of [sensor], [mirror] and [control], and check the gains; ConfigurationError: a line per fault."""
     checks: tuple[Callable[[Configuration], object], ...] = (
         lambda config: factory.sensor(config, lambda _: None),
+        lambda config: coronagraph_from(config.sensor),
         active_actuators,
         _checked_flat_nm,
         _check_law_modes,
