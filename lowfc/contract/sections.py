@@ -82,7 +82,7 @@ class SensorSection(Section):
     focal_mask: Literal["disk", "bowtie"] = "disk"
     """Reflective focal-plane mask: a disk, or the bowtie of Fig. 3."""
     focal_radius: float = Field(4.0, ge=1, le=10)
-    """Radius of its disk, lambda/D."""
+    """Radius of its disk, lambda/D; at most 7 for a prolate pupil."""
     lyot_stop: float = Field(0.9, gt=0, le=1)
     """For circle and prolate: diameter of the Lyot stop in front of the science camera, pupil diameters."""
     sam: str = "sam27d07"
