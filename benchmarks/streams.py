@@ -29,11 +29,8 @@ from lowfc.programs.measure.latency.run import LatencyOptions, one_loop
 
 ROOT = Path(__file__).parents[1]
 SIZE = Size()
-DIRECT, CAMERA_PROCESS, IN_CONTROLLER = (
-    "direct link",
-    "ImageStreamIO, camera process",
-    "ImageStreamIO, read by the controller",
-)
+DIRECT, CAMERA_PROCESS = "direct link", "ImageStreamIO, camera process"
+IN_CONTROLLER = "ImageStreamIO, read by the controller"
 SPANS = {"frame_to_command": "frame to command", "frame_to_mirror": "frame to mirror"}
 PERCENTILES = {"p50": "p50", "p99": "p99", "p99_9": "p99.9"}
 FRAME_STREAM, CHANNEL = "lowfs", "dm00disp03"

@@ -107,8 +107,8 @@ def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> Capt
         raise AcceptanceError("the gains of the tested modes are zero: they have no capture range")
     modes = []
     for noll in dict.fromkeys(trial.what["noll"] for trial in trials):
-        of_mode = [trial for trial in trials if trial.what["noll"] == noll]
-        converged = {trial.what["level_nm"]: removed(trial) for trial in of_mode}
+        of_mode = {trial.what["level_nm"]: trial for trial in trials if trial.what["noll"] == noll}  # the last of each
+        converged = {level_nm: removed(trial) for level_nm, trial in of_mode.items()}
         sizes = sorted({abs(level_nm) for level_nm in converged})
         lost = [abs(level_nm) for level_nm, success in converged.items() if not success]
         good = [size for size in sizes if {size, -size} <= set(converged) and size < min([*lost, np.inf])]
@@ -120,7 +120,7 @@ def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> Capt
                 required_nm=required_nm,
                 captured_nm=max(good, default=0.0),
                 lost_nm=min(lost, default=None),
-                limits=sorted({name for trial in of_mode for name in trial.limits_hit}),
+                limits=sorted({name for trial in of_mode.values() for name in trial.limits_hit}),
                 passed=max(good, default=0.0) >= required_nm * (1 - 1e-6),
             )
         )

@@ -103,7 +103,7 @@ def play(live: Live, *, hold_frames: int, cycles: int, modes: Sequence[int]) -> 
 def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> LinearityResult:
     """Evaluate gain and cross-talk from the probe sequences; AcceptanceError if the loop was disturbed meanwhile."""
     required, modes = configuration.acceptance, []
-    for response in responses:
+    for response in {one.what["noll"]: one for one in responses}.values():  # the last one of each mode
         response.check(LoopMode.OPEN)
         what, noll = response.what, response.loop.noll
         levels_nm, starts = np.array(what["levels_nm"]), np.array(what["starts"], np.intp)
@@ -150,21 +150,11 @@ def draw(found: dict[str, Any], figure: Any) -> None:
     """Draw gain and cross-talk against amplitude."""
     axes = figure.subplots(1, 2, sharex=True)
     for number, mode in enumerate(found["modes"]):
-        x = [row["amplitude_nm"] for row in mode["levels"]]
+        names = ("amplitude_nm", "gain", "gain_error", "crosstalk", "crosstalk_error")
+        x, gain, gain_error, crosstalk, crosstalk_error = ([row[name] for row in mode["levels"]] for name in names)
         style = {"color": f"C{number % 10}", "marker": "o", "markersize": 3, "linewidth": 1}
-        axes[0].errorbar(
-            x,
-            [row["gain"] for row in mode["levels"]],
-            [row["gain_error"] for row in mode["levels"]],
-            label=f"Z{mode['noll']}",
-            **style,
-        )
-        axes[1].errorbar(
-            x,
-            [abs(row["crosstalk"]) for row in mode["levels"]],
-            [row["crosstalk_error"] for row in mode["levels"]],
-            **style,
-        )
+        axes[0].errorbar(x, gain, gain_error, label=f"Z{mode['noll']}", **style)
+        axes[1].errorbar(x, np.abs(crosstalk), crosstalk_error, **style)
     for side in (-1, 1):
         axes[0].axhline(1 + side * found["required_gain_error"], color="grey", linestyle=":")
     axes[1].axhline(found["required_crosstalk"], color="grey", linestyle=":")

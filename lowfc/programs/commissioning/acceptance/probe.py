@@ -33,6 +33,7 @@ Kind = Literal["rejection", "linearity", "capture-range", "noise-floor"]
 LIMITS = (Limit.MODAL_LIMIT, Limit.STROKE, Limit.SLEW, Limit.NEIGHBOUR)
 MAX_MISSING = 0.01
 """Largest fraction of the frames that may be missing or refused."""
+_LIMIT_BITS = sum(1 << limit for limit in LIMITS)
 
 ANNOUNCEMENT = "acceptance "
 """First word of a note that announces a test; its parameters follow as JSON."""
@@ -183,11 +184,13 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
     for what, request in announced:
         frames = what.pop("frames")
         first, play = request.frame_sequence, request.name == "play"
-        for other in history.requests:
-            if other.accepted and other.name in _CHANGES and first < other.frame_sequence < first + frames:
-                raise DataFileError(f"{path}: request {other.name!r} changed the loop during the measurement")
         sequence = history.steps.sequence
-        times_ns = history.steps.time_ns[(sequence >= first) & (sequence < first + frames)]
+        limited = sequence[(sequence >= first) & (history.steps.reasons & _LIMIT_BITS != 0)].tolist()
+        end = min([first + frames, *limited[:1]])  # a limit that acts ends the measurement
+        for other in history.requests:
+            if other.accepted and other.name in _CHANGES and first < other.frame_sequence < end:
+                raise DataFileError(f"{path}: request {other.name!r} changed the loop during the measurement")
+        times_ns = history.steps.time_ns[(sequence >= first) & (sequence < end)]
         for _, event in history.events:
             interrupted = play and event.message.startswith(INTERRUPTIONS)
             if interrupted and times_ns.size and times_ns[0] <= from_timestamp(event.timestamp) <= times_ns[-1]:
