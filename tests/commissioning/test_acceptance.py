@@ -11,7 +11,7 @@ from lowfc.adapters.files.drawing import figure_class, png
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import wire
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.safety import Limit, LoopMode
@@ -221,11 +221,17 @@ def test_a_note_announces_the_probe_sequences_of_a_test_in_a_log() -> None:
     assert _announced(requests, "linearity") == []
 
 
-def test_requests_after_a_limit_ended_the_measurement_do_not_disturb_it(tmp_path: Path) -> None:
-    night = SyntheticLog(limit_nm=(1.0, 1.0)).request("close").frames(20)
-    night.request("note", text='acceptance {"test": "noise-floor", "loop": "closed", "frames": 50}')
-    log = night.frames(20).request("reset").frames(50).write(tmp_path / "night.mcap")
-    (response,) = logged_responses(read_history(LogReader(log)), noise.KIND)
+@pytest.mark.parametrize("name", ["reset", "stop"])
+def test_a_request_disturbs_a_measurement_unless_a_limit_ended_it_before(name: str, tmp_path: Path) -> None:
+    def logged(limit_nm: float) -> list[ProbeResponse]:
+        night = SyntheticLog(limit_nm=(limit_nm, limit_nm)).request("close").frames(20)
+        night.request("note", text='acceptance {"test": "noise-floor", "loop": "closed", "frames": 50}')
+        log = night.frames(20).request(name).frames(50).write(tmp_path / f"{limit_nm:g}.mcap")
+        return logged_responses(read_history(LogReader(log)), noise.KIND)
+
+    with pytest.raises(DataFileError, match=f"request '{name}' disturbed the measurement"):
+        logged(1e3)
+    (response,) = logged(1.0)
     assert response.limits_hit == ["MODAL_LIMIT"]
 
 

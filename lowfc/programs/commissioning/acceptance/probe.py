@@ -37,7 +37,7 @@ _LIMIT_BITS = sum(1 << limit for limit in LIMITS)
 
 ANNOUNCEMENT = "acceptance "
 """First word of a note that announces a test; its parameters follow as JSON."""
-_CHANGES = ("gain", "leak", "limit", "law", "load", "offset", "channel", "reset")
+_CHANGES = ("gain", "leak", "limit", "law", "load", "offset", "channel", "reset", "stop")
 
 
 class AcceptanceError(LowfcError):
@@ -189,7 +189,7 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
         end = min([first + frames, *limited[:1]])  # a limit that acts ends the measurement
         for other in history.requests:
             if other.accepted and other.name in _CHANGES and first < other.frame_sequence < end:
-                raise DataFileError(f"{path}: request {other.name!r} changed the loop during the measurement")
+                raise DataFileError(f"{path}: request {other.name!r} disturbed the measurement")
         times_ns = history.steps.time_ns[(sequence >= first) & (sequence < end)]
         for _, event in history.events:
             interrupted = play and event.message.startswith(INTERRUPTIONS)

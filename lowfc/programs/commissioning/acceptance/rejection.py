@@ -212,15 +212,9 @@ def draw(found: dict[str, Any], figure: Any) -> None:
             ax.loglog(hz, [point[f"{name}_theory"] for point in points], "-", color=colour, linewidth=1)
             for judged, marker, face in ((True, "o", colour), (False, "o", "none")):
                 shown = [point for point in points if point[f"{name}_judged"] is judged]
-                ax.loglog(
-                    [point["frequency_hz"] for point in shown],
-                    [point[name] for point in shown],
-                    marker,
-                    color=colour,
-                    markerfacecolor=face,
-                    markersize=3,
-                    label=f"Z{mode['noll']}" if judged else None,
-                )
+                x, y = ([point[key] for point in shown] for key in ("frequency_hz", name))
+                label = f"Z{mode['noll']}" if judged else None
+                ax.loglog(x, y, marker, color=colour, markerfacecolor=face, markersize=3, label=label)
         ax.set_title(title)
         ax.set_xlabel("frequency, Hz")
         ax.grid(alpha=0.3)
