@@ -271,12 +271,12 @@ def test_safe_is_requested_by_s_by_its_button_by_f12_in_a_form_and_by_s_in_the_h
 
 def test_a_gain_knob_scales_the_gains_of_all_modes_or_of_one_radial_order(run: LiveRun) -> None:
     def gain() -> list[float]:
-        return list(run.requests[-1].values) if run.requests[-1].name == "gain" else []
+        return list(run.requests[-1].values) if run.requests and run.requests[-1].name == "gain" else []
 
     async def scenario(screen: Screen) -> None:
         await screen.pilot.press("g")
         await screen.fill("0.5 0.5 0.05", "2-4")
-        await screen.until(lambda: "0.05-0.5" in screen.text("gains"))
+        await screen.until(lambda: gain() == pytest.approx([0.5, 0.5, 0.05]) and "0.05-0.5" in screen.text("gains"))
         before = len(run.requests)
         await screen.pilot.press(*["right"] * 4)
         await screen.until(lambda: gain() == pytest.approx([0.7, 0.7, 0.07]))
