@@ -102,7 +102,7 @@ class Camera(Collected):
 
     @cached_property
     def put_times_ns(self) -> list[int]:
-        """Publish times of the frames, or their arrival times if any publish time is wrong."""
+        """Publish times of the frames, or their arrival times if any publish time is implausible."""
         puts, arrivals = [frame.put_ns for frame in self.frames], [frame.receive_time_ns for frame in self.frames]
         near = all(abs(arrival - put) <= LATE_NS for put, arrival in zip(puts, arrivals, strict=True))
         return puts if near and all(later > earlier for earlier, later in pairwise(puts)) else arrivals

@@ -77,7 +77,7 @@ def _chunk_ends_ns(path: Path) -> list[int]:
 
 
 def _refuse_disorder(paths: Sequence[Path], chunk_ends_ns: Sequence[Sequence[int]]) -> None:
-    """Raise ConfigurationError if a log's first frame is before the end of the previous log."""
+    """Raise ConfigurationError if a log's first frame is more than `PATIENCE_NS` before the end of the previous log."""
     end_ns, previous = 0, paths[0]
     for path, ends_ns in zip(paths, chunk_ends_ns, strict=True):
         frames = WholeLog(path, topics=(FRAME,), skip_damaged=True)  # the states at its start may be old
