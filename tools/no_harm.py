@@ -181,12 +181,11 @@ def render(results: Results) -> str:
         f"of {results['seconds']:g} s at {results['rate_hz']:g} Hz, mean of {results['seeds']} seeds. "
         f"Number of cases: {len(rows)} (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them "
         f"with every image simulated), without {saturated} in which the star saturates the detector. Added contrast is "
-        "without the terms between modes. A case counts as harmful if "
-        f"closing adds more contrast than {100 * TOLERATED:g} % of the dark zone's own plus three standard errors "
-        f"(`quiet`: {100 * TOLERATED:g} % alone). Harmful cases, with the ratio of added contrast to the dark zone's "
-        f"own: {names or 'none'}. On bright stars (V = {_magnitudes(bright)}; without `quiet`; two seeds) "
-        f"the residual with automatic gains is {min(compared):.2f} to {max(compared):.2f} times that of the best fixed "
-        "gains, chosen afterwards."
+        "without the terms between modes. A case counts as harmful if closing adds more contrast than "
+        f"{100 * TOLERATED:g} % of the dark zone's own plus three standard errors (`quiet`: {100 * TOLERATED:g} % "
+        f"alone). Harmful cases, with the ratio of added contrast to the dark zone's own: {names or 'none'}. On bright "
+        f"stars (V = {_magnitudes(bright)}; without `quiet`; two seeds) the residual with automatic gains is "
+        f"{min(compared):.2f} to {max(compared):.2f} times that of the best fixed gains, chosen afterwards."
     )
 
 

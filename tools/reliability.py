@@ -41,16 +41,15 @@ def _run(cases: str, seed: int) -> Results:
     return {**counts(rows), "cases": rows}
 
 
-def measure_again(results: Results, seed: int, names: Sequence[str]) -> None:
-    """Run cases of a seed and store their results: those named, or those without a result."""
-    run = next(one for one in results["runs"] if one["seed"] == seed)
+def measure_again(results: Results, seed: int, names: Sequence[str]) -> Results:
+    """Run cases of a seed, those named or those without a result; return its run with all results."""
+    run: Results = next(one for one in results["runs"] if one["seed"] == seed)
     kept = {case["name"]: case for case in run["cases"] if case["name"] in CASES}
     if missing := list(names) or [name for name in CASES if name not in kept]:
         about = host()
         found = _run(" ".join(f"--case {name}" for name in missing), seed)["cases"]
         kept |= {case["name"]: {**case, "host": about} for case in found}
-    run["cases"] = list(kept.values())
-    run |= counts(run["cases"])
+    return run | counts(cases := list(kept.values())) | {"cases": cases}
 
 
 def render_chaos(results: Results) -> str:
@@ -199,8 +198,9 @@ def main() -> None:
     options = parser.parse_args()
     if unknown := set(options.names) - set(CASES):
         parser.error(f"no case is called {', '.join(sorted(unknown))}; there are {', '.join(CASES)}")
-    results = json.loads(CASES_FILE.read_text())
-    measure_again(results, options.seed, options.names)
+    run = measure_again(json.loads(CASES_FILE.read_text()), options.seed, options.names)
+    results = json.loads(CASES_FILE.read_text())  # again: another seed may have been measured meanwhile
+    results["runs"] = [run if one["seed"] == options.seed else one for one in results["runs"]]
     CASES_FILE.write_text(json.dumps(results, indent=1) + "\n")
 
 
