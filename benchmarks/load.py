@@ -32,7 +32,7 @@ _START_S, _TIMEOUT_RATIO = 60.0, 12.0
 
 
 class Used(NamedTuple):
-    """Processor time, permitted processors and memory of a process so far."""
+    """Processor time of a process so far, and its permitted processors and memory at that time."""
 
     used_s: float
     processors: str
@@ -77,7 +77,7 @@ def _moment() -> Moment:
 
 
 def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
-    """Use by each role over the last four fifths of `seconds` of frames, before the processes ended.
+    """Use by each role in the last 0.8 `seconds` before the processes end; `seconds` is the duration of the frames.
 
     `share`: processor time of all threads over that of one processor. Empty with fewer than two samples in that time.
     """

@@ -17,8 +17,8 @@ from tools.law_bench import calibrated
 def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:
     """Rms tilt residual per axis with this loop delay; from a linear model, valid for residuals of a few mas.
 
-    The disturbance's sine waves are known exactly; photon and read noise propagate through R. For an automatic gain,
-    the highest gain within the margins is used.
+    The spectrum of sine waves, damped lines and wheels is known; a square wave and a static wavefront are left out.
+    Photon and read noise propagate through R. For an automatic gain, the highest gain within the margins is used.
     """
     control, disturbance = config.control, disturbance_of(config)
     gain = highest_gain(delay_frames) if control.tilt_gain == "auto" else control.tilt_gain

@@ -130,25 +130,26 @@ def measure(options: argparse.Namespace, report: Report) -> Result:
     }
 
 
-def one_run(implementation: Implementation, rules: argparse.Namespace, priority: int) -> dict[str, Any]:
+def one_run(implementation: Implementation, options: argparse.Namespace, priority: int) -> dict[str, Any]:
     """Run an implementation once; ComparisonError or LowfcError if it does not start or end, or sends no command."""
     if implementation.kernel:
-        return _lowfc(implementation.kernel, rules, priority)
-    frames = rules.warm_up + round(rules.seconds * rules.rate_hz)
+        return _lowfc(implementation.kernel, options, priority)
+    frames = options.warm_up + round(options.seconds * options.rate_hz)
     with tempfile.TemporaryDirectory(prefix="lowfc-peers-", dir=_MEMORY) as name:
         folder = Path(name)
         write_shared_files(folder, frames)
-        with _processes(implementation, rules, folder, [str(rules.rate_hz), str(frames)], priority) as children:
+        with _processes(implementation, options, folder, [str(options.rate_hz), str(frames)], priority) as children:
             time.sleep(_SETTLE_S)
             shared.go(folder)
             source = children["source"]
-            deadline_s = time.monotonic() + frames / rules.rate_hz + _DEADLINE_MARGIN_S
+            deadline_s = time.monotonic() + frames / options.rate_hz + _DEADLINE_MARGIN_S
             while source.status is None and time.monotonic() < deadline_s:
                 time.sleep(_POLL_S)
             if source.status != 0:
-                raise ComparisonError(f"the source of frames did not end: {source.stderr_tail()}")
+                end = "did not end" if source.status is None else f"ended with exit status {source.status}"
+                raise ComparisonError(f"the source of frames {end}: {source.stderr_tail()}")
             words = "\n".join(child.stderr_tail() for child in children.values())
-        found = run_statistics(folder, rules.warm_up)
+        found = run_statistics(folder, options.warm_up)
         if found["frame_to_command"] is None:
             raise ComparisonError(f"no command was sent: {words}")
         return found
@@ -183,11 +184,11 @@ def _command_error(folder: Path, frames: int) -> float:
     return float(np.abs(found - expected).max() / np.abs(expected).max())
 
 
-def _lowfc(kernel: str, rules: argparse.Namespace, priority: int) -> dict[str, Any]:
+def _lowfc(kernel: str, options: argparse.Namespace, priority: int) -> dict[str, Any]:
     """Run lowfc's own loop with the size of the comparison; it warms up for half a second by itself."""
-    config = configuration(SIZE, rules.rate_hz, priority=priority, disable_cpu_idle=True, kernel=kernel)
+    config = configuration(SIZE, options.rate_hz, priority=priority, disable_cpu_idle=True, kernel=kernel)
     with prepared_run(SIZE, config) as run:
-        found = one_loop(LatencyOptions(config, rules.seconds, 1), run)
+        found = one_loop(LatencyOptions(config, options.seconds, 1), run)
     return {
         "frames": found["frames"],
         "without_command": found["frames_without_command"],
@@ -230,9 +231,9 @@ def fifo_granted() -> bool:
 
 @contextlib.contextmanager
 def _processes(
-    implementation: Implementation, rules: argparse.Namespace, folder: Path, words: list[str], priority: int
+    implementation: Implementation, options: argparse.Namespace, folder: Path, words: list[str], priority: int
 ) -> Iterator[dict[str, Child]]:
-    start = program(implementation, rules, folder)
+    start = program(implementation, options, folder)
     environment = os.environ | _ONE_THREAD | {"PYTHONPATH": str(ROOT), "MILK_SHM_DIR": str(folder)}
 
     def command(role: str) -> list[str]:

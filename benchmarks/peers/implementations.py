@@ -52,10 +52,10 @@ def _pyrtcao(name: str, description: str, safety: str, *roles: str) -> Implement
 def _lowfc(kernel: str) -> Implementation:
     return Implementation(
         f"lowfc, {kernel}",
-        "its real controller and mirror with prepared frames: the loop of `lowfc latency`, with this size",
+        "its own controller and simulated mirror, with prepared frames: the loop of `lowfc latency`, with this size",
         log="every frame, command, mirror state and step is published for a recorder; bit-exact replay",
         safety="late, dark, saturated, identical and missing frames refused or bridged; limits of mode, stroke, slew "
-        "and neighbours, in the mirror too; command timeout",
+        "and neighbours, the last three in the mirror too; command timeout",
         multi_host="yes, mutual TLS",
         kernel=kernel,
     )

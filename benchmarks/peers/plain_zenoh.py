@@ -25,11 +25,11 @@ PORTS = "ports.json"
 _NUMBER = struct.Struct("<QQ")  # as long as lowfc's envelope
 _ROLES = {"source": Role.CAMERA, "controller": Role.CONTROLLER}
 
-Message = Callable[[int, bytes], None]
+MessageFunction = Callable[[int, bytes], None]
 """Receives or sends a message: frame number, payload."""
 
 
-def join(part: RoleProcess, receive: Message) -> Message:
+def join(part: RoleProcess, receive: MessageFunction) -> MessageFunction:
     """Join a run with a session set up as lowfc's; returns the function that sends."""
     ports = json.loads((part.folder / PORTS).read_text())
     links = Links("peers", ports, "lowfc", part.folder / "credentials")

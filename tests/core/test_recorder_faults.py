@@ -103,7 +103,9 @@ def test_a_disk_error_ends_the_recording_but_not_the_process(
     put_until(frames, lambda: event_published(bench, "RECORDING_FAILED"))
     time.sleep(0.6)  # longer than two flushes
     assert bench.thread.is_alive()
-    assert not event_published(bench, "MESSAGES_LOST"), "one event per topic and flush for the rest of the night"
+    assert not event_published(bench, "MESSAGES_LOST"), (
+        "otherwise each flush reports every topic until the recorder ends"
+    )
     summary = bench.stop()
     assert why in summary.failure
     if not bench.folder.exists():
@@ -167,7 +169,7 @@ def test_messages_lost_while_the_disk_stalls_are_counted(bench: Bench, monkeypat
 
 
 def slow_disk(monkeypatch: pytest.MonkeyPatch, *, refuses: bool) -> tuple[threading.Event, threading.Event]:
-    """Block the flush of a log; return the events that report that it began, and that release it."""
+    """Block the flush of a log; return an event set at its start and one that ends it, with a fault if `refuses`."""
     reached, release, sync = threading.Event(), threading.Event(), os.fsync
 
     def slow(descriptor: int) -> None:

@@ -1,4 +1,4 @@
-"""Steps of a dark hole in one process: the loop undoes those that do not shift the sensor's zero point."""
+"""Steps of a dark hole: the loop undoes those that do not shift the sensor's zero point; an interrupted run ends it."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,7 +35,6 @@ class LoggedLoop(InProcessLoop):
 
     def __init__(self) -> None:
         super().__init__(load(None, CONFIG))
-        self._grid = self.config.mirror.rows, self.config.mirror.columns
         self.kept_steps: list[Step] = []
 
     def steps(self, count: int | None = None, patience_s: float = 0.0) -> Iterator[Step]:

@@ -119,7 +119,7 @@ class DirectReader:
             handler: called with each message, one at a time, on a thread of the bus, of this reader or of a writer.
             subscribe: subscribes a handler to the same topic on the bus; the function it returns unsubscribes.
             now_ns: the host's clock.
-            failed: called with an exception of the handler.
+            failed: called if a message that did not come over the bus has an invalid envelope, or `handler` raises.
             shared: whether the topic has several publishers.
         """
         self._handler = handler
@@ -135,7 +135,7 @@ class DirectReader:
         self._both = False
         self._leave_bus: Callable[[], None] | None = lambda: None  # a message may arrive before `subscribe` returns
         self._leave_bus = subscribe(self._by_bus)
-        path.unlink(missing_ok=True)  # left by a killed process: each role runs only once
+        path.unlink(missing_ok=True)  # left by an earlier process: each role runs only once
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(os.fspath(path))
         self._listener.listen(1)
@@ -149,8 +149,7 @@ class DirectReader:
             with self._turn:
                 if self._first < 0:
                     self._first = sample.sequence
-                surely_new = self._leave_bus is None and sample.sequence > self._newest
-                if surely_new or not self._is_copy(sample):
+                if not self._is_copy(sample):
                     self._forward(sample)
         except Exception as fault:
             self._failed(fault)

@@ -59,10 +59,10 @@ class LogReader:
             path: path of the log, with any name.
             topics: topics whose messages are delivered; None: all.
             skip_damaged: whether to leave out damaged stretches instead of raising an error.
-            from_ns: log time; chunks that end before it are left out.
-            always: topics to which `from_ns` does not apply.
+            from_ns: log time; chunks known to end before it are skipped.
+            always: topics that keep a chunk, with all its messages, from being skipped for `from_ns`.
             sparse: whether to skip chunks without messages of `topics`, by their indexes: for topics with few messages
-                in a long log. The checksums of skipped chunks are not checked.
+                in a long log. After a skipped chunk, its checksum and that of all chunks together are not checked.
         """
         self.path = path
         self.paths: tuple[Path, ...] = (path,)

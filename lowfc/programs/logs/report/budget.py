@@ -15,7 +15,7 @@ Entry = tuple[Term | None, str]
 """A term and its source; or None and what would be required."""
 
 _THROUGH = "times the loop's noise transfer"
-_NO_CAMERA = "the camera's gain and read noise"
+_NO_CAMERA = "a calibration, light, and the camera's gain"
 _NO_TRUTH = "the true wavefront, known only in simulation"
 _TOO_SHORT = "a longer stretch with the loop closed"
 
@@ -61,7 +61,7 @@ def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None)
     else:
         for name, frame_nm, source in (
             ("photon noise", noise.photon_nm, "measured flux"),
-            ("read noise", noise.read_nm, "camera's read noise and rounding"),
+            ("read noise", noise.read_nm, "camera's read noise, rounding and dark charge"),
         ):
             how = f"{source}, through the reconstructor, {_THROUGH}"
             entries[name] = (white_noise(law, frame_nm), how if noise.total_nm.any() else "the simulation has no noise")

@@ -53,7 +53,9 @@ def compared(comparison: Mapping[str, Any]) -> str:
             f"{row['b']:>10.{digits}f}{over:>8}{row['difference']:>+10.{digits}f}{spread:>10}   {verdict}"
         )
     lines += [f"{COUNTS[name]}: a {a}, b {b}" for name, (a, b) in comparison["counts"].items() if a or b]
-    lines.append("us; spread: the larger of both ranges over the repeats, unknown if one has a single repeat.")
+    lines.append(
+        "us, or a ratio (over ...); spread: the larger of both ranges over the repeats, unknown for a single repeat."
+    )
     return "\n".join(lines)
 
 
@@ -66,7 +68,7 @@ def sparkline(counts: Sequence[int]) -> str:
 
 
 def picture(results: Mapping[str, Any]) -> bytes:
-    """PNG: a histogram of each span, and frame to command against time."""
+    """PNG: histograms of `LOOP_SPANS`, and frame to command against time."""
     from lowfc.adapters.files.drawing import figure_class, png
 
     figure = figure_class()(figsize=(9, 8), layout="constrained")
@@ -111,8 +113,10 @@ def _remarks(results: Mapping[str, Any]) -> list[str]:
             lines.append(f"frame to command over half a bare echo and one control step{suffix}: {ratios}")
     if results.get("kernel_ratio"):
         each = zip(_ratios(results, "kernel_ratio"), results["kernel_ratio_spread"], strict=True)
-        ratios = ", ".join(f"{ratio} of {results['numpy_us'][at]:.1f} us" for ratio, at in each)
-        lines.append(f"all results: fused step; ratio of its frame to command to numpy's, in turns: {ratios}")
+        ratios = ", ".join(f"{ratio}, numpy {results['numpy_us'][at]:.1f} us" for ratio, at in each)
+        lines.append(
+            f"all results are of the fused step; its frame to command over numpy's, measured in turns: {ratios}"
+        )
     counts = {name: results.get(name) for name in COUNTS}
     shown = [name for name, count in counts.items() if count or (name in _ALWAYS and count is not None)]
     lines.append(", ".join(f"{counts[name]} {COUNTS[name]}" for name in shown))
@@ -141,6 +145,10 @@ def _title(results: Mapping[str, Any]) -> str:
     if settings.get("log"):
         return f"{Path(settings['log']).name}, {results['rate_hz']:.1f} Hz"
     also = "".join(f", with --{name}" for name in ("record", "view", "trace") if settings.get(name))
-    times = f"medians over {count} times {settings['duration_s']:g} s" if count > 1 else f"{settings['duration_s']:g} s"
+    times = (
+        f"{count} repeats of {settings['duration_s']:g} s: medians, largest max"
+        if count > 1
+        else f"{settings['duration_s']:g} s"
+    )
     reached = f" ({results['rate_hz']:.1f} Hz reached)" if results["rate_hz"] else ""  # 0: of a single frame
     return f"{settings['rate_hz']:g} Hz{reached}, {settings['camera']} frames{also}, {times}"
