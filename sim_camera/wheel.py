@@ -17,7 +17,7 @@ _WALK_WAVES = 64
 
 
 def walk(rng: np.random.Generator, per_root_s: Array, slope: float = 2.0) -> tuple[Array, Complex]:
-    """Sine waves, frequencies (waves,) and amplitudes (waves, any), evenly spaced in log frequency from 1e-4 to 10 Hz.
+    """Frequencies (waves,) and amplitudes (waves, any) of sine waves, 1e-4 to 10 Hz, nearly even in log frequency.
 
     Their power density is per_root_s^2 / (2 pi^2 f^slope) per Hz. Slope 2 is a random walk: its rms displacement after
     t seconds is per_root_s sqrt(t).
@@ -94,7 +94,7 @@ def wheels(
 ) -> tuple[Wheel, ...]:
     """Equal wheels, one for each speed at time 0; `rms_nm` (modes,) is that of the first harmonic at high speed.
 
-    ValueError if a wheel that runs down would not slow down.
+    ValueError if a wheel that runs down would speed up, or does not turn forward.
     """
     if course == "run-down" and (change < 0 or min(speeds_hz) <= 0):
         raise ValueError("wheels that run down have speeds above 0 and a wheel_change of 0 or more")

@@ -16,7 +16,7 @@ from lowfc.adapters.bus.run import Run, new_run_id, open_run
 NO_SKIPS = os.environ.get("LOWFC_NO_SKIPS") == "1"
 ROOT = Path(__file__).parent
 FIRST = frozenset(ROOT / name for name in ("optics", "control", "paper", "design", "contract", "sim"))
-"""Folders whose tests wait for no other process: they run beside the exclusive tests."""
+"""Folders whose tests hardly wait for other processes: they run beside the exclusive tests."""
 LONGEST = ("test_lockstep", "test_gain_watch", "test_calibrate", "test_tutorials", "test_commission", "test_what_if")
 """Test files that are started next, so that no worker runs one of them alone at the end."""
 gc.disable()  # nothing that the collection of tests imports is garbage

@@ -49,10 +49,10 @@ class Measurement(NamedTuple):
     """One table of the documentation.
 
     Attributes:
-        commands: commands that the measurement runs, as printed under the table.
+        commands: commands that the measurement runs, as printed with the table.
         measure: returns its results.
         render: returns the table of the results.
-        has_provenance: whether the table includes date, host and method.
+        has_provenance: whether the table itself names command and host, so that no sentence is added.
     """
 
     commands: tuple[str, ...]

@@ -140,7 +140,7 @@ def _subclasses(kind: type[Result]) -> set[type[Result]]:
     while new:
         new = {child for one in new for child in one.__subclasses__()} - below
         below |= new
-    return {one for one in below if one.model_fields}
+    return {one for one in below if one.model_fields and one.__module__.startswith("lowfc.")}
 
 
 def upgrade() -> str:

@@ -89,7 +89,8 @@ class Client:
     def __init__(self, run: str | None = None, *, bus: Bus | None = None) -> None:
         """Join a run.
 
-        None selects the only run on this host. With a `bus`, which `disconnect` does not close, `run` is only its name.
+        None selects the only run on this host. With a `bus`, which `disconnect` does not close, `run` only names it in
+        messages.
 
         Raises:
             BusError: there is no such run, none at all, or more than one to choose from.

@@ -5,7 +5,7 @@
     ├── DataFileError        a file that is missing, damaged or of the wrong kind
     ├── CalibrationError     a calibration that does not fit the instrument
     ├── BusError             a port, a socket, or a peer that does not answer
-    │   └── BadMessageError  a message from the bus that violates the contract
+    │   └── BadMessageError  a message from the bus that violates the contract; reported in an event
     └── RequestRefusedError  the controller refused the request, with the reason
 
 Numerical code raises ValueError; the adapters above it name the file or the key and re-raise one of these.

@@ -28,7 +28,7 @@ def installed(kind: Kind) -> dict[str, EntryPoint]:
 
 
 def load(kind: Kind, name: str) -> Any:
-    """Import the class of a driver; ConfigurationError if there is none, the import fails or it is no such driver."""
+    """Import a driver's class or factory; ConfigurationError if there is none, or import or methods are wrong."""
     module, colon, attribute = name.rpartition(":")
     with opening(f"the driver {name!r} cannot be loaded"):
         if colon:

@@ -20,6 +20,7 @@ REPEAT_NS = 10_000_000_000
 CLOSE_S = 5.0
 """Timeout of closing a driver, if longer than that of its calls."""
 _HERE = Path(__file__).parent
+_PROGRAMS = _HERE.parent / "programs"
 
 
 def described(fault: Exception) -> str:
@@ -27,7 +28,9 @@ def described(fault: Exception) -> str:
     frames = [
         frame
         for frame in traceback.extract_tb(fault.__traceback__)
-        if Path(frame.filename).parent != _HERE and "importlib" not in frame.filename
+        if (path := Path(frame.filename)).parent != _HERE
+        and not path.is_relative_to(_PROGRAMS)
+        and "importlib" not in frame.filename
     ]
     its_own = [frame for frame in frames if frame.filename == frames[0].filename]
     where = f" ({Path(its_own[-1].filename).name}, line {its_own[-1].lineno})" if its_own else ""

@@ -110,7 +110,9 @@ class MemoryBus:
         self.queryables.append((key_expression, handler))
 
     def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
-        """See `Bus.get`; returns once every handler has replied or failed, or after `timeout_s`."""
+        """See `Bus.get`; returns once every handler has replied or failed, or after `timeout_s`; any key is valid."""
+        if self.closed:
+            raise BusError(f"{key} cannot be queried: the bus is closed")
         answers: list[Sample] = []
         replied = threading.Semaphore(0)
         pending = 0

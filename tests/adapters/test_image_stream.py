@@ -283,7 +283,8 @@ def test_damaged_headers_cause_no_access_outside_the_stream(path: Path) -> None:
     rng = np.random.default_rng(7)
     writer = made(path, planes=2, axes=3, kind=0x20001, keywords={"tint": 1e-3})
     good = bytes(writer.map)
-    rest = slice(writer.semaphores + 10 * 32 + 32 + 4 * 40, None)  # after all bytes that a reader or writer may change
+    # After eleven semaphores and four blocks of counters: all bytes that a reader or writer may change.
+    rest = slice(writer.semaphores + 11 * 32 + 4 * 40, None)
     opened = 0
     for _ in range(1500):
         writer.map[:] = good

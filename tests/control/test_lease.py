@@ -190,7 +190,7 @@ def answer(state: State, name: str, *values: float, modes: tuple[int, ...] = (),
     ("name", "value", "remark"),
     [
         ("gain", 0.5, ""),
-        ("gain", 1.2, "margins are below the 1.8 in gain and 45 degrees in phase that `lowfc tune` keeps"),
+        ("gain", 1.2, "a margin is below the 1.8 in gain or 45 degrees in phase that `lowfc tune` keeps"),
         ("gain", 0.0, "a mode with a gain of 0 is not corrected"),
         ("gain", float(np.float32(0.01)), ""),  # values of a request are float32
         ("gain", 0.001, "below 0.01, the least that `lowfc tune` chooses"),

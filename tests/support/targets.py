@@ -76,7 +76,7 @@ class Target:
     cost: int = 1
 
     def input(self, number: int) -> bytes:
-        """Input `number`; it depends only on this number and the corpus."""
+        """Input `number`; it depends only on this number and the target."""
         rng = Random(f"{self.name} {number}")  # noqa: S311
         data = rng.choice(self.corpus)
         if self.message is not None and rng.random() < 0.5:
@@ -107,7 +107,7 @@ class Loop:
         """Take a frame preceded by the 16 bytes of its envelope."""
         self.count += 1
         sequence, time_ns = Envelope.decode_checked(payload[:16])
-        self.process_input(codec.decode_frame(payload[16:], sequence, -time_ns))
+        self.process_input(codec.decode_frame(payload[16:], sequence, 0 - time_ns))  # its age, received at time 0
 
     def request(self, name: str, payload: bytes) -> None:
         request = codec.decode_request(payload, name, 0)
@@ -135,7 +135,7 @@ class Processes:
         self.controller = Controller(CONFIG, self.services[0], CALIBRATION, "a test", Latch(()))
         self.controller._mirror_adopted = True
         camera = MemoryBus(self.hub, "camera", self.clock)
-        self.frames, self.settings_of = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
+        self.frames, self.camera_states = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
         self.commands = MemoryBus(self.hub, "somebody", self.clock).publisher(COMMAND, "dm")
 
     def frame(self, data: bytes) -> None:
@@ -150,7 +150,7 @@ class Processes:
         self._run_once()
 
     def settings(self, data: bytes) -> None:
-        self.settings_of.put(data)
+        self.camera_states.put(data)
         self._run_once()
 
     def _run_once(self) -> None:
@@ -253,7 +253,7 @@ def _busy(state: State) -> wire.ControllerState:
     return controller_state(state, NORMAL, 0)
 
 
-def _advance_from(what: object, state: State) -> None:
+def _advance_from(_settings: object, state: State) -> None:
     """Check that a decoded state can be advanced."""
     for number in range(1, 4):
         state, _ = advance(NORMAL, state, frame(number + 1000))

@@ -381,7 +381,7 @@ def tone() -> tuple[Any, Any]:
     pol_nm = np.random.default_rng(1).normal(0, 0.2, (frames, MODES))
     pol_nm[:, 0] += TONE_NM * np.sqrt(2) * np.sin(2 * np.pi * TONE_HZ / RATE_HZ * np.arange(frames))
     error_nm, command_nm = np.zeros((frames, MODES)), np.zeros((frames + 1, MODES))
-    for k in range(frames):  # a delay of two frames: the command of the frame before is seen
+    for k in range(frames):  # a delay of two frames: the command computed from frame k - 2 is seen
         error_nm[k] = pol_nm[k] + command_nm[max(k - 1, 0)]
         command_nm[k + 1] = 0.99 * command_nm[k] - 0.4 * error_nm[k]
     return pol_nm, error_nm

@@ -8,11 +8,11 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.sequence_gaps import Arrivals
 
 MAX_WAIT_S = 0.5
-"""Bound of one wait: Python handles a signal to the process that arrives just before the wait only after the wait."""
+"""Longest single wait: Python handles a signal that arrives just before a wait only when that wait ends."""
 
 
 class Mailbox(Arrivals):
-    """Holds the newest message of one publisher; a newer one replaces it.
+    """Holds the message received last; the next one replaces it.
 
     One thread takes. A bare lock ends its wait: in CPython this is the cheapest wait with a timeout.
     """

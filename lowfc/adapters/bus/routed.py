@@ -33,7 +33,7 @@ _ABSENT = {
     *(errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ENETUNREACH, errno.ENETDOWN),
     socket.EAI_AGAIN,
 }
-"""Errors of a router or network that is not up yet; after any other error, waiting is pointless."""
+"""Errors of a router or network that is not up yet; timeouts and a handshake cut short also mean that."""
 
 
 def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict[str, Any]:
@@ -229,7 +229,7 @@ def _transport(tls: dict[str, object], sending: dict[str, Any]) -> dict[str, Any
             "protocols": ["tls"],  # the only permitted protocol
             "tls": tls,
             # A link that is silent for the lease is closed, and restored as soon as possible. Messages sent while it is
-            # silent wait, and arrive stale if it recovers before that.
+            # silent wait, and arrive stale if it recovers before it is closed.
             "tx": {**sending, "lease": LEASE_MS, "keep_alive": 4},
         },
         "shared_memory": {"enabled": False},

@@ -142,7 +142,7 @@ class ZenohBus:
 
     Attributes:
         offset: offset of the router's clock, in a run on several hosts. Envelopes on the network have the router's
-            time; messages sent and received here have this host's.
+            time; those that `put` returns, and the samples that handlers get, have this host's.
         read: converts a message of zenoh to a `Sample`.
         direct_readers: readers of the topics that this process receives over a direct link, by key.
     """
@@ -189,12 +189,13 @@ class ZenohBus:
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as fault:
-            address = links.network.listen or links.network.router or f"127.0.0.1:{links.ports.get(role)}"
-            listens = role in {*links.ports, ROUTER}
-            where = f"cannot listen on {address}; is one running already?" if listens else "cannot join."
-            raise BusError(
-                f"{role} of run {links.run_id!r} {where} Stop that process, or start another run ({plain(fault)})"
-            ) from None
+            what = f"{role} of run {links.run_id!r} cannot join"
+            if role in {*links.ports, ROUTER}:
+                address = links.network.listen or links.network.router if role == ROUTER else ""
+                address = address or f"127.0.0.1:{links.ports.get(role)}"
+                advice = "is one running already? Stop that process, or start another run"
+                what = f"{role} of run {links.run_id!r} cannot listen on {address}; {advice}"
+            raise BusError(f"{what} ({plain(fault)})") from None
         close_links_at_once(self._session)
         if role == ROUTER:
             self.queryable(CLOCK_KEY, lambda query: query.reply(b""))

@@ -13,7 +13,9 @@ _NM = ("nm", "nanometer", "nanometers")
 
 
 def read_shape(path: Path, units: tuple[str, ...] = _NM) -> Single:
-    """Read a mirror's shape (rows, columns), in the first of `units`: the first image of a FITS file, or a .npy file.
+    """Read a mirror's shape (rows, columns): the first image of a FITS file, or a .npy file.
+
+    `units` are the spellings of the unit that a FITS file may state; nothing is converted.
 
     Raises:
         DataFileError: the file is missing, damaged or holds something else.

@@ -62,7 +62,7 @@ def _zstd(data: memoryview, size: int) -> bytes:
         return stream.read(size)
 
 
-# Decompressor of each compression, and the largest ratio of sizes that its format allows.
+# Decompressor of each compression, and the largest ratio of sizes that its format allows (zstd: any).
 _COMPRESSIONS: dict[bytes, tuple[Callable[[memoryview, int], bytes], int]] = {
     b"lz4": (_lz4, 255),
     b"zstd": (_zstd, MAX_BYTES),

@@ -36,7 +36,9 @@ _CHANGED = "its parts are intact, but some are missing, out of order, or changed
 _BEGIN = MAGIC + bytes([Opcode.HEADER])
 _OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _FIRST_BLOCK_BYTES = 1 << 12
-_TRIES = 4  # limit of bytes read in search of chunks, in file sizes: a malicious file must not read for ever
+_TRIES = (
+    4  # limit of bytes read in search of chunks, in file sizes: a malicious file must not occupy the reader for ever
+)
 
 
 @dataclass(slots=True)
@@ -142,7 +144,7 @@ class LogFile:
                     raise UnsoundError("a record has an impossible length")
                 body = self._read(at + HEAD.size, length)
                 if opcode == Opcode.DATA_END and length == 4 and self._summary in (None, end):
-                    if intact and int.from_bytes(body, "little") not in (0, crc):
+                    if intact and int.from_bytes(body, "little") not in ((crc,) if self._by_lowfc else (0, crc)):
                         yield Damage(at, 0, _CHANGED)
                     if self._summary is None and (second := self._appended(end - len(MAGIC), self.size)):
                         yield second
@@ -154,7 +156,7 @@ class LogFile:
                 part = self._part(opcode, body, at)
             except UnsoundError as fault:
                 resumed = self._resume(at, end)
-                # The channels of another log have other ids.
+                # Stop at an appended log: its channels have other ids.
                 if begins and (second := self._appended(max(1, at - len(MAGIC)), resumed)):
                     if at < second.position:
                         yield Damage(at, second.position - at, str(fault))
@@ -181,7 +183,7 @@ class LogFile:
         return None
 
     def _find_summary(self) -> int | None:
-        """First byte of the summary; None unless its checksum is correct."""
+        """First byte of the summary, or of the footer without one; None if a required checksum is wrong or missing."""
         footer_at = self.size - _FOOTER_BYTES
         footer = self._read(footer_at, _FOOTER_BYTES) if self.finished and footer_at > 0 else b""
         if not footer or HEAD.unpack_from(footer) != (Opcode.FOOTER, 20):

@@ -45,7 +45,7 @@ class Service:
         name: name of the process, such as "camera" or "mirror-dm".
         running: True until SIGTERM, SIGINT or `stop`.
         why: cause of the end, once it is stopped.
-        work: number of frames, commands or messages processed; `rate_hz` in Health is its rate.
+        work: number of frames, commands, messages or snapshots processed; `rate_hz` in Health is its rate.
         last_health: newest Health of every other process, by name.
         announces: whether it prints on standard error that it is ready, and which processes it waits for.
         awaited: returns the processes it waits for, in words; empty if none.
@@ -160,7 +160,7 @@ class Service:
         return new
 
     def catch_signals(self) -> None:
-        """Stop at SIGTERM and SIGINT; a second SIGINT ends the process at once. For the main thread."""
+        """Stop at SIGTERM and SIGINT; a SIGINT while stopping ends the process at once. For the main thread."""
         signal.signal(signal.SIGTERM, self._caught)
         signal.signal(signal.SIGINT, self._caught)
 
@@ -210,7 +210,7 @@ class Service:
             self._send_health(now_ns)
 
     def finish(self) -> None:
-        """Publish the last Health, with all counts; publish nothing after it. Raises the fault of a failed handler."""
+        """Publish the last Health, with all counts, and nothing after it; or raise the fault of a failed handler."""
         if self._fault is not None:
             raise self._fault
         self._report_unreadable()
@@ -222,7 +222,7 @@ class Service:
     def event(self, event: str, **details: object) -> None:
         """Publish an event of the table; callable from any thread.
 
-        Warnings and errors are also printed on standard error; of a flood of one warning, only the first.
+        Warnings and errors are also printed on standard error; of one warning, `PRINTED` within `PRINTED_NS`.
         """
         kind = EVENTS[event]
         log = kind.log(self.name, self.clock.now_ns(), **details)

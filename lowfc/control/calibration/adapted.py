@@ -1,4 +1,4 @@
-"""Change the dark, pixel mask or reference image of a calibration, and recompute what depends on them."""
+"""Change the dark, pixel mask or reference image of a calibration; recompute I0, H and R, not `actuators_to_modes`."""
 
 from dataclasses import replace
 
@@ -75,9 +75,13 @@ def _same_response(before: Calibration, changed: Calibration) -> Array:
     response = before.reconstructor.astype(np.float64) @ before.response
     rows = before.reconstructor.astype(np.float64) * changed.good
     remaining = rows @ changed.response
-    if np.linalg.matrix_rank(remaining, _MIN_RESPONSE) < np.linalg.matrix_rank(response, _MIN_RESPONSE):
+    if _rank(remaining) < _rank(response):
         raise ValueError("the remaining good pixels do not tell the modes apart")
     return np.asarray(response @ np.linalg.pinv(remaining, _MIN_RESPONSE) @ rows)
+
+
+def _rank(matrix: Array) -> int:
+    return int(np.linalg.matrix_rank(matrix, rtol=_MIN_RESPONSE))
 
 
 def _reconstructed(calibration: Calibration, read_noise_e: float, gain_e: float) -> Calibration:

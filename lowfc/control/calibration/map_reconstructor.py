@@ -25,10 +25,10 @@ def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: Camer
 def map_reconstructor(
     calibration: Calibration, prior_nm2: Array | Single, flux_dn: float, camera: CameraSettings | None
 ) -> Single:
-    """R (modes, pixels) with the rows of (H'WH + P^-1)^-1 H'W for corrected modes, P the prior of uncorrected modes.
+    """R (modes, pixels) with the rows R_c - C_cu (C_uu + P_u)^-1 R_u for corrected modes c.
 
-    For corrected modes c and uncorrected modes u it is R_c - C_cu (C_uu + P_u)^-1 R_u, with C the noise covariance of
-    the calibration's own R, which is unbiased for a measured or computed H. The rows R_u stay as they are, unbiased.
+    R_u are the rows of the uncorrected modes u, which stay as they are, P_u is their prior, and C the noise covariance
+    of the calibration's own R. If that is the weighted R for the same flux, the rows are (H'WH + P^-1)^-1 H'W.
 
     Args:
         calibration: The calibration in use.

@@ -43,7 +43,7 @@ def covariance_nm2(model: Model) -> Array:
     """Covariance (states, states) of the steady filter's prediction error before a frame.
 
     Raises:
-        ValueError: the Riccati equation has no solution.
+        ValueError: the iteration does not converge.
     """
     A, Q, C = model.states()
     return model.noise_nm2 * _riccati(A, Q / model.noise_nm2, C)
@@ -70,4 +70,6 @@ def _riccati(A: Array, Q: Array, C: Array) -> Array:
         seen = (seen + seen.T) / 2
         if np.abs(grown).max() <= 1e-12 * np.abs(found).max():
             return np.asarray(found)
-    raise ValueError(f"no Kalman filter settles within {2**_DOUBLINGS} frames: a line is far below the noise")
+    raise ValueError(
+        f"no Kalman filter settles within {2**_DOUBLINGS} frames: drift or line far below the noise, or no noise"
+    )

@@ -11,11 +11,14 @@ from lowfc.control.laws.linear_law import Block, LinearLaw, law_from_blocks
 from lowfc.control.laws.stability import delay_weights
 
 _EXACT = 1e-6  # variance of limited commands relative to the states'; the Riccati equation needs one above 0
-_UNKNOWN = 1e-3  # a larger one delays the return from a limit, a smaller one makes the states forget more slowly
+_UNKNOWN = 1e-3  # more delays the return from a limit, less keeps wrong states of the notches longer
 
 
 class Notch(NamedTuple):
-    """A notch of the rejection: at `frequency_hz` it is divided by `depth`; `width_hz` is between its -3 dB points."""
+    """A notch of the rejection: at `frequency_hz` it is divided by `depth`.
+
+    `width_hz` is that between its -3 dB points if it is deep (at a depth of 4, 6 % less); neighbours deepen each other.
+    """
 
     frequency_hz: float
     width_hz: float
@@ -80,8 +83,8 @@ def _block(
     for notch in notches:
         omega = 2 * np.pi * notch.frequency_hz / rate_hz
         z = complex(np.exp(1j * omega))
-        # The resonator R makes S = S0 / (1 + R P S0); with R P S0 = (depth - 1) a / (a + i (w - w0)) that is a notch
-        # of this depth and, between its -3 dB points, of width 2 a depth.
+        # The resonator R makes S = S0 / (1 + R G S0), G = `seen`; with R G S0 = (depth - 1) a / (a + i (w - w0)) it is
+        # a notch of this depth and, if it is deep, of width 2 a depth between its -3 dB points.
         pole = complex(np.exp(-np.pi * notch.width_hz / rate_hz / notch.depth) * z)
         seen = complex(np.polynomial.polynomial.polyval(1 / z, weights)) / z
         target = (notch.depth - 1) * (1 / seen + law(z))

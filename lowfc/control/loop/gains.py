@@ -137,24 +137,24 @@ def check_gains(gains: Iterable[float], leaks: Iterable[float], delay_frames: fl
 
 def prepare_gains(settings: Settings, request: Request) -> None:
     """Cache what a reply to a request for gains or leaks needs, so that no frame waits for it."""
-    if request.name == "gain":
-        highest_gain(settings.delay_frames)
     leaks = np.unique(np.array(request.values if request.name == "leak" else settings.leak, np.float32))
     if leaks.size <= _MAX_PREPARED:
         for leak in leaks[(leaks >= 0) & (leaks <= 1)].tolist():
-            limiting_gain(settings.delay_frames, leak)
+            highest_gain(settings.delay_frames, leak)
 
 
 def remark(settings: Settings, loop: ActiveLoop, request: Request) -> str:
     """Remark on the values of a request for gains or limits; usually empty."""
-    lowest, highest = min(request.values), max(request.values)
+    lowest = min(request.values)
     if request.name == "gain":
-        recommended = highest_gain(settings.delay_frames)
-        if highest > recommended:
-            return (
-                f": above {recommended:.3g} the margins are below the {MIN_GAIN_MARGIN:g} in gain and "
-                f"{MIN_PHASE_MARGIN_DEG:g} degrees in phase that `lowfc tune` keeps, and the loop may ring"
-            )
+        chosen, integrator = _chosen(loop, request), loop.integrator
+        for gain, leak in zip(integrator.gain[chosen].tolist(), integrator.leak[chosen].tolist(), strict=True):
+            recommended = highest_gain(settings.delay_frames, leak)
+            if gain > recommended:
+                return (
+                    f": above {recommended:.3g} a margin is below the {MIN_GAIN_MARGIN:g} in gain or "
+                    f"{MIN_PHASE_MARGIN_DEG:g} degrees in phase that `lowfc tune` keeps, and the loop may ring"
+                )
         if 0 < lowest < np.float32(LOWEST_GAIN):  # values of a request are float32
             return f": below {LOWEST_GAIN:g}, the least that `lowfc tune` chooses, next to nothing is corrected"
     if request.name in ("gain", "limit") and lowest == 0:

@@ -45,7 +45,7 @@ class Settings:
         min_flux_fraction: fraction of the expected flux below which a frame is refused.
         max_saturated_pixels: good pixels at full well above which a frame is refused.
         max_identical_frames: consecutive frames that may give the same measurement as the one before; 0 for no limit.
-        gain: gain, leak and limit (nm) of tip and tilt, then of the other modes.
+        gain: gain of tip and tilt, then of the other modes; likewise `leak`, and `limit_nm`, nm.
         rate_hz: frame rate; 0 if unknown.
         guard: whether laws are guarded.
         auto_gain: whether the gains of tip and tilt, and of the other modes, are automatic.

@@ -1,4 +1,4 @@
-"""Phrases shared by several messages."""
+"""Phrases and formats shared by several messages, and the longest note."""
 
 PAUSED = "operator asked to pause"
 """Cause of the open mode of a loop that is paused."""
@@ -14,8 +14,8 @@ MAX_NOTE_LENGTH = 10_000
 
 def counted(count: float, noun: str, plural: str = "") -> str:
     """Format a number with its noun: 1 frame, 2 frames, 1.5 frames."""
-    number = f"{count:g}" if isinstance(count, float) else count
-    return f"{number} {noun if count == 1 else plural or f'{noun}s'}"
+    number = f"{count:g}" if isinstance(count, float) else str(count)
+    return f"{number} {noun if number == '1' else plural or f'{noun}s'}"
 
 
 def mode_word(mode: str) -> str:

@@ -30,7 +30,7 @@ def equal_holes(centres: Sequence[Sequence[float]], diameter: float) -> tuple[tu
 
 
 def check(layout: Layout) -> None:
-    """Raise ValueError if a hole is impossible, reaches outside the pupil or overlaps another, or if there is none."""
+    """Raise ValueError if there is no hole, or one is impossible, reaches outside the pupil or overlaps another."""
     if not layout.holes:
         raise ValueError(f"{layout.name}: a sparse aperture mask needs at least one hole")
     holes = np.array(layout.holes, dtype=np.float64)

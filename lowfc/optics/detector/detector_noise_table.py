@@ -3,7 +3,7 @@
 The distribution of the digital number for a mean of m electrons is known: Poisson, plus Gaussian, rounded. The table
 has a row for each m of a grid, with 1024 equally likely entries (Marsaglia, Tsang and Wang 2004). Each probability is
 rounded down to a multiple of 1/1024. The remainder is drawn from a second distribution, `rest`: entries equal to
-`_REMAINDER` select it. A mean between two grid values is rounded at random to one of them: the draws have this mean.
+`_REMAINDER` select it. A mean between two grid values is rounded at random to one of them, so that the mean is kept.
 """
 
 import math

@@ -19,7 +19,7 @@ HIGHEST = 1.5  # gain at the right end of a knob's bar
 STEP, FINE_STEP = 0.05, 0.01
 FINE_BELOW = 0.1
 """Knobs below this gain are turned in fine steps."""
-_BAR = 8  # columns of the bar
+_BAR = 8  # columns of the bar beside that of the knob
 _BEFORE = 11  # columns before the bar
 _PENDING_S = 1.0  # until the controller's state has the requested gain
 
@@ -61,7 +61,7 @@ class Gains(Lines):
     def turn(self, steps: int) -> None:
         """Turn the chosen knob."""
         if self._noll:
-            knob = self._knob(self._chosen)
+            knob = round(self._knob(self._chosen), 3)  # the controller's gains are float32
             fine = knob < FINE_BELOW or (steps < 0 and knob <= FINE_BELOW)
             self._request(self._chosen, knob + steps * (FINE_STEP if fine else STEP))
 
@@ -103,7 +103,7 @@ class Gains(Lines):
             knob, indices = self._knob(number), self._indices(number)
             at = min(round(knob / HIGHEST * _BAR), _BAR)
             lowest = float(self._gain[indices].min())
-            least = "" if lowest > 0.99 * knob else f"{lowest:.2g}-"
+            least = "" if lowest >= 0.99 * knob else f"{lowest:.2g}-"
             chosen = number == self._chosen
             lines.append(
                 Text.assemble(

@@ -1,4 +1,4 @@
-"""Files and gains of the configuration: checked, and requested of the controller at its start."""
+"""Checks of the configuration's files and gains; requests for its flat map and law at the controller's start."""
 
 from collections.abc import Callable
 from dataclasses import replace

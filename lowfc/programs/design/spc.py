@@ -166,16 +166,20 @@ def _picture(quarter: Array, request: Request) -> bytes:
 
     edge = min(request.outer + 4.0, float(request.cells))
     axis = np.arange(-edge, edge + FINE_STEP / 2, FINE_STEP)
+    border = edge + FINE_STEP / 2  # of the outermost samples
     decades = np.log10(np.maximum(relative_field(quarter, axis) ** 2, 1e-30))
     floor = np.log10(request.contrast) - 2.0
     drawn = image.imshow(
-        decades, vmin=floor, vmax=0.0, cmap="inferno", origin="lower", extent=(-edge, edge, -edge, edge)
+        decades, vmin=floor, vmax=0.0, cmap="inferno", origin="lower", extent=(-border, border, -border, border)
     )
     angles = np.deg2rad(np.linspace(-request.half_angle_deg, request.half_angle_deg, 91))
     radii = np.concatenate([np.full(91, request.inner), np.full(91, request.outer), [request.inner]])
     outline = np.concatenate([angles, angles[::-1], angles[:1]])
     for side in (-1.0, 1.0):
-        image.plot(side * radii * np.cos(outline), radii * np.sin(outline), "c-", linewidth=0.8)
+        x, y = side * radii * np.cos(outline), radii * np.sin(outline)
+        image.plot(x, y, "c-", linewidth=0.8)
+        if request.symmetry == "octant":
+            image.plot(y, x, "c-", linewidth=0.8)
     image.set(title="image, log10 of contrast", xlabel="x (lambda/D)", ylabel="y (lambda/D)")
     drawing.colorbar(drawn, ax=image)
 

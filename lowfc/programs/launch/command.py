@@ -19,7 +19,9 @@ def sim_loop(
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
     sensor: Annotated[
         str | None,
-        typer.Option(help="sam, bowtie, clowfs, zwfs, bar, lyot, aplc; or a mask: NAME, FILE.json or FILE.json:NAME."),
+        typer.Option(
+            help="sam, bowtie, clowfs, zwfs, bar, lyot, aplc, ...; or a mask: NAME, FILE.json or FILE.json:NAME."
+        ),
     ] = None,
     star_magnitude: Annotated[float | None, typer.Option(help="V magnitude of the star.")] = None,
     lockstep: Annotated[

@@ -52,6 +52,8 @@ def bare_loop(
     seconds: Annotated[float, typer.Option(help="Seconds for which frames are sent.")] = 10.0,
 ) -> None:
     """Wake once between two frames, as long as frames are sent, and record the kernel's counters."""
+    if role not in TRACED:
+        raise typer.BadParameter(f"it runs beside {' or '.join(TRACED)}, not {role}")
     settings = configuration(config)
     cpus = settings.realtime.controller_cpus if role is Role.CONTROLLER else settings.realtime.camera_cpus
     priority = settings.realtime.priority

@@ -36,7 +36,7 @@ _PICTURES: dict[str, tuple[str, rrb.VisualBounds2D | None]] = {
     mirror.COMMAND: ("Mirror, nm (yellow: at limit)", None),
     mirror.SURFACE: ("Mirror over the pupil, nm", None),
     pointing.TRAIL: ("Residual pointing, mas", pointing.BOUNDS),
-    science.IMAGE: ("Science camera: contrast, mean over 2 λ/D from the mask's edge", science.BOUNDS),
+    science.IMAGE: ("Science camera: contrast; numbers: mean over 2 λ/D from the mask's edge", science.BOUNDS),
     trend.TREND: ("Trend of the residual wavefront, nm rms", bounds(trend.WIDTH)),
     spectra.TILTS: ("Power spectrum of tip and tilt, nm²/Hz", bounds(spectra.WIDTH)),
     spectra.OTHERS: ("Power spectrum of the other modes, nm²/Hz", bounds(spectra.WIDTH)),
@@ -54,7 +54,7 @@ def layout(
     """The blueprint, with the tab `active` in front.
 
     Plots show the last `window_s` seconds or, for a log, the interval `span_ns`; with neither, the viewer chooses. In a
-    `still` picture of a whole log, the operator's tab omits panels that show only the last instant.
+    `still` picture of a whole log, the operator's tab has curves and problems in place of the last instant.
     """
     tabs = {
         Tab.OPERATOR: _whole_log() if still else _operator(),

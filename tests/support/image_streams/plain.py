@@ -55,11 +55,13 @@ class PlainStream:
         itemsize = np.dtype(NUMPY_TYPES.get(number, "f8")).itemsize
         elements = columns * rows * planes
         length = (elements * itemsize + 7) // 8 * 8
-        in_time = planes * 40 if kind & 0xF000F == 0x20001 else 0
+        ring_times = (
+            planes * 40 if kind & 0xF000F == 0x20001 else 0
+        )  # of a circular buffer: times and counter per plane
         path.unlink(missing_ok=True)
         with path.open("wb") as file:
             os.fchmod(file.fileno(), 0o666)
-            tail = KEYWORD * len(words) + 11 * SEMAPHORE + 4 * 40 + 10 * TRACE + in_time
+            tail = KEYWORD * len(words) + 11 * SEMAPHORE + 4 * 40 + 10 * TRACE + ring_times
             file.truncate(header_bytes + length + tail)
         stream = cls(path, columns, rows, number if number in NUMPY_TYPES else 10, planes, len(words))
         stream.pack("80s", 32, path.name.removesuffix(".im.shm").encode())

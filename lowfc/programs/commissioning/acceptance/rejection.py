@@ -58,7 +58,10 @@ class RejectionMode(ModeResult):
 
 
 class RejectionResult(AcceptanceResult):
-    """Rejection and noise transfer under a multisine; `points` has one entry per line."""
+    """Rejection and noise transfer under a multisine; `points` has one entry per line.
+
+    The largest departures are absolute values over all modes; `lines_judged` counts lines whose rejection is judged.
+    """
 
     law: str = result_field("law")
     delay_frames: float = result_field("delay", "frames", "g")

@@ -148,7 +148,7 @@ class Collected:
 
     @property
     def failing(self) -> str:
-        """Last failure, else last warning, of the device's process if its driver fails; empty otherwise."""
+        """Last failure, else last warning, of the device's process if its driver has ever failed; empty otherwise."""
         for message in reversed(self.on(EVENT.key)):
             with contextlib.suppress(DecodeError):
                 event = Log.FromString(message.payload)

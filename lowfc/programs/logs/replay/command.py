@@ -44,8 +44,8 @@ def replay_log(
 ) -> None:
     """Replay the recorded inputs through the controller, and compare every step and command with the log, bit by bit.
 
-    Exit status 0 only if they are identical, never with another kernel. Logs may be complete, rotated, truncated or
-    damaged.
+    Exit status 0 only if they are identical, or within --tolerance; never with another kernel. Logs may be complete,
+    rotated, truncated or damaged.
 
     Example: lowfc replay last
     """

@@ -10,7 +10,7 @@ from google.protobuf.message import Message
 from lowfc.arrays import Array
 
 _FLOAT32_FIELD = "actuators"
-"""Field whose bytes hold little-endian float32, nm."""
+"""Field whose bytes hold little-endian float32, nm; those of channels, a repeated message, are compared exactly."""
 _IN_NM = ("_nm", "actuators", "law_state")
 """Endings of the names of fields in nm; a law's state has the unit of its author, nm for lowfc's own laws."""
 _MAX_SHOWN = 4
@@ -50,7 +50,9 @@ def difference(input_number: int, frame_sequence: int, logged: Message, replayed
     else:
         _compare(found, "", logged, replayed)
         if not found.fields:
-            found.fields.append("the bytes, but no value: the sign of a zero, or a field unknown to this version")
+            found.fields.append(
+                "the bytes, but no value: the sign of a zero, an empty part, or a field of another version"
+            )
     return found
 
 
@@ -58,12 +60,12 @@ def _compare(found: Difference, prefix: str, logged: Message, replayed: Message)
     for descriptor in logged.DESCRIPTOR.fields:
         name = descriptor.name
         was, now = getattr(logged, name), getattr(replayed, name)
-        if was == now:
+        before, after = _numbers(descriptor, was), _numbers(descriptor, now)
+        if was == now or (before is not None and after is not None and np.array_equal(before, after, equal_nan=True)):
             continue
         if descriptor.type == FieldDescriptor.TYPE_MESSAGE and not descriptor.is_repeated:
             _compare(found, f"{prefix}{name}.", was, now)
             continue
-        before, after = _numbers(descriptor, was), _numbers(descriptor, now)
         if before is None or after is None or before.shape != after.shape or not name.endswith(_IN_NM):
             found.fields.append(f"{prefix}{name}: log {_short(was)}, replay {_short(now)}")
             found.otherwise = True

@@ -105,7 +105,9 @@ def why_none(run: Run) -> str:
     """The reason if there is no stretch."""
     closed = run.history.steps.mode == LoopMode.CLOSED
     if (closed & run.history.under_calibration).any():
-        return "this log does not contain the law with which the loop was closed"
+        return (
+            "the law with which the loop was closed is not in this log, or the integrator took over some of its modes"
+        )
     if closed.any():
         return "the loop was closed only under an earlier calibration than the last one of this log"
     return "the loop was not closed in this log"

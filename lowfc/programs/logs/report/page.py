@@ -44,11 +44,12 @@ def number(value: float | str | None, digits: int = 3) -> str:
         return NOT_HERE
     if isinstance(value, str | int):
         return str(value)
-    return f"{value:.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"
+    text = f"{value:.{digits}g}"
+    return f"{value:.0f}" if abs(float(text)) >= 10**digits else text
 
 
 def fixed(value: float | str, decimals: int = 3) -> str:
-    """A number in a column with this number of decimals; one that rounds to zero is shown as less than the smallest."""
+    """A number in a column with this number of decimals; a positive one that rounds to zero becomes "< 0.001"."""
     if isinstance(value, str | int):
         return str(value)
     least = 10.0**-decimals

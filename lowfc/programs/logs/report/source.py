@@ -15,6 +15,7 @@ from lowfc.arrays import Array, Long
 from lowfc.contract.codecs.law_codec import driving, overruled
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.loop import guard
 
 Results = dict[str, Any]
 """Results by their names in `--json`; NaN becomes null there."""
@@ -26,9 +27,9 @@ class InForce:
 
     Attributes:
         first: step from which on it is in force; comparisons ignore it and `linear`.
-        law_id, law_name: identity and name of the linear law; without one, empty and "integrator".
+        law_id, law_name: identity, or "unknown", and name of the linear law; without one, empty and "integrator".
         overruled: groups of modes that the integrator drives instead of the law.
-        linear: the linear law; None for the integrator, if it is not in the log, or if it is overruled.
+        linear: the linear law; None for the integrator, if it is not in the log, is overruled or has other modes.
     """
 
     first: int = field(compare=False)
@@ -43,7 +44,7 @@ class InForce:
     @property
     def known(self) -> bool:
         """Whether `linear`, or without it the integrator, describes the whole controller."""
-        return not self.law_id or self.linear is not None
+        return not self.law_id or self.linear is not None or set(self.overruled) == set(guard.NAMES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,8 @@ class Run:
     def seconds(self, host_ns: npt.ArrayLike) -> Array:
         """Convert host times to frame time, seconds since the first step.
 
-        The frames' publish times are interpolated. In lockstep frame time is simulated; otherwise it is only shifted.
+        The frames' publish times are interpolated. In lockstep frame time is simulated; otherwise it differs
+        from host time by an offset. Without frames of steps: host time since the log's beginning.
         """
         history, host = self.history, np.asarray(host_ns, dtype=np.int64)
         rows = rows_of(history.frame_sequence, history.steps.sequence)

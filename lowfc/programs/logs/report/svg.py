@@ -23,7 +23,7 @@ COLOURS = {
     "paper": "#fcfbfa",
 }
 """Placeholders, replaced by the page's variables of these names; most hues are near Okabe and Ito's palette, safe for
-colour blindness. Open loop and closed loop have the same colours in all drawings."""
+colour blindness. Open loop has one colour in all drawings, closed loop another."""
 
 _STYLE: Any = {
     "svg.fonttype": "none",

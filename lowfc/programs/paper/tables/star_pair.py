@@ -29,7 +29,7 @@ ASSUMPTION = (
     f"Every mode drifts by {DRIFT_PM:g} pm/sqrt(s), best gain of each mode for each star, {tolerance.RATE_HZ:g} "
     "Hz; black bodies of 20,000 K (V = 2) and 5,800 K (V = 5) over the band of 20 %, in four wavelengths."
 )
-MAP = "Over the map of the difference of both long exposures, without photon noise of the science camera."
+MAP = "Rms over the dark zone of the difference of the two long exposures, without photon noise of the science camera."
 
 
 def coloured(temperature_K: float) -> Band:
