@@ -35,6 +35,7 @@ class LoggedLoop(InProcessLoop):
 
     def __init__(self) -> None:
         super().__init__(load(None, CONFIG))
+        self._grid = self.config.mirror.rows, self.config.mirror.columns
         self.kept_steps: list[Step] = []
 
     def steps(self, count: int | None = None, patience_s: float = 0.0) -> Iterator[Step]:

@@ -2,7 +2,7 @@
 
 Everything is checked by checksums. In a finished log they cover every byte: chunks and attachments have their own,
 DataEnd has that of the data section, the footer that of the summary. A log rewritten by another tool may lack checksums
-and chunks; a missing checksum is not checked.
+and chunks. A missing checksum of the data section is not checked, nor any other missing one in such a log.
 """
 
 import contextlib
@@ -144,7 +144,7 @@ class LogFile:
                     raise UnsoundError("a record has an impossible length")
                 body = self._read(at + HEAD.size, length)
                 if opcode == Opcode.DATA_END and length == 4 and self._summary in (None, end):
-                    if intact and int.from_bytes(body, "little") not in ((crc,) if self._by_lowfc else (0, crc)):
+                    if intact and int.from_bytes(body, "little") not in (0, crc):
                         yield Damage(at, 0, _CHANGED)
                     if self._summary is None and (second := self._appended(end - len(MAGIC), self.size)):
                         yield second
