@@ -106,9 +106,9 @@ class Night:
             self.put(REQUEST, codec.encode_request(logged or input_, outputs.reply, number, shown))
         elif not isinstance(input_, Frame) and number > self._last_number:
             self.put(CONTROL_INPUT, codec.encode_input(input_, number))
-        self._last_number = number
-        if outputs.changed or number % STATE_EVERY == 0:
+        if outputs.changed or (number > self._last_number and number % STATE_EVERY == 0):
             self._put_state()
+        self._last_number = number
 
     def steps(self) -> int:
         return sum(message.key == STEP.key for message in self.messages)
