@@ -27,7 +27,6 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
-from lowfc.control.cache_warmup import CacheWarmup
 from lowfc.control.loop.safety import Limits, Reason, Rejection
 from lowfc.device.driver import Mirror, MirrorExtras, geometry
 from lowfc.device.mirror_protection import Command, MirrorProtection, Status, apply_command, tick
@@ -92,9 +91,6 @@ class MirrorLoop:
         self._fill_extra = getattr(driver, "fill", _NO_EXTRAS.fill)
         self.watch = DriverWatch(service, PATIENCE_S, self._hang)
         self._turn = threading.Lock()
-        warms_up = config.realtime.cache_warmup and not config.lockstep
-        self._warmup = CacheWarmup(config.period_ns) if warms_up else None
-        self._last_payload: bytes | None = None
         self._pause = Mailbox()  # never receives a message; a signal ends a wait on it at any time
         service.on_stop(self._pause.wake)
         self._applied_ns = self._picture_due_ns = self._state_due_ns = 0
@@ -134,11 +130,7 @@ class MirrorLoop:
         service = self._service
         with self.watch.over(self._close):
             while service.running:
-                wait_ns = None if self._warmup is None else self._warmup.wait_ns(service.clock.host_ns())
-                self._pause.take(min(TICK_NS if wait_ns is None else wait_ns, TICK_NS) * 1e-9)
-                if self._warmup is not None and self._warmup.due(service.clock.host_ns()):
-                    self._warm_up()
-                    continue
+                self._pause.take(TICK_NS * 1e-9)
                 free = self._turn.acquire(timeout=TICK_NS * 1e-9)
                 if free:
                     try:
@@ -183,26 +175,11 @@ class MirrorLoop:
             self._service.event("COMMAND_REFUSED", reason=refused.name)
         if refused is None:
             self._applied_ns = clock.host_ns()
-            if self._warmup is not None:
-                self._last_payload = sample.payload
-                self._warmup.frame_received(sample.receive_time_ns)
-                self._pause.wake()  # `run` then waits until the next warm-up is due
         if not before.following and before.frame_sequence and refused is None:
             self._service.event("COMMAND_BACK")
         for reason in self._status.limits_hit:
             if reason not in before.limits_hit:
                 self._service.event("LIMIT_HIT", reason=reason.name)
-
-    def _warm_up(self) -> None:
-        """Repeat the last command without moving the mirror, unless a command is being applied; see `CacheWarmup`."""
-        if self._last_payload is None or not self._turn.acquire(blocking=False):
-            return
-        try:
-            command, now_ns = command_of(self._last_payload, self._start_check), self._service.clock.now_ns()
-            status, refused = apply_command(self._protection, self._status, command, now_ns, lambda same_nm, _: same_nm)
-            state_of(status, now_ns, refused).SerializeToString()
-        finally:
-            self._turn.release()
 
     def _drive(self, actuators_nm: Single, elapsed_ns: float) -> Single:
         """Call the driver to move; a real mirror is called only with a new command."""

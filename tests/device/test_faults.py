@@ -1,7 +1,6 @@
 """Drivers in their loops; those that fail, hang or return invalid data are reported, counted and retried."""
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -261,19 +260,6 @@ def test_commands_are_limited_and_the_mirror_goes_flat_after_the_command_timeout
     bench.tick()
     assert mirror.heights_nm[2:] == [0.0], "a mirror at rest gets no further call"
     assert bench.listener.events()[-1] == "COMMAND_EXPIRED"
-
-
-def test_a_warm_up_of_the_mirror_neither_calls_its_driver_nor_changes_or_publishes_anything() -> None:
-    mirror = Mirror()
-    bench = Bench(mirror)
-    bench.loop._warm_up()  # before the first command
-    bench.command(20.0)
-    before, published = bench.loop._status, len(bench.listener.messages(MIRROR_STATE))
-    bench.loop._warm_up()
-    assert bench.loop._status is before
-    assert (mirror.heights_nm, len(bench.listener.messages(MIRROR_STATE))) == ([0.0, 20.0], published)
-    with bench.loop._turn, ThreadPoolExecutor(1) as thread:  # a hanging command must not stop Health
-        thread.submit(bench.loop._warm_up).result(5)
 
 
 @pytest.mark.parametrize(
