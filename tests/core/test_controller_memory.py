@@ -47,6 +47,7 @@ from lowfc.contract.published import Published
 from lowfc.control import cache_warmup
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import integrator
+from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.device import DriverOptions
@@ -171,7 +172,9 @@ class Rig:
         assert not any(bus.faults.counts for bus in self.hub.buses)
 
 
-def alone(calibration: Calibration, latch: Latch, config: Configuration) -> tuple[MemoryHub, Service, Controller]:
+def alone(
+    calibration: Calibration | None, latch: Latch, config: Configuration
+) -> tuple[MemoryHub, Service, Controller]:
     """A controller without camera and mirror."""
     hub, clock = MemoryHub(), SimulatedClock(START_NS) if config.lockstep else HostClock()
     service = Service("controller", "test", clock, MemoryBus(hub, "controller", clock))
@@ -381,6 +384,20 @@ def test_safe_mode_outlives_the_controller(calibration: Calibration, tmp_path: P
     assert mode() is LoopMode.SAFE
     file.unlink()
     assert mode() is LoopMode.CLOSED
+
+
+def test_safe_mode_outlives_a_controller_without_mirror_and_calibration(
+    calibration: Calibration, tmp_path: Path
+) -> None:
+    """It neither removes the latch nor opens the loop when an operator loads a calibration."""
+    (file := tmp_path / "safe").touch()
+    latch = Latch([file])
+    controller = alone(None, latch, CLOSED)[2]
+    controller._update_latch()
+    latch.close()
+    assert file.exists()
+    assert controller._carry_out_internal(Request(START_NS, "load", calibration=calibration)).accepted
+    assert mode_of(controller) is LoopMode.SAFE
 
 
 def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration: Calibration, tmp_path: Path) -> None:

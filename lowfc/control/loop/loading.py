@@ -83,6 +83,11 @@ def loaded(
     return state, events
 
 
+def safe_pending(settings: Settings, state: State) -> bool:
+    """Whether safe mode was latched before the start, and is entered once mirror or calibration is known."""
+    return settings.start_mode is LoopMode.SAFE and state.loop is None and not state.conditions.clear_id
+
+
 def misfit(state: State) -> str:
     """Why the camera's last received settings do not fit the calibration; empty if they do."""
     camera, loop = state.conditions.camera, state.loop
@@ -159,7 +164,7 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
     if loop is None:  # probe sequences and channels need no calibration
         loop = ActiveLoop.at_rest(settings, Calibration.none(shape.actuators_nm.shape))
         events.append(PendingEvent("NOT_CALIBRATED", {"why": uncalibrated(state)}))
-        safe = safe or (LATCHED if settings.start_mode is LoopMode.SAFE else "")
+        safe = safe or (LATCHED if safe_pending(settings, state) else "")
     if safe:
         state = _changed(state, LoopMode.SAFE, shape.time_ns, safe, events)
         loop = state.loop or loop  # without the channels that safe mode removes

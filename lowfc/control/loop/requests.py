@@ -15,7 +15,7 @@ from lowfc.control.loop.command_channels import EXTERNAL, FLAT, MIRROR, CommandC
 from lowfc.control.loop.gains import changed_integrator, check_offset, offset_remark, per_mode, prepare_gains
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
-from lowfc.control.loop.loading import holding_cause, in_mode, loaded, misfit, mode_event, uncalibrated
+from lowfc.control.loop.loading import holding_cause, in_mode, loaded, misfit, mode_event, safe_pending, uncalibrated
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, permit, release, renew
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
@@ -277,7 +277,8 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
             f"the calibration is for a mirror of {request.calibration.grid} actuators, this one has "
             f"{before.calibration.grid}"
         )
-    settings = replace(settings, start_mode=LoopMode.OPEN)  # an idle loop opens, whatever the configured mode
+    if not safe_pending(settings, state):  # an idle loop opens, whatever the configured mode
+        settings = replace(settings, start_mode=LoopMode.OPEN)
     after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
     others = (event for event in events if event.name != "MODE_CHANGED")  # `answer` adds it
     return after, f"calibration {request.calibration.id[:12]}", *others

@@ -38,7 +38,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.durations import Durations
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Input, Load, MirrorReport, Outputs, Reply, Report, Request, Tick
-from lowfc.control.loop.loading import holding_cause, misfit
+from lowfc.control.loop.loading import holding_cause, misfit, safe_pending
 from lowfc.control.loop.requests import CONFIGURATION, MAX_REPLY_LENGTH, prepared
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
@@ -307,7 +307,7 @@ class Controller:
 
     def _update_latch(self) -> None:
         """Set or clear the latch if safe mode has changed: after the reply, and in a separate thread."""
-        safe = self._state.mode is LoopMode.SAFE
+        safe = self._state.mode is LoopMode.SAFE or safe_pending(self._settings, self._state)
         if safe is not self._latched_safe:
             self._latched_safe = safe
             self._latch.set(safe)
