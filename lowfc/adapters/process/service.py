@@ -3,6 +3,7 @@
 import contextlib
 import os
 import platform
+import select
 import signal
 import sys
 import threading
@@ -245,7 +246,8 @@ class Service:
 
     def _print(self, line: str) -> None:
         with contextlib.suppress(OSError, ValueError):  # a closed terminal or a full disk must not end the process
-            sys.stderr.write(f"{self.name}: {line}\n")
+            if select.select((), (2,), (), 0)[1]:  # nor a stopped terminal (Ctrl-S) or a full pipe halt it
+                sys.stderr.write(f"{self.name}: {line}\n")
 
     def unreadable(self, key: str, why: object) -> None:
         """Count an unreadable message; each Health reports new ones in one event. Callable from any thread."""
