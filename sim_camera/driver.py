@@ -1,6 +1,5 @@
 """The simulated camera as a driver: receives mirror states; publishes frames and the true wavefront."""
 
-import threading
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from google.protobuf.message import DecodeError
 from pydantic import Field
 
 from lowfc.adapters.bus.bus import Publisher, Sample
+from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.files import factory
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Single
@@ -154,7 +154,7 @@ class SimulatedCamera:
         flat = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
         self._shapes = deque([flat] * len(self._weights), maxlen=len(self._weights))
         self._states: deque[Sample] = deque(maxlen=_REMEMBERED)
-        self._arrived = threading.Event()
+        self._arrived = Mailbox()  # a signal's handler may wake it; an Event would deadlock
         self._latched = flat
         # In lockstep a shape applies from the start of an exposure, and the mirror's state already includes settling.
         settling = 0.0 if config.lockstep else config.mirror.settling_us * 1e3 / config.period_ns
@@ -177,7 +177,7 @@ class SimulatedCamera:
         self._contrast = Contrast(modal)
         self._truths = service.publisher(TRUTH)
         service.bus.subscribe(MIRROR_STATE, self._on_mirror_state, self._config.mirror.name)
-        service.on_stop(self._arrived.set)
+        service.on_stop(self._arrived.wake)
 
     def through(self, publisher: Publisher) -> Puts:
         """The publisher itself, or wrapped by the fault of the options."""
@@ -238,8 +238,7 @@ class SimulatedCamera:
             BusError: no state of the mirror for PATIENCE_S.
         """
         while self._newest_state < self._last_frame and self._service.running:
-            self._arrived.clear()
-            if not self._states and not self._arrived.wait(PATIENCE_S):
+            if not self._states and self._arrived.take(PATIENCE_S) is None and self._service.running:
                 raise BusError(self._no_progress())
             self._drain()
 
@@ -300,7 +299,7 @@ class SimulatedCamera:
 
     def _on_mirror_state(self, sample: Sample) -> None:
         self._states.append(sample)
-        self._arrived.set()
+        self._arrived.put(sample)
 
     def _drain(self) -> None:
         """Process the received mirror states; the newest shape is that of the next exposure."""
