@@ -153,7 +153,8 @@ class Command(NamedTuple):
 
     Attributes:
         safe: the loop is in safe mode.
-        clear_id: identity of the operator's last clear; 0 without one.
+        clear_id: identity of the operator's last clear; without one, before the first frame the time of the loop mode's
+            beginning, then 0.
     """
 
     frame_sequence: int
