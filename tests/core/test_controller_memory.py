@@ -370,34 +370,24 @@ def test_states_refer_to_law_and_probe_sequence_by_identity(rig: Rig) -> None:
 
 
 def test_safe_mode_outlives_the_controller(calibration: Calibration, tmp_path: Path) -> None:
-    """The latch is a file."""
+    """The latch is a file; it acts also if an operator loads the first calibration."""
     file = tmp_path / "safe"
 
-    def mode() -> LoopMode:
+    def mode(first: Calibration | None = calibration) -> LoopMode:
         latch = Latch([file])
-        found = mode_of(alone(calibration, latch, CLOSED)[2])
+        controller = alone(first, latch, CLOSED)[2]
+        controller._update_latch()
         latch.close()  # otherwise it would write the file again
-        return found
+        if first is None:
+            controller._carry_out_internal(Request(START_NS, "load", calibration=calibration))
+        return mode_of(controller)
 
     assert mode() is LoopMode.CLOSED
     file.touch()
+    assert mode(None) is LoopMode.SAFE
     assert mode() is LoopMode.SAFE
     file.unlink()
     assert mode() is LoopMode.CLOSED
-
-
-def test_safe_mode_outlives_a_controller_without_mirror_and_calibration(
-    calibration: Calibration, tmp_path: Path
-) -> None:
-    """It neither removes the latch nor opens the loop when an operator loads a calibration."""
-    (file := tmp_path / "safe").touch()
-    latch = Latch([file])
-    controller = alone(None, latch, CLOSED)[2]
-    controller._update_latch()
-    latch.close()
-    assert file.exists()
-    assert controller._carry_out_internal(Request(START_NS, "load", calibration=calibration)).accepted
-    assert mode_of(controller) is LoopMode.SAFE
 
 
 def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration: Calibration, tmp_path: Path) -> None:
@@ -406,6 +396,17 @@ def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration:
     MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(small.SerializeToString())
     with pytest.raises(CalibrationError, match="20, 20"):
         controller.run()
+
+
+def test_the_flat_map_waits_for_a_mirror_that_starts_later(tmp_path: Path) -> None:
+    np.save(tmp_path / "flat.npy", np.ones(GRID, np.float32))
+    config = configured(lockstep=False, mirror__flat=str(tmp_path / "flat.npy"))
+    hub, _, controller = alone(None, Latch([tmp_path / "safe"]), config)
+    controller._send_start_requests()
+    shape = wire.MirrorState(rows=GRID[0], columns=GRID[1], actuators=bytes(4 * GRID[0] * GRID[1]))
+    MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
+    controller._between_frames(None)
+    assert [one.name for one in controller._state.loop.command_channels.channels] == ["flat"]
 
 
 def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: Calibration, tmp_path: Path) -> None:

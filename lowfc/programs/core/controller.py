@@ -76,7 +76,7 @@ class Controller:
         self._latch = latch
         self._settings = settings_under(latch, config, service.event)
         self._configuration = config.to_toml()
-        self._start_up = StartUp(config)
+        self._start_up, self._start_pending = StartUp(config), True
         self._gain_watch = GainWatch(self._settings, config.control.on_harm, contrast_of(config).form)
         self._gain_requests: deque[Request] = deque()
         self._latched_safe = latch.safe
@@ -240,6 +240,8 @@ class Controller:
             self._bench.update()
             if self._mirror.due:
                 self._report_mirror()
+        if self._start_pending:
+            self._send_start_requests()
         silent_ns = self._service.clock.host_ns() - self._last_frame_ns
         if silent_ns >= TICK_NS and not self._service.clock.lockstep:
             self._apply_report(Tick(self._service.clock.now_ns(), silent_ns))
@@ -342,7 +344,10 @@ class Controller:
             self._apply_report(MirrorReport(self._service.clock.now_ns(), fault, self._mirror.last()))
 
     def _send_start_requests(self) -> None:
-        """Request the configured mirror shapes and control law, as an operator would."""
+        """Once the mirror's grid is known, request its configured shapes and control law, as an operator would."""
+        if self._state.loop is None:
+            return
+        self._start_pending = False
         for request in self._start_up.requests(self._state, self._service.clock.now_ns()):
             reply = self._carry_out_internal(request, lock=contextlib.nullcontext())
             if not reply.accepted and request.name == "law" and misfit(self._state):
