@@ -2,13 +2,13 @@
 
 import contextlib
 import threading
+import time
 from collections.abc import Callable
 
 import numpy as np
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.bus.start_check import StartCheck
 from lowfc.adapters.files.factory import true_mirror
 from lowfc.adapters.process.clock import SimulatedClock
@@ -91,8 +91,6 @@ class MirrorLoop:
         self._fill_extra = getattr(driver, "fill", _NO_EXTRAS.fill)
         self.watch = DriverWatch(service, PATIENCE_S, self._hang)
         self._turn = threading.Lock()
-        self._pause = Mailbox()  # never receives a message; a signal ends a wait on it at any time
-        service.on_stop(self._pause.wake)
         self._applied_ns = self._picture_due_ns = self._state_due_ns = 0
         self._states = service.publisher(MIRROR_STATE, name)
         self._surfaces = service.publisher(SURFACE, name)
@@ -130,7 +128,7 @@ class MirrorLoop:
         service = self._service
         with self.watch.over(self._close):
             while service.running:
-                self._pause.take(TICK_NS * 1e-9)
+                time.sleep(TICK_NS * 1e-9)
                 free = self._turn.acquire(timeout=TICK_NS * 1e-9)
                 if free:
                     try:
