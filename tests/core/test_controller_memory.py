@@ -400,8 +400,8 @@ def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration:
 
 def test_the_flat_map_waits_for_a_mirror_that_starts_later(tmp_path: Path) -> None:
     np.save(tmp_path / "flat.npy", np.ones(GRID, np.float32))
-    config = configured(lockstep=False, mirror__flat=str(tmp_path / "flat.npy"))
-    hub, _, controller = alone(None, Latch([tmp_path / "safe"]), config)
+    flat = configured(lockstep=False, mirror__flat=str(tmp_path / "flat.npy"))
+    hub, _, controller = alone(None, Latch([tmp_path / "safe"]), flat)
     controller._send_start_requests()
     shape = wire.MirrorState(rows=GRID[0], columns=GRID[1], actuators=bytes(4 * GRID[0] * GRID[1]))
     MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())

@@ -153,8 +153,7 @@ class Command(NamedTuple):
 
     Attributes:
         safe: the loop is in safe mode.
-        clear_id: identity of the operator's last clear; without one, before the first frame the time of the loop mode's
-            beginning, then 0.
+        clear_id: identity of the operator's last clear or, before the first frame, of the mode's beginning; else 0.
     """
 
     frame_sequence: int
