@@ -95,11 +95,14 @@ class CameraLoop:
                 return None
             if not isinstance(exposure, Exposure):
                 raise TypeError(f"expose() returned {type(exposure).__name__}, expected Exposure or None")
-            if not isinstance(exposure.pixels, np.ndarray):
-                raise TypeError(f"pixels of Exposure are {type(exposure.pixels).__name__}, expected a numpy array")
-            if exposure.pixels.shape != (settings.rows, settings.columns):
+            if not isinstance(pixels := exposure.pixels, np.ndarray):
+                raise TypeError(f"pixels of Exposure are {type(pixels).__name__}, expected a numpy array")
+            if pixels.shape != (settings.rows, settings.columns):
                 settings = self._publish_settings()  # the region changed during the exposure
-            pixels = _checked(exposure.pixels, settings)
+            shape = settings.rows, settings.columns
+            if pixels.dtype != np.uint16 or pixels.shape != shape:
+                expected = f"expected uint16 of shape {shape}, as the settings say"
+                raise ValueError(f"pixels are {pixels.dtype} of shape {pixels.shape}, {expected}")
             end_ns = self._end_ns(exposure, settings)
             self._follow_numbers(exposure, settings)
         except Exception as fault:
@@ -191,13 +194,3 @@ class CameraLoop:
             health.mean_rate_hz = (self._service.work - 1) * 1e9 / elapsed_ns
         health.driver_failures = self.watch.failures
         self.watch.call(self._fill_extra, health)
-
-
-def _checked(pixels: Pixels, settings: CameraSettings) -> Pixels:
-    """Check pixels before publication; ValueError if their type or shape is wrong."""
-    if pixels.dtype != np.uint16 or pixels.shape != (settings.rows, settings.columns):
-        raise ValueError(
-            f"pixels are {pixels.dtype} of shape {pixels.shape}, expected uint16 of shape "
-            f"{(settings.rows, settings.columns)}, as the settings say"
-        )
-    return pixels
