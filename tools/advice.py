@@ -187,7 +187,7 @@ ADVICE: dict[str, Advice] = {
     ),
     "RECORDING_FAILED": Advice(
         "the disk is nearly full, a write failed, or the folder is gone. A log is readable up to its last flush.",
-        "free some space, end the recorder and start another (`lowfc record`); the loop continues without a log.",
+        "free some space, then `lowfc ctl record start`; the loop continues without a log.",
     ),
     "DISK_SLOW": Advice("one write took long; messages waited in memory.", "use a faster or less busy disk."),
     "ON_EVENT_FAILED": Advice(

@@ -206,9 +206,7 @@ class Recorder:
         return self._failure
 
     def _resume(self) -> str:
-        if self._failure:
-            return f"{self._failure}; start another recorder"
-        if not self._paused or not self.service.running:
+        if not (self._paused or self._failure) or not self.service.running:
             return "recording is already in progress" if self.service.running else "the recorder is ending"
         try:
             if short := self._series.shortage():
@@ -217,7 +215,7 @@ class Recorder:
         except DataFileError as fault:
             self._series.give_up()
             return str(fault)
-        self._paused = False
+        self._paused, self._failure = False, ""
         self.service.state = "ready"
         self._peers.query_soon()
         return ""
