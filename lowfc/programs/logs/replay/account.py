@@ -34,6 +34,7 @@ class Account(Result):
         runs: names of the runs in the logs.
         stopped: reasons why a recording ended early.
         recorded_on: versions and host in the first log.
+        span_ns: log times of the first frame and the last; (0, 0) without one.
     """
 
     frames: int = 0
@@ -61,6 +62,7 @@ class Account(Result):
     host_differs: dict[str, tuple[str, str]] = Field({})
     recorded_on: dict[str, str] = Field({}, exclude=True)
     finished: bool = Field(True, exclude=True)
+    span_ns: tuple[int, int] = Field((0, 0), exclude=True)
 
     @computed_field  # type: ignore[prop-decorator]
     @property
@@ -78,8 +80,9 @@ class Account(Result):
     def add(self, later: "Account") -> None:
         """Add the account of the next segment, whose worker has read further and knows the later state of the logs."""
         for name, field in type(self).model_fields.items():
-            if field.annotation in (int, Counter[str]) or name == "log_s":
+            if field.annotation in (int, Counter[str]):
                 setattr(self, name, getattr(self, name) + getattr(later, name))
+        self.span_ns = self.span_ns[0] or later.span_ns[0], later.span_ns[1] or self.span_ns[1]
         self.first_difference = self.first_difference or later.first_difference
         self.other_kernel = self.other_kernel or later.other_kernel
         self.largest_difference_nm = max(self.largest_difference_nm, later.largest_difference_nm)

@@ -31,12 +31,7 @@ class Replay:
         self.context = Context(tolerance_nm, segment, kernel=kernel)
         self._controllers: dict[int, ControllerReplay] = {}
         self._recording = "", ""
-        self._last_ns = self._begun_ns = self._ended_ns = 0
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first frame of the segment to its last, by their log times."""
-        return (self._ended_ns - self._begun_ns) * 1e-9
+        self._last_ns = 0
 
     def begin_file(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
         """Begin a file; forget controllers and frames of another recording, because lockstep runs share sequences."""
@@ -57,7 +52,7 @@ class Replay:
         if topic is FRAME:
             context.frames.add(message.sequence, message.payload)
             if inside:
-                self._begun_ns, self._ended_ns = self._begun_ns or now_ns, now_ns
+                context.account.span_ns = context.account.span_ns[0] or now_ns, now_ns
         elif topic in published.TOPICS:
             context.published.store(topic, message.payload)
             for controller in self._controllers.values():

@@ -42,7 +42,8 @@ def replay_files(
     previous one ends, DataFileError if one cannot be replayed.
     """
     chunk_ends_ns = [_chunk_ends_ns(path) for path in paths]
-    ends_ns = [end_ns for ends in chunk_ends_ns for end_ns in ends]
+    # Sorted, because a large calibration at the start of a file is a chunk by itself, with its former time.
+    ends_ns = sorted(end_ns for ends in chunk_ends_ns for end_ns in ends)
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigurationError("a log is named twice; name each once, in the order they were recorded")
     if len(paths) > 1:
@@ -67,6 +68,7 @@ def replay_files(
         total.add(account)
     unaccounted = total.steps - total.frames - total.unchecked
     total.leave_out("without a state of the controller before them", max(0, unaccounted))
+    total.log_s = (total.span_ns[1] - total.span_ns[0]) * 1e-9
     return total
 
 
@@ -118,7 +120,7 @@ def _replay_segment(
     finally:
         gc.enable()
     about = [(part.path.name, part.metadata) for part in log.parts]
-    account.complete, account.log_s, account.recorded_on = log.complete, run.duration_s, about[0][1].get("lowfc", {})
+    account.complete, account.recorded_on = log.complete, about[0][1].get("lowfc", {})
     account.finished = log.finished
     account.damaged = [f"byte {one.position}: {one.why}" for one in log.damage]
     account.runs = sorted({metadata.get("lowfc", {}).get("run", "?") for _, metadata in about})
