@@ -246,6 +246,8 @@ def test_the_noise_is_that_of_the_reconstructor_in_use(tmp_path: Path) -> None:
     assert after is not None
     assert (after.total_nm[:2] < 0.99 * before.total_nm[:2]).any()
     assert after.total_nm[2] == before.total_nm[2]
+    run.history.controllers.append(wire.ControllerState())  # restarted afterwards
+    assert np.array_equal(closed_loop.noise_of(run.history, slice(None)).total_nm, after.total_nm)
 
 
 def test_a_limit_of_mirror_and_controller_has_the_larger_count(good: Path) -> None:
@@ -407,6 +409,16 @@ def test_theory_is_that_of_the_linear_law_in_use(tmp_path: Path, logged: bool) -
         tip = made.results["spectra"]["groups"][0]
         assert tip["measured_over_theory"]["median"] == pytest.approx(1, abs=0.03)
         assert "linear law pi" in page(made)
+
+
+def test_the_stretch_of_a_law_ends_where_the_law_is_overruled(tmp_path: Path) -> None:
+    night = SyntheticLog(guard=True, rate_hz=1000.0).frames(20)
+    night.law(0.01)
+    found = results(night.frames(700).write(tmp_path / "x.mcap"))
+    (overruled,) = (event for event in found["events"] if event["name"] == "LAW_OVERRULED")
+    stretch = found["closed_stretch"]
+    assert (stretch["law"], stretch["to_s"], stretch["steps_limited"]) == ("pi", pytest.approx(0.617), 0)
+    assert overruled["time_s"] == pytest.approx(0.618, abs=1e-4)
 
 
 @pytest.mark.parametrize(("lost", "without", "at_the_end"), [(1, 0, 1), (50, 0, 50), (80, 30, 50)])

@@ -15,7 +15,7 @@ from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.margins import noise_transfer, rejection
 from lowfc.control.laws.spectra import SHORTEST, Spectrum, TimeSeries, in_bins, spectrum, time_series
 from lowfc.control.laws.stability import settling_frames
-from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.logs.report.source import InForce, Results, Run
 
@@ -69,7 +69,9 @@ def longest_stretch(run: Run) -> Stretch | None:
     history, laws = run.history, run.law_rows()
     steps = history.steps
     known = np.array([*(law.known for law in run.laws), False])  # the last for steps before the first law
-    closed = (steps.mode == LoopMode.CLOSED) & known[laws] & history.under_calibration
+    linear = np.array([*(law.linear is not None for law in run.laws), False])
+    overruled = linear[laws] & (steps.reasons >> Limit.LAW_OVERRULED & 1 == 1)  # the next state names it
+    closed = (steps.mode == LoopMode.CLOSED) & known[laws] & ~overruled & history.under_calibration
     edges = np.flatnonzero(np.diff(np.where(closed, laws, -1), prepend=-1, append=-1))
     spans = [(first, last) for first, last in pairwise(edges.tolist()) if closed[first]]
     if not spans:
@@ -119,7 +121,7 @@ def stretch_results(run: Run, stretch: Stretch | None) -> Results | None:
         return None
     steps = run.history.steps
     times_s = run.step_s[stretch.rows]
-    limited = (steps.reasons[stretch.rows] >> 20) != 0
+    limited = steps.reasons[stretch.rows] & ~(1 << Limit.LAW_OVERRULED) >= 1 << Limit.MODAL_LIMIT
     return {
         "from_s": float(times_s[0]),
         "to_s": float(times_s[-1]),
@@ -247,8 +249,10 @@ def noise_of(history: History, rows: slice) -> SensorNoise | None:
             return SensorNoise(nothing, nothing)
         charge_e = history.configuration.dark_e
     end = history.steps.sequence[rows][-1]
-    states = [state for state in history.controllers if state.frame_sequence <= end]
-    in_use = calibration_in_use(states[-1], calibration) if states else calibration
+    newest = np.array([state.frame_sequence for state in history.controllers], np.uint64)
+    from_frame = np.maximum.accumulate(newest) + (newest == 0)  # a state after a start or `clear` has no frame
+    count = np.searchsorted(from_frame, end, side="right")
+    in_use = calibration_in_use(history.controllers[count - 1], calibration) if count else calibration
     em_gain = max(camera.em_gain, 1.0)
     excess = 2.0 if em_gain > 1 else 1.0
     readout_e2 = camera.read_noise_e**2 + camera.gain_e_per_dn**2 / 12  # after the EM gain; rounding to whole DN
