@@ -711,10 +711,16 @@ def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
         assert log.metadata["recording"] == account, "of this recording, not of the recorder"
 
 
-def test_a_log_that_cannot_be_created_is_refused_and_can_be_requested_again(bench: Bench) -> None:
-    bench.start()
+def test_a_log_that_cannot_be_created_is_refused_and_can_be_requested_again(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.start(bytes_per_s=1e6)
     operator = Client(bus=MemoryBus(bench.hub, "operator", bench.clock))
     first = operator.record(False).text
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.disk_usage", lambda folder: Path(os.devnull, "x").stat())
+        with pytest.raises(RequestRefusedError, match="cannot be accessed: Not a directory"):
+            operator.record(True)
     moved = bench.folder.with_name("elsewhere")
     bench.folder.rename(moved)
     bench.folder.write_text("a file")

@@ -75,6 +75,7 @@ class Recorder:
         self._account = LossAccount()
         self._selection = selection
         self._folder, self._min_free_bytes = folder, limits.min_free_bytes
+        self._present_folder = str(Path.cwd())  # it may be removed later
         self._expect, self._expected_bytes_per_s = expected_bytes_per_s, 0.0
         self._series = LogSeries(folder, clock, {**metadata, **selection.metadata}, attachments, limits)
         self._peers = Peers(bus)
@@ -174,7 +175,7 @@ class Recorder:
                 return
             self._queries.popleft()
             path = str(self._series.files[-1].absolute()) if self._series.files else ""
-            estimate = self._estimate() if query.name == "start" else ""
+            estimate = self._estimate() if query.name == "start" and not refusal else ""
             answer = wire.Request(
                 timestamp=timestamp(self._clock.now_ns()),
                 name=query.name,
@@ -361,7 +362,7 @@ class Recorder:
         lost = self._account.lost()
         health.recording.files.extend(map(str, self._series.files[-MAX_HEALTH_LOGS:]))
         health.recording.file = health.recording.files[-1] if health.recording.files else ""
-        health.recording.folder = str(Path.cwd())
+        health.recording.folder = self._present_folder
         health.recording.messages = self._series.messages
         health.recording.lost = sum(lost.values())
         health.recording.failure = self._failure
