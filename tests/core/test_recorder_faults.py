@@ -233,6 +233,12 @@ def test_a_recorder_stopped_while_a_log_is_finished_completes_the_log(
     assert not log.name.endswith(UNFINISHED)
 
 
+def test_a_log_may_be_moved_as_soon_as_it_has_its_name(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(writer, "_sync_folder", lambda folder: next(folder.glob("*.mcap")).unlink())
+    bench.start()
+    assert bench.stop().failure == ""
+
+
 def test_a_stop_requested_while_the_recorder_ends_is_answered_with_the_complete_log(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -208,7 +208,8 @@ class LogSeries:
 def _finish(log: LogWriter, totals: Mapping[str, str]) -> int:
     """Finish a file; return its growth in bytes."""
     before_bytes = log.bytes_written
-    return log.finish({"recording": totals}).stat().st_size - before_bytes
+    log.finish({"recording": totals})  # as soon as it has its name, another program may move the file
+    return log.bytes_written - before_bytes
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str:
