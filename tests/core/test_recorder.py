@@ -120,7 +120,6 @@ def test_the_camera_is_known_before_the_first_log_begins(bench: Bench, state: wi
 
 
 def test_every_lost_message_is_counted(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also after the removal of the folder in which the recorder was started."""
     (started_in := tmp_path / "here").mkdir()
     monkeypatch.chdir(started_in)
     frames, steps = bench.camera.publisher(FRAME), bench.controller.publisher(STEP)
@@ -131,7 +130,7 @@ def test_every_lost_message_is_counted(bench: Bench, tmp_path: Path, monkeypatch
 
     bench.hub.lose = lose
     bench.start()
-    started_in.rmdir()
+    started_in.rmdir()  # the recorder does not depend on it
     put(frames, 50)  # the last one is lost too: only the camera's Health reveals it
     put(steps, 5)  # none arrives
     summary = bench.stop()

@@ -451,18 +451,12 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return report_log.SyntheticLog().frames(STEPS).write(tmp_path_factory.mktemp("night") / "night.mcap")
 
 
-def test_several_processes_give_the_account_of_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second file begins with a calibration as large as a chunk, received before the end of the first file."""
-    made, paths = report_log.SyntheticLog(), [tmp_path / "1.mcap", tmp_path / "2.mcap"]
-    place = next(place for place, sample in enumerate(made.samples) if sample.key == CALIBRATION.key)
-    unknown_field = b"\xc2\x3e\xe0\xa7\x12" + np.random.default_rng(1).bytes(300_000)
-    made.samples[place] = large = made.samples[place]._replace(payload=made.samples[place].payload + unknown_field)
-    samples = made.frames(STEPS).samples
-    for path, made.samples in zip(paths, (samples[:2500], [large, *samples[2500:]]), strict=True):
-        made.write(path)
+def test_several_processes_give_the_account_of_one(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chunk_ends_ns = workers._chunk_ends_ns  # out of order: a large calibration is a chunk, and has its former time
+    monkeypatch.setattr(workers, "_chunk_ends_ns", lambda path: chunk_ends_ns(path)[::-1])
     monkeypatch.setattr(workers, "_WORTH_BYTES", 1)
-    one, two = (workers.replay_files(paths, 0.0, jobs, lambda done: None) for jobs in (1, 2))
-    assert (one.identical, one.frames, one.log_s) == (True, STEPS, pytest.approx((STEPS - 1) / 1000))
+    one, two = (workers.replay_files([log], 0.0, jobs, lambda done: None) for jobs in (1, 2))
+    assert (one.identical, one.log_s) == (True, pytest.approx((STEPS - 1) / 1000))
     assert one == two
 
 

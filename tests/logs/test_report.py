@@ -415,10 +415,11 @@ def test_the_stretch_of_a_law_ends_where_the_law_is_overruled(tmp_path: Path) ->
     night = SyntheticLog(guard=True, rate_hz=1000.0).frames(20)
     night.law(0.01)
     found = results(night.frames(700).write(tmp_path / "x.mcap"))
-    (overruled,) = (event for event in found["events"] if event["name"] == "LAW_OVERRULED")
     stretch = found["closed_stretch"]
     assert (stretch["law"], stretch["to_s"], stretch["steps_limited"]) == ("pi", pytest.approx(0.617), 0)
-    assert overruled["time_s"] == pytest.approx(0.618, abs=1e-4)
+    assert ("LAW_OVERRULED", pytest.approx(0.618, abs=1e-4)) in [
+        (one["name"], one["time_s"]) for one in found["events"]
+    ]
 
 
 @pytest.mark.parametrize(("lost", "without", "at_the_end"), [(1, 0, 1), (50, 0, 50), (80, 30, 50)])

@@ -36,9 +36,7 @@ _CHANGED = "its parts are intact, but some are missing, out of order, or changed
 _BEGIN = MAGIC + bytes([Opcode.HEADER])
 _OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _FIRST_BLOCK_BYTES = 1 << 12
-_TRIES = (
-    4  # limit of bytes read in search of chunks, in file sizes: a malicious file must not occupy the reader for ever
-)
+_TRIES = 4  # limit of bytes read in search of chunks, in file sizes: a malicious file must not occupy the reader
 
 
 @dataclass(slots=True)

@@ -6,7 +6,7 @@ which are counted, but never delays the control loop. A disk error ends the reco
 
 import signal
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from functools import partial
@@ -350,8 +350,7 @@ class Recorder:
 
     def _totals(self) -> dict[str, str]:
         """Totals at the end of a log, over all files of its recording so far."""
-        since = {key: count - self._lost_before.get(key, 0) for key, count in self._account.lost().items()}
-        lost = {key: count for key, count in since.items() if count > 0}
+        lost = Counter(self._account.lost()) - Counter(self._lost_before)
         return {
             "messages": str(self._series.messages - self._messages_before),
             "messages_lost": str(sum(lost.values())),

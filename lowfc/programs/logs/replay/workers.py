@@ -42,8 +42,7 @@ def replay_files(
     previous one ends, DataFileError if one cannot be replayed.
     """
     chunk_ends_ns = [_chunk_ends_ns(path) for path in paths]
-    # Sorted, because a large calibration at the start of a file is a chunk by itself, with its former time.
-    ends_ns = sorted(end_ns for ends in chunk_ends_ns for end_ns in ends)
+    ends_ns = sorted(end_ns for ends in chunk_ends_ns for end_ns in ends)  # a repeated calibration may be an old chunk
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigurationError("a log is named twice; name each once, in the order they were recorded")
     if len(paths) > 1:
