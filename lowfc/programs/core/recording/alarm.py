@@ -74,7 +74,7 @@ class Alarm:
             if status := command.wait(TIMEOUT_S):
                 self._fail(f"it ended with exit status {status}")
         except subprocess.TimeoutExpired:
-            with contextlib.suppress(ProcessLookupError):
+            with contextlib.suppress(OSError):  # it has ended, or runs as another user
                 os.killpg(command.pid, signal.SIGKILL)
             command.wait()
             self._fail(f"it was killed after {TIMEOUT_S:g} s")
