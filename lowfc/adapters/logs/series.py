@@ -138,14 +138,6 @@ class LogSeries:
         if self._finishing is not None and self._finishing[1].done():
             self._await_finished()
 
-    def shortage(self) -> str:
-        """Sentence if the disk is too full to continue; empty otherwise.
-
-        Raises:
-            DataFileError: the folder cannot be accessed.
-        """
-        return shortage(self._folder, self._limits.min_free_bytes)
-
     def end(self, totals: Mapping[str, str], *, wait: bool = True) -> None:
         """Finish the file, with `totals` as its "recording" metadata; without `wait`, return before it is finished.
 

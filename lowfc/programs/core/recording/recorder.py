@@ -18,7 +18,7 @@ from lowfc.adapters.bus.bus import ALL, UNREADABLE, Bus, Query, Sample
 from lowfc.adapters.bus.names import MAX_HEALTH_LOGS
 from lowfc.adapters.logs.loss_account import LossAccount
 from lowfc.adapters.logs.selection import EVERYTHING, Selection
-from lowfc.adapters.logs.series import STANDARD, LogLimits, LogSeries
+from lowfc.adapters.logs.series import STANDARD, LogLimits, LogSeries, shortage
 from lowfc.adapters.logs.writer import Attachment
 from lowfc.adapters.process.clock import Clock
 from lowfc.adapters.process.realtime import NOTHING, Granted
@@ -210,7 +210,7 @@ class Recorder:
         if not (self._paused or self._failure) or not self.service.running:
             return "recording is already in progress" if self.service.running else "the recorder is ending"
         try:
-            if short := self._series.shortage():
+            if short := shortage(self._folder, self._min_free_bytes):
                 return short
             self._begin()
         except DataFileError as fault:
@@ -280,7 +280,7 @@ class Recorder:
             self._note_flush()
             if self._failure or self._paused:
                 return
-            if short := self._series.shortage():
+            if short := shortage(self._folder, self._min_free_bytes):
                 self._failure = short
                 self._series.end(self._totals() | {"stopped": short})
                 self.service.event("RECORDING_FAILED", why=f"{short}; the log is complete")
