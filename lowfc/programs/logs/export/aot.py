@@ -228,9 +228,10 @@ def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibrati
         except DecodeError:
             continue
         surface_nm = actuators(command)
-        row = row_of.pop(command.frame_sequence, None)  # later commands of this frame only repeat it
-        if row is not None and surface_nm is not None and surface_nm.size == shape[1]:
-            rows[row] = surface_nm.ravel() * np.float32(_NM)
+        if surface_nm is not None and surface_nm.size == shape[1]:  # otherwise it is of another mirror
+            row = row_of.pop(command.frame_sequence, None)  # later commands of this frame only repeat it
+            if row is not None:
+                rows[row] = surface_nm.ravel() * np.float32(_NM)
 
 
 def _mode_images(noll: tuple[int, ...]) -> Single:
