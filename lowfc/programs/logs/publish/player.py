@@ -164,7 +164,7 @@ class Player:
         if not self._begun_ns:
             self._first_log_ns = self._last_log_ns
             self._begun_ns = self._sent_ns = self._clock.host_ns()
-        due_ns = self._begun_ns + round((self._last_log_ns - self._first_log_ns) / self._speed)
+        due_ns = self._begun_ns + round(min((self._last_log_ns - self._first_log_ns) / self._speed, LAST_NS))
         if (wait_ns := due_ns - self._clock.host_ns()) > LONG_WAIT_NS:
             when = _utc(self._last_log_ns)
             self._announce(f"the next message, of {when}, follows in {wait_ns / 1e9:.0f} s; Ctrl-C ends it")
