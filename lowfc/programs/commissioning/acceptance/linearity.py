@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from lowfc.arrays import Array, Integers
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.excitation import build_staircase
 from lowfc.control.calibration.linearity import SURE, gains, levels
@@ -83,16 +84,18 @@ def play(live: Live, *, hold_frames: int, cycles: int, modes: Sequence[int]) -> 
     skipped = int(np.ceil(live.loop.delay_frames)) + _SPARE_FRAMES
     if hold_frames <= skipped:
         raise AcceptanceError(f"{hold_frames} frames at each level are too few: the first {skipped} do not show it yet")
+    amplitudes_nm = (np.array(AMPLITUDES) * live.configuration.acceptance.linear_nm).tolist()
     plan = []
     for noll in chosen(modes, live.loop.noll):
         shape = live.calibration.modes_to_actuators[:, live.loop.noll.index(noll)][None]
         step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
-        levels_nm = levels(np.array(AMPLITUDES) * live.configuration.acceptance.linear_nm, cycles)
-        stairs, starts = build_staircase(levels_nm, hold_frames, step_nm)
+        stairs, _ = build_staircase(levels(amplitudes_nm, cycles), hold_frames, step_nm)
         what = {
             "noll": noll,
-            "levels_nm": levels_nm.tolist(),
-            "starts": (starts + skipped).tolist(),
+            "amplitudes_nm": amplitudes_nm,
+            "cycles": cycles,
+            "hold": hold_frames,
+            "step_nm": step_nm,
             "averaged": hold_frames - skipped,
         }
         plan.append((what, stairs.astype(np.float32)[:, None], shape))
@@ -106,7 +109,7 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> L
     for response in {one.what["noll"]: one for one in responses}.values():  # the last one of each mode
         response.check(LoopMode.OPEN)
         what, noll = response.what, response.loop.noll
-        levels_nm, starts = np.array(what["levels_nm"]), np.array(what["starts"], np.intp)
+        levels_nm, starts = _levels(what)
         found = gains(response.filled(response.error_nm), noll.index(what["noll"]), levels_nm, starts, what["averaged"])
         within = found.within(required.gain_error, required.crosstalk)
         rows = []
@@ -144,6 +147,15 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> L
         required_crosstalk=required.crosstalk,
         modes=modes,
     )
+
+
+def _levels(what: dict[str, Any]) -> tuple[Array, Integers]:
+    """Levels (levels,) of an announced staircase, nm, and the first averaged frame (levels,) of each."""
+    if "starts" in what:  # the announcement of version 0.1
+        return np.array(what["levels_nm"]), np.array(what["starts"], np.intp)
+    levels_nm = levels(what["amplitudes_nm"], what["cycles"])
+    _, starts = build_staircase(levels_nm, what["hold"], what["step_nm"])
+    return levels_nm, starts + what["hold"] - what["averaged"]
 
 
 def draw(found: dict[str, Any], figure: Any) -> None:
