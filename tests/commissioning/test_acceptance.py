@@ -10,6 +10,7 @@ import pytest
 from lowfc.adapters.files.drawing import figure_class, png
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
+from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import wire
@@ -30,7 +31,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
 )
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
 from tests.support.loops import refusal
-from tests.support.report_log import SyntheticLog
+from tests.support.report_log import TOYS, SyntheticLog
 
 MULTISINE = {"duration_s": 3.0, "rms_nm": 3.0, "lines_per_mode": 8, "modes": (), "seed": 1}
 
@@ -243,6 +244,17 @@ def test_a_request_disturbs_a_measurement_unless_a_limit_ended_it_before(name: s
         logged(1e3)
     (response,) = logged(1.0)
     assert response.limits_hit == ["MODAL_LIMIT"]
+
+
+def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_of_its_time(tmp_path: Path) -> None:
+    night = SyntheticLog().frames(20)
+    night.request("note", text='acceptance {"test": "noise-floor", "loop": "open", "frames": 50}').frames(60)
+    night.request("gain", (0.1,)).request("safe").request("clear").load(
+        identified(replace(TOYS, flux_dn=2 * TOYS.flux_dn))
+    )
+    log = night.frames(5).write(tmp_path / "night.mcap")
+    (response,) = logged_responses(read_history(LogReader(log)), noise.KIND)
+    assert (response.loop.law.gain[0], response.loop.calibration.id) == (np.float32(0.4), TOYS.id)
 
 
 def test_modes_default_to_all_and_must_be_controlled() -> None:

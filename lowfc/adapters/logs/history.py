@@ -43,9 +43,7 @@ from lowfc.contract.messages import (
     EVENT,
     FRAME,
     HEALTH,
-    LAW,
     MIRROR_STATE,
-    PLAY,
     REQUEST,
     STEP,
     TIMING,
@@ -56,7 +54,7 @@ from lowfc.contract.messages import (
     topic_of,
     wire,
 )
-from lowfc.contract.published import Published
+from lowfc.contract.published import TOPICS, Published
 from lowfc.contract.recorded_configuration import recorded
 from lowfc.control.calibration.calibration import Calibration
 
@@ -115,7 +113,7 @@ class History:
         commands_late: commands that the camera counted as late from its first Health in the log to its last,
             restarts included; None without two of them.
         counts: number of messages, by topic key.
-        published: laws and played tables, by identity.
+        published: calibrations, laws and played tables, by identity.
         span_ns: log times of the first message that is not retained, and of the last message; (0, 0) without one.
     """
 
@@ -271,7 +269,7 @@ class _HistoryBuilder:
             self._frames.add(sequence=message.sequence, publish_ns=message.publish_time_ns)
         elif topic is COMMAND:
             self._commands.add(publish_ns=message.publish_time_ns)
-        elif topic in (LAW, PLAY):
+        elif topic in TOPICS:
             history.published.store(topic, message.payload)
         if topic not in _DECODED:
             return

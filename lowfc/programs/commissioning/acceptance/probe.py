@@ -195,13 +195,15 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
             interrupted = play and event.message.startswith(INTERRUPTIONS)
             if interrupted and times_ns.size and times_ns[0] <= from_timestamp(event.timestamp) <= times_ns[-1]:
                 raise DataFileError(f"{path}: {event.message}, during the measurement")
-        states = history.controllers
-        before = [state for state in states if state.frame_sequence < first and len(state.gain) == modes]
+        asked_ns = from_timestamp(request.timestamp)  # a later state has no frame after a `clear`
+        states = [state for state in history.controllers if len(state.gain) == modes]
+        before = [state for state in states if from_timestamp(state.timestamp) <= asked_ns]
         if not before:
             raise DataFileError(f"{path}: does not contain the state of the controller before the test")
         decoded = codec.request(request, request.name, 0, plays=history.published.plays)
         basis = decoded.actuators_nm.reshape(-1, calibration.grid[0] * calibration.grid[1])
-        loop = loop_of(before[-1], calibration, history.rate_hz, history.published.laws)
+        in_use = history.published.calibrations.get(before[-1].calibration_id, calibration)
+        loop = loop_of(before[-1], in_use, history.rate_hz, history.published.laws)
         table = decoded.table if play else np.zeros((frames, 0), np.float32)
         found.append(probe_response(what, loop, request.text if play else "", table, basis, first, history.steps))
     return found
