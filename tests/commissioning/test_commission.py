@@ -179,6 +179,16 @@ def test_a_wrong_sign_fails_the_check_with_automatic_gains(
     bench.loop.run(20)
 
 
+def test_a_loop_that_opens_before_its_first_closed_step_fails_the_check(
+    commissioned: tuple[Bench, dict[str, Any]],
+) -> None:
+    bench, _ = commissioned
+    bench.actions = {"observing": bench.loop.open_loop}
+    with pytest.raises(CalibrationError, match="the loop went from closed to open"):
+        bench.steps()._measured_nm(10, 1, 1.0)
+    bench.actions.clear()
+
+
 def test_with_a_linear_law_its_own_residual_is_predicted(commissioned: tuple[Bench, dict[str, Any]]) -> None:
     bench, results = commissioned
     bench.loop.open_loop()

@@ -283,9 +283,9 @@ class Commissioning:
 
     def _measured_nm(self, frames: int, settling: int, predicted: float) -> float:
         """Close the loop and measure its error, nm rms; a failure opens it, unless another operator ended the lease."""
-        self._loop.close_loop()
+        first = self._loop.close_loop().frame_sequence
         try:
-            closed = self._steps(frames, LoopMode.CLOSED)
+            closed = self._steps(frames, LoopMode.CLOSED, first)
             self._advice = (
                 f"the calibration is saved in {self._options.out} and loaded, but the closed loop did not behave as "
                 "predicted: check the sign of the mirror, the delay and the disturbance before you close it; "
@@ -307,15 +307,16 @@ class Commissioning:
             raise
         return measured
 
-    def _steps(self, frames: int, mode: LoopMode = LoopMode.OPEN) -> Steps:
+    def _steps(self, frames: int, mode: LoopMode = LoopMode.OPEN, first: int = 0) -> Steps:
         steps: list[Step] = []
         self._report(f"observing {frames} frames, {frames / self._config.camera.rate_hz:.0f} s")
         for step in self._loop.steps():
-            if step.mode is mode:
-                steps.append(step)
-            elif steps:  # the first steps may still be of the previous mode
+            if step.frame_sequence < first:  # of the previous mode
+                continue
+            if step.mode is not mode:
                 self._loop.check_lease()  # its error names who ended the lease
                 raise CalibrationError(f"the loop went from {mode.in_words} to {step.mode.in_words}")
+            steps.append(step)
             if len(steps) >= frames:
                 break
             if len(steps) % LEASE_CHECK_FRAMES == 0:
