@@ -180,7 +180,8 @@ class Mirror(Device):
     def iterate(self, now_ns: int) -> None:
         super().iterate(now_ns)
         self.status = self.changed("tick", self.mirror.tick)(self.status, now_ns)
-        if now_ns - self._published_ns >= 100 * MS and not self.changes.get("silent"):
+        silent = self.changed("silent", False, self.status)
+        if now_ns - self._published_ns >= 100 * MS and not silent:
             self._publish(now_ns, now_ns)
 
     def _publish(self, time_ns: int, now_ns: int) -> None:
@@ -355,10 +356,14 @@ WIDE = Limits(10_000.0, 10_000.0, 10_000.0)
 UNTRIED = {"limits": WARNING}
 NEVER_EXPIRED = {"dead-man": WRONG, "longest command": WARNING} | UNTRIED
 MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
-    "silent and deaf": ({"silent": True, "deaf": True}, {"idle state": WRONG, "answers": WRONG} | UNTRIED),
+    "silent and deaf": ({"silent": lambda *_: True, "deaf": True}, {"idle state": WRONG, "answers": WRONG} | UNTRIED),
     "no answers": ({"deaf": True}, {"answers": WRONG} | UNTRIED),
     "one command in three unanswered": ({"drops": 3}, {"answers": WRONG} | UNTRIED),
-    "silent when idle": ({"silent": True}, {"idle state": WRONG, "silence": WRONG} | NEVER_EXPIRED),
+    "silent when idle": (
+        {"silent": lambda *_: True},
+        {"idle state": WRONG, "silence": WRONG} | NEVER_EXPIRED,
+    ),
+    "silent until a command expires": ({"silent": lambda _, status: status.following}, {"silence": WRONG} | UNTRIED),
     "no envelope": ({"attach": lambda *_: None}, {"envelope": WRONG}),
     "a count without start": ({"attach": lambda s, t: envelope(s & 0xFFFF, t)}, {"sequence": WRONG}),
     "another clock": ({"attach": put_at(lambda t: t - 35 * MS)}, {"publish time": WRONG}),

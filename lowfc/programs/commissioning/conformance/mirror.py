@@ -286,7 +286,8 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
     advice = "limit valid_for_ns in the driver: a sender's mistake must not hold the mirror for ever"
     yield judged("longest command", expected, bounded, "EXPIRED", advice, late, warning)
     arrivals = [message.receive_time_ns for message, _ in mirror.since(sent_ns)]
-    longest_s = max((later - earlier for earlier, later in pairwise(arrivals)), default=MAX_VALID_NS) / 1e9
+    times_ns = sent_ns, *arrivals, mirror.connection.now_ns()
+    longest_s = max(later - earlier for earlier, later in pairwise(times_ns)) / 1e9
     expected, got = "ten states a second also without commands", f"longest time without one {longest_s:.2g} s"
     advice, severity = "publish the state ten times a second, also when idle", wrong if longest_s > 1.0 else warning
     yield judged("silence", expected, longest_s <= 0.25, got, advice, severity=severity)
