@@ -436,6 +436,17 @@ def test_a_fault_of_a_mirror_is_found(fault: str) -> None:
     assert of_mirror(Mirror(**changes)) == expected
 
 
+@pytest.mark.parametrize("number", [20, 33])
+def test_an_answer_that_is_read_late_because_this_host_stalls_is_no_fault(number: int) -> None:
+    class Stalled(Mirror):
+        def wait(self, seconds: float) -> None:
+            if self._received == number:
+                self._received, seconds = 1000, 0.6037
+            super().wait(seconds)
+
+    assert of_mirror(Stalled()) == {}
+
+
 def test_gentle_does_not_test_the_limits() -> None:
     mirror = Mirror()
     highest_nm: list[float] = []

@@ -175,12 +175,13 @@ class Dialogue(Collected):
         self._commanded_nm, before = surface_nm, len(self.states)
         sequence, sent_ns = self.put(surface_nm, valid_ns=valid_ns)
         end_ns = self.connection.now_ns() + round(ANSWER_S * NS)
-        while self.connection.now_ns() < end_ns:
+        while True:
             for message, state in self.states[before:]:
                 if state.frame_sequence == sequence:
                     return state, sent_ns, message.receive_time_ns - sent_ns
+            if self.connection.now_ns() >= end_ns:
+                return None, sent_ns, 0
             self.collect(TURN_S)
-        return None, sent_ns, 0
 
     def go(self, surface_nm: Single) -> wire.MirrorState | None:
         """Move to a shape in steps of at most half the slew limit; return the last answer, None if one was missing."""

@@ -254,8 +254,7 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
 def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator[Check]:
     """Raise the mirror, let the command expire while refused ones arrive, then let one of long validity expire."""
     raised_nm = base_nm + np.float32(raised_by_nm)
-    mirror.ask(raised_nm, EXPIRES_NS)
-    sent_ns = mirror.connection.now_ns()
+    _, sent_ns, _ = mirror.ask(raised_nm, EXPIRES_NS)
     mirror.listen(EXPIRES_NS / 2e9)
     nan_nm = np.full(mirror.expected.grid, np.nan, np.float32)
     for _ in range(round((EXPIRES_NS / 2 + SLACK_NS) / _REFUSED_EVERY_NS)):
