@@ -102,6 +102,9 @@ def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, 
     assert np.linalg.norm(difference) < 0.1 * np.linalg.norm(before.actuators_to_modes)
     assert made.id != before.id
     assert made.estimator == f"weighted+{method}"
+    first = data.measured._replace(initial=data.measured.initial._replace(estimator=f"weighted+{method}+first"))
+    request = CalibrationRequest(method, OUT, 50.0)
+    assert not measured_calibration(config, before, first, request)[0].provisional, "it has a verdict"
 
 
 def closed(config: Configuration, calibration: Calibration, frames: int, world: Configuration) -> np.ndarray:

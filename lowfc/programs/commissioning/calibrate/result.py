@@ -12,7 +12,7 @@ from lowfc.arrays import Array, single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
-from lowfc.control.calibration.calibration import Calibration, comparable
+from lowfc.control.calibration.calibration import FIRST, Calibration, comparable
 from lowfc.control.calibration.regularised import Reconstruction, advice, reconstruct
 from lowfc.control.calibration.response_fit import MAX_ELEMENT, MAX_ELEMENT_RMS, Check, Measured, cross_talk
 from lowfc.control.loop.wording import counted
@@ -143,7 +143,7 @@ def measured_calibration(
     config: Configuration, before: Calibration, measured: Measured, request: CalibrationRequest
 ) -> tuple[Calibration, Reconstruction]:
     """The calibration from cycles of pokes, with dark, mask and mirror commands of the previous one."""
-    names = dict.fromkeys([*measured.initial.estimator.split("+"), request.method])
+    names = dict.fromkeys([*measured.initial.estimator.removesuffix(FIRST).split("+"), request.method])
     calibration = replace(
         before,
         reference=before.reference if measured.reference is None else single(measured.reference),
