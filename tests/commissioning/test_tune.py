@@ -16,6 +16,7 @@ from astropy.io import fits
 from lowfc.adapters.files import law_file
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.client import Answer
+from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.codecs.law_codec import driving
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
@@ -333,6 +334,13 @@ def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
         DataFileError, match="tuning requires at least 2048 consecutive frames, 2 s; the longest sequence of good"
     ):
         tune(night.write(tmp_path / "short.mcap"))
+
+
+def test_frames_of_an_earlier_calibration_are_excluded(tmp_path: Path) -> None:
+    night = SyntheticLog().request("close").frames(2700).request("open")
+    night.load(identified(replace(night.calibration, flux_dn=2 * night.calibration.flux_dn)))
+    with pytest.raises(DataFileError, match="the longest sequence of good frames has 100"):
+        telemetry_from_log(LogReader(night.frames(100).write(tmp_path / "two.mcap")))
 
 
 def test_tune_never_overwrites_a_log(log: Path) -> None:

@@ -76,7 +76,8 @@ class Telemetry:
 def telemetry_from_log(log: LogReader) -> Telemetry:
     """The used closed-loop frames of a log; all used frames if there are too few of them.
 
-    Frames with a probe sequence, as in an acceptance test, are excluded: a law must not learn from them.
+    Frames with a probe sequence, as in an acceptance test, are excluded: a law must not learn from them. So are those
+    measured with an earlier calibration than the last one.
     """
     history = read_history(log)
     run = LoggedRun(history)
@@ -94,7 +95,7 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
         run.timing,
         (run.law, driving(history.controller, history.published.laws)),
         steps,
-        usable,
+        usable & run.under_calibration,
         (None if run.true_nm is None else run.true_nm[1], run.continuous_rms_nm),
         config,
         run.calibration if history.controller is None else calibration_in_use(history.controller, run.calibration),

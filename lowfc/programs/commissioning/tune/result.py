@@ -264,11 +264,10 @@ def _doubts(run: Telemetry, open_mas: float | None, stable: bool) -> list[str]:
     if not run.closed and open_mas is not None and open_mas > OPTICAL_GAIN_MAS:
         found.append(
             f"an open loop with {open_mas:.1f} mas rms of tilt per axis, above {OPTICAL_GAIN_MAS:g}: the optical gain "
-            "of the sensor is low, and some lines are spurious; close the loop with any stable gain and tune from that "
-            "log"
+            "of the sensor is low, and some lines are spurious; close the loop with any stable gain and tune again"
         )
     if not stable:
-        found.append("the law of the log is unstable with this delay: theory cannot predict it")
+        found.append("the present law is unstable with this delay: theory cannot predict it")
     return found
 
 

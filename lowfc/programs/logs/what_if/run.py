@@ -84,7 +84,7 @@ class LoggedRun:
             any.
         continuous_rms_nm: rms of the true residual (steps, modes) over each period; None if the log does not have it.
         calibration: calibration of the log.
-        used: (steps,) whether the frame was used.
+        used: (steps,) whether the frame was used; `under_calibration`: whether it came after an earlier calibration.
         law: last law of the run.
         controller_delay: delay assumed by the controller, frames; `measured_delay`, from `measured_from`, is None if
             it cannot be measured; the comparison uses `delay_frames`, with `weights`.
@@ -106,6 +106,7 @@ class LoggedRun:
         self.true_nm = None if true is None else (true.disturbance_nm[rows], true.residual_nm[rows])
         self.continuous_rms_nm = true.modes_residual_rms_nm[rows] if true is not None and true.continuous else None
         self.used: Mask = used[rows]
+        self.under_calibration: Mask = history.under_calibration[rows]
         self.missing = missing_before(self.steps.sequence)
         self.played = _played(self.steps.sequence, history.requests, history.published.plays)
         self.law, self.controller_delay = _law_and_delay(history, self.calibration)
