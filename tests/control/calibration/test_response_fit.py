@@ -309,16 +309,23 @@ def test_poorly_measured_combinations_can_be_truncated_or_damped() -> None:
     faint = np.column_stack([H[:, :3], H[:, 2] + 0.01 * H[:, 3]])
     whole = reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0)
     assert whole.condition_number > 50
-    assert "Z4 and Z5" in advice(whole, (2, 3, 4, 5), 1.0) or "Z5 and Z4" in advice(whole, (2, 3, 4, 5), 1.0)
-    assert "no regularisation" in advice(whole, (2, 3, 4, 5), 1e6)
+    one_nm, noll = np.ones(4, np.float32), (2, 3, 4, 5)
+    assert "Z4 and Z5" in advice(whole, noll, one_nm) or "Z5 and Z4" in advice(whole, noll, one_nm)
+    assert "no regularisation" in advice(whole, noll, 1e6 * one_nm)
+    assert "no regularisation" in advice(whole, noll, np.array([1, 1, 1e6, 1e6]))  # that of its largest mode counts
+    assert "--truncate" not in advice(whole, noll, 1e-9 * one_nm)  # which would leave no combination
+    for faint_by in np.linspace(0.005, 0.02, 20):
+        made = reconstruct(I0, np.column_stack([H[:, :3], H[:, 2] + faint_by * H[:, 3]]), None, GOOD, FLUX_E, 0.0)
+        cut = float(advice(made, noll, 0.9 / made.singular_values[-1] * one_nm).split()[-1])
+        assert made.singular_values[-1] < cut * made.singular_values[0] < made.singular_values[-2]
     truncated = reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, truncate=0.05)
     assert np.count_nonzero(truncated.kept) == 3
     assert np.linalg.matrix_rank(truncated.matrix) == 3
-    assert "1 of 4 combinations" in advice(truncated, (2, 3, 4, 5), 1.0)
+    assert "1 of 4 combinations" in advice(truncated, noll, one_nm)
     damped = reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, tikhonov=0.05)
     assert np.linalg.norm(truncated.matrix) < np.linalg.norm(damped.matrix) < np.linalg.norm(whole.matrix)
     slightly = reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, tikhonov=0.002)
-    assert "is damped to 79.7%" in advice(slightly, (2, 3, 4, 5), 1.0)
+    assert "is damped to 79.7%" in advice(slightly, noll, one_nm)
     with pytest.raises(ValueError, match="at least 0 and below 1"):
         reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, truncate=1.0)
     with pytest.raises(ValueError, match="weighted"):

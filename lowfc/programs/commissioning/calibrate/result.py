@@ -179,6 +179,7 @@ def result_of(
 ) -> CalibrationResult:
     """The result of a measured or computed calibration."""
     delay_frames, error_frames = (configured_delay(config), 0.0) if data is None else data.delay[:2]
+    limit_nm = factory.settings(config).integrator(calibration.noll).limit_nm
     optional: dict[str, Any] = {}
     noise = None if computed is None else computed_noise_nm(config, calibration, computed)
     if data is not None and computed is not None and noise is not None:
@@ -200,7 +201,7 @@ def result_of(
         flux_dn=calibration.flux_dn,
         cycles=0 if data is None else data.measured.cycles,
         file=str(file),
-        advice=[advice(reconstruction, calibration.noll, config.control.limit_nm)],
+        advice=[advice(reconstruction, calibration.noll, limit_nm)],
         **optional,
         **({} if verdict is None else verdict.json_object()),
     )
