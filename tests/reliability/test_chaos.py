@@ -238,7 +238,8 @@ def test_logs_are_read_with_their_losses_and_what_cannot_be_read(tmp_path: Path)
     assert found.lost == {STEP.key: 6}
     assert [finished for _, finished in found.log_ends] == [True, True, False, False]
     assert found.messages == 4
-    undecodable, damaged = found.unreadable
+    shapeless, undecodable, damaged = found.unreadable
+    assert shapeless == f"a message on {COMMAND.at('dm')} has 0 bytes of actuators"
     assert TRUTH.key in undecodable
     assert "4.mcap" in damaged
 

@@ -117,5 +117,7 @@ def _add(found: Evidence, message: Sample, number: int | None) -> None:
     shape = actuators(decoded) if topic in (COMMAND, MIRROR_STATE) else _NONE
     if shape is not None:
         found.entries[topic].append(Entry(message.sequence, message.receive_time_ns, decoded, shape))
+    elif topic is COMMAND or decoded.actuators:  # a mirror whose position is unknown reports none
+        found.unreadable.append(f"a message on {message.key} has {len(decoded.actuators)} bytes of actuators")
     if topic is HEALTH and decoded.state == "stopped" and number is not None:
         found.sent |= {(number, one.topic, start_s): one.published for one in decoded.topics if one.published}
