@@ -62,6 +62,7 @@ def bare_loop(
     folder = open_run(run, (settings.mirror.name,)).path
     pid = json.loads(_wait_and_read(folder / PROCESSES_FILE))[role]
     begin_ns = int(_wait_and_read(folder / BEGIN_FILE))
+    HostClock().sleep_until_ns(begin_ns)  # before the first frame, another thread may be the busiest
     counters = Counters(pid, busiest_thread(pid, WARM_UP_S / 2), cpus)
     rows = _wake(settings, counters, begin_ns, seconds)
     with being_written(folder / trace_file(role)) as part, part.open("wb") as file:
