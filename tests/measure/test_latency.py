@@ -404,6 +404,19 @@ def test_the_log_of_the_run_gives_the_same_latencies(measured: tuple[dict[str, A
     assert "frame to mirror" in done.stdout
 
 
+def test_what_a_log_left_out_is_not_counted_as_missing(tmp_path: Path) -> None:
+    night, made = Path(__file__).parents[1] / "golden" / "0.1" / "night.mcap", tmp_path / "few.mcap"
+    few = ["export", night, "--decimate", "2", "--topics", "lowfc/control/timing", "--out", made]
+    assert lowfc(*few, "--topics", "lowfc/camera/frame").exit_code == 0
+    whole, logged = json_of("latency", night), json_of("latency", made)
+    assert (logged["frames"], whole["frames"]) == (3, 6)
+    assert (logged["rate_hz"], logged["frames_without_mirror_state"]) == (whole["rate_hz"], None)
+    assert "few.mcap, 1000.0 Hz, 1 in 2 frames" in lowfc("latency", made).stdout
+    made.unlink()
+    assert lowfc(*few).exit_code == 0
+    assert "lacks lowfc/camera/frame or" in refusal("latency", made, kind=DataFileError)
+
+
 def test_files_that_are_no_results_or_logs_are_errors(tmp_path: Path) -> None:
     other = tmp_path / "other.json"
     listed = '{"latency_us": [1], "ratio": null, "repeats": []}'

@@ -9,7 +9,7 @@ from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
 from lowfc.adapters.logs.recovery import missing_parts
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import HEALTH, TIMING, Role, wire
+from lowfc.contract.messages import FRAME, HEALTH, MIRROR_STATE, TIMING, Role, wire
 from lowfc.programs.measure.latency.frame_statistics import controller_counts, join, repeat_statistics
 
 _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
@@ -28,8 +28,12 @@ def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tup
     statistics = repeat_statistics(join(history.frame_sequence, history.frame_publish_ns, None, timing, mirror))
     if "frame_to_command" not in statistics["latency_us"]:
         raise DataFileError(
-            f"{log.path} has no {TIMING.key} after its first 0.5 s: it is short, lacks this topic, or is not of a loop"
+            f"{log.path} has no timed frame after its first 0.5 s: it is short, is not of a loop, or lacks {FRAME.key} "
+            f"or {TIMING.key}"
         )
+    if MIRROR_STATE in log.selection.excluded:
+        statistics["frames_without_mirror_state"] = None
+    statistics["rate_hz"] *= log.selection.interval_frames  # of the loop, not of the recorded frames
     controller = history.health.get(Role.CONTROLLER, wire.Health())
     host: dict[str, Any] = dict(log.metadata.get("lowfc", {}))
     host |= {"granted": list(controller.realtime_granted), "refused": list(controller.realtime_refused)}
@@ -40,5 +44,6 @@ def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tup
                 trip_ns = wire.Health.FromString(message.payload).router_round_trip_ns
                 round_trips_ns[name] = max(round_trips_ns[name], trip_ns)
         host["clock_error_us"] = sum(sorted(round_trips_ns.values())[-2:]) / 2e3
-    about = {"settings": {"log": str(log.path)}, **missing_parts(log), "host": host}
+    settings = {"log": str(log.path), "selection": log.selection.description}
+    about = {"settings": settings, **missing_parts(log), "host": host}
     return statistics | controller_counts(controller), about

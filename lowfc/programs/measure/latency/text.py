@@ -143,7 +143,8 @@ def _remarks(results: Mapping[str, Any]) -> list[str]:
 def _title(results: Mapping[str, Any]) -> str:
     settings, count = results["settings"], len(results["repeats"])
     if settings.get("log"):
-        return f"{Path(settings['log']).name}, {results['rate_hz']:.1f} Hz"
+        left_out = f", {settings['selection']}" if settings["selection"] else ""
+        return f"{Path(settings['log']).name}, {results['rate_hz']:.1f} Hz{left_out}"
     also = "".join(f", with --{name}" for name in ("record", "view", "trace") if settings.get(name))
     times = (
         f"{count} repeats of {settings['duration_s']:g} s: medians, largest max"
