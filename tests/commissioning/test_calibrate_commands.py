@@ -277,6 +277,9 @@ def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
         json_of("dark", "--file", "small.fits")
     np.save("cube.npy", cube)
     assert json_of("dark", "--file", "cube.npy")["frames"] == 64
+    np.save("lit.npy", cube + 0.03 * loop.calibration().flux_dn * loop.calibration().reference.reshape(80, 80))
+    with pytest.raises(CalibrationError, match=r"3\.\d% of the star's light is in them"):
+        json_of("dark", "--file", "lit.npy")
     dark = InProcessLoop(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
     connect(dark, monkeypatch)
     found = json_of("dark", "--star-blocked", "--frames", "50", "--out", "night.fits")

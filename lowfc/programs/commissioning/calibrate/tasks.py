@@ -156,8 +156,7 @@ def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, loa
         elif cube.shape[1:] != before.shape:
             raise DataFileError(f"{file}: its frames have {cube.shape[1:]} pixels, the calibration {before.shape}")
         found = measure_dark(cube.reshape(len(cube), -1))
-        if file is None:
-            check_dark(found.dark_dn, before.reference.astype(np.float64), before.flux_dn)
+        check_dark(found.dark_dn, before.reference.astype(np.float64), before.flux_dn)
         write(with_dark(before, found.dark_dn, found.good, *noise), out, loop if load else None)
     counts = {name: int(np.count_nonzero(getattr(found, name))) for name in ("hot", "noisy", "dead")}
     level, noise_dn = float(np.median(found.dark_dn)), float(np.median(found.noise_dn))
