@@ -155,7 +155,7 @@ def measured_calibration(
     reconstruction = compute_reconstructor(
         config, calibration, measured.initial.matrix, truncate=request.truncate, tikhonov=request.tikhonov
     )
-    actuators = single(_actuators_to_modes(config, before, reconstruction.matrix))
+    actuators = single(_actuators_to_modes(config, before, reconstruction.matrix, measured.response))
     calibration = replace(calibration, reconstructor=single(reconstruction.matrix), actuators_to_modes=actuators)
     return identified(calibration), reconstruction
 
@@ -289,10 +289,11 @@ def comparison(one: Calibration, other: Calibration) -> Comparison:
     )
 
 
-def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array) -> Array:
-    """Modes (modes, actuators) that the sensor measures of each actuator: modal shapes measured, others modelled."""
+def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array, response: Array) -> Array:
+    """Modes (modes, actuators) that R measures of each actuator: modal shapes measured, others modelled."""
     commands = before.modes_to_actuators.astype(np.float64)
-    measured = np.asarray(np.linalg.pinv(commands))  # without a model: other shapes are projected onto the modal shapes
+    # Without a model: other shapes are projected onto the modal shapes. R H is the identity unless R is regularised.
+    measured = np.asarray(matrix @ response @ np.linalg.pinv(commands))
     optics = factory.twin(config, None, lambda _: None)
     light = twin_reference(optics)
     if light.shape != before.shape:
@@ -302,7 +303,7 @@ def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Arra
     modelled = factory.actuators_to_modes(matrix, light.reshape(-1), good, optics, on_nodes)
     if before.actuators_to_modes.size:
         modelled[:, ~before.actuators_to_modes.any(axis=0)] = 0  # actuators that are not active
-    return np.asarray(measured + modelled - (modelled @ commands) @ measured)
+    return np.asarray(measured + modelled - (modelled @ commands) @ np.linalg.pinv(commands))
 
 
 def _span(calibration: Calibration) -> str:

@@ -105,9 +105,10 @@ def compute_calibration(
     if name:
         calibration = replace(calibration, estimator=f"{calibration.estimator}+at {name}")
     if request.truncate or request.tikhonov:
-        calibration = replace(
-            calibration, reconstructor=single(quality.matrix), estimator=f"{calibration.estimator}+regularised"
-        )
+        R, measured = quality.matrix, quality.matrix @ calibration.response  # what R measures of each mode
+        actuators = single(measured @ calibration.actuators_to_modes)
+        estimator = f"{calibration.estimator}+regularised"
+        calibration = replace(calibration, reconstructor=single(R), actuators_to_modes=actuators, estimator=estimator)
     with Client(run) if load else contextlib.nullcontext() as loop:
         calibration = write(calibration, request.out, loop)
     return result_of(config, calibration, quality, "analytic", request.out)
