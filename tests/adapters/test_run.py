@@ -61,6 +61,8 @@ def test_a_mirror_that_the_run_does_not_have_is_refused() -> None:
     with pytest.raises(BusError, match="no 'mirror-tip'"):
         open_run("night", mirrors=("dm", "tip"))
     assert mirror_role("tip") == "mirror-tip"
+    with pytest.raises(BusError, match="there is no run 'dusk'"):
+        open_run("dusk", ())
 
 
 @pytest.mark.parametrize(

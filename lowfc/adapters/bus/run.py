@@ -157,11 +157,11 @@ def open_run(
     listeners: tuple[str, ...] = (),
     network: Network | None = None,
 ) -> Run:
-    """Open the run of that name; the first call creates its directory, ports and secret.
+    """Open the run of that name; the first call with `mirrors` creates its directory, ports and secret.
 
     Args:
         run_id: name of the run.
-        mirrors: names of its mirrors.
+        mirrors: names of its mirrors; empty to join a run that exists, whatever its mirrors.
         base: parent of its directory; the user's runtime directory when None.
         listeners: additional roles with a port, if this call creates the run: a launcher must listen to receive from a
             viewer, which only connects.
@@ -169,11 +169,14 @@ def open_run(
             or a launcher created the run, which then stays on its host.
 
     Raises:
-        BusError: the name is invalid, or the run exists without one of `mirrors`, or with another network.
+        BusError: the name is invalid, or the run exists without one of `mirrors`, or with another network; without
+            `mirrors`, it does not exist.
         DataFileError: the run's directory is damaged, or cannot be made.
     """
     path, wanted = run_path(run_id, base), _absolute(network or Network())
     if not path.is_dir():
+        if not mirrors:
+            raise BusError(f"there is no run {run_id!r}")
         try:
             _make(path, mirrors, listeners, wanted)
         except OSError as fault:
