@@ -56,6 +56,7 @@ def test_a_run_is_made_with_the_mirror_of_the_role() -> None:
         done = lowfc("config", "zenoh", "--role", role, "--make")
         assert done.exit_code == 0, done.exception
     assert set(open_run("default", ()).links.ports) == {"camera", "controller", "mirror-tt", "recorder"}
+    assert "no process of run 'default' reports its health" in refusal("hosts", "--run", "default", kind=BusError)
     refused = lowfc("config", "zenoh", "--role", "mirror-Tip Tilt", "--run", "x", "--make").exception
     assert "mirror.name = 'Tip Tilt'" in str(refused)
     for run in ("default", "x"):

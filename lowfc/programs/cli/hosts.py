@@ -141,10 +141,10 @@ def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) 
         run = the_known_run(run)
     run = run or DEFAULT_RUN  # with a router, all processes of the run may be on other hosts
     with ExitStack() as stack:
-        base = None
-        if not run_path(run).is_dir():  # a list creates no run
-            base = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lowfc-")))
-        links = open_run(run, (settings.mirror.name,), base, network=settings.network).links
+        exists = run_path(run).is_dir()  # a list creates no run
+        base = None if exists else Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lowfc-")))
+        mirrors = () if exists else (settings.mirror.name,)
+        links = open_run(run, mirrors, base, network=settings.network).links
         bus = ZenohBus(links, Role.OPERATOR, HostClock())
         stack.callback(bus.close)
         time.sleep(CONNECT_S)
