@@ -144,6 +144,15 @@ def test_states_that_were_not_received_are_queried_again() -> None:
     assert [watch.update().state.calibration_id for _ in range(2)] == ["", "night"]
 
 
+def test_a_silent_process_is_left_out() -> None:
+    hub, clock = MemoryHub(), FakeClock()
+    watch = Watch(MemoryBus(hub, "operator", clock), clock)
+    MemoryBus(hub, "recorder", clock).publisher(HEALTH, "recorder").put(wire.Health(pid=7).SerializeToString())
+    assert watch.update().processes.keys() == {"recorder"}
+    clock.advance(3_000_000_000)
+    assert not watch.update().processes
+
+
 def test_an_unreadable_step_leaves_the_one_before() -> None:
     hub, clock = MemoryHub(), FakeClock()
     steps = MemoryBus(hub, "controller", clock).publisher(STEP)

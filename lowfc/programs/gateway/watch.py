@@ -11,7 +11,7 @@ from lowfc.programs.view.verdicts.tile import Verdict
 from lowfc.programs.view.verdicts.verdict import judge
 
 SILENT_NS = 2_000_000_000
-"""Longest time without a Health of the controller, which is sent twice a second."""
+"""Longest time without a Health, sent twice a second; a process other than the controller is then left out."""
 
 
 class RunView(NamedTuple):
@@ -36,12 +36,11 @@ class Watch(Monitor):
         snapshot = self.snapshot(now_ns)
         if (sample := self.newest.get(STEP)) is not None:
             self._step = step_of(sample) or self._step
-        controller = snapshot.health.get(Role.CONTROLLER)
-        connected = controller is not None and now_ns - controller.time_ns < SILENT_NS
+        alive = {name for name, one in snapshot.health.items() if now_ns - one.time_ns < SILENT_NS}
         return RunView(
-            connected,
+            Role.CONTROLLER in alive,
             snapshot.controller or wire.ControllerState(),
-            {name: one.health for name, one in snapshot.health.items()},
+            {name: one.health for name, one in snapshot.health.items() if name in alive | {Role.CONTROLLER}},
             judge(self.watcher.state()),
             self._step,
             snapshot.frame,
