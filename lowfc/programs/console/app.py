@@ -64,15 +64,15 @@ class Console(OrderedKeys):
     #top {{ height: 2; }}
     #verdict {{ width: 1fr; height: 2; padding: 0 1; text-style: bold; }}
     #clock {{ width: 11; height: 2; padding: 0 1; text-style: bold; }}
-    #readings {{ height: 17; }}
+    #readings {{ height: 18; }}
     #left {{ width: 1fr; min-width: {_LEFT}; }}
     #right {{ width: 1fr; padding: 0 0 0 1; }}
-    #tiles {{ height: 8; }}
+    #tiles {{ height: 9; }}
     #modes, #pictures {{ height: 7; }}
     #log, #table {{ text-wrap: nowrap; text-overflow: ellipsis; }}
     #sparks {{ height: 2; }}
     #gains {{ height: 5; }}
-    #facts {{ height: 5; }}
+    #facts {{ height: 6; }}
     .disconnected {{ visibility: hidden; }}
     #log {{ height: 1fr; }}
     #answer {{ height: 2; padding: 0 1; }}
