@@ -1,5 +1,6 @@
 """Readings of the run, several times a second: the verdict of the view's tiles, and values."""
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -123,11 +124,9 @@ class Feed(Monitor):
         query = super()._query
 
         def queries() -> None:
-            query()
-            try:
+            with contextlib.suppress(LowfcError):  # the console ends, or there is no controller that sends Health yet
+                query()
                 self._config = configuration_of(Client(self._run_id, bus=self._bus))
-            except LowfcError:  # no controller yet: it is queried once it sends Health
-                return
 
         threading.Thread(target=queries, name="query", daemon=True).start()
 

@@ -6,6 +6,7 @@ event that gives the reason; a hung window is only reported, a closed one ends t
 write the file ends it with an error.
 """
 
+import contextlib
 import platform
 import threading
 import time
@@ -21,7 +22,7 @@ from lowfc.adapters.process.host import resident_bytes
 from lowfc.adapters.process.service import Service
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show, ViewerError
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import DataFileError, LowfcError
+from lowfc.contract.errors import BusError, DataFileError, LowfcError
 from lowfc.contract.events import Level
 from lowfc.contract.messages import EVENT, STEP, TRUTH, Log, Role, timestamp, wire
 from lowfc.programs.view.layout import LIVE_WINDOW_S
@@ -137,7 +138,8 @@ class LiveView:
         self._earlier_events_requested |= events_due
 
         def add() -> None:
-            render.add_earlier(sample for _, sample in states(self._bus, SHOWN))
+            with contextlib.suppress(BusError):  # the view has ended
+                render.add_earlier(sample for _, sample in states(self._bus, SHOWN))
             if events_due:
                 render.add_earlier(earlier_events(recorder, self._clock.now_ns()))
 
