@@ -190,11 +190,13 @@ def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame
     for health, seconds in ((watch.health["camera"], 10), (watch.health["controller"], 17)):
         health.timestamp.FromSeconds(seconds)
     assert status_line(watch, 17.0) == "   17 s  closed  the camera has been silent for 7 s"
+    watch.health["controller"].holding = "reserved for [/b]"
     with Console(width=120, file=io.StringIO(), record=True) as console:
         console.print(screen(watch, load(None, {"sensor.kind": "zwfs"}), None, 17.0))
     shown = console.export_text()
     assert "2.20" not in shown, "statistics seven seconds old are not shown"
     assert "bench, V = 2, zwfs; 17 s" in shown
+    assert "closed (command held: reserved for [/b])" in shown, "text of an operator is not rich's markup"
 
 
 @pytest.mark.parametrize(("received", "missing", "lost"), [(500, 0, 0), (371, 129, 129), (309, 0, 191), (0, 0, 0)])

@@ -34,19 +34,20 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     table.add_column(style="dim", justify="right")
     table.add_column()
     silent = _silence_notice(watch)
-    table.add_row("loop", f"{mode(controller)}, {silent or f'{camera.rate_hz:.0f} Hz of {config.camera.rate_hz:g} Hz'}")
+    rate = silent or f"{camera.rate_hz:.0f} Hz of {config.camera.rate_hz:g} Hz"
+    table.add_row("loop", Text(f"{mode(controller)}, {rate}"))  # a string would be read as rich's markup
     table.add_row("wavefront", silent or _wavefront_in_words(camera))
     table.add_row("frame to command", latency(controller.frame_to_command))
     table.add_row("frame to mirror", latency(camera.frame_to_mirror))
     table.add_row("frames", f"{frames.received} received, {frames.skipped} skipped, {frames.missing} missing")
-    table.add_row("mirror", f"{mirror.state or 'starting'}, {counted(commands.received, 'command')}")
+    table.add_row("mirror", Text(f"{printable(mirror.state) or 'starting'}, {counted(commands.received, 'command')}"))
     table.add_row("recorder", recording(recorder))
     for log in watch.events[-_EVENTS_SHOWN:]:
         table.add_row(Text(printable(log.name)), Text(printable(log.message), style=_STYLES.get(log.level, "")))
     end = f" of {duration_s:g} s" if duration_s is not None else ", Ctrl-C ends it"
     sensor = config.sensor.sam if config.sensor.kind == "sam" else config.sensor.kind
     scene = f"{config.disturbance.preset}, V = {config.star.magnitude:g}, {sensor}"
-    return Panel(Group(table), title="lowfc", subtitle=f"{scene}; {elapsed_s:.0f} s{end}", expand=False)
+    return Panel(Group(table), title="lowfc", subtitle=Text(f"{scene}; {elapsed_s:.0f} s{end}"), expand=False)
 
 
 def status_line(watch: Watch, elapsed_s: float, lockstep_hz: float | None = None) -> str:
@@ -96,7 +97,7 @@ def _wavefront_in_words(camera: wire.Health) -> str:
 def mode(controller: wire.Health) -> str:
     """Text of the loop mode, with the reason if a closed loop holds its command."""
     word = mode_word(mode_name(controller.mode) or "starting")
-    return f"{word} (command held: {controller.holding})" if controller.holding else word
+    return f"{word} (command held: {printable(controller.holding)})" if controller.holding else word
 
 
 def latency(durations: wire.Latency) -> str:
