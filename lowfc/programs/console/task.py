@@ -23,7 +23,7 @@ class Task:
         environment = {key: value for key, value in os.environ.items() if key != "ZENOH_RUNTIME"}  # set for monitors
         with os.fdopen(number, "wb") as stream:
             self._process = subprocess.Popen(  # noqa: S603  # our own program
-                [sys.executable, "-m", "lowfc", *words],
+                [sys.executable, "-P", "-m", "lowfc", *words],  # -P: import nothing from the working directory
                 stdin=subprocess.DEVNULL,
                 stdout=stream,
                 stderr=stream,
