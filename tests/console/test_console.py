@@ -354,6 +354,7 @@ def test_texts_name_keys_for_commands_and_ranges_for_long_lists() -> None:
     assert phrased("`lowfc ctl permit` and `lowfc tune`") == "`lowfc ctl permit` and `lowfc tune`"
     assert phrased("gain is now 0.5 0.5 0.05 0.01: below 2") == "gain is now 0.01 to 0.5 (4 modes): below 2"
     assert phrased("1.9 1.9 1.9 1.9 1.9") == "1.9 (5 modes)"
+    assert panels.event_line(EVENTS["NOTE"].log("controller", 0, text="1 2 3 4")).plain.endswith("NOTE 1 2 3 4")
 
 
 def test_tasks_are_commands_with_the_options_of_their_form(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:

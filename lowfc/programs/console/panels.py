@@ -192,11 +192,12 @@ def peers(reading: Reading, run: str) -> Text:
 def event_line(event: Log, times: int = 1) -> Text:
     """An event and its count."""
     ink = WRONG if event.level >= Severity.ERROR else WARNED if event.level >= Severity.WARNING else style()
+    message = printable(event.message)
     return Text.assemble(
         (f"{clock(from_timestamp(event.timestamp))} ", DIM),
         (f"{times} x " if times > 1 else "", BOLD),
         (f"{printable(event.name)}: ", DIM),
-        (phrased(printable(event.message)), ink),
+        (message if message.startswith("NOTE ") else phrased(message), ink),  # an operator's words stay
     )
 
 
