@@ -59,7 +59,7 @@ class Stream(Generic[T]):
         self._gaps: dict[int, Gaps] = {}
         self._damaged = 0
         self._waiting: deque[Sample] = deque()
-        self._fill()
+        self._fill(time.monotonic() + patience_s)
 
     @property
     def lost(self) -> int:
@@ -70,9 +70,10 @@ class Stream(Generic[T]):
         return self
 
     def __next__(self) -> T:
-        """The next message; BusError if none arrives in time."""
+        """The next message; BusError if no valid one arrives in time."""
+        deadline_s = time.monotonic() + self._patience_s
         while self._remaining > 0:
-            self._fill()
+            self._fill(deadline_s)
             sample = self._waiting.popleft()
             count = count_of(sample.sequence)
             self._gaps.setdefault(start_of(sample.sequence), Gaps(count)).add(count)
@@ -81,6 +82,7 @@ class Stream(Generic[T]):
                 self._remaining -= 1
                 return found
             self._damaged += 1
+            self._expire(deadline_s)
         self.close()
         raise StopIteration
 
@@ -90,15 +92,19 @@ class Stream(Generic[T]):
         self._ring.close()
         self._waiting.clear()
 
-    def _fill(self) -> None:
-        deadline_s = time.monotonic() + self._patience_s
+    def _fill(self, deadline_s: float) -> None:
         while not self._waiting:
             self._waiting.extend(self._ring.drain())
             if not self._waiting:
-                if time.monotonic() >= deadline_s:
-                    self.close()
-                    raise BusError(f"no {self._what} came within {self._patience_s:g} s: `lowfc ctl status` shows why")
+                self._expire(deadline_s)
                 time.sleep(_POLL_S)
+
+    def _expire(self, deadline_s: float) -> None:
+        if time.monotonic() >= deadline_s:
+            self.close()
+            unread = f" ({self._damaged} could not be read)" if self._damaged else ""
+            why = f"no {self._what} came within {self._patience_s:g} s{unread}"
+            raise BusError(f"{why}: `lowfc ctl status` shows why")
 
 
 def frame_of(sample: Sample) -> Frame | None:

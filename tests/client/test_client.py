@@ -491,6 +491,9 @@ def test_a_silent_stream_raises_also_at_its_start() -> None:
         next(frames)
     with pytest.raises(BusError, match="no frame came"):
         stream()
+    broken = frame_sample(2)._replace(payload=b"\xff")
+    with pytest.raises(BusError, match=r"no frame came within 0.02 s \([0-9]{1,5} could not be read\)"):
+        next(stream(*[broken] * 100_000))
 
 
 def test_an_ended_stream_unsubscribes(controller: FakeController) -> None:
