@@ -240,8 +240,7 @@ class Controller:
             self._bench.update()
             if self._mirror.due:
                 self._report_mirror()
-        if self._start_pending:
-            self._send_start_requests()
+        self._send_start_requests()
         silent_ns = self._service.clock.host_ns() - self._last_frame_ns
         if silent_ns >= TICK_NS and not self._service.clock.lockstep:
             self._apply_report(Tick(self._service.clock.now_ns(), silent_ns))
@@ -345,7 +344,7 @@ class Controller:
 
     def _send_start_requests(self) -> None:
         """Once the mirror's grid is known, request its configured shapes and control law, as an operator would."""
-        if self._state.loop is None:
+        if self._state.loop is None or not self._start_pending:
             return
         self._start_pending = False
         for request in self._start_up.requests(self._state, self._service.clock.now_ns()):
