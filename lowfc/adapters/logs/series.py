@@ -105,7 +105,10 @@ class LogSeries:
             DataFileError: the file cannot be created, or the disk refuses; see `give_up`.
         """
         now_ns = self._clock.host_ns()
-        path = log_path(self._folder, now_ns)
+        try:
+            path = log_path(self._folder, now_ns)
+        except OSError as fault:
+            raise DataFileError(f"{self._folder} cannot be accessed: {fault.strerror}") from fault
         if new_recording:
             self._recording, self._part = path.stem, 0
         self._part += 1
