@@ -14,10 +14,7 @@ from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import wire
-from lowfc.control.calibration.excitation import build_staircase
-from lowfc.control.calibration.linearity import levels
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
-from lowfc.control.loop import requests
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.programs.commissioning.acceptance import capture, linearity, noise, rejection
 from lowfc.programs.commissioning.acceptance.live import Live
@@ -133,20 +130,14 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, Prob
         responses_of(silent, linearity, hold_frames=7, cycles=3, modes=(2,))
 
 
-def test_linearity_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(requests, "MAX_NOTE_LENGTH", 300)  # any number of cycles fits
+def test_linearity_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain() -> None:
     loop = InProcessLoop(configured())
     with pytest.raises(AcceptanceError, match="2 frames at each level are too few: the first 3"):
         responses_of(loop, linearity, hold_frames=2, cycles=3, modes=(2,))
     (one,) = responses_of(loop, linearity, hold_frames=7, cycles=3, modes=(2,))
     found = linearity.judge([one], loop.config)
     assert found.passed, found.text()
-    levels_nm = levels(one.what["amplitudes_nm"], 3)
-    starts = build_staircase(levels_nm, 7, one.what["step_nm"])[1] + 3
-    former = {"noll": 2, "levels_nm": levels_nm.tolist(), "starts": starts.tolist(), "averaged": 4}
-    assert linearity.judge([replace(one, what=former)], loop.config) == found
+    assert len(str(one.what)) < 100, "the note of any number of cycles is short"
     (mode,) = found.modes
     assert mode.levels[1].gain == pytest.approx(1.0, abs=0.03)
     assert [row.amplitude_nm for row in mode.levels] == pytest.approx([6, 12, 24])
@@ -249,11 +240,8 @@ def test_a_request_disturbs_a_measurement_unless_a_limit_ended_it_before(name: s
 def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_of_its_time(tmp_path: Path) -> None:
     night = SyntheticLog().frames(20)
     night.request("note", text='acceptance {"test": "noise-floor", "loop": "open", "frames": 50}').frames(60)
-    night.request("gain", (0.1,)).request("safe").request("clear").load(
-        identified(replace(TOYS, flux_dn=2 * TOYS.flux_dn))
-    )
-    log = night.frames(5).write(tmp_path / "night.mcap")
-    (response,) = logged_responses(read_history(LogReader(log)), noise.KIND)
+    night.request("gain", (0.1,)).request("safe").request("clear").load(identified(replace(TOYS, flux_dn=1.0)))
+    (response,) = logged_responses(read_history(LogReader(night.frames(5).write(tmp_path / "night.mcap"))), noise.KIND)
     assert (response.loop.law.gain[0], response.loop.calibration.id) == (np.float32(0.4), TOYS.id)
 
 

@@ -1,11 +1,12 @@
 """`lowfc acceptance linearity`: gain and cross-talk of each mode as a function of amplitude, with the loop open."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from lowfc.arrays import Array, Integers
+from lowfc.arrays import Integers, Single
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.excitation import build_staircase
 from lowfc.control.calibration.linearity import SURE, gains, levels
@@ -84,21 +85,13 @@ def play(live: Live, *, hold_frames: int, cycles: int, modes: Sequence[int]) -> 
     skipped = int(np.ceil(live.loop.delay_frames)) + _SPARE_FRAMES
     if hold_frames <= skipped:
         raise AcceptanceError(f"{hold_frames} frames at each level are too few: the first {skipped} do not show it yet")
-    amplitudes_nm = (np.array(AMPLITUDES) * live.configuration.acceptance.linear_nm).tolist()
     plan = []
     for noll in chosen(modes, live.loop.noll):
         shape = live.calibration.modes_to_actuators[:, live.loop.noll.index(noll)][None]
         step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
-        stairs, _ = build_staircase(levels(amplitudes_nm, cycles), hold_frames, step_nm)
-        what = {
-            "noll": noll,
-            "amplitudes_nm": amplitudes_nm,
-            "cycles": cycles,
-            "hold": hold_frames,
-            "step_nm": step_nm,
-            "averaged": hold_frames - skipped,
-        }
-        plan.append((what, stairs.astype(np.float32)[:, None], shape))
+        levels_nm = levels(np.array(AMPLITUDES) * live.configuration.acceptance.linear_nm, cycles)
+        stairs, _ = build_staircase(levels_nm, hold_frames, step_nm)
+        plan.append(({"noll": noll, "averaged": hold_frames - skipped}, stairs.astype(np.float32)[:, None], shape))
     live.expect(sum(len(table) for _, table, _ in plan))
     return [live.play(KIND, what, LoopMode.OPEN, table, shape) for what, table, shape in plan]
 
@@ -109,7 +102,7 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> L
     for response in {one.what["noll"]: one for one in responses}.values():  # the last one of each mode
         response.check(LoopMode.OPEN)
         what, noll = response.what, response.loop.noll
-        levels_nm, starts = _levels(what)
+        levels_nm, starts = _levels(response.table[:, 0], what["averaged"])
         found = gains(response.filled(response.error_nm), noll.index(what["noll"]), levels_nm, starts, what["averaged"])
         within = found.within(required.gain_error, required.crosstalk)
         rows = []
@@ -149,13 +142,13 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> L
     )
 
 
-def _levels(what: dict[str, Any]) -> tuple[Array, Integers]:
-    """Levels (levels,) of an announced staircase, nm, and the first averaged frame (levels,) of each."""
-    if "starts" in what:  # the announcement of version 0.1
-        return np.array(what["levels_nm"]), np.array(what["starts"], np.intp)
-    levels_nm = levels(what["amplitudes_nm"], what["cycles"])
-    _, starts = build_staircase(levels_nm, what["hold"], what["step_nm"])
-    return levels_nm, starts + what["hold"] - what["averaged"]
+def _levels(stairs: Single, averaged: int) -> tuple[Single, Integers]:
+    """Levels (levels,) of a staircase (frames,), and the first of the last `averaged` frames (levels,) at each."""
+    edges = np.flatnonzero(np.diff(stairs, prepend=np.nan, append=np.nan))
+    hold = min(frames for frames in np.diff(edges).tolist() if frames > 1)  # a value between levels lasts for one
+    starts = np.concatenate([np.arange(at, end - hold + 1, hold) for at, end in pairwise(edges)])
+    starts = starts[stairs[starts] != 0]  # it ends at zero
+    return stairs[starts], starts + hold - averaged
 
 
 def draw(found: dict[str, Any], figure: Any) -> None:
