@@ -108,8 +108,7 @@ def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, 
     assert made.id != before.id
     assert made.estimator == f"weighted+{method}"
     first = data.measured._replace(initial=data.measured.initial._replace(estimator=f"weighted+{method}+first"))
-    request = CalibrationRequest(method, OUT, 50.0)
-    assert not measured_calibration(config, before, first, request)[0].provisional, "it has a verdict"
+    assert not measured_calibration(config, before, first, CalibrationRequest(method, OUT, 50.0))[0].provisional
 
 
 def closed(config: Configuration, calibration: Calibration, frames: int, world: Configuration) -> np.ndarray:

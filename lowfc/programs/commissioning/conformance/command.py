@@ -1,5 +1,6 @@
 """The command `lowfc conformance`: command-line arguments."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
@@ -7,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lowfc.adapters.process.terminal import ConfigFile, Json, configuration, new_app
+from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.programs.commissioning.checks import Check, Status, print_report
 
 if TYPE_CHECKING:
@@ -81,7 +83,6 @@ def mirror(
 
     from lowfc.adapters.bus.run import mirror_role
     from lowfc.adapters.process.progress import passing_bar
-    from lowfc.contract.errors import BusError, ConfigurationError
     from lowfc.contract.messages import Role
     from lowfc.programs.commissioning.conformance.dialogue import Dialogue, Expected
     from lowfc.programs.commissioning.conformance.mirror import mirror_checks
@@ -102,7 +103,6 @@ def _run_with(role: str, name: str | None) -> "Run":
     """The run of that name, or the only one with such a device."""
     from lowfc.adapters.bus.run import open_run
     from lowfc.client.runs import live_runs, the_known_run
-    from lowfc.contract.errors import BusError
 
     if name is None:
         found = [run for run, roles in live_runs().items() if role in roles]
@@ -125,8 +125,6 @@ def _run_with(role: str, name: str | None) -> "Run":
 
 @contextmanager
 def _connection(run: "Run", role: str) -> "Iterator[Connection]":
-    import time
-
     from lowfc.programs.commissioning.conformance.connection import Connection
 
     connection = Connection(run.links, role)

@@ -174,12 +174,11 @@ class Dialogue(Collected):
         """
         self._commanded_nm, before = surface_nm, len(self.states)
         sequence, sent_ns = self.put(surface_nm, valid_ns=valid_ns)
-        end_ns = self.connection.now_ns() + round(ANSWER_S * NS)
         while True:
             for message, state in self.states[before:]:
                 if state.frame_sequence == sequence:
                     return state, sent_ns, message.receive_time_ns - sent_ns
-            if self.connection.now_ns() >= end_ns:
+            if self.connection.now_ns() >= sent_ns + ANSWER_S * NS:
                 return None, sent_ns, 0
             self.collect(TURN_S)
 

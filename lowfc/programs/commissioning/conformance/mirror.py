@@ -284,8 +284,7 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
     late, bounded = f"not within {(MAX_VALID_NS + SLACK_NS) / 1e9:g} s", _expired_ns(mirror, sent_ns) is not None
     advice = "limit valid_for_ns in the driver: a sender's mistake must not hold the mirror for ever"
     yield judged("longest command", expected, bounded, "EXPIRED", advice, late, warning)
-    arrivals = [message.receive_time_ns for message, _ in mirror.since(sent_ns)]
-    times_ns = sent_ns, *arrivals, mirror.connection.now_ns()
+    times_ns = sent_ns, *(message.receive_time_ns for message, _ in mirror.since(sent_ns)), mirror.connection.now_ns()
     longest_s = max(later - earlier for earlier, later in pairwise(times_ns)) / 1e9
     expected, got = "ten states a second also without commands", f"longest time without one {longest_s:.2g} s"
     advice, severity = "publish the state ten times a second, also when idle", wrong if longest_s > 1.0 else warning

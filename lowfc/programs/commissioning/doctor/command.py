@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lowfc.adapters.process.terminal import ConfigFile, Json, configuration
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.programs.commissioning.checks import Check, Status, print_report
 
 if TYPE_CHECKING:
@@ -78,7 +78,6 @@ def doctor(
 
 def examine(facts: "Facts") -> list[Check]:
     """The result of every check; a note if a check cannot read its data."""
-    from lowfc.contract.errors import LowfcError
     from lowfc.programs.commissioning.doctor import resources, timing
 
     unknown = (OSError, ValueError, LookupError, LowfcError)

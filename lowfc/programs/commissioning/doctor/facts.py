@@ -50,12 +50,11 @@ def gather(host: Host, config: Configuration, seconds: float) -> Facts:
     """Request the loop's real-time measures, measure wake-ups in each class, and note other busy processes."""
     facts = Facts(host, config, OSError("not tried"), ())
     host.busy()  # the next call reports the load since this one
-    trial: Trial | OSError
     try:
-        trial = try_out(config.realtime, facts.named_cpus, seconds)
+        facts = replace(facts, trial=try_out(config.realtime, facts.named_cpus, seconds))
     except OSError as fault:
-        trial = fault
-    return replace(facts, trial=trial, busy=tuple(host.busy()))
+        facts = replace(facts, trial=fault)
+    return replace(facts, busy=tuple(host.busy()))
 
 
 def ranges(cpus: Iterable[int]) -> str:

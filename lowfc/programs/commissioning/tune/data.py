@@ -76,8 +76,7 @@ class Telemetry:
 def telemetry_from_log(log: LogReader) -> Telemetry:
     """The used closed-loop frames of a log; all used frames if there are too few of them.
 
-    Frames with a probe sequence, as in an acceptance test, are excluded: a law must not learn from them. So are those
-    measured with an earlier calibration than the last one.
+    Frames with a probe sequence, as in an acceptance test, or of an earlier calibration are excluded.
     """
     history = read_history(log)
     run = LoggedRun(history)
