@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.arrays import Integers, Single
+from lowfc.arrays import Array, Integers
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.excitation import build_staircase
 from lowfc.control.calibration.linearity import SURE, gains, levels
@@ -102,7 +102,7 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> L
     for response in {one.what["noll"]: one for one in responses}.values():  # the last one of each mode
         response.check(LoopMode.OPEN)
         what, noll = response.what, response.loop.noll
-        levels_nm, starts = _levels(response.table[:, 0], what["averaged"])
+        levels_nm, starts = _levels(response.table[:, 0].astype(float), what["averaged"])
         found = gains(response.filled(response.error_nm), noll.index(what["noll"]), levels_nm, starts, what["averaged"])
         within = found.within(required.gain_error, required.crosstalk)
         rows = []
@@ -142,7 +142,7 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> L
     )
 
 
-def _levels(stairs: Single, averaged: int) -> tuple[Single, Integers]:
+def _levels(stairs: Array, averaged: int) -> tuple[Array, Integers]:
     """Levels (levels,) of a staircase (frames,), and the first of the last `averaged` frames (levels,) at each."""
     edges = np.flatnonzero(np.diff(stairs, prepend=np.nan, append=np.nan))
     hold = min(frames for frames in np.diff(edges).tolist() if frames > 1)  # a value between levels lasts for one
