@@ -2,6 +2,7 @@
 
 import ctypes
 import json
+import multiprocessing.resource_tracker
 import multiprocessing.spawn
 import os
 import re
@@ -331,6 +332,7 @@ def test_a_trial_ends_after_an_interrupt() -> None:
 
 
 def test_a_failed_trial_has_its_cause(monkeypatch: pytest.MonkeyPatch) -> None:
+    multiprocessing.resource_tracker.ensure_running()  # by this Python, not by the program below
     monkeypatch.setattr(multiprocessing.spawn, "get_executable", lambda: b"/bin/false")
     with pytest.raises(OSError, match="the trial's process ended"):
         try_out(Realtime(), set(), 0.01)
