@@ -98,9 +98,6 @@ def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, 
     talk = np.abs(cross_talk(made.reconstructor, before.response))
     assert (talk - 4 * data.measured.error[:, None]).max() < 0.02
     assert np.allclose(made.actuators_to_modes @ made.modes_to_actuators, np.eye(len(made.noll)), atol=1e-4)
-    damped, _ = measured_calibration(config, before, data.measured, CalibrationRequest(method, OUT, 50.0, tikhonov=0.5))
-    seen = damped.actuators_to_modes @ made.modes_to_actuators
-    assert np.allclose(seen, damped.reconstructor @ damped.response, atol=1e-4)
     difference = made.actuators_to_modes - before.actuators_to_modes
     assert np.linalg.norm(difference) < 0.1 * np.linalg.norm(before.actuators_to_modes)
     assert made.id != before.id

@@ -404,15 +404,6 @@ def test_the_log_of_the_run_gives_the_same_latencies(measured: tuple[dict[str, A
     assert "frame to mirror" in done.stdout
 
 
-def test_what_a_log_left_out_is_not_counted_as_missing(tmp_path: Path) -> None:
-    night, made = Path(__file__).parents[1] / "golden" / "0.1" / "night.mcap", tmp_path / "few.mcap"
-    few = ["export", night, "--decimate", "2", "--out", made, "--topics", "lowfc/c*/[ft][ri]*"]  # frames and timing
-    assert lowfc(*few).exit_code == 0
-    logged = json_of("latency", made)
-    assert [logged[key] for key in ("frames", "rate_hz", "frames_without_mirror_state")] == [3, 1000.0, None]
-    assert "few.mcap, 1000.0 Hz, 1 in 2 frames" in lowfc("latency", made).stdout
-
-
 def test_files_that_are_no_results_or_logs_are_errors(tmp_path: Path) -> None:
     other = tmp_path / "other.json"
     listed = '{"latency_us": [1], "ratio": null, "repeats": []}'
