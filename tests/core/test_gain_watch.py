@@ -12,7 +12,7 @@ from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.state_codec import calibration_in_use, controller_state, decode_state
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.map_reconstructor import map_reconstructor, noise_covariance_nm2
+from lowfc.control.calibration.map_reconstructor import map_rows, noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import TOGETHER, GainBank, TiltCrossTalk
 from lowfc.control.laws.integrator import RELAXING, TIP_TILT
 from lowfc.control.laws.linear_law import integrator
@@ -127,7 +127,7 @@ def test_the_noise_of_tip_falls_to_a_quarter_if_only_tip_and_tilt_are_corrected(
     config = load(None, {"star.magnitude": 5.0, "camera.rate_hz": 1000.0})
     known = calibrated(config)
     prior_nm2 = 1.0 - np.isin(config.noll, TIP_TILT)
-    rows = map_reconstructor(known, prior_nm2, known.flux_dn, known.camera)
+    (rows,) = map_rows(known, prior_nm2, known.flux_dn, known.camera, known.reconstructor)
     noise_nm = [
         float(np.sqrt(noise_covariance_nm2(one, known.flux_dn, known.camera)[0, 0]))
         for one in (known, replace(known, reconstructor=rows))

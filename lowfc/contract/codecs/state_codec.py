@@ -13,7 +13,7 @@ from lowfc.contract.codecs.codec import wire_mode, wire_reasons
 from lowfc.contract.codecs.law_codec import command_channels_of, integrator_of, law_header, law_of, put_command_channels
 from lowfc.contract.messages import fields_of, floats, from_timestamp, timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.map_reconstructor import map_reconstructor
+from lowfc.control.calibration.map_reconstructor import map_rows
 from lowfc.control.kernel.tables import NUMPY, Kernel
 from lowfc.control.laws import linear_law
 from lowfc.control.laws.linear_law import LinearLaw
@@ -94,7 +94,7 @@ def calibration_in_use(message: wire.ControllerState, calibration: Calibration) 
     if message.calibration_id != calibration.id or prior_nm2.size != len(calibration.noll):
         return calibration
     camera = camera_settings(message.camera_expected) if message.HasField("camera_expected") else calibration.camera
-    rows = map_reconstructor(calibration, prior_nm2, message.weighting_flux_dn, camera)
+    (rows,) = map_rows(calibration, prior_nm2, message.weighting_flux_dn, camera, calibration.reconstructor)
     return replace(calibration, reconstructor=rows)
 
 

@@ -22,28 +22,30 @@ def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: Camer
     return excess * noise_nm2(R, I0, flux_e, read_noise_e)
 
 
-def map_reconstructor(
-    calibration: Calibration, prior_nm2: Array | Single, flux_dn: float, camera: CameraSettings | None
-) -> Single:
-    """R (modes, pixels) with the rows R_c - C_cu (C_uu + P_u)^-1 R_u for corrected modes c.
+def map_rows(
+    calibration: Calibration, prior_nm2: Array | Single, flux_dn: float, camera: CameraSettings | None, *of: Single
+) -> list[Single]:
+    """Matrices M (modes, any), such as R, with the rows M_c - C_cu (C_uu + P_u)^-1 M_u for corrected modes c.
 
-    R_u are the rows of the uncorrected modes u, which stay as they are, P_u is their prior, and C the noise covariance
-    of the calibration's own R. If that is the weighted R for the same flux, the rows are (H'WH + P^-1)^-1 H'W.
+    M_u are the rows of the uncorrected modes u, which stay as they are, P_u is their prior, and C the noise covariance
+    of the calibration's own R. If that is the weighted R for the same flux, its rows are (H'WH + P^-1)^-1 H'W.
 
     Args:
         calibration: The calibration in use.
         prior_nm2: (modes,) mean square of an uncorrected mode; 0 for a corrected mode.
         flux_dn: Sum of the good pixels, for the weights.
-        camera: Camera settings; if they or their gain are unknown, or no mode or every mode is corrected, the
-            calibration's own R is returned.
+        camera: Camera settings; if they or their gain are unknown, or no mode or every mode is corrected, the matrices
+            are returned.
+        of: The matrices M.
     """
-    R, prior_nm2 = calibration.reconstructor, np.asarray(prior_nm2, np.float64)
+    prior_nm2 = np.asarray(prior_nm2, np.float64)
     uncorrected = prior_nm2 > 0
     covariance = noise_covariance_nm2(calibration, flux_dn, camera)
     if covariance is None or not uncorrected.any() or uncorrected.all():
-        return R
+        return list(of)
     among = covariance[np.ix_(uncorrected, uncorrected)] + np.diag(prior_nm2[uncorrected])
     mixed = np.linalg.solve(among, covariance[np.ix_(uncorrected, ~uncorrected)]).T
-    rows = R.astype(np.float64)
-    rows[~uncorrected] -= mixed @ rows[uncorrected]
-    return single(rows)
+    found = [matrix.astype(np.float64) for matrix in of]
+    for rows in found:
+        rows[~uncorrected] -= mixed @ rows[uncorrected]
+    return list(map(single, found))

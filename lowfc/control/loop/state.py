@@ -9,7 +9,7 @@ import numpy as np
 
 from lowfc.arrays import Mask, Single
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.map_reconstructor import map_reconstructor
+from lowfc.control.calibration.map_reconstructor import map_rows
 from lowfc.control.kernel.tables import NUMPY, Kernel
 from lowfc.control.laws import linear_law
 from lowfc.control.laws.integrator import TIP_TILT, Integrator
@@ -139,7 +139,7 @@ class LawRunner(NamedTuple):
 
 
 class Weighting(NamedTuple):
-    """Weighting of R, as for `map_reconstructor`.
+    """Weighting of R, as for `map_rows`.
 
     Attributes:
         prior_nm2: (modes,) mean square of each uncorrected mode, nm^2; 0 for a mode that the loop corrects.
@@ -219,12 +219,19 @@ class ActiveLoop(NamedTuple):
         return self._replace(integrator=replace(integrator, uncorrected=self.automatic & (integrator.gain == 0)))
 
     def with_weighting(self, weighting: Weighting | None) -> "ActiveLoop":
-        """A copy with R computed for other uncorrected modes or another flux."""
-        calibration = self.calibration
+        """A copy with R, and the modes that it measures of a channel, for other uncorrected modes or another flux."""
+        calibration, channels = self.calibration, self.command_channels
+        to_modes = calibration.actuators_to_modes if calibration.actuators_to_modes.size else self.inverse
         if weighting is not None:
-            rows = map_reconstructor(calibration, weighting.prior_nm2, weighting.flux_dn, self.camera)
-            calibration = replace(calibration, reconstructor=rows)
-        return self._replace(weighting=weighting, estimator=Estimator.of(calibration, self.estimator.kernel))
+            own = calibration.reconstructor, to_modes
+            R, to_modes = map_rows(calibration, weighting.prior_nm2, weighting.flux_dn, self.camera, *own)
+            calibration = replace(calibration, reconstructor=R)
+        return self._replace(
+            weighting=weighting,
+            estimator=Estimator.of(calibration, self.estimator.kernel),
+            to_modes=to_modes,
+            command_channels=None if channels is None else channels.with_all(channels.channels, to_modes),
+        )
 
     def channels_or_empty(self) -> CommandChannels:
         """The command channels; an empty object if there are none."""

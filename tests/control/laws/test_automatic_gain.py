@@ -5,7 +5,7 @@ import pytest
 
 from lowfc.arrays import Array, single
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.map_reconstructor import map_reconstructor, noise_covariance_nm2
+from lowfc.control.calibration.map_reconstructor import map_rows, noise_covariance_nm2
 from lowfc.control.calibration.regularised import pixel_variance, reconstruct
 from lowfc.control.laws.automatic_gain import SURE, GainBank, TiltCrossTalk, Verdict, uncorrected_prior_nm2
 from lowfc.control.laws.stability import delay_weights, highest_gain
@@ -242,7 +242,7 @@ def test_rows_of_corrected_modes_are_the_map_estimate() -> None:
     """Rows of (H'WH + P^-1)^-1 H'W without a prior for corrected modes; the other rows are unchanged."""
     calibration, camera = _calibration(measured=False)
     prior = np.array([0, 0, 1e-3, 1e-4, 0])
-    rows = map_reconstructor(calibration, prior, 5e4, camera)
+    (rows,) = map_rows(calibration, prior, 5e4, camera, calibration.reconstructor)
     H, I0 = calibration.response.astype(float), calibration.reference.astype(float)
     W = 1 / pixel_variance(I0, 1e5, 2.0)
     inverse = np.diag(np.where(prior > 0, 1 / np.maximum(prior, 1e-12), 0))
@@ -258,7 +258,7 @@ def test_rows_of_corrected_modes_are_the_map_estimate() -> None:
 def test_r_is_unchanged_if_all_or_no_modes_are_corrected_or_the_camera_is_unknown() -> None:
     calibration, camera = _calibration(measured=True)
     for prior, seen_by in ((np.zeros(5), camera), (np.ones(5), camera), (np.array([1.0, 0, 0, 0, 0]), None)):
-        assert map_reconstructor(calibration, prior, 5e4, seen_by) is calibration.reconstructor
+        assert map_rows(calibration, prior, 5e4, seen_by, calibration.reconstructor)[0] is calibration.reconstructor
 
 
 def test_the_prior_of_uncorrected_modes_is_their_power_minus_noise_plus_two_standard_errors() -> None:
