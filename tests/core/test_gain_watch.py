@@ -144,6 +144,9 @@ def test_modes_not_corrected_reduce_the_noise_of_the_others(faint: Bench) -> Non
     state = controller_state(faint.state, faint.settings, 0)
     in_use = calibration_in_use(state, active_loop.calibration).reconstructor
     np.testing.assert_array_equal(in_use, active_loop.estimator.rows[:-1])
+    channels = active_loop.to_modes @ active_loop.calibration.modes_to_actuators  # with the shapes of the modes
+    np.testing.assert_allclose(channels, in_use @ active_loop.calibration.response, atol=0.02)
+    assert np.abs(channels - np.eye(len(channels))).max() > 0.1
     original, reweighted = (
         np.diag(
             noise_covariance_nm2(

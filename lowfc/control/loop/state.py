@@ -159,7 +159,7 @@ class ActiveLoop(NamedTuple):
         integrator: gain, leak and limit of each mode; a law has these limits too.
         to_actuators: (actuators, modes) as in the calibration, in the memory layout of the faster product.
         inverse: (modes, actuators) modal command of a mirror shape.
-        to_modes: (modes, actuators) modes that the sensor sees of a mirror shape.
+        to_modes: (modes, actuators) modes that R measures of a mirror shape, nm of wavefront rms per nm of surface.
         delay_weights: (index in `history_nm`, fraction) of each command that an exposure sees.
         camera: camera settings of the calibration: its own, or the first received that fit it; None until then.
         automatic: (modes,) whether the gain of a mode is automatic.
