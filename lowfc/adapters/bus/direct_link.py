@@ -96,8 +96,8 @@ class DirectReader:
     A copy is recognised by its envelope; the sequence alone is not enough, as two publishers may have started in the
     same second. The bus is unsubscribed while the only publisher of a topic uses the socket; its messages that arrive
     over the bus after a newer one from the socket are dropped as late. The socket keeps the publisher's order: a
-    message that arrives through it out of order was published so and is forwarded. On a topic with several publishers
-    the bus stays subscribed, and a message that only the bus carried may come after a newer one.
+    message that arrives through it out of order, or repeated, was published so and is forwarded. On a topic with
+    several publishers the bus stays subscribed, and a message that only the bus carried may come after a newer one.
     """
 
     def __init__(
@@ -149,7 +149,9 @@ class DirectReader:
             with self._turn:
                 if self._first < 0:
                     self._first = sample.sequence
-                if not self._is_copy(sample):
+                # Without the bus, a newer message is no copy; it is not remembered, and its repetition is forwarded.
+                surely_new = self._leave_bus is None and sample.sequence > self._newest
+                if surely_new or not self._is_copy(sample):
                     self._forward(sample)
         except Exception as fault:
             self._failed(fault)
