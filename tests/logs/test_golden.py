@@ -44,7 +44,7 @@ def test_a_replay_is_identical_except_for_rules_that_changed_on_purpose(
     results = json_of("replay", path, "--tolerance", 1e-3)
     assert (results["frames"], results["different"], results["unchecked"]) == (frames, 0, 0)
     assert results["rules_changed"] == changed
-    whole = json_of("replay", log, "--tolerance", 1e-3)  # it names its host
+    whole = json_of("replay", log, "--tolerance", 1e-3) if lost_bytes else results  # it names its host
     if not {"blas", "cpu_features", "numpy"} & whole["host_differs"].keys():
         assert (results["identical"], results["largest_difference_nm"]) == (True, 0.0)
 

@@ -198,7 +198,7 @@ class ActiveLoop(NamedTuple):
             integrator,
             np.asfortranarray(calibration.modes_to_actuators),
             inverse,
-            calibration.actuators_to_modes if calibration.actuators_to_modes.size else inverse,
+            _own_to_modes(calibration, inverse),
             tuple((lag, weight) for lag, weight in enumerate(weights) if weight),
             calibration.camera,
             settings.automatic(calibration.noll),
@@ -221,7 +221,7 @@ class ActiveLoop(NamedTuple):
     def with_weighting(self, weighting: Weighting | None) -> "ActiveLoop":
         """A copy with R, and the modes that it measures of a channel, for other uncorrected modes or another flux."""
         calibration, channels = self.calibration, self.command_channels
-        to_modes = calibration.actuators_to_modes if calibration.actuators_to_modes.size else self.inverse
+        to_modes = _own_to_modes(calibration, self.inverse)
         if weighting is not None:
             own = calibration.reconstructor, to_modes
             R, to_modes = map_rows(calibration, weighting.prior_nm2, weighting.flux_dn, self.camera, *own)
@@ -273,6 +273,11 @@ class ActiveLoop(NamedTuple):
         if self.law_runner is None:
             return self
         return self._replace(law_runner=self.law_runner.predicted(frames, self.history_nm[0]))
+
+
+def _own_to_modes(calibration: Calibration, inverse: Single) -> Single:
+    """`ActiveLoop.to_modes` for the calibration's own R."""
+    return calibration.actuators_to_modes if calibration.actuators_to_modes.size else inverse
 
 
 class Conditions(NamedTuple):

@@ -55,9 +55,8 @@ class PlainStream:
         itemsize = np.dtype(NUMPY_TYPES.get(number, "f8")).itemsize
         elements = columns * rows * planes
         length = (elements * itemsize + 7) // 8 * 8
-        ring_times = (
-            planes * 40 if kind & 0xF000F == 0x20001 else 0
-        )  # of a circular buffer: times and counter per plane
+        # Of a circular buffer: times and counter of each plane.
+        ring_times = planes * 40 if kind & 0xF000F == 0x20001 else 0
         path.unlink(missing_ok=True)
         with path.open("wb") as file:
             os.fchmod(file.fileno(), 0o666)

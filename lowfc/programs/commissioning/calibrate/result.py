@@ -292,8 +292,9 @@ def comparison(one: Calibration, other: Calibration) -> Comparison:
 def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array, response: Array) -> Array:
     """Modes (modes, actuators) that R measures of each actuator: modal shapes measured, others modelled."""
     commands = before.modes_to_actuators.astype(np.float64)
+    inverse = np.linalg.pinv(commands)
     # Without a model: other shapes are projected onto the modal shapes. R H is the identity unless R is regularised.
-    measured = np.asarray(matrix @ response @ np.linalg.pinv(commands))
+    measured = matrix @ response @ inverse
     optics = factory.twin(config, None, lambda _: None)
     light = twin_reference(optics)
     if light.shape != before.shape:
@@ -303,7 +304,7 @@ def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Arra
     modelled = factory.actuators_to_modes(matrix, light.reshape(-1), good, optics, on_nodes)
     if before.actuators_to_modes.size:
         modelled[:, ~before.actuators_to_modes.any(axis=0)] = 0  # actuators that are not active
-    return np.asarray(measured + modelled - (modelled @ commands) @ np.linalg.pinv(commands))
+    return np.asarray(measured + modelled - (modelled @ commands) @ inverse)
 
 
 def _span(calibration: Calibration) -> str:
