@@ -45,6 +45,8 @@ CONFIG = """
 [sensor]
 sam = "sam27d10_bal14"
 modes = 6
+[camera]
+rate_hz = 100.0
 [star]
 magnitude = 0.0
 [disturbance]
