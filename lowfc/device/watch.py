@@ -80,6 +80,7 @@ class DriverWatch:
         self._in_call = False
         self._kind, self._reported_ns = "", 0
         self._closed = threading.Event()
+        self._ending = threading.Lock()  # a call does not end while it is being reported as hanging
 
     @contextmanager
     def over(self, close: Callable[[], None]) -> Iterator[None]:
@@ -105,8 +106,9 @@ class DriverWatch:
 
     def returned(self) -> bool:
         """Note that the call has returned; return whether it did so in time."""
-        self._in_call = False
-        in_time, self.hangs = not self.hangs, False
+        with self._ending:
+            self._in_call = False
+            in_time, self.hangs = not self.hangs, False
         return in_time
 
     def worked(self) -> None:
@@ -125,7 +127,7 @@ class DriverWatch:
 
     def failed(self, fault: Exception) -> None:
         """Note that a call raised or returned an invalid result; a `LowfcError`, for the user, is raised again."""
-        self._in_call = self.hangs = False
+        self.returned()
         self._report(fault)
         self.retry_ns = self._service.clock.host_ns() + PAUSES_NS[min(self._consecutive, len(PAUSES_NS) - 1)]
         self._consecutive += 1
@@ -142,15 +144,16 @@ class DriverWatch:
 
     def check(self) -> None:
         """Report a call that lasts too many checks; checks are counted, not time, as the host may have stopped."""
-        if not self._in_call or self._calls != self._checked_call:
-            self._checked_call, self._checks = self._calls, 0
-            return
-        self._checks += 1
-        if self._checks * CHECK_S >= self.timeout_s and not self.hangs:
-            self.hangs = True
-            self._count()
-            self._service.event("DRIVER_HANGS", hangs_s=self._checks * CHECK_S)
-            self._hanging()
+        with self._ending:
+            if not self._in_call or self._calls != self._checked_call:
+                self._checked_call, self._checks = self._calls, 0
+                return
+            self._checks += 1
+            if self._checks * CHECK_S >= self.timeout_s and not self.hangs:
+                self.hangs = True
+                self._count()
+                self._service.event("DRIVER_HANGS", hangs_s=self._checks * CHECK_S)
+                self._hanging()
 
     def _count(self) -> None:
         self.failures += 1

@@ -1,11 +1,12 @@
 """Drivers in their loops; those that fail, hang or return invalid data are reported, counted and retried."""
 
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from lowfc.device import CameraSettings, Exposure, Single, geometry
 from lowfc.device.camera_loop import CameraLoop
 from lowfc.device.driver import camera_state
 from lowfc.device.mirror_loop import MirrorLoop
+from lowfc.device.watch import DriverWatch
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
@@ -334,6 +336,19 @@ def test_a_hanging_mirror_reports_no_position_and_goes_flat_before_the_next_comm
     assert bench.command(30.0).refused == 0
     assert bench.listener.events() == ["STARTED", "DRIVER_HANGS", "COMMAND_REFUSED", "COMMAND_BACK"]
     assert bench.loop.watch.failures == 1
+
+
+def test_a_call_that_returns_while_it_is_reported_as_hanging_ends_after_the_report() -> None:
+    order: list[object] = []
+    bench = CameraBench()
+    watch = DriverWatch(bench.listener.service("mirror-dm"), 0.1, lambda: order.append("reported"))
+    returning = threading.Thread(target=lambda: order.append(watch.returned()))
+    watch.begin()
+    watch.check()
+    with patch.object(watch, "_count", lambda: (returning.start(), returning.join(0.2))):
+        watch.check()
+    returning.join()
+    assert order == ["reported", False]
 
 
 def test_a_mirror_that_fails_at_the_start_is_retried() -> None:
