@@ -4,6 +4,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -229,9 +230,13 @@ class MirrorLoop:
         """After a fault, step towards the idle state: flat, or the shape read back or last commanded."""
         if self._service.clock.host_ns() < self.watch.retry_ns:
             return
-        if self._driven_nm is None and (held_nm := self._read_shape()) is not None:
-            self._status = self._status._replace(driven_nm=held_nm)
-        self._status = tick(self._protection, self._status, self._service.clock.now_ns(), self._drive)
+        protection = self._protection
+        if self._driven_nm is None:
+            if (held_nm := self._read_shape()) is not None:
+                self._status = self._status._replace(driven_nm=held_nm)
+            else:  # the failed call may have moved the mirror: only the last shape is certainly within the slew limit
+                protection = replace(protection, flatten=False)
+        self._status = tick(protection, self._status, self._service.clock.now_ns(), self._drive)
         self._known = True
         self._returning = self._protection.flatten and bool(self._status.driven_nm.any())
         if not self._returning:
