@@ -3,7 +3,6 @@
 import contextlib
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -42,16 +41,16 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
     joined = open_run(the_run(run), ())
     run_id, of_run = joined.run_id, joined.path / "config.toml"
     known = configuration(config) if config is not None or not of_run.exists() else load(of_run)
-    clock, stop = clock_of(known), threading.Event()
+    clock, signalled = clock_of(known), list[int]()  # an Event may lock up in the handler of a second signal
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, lambda number, _: signalled.append(number))
     bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
 
     def request(put: Put, value: Any) -> None:
         put(Client(run_id, bus=bus), value)  # on a thread of the server: `safe` waits for no other put
 
     def ended() -> bool:
-        return stop.is_set() or joined.restarted()
+        return bool(signalled) or joined.restarted()
 
     with contextlib.ExitStack() as stack:
         stack.callback(lambda: bus.close())
@@ -61,7 +60,7 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
         sys.stderr.write(f"gateway: run {run_id} by PV Access at {where}\n")
         while True:
             _serve(Client(run_id, bus=bus), Watch(bus, clock), gateway, ended)
-            if stop.is_set():
+            if signalled:
                 return
             bus.close()
             joined = open_run(run_id, ())
