@@ -104,7 +104,7 @@ class Controller:
         self._steps = service.publisher(STEP)
         self._inputs = service.publisher(CONTROL_INPUT)
         self._states = service.publisher(CONTROLLER_STATE)
-        self._requests = service.publisher(REQUEST)
+        self._requests, self._requests_lock = service.publisher(REQUEST), threading.Lock()
         self._timing = StageTiming(service.publisher(TIMING))
         self._arrays = Arrays(*(service.publisher(topic) for topic in (CALIBRATION, LAW, PLAY)))
         self._offload = Offload(service.publisher(OFFLOAD), round(1e9 / float(OFFLOAD.rate) / config.period_ns))
@@ -261,7 +261,8 @@ class Controller:
         message = controller_state(state, self._settings, now_ns) if request.name == "status" else None
         short = Request(request.time_ns, request.name, request.modes, request.values, request.text)
         query.reply(codec.encode_request(short, reply, number, message))  # without the arrays: the requester has them
-        self._requests.put(codec.encode_request(request, reply, number, message))
+        with self._requests_lock:  # in lockstep the receiving thread has requests, too
+            self._requests.put(codec.encode_request(request, reply, number, message))
 
     def _carry_out(
         self, request: Request, lock: AbstractContextManager[object] | None = None
@@ -298,7 +299,8 @@ class Controller:
         """Carry out an internal request and publish it like an operator's."""
         request = prepared(self._settings, request)
         reply, _, number = self._carry_out(request, lock)
-        self._requests.put(codec.encode_request(request, reply, number, None))
+        with self._requests_lock:
+            self._requests.put(codec.encode_request(request, reply, number, None))
         return reply
 
     def safe_by_signal(self) -> None:
