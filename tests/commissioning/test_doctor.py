@@ -431,6 +431,7 @@ def test_real_time_rights_are_shown_applied_and_removed(tmp_path: Path, monkeypa
     assert [words[0] for words in calls] == ["groupadd", "lowfc", "usermod"]
     assert "exclude each other" in refusal("doctor", "--apply", "--undo")
     assert "leave out --json" in refusal("doctor", "--setup", "--json")
+    assert "leave out --device" in refusal("doctor", "--apply", "--device", "isio")
     permissions.undo(tmp_path)
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != device]
     assert device.stat().st_mode & 0o777 == 0o600

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.adapters.process.terminal import ConfigFile, Json, configuration
+from lowfc.adapters.process.terminal import ConfigFile, Json, configuration, options_set
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.programs.commissioning.checks import Check, Status, print_report
 
@@ -22,6 +22,7 @@ FIELDS = {"name": "name", "status": "status", "detail": "got", "advice": "advice
 
 
 def doctor(
+    context: typer.Context,
     config: ConfigFile = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit status 1 if there is a warning.")] = False,
     device: Annotated[str | None, typer.Option(help="Check only the requirements of the driver of this name.")] = None,
@@ -46,8 +47,11 @@ def doctor(
     if apply and undo:
         raise ConfigurationError("--apply and --undo exclude each other: use one")
     if setup or apply or undo:
-        if as_json:
-            raise ConfigurationError("--setup, --apply and --undo print plain text only: leave out --json")
+        for option in options_set(context):
+            if option not in ("--setup", "--apply", "--undo"):
+                raise ConfigurationError(
+                    f"--setup, --apply and --undo print text and use no other option: leave out {option}"
+                )
         from lowfc.programs.commissioning.doctor import permissions
 
         root = Path("/")
