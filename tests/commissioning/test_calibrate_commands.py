@@ -256,6 +256,9 @@ def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:
     made = calibration_file.load(Path("there.fits"))
     assert np.abs(cross_talk(made.reconstructor, made.response)).max() < 1e-3
     assert np.array_equal(made.response, loop.calibration().response)
+    loop.ask("lease", values=60.0, text="somebody", lease_id=2)
+    with pytest.raises(RequestRefusedError, match="reserved for somebody"):
+        json_of("reference", "--frames", "200", "--out", "there.fits")
 
 
 def test_a_dark_finds_bad_pixels_and_is_refused_with_light(

@@ -167,8 +167,9 @@ def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, loa
 def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> ReferenceResult:
     """Write the calibration in use with the present image as its reference."""
     require_folder(out)
-    with Client(run) as loop, _in_use(loop) as (before, noise):
+    with Client(run) as loop, loop.reserved("lowfc calibrate reference"), _in_use(loop) as (before, noise):
         cube = next_frames(loop, frames)
+        loop.check_lease()  # another shape of the mirror is another zero point
         check_size(cube.shape[1:], before)
         pixels = cube.reshape(frames, -1)
         light, flux = normalised(pixels, before.dark.astype(np.float64), before.good.astype(np.float64))
