@@ -104,6 +104,8 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, Prob
     loop, one = multisine
     with pytest.raises(AcceptanceError, match=r"2 modes|3 modes"):
         responses_of(loop, rejection, **MULTISINE | {"duration_s": 0.1})
+    with pytest.raises(AcceptanceError, match=r"3 columns has at most 1333250 frames, 5333 s; .* would have 1500\d+"):
+        responses_of(loop, rejection, **MULTISINE | {"duration_s": 6000.0})
     other = one.mode.copy()
     other[50] = LoopMode.OPEN
     limited = one.reasons.copy()
@@ -112,7 +114,8 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, Prob
     missing[100:110] = np.nan
     for disturbed, why in (
         (replace(one, mode=other), "became open"),
-        (replace(one, reasons=limited), "SLEW"),
+        (replace(one, reasons=limited), r"SLEW\) and ended the probe: use a smaller amplitude"),
+        (replace(one, reasons=limited, target=""), r"SLEW\): measure when"),
         (replace(one, error_nm=missing), f"10 of {len(one.table)}"),
     ):
         with pytest.raises(AcceptanceError, match=why):

@@ -10,6 +10,7 @@ import numpy as np
 from lowfc.adapters.logs.columns import steps_as_columns
 from lowfc.arrays import Single
 from lowfc.client import Client, Step, configuration_of
+from lowfc.contract.codecs.codec import max_bytes
 from lowfc.contract.messages import wire
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.command_channels import MIRROR, OFFSET
@@ -25,6 +26,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
     probe_response,
 )
 
+_OTHER_BYTES = 1000  # of a request to play, besides its table and shapes
 _LAW = ("gain", "leak", "limit_nm", "law", "calibration_id")
 
 
@@ -95,16 +97,23 @@ class Live:
     ) -> ProbeResponse:
         """Play a table and return the loop's response; without shapes in `basis` the table is added to the offset.
 
-        With a table without columns no probe is added: only the steps are recorded. AcceptanceError if gains or law
-        changed, or the mirror or the camera failed.
+        With a table without columns no probe is added: only the steps are recorded. AcceptanceError if the table is
+        too large for a request, gains or law changed, or the mirror or the camera failed.
         """
         modes = len(self.calibration.noll)
         basis = np.zeros((modes, 0), np.float32) if basis is None else basis
+        frames, columns = table.shape
+        most = (max_bytes("play") - _OTHER_BYTES - basis.nbytes) // (table.itemsize * max(columns, 1))
+        if columns and frames > most:
+            raise AcceptanceError(
+                f"a probe sequence of {columns} columns has at most {most} frames, {most / self.loop.rate_hz:.0f} s; "
+                f"this one would have {frames}: choose a shorter one"
+            )
         self.set_mode(mode)
-        before, frames = self._state(), len(table)
+        before = self._state()
         steps, watch = self.client.steps(), self.client.mirror_watch()
         first = self.client.note(ANNOUNCEMENT + json.dumps({"test": kind, **what, "frames": frames})).frame_sequence
-        if table.shape[1]:
+        if columns:
             answer = self.client.play(basis, table) if basis.size else self.client.play_offset(table)
             first = answer.frame_sequence
         recorded: list[Step] = []
@@ -124,10 +133,10 @@ class Live:
         if [getattr(before, name) for name in _LAW] != [getattr(after, name) for name in _LAW]:
             raise AcceptanceError("gains or control law changed during the measurement: measure again")
         watch.read()
-        if table.shape[1] and watch.interruption:
+        if columns and watch.interruption:
             raise AcceptanceError(f"{watch.interruption} during the measurement: measure again")
         loop = loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws())
-        target = "" if not table.shape[1] else MIRROR if basis.size else OFFSET
+        target = "" if not columns else MIRROR if basis.size else OFFSET
         return probe_response(what, loop, target, table, basis, first, steps_as_columns(recorded, modes))
 
     def _state(self) -> wire.ControllerState:

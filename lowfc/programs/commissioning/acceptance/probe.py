@@ -130,7 +130,7 @@ class ProbeResponse:
 
     @property
     def limits_hit(self) -> list[str]:
-        """Names of the limits that acted and ended the probe sequence."""
+        """Names of the limits that acted; they end a probe sequence."""
         return [reason.name for reason in count_reasons(self.reasons) if reason in LIMITS]
 
     @property
@@ -147,9 +147,9 @@ class ProbeResponse:
                 f"{mode.in_words}: measure again"
             )
         if self.limits_hit:
+            probe = " and ended the probe: use a smaller amplitude, or" if self.target else ":"
             raise AcceptanceError(
-                f"a limit acted ({', '.join(self.limits_hit)}) and ended the probe: use a smaller amplitude, or "
-                "measure when the disturbance is smaller"
+                f"a limit acted ({', '.join(self.limits_hit)}){probe} measure when the disturbance is smaller"
             )
         if self.missing > MAX_MISSING * len(self.error_nm):
             raise AcceptanceError(

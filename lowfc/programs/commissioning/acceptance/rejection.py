@@ -121,7 +121,6 @@ def play(
         ) from None
     period = np.zeros((frames, len(noll)), np.float32)
     period[:, [noll.index(mode) for mode in tested]] = multisine(frames, bins, rms_nm, seed)
-    live.set_mode(LoopMode.CLOSED)
     table = with_lead_in(period, live.loop.settling_frames() + _LEAD_FRAMES)
     basis = None
     if isinstance(live.loop.law, LinearLaw) and live.loop.law.signal == "pol":
