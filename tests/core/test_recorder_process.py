@@ -132,6 +132,17 @@ def test_record_rotates_logs_and_reports_messages_and_losses(bench: Bench) -> No
     assert done["longest_unflushed_ms"] >= done["longest_wait_ms"] > 0
 
 
+def test_a_second_recorder_is_refused_and_leaves_the_configuration_of_the_run(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lowfc.programs.core.recording.process.set_up_below_loop", lambda *_: NOTHING)
+    other = tmp_path / "other.toml"
+    other.write_text(f"recorder.folder = '{tmp_path}'\n")
+    done = lowfc("record", "--run", bench.run.run_id, "--config", other)
+    assert "cannot listen" in str(done.exception)
+    assert not (bench.run.path / "config.toml").exists()
+
+
 def test_a_recording_can_be_stopped_without_a_controller(own_runtime: Path, bench: Bench) -> None:
     stopped = lowfc("ctl", "record", "stop", "--json")
     reader = LogReader(Path(json.loads(stopped.stdout)["log"]))
@@ -161,8 +172,10 @@ def test_an_impossible_recording_is_refused_before_any_file_is_created(
 def test_a_recording_has_the_configuration_of_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded: list[tuple[float, int]] = []
 
-    def record(run: Run, config: Configuration, calibration: Path | None) -> Summary:
+    def record(run: Run, config: Configuration, calibration: Path | None, shared: bytes | None) -> Summary:
         recorded.append((config.star.magnitude, config.recorder.every))
+        if shared is not None:
+            (run.path / "config.toml").write_bytes(shared)
         return Summary((), 0, {}, "", 0, 0, 0)
 
     monkeypatch.setattr("lowfc.programs.core.recording.process.record", record)

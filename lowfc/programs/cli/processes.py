@@ -110,7 +110,6 @@ def record(
     Example: lowfc record --run bench --folder logs --longest-s 600 --min-free-mb 2000
     """
     from lowfc.adapters.bus.run import open_run, run_path
-    from lowfc.adapters.files.whole_file import write_whole
     from lowfc.client.runs import waiting_message
     from lowfc.contract.configuration import load
     from lowfc.contract.messages import Role
@@ -131,11 +130,12 @@ def record(
     run_config = run_path(run) / "config.toml"
     settings = configuration(run_config if config is None and run_config.exists() else config, overrides)
     joined = open_run(run, (settings.mirror.name,), network=settings.network)
+    shared = None  # without this call's options
     if config is not None and Role.LAUNCHER not in joined.links.ports:
-        write_whole(run_config, load(config).to_toml().encode())  # for other processes: without this call's options
+        shared = load(config).to_toml().encode()
     if not joined.links.network.router and (waiting := waiting_message(run)):
         typer.echo(f"recorder: {waiting}", err=True)
-    summary = run_recorder(joined, settings, calibration)
+    summary = run_recorder(joined, settings, calibration, shared)
     typer.echo(json.dumps(json_object(summary)) if as_json else report(summary), err=not as_json)
     if summary.failure:
         raise typer.Exit(1)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lowfc.adapters.bus.run import Run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.logs.series import LogLimits, shortage
 from lowfc.adapters.logs.writer import Attachment
 from lowfc.adapters.process.join import clock_of
@@ -24,8 +25,10 @@ from lowfc.programs.core.recording.volume import bytes_per_s, configured_selecti
 _MAX_ATTACHMENT_BYTES = 1 << 28
 
 
-def record(run: Run, config: Configuration, calibration: Path | None) -> Summary:
+def record(run: Run, config: Configuration, calibration: Path | None, shared: bytes | None = None) -> Summary:
     """Record a run until SIGTERM or SIGINT; the configuration and the calibration (FITS) are attached to each log.
+
+    `shared` (TOML) becomes the run's configuration, for other processes, once the recorder has joined.
 
     Raises:
         BusError: another recorder is recording this run.
@@ -63,6 +66,8 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
             expected_bytes_per_s=announced_bytes_per_s,
             awaited=_launched_processes(run),
         )
+        if shared is not None:
+            write_whole(run.path / "config.toml", shared)
         recorder.catch_signals()
         recorder.service.announces = True
         if log.on_event:
