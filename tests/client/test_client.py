@@ -657,6 +657,10 @@ def test_the_status_shows_the_whole_state() -> None:
     assert text(json_object(state)).splitlines()[-1].endswith("abc, provisional: from the first steps of commissioning")
     assert json_object(wire.ControllerState())["mode"] == "starting"
     assert "provisional" not in text(json_object(wire.ControllerState(calibration_id="abc")))
+    later = wire.ControllerState(mode=9, refused=40, limits_hit=[41], counts=[wire.ReasonCount(reason=42, count=3)])
+    shown = json_object(later)
+    assert [shown[key] for key in ("mode", "refused", "limits_hit", "counts")] == ["mode 9", "40", ["41"], {"42": 3}]
+    assert "reason 42 3 times" in text(shown)
 
 
 # The recorder's switch.

@@ -13,7 +13,7 @@ from lowfc.arrays import Long, Sequences, Single
 from lowfc.contract.codecs.codec import encode_step
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.loop.inputs import Step
-from lowfc.control.loop.safety import REASONS, LoopMode, Reason
+from lowfc.control.loop.safety import REASONS, Reason
 
 STAGES = ("transport", "wakeup", "compute", "publish", "frame_to_command")
 """Stages of the controller, whose durations are in ControlTiming."""
@@ -231,11 +231,6 @@ def count_reasons(bits: Long) -> dict[Reason, int]:
     """Number of rows with each reason, without reasons that do not occur."""
     counts = {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in REASONS} if bits.any() else {}
     return {reason: count for reason, count in counts.items() if count}
-
-
-def mode_name(number: int) -> str:
-    """Name of a loop mode; a numbered name if this version does not know it."""
-    return LoopMode(number).name.lower() if number in list(LoopMode) else f"mode {number}"
 
 
 class TimingRows:

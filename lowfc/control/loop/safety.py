@@ -78,6 +78,16 @@ def reason_of(number: int) -> Reason:
     return Rejection(number) if number < Limit.MODAL_LIMIT else Limit(number)
 
 
+def reason_name(number: int) -> str:
+    """Name of a reason; its number if this version does not know it."""
+    return next((reason.name for reason in REASONS if reason == number), str(number))
+
+
+def mode_name(number: int) -> str:
+    """Name of a loop mode; a numbered name if this version does not know it."""
+    return LoopMode(number).name.lower() if number in list(LoopMode) else f"mode {number}"
+
+
 @dataclass(frozen=True, slots=True)
 class Limits:
     """Limits of the mirror, in nm of surface; ValueError unless each is finite and above twice the margin.

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from lowfc.contract.codecs.law_codec import overruled
 from lowfc.contract.envelope import count_of
 from lowfc.contract.messages import FRAME, Role, from_timestamp, wire
-from lowfc.control.loop.safety import REASONS, Rejection, reason_of
+from lowfc.control.loop.safety import Limit, Rejection, reason_name
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.control.loop.wording import PAUSED, counted, mode_word
 from lowfc.programs.cli.contrast import contrast_cases, contrast_in_words, costliest_modes
@@ -72,9 +72,9 @@ def json_object(
         "holding": controller.holding or None,
         "mirrors": {
             name: {
-                "refused": _reason(one.command_refused) if one.command_refused else None,
+                "refused": reason_name(one.command_refused) if one.command_refused else None,
                 "expired": one.command_expired,
-                "limits_hit": [_reason(reason) for reason in one.limits_hit],
+                "limits_hit": [reason_name(reason) for reason in one.limits_hit],
             }
             for name, one in sorted(processes.items())
             if name.partition("-")[0] == Role.MIRROR
@@ -110,9 +110,9 @@ def json_object(
             for one in state.interlocks_acting
         ],
         "interlocks_configured": len(settings.interlocks),
-        "limits_hit": [reason_of(reason).name for reason in state.limits_hit],
-        "refused": reason_of(state.refused).name if state.refused else None,
-        "counts": {reason_of(line.reason).name: line.count for line in state.counts},
+        "limits_hit": [reason_name(reason) for reason in state.limits_hit],
+        "refused": reason_name(state.refused) if state.refused else None,
+        "counts": {reason_name(line.reason): line.count for line in state.counts},
         "stroke_nm": settings.stroke_nm,
         "slew_nm": settings.slew_nm,
         "neighbour_nm": settings.neighbour_nm,
@@ -244,11 +244,6 @@ def _mode_in_words(known: dict[str, Any], since: str = "") -> str:
     return f"{word}, command held: {known['holding']}" if known["holding"] else word
 
 
-def _reason(number: int) -> str:
-    """Name of a reason, or its number if it is unknown (sent by a mirror of a later version)."""
-    return next((reason.name for reason in REASONS if reason == number), str(number))
-
-
 def _mirror_in_words(mirror: dict[str, Any]) -> str:
     if mirror["refused"]:
         return f"refuses commands: {mirror['refused']}"
@@ -272,6 +267,8 @@ def _count_text(reason: str, count: int) -> str:
         return f"no frame {counted(count, 'time')}"
     if reason in Rejection.__members__:
         return f"{counted(count, 'frame')} refused as {_in_words(reason)}"
+    if reason not in Limit.__members__:  # of a controller of a later version
+        return f"reason {reason} {counted(count, 'time')}"
     return f"{_in_words(reason)} acted on {counted(count, 'command')}"
 
 

@@ -13,7 +13,7 @@ from lowfc.contract.codecs import codec
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import HEALTH, MIRROR_STATE, wire
 from lowfc.control.loop.inputs import MirrorShape
-from lowfc.control.loop.safety import REASONS
+from lowfc.control.loop.safety import reason_name
 from lowfc.control.loop.state import State
 
 CHECK_PERIOD_NS = 100_000_000
@@ -93,5 +93,5 @@ class MirrorReports:
 
 def _fault_in(health: wire.Health) -> str:
     if number := int(health.command_refused):  # a mirror of another version may have other reasons
-        return f"refuses commands: {next((reason.name for reason in REASONS if reason == number), number)}"
+        return f"refuses commands: {reason_name(number)}"
     return "gets no commands" if health.command_expired else ""

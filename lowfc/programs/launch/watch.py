@@ -6,7 +6,7 @@ from typing import Any
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.names import Names
 from lowfc.contract.messages import FRAME, Log, Role, wire
-from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.safety import mode_name as name_of_mode
 from lowfc.optics.chain.added_contrast import BEYOND_QUADRATIC
 
 
@@ -114,7 +114,7 @@ def wavefront(known: wire.WavefrontFigures) -> dict[str, Any]:
 
 def mode_name(mode: wire.LoopMode) -> str | None:
     """Loop mode; None before a controller reported one."""
-    return LoopMode(mode).name.lower() if mode else None
+    return name_of_mode(mode) if mode else None
 
 
 def topic_count(health: wire.Health, key: str) -> wire.TopicCount:

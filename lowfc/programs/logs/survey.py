@@ -13,7 +13,6 @@ from typing import Any
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.logs.columns import mode_name
 from lowfc.adapters.logs.history import attached_configuration
 from lowfc.adapters.logs.loss_account import LossAccount
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
@@ -35,6 +34,7 @@ from lowfc.contract.messages import (
     topic_of,
     wire,
 )
+from lowfc.control.loop.safety import mode_name
 
 
 class Digest:

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.logs.columns import STAGES, joined, mode_name, rows_of
+from lowfc.adapters.logs.columns import STAGES, joined, rows_of
 from lowfc.adapters.logs.history import History
 from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import DataFileError
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.loop.safety import REASONS
+from lowfc.control.loop.safety import REASONS, mode_name
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,12 +4,12 @@ from collections import Counter
 
 import numpy as np
 
-from lowfc.adapters.logs.columns import count_reasons, mode_name
+from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long, Single
 from lowfc.contract.events import Level
 from lowfc.contract.messages import wire
-from lowfc.control.loop.safety import Limit
+from lowfc.control.loop.safety import Limit, mode_name
 from lowfc.programs.logs.report.source import Results, Run
 
 _FIRST_LIMIT = Limit.MODAL_LIMIT

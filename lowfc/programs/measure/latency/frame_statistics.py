@@ -11,7 +11,7 @@ from lowfc.adapters.logs.columns import STAGES as TIMED
 from lowfc.adapters.logs.columns import rows_of
 from lowfc.arrays import Array, Long, Mask, Sequences
 from lowfc.contract.messages import FRAME, wire
-from lowfc.control.loop.safety import Rejection, reason_of
+from lowfc.control.loop.safety import Rejection, reason_name
 from lowfc.programs.launch.watch import topic_count
 
 WARM_UP_S = 0.5
@@ -175,11 +175,10 @@ def repeat_statistics(frames: Frames) -> dict[str, Any]:
 def controller_counts(health: wire.Health) -> dict[str, Any]:
     """The controller's counts of the whole run: frames_skipped, frames_missing, and frames by refusal or limit."""
     frames = topic_count(health, FRAME.key)
-    reasons = {reason_of(one.reason): one.count for one in health.counts}
     return {
         "frames_skipped": frames.skipped,
         "frames_missing": frames.missing,
-        "reasons": {reason.name: count for reason, count in reasons.items() if reason is not Rejection.NO_FRAME},
+        "reasons": {reason_name(one.reason): one.count for one in health.counts if one.reason != Rejection.NO_FRAME},
     }
 
 
