@@ -15,7 +15,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from lowfc.adapters.files import calibration_file, factory
-from lowfc.adapters.process.progress import progress_lines
+from lowfc.adapters.process.progress import counting_bar, progress_lines
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError, RequestRefusedError
@@ -247,6 +247,13 @@ def test_progress_of_several_tasks_in_turn_has_the_time_to_go_of_each() -> None:
         *("first: 50%, about 10 s to go", "second: 25%, about 15 s to go", "second: 75%, about 5 s to go"),
         "third: 50%, about 10 s to go",
     ]
+
+
+def test_a_bar_shows_brackets_in_its_description() -> None:
+    shown = StringIO()
+    with counting_bar(Console(file=shown, force_terminal=True, width=80)) as count:
+        count("reading [/b].mcap", 1, 2)
+    assert "reading [/b].mcap" in shown.getvalue()
 
 
 def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:

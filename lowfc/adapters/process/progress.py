@@ -27,7 +27,7 @@ def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted
     if not console.is_terminal:
         yield progress_lines(lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True))
         return
-    with passing_bar(console, TextColumn("{task.description}"), BarColumn(), *columns) as bar:
+    with passing_bar(console, TextColumn("{task.description}", markup=False), BarColumn(), *columns) as bar:
         tasks: list[TaskID] = []
 
         def count(what: str, done: int, total: int) -> None:

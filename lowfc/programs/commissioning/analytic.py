@@ -28,7 +28,7 @@ def analytic(config: Configuration, console: Console, at: WavefrontFunction | No
     """
 
     def warn(text: str) -> None:
-        console.print(f"warning: {text}", style="yellow", highlight=False, soft_wrap=True)
+        console.print(f"warning: {text}", style="yellow", highlight=False, soft_wrap=True, markup=False)
 
     with counting_bar(console, TimeElapsedColumn()) as count:
         optics = factory.twin(config, lambda done, total: count("building the optical model", done, total), warn)

@@ -111,7 +111,7 @@ class Player:
         """Publish logs one after the other; return what was published, and the timing errors."""
         log, progress_due_ns = WholeLog(logs, skip_damaged=True), 0
         self._announce = partial(console.print, highlight=False)
-        with passing_bar(console, TextColumn("{task.description}"), BarColumn()) as bar:
+        with passing_bar(console, TextColumn("{task.description}", markup=False), BarColumn()) as bar:
             task = bar.add_task(titled(log.paths))
             for message in log:
                 if not self._service.running:
