@@ -86,7 +86,7 @@ def dark_hole(
     """
     (folder / "run.toml").write_text(f"{GAINS}{toml}")
     run, failure = new_run_id(), ""
-    words = [sys.executable, "-m", *COMMAND.split(), "--run", run, "--config", "run.toml", "--json"]
+    words = [sys.executable, "-P", "-m", *COMMAND.split(), "--run", run, "--config", "run.toml", "--json"]
     words += [] if seed is None else ["--seed", str(seed)]
     pipe = subprocess.PIPE
     with subprocess.Popen(words, cwd=folder, text=True, stdout=pipe, stderr=pipe) as process:  # noqa: S603  # our own

@@ -271,7 +271,7 @@ def _sim_loop(preset: str, folder: Path, config: str, duration_s: float, seed: i
 
 def _lowfc(folder: Path, *words: str) -> dict[str, Any]:
     """JSON printed by a command; LowfcError if it failed."""
-    command = [sys.executable, "-m", "lowfc", *words, "--json"]
+    command = [sys.executable, "-P", "-m", "lowfc", *words, "--json"]
     done = subprocess.run(  # noqa: S603  # our own program
         command, cwd=folder, capture_output=True, text=True, check=False
     )

@@ -66,7 +66,7 @@ class TerminalConsole(contextlib.AbstractContextManager["TerminalConsole"]):
         self._screen = b""
         began_s = time.monotonic()
         self.process = subprocess.Popen(  # noqa: S603  # our own program
-            [sys.executable, "-m", "lowfc", "console", "--run", run],
+            [sys.executable, "-P", "-m", "lowfc", "console", "--run", run],
             cwd=folder,
             stdin=console_end,
             stdout=console_end,
