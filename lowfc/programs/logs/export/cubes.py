@@ -10,7 +10,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.logs.history import History
+from lowfc.adapters.logs.history import LAST_NS, History
 from lowfc.arrays import Pixels
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.envelope import count_of
@@ -84,7 +84,8 @@ def _copy_frames(
     sequence, time_ns = np.zeros(count, np.uint64), np.zeros(count, np.int64)
     shape: tuple[int, ...] | None = None
     row = -1
-    for row, message in enumerate(itertools.islice(history.reader(FRAME), count)):
+    kept = (one for one in history.reader(FRAME) if max(one.receive_time_ns, one.publish_time_ns) <= LAST_NS)
+    for row, message in enumerate(itertools.islice(kept, count)):
         number = count_of(message.sequence)
         try:
             frame = decode_frame(message.payload, message.sequence, 0)
