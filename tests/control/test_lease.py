@@ -249,6 +249,10 @@ def test_removing_a_channel_and_a_missing_one() -> None:
 def test_the_refusal_of_an_offset_names_its_mode() -> None:
     _, reply = answer(loaded(DEFAULTS), "offset", 80.0, modes=(4,))
     assert (reply.accepted, reply.text) == (False, "offset of mode 4: at most its limit, 50 nm; asked for 80 nm")
+    loop = (state := loaded(DEFAULTS)).loop
+    truncated = replace(loop.calibration, actuators_to_modes=np.zeros_like(loop.calibration.modes_to_actuators.T))
+    _, reply = answer(state._replace(loop=loop._replace(calibration=truncated)), "offset", 5.0, modes=(4,))
+    assert "offset of mode 4: R measures it only in part" in reply.text
 
 
 def test_events_use_singular_and_plural() -> None:

@@ -180,14 +180,22 @@ def offset_remark(loop: ActiveLoop, offset_nm: Single) -> str:
 
 
 def check_offset(loop: ActiveLoop, largest_nm: npt.NDArray[np.floating[Any]]) -> None:
-    """Refuse offsets (modes,), nm rms of wavefront, beyond the limits of their modes.
+    """Refuse offsets (modes,), nm rms of wavefront, beyond the limits of their modes, or of modes not fully measured.
 
     Raises:
-        ValueError: an offset is too large; the text names its mode.
+        ValueError: an offset is refused; the text names its mode.
     """
     for mode, limit_nm, asked_nm in zip(loop.calibration.noll, loop.integrator.limit_nm, largest_nm, strict=True):
         if asked_nm > limit_nm:
             raise ValueError(f"offset of mode {mode}: at most its limit, {limit_nm:g} nm; asked for {asked_nm:g} nm")
+    if not (own := loop.calibration.actuators_to_modes).size:
+        return
+    departure = np.linalg.norm(own @ loop.to_actuators - np.eye(len(own)), axis=0)
+    for mode in np.array(loop.calibration.noll)[(departure > _MAX_DEPARTURE) & (largest_nm > 0)]:
+        raise ValueError(
+            f"offset of mode {mode}: R measures it only in part (--truncate, --tikhonov), so the loop would overshoot"
+        )
 
 
+_MAX_DEPARTURE = 0.1  # of what R measures of a mode from that mode, for an offset of it
 _ATTRIBUTES = {"gain": "gain", "leak": "leak", "limit": "limit_nm"}
