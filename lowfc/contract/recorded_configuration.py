@@ -20,7 +20,7 @@ _SECTIONS: dict[str, type[BaseModel]] = {
 def recorded(content: bytes) -> tuple[Configuration, list[str]]:
     """Read a recorded configuration; return it with remarks on what this version would refuse in a file.
 
-    An unknown key is ignored, and an invalid value is replaced by the default. Values that are valid but contradict
+    An unknown key is ignored, an invalid value is replaced by the default, and an invalid interlock left out. Values that are valid but contradict
     each other stay as they are, since the run used them.
 
     Raises:
@@ -42,6 +42,8 @@ def recorded(content: bytes) -> tuple[Configuration, list[str]]:
             remarks.append(f"and {len(of_keys) - MAX_FAULTS} more")
         if not of_keys:
             return _constructed(data, {str(detail["loc"][0]) for detail in faults if detail["loc"]}), remarks
+        if isinstance(interlocks := data.get("interlocks"), list):
+            data["interlocks"] = [one for one in interlocks if one is not None]
     return Configuration.model_validate(data), remarks
 
 
@@ -65,7 +67,10 @@ def _mend(data: dict[str, Any], detail: Any) -> str:
     """Remove the key at fault; return the consequence in words."""
     section, *path = detail["loc"]
     table = data.get(section)
-    if isinstance(table, list) and path and detail["type"] == "extra_forbidden":  # a key of one interlock
+    if isinstance(table, list) and path:  # of one interlock
+        if detail["type"] != "extra_forbidden" or table[path[0]] is None:
+            table[path[0]] = None
+            return "this interlock is left out"
         table, path = table[path[0]], path[1:]
     if path and isinstance(table, dict):
         table.pop(path[0], None)

@@ -34,7 +34,9 @@ def test_known_keys_are_used_and_the_rest_are_remarks() -> None:
     assert config == load(None, {"camera.rate_hz": 300.0})
     assert remarks == REMARKS
     assert recorded(Configuration().to_toml().encode()) == (Configuration(), [])
-    config, _ = recorded(b"[[interlocks]]\nname = 'dome'\nvalue = 1.0\naction = 'open'\nfoo = 1\nbar = 2\n[[more]]\n")
+    later = b"[[interlocks]]\nname = 'flow'\nvalue = 'on'\ntest = 'above'\naction = 'explode'\nfoo = 1\n"
+    one = b"[[interlocks]]\nname = 'dome'\nvalue = 1.0\naction = 'open'\nfoo = 1\nbar = 2\n"
+    config, _ = recorded(later + one + b"[[more]]\n")
     assert [one.name for one in config.interlocks] == ["dome"]
 
 
