@@ -20,8 +20,8 @@ _SECTIONS: dict[str, type[BaseModel]] = {
 def recorded(content: bytes) -> tuple[Configuration, list[str]]:
     """Read a recorded configuration; return it with remarks on what this version would refuse in a file.
 
-    An unknown key is ignored, an invalid value is replaced by the default, and an invalid interlock left out. Values that are valid but contradict
-    each other stay as they are, since the run used them.
+    An unknown key is ignored, an invalid value is replaced by the default, and an invalid interlock left out. Values
+    that are valid but contradict each other stay as they are, since the run used them.
 
     Raises:
         ConfigurationError: it is not a readable TOML file.

@@ -369,6 +369,8 @@ def test_a_damaged_law_file_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "law.fits"
     with pytest.raises(DataFileError, match="there is no such law file: make one with `lowfc tune"):
         law_file.load(path)
+    with pytest.raises(DataFileError, match="printable ASCII"):
+        law_file.save(replace(LAWS["notch"], name="é"), path)
     law_file.save(LAWS["notch"], path)
     with fits.open(path, mode="update") as units:
         units["MEASUREMENT_GAIN"].data[0, 0] += 1

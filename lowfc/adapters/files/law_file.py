@@ -7,6 +7,7 @@ from astropy.io import fits
 
 from lowfc.adapters.files import fits_file
 from lowfc.adapters.files.whole_file import write_whole
+from lowfc.contract.errors import DataFileError
 from lowfc.contract.former_names import LAW_EXTENSIONS
 from lowfc.control.laws.linear_law import LinearLaw, Signal
 
@@ -24,7 +25,9 @@ _EXTENSIONS = (
 
 
 def to_bytes(law: LinearLaw) -> bytes:
-    """Encode a law as a FITS file."""
+    """Encode a law as a FITS file; DataFileError if its name is not printable ASCII."""
+    if not (law.name.isascii() and law.name.isprintable()):
+        raise DataFileError(f"the name of a law in a file is printable ASCII, got {law.name!r}")
     primary = fits_file.primary_hdu(KIND)
     header = primary.header
     header["LAWID"] = law.id

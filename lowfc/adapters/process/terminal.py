@@ -67,6 +67,8 @@ def run_app(app: Callable[[], object]) -> NoReturn:
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    if os.path.expanduser("~") == "~":  # noqa: PTH111  # Path.home, and astropy with it, would raise RuntimeError
+        os.environ["HOME"] = "/"
     try:
         app()
         sys.stdout.flush()
