@@ -29,10 +29,13 @@ class BenchValues:
     def query(self) -> None:
         """Query the publisher of each value, so that every interlock is evaluated before the first frame."""
         for slot in self._slots:
-            for sample in self._service.bus.get(BENCH.at(slot.name), timeout_s=ANSWER_S):
-                slot.mailbox.put(sample)
+            answers, age_ns = self._service.bus.get(BENCH.at(slot.name), timeout_s=ANSWER_S), 0
+            if answers and not slot.mailbox.waiting:  # a value published meanwhile is newer
+                newest = max(answers, key=lambda answer: answer.publish_time_ns)
+                slot.mailbox.put(newest)
+                age_ns = max(0, newest.receive_time_ns - newest.publish_time_ns)
             now_ns = self._service.clock.now_ns()
-            self._report(slot.report(now_ns) or BenchReport(now_ns, slot.name, None))
+            self._report(slot.report(now_ns, age_ns) or BenchReport(now_ns, slot.name, None))
 
     def update(self) -> None:
         """Report new values, and values that have become too old for an interlock."""
@@ -55,12 +58,12 @@ class _Slot:
         self._value: Value | None = None
         self._received_ns = 0
 
-    def report(self, now_ns: int) -> BenchReport | None:
-        """The newest value and its age; None without a value."""
+    def report(self, now_ns: int, age_ns: int = 0) -> BenchReport | None:
+        """The newest value and its age; None without a value. A value that is waiting has the age `age_ns`."""
         sample = self.mailbox.take(0.0)
         if sample is not None:
             try:
-                self._value, self._received_ns = decode_bench_value(sample.payload), now_ns
+                self._value, self._received_ns = decode_bench_value(sample.payload), now_ns - age_ns
             except BadMessageError as fault:
                 self._unreadable(sample.key, fault)
         if self._value is None:
