@@ -148,15 +148,18 @@ def test_a_newcomer_gets_a_health_before_the_next_is_due(hub: MemoryHub, clock: 
     listener = Listener(hub, clock, HEALTH)
     camera.beat()
     assert listener.messages(HEALTH) == []
-    service(hub, clock, "controller").beat()
+    controller = service(hub, clock, "controller")
+    controller.beat()
     camera.beat()
     assert list(listener.messages(HEALTH)[-1].peers_alive) == ["controller"]
-    again = service(hub, clock, "controller")
-    camera.beat()
-    assert len(listener.messages(HEALTH)) == 2  # one of each process
-    again.beat()  # the same name and process: not a newcomer
+    controller.state = "ready"  # its second Health: not a newcomer
     camera.beat()
     assert [health.process for health in listener.messages(HEALTH)] == ["controller", "camera", "controller"]
+    assert [camera.has_newcomers(), camera.has_newcomers()] == [True, False]
+    service(hub, clock, "controller").beat()  # restarted; in a container, with its former process id
+    camera.beat()
+    assert listener.messages(HEALTH)[-1].process == "camera"
+    assert camera.has_newcomers()
 
 
 def test_a_flood_of_bad_messages_gives_one_event_and_the_last_health_has_all_counts(

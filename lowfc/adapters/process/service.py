@@ -22,6 +22,7 @@ from lowfc.adapters.process.clock import WALL_TOLERANCE_NS, Clock
 from lowfc.adapters.process.host import resident_bytes
 from lowfc.adapters.process.realtime import NOTHING, Granted
 from lowfc.adapters.process.supervision import Supervisor
+from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import EVENT, HEALTH, Log, Role, Topic, timestamp, wire
@@ -84,6 +85,7 @@ class Service:
         self._state: ProcessState = "starting"
         self._fault: Exception | None = None
         self._names = Names()
+        self._starts: dict[str, int] = {}  # by name; in containers a restarted process has its former id
         self._known: set[tuple[str, int]] = set()
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
@@ -155,7 +157,7 @@ class Service:
 
     def has_newcomers(self) -> bool:
         """Whether a process has joined or restarted since the last call."""
-        there = {(name, health.pid) for name, health in list(self.last_health.items())}
+        there = set(self._starts.items())
         new = not there <= self._known
         self._known = there
         return new
@@ -331,9 +333,9 @@ class Service:
         name, health = self._names.health(sample.key, sample.payload)
         if name == self.name:
             return
-        known = self.last_health.get(name)
         self.last_health[name] = health
-        if known is None or known.pid != health.pid:
+        known_s, self._starts[name] = self._starts.get(name), start_of(sample.sequence)
+        if known_s != self._starts[name]:
             self._due_ns = 0  # publish Health at the next beat, so that a newcomer does not wait for it
 
     def _connected(self, name: str) -> bool:

@@ -53,7 +53,7 @@ class Monitor:
                 self._accumulator.add(sample)
                 self.newest[topic] = sample
         found = self._accumulator.snapshot(now_ns, behind_s=behind_s)
-        processes = {(name, one.health.pid) for name, one in found.health.items()}
+        processes = {(name, one.start_s) for name, one in found.health.items()}
         incomplete = Role.CONTROLLER in found.health and not self._complete(found)
         if not processes <= self._known or (incomplete and now_ns - self._queried_ns > _QUERY_AGAIN_NS):
             self._known, self._queried_ns = processes, now_ns

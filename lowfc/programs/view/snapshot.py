@@ -13,6 +13,7 @@ from lowfc.adapters.logs.columns import StepRows, Steps, TimingRows, TruthRows, 
 from lowfc.arrays import Long, Mask, Pixels, Sequences, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import decode_frame
+from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import (
     CALIBRATION,
@@ -73,11 +74,12 @@ class Wavefronts(NamedTuple):
 
 
 class LastHealth(NamedTuple):
-    """A process's last Health, when it was sent (host clock), and the first one of the process since its start."""
+    """A process's last Health, when it was sent (host clock), the first one since its start, and that start, unix s."""
 
     time_ns: int
     health: wire.Health
     first: wire.Health
+    start_s: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +215,7 @@ class Accumulator:
             if topic.latest_only:
                 self._newest[topic] = message.payload
             else:
-                self._read(topic, key, message.payload, message.publish_time_ns)
+                self._read(topic, message)
         except _UNREADABLE:
             self.unreadable += 1
 
@@ -270,8 +272,9 @@ class Accumulator:
             return self._data_ns or self._simulated_ns
         return self._data_ns + max(0, host_ns - self._data_host_ns) if self._data_ns else host_ns
 
-    def _read(self, topic: Topic, key: str, payload: bytes, publish_time_ns: int) -> None:
+    def _read(self, topic: Topic, message: Sample) -> None:
         """Read a message of a topic that keeps them all; another number of modes restarts the rows."""
+        payload, publish_time_ns = message.payload, message.publish_time_ns
         if topic is STEP:
             step = wire.ControlStep.FromString(payload)
             time_ns = checked_time_ns(step.timestamp)
@@ -287,10 +290,10 @@ class Accumulator:
         elif topic is TIMING:
             _added(self._timings, wire.ControlTiming.FromString(payload))
         elif topic is HEALTH:
-            name, health = self._names.health(key, payload)
-            before = self._health.get(name)
-            first = before.first if before is not None and before.first.pid == health.pid else health
-            self._health[name] = LastHealth(publish_time_ns, health, first)
+            name, health = self._names.health(message.key, payload)
+            before, start_s = self._health.get(name), start_of(message.sequence)
+            first = before.first if before is not None and before.start_s == start_s else health
+            self._health[name] = LastHealth(publish_time_ns, health, first, start_s)
         elif topic is EVENT:
             event = Log.FromString(payload)
             checked_time_ns(event.timestamp)

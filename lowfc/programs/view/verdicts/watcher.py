@@ -228,12 +228,12 @@ class Watcher:
             if last is None:
                 continue
             count = count_in(last.health)
-            pid, before = self._last_counts.get(name, (-1, 0))
-            if pid != last.health.pid:
+            start_s, before = self._last_counts.get(name, (-1, 0))
+            if start_s != last.start_s:
                 before = count_in(last.first)
             if count > before:
                 grown[name] = count - before
-            self._last_counts[name] = (last.health.pid, count)
+            self._last_counts[name] = (last.start_s, count)
         return grown
 
 
