@@ -99,6 +99,8 @@ def test_the_best_clock_exchange_is_the_recent_one_with_the_shortest_round_trip(
     for _ in range(RECENT):
         offset.exchanged(5000, 9300, 5600)
     assert offset.best == (4000, 600)
+    offset.exchanged(7000, 9_000_000, 8000)  # the other host was rebooted
+    assert offset.best == (9_000_000 - 7500, 1000)
 
 
 class Hosts:
