@@ -370,6 +370,10 @@ def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
     stretch = results(night.write(tmp_path / "x.mcap"))["closed_stretch"]
     assert stretch["from_s"] > 0.549
     assert stretch["frames"] + stretch["steps_settling"] == 300
+    night.start_controller()  # with the first calibration; its first state with a frame follows after 50 frames
+    found = results(night.request("gain", (0.2,)).frames(300).write(tmp_path / "restarted.mcap"))
+    assert found["requests"][-1]["time_s"] == pytest.approx(0.85)
+    assert found["closed_stretch"]["frames"] + found["closed_stretch"]["steps_settling"] == 250
 
 
 def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -> None:

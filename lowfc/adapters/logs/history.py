@@ -164,8 +164,8 @@ class History:
         others = [number for number, state in enumerate(states) if state.calibration_id not in own]
         if not others:
             return np.ones(steps.sequence.shape, np.bool_)
-        around = states[others[-1] : others[-1] + 2]  # a state is published at every change
-        return steps.sequence > max(state.frame_sequence for state in around)
+        last, *later = (state.frame_sequence for state in states[others[-1] :])  # one is published at every change
+        return steps.sequence > max(last, next(filter(None, later), 0))  # that of a start or a `clear` has no frame
 
     @cached_property
     def true(self) -> Truths | None:

@@ -8,7 +8,7 @@ from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long, Single
 from lowfc.contract.events import Level
-from lowfc.contract.messages import wire
+from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.loop.safety import Limit, mode_name
 from lowfc.programs.logs.report.source import Results, Run
 
@@ -134,6 +134,8 @@ def _limits(reasons: Long) -> dict[str, int]:
 
 def _request_time_s(run: Run, request: wire.Request) -> float:
     """Time of the first step with a request in force, or of the last step before it."""
-    sequence = run.history.steps.sequence
-    later = sequence >= request.frame_sequence
+    steps = run.history.steps
+    later = steps.sequence >= request.frame_sequence
+    if request.frame_sequence <= 1:  # the controller had no frame yet
+        later = steps.time_ns > from_timestamp(request.timestamp)
     return float(run.step_s[int(np.argmax(later)) if later.any() else -1])
