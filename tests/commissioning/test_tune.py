@@ -185,10 +185,16 @@ def test_tuning_uses_the_steps_of_a_running_loop() -> None:
 
 
 class ReportingLoop(StreamedLoop):
-    """A loop whose mirror reports each command a fifth of a frame period after the end of the exposure."""
+    """A loop whose mirror reports each command a fifth of a frame period after the end of the exposure.
+
+    The clock of the camera's host is behind by seven periods.
+    """
+
+    def camera_lag_ns(self) -> int:
+        return 7 * PERIOD_NS
 
     def mirror_watch(self) -> Any:
-        applied = [(frame_sequence(index), index * PERIOD_NS + PERIOD_NS // 5) for index in range(4000, 5000)]
+        applied = [(frame_sequence(index), (index + 7) * PERIOD_NS + PERIOD_NS // 5) for index in range(4000, 5000)]
         return SimpleNamespace(applied=applied, read=lambda: None)
 
 

@@ -194,6 +194,16 @@ def test_a_wrong_delay_of_the_controller_is_found_and_corrected(runs: dict[str, 
     np.testing.assert_allclose(column(results, "what_if"), column(results, "was"), atol=1e-5)
 
 
+def test_the_clock_of_the_cameras_host_does_not_change_the_measured_delay(tmp_path: Path) -> None:
+    delays = []
+    for name, lag_ns in (("same", 0), ("other", 2 * toy.PERIOD_NS)):
+        night = SyntheticLog(truth=False).frames(100).health("camera", router_offset_ns=lag_ns)
+        night.samples = [one._replace(publish_time_ns=one.publish_time_ns + lag_ns) for one in night.samples]
+        run = LoggedRun(read_history(LogReader(night.write(tmp_path / f"{name}.mcap"))))
+        delays.append((run.measured_delay, run.timing.applied))
+    assert delays[0] == delays[1] == (2.0, pytest.approx(1.0, abs=0.1))
+
+
 def test_a_configuration_file_gives_the_same_as_the_options(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     path = tmp_path / "other.toml"
     path.write_text("[control]\ntilt_gain=0.2\ngain=0.9\nleak=0.01\ntilt_leak=0.01\n")

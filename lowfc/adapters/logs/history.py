@@ -156,6 +156,14 @@ class History:
         """See `columns.exposure_fraction`."""
         return exposure_fraction(self.camera)
 
+    def camera_lag_ns(self, process: str) -> int:
+        """Time by which the camera's clock, that of the times of frames, is behind another process's; 0 on one host.
+
+        The recorder's clock is that of all publish times.
+        """
+        camera, other = (self.health.get(name, wire.Health()) for name in (Role.CAMERA, process))
+        return camera.router_offset_ns - other.router_offset_ns
+
     @property
     def under_calibration(self) -> Mask:
         """Whether each step (steps,) came after the last change of calibration in the log."""

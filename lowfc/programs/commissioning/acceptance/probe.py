@@ -193,7 +193,8 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
         times_ns = history.steps.time_ns[(sequence >= first) & (sequence < end)]
         for _, event in history.events:
             interrupted = play and event.message.startswith(INTERRUPTIONS)
-            if interrupted and times_ns.size and times_ns[0] <= from_timestamp(event.timestamp) <= times_ns[-1]:
+            event_ns = from_timestamp(event.timestamp) - history.camera_lag_ns(event.name)
+            if interrupted and times_ns.size and times_ns[0] <= event_ns <= times_ns[-1]:
                 raise DataFileError(f"{path}: {event.message}, during the measurement")
         asked_ns = from_timestamp(request.timestamp)  # a later state has no frame after a `clear`
         states = [state for state in history.controllers if len(state.gain) == modes]

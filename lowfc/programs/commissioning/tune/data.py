@@ -137,6 +137,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
     stream.close()
     states.append(_state(loop))
     steps = _from_first_used(loop.run_id, steps_as_columns(received, len(calibration.noll)))
+    steps = replace(steps, time_ns=steps.time_ns + loop.camera_lag_ns())  # as the times of the mirror's reports
     period_s = float(np.median(np.diff(steps.time_ns))) * 1e-9 if len(steps.time_ns) > 1 else 0.0
     rate_hz = 1 / period_s if period_s > 0 else config.camera.rate_hz
     assumed, measured = float(states[0].delay_frames), _measured_delay(steps, watch, config)

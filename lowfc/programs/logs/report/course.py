@@ -8,7 +8,7 @@ from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long, Single
 from lowfc.contract.events import Level
-from lowfc.contract.messages import from_timestamp, wire
+from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.control.loop.safety import Limit, mode_name
 from lowfc.programs.logs.report.source import Results, Run
 
@@ -137,5 +137,5 @@ def _request_time_s(run: Run, request: wire.Request) -> float:
     steps = run.history.steps
     later = steps.sequence >= request.frame_sequence
     if request.frame_sequence <= 1:  # the controller had no frame yet
-        later = steps.time_ns > from_timestamp(request.timestamp)
+        later = steps.time_ns + run.history.camera_lag_ns(Role.CONTROLLER) > from_timestamp(request.timestamp)
     return float(run.step_s[int(np.argmax(later)) if later.any() else -1])

@@ -13,7 +13,7 @@ from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
 from lowfc.arrays import Array, Long
 from lowfc.contract.codecs.law_codec import driving, overruled
-from lowfc.contract.messages import from_timestamp, wire
+from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop import guard
 
@@ -112,7 +112,7 @@ def _laws_in_force(history: History) -> tuple[InForce, ...]:
         if state.frame_sequence:
             later = steps.sequence > state.frame_sequence
         else:  # a controller that has just started
-            later = steps.time_ns > from_timestamp(state.timestamp)
+            later = steps.time_ns + history.camera_lag_ns(Role.CONTROLLER) > from_timestamp(state.timestamp)
         first = int(np.argmax(later)) if later.any() else int(steps.sequence.size)
         law = InForce(first, _shortest(state.gain), _shortest(state.leak), _shortest([state.delay_frames])[0])
         if state.HasField("law"):

@@ -15,7 +15,7 @@ from lowfc.contract.codecs.law_codec import integrator_of
 from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import FRAME, floats, wire
+from lowfc.contract.messages import FRAME, Role, floats, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.integrator import Integrator
@@ -140,7 +140,8 @@ class LoggedRun:
         known = rows >= 0
         if not known.any():
             return Timing.of(delay, exposure)
-        waited_ns = history.mirror.publish_time_ns[known] - self.steps.time_ns[rows[known]]
+        ended_ns = self.steps.time_ns[rows[known]] + history.camera_lag_ns(Role.RECORDER)
+        waited_ns = history.mirror.publish_time_ns[known] - ended_ns
         return Timing.measured(delay, exposure, float(np.median(waited_ns)) * 1e-9 * history.rate_hz)
 
     def rows_to_compare(self, laws: list[Integrator], usable: Mask) -> tuple[Mask, int, str]:
@@ -197,7 +198,7 @@ class LoggedRun:
             return delay_from_truth(moved_nm, steps.command_nm, self.missing), "the true wavefront"
         if history.camera is None:
             return None, ""
-        starts_ns = steps.time_ns - int(history.camera.exposure_ns)
+        starts_ns = steps.time_ns + history.camera_lag_ns(Role.RECORDER) - int(history.camera.exposure_ns)
         mirror = history.mirror
         delay = delay_from_times(steps.sequence, starts_ns, mirror.sequence, mirror.publish_time_ns)
         return delay, "the times of frames and mirror"
