@@ -150,6 +150,7 @@ def test_the_units_match_the_programs_and_the_configuration() -> None:
         unit = settings(name)
         assert unit["Type"] == ["notify"]
         assert unit["Restart"] == ["on-failure"]
+        assert unit["After"][-1] == "network.target time-sync.target"
         controls = command(name)[:2] == ["lowfc", "controller"]  # compiles the fused step, if configured
         assert ("MemoryDenyWriteExecute" in unit) != controls
         assert f"NUMBA_CACHE_DIR=/var/cache/{unit['CacheDirectory'][0]}/numba" in unit["Environment"]
