@@ -57,6 +57,7 @@ from lowfc.contract.messages import (
 from lowfc.contract.published import TOPICS, Published
 from lowfc.contract.recorded_configuration import recorded
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.continuous import Timing
 
 LAST_NS = (1 << 63) - 1
 """Latest time of a message that is read, in the year 2262; a later one does not fit an array of times."""
@@ -163,6 +164,19 @@ class History:
         """
         camera, other = (self.health.get(name, wire.Health()) for name in (Role.CAMERA, process))
         return camera.router_offset_ns - other.router_offset_ns
+
+    def timing(self, delay_frames: float, exposure: float) -> Timing:
+        """Times of the exposures, which are a fraction of a period long, and of the mirror's moves.
+
+        A lockstep log has no times of application: commands are then applied with the first exposure wholly with them.
+        """
+        rows = rows_of(self.mirror.sequence, self.steps.sequence)
+        known = rows >= 0
+        if not known.any():
+            return Timing.of(delay_frames, exposure)
+        ended_ns = self.steps.time_ns[rows[known]] + self.camera_lag_ns(Role.RECORDER)
+        waited_ns = self.mirror.publish_time_ns[known] - ended_ns
+        return Timing.measured(delay_frames, exposure, float(np.median(waited_ns)) * 1e-9 * self.rate_hz)
 
     @property
     def under_calibration(self) -> Mask:

@@ -22,7 +22,6 @@ _FILTER_REACH = 48
 """Frames before and after from which a mean between measurements is interpolated."""
 
 _MOMENTS = 8  # instants of a period over which a mean square is taken
-_LONGEST = 5  # a command applied later, in periods, is implausible
 
 
 class Timing(NamedTuple):
@@ -49,10 +48,10 @@ class Timing(NamedTuple):
     def measured(cls, delay: float, exposure: float, waited: float) -> "Timing":
         """Timing in which commands are in force `waited` periods after the end of their exposures.
 
-        Whole periods follow from `delay`; the result is that of `of` for a fractional delay or an implausible time.
+        Whole periods follow from `delay`; the result is that of `of` for a fractional delay or a time beyond it.
         """
         after = exposure + waited
-        if delay != round(delay) or not exposure < after <= _LONGEST:
+        if delay != round(delay) or not exposure < after <= delay:
             return cls.of(delay, exposure)
         return cls(delay, delay + after - np.ceil(after), exposure)
 

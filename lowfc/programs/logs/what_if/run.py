@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lowfc.adapters.files.factory import settings
-from lowfc.adapters.logs.columns import Steps, rows_of
+from lowfc.adapters.logs.columns import Steps
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Integers, Mask, Sequences, Single
 from lowfc.contract.codecs.codec import decode_frame
@@ -128,21 +128,11 @@ class LoggedRun:
 
     @property
     def timing(self) -> Timing:
-        """Times of the exposures and of the mirror's moves.
-
-        A lockstep log has no times of application: commands are then applied with the first exposure wholly with them.
-        """
-        history, delay = self.history, self.delay_frames
-        exposure = history.exposure_fraction
+        """Times of the exposures and of the mirror's moves, see `History.timing`."""
+        exposure = self.history.exposure_fraction
         if exposure is None:
-            exposure = (history.configuration or Configuration()).camera.exposure_fraction
-        rows = rows_of(history.mirror.sequence, self.steps.sequence)
-        known = rows >= 0
-        if not known.any():
-            return Timing.of(delay, exposure)
-        ended_ns = self.steps.time_ns[rows[known]] + history.camera_lag_ns(Role.RECORDER)
-        waited_ns = history.mirror.publish_time_ns[known] - ended_ns
-        return Timing.measured(delay, exposure, float(np.median(waited_ns)) * 1e-9 * history.rate_hz)
+            exposure = (self.history.configuration or Configuration()).camera.exposure_fraction
+        return self.history.timing(self.delay_frames, exposure)
 
     def rows_to_compare(self, laws: list[Integrator], usable: Mask) -> tuple[Mask, int, str]:
         """Usable steps to compare, the settling time of the laws in frames, and a description."""
