@@ -15,6 +15,7 @@ from lowfc.optics.chain.fourier import kernel, to_image
 from lowfc.optics.chain.grid import image_axis
 from lowfc.optics.chain.relay import ApertureMask, Defocus, PupilImage, direct_kernel, fresnel_distance
 from lowfc.optics.chain.sensor import Sensor, field, image, light_budget, reference, response, shear_response
+from lowfc.optics.detector.detector import Detector, expose
 
 
 def relative_l2(ours, truth):
@@ -344,6 +345,14 @@ def test_fitting_shear_and_background_removes_their_bias(name, noise_factor):
     assert bias_nm(shear, with_background) > 20 * bias_nm(both, with_background)
     assert bias_nm(both, with_background) < 0.15
     assert noise_factor[0] < shear_noise_nm[0] / noise_nm[0] < noise_factor[1]
+
+
+def test_the_noise_of_a_frame_includes_rounding_to_whole_dn():
+    made, noise_nm = calibrated(camera__gain_e_per_dn=4.0, star__magnitude=5.0)
+    mean_e = np.tile(4.0 * made.flux_dn * made.reference, (100, 1))
+    light = expose(Detector(gain_e_per_dn=4.0), mean_e, np.random.Generator(np.random.SFC64(1))) - made.dark
+    modes_nm = (light / light.sum(axis=1, keepdims=True) - made.reference) @ made.reconstructor.T
+    assert np.median(modes_nm.std(axis=0) / noise_nm) == pytest.approx(1, abs=0.1)
 
 
 def test_saturating_star_and_no_light_are_refused():

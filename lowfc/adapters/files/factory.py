@@ -271,12 +271,13 @@ def frame_noise_nm(config: Configuration, calibration: Calibration) -> Array:
 
 
 def frame_noise_nm2(config: Configuration, calibration: Calibration) -> Array:
-    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront."""
+    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront, with that of rounding to whole DN."""
     camera = detector(config)
     flux_e = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain
     reference, matrix = calibration.reference.astype(float), calibration.reconstructor.astype(float)
     excess = 2.0 if camera.em_gain > 1 else 1.0
-    return excess * noise_nm2(matrix, reference, flux_e, equivalent_read_noise_e(camera))
+    rounding_e = camera.gain_e_per_dn / camera.em_gain / np.sqrt(12 * excess)
+    return excess * noise_nm2(matrix, reference, flux_e, float(np.hypot(equivalent_read_noise_e(camera), rounding_e)))
 
 
 def _check_exposure(config: Configuration, light: Array) -> None:
