@@ -11,7 +11,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from lowfc.adapters.bus.run import Run, open_run
+from lowfc.adapters.bus.run import Links, Run, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.clock import HostClock
@@ -212,3 +212,12 @@ def test_an_interruption_or_a_fault_before_the_first_process_leaves_no_run(
     with pytest.raises(KeyboardInterrupt):
         sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
     assert not (own_runtime / "lowfc" / "night").exists()
+
+    def beaten(links: Links, *_: object) -> None:
+        held.enter_context(socket.create_server(("127.0.0.1", links.ports[Role.LAUNCHER])))
+        raise BusError("launcher of run 'night' cannot listen")
+
+    monkeypatch.setattr(sim_loop, "ZenohBus", beaten)
+    with contextlib.ExitStack() as held, pytest.raises(BusError, match="cannot listen"):
+        sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
+    assert (own_runtime / "lowfc" / "night").exists(), "it is that of the other launcher"

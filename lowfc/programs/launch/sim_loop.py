@@ -61,7 +61,12 @@ def sim_loop(
         console.print(f"run {run.run_id}", highlight=False)
         if record:
             console.print(estimate(config), highlight=False, markup=False, soft_wrap=True)
-        bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # its listener marks the run as starting
+        try:
+            bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # its listener marks the run as starting
+        except BusError:
+            if run.links.live():  # another launcher of this name was faster: the directory is its own
+                ends.pop_all()
+            raise
         ends.callback(bus.close)
         bus.subscribe(HEALTH, watch.add_health)
         bus.subscribe(EVENT, watch.add_event)
