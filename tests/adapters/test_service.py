@@ -160,6 +160,11 @@ def test_a_newcomer_gets_a_health_before_the_next_is_due(hub: MemoryHub, clock: 
     camera.beat()
     assert listener.messages(HEALTH)[-1].process == "camera"
     assert camera.has_newcomers()
+    before = len(listener.messages(HEALTH))
+    for number in (1, 2, 1):  # two views, in turns
+        MemoryBus(hub, "viewer", clock).publisher(HEALTH, "viewer").put(wire.Health(pid=number).SerializeToString())
+        camera.beat()
+    assert [health.process for health in listener.messages(HEALTH)[before:]] == ["", "camera", "", ""]
 
 
 def test_a_flood_of_bad_messages_gives_one_event_and_the_last_health_has_all_counts(

@@ -334,8 +334,9 @@ class Service:
         if name == self.name:
             return
         self.last_health[name] = health
-        known_s, self._starts[name] = self._starts.get(name), start_of(sample.sequence)
-        if known_s != self._starts[name]:
+        start_s = start_of(sample.sequence)
+        if name not in self._starts or (self._starts[name] != start_s and name != Role.VIEWER):  # may be several
+            self._starts[name] = start_s
             self._due_ns = 0  # publish Health at the next beat, so that a newcomer does not wait for it
 
     def _connected(self, name: str) -> bool:
