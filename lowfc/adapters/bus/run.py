@@ -16,6 +16,7 @@ import socket
 import stat
 import tempfile
 import time
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -194,7 +195,7 @@ def open_run(
         if role not in links.ports:
             raise BusError(
                 f"run {run_id!r} has no {role!r} (it has {', '.join(sorted(links.ports))}); "
-                "start another run, or stop this one and start it with that mirror"
+                f"start another run, or {_ADVICE} with that mirror: {path}"
             )
     return Run(run_id, path, links, (path / _LINKS).stat().st_ctime_ns)
 
@@ -274,10 +275,14 @@ def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], netw
     """Create the directory under another name and rename it; a later process uses the first one's directory."""
     # Monitors connect and do not listen: there may be several, and no other process connects to them.
     roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, *listeners]
+    taken = set[int]()  # a killed run would seem to be running again, and one that starts later could not listen
+    for other in path.parent.glob(f"*/{_LINKS}"):
+        with contextlib.suppress(DataFileError):
+            taken |= set(_read(other.parent).ports.values())
     links = {
         "run_id": path.name,
         "user": _USER,
-        "ports": dict(zip(map(str, roles), free_ports(len(roles)), strict=True)),
+        "ports": dict(zip(map(str, roles), free_ports(len(roles), taken), strict=True)),
         **({"network": network.model_dump()} if network.router else {}),
     }
     draft = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))  # mode 0700
@@ -307,11 +312,11 @@ def _read(path: Path) -> Links:
         ) from fault
 
 
-def free_ports(count: int) -> list[int]:
+def free_ports(count: int, taken: AbstractSet[int] = frozenset()) -> list[int]:
     """Return unused loopback TCP ports below the host's ephemeral range, or in it if it begins at 15000 or below.
 
-    BusError if too few are free. Any outgoing connection may take an ephemeral port before its role listens; one
-    retried to such a port without a listener may even be assigned the port itself and connect to itself.
+    None is `taken`; BusError if too few are free. Any outgoing connection may take an ephemeral port before its role
+    listens; one retried to such a port without a listener may even be assigned the port itself and connect to itself.
     """
     candidates = range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))
     chooser = random.SystemRandom()
@@ -324,7 +329,8 @@ def free_ports(count: int) -> list[int]:
                 probe.bind(("127.0.0.1", port))
             except OSError:
                 continue
-            ports.append(probe.getsockname()[1])
+            if (port := probe.getsockname()[1]) not in taken:
+                ports.append(port)
             if len(ports) == count:
                 return ports
     raise BusError(f"found only {len(ports)} of {count} free TCP ports on 127.0.0.1; stop what occupies them")
