@@ -4,8 +4,9 @@ import inspect
 import json
 import re
 import socket
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -78,13 +79,16 @@ def test_the_roles_of_a_run_with_a_router_are_those_of_its_certificates() -> Non
 
 
 @pytest.mark.usefixtures("own_runtime")
-def test_a_run_that_cannot_be_joined_hides_no_other() -> None:
+def test_a_run_that_cannot_be_joined_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = ZenohBus(open_run("bench").links, Role.CAMERA, HostClock())
     with socket.create_server(("127.0.0.1", 0)) as router, closing(bench):
         address = f"tls/127.0.0.1:{router.getsockname()[1]}"
         open_run("across", network=NETWORK.model_copy(update={"router": address}))
         listed = json_of("runs")
         text = lowfc("runs").stdout
+        monkeypatch.setattr("lowfc.programs.cli.runs.Client", lambda name: nullcontext(Mock(processes=dict)))
+        alone = lowfc("runs").stdout.splitlines()[0]
+    assert alone == "across  no controller; no process yet; not recording", "the absent are not starting"
     assert [one["run"] for one in listed["runs"]] == ["bench"]
     (why,) = listed["not_joined"].values()
     assert "ca.pem cannot be read" in why
