@@ -28,7 +28,7 @@ FULL_DISK = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
 
 def test_a_run_has_ports_a_secret_and_private_files(monkeypatch: pytest.MonkeyPatch) -> None:
     lowest_outgoing = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
-    monkeypatch.setattr("lowfc.adapters.bus.run._LOWEST_PORT", lowest_outgoing - 20)  # few to choose from
+    monkeypatch.setattr("lowfc.adapters.bus.run._LOWEST_PORT", lowest_outgoing - 12)  # few to choose from
     run = open_run("night", mirrors=("dm", "tip"))
     assert set(run.links.ports) == {"camera", "controller", "mirror-dm", "mirror-tip", "recorder"}
     assert len(set(run.links.ports.values())) == 5
@@ -40,8 +40,7 @@ def test_a_run_has_ports_a_secret_and_private_files(monkeypatch: pytest.MonkeyPa
     other = open_run(new_run_id())
     assert other.path != run.path
     assert other.links.secret != run.links.secret
-    third = open_run(new_run_id())
-    assert len({port for one in (run, other, third) for port in one.links.ports.values()}) == 5 + 4 + 4
+    assert not set(other.links.ports.values()) & set(run.links.ports.values())
     run.remove()
     assert not run.path.exists()
 
