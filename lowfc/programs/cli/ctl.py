@@ -26,7 +26,7 @@ ctl_app.add_typer(record_app, name="record")
 ZERO = "--zero"
 INTEGRATOR = "integrator"
 SIGNAL = (
-    "if the controller does not answer, a signal on its host puts it in safe mode: "
+    "if the controller does not answer, a signal on its host puts it and any other loop there in safe mode: "
     "pkill -USR1 -f '^[^ ]*python.* (-m |[^ ]*/)lowfc controller'"
 )
 
