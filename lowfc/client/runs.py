@@ -17,13 +17,13 @@ def the_run(name: str | None) -> str:
     """Find a run by its name or a unique prefix, or the only run if `name` is None; it may be without a controller.
 
     Raises:
-        BusError: there is no such run, none at all, or more than one to choose from.
+        BusError: there is no such run, or it is stopped; there is none at all, or more than one.
         DataFileError: the run's directory is damaged.
     """
     runs = live_runs(name)
     if name in runs:
         return name
-    found = [run for run in runs if run.startswith(name or "")]
+    found = [] if name and (runtime_base() / name).is_dir() else [run for run in runs if run.startswith(name or "")]
     if len(found) == 1:
         return found[0]
     if not runs:

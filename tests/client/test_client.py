@@ -352,6 +352,9 @@ def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., 
         the_run("day")
     with pytest.raises(BusError, match=r"noon \(did you mean 'night'\?\)$"):
         the_run("ngiht")
+    open_run("noo")  # which is stopped: the request is not for another run
+    with pytest.raises(BusError, match="there is no run 'noo'"):
+        the_run("noo")
 
 
 def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
