@@ -315,10 +315,10 @@ def _read(path: Path) -> Links:
 def free_ports(count: int, taken: AbstractSet[int] = frozenset()) -> list[int]:
     """Return unused loopback TCP ports below the host's ephemeral range, or in it if it begins at 15000 or below.
 
-    None is `taken`; BusError if too few are free. Any outgoing connection may take an ephemeral port before its role
-    listens; one retried to such a port without a listener may even be assigned the port itself and connect to itself.
+    None of the former is `taken`; BusError if too few are free. Any outgoing connection may take an ephemeral port
+    before its role listens; one retried to such a port without a listener may be assigned it, and connect to itself.
     """
-    candidates = range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))
+    candidates = sorted({*range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))} - taken)
     chooser = random.SystemRandom()
     with contextlib.ExitStack() as held:
         ports: list[int] = []
@@ -329,8 +329,7 @@ def free_ports(count: int, taken: AbstractSet[int] = frozenset()) -> list[int]:
                 probe.bind(("127.0.0.1", port))
             except OSError:
                 continue
-            if (port := probe.getsockname()[1]) not in taken:
-                ports.append(port)
+            ports.append(probe.getsockname()[1])
             if len(ports) == count:
                 return ports
     raise BusError(f"found only {len(ports)} of {count} free TCP ports on 127.0.0.1; stop what occupies them")
