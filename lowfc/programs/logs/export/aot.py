@@ -96,7 +96,7 @@ class _System:
             name="lowfc",
             date_beginning=_date(first_ns),
             date_end=_date(last_ns),
-            config=json.dumps(config.model_dump()) if config is not None else None,
+            config=json.dumps(config.model_dump(), default=str) if config is not None else None,
             main_telescope=telescope,
             sources=[source],
             wavefront_sensors=[sensor],
