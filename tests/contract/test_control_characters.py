@@ -59,7 +59,7 @@ def test_a_command_escapes_its_output_and_errors(
         raise RequestRefusedError(HOSTILE)
 
     monkeypatch.setattr(sys, "argv", ["lowfc"])
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)}
     try:
         with pytest.raises(SystemExit):
             run_app(failing)

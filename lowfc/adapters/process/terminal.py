@@ -63,10 +63,13 @@ def run_app(app: Callable[[], object]) -> NoReturn:
 
     The status is 2 unless the error's class sets another.
 
-    SIGTERM ends a command as Ctrl-C does; the processes of a loop catch both themselves.
+    SIGTERM ends a command as Ctrl-C does; the processes of a loop catch both themselves. A lost terminal acts as
+    SIGTERM.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup leaves it
+        signal.signal(signal.SIGHUP, _terminate)
     if os.path.expanduser("~") == "~":  # noqa: PTH111  # Path.home, and astropy with it, would raise RuntimeError
         os.environ["HOME"] = "/"
     try:
@@ -86,6 +89,11 @@ def run_app(app: Callable[[], object]) -> NoReturn:
             sys.stderr.write("interrupted\n")
         raise
     sys.exit(0)
+
+
+def _terminate(number: int, frame: object) -> None:
+    signal.signal(number, signal.SIG_IGN)  # the shell and the kernel may both send one
+    signal.raise_signal(signal.SIGTERM)
 
 
 def options_set(context: typer.Context) -> list[str]:

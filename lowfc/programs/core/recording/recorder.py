@@ -93,13 +93,12 @@ class Recorder:
         bus.queryable(RECORD_KEY.format(name=ALL), self._queries.append)
 
     def catch_signals(self) -> None:
-        """Finish the log at SIGTERM, Ctrl-C or a lost terminal; for the main thread.
+        """Finish the log at SIGTERM or Ctrl-C; for the main thread.
 
         After a second signal the recorder does not wait for the last Health of the others.
         """
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves it
-                signal.signal(number, self._stop_by_signal)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._stop_by_signal)
 
     def run(self) -> Summary:
         """Record until stopped; DataFileError if the first log cannot be opened."""
