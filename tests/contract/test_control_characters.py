@@ -1,5 +1,6 @@
 """Control characters in notes and other text of unknown origin are escaped and never sent to a terminal."""
 
+import errno
 import signal
 import sys
 from pathlib import Path
@@ -47,8 +48,9 @@ def test_a_process_escapes_its_events(capsys: pytest.CaptureFixture[str]) -> Non
     assert capsys.readouterr().err == f"camera: RECORDING_FAILED recording stopped: {SHOWN}\n"
 
 
+@pytest.mark.parametrize("fault", [RequestRefusedError(HOSTILE), OSError(errno.ENAMETOOLONG, "too long", HOSTILE)])
 def test_a_command_escapes_its_output_and_errors(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, fault: Exception
 ) -> None:
     print_result({}, f"{HOSTILE}\nframe 3", as_json=False)
     check(capsys.readouterr().out)
@@ -56,7 +58,7 @@ def test_a_command_escapes_its_output_and_errors(
 
     @failing.command()
     def fail() -> None:
-        raise RequestRefusedError(HOSTILE)
+        raise fault
 
     monkeypatch.setattr(sys, "argv", ["lowfc"])
     before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)}

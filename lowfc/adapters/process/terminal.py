@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
+_HOST_FAULTS = (errno.EACCES, errno.EIO, errno.ENAMETOOLONG, errno.ENOSPC, errno.EPIPE, errno.EROFS)
 
 RunId = Annotated[str, typer.Option("--run", help="Name of the run; processes of one run find each other by it.")]
 AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")]
@@ -76,10 +77,16 @@ def run_app(app: Callable[[], object]) -> NoReturn:
         app()
         sys.stdout.flush()
     except OSError as fault:
-        if fault.filename is not None or fault.errno not in (errno.ENOSPC, errno.EIO, errno.EPIPE):
+        if fault.filename is None and fault.errno == errno.ENOENT:
+            text = "the working directory has been removed: change to another one"
+        elif fault.filename is None and fault.errno in _HOST_FAULTS:
+            text = f"standard output cannot be written: {fault.strerror}"
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # discard the rest
+        elif fault.errno in _HOST_FAULTS:
+            text = f"{printable(str(fault.filename))} cannot be read or written: {fault.strerror}"
+        else:
             raise
-        sys.stderr.write(f"error: standard output cannot be written: {fault.strerror}\n")
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # discard the rest
+        sys.stderr.write(f"error: {text}\n")
         sys.exit(2)
     except LowfcError as error:
         sys.stderr.write(f"error: {printable(str(error), keep=LINES)}\n")
