@@ -293,6 +293,11 @@ def test_a_failed_write_leaves_the_old_file_only(tmp_path: Path, monkeypatch) ->
             with pytest.raises(DataFileError, match=f"^{file} cannot be written: {why}"):
                 refusing(file)
     (tmp_path / "pipe").unlink()
+    (tmp_path / "loop").symlink_to("loop")
+    for usual in (tmp_path / "loop", tmp_path / ("x" * 255)):
+        require_folder(path, usual)
+        write_whole(usual, b"")
+        usual.unlink()
     with pytest.raises(DataFileError, match="nowhere/file cannot be written: No such file"):
         write_whole(tmp_path / "nowhere" / "file", b"")
     monkeypatch.setattr(Path, "replace", FULL_DISK)

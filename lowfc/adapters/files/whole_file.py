@@ -11,6 +11,8 @@ from pathlib import Path
 
 from lowfc.contract.errors import ConfigurationError, DataFileError
 
+_NAME_LENGTH = 50  # characters of the final name in that of the temporary file, which must not be too long
+
 
 @contextlib.contextmanager
 def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> Iterator[Path]:
@@ -25,7 +27,7 @@ def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> 
     try:
         _require_replaceable(path, source)
         most = source.stat().st_mode & mode if source is not None and source.exists() else mode
-        part = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+        part = path.with_name(f".{path.name[:_NAME_LENGTH]}.{secrets.token_hex(4)}")
         descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, most)
         mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
         os.close(descriptor)
@@ -66,7 +68,7 @@ def require_folder(*files: Path | None) -> None:
                 pass
         except OSError as error:
             raise DataFileError(f"{file} cannot be written: {error.strerror}") from error
-    if len({file.resolve() for file in written}) < len(written):
+    if len({os.path.realpath(file) for file in written}) < len(written):  # Path.resolve fails on a loop of links
         raise ConfigurationError(f"these must be different files: {', '.join(map(str, written))}")
 
 

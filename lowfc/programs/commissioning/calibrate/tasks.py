@@ -64,7 +64,7 @@ class ReferenceResult(Result):
 
 def calibrate_with_pokes(request: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:
     """Calibrate a running loop with pokes; write the file at the end, and with `load` use it if it is recommended."""
-    require_folder(request.out)
+    require_folder(request.out, partial_of(request.out))
     console = Console(stderr=True)
     report = reporter(console)
     with contextlib.ExitStack() as stack:

@@ -48,6 +48,7 @@ def commission(
     from lowfc.adapters.process.progress import percentage_bar
     from lowfc.client import Client, configuration_of
     from lowfc.programs.commissioning.analytic import analytic
+    from lowfc.programs.commissioning.calibrate.run import partial_of
     from lowfc.programs.commissioning.calibrate.tasks import reporter
     from lowfc.programs.commissioning.commission.commissioning import Commissioning, CommissionOptions, provisional_path
 
@@ -61,7 +62,7 @@ def commission(
         )
     if out.exists() and not (resume or force):
         raise DataFileError(f"{out} already exists; use another name (--out), or replace it with --force")
-    require_folder(out)
+    require_folder(out, provisional_path(out), partial_of(out))
     console = Console(stderr=True)
     report = reporter(console)
     options = CommissionOptions(out, frames, dark, no_dark, snr, cycles, resume, close)
