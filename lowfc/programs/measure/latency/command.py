@@ -15,6 +15,7 @@ import typer
 
 from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.adapters.process.terminal import ConfigFile, Json, LogsOrMeasure, configuration, options_set
+from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli.output import print_result
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 _RATE_HZ = 1000.0
 _LEAK = 0.01
+_MAX_RESULT_BYTES = 1 << 28
 
 
 class Kernels(StrEnum):
@@ -190,7 +192,7 @@ def _compare(files: tuple[Path, Path]) -> dict[str, Any]:
 
 def _result(file: Path) -> dict[str, Any]:
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
+        found = json.loads(input_file.read_whole(file, _MAX_RESULT_BYTES))
     except OSError as fault:
         raise DataFileError(f"{file} cannot be read: {fault.strerror}") from None
     except (ValueError, RecursionError) as fault:  # not UTF-8, or not JSON
