@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from lowfc.adapters.files.factory import settings
+from lowfc.adapters.process.terminal import configuration
 from lowfc.arrays import Mask, Single
-from lowfc.contract.configuration import MAX_LIMIT_NM, Configuration, load
+from lowfc.contract.configuration import MAX_LIMIT_NM, Configuration
 from lowfc.contract.errors import ConfigurationError, nearest
 from lowfc.control.calibration.calibration import ESTIMATORS
 from lowfc.control.laws.integrator import TIP_TILT, Integrator
@@ -72,7 +73,7 @@ def requested(
     return WhatIf(
         overrides,
         estimator,
-        None if config is None else load(config),
+        None if config is None else configuration(config),
         calibration,
         controller,
         None if controller is None else user_controller(controller),
