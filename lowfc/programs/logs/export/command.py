@@ -105,7 +105,7 @@ def export_log(
     write = _writer(to, with_frames=frames)
     reader = WholeLog(log, skip_damaged=True)
     out = out if out is not None else reader.path.parent / (stem_of(reader.path) + _ENDINGS[to])
-    files = [out] + ([out.with_suffix(".frames.npy")] if frames and to is Format.NPZ else [])
+    files = [out] + ([out.parent / f"{out.stem}.frames.npy"] if frames and to is Format.NPZ else [])
     require_folder(*files)
     for file in files:
         if file.exists() and not force:
