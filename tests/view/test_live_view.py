@@ -255,9 +255,12 @@ def test_repeated_failures_end_the_view(scenes: Scenes, monkeypatch: pytest.Monk
     assert "5 times" in failed(scenes())
 
 
-def test_a_view_to_a_file_is_not_restarted(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("method", ["set_time", "flush"])
+def test_a_view_to_a_file_is_not_restarted(scenes: Scenes, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
     scene = scenes(None)
-    monkeypatch.setattr(Tape, "set_time", None)
+    monkeypatch.setattr(Tape, method, None)
+    if method == "flush":  # as on a full disk, at the end
+        scene.view.service.stop("the test is over")
     assert "writing the view to a file failed: drawing failed" in failed(scene)
 
 

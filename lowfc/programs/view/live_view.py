@@ -44,6 +44,7 @@ MAX_EARLIER_EVENTS = 1000
 """Largest number of events shown from before the start of the view."""
 
 _RECORDER_S = 3.0  # after which a recorder without Health counts as absent
+_FILE_S = 60.0
 _POLL_S = 0.1
 _CHECK_S = 1.0
 _FROZEN_S = 3.0
@@ -125,9 +126,11 @@ class LiveView:
     def _end_render(self) -> None:
         if self._render is not None:
             self._render.abandon()
-            self._render.join(3.0)
+            self._render.join(_FILE_S if self.viewer is None else 3.0)  # a file is complete when the thread ends
             self._drawn += self._render.snapshots
-            self._render = None
+            fault, self._render = self._render.fault, None
+            if fault is not None and self.viewer is None:
+                self._renew(f"drawing failed: {fault!r}")
 
     def _add_earlier(self, render: RenderThread) -> None:
         """Add messages from before this view; in a thread, because a frozen peer answers late."""

@@ -153,4 +153,5 @@ class RenderThread(threading.Thread):
             self.drawn_s = time.monotonic()
             due_s = max(due_s + 1 / PICTURES_HZ, self.drawn_s)
             time.sleep(due_s - self.drawn_s)
+        stream.flush()  # raises the fault of a full disk, unlike `disconnect`
         stream.disconnect()

@@ -17,6 +17,7 @@ from lowfc.adapters.process.join import clock_of
 from lowfc.adapters.process.progress import reading_bar
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer
 from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Role
 from lowfc.programs.view.live_view import LiveView, ViewError
 from lowfc.programs.view.recorded import Drawn, draw_logs
@@ -99,6 +100,11 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
                     time.sleep(_POLL_S)
         else:
             drawn = _draw(logs, config, stream, target)
+            if target.save is not None:
+                try:
+                    stream.flush()
+                except RuntimeError as fault:
+                    raise DataFileError(f"{target.save} cannot be written: is the disk full? {fault}") from None
             stream.disconnect()  # the viewer keeps its data
             if viewer is not None:
                 viewer.screenshot(target.picture)
