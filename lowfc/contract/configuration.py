@@ -34,7 +34,7 @@ from lowfc.contract.sections import (
     Star,
 )
 from lowfc.control.kernel.tables import KernelName
-from lowfc.control.loop.safety import Limits
+from lowfc.control.loop.safety import MAX_LIMIT_NM, Limits
 
 MIN_FRAME_AGE_NS, MIN_FRAME_TIMEOUT_NS = 20_000_000, 50_000_000
 """Minimum of max_frame_age_ms and of frame_timeout_ms if the configuration does not set them."""
@@ -50,7 +50,6 @@ _SHOULD = re.compile("^(?:Input|String|List|Tuple) should")
 Milliseconds = Annotated[float, Field(ge=0, le=1e9)]
 Cpus = list[Annotated[int, Field(ge=0, lt=8192)]]  # the kernel's largest number of processors
 Gain = Annotated[float, Field(ge=0, le=4)]
-MAX_LIMIT_NM = 1e9
 ModalLimit = Annotated[float, Field(gt=0, le=MAX_LIMIT_NM)]
 FIXED_GAINS = {"control.tilt_gain": 0.5, "control.gain": 0.05}
 """For runs that must not depend on automatic gains, such as timing measurements."""

@@ -282,6 +282,7 @@ def test_gain_and_leak_are_set_for_all_some_or_each_mode(name: str) -> None:
         (ask("leak", 1.5), "between 0 and 1"),
         (ask("leak", 0.5, -0.1, 0.2), "between 0 and 1, got -0.1"),
         (ask("leak", float("nan")), "finite"),
+        (ask("limit", 2e9), "between 0 and 1e+09 nm, got 2e+09"),
     ],
 )
 def test_a_bad_value_is_refused_and_changes_nothing(request_: Request, message: str) -> None:

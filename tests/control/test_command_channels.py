@@ -252,6 +252,7 @@ def test_an_inconsistent_probe_sequence_is_refused(fields: dict[str, object], wh
         ("a", np.ones((3, 3)), "actuators"),
         ("a", np.full(GRID, 701.0), "limit"),
         ("a", np.full(GRID, np.nan), "finite"),
+        ("external", np.full(GRID, 1e38), "at most 1e+09 nm"),
         ("a", np.indices(GRID).sum(axis=0) % 2 * 500.0, "neighbours"),
     ],
 )

@@ -17,6 +17,7 @@ from lowfc.control.laws.stability import (
     limiting_gain,
 )
 from lowfc.control.loop.inputs import PendingEvent, Request
+from lowfc.control.loop.safety import MAX_LIMIT_NM
 from lowfc.control.loop.state import ActiveLoop, Settings, Weighting
 from lowfc.control.loop.wording import AUTO, counted
 
@@ -108,8 +109,8 @@ def _changed(integrator: Integrator, noll: tuple[int, ...], delay_frames: float,
     lowest, highest = min(request.values), max(request.values)
     if request.name == "leak" and not (lowest >= 0 and highest <= 1):
         raise ValueError(f"leak must be between 0 and 1, got {lowest if lowest < 0 else highest:g}")
-    if request.name == "limit" and lowest < 0:
-        raise ValueError(f"limit must be at least 0 nm, got {lowest:g}")
+    if request.name == "limit" and not (lowest >= 0 and highest <= MAX_LIMIT_NM):
+        raise ValueError(f"limit must be between 0 and {MAX_LIMIT_NM:g} nm, got {lowest if lowest < 0 else highest:g}")
     chosen = np.isin(noll, _modes(noll, request))
     if request.name == "gain":
         check_gains(values[chosen].tolist(), integrator.leak[chosen].tolist(), delay_frames)

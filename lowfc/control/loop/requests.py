@@ -17,7 +17,7 @@ from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
 from lowfc.control.loop.loading import holding_cause, in_mode, loaded, misfit, mode_event, safe_pending, uncalibrated
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, permit, release, renew
-from lowfc.control.loop.safety import Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
+from lowfc.control.loop.safety import MAX_LIMIT_NM, Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
 from lowfc.control.loop.wording import MAX_NOTE_LENGTH, MEASURED_FIRST, PAUSED, counted
 
@@ -310,8 +310,8 @@ def _with(state: State, loop: ActiveLoop, command_channels: CommandChannels) -> 
 
 def _check_shape(limits: Limits | None, shape_nm: Single, prefix: str = "") -> None:
     """Refuse a channel, or a sum of channels, that exceeds the mirror's limits without any command of the law."""
-    if not np.isfinite(shape_nm).all():
-        raise ValueError("every actuator of a channel must be finite")
+    if not (np.abs(shape_nm) <= MAX_LIMIT_NM).all():
+        raise ValueError(f"every actuator of a channel must be finite, and at most {MAX_LIMIT_NM:g} nm from flat")
     if limits is None:  # already on the mirror
         return
     largest_nm, difference_nm = float(np.abs(shape_nm).max()), neighbour_difference_nm(shape_nm)

@@ -15,6 +15,8 @@ import numpy.typing as npt
 from lowfc.arrays import Single
 from lowfc.control.loop.wording import mode_word
 
+MAX_LIMIT_NM = 1e9
+"""Largest modal limit and actuator of a channel; the square of a much larger number overflows in float32."""
 MARGIN_NM = 1e-3
 """Least distance kept from stroke and slew limit, and half of it from the neighbour limit, so that float32 rounding
 (6e-5 nm at 750 nm) cannot cross them."""

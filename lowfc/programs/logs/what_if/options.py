@@ -13,11 +13,12 @@ import numpy as np
 from lowfc.adapters.files.factory import settings
 from lowfc.adapters.process.terminal import configuration
 from lowfc.arrays import Mask, Single
-from lowfc.contract.configuration import MAX_LIMIT_NM, Configuration
+from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, nearest
 from lowfc.control.calibration.calibration import ESTIMATORS
 from lowfc.control.laws.integrator import TIP_TILT, Integrator
 from lowfc.control.laws.what_if import Controller
+from lowfc.control.loop.safety import MAX_LIMIT_NM
 
 LAW_KEYS = ("gain", "leak", "limit_nm")
 KEYS = (*LAW_KEYS, *(f"tilt_{key}" for key in LAW_KEYS), "estimator")
