@@ -60,17 +60,17 @@ DECLARED: tuple[Declaration, ...] = (
     _declared("leak", "Set integrator leaks.", "leak 0.01", _MODES, ("values", _ONE_OR_EACH)),
     _declared(
         "limit",
-        "Set the modal limits.",
+        "Set the modal limits, nm rms of wavefront.",
         "limit 100 --modes 2,3",
         _MODES,
         ("values", f"{_ONE_OR_EACH}, nm rms of wavefront"),
     ),
     _declared(
         "offset",
-        "Set the loop's target wavefront; zero without values.",
+        "Set the loop's target wavefront.",
         "offset 5 -3 --modes 4,11",
         _MODES,
-        ("values", f"{_ONE_OR_EACH}, nm rms of wavefront"),
+        ("values", f"{_ONE_OR_EACH}, nm rms of wavefront; none for zero"),
     ),
     _declared(
         "channel",

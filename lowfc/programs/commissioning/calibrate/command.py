@@ -10,9 +10,7 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.control.calibration.response_fit import MIN_CYCLES
 from lowfc.programs.cli.result import print_result
 
-calibrate_app = new_app(
-    "Measure or compute a calibration.\n\nExample: lowfc calibrate --method hadamard --out night.fits"
-)
+calibrate_app = new_app("")
 
 Method = Literal["analytic", "poke", "hadamard", "in-loop"]
 Out = Annotated[Path, typer.Option("--out", help="Output file (FITS).")]
@@ -112,6 +110,9 @@ def calibrate(
     print_result(result, as_json=as_json)
     if not result.recommended:
         raise typer.Exit(1)
+
+
+calibrate_app.info.help = calibrate.__doc__
 
 
 @calibrate_app.command()
