@@ -27,8 +27,8 @@ RunId = Annotated[str, typer.Option("--run", help="Name of the run; processes of
 AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 _LOGS = "Logs (MCAP), finished or not; all files of a recording are one log. `last`: the newest in the log folder."
-Logs = Annotated[list[Path], typer.Argument(help=_LOGS, metavar="LOG...", readable=False, show_default=False)]
-_IfAny = partial(typer.Argument, metavar="[LOG...]", readable=False, show_default=False)
+Logs = Annotated[list[Path], typer.Argument(help=_LOGS, metavar="LOG", readable=False, show_default=False)]
+_IfAny = partial(typer.Argument, metavar="LOG", readable=False, show_default=False)
 LogsIfAny = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one: the running loop.")]
 LogsOrLive = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one: --live.")]
 LogsOrMeasure = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one: a loop started for this measurement.")]

@@ -27,7 +27,7 @@ def validate(
         list[str],
         typer.Argument(
             help=f"Any of {', '.join(TABLES)}; all: all of these; or {', '.join(ADDITIONAL)}.",
-            metavar="TABLE...",
+            metavar="TABLE",
             show_default=False,
         ),
     ],
