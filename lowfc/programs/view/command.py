@@ -27,7 +27,7 @@ def view(
     ] = None,
     run: Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")] = None,
     config: ConfigFile = None,
-    memory_mb: Annotated[float, typer.Option(min=16, help="Memory of the viewer for past data, MB.")] = _MEMORY_MB,
+    memory_mb: Annotated[float, typer.Option(min=16, max=1e6, help="Viewer's memory for past data, MB.")] = _MEMORY_MB,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port of the stream, or of Foxglove.")] = None,
     web_port: Annotated[int | None, typer.Option(min=1, max=65535, help="TCP port of the page.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,

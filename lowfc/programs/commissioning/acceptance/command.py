@@ -57,8 +57,8 @@ def rejection(
 def linearity(
     context: typer.Context,
     logs: LogsIfAny = None,
-    hold: Annotated[int, typer.Option(min=2, help="Frames at each level.")] = 10,
-    cycles: Annotated[int, typer.Option(min=2, help="Push-pull cycles of each amplitude.")] = 20,
+    hold: Annotated[int, typer.Option(min=2, max=1000, help="Frames at each level.")] = 10,
+    cycles: Annotated[int, typer.Option(min=2, max=1000, help="Push-pull cycles of each amplitude.")] = 20,
     modes: Modes = None,
     config: Required = None,
     run: AnyRun = None,

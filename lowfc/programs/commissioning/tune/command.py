@@ -19,7 +19,7 @@ Kind = Literal["integrator", "pi-notch", "lqg"]
 def tune(
     logs: LogsOrLive = None,
     controller: Annotated[Kind, typer.Option(help="Kind of law.")] = "integrator",
-    live: Annotated[float | None, typer.Option(min=1.0, help="Observe a running loop for this many seconds.")] = None,
+    live: Annotated[float | None, typer.Option(min=1.0, max=1e5, help="Seconds to observe a running loop.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the law to this file (FITS).")] = None,
     apply: Annotated[bool, typer.Option("--apply", help="Apply the gains or the law to the running loop.")] = False,
     plot: Annotated[Path | None, typer.Option(help="Draw spectra into this file (PNG).")] = None,
