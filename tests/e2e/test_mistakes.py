@@ -126,13 +126,21 @@ def _refused_here(folder: Path, *words: str) -> str:
     return str(done.exception) if isinstance(done.exception, LowfcError) else done.stderr
 
 
-def test_a_full_disk_on_standard_output_is_one_line(tmp_path: Path) -> None:
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [*LOWFC, "config", "show"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, check=False
-        )
-    assert done.returncode == 2
-    assert done.stderr == "error: standard output cannot be written: No space left on device\n"
+@pytest.mark.parametrize(
+    ("words", "output", "status", "error"),
+    [
+        ("config show", ">/dev/full", 2, "error: standard output cannot be written: No space left on device\n"),
+        ("--version", ">/dev/full", 2, "error: standard output cannot be written: No space left on device\n"),
+        ("--version", ">&-", 2, "error: standard output cannot be written: Bad file descriptor\n"),
+        ("console", "<&-", 2, "error: the console requires a terminal; `lowfc ctl` operates a loop without one\n"),
+        ("runs --help", "2>&-", 0, ""),
+    ],
+)
+def test_a_full_disk_or_a_closed_stream_is_one_line(words: str, output: str, status: int, error: str) -> None:
+    script = ["sh", "-c", f'exec "$@" {words} {output}', "sh", *LOWFC]
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    done = subprocess.run(script, env=buffered, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (status, error)
 
 
 def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path) -> None:

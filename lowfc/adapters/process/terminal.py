@@ -1,6 +1,7 @@
 """Command lines: display of users' errors, and the options and arguments that several commands share."""
 
 import errno
+import io
 import os
 import signal
 import sys
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
-_HOST_FAULTS = (errno.EACCES, errno.EIO, errno.ENAMETOOLONG, errno.ENOSPC, errno.EPIPE, errno.EROFS)
+_HOST_FAULTS = (errno.EACCES, errno.EBADF, errno.EIO, errno.ENAMETOOLONG, errno.ENOSPC, errno.EPIPE, errno.EROFS)
 
 RunId = Annotated[str, typer.Option("--run", help="Name of the run; processes of one run find each other by it.")]
 AnyRun = Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")]
@@ -67,15 +68,12 @@ def run_app(app: Callable[[], object]) -> NoReturn:
     SIGTERM ends a command as Ctrl-C does; the processes of a loop catch both themselves. A lost terminal acts as
     SIGTERM.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup leaves it
-        signal.signal(signal.SIGHUP, _terminate)
-    if os.path.expanduser("~") == "~":  # noqa: PTH111  # Path.home, and astropy with it, would raise RuntimeError
-        os.environ["HOME"] = "/"
+    _prepare_process()
     try:
-        app()
-        sys.stdout.flush()
+        try:
+            app()
+        finally:  # it ends by SystemExit
+            sys.stdout.flush()
     except OSError as fault:
         if fault.filename is None and fault.errno == errno.ENOENT:
             text = "the working directory has been removed: change to another one"
@@ -96,6 +94,20 @@ def run_app(app: Callable[[], object]) -> NoReturn:
             sys.stderr.write("interrupted\n")
         raise
     sys.exit(0)
+
+
+def _prepare_process() -> None:
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup leaves it
+        signal.signal(signal.SIGHUP, _terminate)
+    if os.path.expanduser("~") == "~":  # noqa: PTH111  # Path.home, and astropy with it, would raise RuntimeError
+        os.environ["HOME"] = "/"
+    for name, flags, mode in (("stdin", os.O_RDONLY, "r"), ("stdout", os.O_RDONLY, "w"), ("stderr", os.O_WRONLY, "w")):
+        if getattr(sys, name) is None:  # closed by the caller: input is empty, and a result cannot be written
+            setattr(sys, name, os.fdopen(os.open(os.devnull, flags), mode))
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr, for a terminal without UTF-8
 
 
 def _terminate(number: int, frame: object) -> None:
