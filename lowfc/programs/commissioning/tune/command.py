@@ -37,7 +37,7 @@ def tune(
     from lowfc.adapters.files.whole_file import require_folder, write_whole
     from lowfc.adapters.logs.parts import WholeLog, named_log
     from lowfc.adapters.process.progress import passing_bar, reading_bar
-    from lowfc.client import Client
+    from lowfc.client import Client, the_run
     from lowfc.programs.commissioning.tune.data import telemetry_from_log, telemetry_from_run
     from lowfc.programs.commissioning.tune.result import picture, result_of, tuned
 
@@ -47,6 +47,8 @@ def tune(
         raise ConfigurationError("--run has no effect on a LOG without --apply: omit it")
     console = Console(stderr=True)
     require_folder(out, plot)
+    if apply:
+        the_run(run)  # an error now rather than after the work if there is no such loop
     if plot is not None:
         figure_class()  # an error now rather than after the work if matplotlib is missing
     if logs:
