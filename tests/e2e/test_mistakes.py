@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -143,8 +144,11 @@ def test_a_full_disk_or_a_closed_stream_is_one_line(words: str, output: str, sta
     assert (done.returncode, done.stderr) == (status, error)
 
 
-def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path) -> None:
-    process = subprocess.Popen([*LOWFC, "config", "show"], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+@pytest.mark.parametrize("words", ["main config show", "sim_camera --help", "sim_dm --help"])
+def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path, words: str) -> None:
+    entry, *options = words.split()
+    start = [sys.executable, "-c", f"from lowfc.__main__ import {entry}; {entry}()", *options]
+    process = subprocess.Popen(start, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     until(lambda: "pydantic_core" in Path(f"/proc/{process.pid}/maps").read_text(), 20)  # in the middle of the imports
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=20)
