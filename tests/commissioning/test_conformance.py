@@ -476,6 +476,14 @@ def test_configured_dead_and_stuck_actuators_are_no_fault(dead: list[int], untes
     assert of_mirror(free, config) == untested
 
 
+def test_inactive_actuators_are_no_fault(tmp_path: Path) -> None:
+    active = np.ones((6, 7), np.float32)
+    active[:, 4:] = 0
+    np.save(tmp_path / "active.npy", active)
+    config = load(None, {**SMALL, "mirror.active": str(tmp_path / "active.npy")})
+    assert of_mirror(Mirror(state=shaped(lambda shape: shape * active)), config) == {}
+
+
 def test_the_report_has_advice_for_failed_checks(capsys: pytest.CaptureFixture[str]) -> None:
     checks = list(camera_checks(watch(Camera(frame=setting(encoding="16UC1")), 1.0, lambda _: None)))
     print_report(checks, STATUSES, FIELDS, None)

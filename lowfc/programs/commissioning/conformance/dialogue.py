@@ -7,6 +7,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.run import mirror_role
 from lowfc.adapters.files.factory import mirror_limits
+from lowfc.adapters.files.mirror_maps import active_actuators
 from lowfc.arrays import Mask, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
@@ -30,24 +31,25 @@ _MAX_MOVES = 400  # to a distant shape
 
 
 class Expected:
-    """The mirror as configured; dead and stuck actuators do not move.
+    """The mirror as configured; dead, stuck and inactive actuators do not count.
 
     Attributes:
         name: name in the mirror's topics.
         grid: rows and columns of actuators.
         limits: the mirror's limits, nm of surface.
         step_nm: smallest step of its driver, nm of surface.
-        moving: whether each actuator moves (rows, columns).
+        moving: whether each actuator is active, and neither dead nor stuck (rows, columns).
         period_ns: time between two commands of the loop.
     """
 
     def __init__(self, config: Configuration) -> None:
-        """Read the mirror's section."""
+        """Read the mirror's section; ConfigurationError if its map of active actuators cannot be used."""
         section = config.mirror
         self.name, self.grid = section.name, (section.rows, section.columns)
         self.limits, self.period_ns = mirror_limits(config), config.period_ns
         self.step_nm: float = section.stroke_nm / 2**section.driver_bits
-        self.moving: Mask = np.ones(self.grid, bool)
+        active = active_actuators(config)
+        self.moving: Mask = np.ones(self.grid, bool) if active is None else active
         self.moving.flat[[*section.dead, *map(int, section.stuck_nm)]] = False
 
     @property

@@ -176,7 +176,8 @@ def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wir
         return ok(f"within {float(off_nm.max()):.2g} nm")
     got = f"{away.size} of {off_nm.size} actuators off, by {float(off_nm.max()):.3g} nm at most"
     if away.size <= off_nm.size // 10:
-        return warning(got, f"are they dead? Name them in mirror.dead: {', '.join(map(str, away[:8]))}")
+        named = ", ".join(map(str, away[:8]))
+        return warning(got, f"are they dead? Exclude them in the map mirror.active (row * columns + column): {named}")
     return wrong(got, _difference(base_nm, commanded_nm, where_nm))
 
 
@@ -206,6 +207,8 @@ def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single) -> str:
         advice += ": report nm, not um"
     elif scale < 0:
         advice += ": the sign is wrong; a positive command raises the surface"
+    elif how == "with the right orientation" and abs(scale - 1) < 0.05:
+        advice += ": does the driver round? Set mirror.driver_bits so that stroke_nm / 2^driver_bits is its step"
     return advice
 
 
