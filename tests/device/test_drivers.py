@@ -164,9 +164,10 @@ def test_a_driver_that_cannot_be_imported_gives_one_sentence(
 def test_driver_sections_of_a_configuration_are_checked(tmp_path: Path) -> None:
     (tmp_path / "mine.py").touch()
     good = {"drivers.sim": {"camera": {"fault": ""}}, "drivers.json": {"any": 1}, "drivers.mine.level": 1}
-    assert plugins.faults(load(None, good), tmp_path) == []
-    wrong = plugins.faults(load(None, {"drivers.sim": {"camera": {"falt": ""}}, "drivers.sin.x": 1}), tmp_path)
-    assert ["'falt'" in wrong[0], "did you mean 'sim'" in wrong[1], len(wrong)] == [True, True, 2]
+    assert plugins.faults(load(None, good | {"drivers.in_another_folder.level": 1}), tmp_path) == []
+    bad = {"drivers.sim": {"camera": {"falt": ""}}, "drivers.sin.x": 1, "drivers.my/file": {"x": 1}}
+    wrong = plugins.faults(load(None, bad), tmp_path)
+    assert ["'falt'" in wrong[0], "did you mean 'sim'" in wrong[1], len(wrong)] == [True, True, 3]
 
 
 class Sized(Ramp):
