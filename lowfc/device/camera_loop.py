@@ -61,7 +61,7 @@ class CameraLoop:
         """
         service = self._service
         step = getattr(self._driver, "step", _NO_EXTRAS.step) if service.clock.lockstep else _NO_EXTRAS.step
-        with self.watch.over(self._driver.close):
+        with self.watch.over(self._close):
             service.require(wait_for, WAIT_S, "the camera will not start without")
             service.awaited = lambda: "" if service.work else "the camera's first frame"
             service.state = "running"
@@ -80,6 +80,12 @@ class CameraLoop:
         self._lost_due_ns = 0  # those of the last half second, too
         self._report_lost()
         service.finish()
+
+    def _close(self) -> None:
+        try:
+            self._fill_extra = self.watch.last_fields(self._fill_extra)
+        finally:
+            self._driver.close()
 
     def _next_frame(self) -> tuple[Pixels, int] | None:
         """Pixels of the next exposure and the run's time of its end; None if there is no frame."""

@@ -142,7 +142,11 @@ class MirrorLoop:
 
     def _close(self) -> None:
         self._leave()
-        self._driver.close()
+        with self._turn:  # over a router, a command may still be with the driver
+            try:
+                self._fill_extra = self.watch.last_fields(self._fill_extra)
+            finally:
+                self._driver.close()
 
     def _arrived(self, sample: Sample) -> None:
         """Handle a command on the receive thread; superseded commands are skipped."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from lowfc.adapters.process.service import Service
 from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.contract.messages import wire
 
 CHECK_S = 0.1
 PAUSES_NS = (0, 100_000_000, 200_000_000, 500_000_000, 1_000_000_000, 2_000_000_000, 4_000_000_000)
@@ -124,6 +125,12 @@ class DriverWatch:
             method(*arguments)
         except Exception as fault:
             self._report(fault)
+
+    def last_fields(self, fill: Callable[[wire.Health], None]) -> Callable[[wire.Health], None]:
+        """Call the driver's `fill` for the last time; the result adds its fields to a Health after `close`."""
+        last = wire.Health()
+        self.call(fill, last)
+        return lambda health: health.MergeFrom(last)
 
     def failed(self, fault: Exception) -> None:
         """Note that a call raised or returned an invalid result; a `LowfcError`, for the user, is raised again."""
