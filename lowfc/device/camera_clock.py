@@ -8,7 +8,7 @@ class CameraClock:
     """Converts times of a camera whose clock has its own epoch and rate to CLOCK_MONOTONIC.
 
     The offset is the smallest difference between reception and time stamp in the last 5 to 10 s. Converted times are
-    therefore late by the shortest transfer time.
+    therefore late by the shortest transfer time. A stamp before the previous one is a restart of the camera's clock.
 
     Example:
         self.clock = CameraClock()                                    # in __init__
@@ -18,12 +18,15 @@ class CameraClock:
     def __init__(self) -> None:
         """Start without any frame."""
         self._minima_ns: list[int] = []  # smallest offset in the previous and the present half window
-        self._begun_ns = 0
+        self._begun_ns = self._last_ns = 0
 
     def monotonic_ns(self, stamp_ns: int, received_ns: int) -> int:
         """Convert the stamp of a received frame (end of the exposure, ns of the camera's clock)."""
         offset_ns = received_ns - stamp_ns
         age_ns = received_ns - self._begun_ns
+        if stamp_ns < self._last_ns:
+            self._minima_ns = []
+        self._last_ns = stamp_ns
         if not self._minima_ns or age_ns > WINDOW_NS // 2:
             self._minima_ns = [*self._minima_ns[-1:], offset_ns] if age_ns < WINDOW_NS else [offset_ns]
             self._begun_ns = received_ns
