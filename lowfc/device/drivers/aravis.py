@@ -15,6 +15,8 @@ ADVICE = (
     "with a link to /usr/lib/python3/dist-packages/gi in its site-packages"
 )
 _BUFFERS = 32
+_QUEUED = 2
+"""Frames read after a stall; older ones are dropped and counted as lost: all of them saw the same mirror shape."""
 
 
 def _aravis() -> Any:
@@ -71,6 +73,9 @@ class AravisCamera:
         buffer = self._stream.timeout_pop_buffer(WAIT_MS * 1000)
         if buffer is None:
             return None
+        while self._stream.get_n_buffers()[1] >= _QUEUED:  # those that wait to be read
+            self._stream.push_buffer(buffer)
+            buffer = self._stream.timeout_pop_buffer(0)
         try:
             if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:
                 return None
