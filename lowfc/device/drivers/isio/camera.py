@@ -1,5 +1,6 @@
 """Driver of a camera whose images another program writes to an ImageStreamIO stream."""
 
+import time
 from dataclasses import fields, replace
 from typing import Any, Literal
 
@@ -19,6 +20,8 @@ Setting = Literal[
 ]
 _INTEGERS = ("region_row", "region_column")
 _WAIT_S = 0.5
+_SILENT_PERIODS = 2
+"""Periods without an image, and at least `_WAIT_S`, after which the stream is reported as silent."""
 _FULL_DN = 65535
 
 
@@ -76,7 +79,7 @@ class IsioCamera:
             settings.setdefault("saturation_dn", min(configured.saturation_dn or full_dn, full_dn))
         self._settings = replace(configured, clock="realtime", **settings)
         self._generation = self._reader.generation
-        self._silent = False
+        self._silent, self._image_s = False, time.monotonic()
 
     def join(self, service: Service) -> None:
         """Keep the process's service for events."""
@@ -95,11 +98,12 @@ class IsioCamera:
         """Next image of the stream."""
         image = self._reader.next(_WAIT_S)
         if image is None:
-            if not self._silent:
+            silent_s = time.monotonic() - self._image_s
+            if not self._silent and silent_s >= _SILENT_PERIODS * self._settings.period_ns * 1e-9:
                 self._silent = True
                 self._service.event("STREAM_SILENT", stream=self._options.stream, why=self._reader.silence_cause())
             return None
-        self._silent = False
+        self._silent, self._image_s = False, time.monotonic()
         if image.generation != self._generation:
             self._generation = image.generation
             rows, columns = image.pixels.shape
