@@ -62,7 +62,7 @@ class Variables(dict[str, "Variables.Shared"]):
         self.conf = conf
         return SimpleNamespace(conf=lambda: conf, stop=lambda: self.closed.append("server"))
 
-    def context(self, provider: str, conf: dict[str, str], useenv: bool) -> SimpleNamespace:
+    def context(self, provider: str, conf: dict[str, str], useenv: bool, nt: bool) -> SimpleNamespace:
         def monitor(name: str, callback: Callable[[Any], None], notify_disconnect: bool) -> SimpleNamespace:
             self.monitors[name] = callback
             return SimpleNamespace(close=lambda: self.closed.append(name))
@@ -91,13 +91,17 @@ def pvs(monkeypatch: pytest.MonkeyPatch) -> Variables:
 
 
 def received(value: Any, kind: str = "epics:nt/NTScalar:1.0", severity: int = 0, **fields: Any) -> Any:
-    """Update of a monitor."""
+    """Update of a monitor; a text in bytes is decoded when it is read, as by p4p."""
 
     class Raw(dict[str, Any]):
         def getID(self) -> str:
             return kind
 
-    return SimpleNamespace(raw=Raw({"value": value, **fields}), severity=severity)
+        def __getitem__(self, name: str) -> Any:
+            found = super().__getitem__(name)
+            return found.decode() if isinstance(found, bytes) else found
+
+    return Raw({"value": value, "alarm.severity": severity, **fields})
 
 
 def choice(index: int, *choices: str) -> Any:
@@ -188,7 +192,8 @@ def test_a_put_is_a_request_and_fails_with_its_refusal(pvs: Variables) -> None:
         (received(np.nan), None),
         (received([1, 2]), None),
         (received(2.0, severity=3), None),
-        (SimpleNamespace(getID=lambda: "epics:nt/NTTable:1.0"), None),
+        (received({}, "epics:nt/NTTable:1.0"), None),
+        (received(b"\xb0C"), None),
         (TimeoutError("disconnected"), None),
     ],
 )

@@ -66,7 +66,8 @@ class EpicsGateway:
             self._server.stop()
             raise BusError(f"cannot serve PV Access on {address}:{port}: it is in use; set another gateway.port")
         searched = {"EPICS_PVA_ADDR_LIST": config.search, "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
-        self._context = p4p.client.thread.Context("pva", conf=searched, useenv=False)
+        # p4p ends a monitor silently if an update cannot be converted: `_value_of` converts instead.
+        self._context = p4p.client.thread.Context("pva", conf=searched, useenv=False, nt=False)
         self._monitors = [
             self._context.monitor(pv, self._receiver(name), notify_disconnect=True) for name, pv in config.bench.items()
         ]
@@ -130,15 +131,19 @@ class _PutHandler:
 
 def _value_of(value: Any) -> Value | None:
     """The bench value of a monitor's update; None if the PV is disconnected, invalid, not a scalar or too long."""
-    if not hasattr(value, "raw") or value.severity >= _INVALID:  # an Exception, or a structure such as a table
+    if isinstance(value, Exception):
         return None
-    raw: Any = value.raw
     plain: Any
-    if raw.getID().startswith("epics:nt/NTEnum"):
-        choices, index = raw["value.choices"], raw["value.index"]
-        plain = str(choices[index]) if 0 <= index < len(choices) else None
-    else:
-        plain = raw["value"]
+    try:
+        if value.get("alarm.severity", 0) >= _INVALID:
+            return None
+        if value.getID().startswith("epics:nt/NTEnum"):
+            choices, index = value["value.choices"], value["value.index"]
+            plain = str(choices[index]) if 0 <= index < len(choices) else None
+        else:
+            plain = value["value"]
+    except (LookupError, TypeError, ValueError):  # a structure without a value, or a text that is not UTF-8
+        return None
     if isinstance(plain, bool):
         return plain
     if isinstance(plain, str):
