@@ -41,8 +41,8 @@ class Variables(dict[str, "Variables.Shared"]):
     """
 
     class Shared:
-        def __init__(self, nt: Any, initial: Any, handler: Any = None) -> None:
-            self.nt, self.handler = nt, handler
+        def __init__(self, nt: Any, initial: Any, handler: Any = None, queue: Any = None) -> None:
+            self.nt, self.handler, self.queue = nt, handler, queue
             self.posts: list[tuple[Any, int, str]] = []
 
         def post(self, value: Any, timestamp: float, severity: int = 0, message: str = "") -> None:
@@ -79,6 +79,7 @@ def pvs(monkeypatch: pytest.MonkeyPatch) -> Variables:
         "p4p.nt": {"NTScalar": lambda code, display: code, "NTNDArray": lambda: "image"},
         "p4p.server": {"Server": found.server},
         "p4p.server.thread": {"SharedPV": found.Shared},
+        "p4p.util": {"ThreadedWorkQueue": lambda maxsize, daemon: SimpleNamespace(start=object)},
     }
     for name, content in {"p4p": {}, **modules}.items():
         module = ModuleType(name)
@@ -170,6 +171,7 @@ def test_a_put_is_a_request_and_fails_with_its_refusal(pvs: Variables) -> None:
         (variable("gain", Kind.NUMBERS, put), variable("close", Kind.BOOLEAN, put), variable("mode", Kind.TEXT)), ask
     )
     assert pvs["night:mode"].handler is None
+    assert pvs["night:gain"].queue is not pvs["night:close"].queue, "a put waits for no put to another variable"
     ended = []
     for name, value in (("gain", np.array([0.2])), ("gain", np.array([9.0])), ("close", True), ("close", False)):
         operation = Operation(value)

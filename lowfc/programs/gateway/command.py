@@ -47,7 +47,7 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
     bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
 
     def request(put: Put, value: Any) -> None:
-        put(Client(run_id, bus=bus), value)  # on a thread of the server: `safe` waits for no other put
+        put(Client(run_id, bus=bus), value)  # on a thread of this variable: `safe` waits for no other put
 
     def ended() -> bool:
         return bool(signalled) or joined.restarted()

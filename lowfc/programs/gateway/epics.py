@@ -28,6 +28,7 @@ def protocol() -> Any:
         import p4p.client.thread
         import p4p.nt
         import p4p.server.thread
+        import p4p.util
     return p4p
 
 
@@ -47,7 +48,10 @@ class EpicsGateway:
                 continue
             nt = p4p.nt.NTScalar(_CODES[one.kind], display=True)
             described = {"value": _EMPTY[one.kind], "display.description": one.description, "display.units": one.unit}
-            handler = {} if one.put is None else {"handler": _PutHandler(one.kind, one.put, ask)}
+            handler: dict[str, Any] = {}
+            if one.put is not None:  # a thread for each PV: by default p4p has four for all, and `safe` would wait
+                handler["queue"] = p4p.util.ThreadedWorkQueue(maxsize=0, daemon=True).start()
+                handler["handler"] = _PutHandler(one.kind, one.put, ask)
             self._pvs[one.name] = p4p.server.thread.SharedPV(nt=nt, initial=described, **handler)
         address, port = config.listen, config.port
         served = {
@@ -118,7 +122,7 @@ class _PutHandler:
         self._kind, self._put, self._ask = kind, put, ask
 
     def put(self, pv: Any, operation: Any) -> None:
-        """Carry out one put, on a thread of the server."""
+        """Carry out one put, on the variable's own thread."""
         try:
             value = operation.value()
             if self._kind is not Kind.BOOLEAN or value:  # a display writes 0 to reset a button
