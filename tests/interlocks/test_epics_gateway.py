@@ -152,6 +152,9 @@ def test_a_variable_is_posted_when_it_changes_and_is_invalid_with_a_fault(pvs: V
         "night:close": [(False, 0, ""), (False, *fault)],
         "night:frame": [([[1.0, 1.0]], 0, "")],
     }
+    for _ in range(2):
+        served.update({"rate": np.nan}, "")
+    assert [severity for _, severity, _ in pvs["night:rate"].posts] == [0, 0, 3, 3], "NaN is invalid, and posted once"
     served.close()
     assert pvs.closed == ["BENCH:MASK", "context", "server"]
 

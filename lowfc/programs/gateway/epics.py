@@ -82,7 +82,7 @@ class EpicsGateway:
         return int(self._server.conf()["EPICS_PVAS_SERVER_PORT"])
 
     def update(self, values: dict[str, Any], fault: str) -> None:
-        """Post a new image, and the variables that have changed; with a fault, these are marked as invalid."""
+        """Post a new image, and the variables that have changed; these are invalid with a fault, or if NaN."""
         for one in self.variables:
             value = values.get(one.name, _EMPTY.get(one.kind))
             if value is None:
@@ -91,10 +91,11 @@ class EpicsGateway:
             if one.kind is Kind.IMAGE:
                 pv.post(value, timestamp=time.time())
                 continue
-            news = (np.asarray(value).tolist(), fault)
+            why = fault or ("not measured now" if one.kind is Kind.NUMBER and np.isnan(value) else "")
+            news = str(np.asarray(value).tolist()), why  # as text, since NaN differs from itself
             if self._last.get(one.name) != news:
                 self._last[one.name] = news
-                pv.post(value, severity=_INVALID if fault else 0, message=fault, timestamp=time.time())
+                pv.post(value, severity=_INVALID if why else 0, message=why, timestamp=time.time())
 
     def close(self) -> None:
         """Stop the server and the monitors."""

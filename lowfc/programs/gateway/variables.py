@@ -5,6 +5,7 @@ A request with a `lowfc ctl` command that changes something is offered if it tak
 
 from collections.abc import Callable, Iterator
 from enum import Enum
+from math import nan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,8 +50,8 @@ def _status(key: str, empty: Any) -> Callable[[RunView, dict[str, Any]], Any]:
 
 def _latency(percentile: str) -> Callable[[RunView, dict[str, Any]], Any]:
     def read(view: RunView, status: dict[str, Any]) -> float:
-        controller = view.processes.get(Role.CONTROLLER, wire.Health())
-        return float(getattr(controller.frame_to_command, f"{percentile}_ns") * 1e-3)
+        latency = view.processes.get(Role.CONTROLLER, wire.Health()).frame_to_command
+        return float(getattr(latency, f"{percentile}_ns") * 1e-3) if latency.count else nan
 
     return read
 
@@ -71,14 +72,14 @@ READINGS = (
     Variable("interlocks", Kind.TEXT, "", "Interlocks that are tripped.", lambda _, status: interlocks(status)),
     Variable("reserved_for", Kind.TEXT, "", "Holder of the loop's reservation.", _status("reserved_for", "")),
     Variable(
-        "residual", Kind.NUMBER, "nm", "Modal error with noise, rms of a second.", _status("residual_rms_nm", 0.0)
+        "residual", Kind.NUMBER, "nm", "Modal error with noise, rms of a second.", _status("residual_rms_nm", nan)
     ),
-    Variable("flux", Kind.NUMBER, "", "Flux relative to the calibration.", _status("flux_fraction", 0.0)),
+    Variable("flux", Kind.NUMBER, "", "Flux relative to the calibration.", _status("flux_fraction", nan)),
     Variable("rate", Kind.NUMBER, "Hz", "Frame rate.", _status("rate_hz", 0.0)),
     Variable("frames_missing", Kind.NUMBER, "", "Frames that never arrived.", _status("frames_missing", 0)),
-    Variable("latency_p50", Kind.NUMBER, "us", "From frame to command, median.", _latency("p50")),
-    Variable("latency_p99", Kind.NUMBER, "us", "From frame to command, 99th percentile.", _latency("p99")),
-    Variable("latency_max", Kind.NUMBER, "us", "From frame to command, longest.", _latency("max")),
+    Variable("latency_p50", Kind.NUMBER, "us", "Frame to command since the start, median.", _latency("p50")),
+    Variable("latency_p99", Kind.NUMBER, "us", "Frame to command since the start, 99th percentile.", _latency("p99")),
+    Variable("latency_max", Kind.NUMBER, "us", "Frame to command since the start, longest.", _latency("max")),
     Variable("law", Kind.TEXT, "", "Control law in use.", lambda _, status: status["law"]["name"]),
     Variable("recording", Kind.TEXT, "", "Recording, stopped, failed or none.", _status("recording", "")),
     Variable("error", Kind.NUMBERS, "nm", "Modal error of the newest frame.", _step("error_nm")),
