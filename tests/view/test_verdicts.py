@@ -366,6 +366,14 @@ def test_a_loop_that_opened_for_another_reason_is_not_blamed_on_the_camera(why: 
     assert (tile(verdict, "LOOP").level, verdict.level) == (Level.NEUTRAL, Level.NEUTRAL)
 
 
+def test_the_cause_of_the_mode_is_that_of_the_controllers_state() -> None:
+    stage = begun(1)
+    changed(LoopMode.OPEN, "operator asked to pause")(stage)
+    state = wire.ControllerState(mode=wire.LOOP_MODE_OPEN, mode_cause="operator asked to open")
+    stage.send(CONTROLLER_STATE, state)
+    assert tile(stage.run(2), "LOOP").detail.startswith(state.mode_cause)
+
+
 def test_past_refusals_are_reported_as_ended() -> None:
     stage = begun(3)
     stage.reasons = (Rejection.DARK,)

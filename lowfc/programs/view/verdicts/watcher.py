@@ -100,12 +100,13 @@ class Watcher:
         wavefront, true = _rms(now)
         if wavefront is None and stopped:
             wavefront, true = _rms(self._last_active)
-        active = self._last_active if stopped else now
+        active, reported = self._last_active if stopped else now, snapshot.controller
+        cause = printable(reported.mode_cause) if reported is not None and reported.mode == self._mode else ""
         durations_us = np.concatenate([np.zeros(0), *(one.durations_ns / 1e3 for one in active)])
         return RunState(
             snapshot=snapshot,
             mode=self._mode,
-            why=self._why,
+            why=cause or self._why,  # the cause may change without an event, or before this view
             running_s=(snapshot.host_ns - self._begun_ns) * 1e-9 if self._begun_ns else 0.0,
             rate_hz=_rate_hz(now),
             controller=controller,
