@@ -48,7 +48,8 @@ def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     night.request("close")
     night.frames(1500, lost={200, 201, 202, 203, 204, 700}, dark={800})
     night.request("gain", (0.2,))
-    night.put(REQUEST, wire.Request(name="renew", accepted=True))
+    for name in ("renew", "configuration"):
+        night.put(REQUEST, wire.Request(name=name, accepted=True))
     night.frames(200)
     night.request("gain", (9.0,))
     night.frames(100)

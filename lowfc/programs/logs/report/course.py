@@ -53,19 +53,19 @@ def events(run: Run) -> list[Results]:
 
 
 def requests(run: Run) -> list[Results]:
-    """Requests, also the controller's own, and their answers, except for the status and the renewal of leases."""
+    """Requests, also the controller's own, and their answers, without those that change nothing and are periodic."""
     steps = run.history.steps
-    found = [request for request in run.history.requests if request.name not in ("status", "renew")]
+    found = [one for one in run.history.requests if one.name not in ("status", "configuration", "renew")]
     return [
         {
-            "time_s": _request_time_s(run, request),
-            "name": request.name,
-            "modes": list(request.modes),
-            "values": list(request.values),
-            "accepted": request.accepted,
-            "reply": request.reply,
+            "time_s": _request_time_s(run, one),
+            "name": one.name,
+            "modes": list(one.modes),
+            "values": list(one.values),
+            "accepted": one.accepted,
+            "reply": one.reply,
         }
-        for request in found
+        for one in found
         if steps.sequence.size
     ]
 
