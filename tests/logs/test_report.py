@@ -57,6 +57,7 @@ def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     night.frames(50)
     night.start_camera()
     night.frames(100)
+    night.request("safe").request("clear").request("note", text="camera off")
     counts = [wire.TopicCount(topic=FRAME.key, received=2244, skipped=4, missing=2)]
     night.health("controller", topics=counts, state="stopped")
     night.health("camera", commands_late=43, state="stopped")
@@ -73,9 +74,10 @@ def test_modes_laws_and_requests_are_listed(eventful: dict[str, Any]) -> None:
         (pytest.approx(2.1), [0.4, 0.4, 0.2]),
     ]
     requests = eventful["requests"]
-    assert [one["name"] for one in requests] == ["open", "close", "gain", "gain"]
-    assert [one["accepted"] for one in requests] == [True, True, True, False]
-    assert [one["time_s"] for one in requests] == pytest.approx([0, 0.3, 1.8, 2.0], abs=1e-3)
+    assert [one["name"] for one in requests] == ["open", "close", "gain", "gain", "safe", "clear", "note"]
+    assert [one["accepted"] for one in requests] == [True, True, True, False, True, True, True]
+    end_s = eventful["run"]["steps_s"]
+    assert [one["time_s"] for one in requests] == pytest.approx([0, 0.3, 1.8, 2.0, *[end_s] * 3], abs=1e-3)
     assert eventful["run"]["steps"] == 2244
     assert eventful["run"]["host"] == "bench"
     assert eventful["run"]["versions"] == {"lowfc": "0.1.0", "numpy": "2.0"}

@@ -7,6 +7,7 @@ import numpy as np
 from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long, Single
+from lowfc.contract.envelope import start_of
 from lowfc.contract.events import Level
 from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.control.loop.safety import Limit, mode_name
@@ -136,6 +137,6 @@ def _request_time_s(run: Run, request: wire.Request) -> float:
     """Time of the first step with a request in force, or of the last step before it."""
     steps = run.history.steps
     later = steps.sequence >= request.frame_sequence
-    if request.frame_sequence <= 1:  # the controller had no frame yet
-        later = steps.time_ns + run.history.camera_lag_ns(Role.CONTROLLER) > from_timestamp(request.timestamp)
+    if not start_of(request.frame_sequence):  # no frame since the controller's start, or since `clear`
+        later = steps.time_ns + run.history.camera_lag_ns(Role.CONTROLLER) >= from_timestamp(request.timestamp)
     return float(run.step_s[int(np.argmax(later)) if later.any() else -1])
