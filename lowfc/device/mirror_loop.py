@@ -31,7 +31,7 @@ from lowfc.contract.messages import (
 from lowfc.control.loop.safety import Limits, Reason, Rejection
 from lowfc.device.driver import Mirror, MirrorExtras, geometry
 from lowfc.device.mirror_protection import Command, MirrorProtection, Status, apply_command, tick
-from lowfc.device.watch import DriverWatch
+from lowfc.device.watch import CLOSE_S, DriverWatch
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.mirror import influence_factors
 
@@ -142,11 +142,13 @@ class MirrorLoop:
 
     def _close(self) -> None:
         self._leave()
-        with self._turn:  # over a router, a command may still be with the driver
-            try:
-                self._fill_extra = self.watch.last_fields(self._fill_extra)
-            finally:
-                self._driver.close()
+        free = self._turn.acquire(timeout=CLOSE_S)  # over a router, a command may still be with the driver
+        try:
+            self._fill_extra = self.watch.last_fields(self._fill_extra)
+        finally:
+            self._driver.close()
+            if free:
+                self._turn.release()
 
     def _arrived(self, sample: Sample) -> None:
         """Handle a command on the receive thread; superseded commands are skipped."""
