@@ -4,7 +4,7 @@ import inspect
 import json
 import re
 import socket
-from contextlib import closing, nullcontext
+from contextlib import closing
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -18,7 +18,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.clock_offset import FIRST_EXCHANGES, PERIOD_S, RECENT
 from lowfc.contract.configuration import Network
 from lowfc.contract.errors import BusError
-from lowfc.contract.messages import Role
+from lowfc.contract.messages import Role, wire
 from lowfc.programs.cli.hosts import certs
 from tests.e2e.test_hosts import SHIFTS_NS
 from tests.support.loops import json_of, lowfc, refusal
@@ -78,17 +78,23 @@ def test_the_roles_of_a_run_with_a_router_are_those_of_its_certificates() -> Non
     assert set(re.findall(r"`(.*?)`", documented[1])) == {ROUTER, *certified}
 
 
+def test_a_list_stores_the_connection_of_a_run_that_answers(toml: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lowfc.adapters.bus.zenoh_bus.ZenohBus", Mock())
+    answers = {"camera": wire.Health(process="camera", run_id="bench")}
+    monkeypatch.setattr("lowfc.client.Client", lambda *_, **__: Mock(processes=lambda: answers))
+    for run in ("bnch", "bench"):
+        assert json_of("hosts", "--config", toml, "--run", run)["run"] == "bench"
+    assert runs() == ["bench"]
+
+
 @pytest.mark.usefixtures("own_runtime")
-def test_a_run_that_cannot_be_joined_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_cannot_be_joined_hides_no_other() -> None:
     bench = ZenohBus(open_run("bench").links, Role.CAMERA, HostClock())
     with socket.create_server(("127.0.0.1", 0)) as router, closing(bench):
         address = f"tls/127.0.0.1:{router.getsockname()[1]}"
         open_run("across", network=NETWORK.model_copy(update={"router": address}))
         listed = json_of("runs")
         text = lowfc("runs").stdout
-        monkeypatch.setattr("lowfc.programs.cli.runs.Client", lambda name: nullcontext(Mock(processes=dict)))
-        alone = lowfc("runs").stdout.splitlines()[0]
-    assert alone == "across  no controller; no process yet; not recording", "the absent are not starting"
     assert [one["run"] for one in listed["runs"]] == ["bench"]
     (why,) = listed["not_joined"].values()
     assert "ca.pem cannot be read" in why

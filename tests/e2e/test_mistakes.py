@@ -220,8 +220,7 @@ def test_an_interruption_or_a_fault_before_the_first_process_leaves_no_run(
     (open_run("night", listeners=(Role.LAUNCHER,)).path / "config.toml").mkdir()
     with pytest.raises(DataFileError, match=r"config.toml cannot be written"):
         sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
-    other_launcher = BusError("it was faster"), {"launcher"}
-    for fault, live in ((KeyboardInterrupt, set()), other_launcher):
+    for fault, live in ((KeyboardInterrupt, set()), (BusError("another was faster"), {"launcher"})):
         monkeypatch.setattr(sim_loop, "ZenohBus", Mock(side_effect=fault))
         monkeypatch.setattr(Links, "live", Mock(side_effect=[set(), live]))
         with pytest.raises((KeyboardInterrupt, BusError)):

@@ -124,7 +124,7 @@ def router(
 
 
 def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) -> None:
-    """List the processes of a run, and the clock offsets of their hosts from the router.
+    """List the processes of a run, and the clock offsets of their hosts from the router; store the connection to it.
 
     Example: lowfc hosts --config lowfc.toml --run bench
     """
@@ -141,7 +141,7 @@ def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) 
         run = the_known_run(run)
     run = run or DEFAULT_RUN  # with a router, all processes of the run may be on other hosts
     with ExitStack() as stack:
-        exists = run_path(run).is_dir()  # a list creates no run
+        exists = run_path(run).is_dir()  # a list without an answer creates no run
         base = None if exists else Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lowfc-")))
         mirrors = () if exists else (settings.mirror.name,)
         links = open_run(run, mirrors, base, network=settings.network).links
@@ -151,11 +151,14 @@ def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) 
         processes = Client(run, bus=bus).processes()
     if not processes:
         raise BusError(f"no process of run {run!r} reports its health")
+    name = next((health.run_id for health in processes.values() if health.run_id), run)  # the router has one run
     if links.network.router:
+        if name == run:
+            open_run(run, mirrors, network=settings.network)  # ctl and view now find it without the configuration
         for warning in ending_certificates(links.network, datetime.datetime.now(datetime.UTC)):
             sys.stderr.write(f"warning: {warning}\n")
     rows = [_host_process(health) for _, health in sorted(processes.items())]
-    print_result(HostsResult(run=run, processes=rows), as_json=as_json)
+    print_result(HostsResult(run=name, processes=rows), as_json=as_json)
 
 
 def _host_process(health: "wire.Health") -> HostProcess:

@@ -178,7 +178,7 @@ def controller_counts(health: wire.Health) -> dict[str, Any]:
     return {
         "frames_skipped": frames.skipped,
         "frames_missing": frames.missing,
-        "reasons": {reason_name(one.reason): one.count for one in health.counts if one.reason != Rejection.NO_FRAME},
+        "reasons": {reason_name(int(one.reason)): one.count for one in health.counts if one.reason != wire.REASON_NO_FRAME},
     }
 
 
