@@ -235,6 +235,9 @@ def test_work_before_the_first_cycle_does_not_affect_the_time_to_go() -> None:
     for done in (400, 500, 600):
         count("hadamard cycle", done, 1000)
     assert lines == ["hadamard cycle: 50%, about 15 s to go"]
+    with counting_bar(Console(file=(shown := StringIO()), force_terminal=True, width=80)) as count:
+        count("reading [/b].mcap", 1, 2)
+    assert "reading [/b].mcap" in shown.getvalue()
 
 
 def test_progress_of_several_tasks_in_turn_has_the_time_to_go_of_each() -> None:
@@ -247,13 +250,6 @@ def test_progress_of_several_tasks_in_turn_has_the_time_to_go_of_each() -> None:
         *("first: 50%, about 10 s to go", "second: 25%, about 15 s to go", "second: 75%, about 5 s to go"),
         "third: 50%, about 10 s to go",
     ]
-
-
-def test_a_bar_shows_brackets_in_its_description() -> None:
-    shown = StringIO()
-    with counting_bar(Console(file=shown, force_terminal=True, width=80)) as count:
-        count("reading [/b].mcap", 1, 2)
-    assert "reading [/b].mcap" in shown.getvalue()
 
 
 def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:

@@ -409,23 +409,6 @@ def test_the_flat_map_waits_for_a_mirror_that_starts_later(tmp_path: Path) -> No
     assert [one.name for one in controller._state.loop.command_channels.channels] == ["flat"]
 
 
-def test_requests_of_two_threads_are_published_in_turn(calibration: Calibration, tmp_path: Path) -> None:
-    hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), CONFIG)
-    other, course = threading.Thread(target=lambda: controller._carry_out_internal(Request(0, "safe"))), []
-
-    def received(_: Sample) -> None:
-        course.append("begins")
-        if other.ident is None:
-            other.start()
-            other.join(0.2)
-        course.append("ends")
-
-    MemoryBus(hub, "recorder", HostClock()).subscribe(REQUEST, received)
-    controller._carry_out_internal(Request(0, "safe"))
-    other.join()
-    assert course == ["begins", "ends"] * 2
-
-
 def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: Calibration, tmp_path: Path) -> None:
     hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     mirror, shape = MemoryBus(hub, "mirror-dm", HostClock()), wire.MirrorState(rows=1, columns=1, actuators=bytes(4))

@@ -132,18 +132,13 @@ def test_record_rotates_logs_and_reports_messages_and_losses(bench: Bench) -> No
     assert done["longest_unflushed_ms"] >= done["longest_wait_ms"] > 0
 
 
-def test_a_second_recorder_is_refused_and_leaves_the_configuration_of_the_run(
-    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_recording_can_be_stopped_without_a_controller_but_not_replaced(
+    own_runtime: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lowfc.programs.core.recording.process.set_up_below_loop", lambda *_: NOTHING)
-    other = tmp_path / "other.toml"
-    other.write_text(f"recorder.folder = '{tmp_path}'\n")
-    done = lowfc("record", "--run", bench.run.run_id, "--config", other)
-    assert "cannot listen" in str(done.exception)
+    (config := own_runtime / "other.toml").touch()
+    assert "cannot listen" in str(lowfc("record", "--run", bench.run.run_id, "--config", config).exception)
     assert not (bench.run.path / "config.toml").exists()
-
-
-def test_a_recording_can_be_stopped_without_a_controller(own_runtime: Path, bench: Bench) -> None:
     stopped = lowfc("ctl", "record", "stop", "--json")
     reader = LogReader(Path(json.loads(stopped.stdout)["log"]))
     assert (len(list(reader)) > 0, reader.complete) == (True, True)

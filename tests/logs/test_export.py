@@ -287,13 +287,6 @@ def test_a_failed_export_leaves_no_file(tmp_path: Path, to: Format, frame: Messa
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_frame_of_an_impossible_time_is_left_out(tmp_path: Path) -> None:
-    night = a_night()
-    night.samples.insert(0, night.samples[0]._replace(key=FRAME.key, payload=b"", receive_time_ns=1 << 63))
-    results = export_log(night.write(tmp_path / "night.mcap"), Format.NPZ, frames=True, console=QUIET)
-    assert results["frames"] == sum(one.key == FRAME.key for one in night.samples) - 1
-
-
 def test_invalid_exports_are_refused(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigurationError, match="cannot hold frames"):
         export_log(log, Format.CSV, frames=True, console=QUIET)

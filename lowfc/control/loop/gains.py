@@ -193,9 +193,7 @@ def check_offset(loop: ActiveLoop, largest_nm: npt.NDArray[np.floating[Any]]) ->
         return
     departure = np.linalg.norm(own @ loop.to_actuators - np.eye(len(own)), axis=0)
     for mode in np.array(loop.calibration.noll)[(departure > _MAX_DEPARTURE) & (largest_nm > 0)]:
-        raise ValueError(
-            f"offset of mode {mode}: R measures it only in part (--truncate, --tikhonov), so the loop would overshoot"
-        )
+        raise ValueError(f"offset of mode {mode}: R measures it only in part (--truncate): the loop would overshoot")
 
 
 _MAX_DEPARTURE = 0.1  # of what R measures of a mode from that mode, for an offset of it

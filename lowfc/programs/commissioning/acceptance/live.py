@@ -105,10 +105,8 @@ class Live:
         frames, columns = table.shape
         most = (max_bytes("play") - _OTHER_BYTES - basis.nbytes) // (table.itemsize * max(columns, 1))
         if columns and frames > most:
-            raise AcceptanceError(
-                f"a probe sequence of {columns} columns has at most {most} frames, {most / self.loop.rate_hz:.0f} s; "
-                f"this one would have {frames}: choose a shorter one"
-            )
+            longest_s = most / self.loop.rate_hz
+            raise AcceptanceError(f"a probe sequence of {columns} columns takes at most {longest_s:.0f} s: shorten it")
         self.set_mode(mode)
         before = self._state()
         steps, watch = self.client.steps(), self.client.mirror_watch()

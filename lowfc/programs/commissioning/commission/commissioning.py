@@ -138,10 +138,7 @@ class Commissioning:
                     f"{first_file} is for frames of {first.shape[0]} x {first.shape[1]} pixels, the camera's are "
                     f"{camera.shape[0]} x {camera.shape[1]}: omit --resume"
                 )
-            self._report(
-                f"resuming from {first_file}: camera, dark, reference image, orientation and sign are those of this "
-                "file; --dark, --no-dark and --frames have no effect"
-            )
+            self._report(f"resuming from {first_file} with its dark: --dark, --no-dark and --frames have no effect")
         else:
             first = self._first()
             calibration_file.save(first, first_file)

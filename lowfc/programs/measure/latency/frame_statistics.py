@@ -11,7 +11,7 @@ from lowfc.adapters.logs.columns import STAGES as TIMED
 from lowfc.adapters.logs.columns import rows_of
 from lowfc.arrays import Array, Long, Mask, Sequences
 from lowfc.contract.messages import FRAME, wire
-from lowfc.control.loop.safety import Rejection, reason_name
+from lowfc.control.loop.safety import reason_name
 from lowfc.programs.launch.watch import topic_count
 
 WARM_UP_S = 0.5
@@ -178,7 +178,7 @@ def controller_counts(health: wire.Health) -> dict[str, Any]:
     return {
         "frames_skipped": frames.skipped,
         "frames_missing": frames.missing,
-        "reasons": {reason_name(int(one.reason)): one.count for one in health.counts if one.reason != wire.REASON_NO_FRAME},
+        "reasons": {reason_name(one.reason): one.count for one in health.counts if one.reason != wire.REASON_NO_FRAME},
     }
 
 
