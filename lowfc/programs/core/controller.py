@@ -120,8 +120,8 @@ class Controller:
             self._arrays.publish(Request(now_ns, "load", calibration=calibration))
             self._apply_report(Load(now_ns, calibration, source))
         service.awaited = lambda: "" if self._state.frame_sequence else "a camera"
-        service.state = "ready"
 
+        self._service.state = "ready"  # from here on the service manager expects beats
     def run(self) -> None:
         """Do everything except frames, which the receiving thread processes; `_lock` serialises both."""
         self._camera.await_first()
