@@ -8,6 +8,7 @@ from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -185,13 +186,9 @@ def test_tuning_uses_the_steps_of_a_running_loop() -> None:
 
 
 class ReportingLoop(StreamedLoop):
-    """A loop whose mirror reports each command a fifth of a frame period after the end of the exposure.
+    """Its mirror reports each command a fifth of a period after the exposure; its camera's clock is 7 periods late."""
 
-    The clock of the camera's host is behind by seven periods.
-    """
-
-    def camera_lag_ns(self) -> int:
-        return 7 * PERIOD_NS
+    camera_lag_ns = Mock(return_value=7 * PERIOD_NS)
 
     def mirror_watch(self) -> Any:
         applied = [(frame_sequence(index), (index + 7) * PERIOD_NS + PERIOD_NS // 5) for index in range(4000, 5000)]

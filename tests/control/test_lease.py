@@ -160,14 +160,11 @@ def test_a_lease_ends_after_its_number_of_frames() -> None:
     assert not remaining_rows(state)
 
 
-def test_without_frames_a_lease_ends_by_the_clock() -> None:
+def test_without_frames_a_lease_ends_by_the_clock_and_before_the_next_request() -> None:
     state, all_outputs = feed(DEFAULTS, played(held(1.0)), Tick(S, 0), Tick(S + 1, 0))
     assert names(all_outputs) == ["LEASE_ENDED"]
     assert not remaining_rows(state)
-
-
-def test_an_expired_lease_ends_before_the_next_request() -> None:
-    _state, outputs = applied(held(1.0), Request(S + 1, "gain", values=(0.3,)))
+    _, outputs = applied(held(1.0), Request(S + 1, "gain", values=(0.3,)))
     check_reply(outputs, True)
     assert names([outputs]) == ["LEASE_ENDED"]
 

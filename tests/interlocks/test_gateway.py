@@ -14,12 +14,11 @@ import pytest
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import free_ports
 from lowfc.adapters.process.service import Service
-from lowfc.client import running
-from lowfc.client.bench import bench_message
+from lowfc.client import Client, running
 from lowfc.client.requests import DECLARED
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.messages import BENCH, CONTROLLER_STATE, HEALTH, STEP, wire
-from lowfc.control.loop.interlocks import Action, BenchReport, Interlock
+from lowfc.contract.messages import CONTROLLER_STATE, HEALTH, STEP, wire
+from lowfc.control.loop.interlocks import Action, Interlock
 from lowfc.programs.core.bench_values import BenchValues
 from lowfc.programs.gateway.variables import Kind, variables
 from lowfc.programs.gateway.watch import Watch
@@ -158,12 +157,12 @@ def test_a_silent_process_is_left_out() -> None:
 
 
 def test_a_value_queried_at_the_start_is_as_old_as_its_publication() -> None:
-    hub, clock, reports = MemoryHub(), FakeClock(), list[BenchReport]()
-    MemoryBus(hub, "operator", clock).publisher(BENCH, "mask").put(bench_message("mask", True, 0))
+    hub, clock, report = MemoryHub(), FakeClock(), Mock()
+    Client(bus=MemoryBus(hub, "operator", clock)).bench("mask", True)
     clock.advance(9)
     service = Service("controller", "night", clock, MemoryBus(hub, "controller", clock))
-    BenchValues(service, [Interlock("mask", "equal", False, Action.HOLD, 5)], reports.append).query()
-    assert [(one.value, one.age_ns) for one in reports] == [(True, 9)]
+    BenchValues(service, [Interlock("mask", "equal", False, Action.HOLD, 5)], report).query()
+    assert report.call_args.args[0].age_ns == 9
 
 
 def test_an_unreadable_step_leaves_the_one_before() -> None:

@@ -195,13 +195,10 @@ def test_a_wrong_delay_of_the_controller_is_found_and_corrected(runs: dict[str, 
 
 
 def test_the_clock_of_the_cameras_host_does_not_change_the_measured_delay(tmp_path: Path) -> None:
-    delays = []
-    for name, lag_ns in (("same", 0), ("other", 2 * toy.PERIOD_NS)):
-        night = SyntheticLog(truth=False).frames(100).health("camera", router_offset_ns=lag_ns)
-        night.samples = [one._replace(publish_time_ns=one.publish_time_ns + lag_ns) for one in night.samples]
-        run = LoggedRun(read_history(LogReader(night.write(tmp_path / f"{name}.mcap"))))
-        delays.append((run.measured_delay, run.timing.applied))
-    assert delays[0] == delays[1] == (2.0, pytest.approx(1.0, abs=0.1))
+    night = SyntheticLog(truth=False).frames(100).health("camera", router_offset_ns=2 * toy.PERIOD_NS)
+    night.samples = [one._replace(publish_time_ns=one.publish_time_ns + 2 * toy.PERIOD_NS) for one in night.samples]
+    run = LoggedRun(read_history(LogReader(night.write(tmp_path / "x.mcap"))))
+    assert (run.measured_delay, run.timing.applied) == (2.0, pytest.approx(1.0, abs=0.1))
 
 
 def test_a_configuration_file_gives_the_same_as_the_options(runs: dict[str, LoggedRun], tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from lowfc.adapters.logs.columns import (
 )
 from lowfc.adapters.logs.parts import WholeLog
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.arrays import Long, Mask, Sequences, Single
+from lowfc.arrays import Integers, Long, Mask, Sequences, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
@@ -158,10 +158,7 @@ class History:
         return exposure_fraction(self.camera)
 
     def camera_lag_ns(self, process: str) -> int:
-        """Time by which the camera's clock, that of the times of frames, is behind another process's; 0 on one host.
-
-        The recorder's clock is that of all publish times.
-        """
+        """Time to add to a frame's time for another process's clock; publish times are of the recorder's clock."""
         camera, other = (self.health.get(name, wire.Health()) for name in (Role.CAMERA, process))
         return camera.router_offset_ns - other.router_offset_ns
 
@@ -170,13 +167,8 @@ class History:
 
         A lockstep log has no times of application: commands are then applied with the first exposure wholly with them.
         """
-        rows = rows_of(self.mirror.sequence, self.steps.sequence)
-        known = rows >= 0
-        if not known.any():
-            return Timing.of(delay_frames, exposure)
-        ended_ns = self.steps.time_ns[rows[known]] + self.camera_lag_ns(Role.RECORDER)
-        waited_ns = self.mirror.publish_time_ns[known] - ended_ns
-        return Timing.measured(delay_frames, exposure, float(np.median(waited_ns)) * 1e-9 * self.rate_hz)
+        applied = self.mirror.sequence, self.mirror.publish_time_ns - self.camera_lag_ns(Role.RECORDER)
+        return measured_timing(Timing.of(delay_frames, exposure), self.steps, *applied, self.rate_hz)
 
     @property
     def under_calibration(self) -> Mask:
@@ -388,3 +380,12 @@ class _HistoryBuilder:
                 f"{history.log.path}: the message of its calibration is lost; the attached one is used"
             )
         return found
+
+
+def measured_timing(timing: Timing, steps: Steps, applied: Sequences, applied_ns: Integers, rate_hz: float) -> Timing:
+    """The timing by the mirror's reports: frame and time, on the camera's clock, of each applied command."""
+    rows = rows_of(applied, steps.sequence)
+    if not (rows >= 0).any():
+        return timing
+    waited_ns = (applied_ns - steps.time_ns[rows])[rows >= 0]
+    return Timing.measured(timing.delay, timing.exposure, float(np.median(waited_ns)) * 1e-9 * rate_hz)

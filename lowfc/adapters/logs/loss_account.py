@@ -1,5 +1,6 @@
 """Account of the messages of a recording: recorded and lost ones, by topic."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -130,18 +131,15 @@ class LossAccount:
 
     def recorded(self) -> dict[str, int]:
         """Number of messages recorded so far, by key, including keys whose messages were all lost."""
-        sums: dict[str, int] = {}
-        for key, tally in self._all():
-            sums[key] = sums.get(key, 0) + tally.recorded
-        return sums
+        return self._sum(lambda tally: tally.recorded)
 
     def lost(self) -> dict[str, int]:
         """Number of messages lost so far, by key, without keys that lost none."""
-        return self._sum(lambda tally: tally.lost)
+        return +self._sum(lambda tally: tally.lost)
 
     def newly_lost(self) -> dict[str, int]:
         """Messages lost since the last call, by key; one that arrives after its report offsets a later one."""
-        found = self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
+        found = +self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():
             tally.reported = max(tally.reported, tally.confirmed)
             tally.unconfirmed = tally.lost
@@ -161,11 +159,10 @@ class LossAccount:
     def _all(self) -> Iterator[tuple[str, _Tally]]:
         return ((key, tally) for (key, _), tallies in self._tallies.items() for tally in tallies.values())
 
-    def _sum(self, number: Callable[[_Tally], int]) -> dict[str, int]:
-        sums: dict[str, int] = {}
+    def _sum(self, number: Callable[[_Tally], int]) -> Counter[str]:
+        sums: Counter[str] = Counter()
         for key, tally in self._all():
-            if number(tally):
-                sums[key] = sums.get(key, 0) + number(tally)
+            sums[key] += number(tally)
         return sums
 
     def _author(self, topic: Topic, sample: Sample) -> str:

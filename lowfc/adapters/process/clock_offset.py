@@ -11,8 +11,6 @@ from typing import NamedTuple
 
 RECENT = 16
 """Number of compared exchanges: 8 s, in which two clocks drift apart by at most about 0.1 ms."""
-DRIFT_NS = 1_000_000
-"""More than that drift. Offsets of two exchanges that differ by more than their errors and this are of two clocks."""
 FIRST_EXCHANGES = 8
 """Number of exchanges before the first message is sent."""
 PERIOD_S = 0.5
@@ -41,8 +39,8 @@ class ClockOffset:
     def exchanged(self, queried_ns: int, theirs_ns: int, answered_ns: int) -> None:
         """Add one exchange: this host's time at query and receipt, and the other's time at its answer."""
         new = Exchange(theirs_ns - (queried_ns + answered_ns) // 2, answered_ns - queried_ns)
-        apart_ns = abs(new.offset_ns - self.offset_ns)
-        if self.best is not None and apart_ns > (new.round_trip_ns + self.best.round_trip_ns) // 2 + DRIFT_NS:
+        apart_ns = abs(new.offset_ns - self.offset_ns) - 1_000_000  # ten times the drift
+        if self.best is not None and apart_ns > (new.round_trip_ns + self.best.round_trip_ns) // 2:
             self._recent.clear()  # another clock, as after the other host's reboot
         self._recent.append(new)
         self.best = min(self._recent, key=lambda exchange: exchange.round_trip_ns)

@@ -86,7 +86,7 @@ class Service:
         self._fault: Exception | None = None
         self._names = Names()
         self._starts: dict[str, int] = {}  # by name; in containers a restarted process has its former id
-        self._known: set[tuple[str, int]] = set()
+        self._known: dict[str, int] = {}
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
         self._last_warning: Log | None = None
@@ -157,10 +157,8 @@ class Service:
 
     def has_newcomers(self) -> bool:
         """Whether a process has joined or restarted since the last call."""
-        there = set(self._starts.items())
-        new = not there <= self._known
-        self._known = there
-        return new
+        before, self._known = self._known, dict(self._starts)
+        return before != self._known
 
     def catch_signals(self) -> None:
         """Stop at SIGTERM and SIGINT; a SIGINT while stopping ends the process at once. For the main thread."""

@@ -121,9 +121,9 @@ class Controller:
             self._apply_report(Load(now_ns, calibration, source))
         service.awaited = lambda: "" if self._state.frame_sequence else "a camera"
 
-        self._service.state = "ready"  # from here on the service manager expects beats
     def run(self) -> None:
         """Do everything except frames, which the receiving thread processes; `_lock` serialises both."""
+        self._service.state = "ready"  # from here on the service manager expects beats
         self._camera.await_first()
         self._adopt_mirror()
         self._bench.query()

@@ -274,32 +274,31 @@ class Accumulator:
 
     def _read(self, topic: Topic, message: Sample) -> None:
         """Read a message of a topic that keeps them all; another number of modes restarts the rows."""
-        payload, publish_time_ns = message.payload, message.publish_time_ns
         if topic is STEP:
-            step = wire.ControlStep.FromString(payload)
+            step = wire.ControlStep.FromString(message.payload)
             time_ns = checked_time_ns(step.timestamp)
             if not self._steps.add(step):
                 self._steps = _added(StepRows(len(step.command_nm)), step)
             if NOT_NEW.isdisjoint(step.reasons):
-                self._set_data_time(time_ns, publish_time_ns)
+                self._set_data_time(time_ns, message.publish_time_ns)
         elif topic is TRUTH:
-            truth = wire.Truth.FromString(payload)
+            truth = wire.Truth.FromString(message.payload)
             checked_time_ns(truth.timestamp)
             if not self._truths.add(truth):
                 self._truths = _added(TruthRows(len(truth.residual_nm)), truth)
         elif topic is TIMING:
-            _added(self._timings, wire.ControlTiming.FromString(payload))
+            _added(self._timings, wire.ControlTiming.FromString(message.payload))
         elif topic is HEALTH:
-            name, health = self._names.health(message.key, payload)
+            name, health = self._names.health(message.key, message.payload)
             before, start_s = self._health.get(name), start_of(message.sequence)
             first = before.first if before is not None and before.start_s == start_s else health
-            self._health[name] = LastHealth(publish_time_ns, health, first, start_s)
+            self._health[name] = LastHealth(message.publish_time_ns, health, first, start_s)
         elif topic is EVENT:
-            event = Log.FromString(payload)
+            event = Log.FromString(message.payload)
             checked_time_ns(event.timestamp)
             self._events.append(event)
         else:
-            state = topic.message.FromString(payload)
+            state = topic.message.FromString(message.payload)
             if isinstance(state, wire.ControllerState):
                 checked_time_ns(state.mode_timestamp)
             self._states[topic] = decode_calibration(state) if isinstance(state, wire.Calibration) else state

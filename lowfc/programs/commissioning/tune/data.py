@@ -9,7 +9,7 @@ import numpy as np
 
 from lowfc.adapters.files.factory import contrast_of, frame_noise_nm2
 from lowfc.adapters.logs.columns import Steps, steps_as_columns
-from lowfc.adapters.logs.history import read_history
+from lowfc.adapters.logs.history import measured_timing, read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask, Single
 from lowfc.client import Client, MirrorWatch, configuration_of
@@ -137,23 +137,26 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
     stream.close()
     states.append(_state(loop))
     steps = _from_first_used(loop.run_id, steps_as_columns(received, len(calibration.noll)))
-    steps = replace(steps, time_ns=steps.time_ns + loop.camera_lag_ns())  # as the times of the mirror's reports
+    reports = np.array(() if watch is None else watch.applied, np.int64).reshape(-1, 2)
+    applied, applied_ns = reports[:, 0].astype(np.uint64), reports[:, 1] - loop.camera_lag_ns()
     period_s = float(np.median(np.diff(steps.time_ns))) * 1e-9 if len(steps.time_ns) > 1 else 0.0
     rate_hz = 1 / period_s if period_s > 0 else config.camera.rate_hz
-    assumed, measured = float(states[0].delay_frames), _measured_delay(steps, watch, config)
-    if measured is not None and measured < assumed:  # a delay after the mirror's report is not in these times
-        measured = None
+    assumed = float(states[0].delay_frames)
+    measured = delay_from_times(steps.sequence, steps.time_ns - config.exposure_ns, applied, applied_ns)
+    if config.lockstep or (measured is not None and measured < assumed):
+        measured = None  # time is simulated, or a delay after the mirror's report is not in these times
     seen = SeenCommands.of(steps, missing_before(steps.sequence), states, assumed, measured)
     played = np.zeros(steps.sequence.shape, np.bool_)
     for state in states:
         if state.HasField("play"):
             played |= during_probe(steps.sequence, state.play.first_sequence, state.play.frames)
     steps, usable = _without_probes(steps, seen, assumed, played)
+    timing = Timing.of(seen.delay_frames, config.camera.exposure_fraction)
     lost = [f"{counted(stream.lost, 'step')} lost on the way to this command"] if stream.lost else []
     return _telemetry(
         loop.run_id,
         rate_hz,
-        _timing(seen.delay_frames, config.camera.exposure_fraction, steps, watch, rate_hz),
+        measured_timing(timing, steps, applied, applied_ns, rate_hz),
         (integrator_of(states[-1]), driving(states[-1], loop.laws())),
         steps,
         usable,
@@ -197,24 +200,6 @@ def _delay_warnings(assumed: float, seen: SeenCommands, measured: float | None, 
         f"the controller assumed a delay of {counted(assumed, 'frame')}, but measured from {source} it is "
         f"{measured:.2f}: the law is made for {counted(seen.delay_frames, 'frame')}; set control.delay_frames"
     ]
-
-
-def _measured_delay(steps: Steps, watch: MirrorWatch | None, config: Configuration) -> float | None:
-    """Delay in frames from the mirror's latest reports; None without them, and in simulated time."""
-    if watch is None or config.lockstep or not watch.applied:
-        return None
-    applied, applied_ns = np.array(watch.applied, np.int64).T
-    return delay_from_times(steps.sequence, steps.time_ns - config.exposure_ns, applied.astype(np.uint64), applied_ns)
-
-
-def _timing(delay: float, exposure: float, steps: Steps, watch: MirrorWatch | None, rate_hz: float) -> Timing:
-    """Times at which commands are applied, from the mirror's latest reports."""
-    ended_ns = dict(zip(steps.sequence.tolist(), steps.time_ns.tolist(), strict=True))
-    applied = () if watch is None else watch.applied
-    waited_ns = [time_ns - ended_ns[sequence] for sequence, time_ns in applied if sequence in ended_ns]
-    if not waited_ns:
-        return Timing.of(delay, exposure)
-    return Timing.measured(delay, exposure, float(np.median(waited_ns)) * 1e-9 * rate_hz)
 
 
 def _telemetry(
