@@ -302,13 +302,6 @@ class Client:
                 found[name] = health
         return found
 
-    def camera_lag_ns(self) -> int:
-        """Time by which the camera's clock, that of the times of frames, is behind this host's; 0 on one host."""
-        offset = self._bus.offset
-        if offset is None:
-            return 0
-        return self.processes().get(Role.CAMERA, wire.Health()).router_offset_ns - offset.offset_ns
-
     def laws(self) -> dict[str, LinearLaw]:
         """The control law published last, by its identity, whether or not it drives the mirror; empty before any."""
         published = Published()

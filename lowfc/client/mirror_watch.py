@@ -24,11 +24,12 @@ class MirrorWatch:
             host's clock.
         interruption: clause on the last event since construction that ends a probe sequence: a mirror did not follow
             commands, or received none because frames stopped; empty without one.
+        offset: offset of the router's clock from this host's; None on one host.
     """
 
     def __init__(self, bus: Bus) -> None:
         """Subscribe to the mirrors' states and events; BusError if no mirror reports."""
-        self.interruption = ""
+        self.interruption, self.offset = "", bus.offset
         self.applied: deque[tuple[int, int]] = deque(maxlen=WAITING)
         self._events: Ring = bus.ring(EVENT, WAITING)
         self._states: Ring = bus.ring(MIRROR_STATE, WAITING)

@@ -188,11 +188,11 @@ def test_tuning_uses_the_steps_of_a_running_loop() -> None:
 class ReportingLoop(StreamedLoop):
     """Its mirror reports each command a fifth of a period after the exposure; its camera's clock is 7 periods late."""
 
-    camera_lag_ns = Mock(return_value=7 * PERIOD_NS)
+    processes = Mock(return_value={"camera": wire.Health(router_offset_ns=9 * PERIOD_NS)})
 
     def mirror_watch(self) -> Any:
         applied = [(frame_sequence(index), (index + 7) * PERIOD_NS + PERIOD_NS // 5) for index in range(4000, 5000)]
-        return SimpleNamespace(applied=applied, read=lambda: None)
+        return SimpleNamespace(applied=applied, read=lambda: None, offset=SimpleNamespace(offset_ns=2 * PERIOD_NS))
 
 
 def test_the_mirrors_reports_give_the_time_of_application() -> None:
@@ -230,7 +230,7 @@ class SteppedLoop(StreamedLoop):
 
     def mirror_watch(self) -> Any:
         applied = [(step.frame_sequence, step.time_ns + self.report_ns) for step in self.recorded[-1024:]]
-        return SimpleNamespace(applied=applied, read=lambda: None)
+        return SimpleNamespace(applied=applied, read=lambda: None, offset=None)
 
 
 def closed_loop(disturbance_nm: np.ndarray, delay_frames: int) -> list[Step]:

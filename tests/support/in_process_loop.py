@@ -103,7 +103,7 @@ class InProcessLoop(Client):
         self._bench = Bench(config, flat if calibration is None else calibration, world=world)
         self.scene = self._bench.scene
         self.hub = MemoryHub()
-        self._bus = self._operator = OperatorBus(self)
+        self._operator = OperatorBus(self)
         self.start_mirror()
         self._lose = lose
         self._listeners: list[tuple[str, deque[Any]]] = []

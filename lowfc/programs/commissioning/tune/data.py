@@ -17,7 +17,7 @@ from lowfc.contract.codecs.law_codec import driving, integrator_of
 from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, DataFileError
-from lowfc.contract.messages import wire
+from lowfc.contract.messages import Role, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.integrator import Integrator
@@ -138,7 +138,10 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
     states.append(_state(loop))
     steps = _from_first_used(loop.run_id, steps_as_columns(received, len(calibration.noll)))
     reports = np.array(() if watch is None else watch.applied, np.int64).reshape(-1, 2)
-    applied, applied_ns = reports[:, 0].astype(np.uint64), reports[:, 1] - loop.camera_lag_ns()
+    applied, applied_ns = reports[:, 0].astype(np.uint64), reports[:, 1]
+    if watch is not None and watch.offset is not None:  # on the clock of the camera's host, as the times of frames are
+        camera = loop.processes().get(Role.CAMERA, wire.Health())
+        applied_ns += watch.offset.offset_ns - camera.router_offset_ns
     period_s = float(np.median(np.diff(steps.time_ns))) * 1e-9 if len(steps.time_ns) > 1 else 0.0
     rate_hz = 1 / period_s if period_s > 0 else config.camera.rate_hz
     assumed = float(states[0].delay_frames)
