@@ -38,7 +38,7 @@ def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> 
         finally:
             part.unlink(missing_ok=True)
     except OSError as error:
-        raise DataFileError(f"{path} cannot be written: {error.strerror or error}") from error
+        raise DataFileError(f"{path} cannot be written: {error.strerror or f'is the disk full? {error}'}") from error
 
 
 def write_whole(path: Path, content: bytes, source: Path | None = None, mode: int = 0o666) -> None:
