@@ -19,3 +19,8 @@ def printable(text: str, keep: str = "") -> str:
         else character
         for character in text
     )
+
+
+def encodable(text: str) -> str:
+    """Text with the bytes of a file name that are not UTF-8 as escapes: messages and logs are UTF-8."""
+    return text.encode(errors="backslashreplace").decode()

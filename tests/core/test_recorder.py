@@ -63,15 +63,16 @@ def test_everything_is_recorded_verbatim(bench: Bench) -> None:
 @pytest.mark.parametrize("camera_present", [False, True])
 def test_a_log_of_a_run_without_other_processes_is_removed(tmp_path: Path, camera_present: bool) -> None:
     hub, clock = MemoryHub(), HostClock()
-    recorder = Recorder(MemoryBus(hub, "recorder", clock), clock, "bnch", tmp_path / "logs", metadata={})
+    folder = tmp_path / "caf\udce9"  # in Latin-1
+    recorder = Recorder(MemoryBus(hub, "recorder", clock), clock, "bnch", folder, metadata={})
     thread = threading.Thread(target=recorder.run, daemon=True)
     thread.start()
-    until(lambda: list((tmp_path / "logs").glob("*.part")))
+    until(lambda: list((folder).glob("*.part")))
     if camera_present:  # a camera without Health that starts after the recorder
         MemoryBus(hub, "camera", clock).publisher(FRAME).put(b"a frame")
     recorder.service.stop("end of the test")
     thread.join(PATIENCE_S)
-    assert len(list((tmp_path / "logs").iterdir())) == camera_present
+    assert len(list((folder).iterdir())) == camera_present
     assert len(recorder.service.health().recording.files) == camera_present
 
 

@@ -79,9 +79,9 @@ def test_rerun_reads_recovered_logs_completely(recovered: dict[Path, Counter[str
 
 
 def test_an_unfinished_log_is_completed(tmp_path: Path) -> None:
-    part = small_log(tmp_path / "night.mcap", finished=False)
+    part = small_log(tmp_path / "caf\udce9.mcap", finished=False)
     before = part.read_bytes()
-    new = tmp_path / "night-recovered.mcap"
+    new = tmp_path / "caf\udce9-recovered.mcap"
     assert json_of("recover", part) == {
         "log": str(part),
         "bytes": len(before),
@@ -92,7 +92,7 @@ def test_an_unfinished_log_is_completed(tmp_path: Path) -> None:
         "damage": [],
     }
     assert part.read_bytes() == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["night-recovered.mcap", "night.mcap.part"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["caf\udce9-recovered.mcap", "caf\udce9.mcap.part"]
     old, copy = LogReader(part), LogReader(new)
     assert contents(list(copy)) == contents(list(old)) == contents(small_samples())
     assert copy.records[:-1] == old.records

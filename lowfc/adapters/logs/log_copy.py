@@ -14,6 +14,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.writer import begun_writer
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import DataFileError
+from lowfc.contract.printable import encodable
 
 
 class LogCopy:
@@ -31,7 +32,7 @@ class LogCopy:
 
     def add_metadata(self, name: str, entries: dict[str, str]) -> None:
         """Add metadata."""
-        self._writer.add_metadata(name, entries)
+        self._writer.add_metadata(name, {key: encodable(value) for key, value in entries.items()})
 
     def add_file(
         self,

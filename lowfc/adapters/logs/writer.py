@@ -29,6 +29,7 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Topic, topic_of
+from lowfc.contract.printable import encodable
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -196,7 +197,7 @@ class LogWriter:
 
     def _describe(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
         for name, entries in metadata.items():
-            self._writer.add_metadata(name, dict(entries))
+            self._writer.add_metadata(name, {key: encodable(value) for key, value in entries.items()})
 
     def _flush(self) -> None:
         self._writer.flush()  # type: ignore[no-untyped-call]

@@ -18,6 +18,7 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import Role
 from lowfc.contract.network import Section
+from lowfc.contract.printable import printable
 
 _HEADER = (
     "# Keys after a # have their defaults; remove the # to set a value. For keys that are not set, a command may use",
@@ -110,7 +111,7 @@ def config_check(
         analytic(settings, Console(stderr=True))
     else:
         load_calibration(calibration)
-    typer.echo(f"{config}: fine")
+    typer.echo(f"{printable(str(config))}: fine")
 
 
 def config_zenoh(

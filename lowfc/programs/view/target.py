@@ -9,6 +9,7 @@ import rerun as rr
 from lowfc.adapters.bus.run import free_ports
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show, has_screen
 from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.printable import encodable
 from lowfc.programs.view.draw.tabs import Tab
 from lowfc.programs.view.layout import APPLICATION, layout
 
@@ -44,6 +45,8 @@ class Target:
         for option, (file, suffix) in files.items():
             if file is not None and file.suffix != suffix:
                 raise ConfigurationError(f"{option} requires a file name that ends in {suffix}; got {file}")
+        if encodable(str(self.save)) != str(self.save):
+            raise ConfigurationError(f"--save: rerun writes only files with a name in UTF-8; got {self.save}")
         if self.port and self.port == self.web_port:
             raise ConfigurationError(f"--port and --web-port must differ; both are {self.port}")
         if self.port and self.show is None:
@@ -79,7 +82,7 @@ class Target:
 
         Data that the viewer does not read is buffered; when the buffer is full, the stream blocks.
         """
-        stream = rr.RecordingStream(APPLICATION, recording_id=recording)
+        stream = rr.RecordingStream(APPLICATION, recording_id=encodable(recording))
         stream.set_log_time_enabled(False)  # one timeline, that of the data
         stream.set_log_tick_enabled(False)
         if viewer is not None:

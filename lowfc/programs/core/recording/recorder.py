@@ -25,6 +25,7 @@ from lowfc.adapters.process.realtime import NOTHING, Granted
 from lowfc.adapters.process.service import Service
 from lowfc.contract.errors import BadMessageError, DataFileError
 from lowfc.contract.messages import EVENT, HEALTH, RECORD_KEY, TOPICS, Role, Topic, timestamp, wire
+from lowfc.contract.printable import encodable
 from lowfc.programs.core.recording.peers import Peers
 from lowfc.programs.core.recording.summary import Summary
 from lowfc.programs.core.recording.volume import growth_in_words
@@ -75,7 +76,7 @@ class Recorder:
         self._account = LossAccount()
         self._selection = selection
         self._folder, self._min_free_bytes = folder, limits.min_free_bytes
-        self._present_folder = str(Path.cwd())  # it may be removed later
+        self._present_folder = encodable(str(Path.cwd()))  # it may be removed later
         self._expect, self._expected_bytes_per_s = expected_bytes_per_s, 0.0
         self._series = LogSeries(folder, clock, {**metadata, **selection.metadata}, attachments, limits)
         self._peers = Peers(bus)
@@ -173,14 +174,14 @@ class Recorder:
             if refusal is None:
                 return
             self._queries.popleft()
-            path = str(self._series.files[-1].absolute()) if self._series.files else ""
+            path = encodable(str(self._series.files[-1].absolute())) if self._series.files else ""
             estimate = self._estimate() if query.name == "start" and not refusal else ""
             answer = wire.Request(
                 timestamp=timestamp(self._clock.now_ns()),
                 name=query.name,
                 text=path,
                 accepted=not refusal,
-                reply=refusal or "; ".join(filter(None, (f"{_DONE[query.name]} {path}", estimate))),
+                reply=encodable(refusal) or "; ".join(filter(None, (f"{_DONE[query.name]} {path}", estimate))),
             )
             query.reply(answer.SerializeToString())
 
@@ -358,12 +359,12 @@ class Recorder:
 
     def _fill_health(self, health: wire.Health) -> None:
         lost = self._account.lost()
-        health.recording.files.extend(map(str, self._series.files[-MAX_HEALTH_LOGS:]))
+        health.recording.files.extend(encodable(str(file)) for file in self._series.files[-MAX_HEALTH_LOGS:])
         health.recording.file = health.recording.files[-1] if health.recording.files else ""
         health.recording.folder = self._present_folder
         health.recording.messages = self._series.messages
         health.recording.lost = sum(lost.values())
-        health.recording.failure = self._failure
+        health.recording.failure = encodable(self._failure)
         health.recording.stopped = self._paused and not self._failure
         health.recording.bytes = self._series.bytes_written
         counts = {count.topic: count for count in health.topics}  # already has this process's sent counts

@@ -1,5 +1,6 @@
 """The command `lowfc report`."""
 
+import json
 import sys
 from functools import partial
 from pathlib import Path
@@ -40,7 +41,7 @@ def report(
 
 
 def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
-    from pydantic_core import to_json
+    from pydantic_core import to_jsonable_python
     from rich.console import Console
     from rich.progress import TimeElapsedColumn
 
@@ -66,7 +67,7 @@ def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
         sys.stderr.write(f"warning: {remark}\n")
     if as_json:
         # A log may hold values that JSON cannot represent, such as NaN.
-        sys.stdout.write(to_json(found.results, inf_nan_mode="null").decode() + "\n")
+        sys.stdout.write(json.dumps(to_jsonable_python(found.results, inf_nan_mode="null")) + "\n")
     else:
         verdict = found.results["verdict"]
         because = f": {verdict['because']}" if verdict["because"] else ""
