@@ -90,7 +90,7 @@ class Control(Section):
     """Action after a frame timeout: hold the command, or relax the mirror to flat."""
     command_timeout_ms: float = Field(200.0, gt=0, le=1e9)
     """Time without a new command after which the mirror's last command expires; more than 2000 acts as 2000."""
-    max_start_ahead_h: float = Field(24.0, ge=0)
+    max_start_ahead_h: float = Field(24.0, ge=0, le=1e9)
     """Hours by which a start time in the sequence of a camera or controller may be ahead of this host's clock; 0: no
     limit, for a host whose clock is not set."""
     min_flux_fraction: float = Field(0.2, ge=0, lt=1)
@@ -161,7 +161,7 @@ class Recorder(Section):
     LOWFC_PROCESS, LOWFC_TIME, LOWFC_RUN and LOWFC_OTHERS; empty for none."""
     on_event_level: Literal["info", "warning", "error"] = "error"
     """Lowest event level that runs the command."""
-    on_event_every_s: float = Field(10.0, ge=0)
+    on_event_every_s: float = Field(10.0, ge=0, le=1_000_000)
     """Shortest time from the end of the command to its next run, which reports the most severe event since then;
     LOWFC_OTHERS is the number of others."""
 

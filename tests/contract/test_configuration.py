@@ -116,6 +116,8 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(
         ("camera.rate_hz", float("nan")),
         ("camera.rate_hz", 1e-15),
         ("control.max_frame_age_ms", 1e10),
+        ("control.max_start_ahead_h", 1e306),
+        ("recorder.on_event_every_s", 1e10),
         ("control.frame_timeout_ms", 1e10),
         ("control.command_timeout_ms", 1e10),
         ("realtime.camera_cpus", [10**20]),
