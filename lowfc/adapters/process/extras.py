@@ -26,4 +26,6 @@ def package_required(what: str, extra: str) -> Iterator[None]:
     try:
         yield
     except ImportError as fault:
+        if isinstance(fault.__cause__, KeyboardInterrupt):  # Ctrl-C in the initialisation of a compiled module
+            raise fault.__cause__ from None
         raise ConfigurationError(f"{what}, which is missing ({fault}); install: {install_advice(extra)}") from None
