@@ -61,7 +61,7 @@ class CameraLoop:
         """
         service = self._service
         step = getattr(self._driver, "step", _NO_EXTRAS.step) if service.clock.lockstep else _NO_EXTRAS.step
-        with self.watch.over(self._close):
+        with self.watch.over(self._driver.close, self._fill_extra):
             service.require(wait_for, WAIT_S, "the camera will not start without")
             service.awaited = lambda: "" if service.work else "the camera's first frame"
             service.state = "running"
@@ -80,12 +80,6 @@ class CameraLoop:
         self._lost_due_ns = 0  # those of the last half second, too
         self._report_lost()
         service.finish()
-
-    def _close(self) -> None:
-        try:
-            self._fill_extra = self.watch.last_fields(self._fill_extra)
-        finally:
-            self._driver.close()
 
     def _next_frame(self) -> tuple[Pixels, int] | None:
         """Pixels of the next exposure and the run's time of its end; None if there is no frame."""
@@ -161,8 +155,10 @@ class CameraLoop:
             if step == 0:
                 raise ValueError(f"it returned frame number {number} twice")
             max_step = MAX_LOST_FRAMES + MAX_RATE_RATIO * (now_ns - self._number_ns) // settings.period_ns
-            if step > max_step:
-                self._restart()
+            if step > max_step:  # a restart: the controller then waits for the settings
+                self._service.bus.restart()
+                self._settings = None
+                self._publish_settings()
             else:
                 lost += step - 1
         self._number, self._number_ns = number, now_ns
@@ -170,12 +166,6 @@ class CameraLoop:
             self._frames.published += lost
             self._frames.skipped += lost
             self._lost += lost
-
-    def _restart(self) -> None:
-        """Restart the publishers of frames and settings; the controller then waits for the settings."""
-        self._service.bus.restart()
-        self._settings = None
-        self._publish_settings()
 
     def _report_lost(self) -> None:
         """Report lost frames, one event per half second."""
@@ -199,4 +189,4 @@ class CameraLoop:
         if (elapsed_ns := self._last_put_ns - self._first_put_ns) > 0:
             health.mean_rate_hz = (self._service.work - 1) * 1e9 / elapsed_ns
         health.driver_failures = self.watch.failures
-        self.watch.call(self._fill_extra, health)
+        self.watch.fill(self._fill_extra, health)

@@ -127,7 +127,7 @@ class MirrorLoop:
     def run(self) -> None:
         """Run the command timeout and the recovery from faults; the receive thread applies commands."""
         service = self._service
-        with self.watch.over(self._close):
+        with self.watch.over(self._close, self._fill_extra):
             while service.running:
                 time.sleep(TICK_NS * 1e-9)
                 free = self._turn.acquire(timeout=TICK_NS * 1e-9)
@@ -143,12 +143,9 @@ class MirrorLoop:
     def _close(self) -> None:
         self._leave()
         free = self._turn.acquire(timeout=CLOSE_S)  # over a router, a command may still be with the driver
-        try:
-            self._fill_extra = self.watch.last_fields(self._fill_extra)
-        finally:
-            self._driver.close()
-            if free:
-                self._turn.release()
+        self._driver.close()
+        if free:
+            self._turn.release()
 
     def _arrived(self, sample: Sample) -> None:
         """Handle a command on the receive thread; superseded commands are skipped."""
@@ -280,7 +277,7 @@ class MirrorLoop:
         health.command_expired = bool(status.received_ns) and not status.following
         health.limits_hit.extend(reason.value for reason in status.limits_hit)  # type: ignore[misc]
         health.driver_failures = self.watch.failures
-        self.watch.call(self._fill_extra, health)
+        self.watch.fill(self._fill_extra, health)
 
 
 def state_of(status: Status, time_ns: int, refused: Reason | None = None, *, known: bool = True) -> wire.MirrorState:

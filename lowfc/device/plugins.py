@@ -78,16 +78,13 @@ def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = 
 
 
 def faults(config: Configuration, folder: Path) -> list[str]:
-    """List the faults of the sections [drivers.NAME] of a configuration whose file is in `folder`, a sentence each.
-
-    An unknown name is a fault only if it resembles that of an installed driver, or cannot be that of a file, which may
-    be in any folder.
-    """
+    """List the faults of the sections [drivers.NAME] of a configuration whose file is in `folder`, a sentence each."""
     found, files = [], {one.stem for here in (folder, Path.cwd()) for one in here.glob("*.py")}
     for name in config.drivers:
         kinds = [kind for kind in KINDS if name in installed(kind)]
         module = name.partition(".")[0]
         importable = module in sys.modules or importlib.util.find_spec(module) is not None
+        # an unknown name may be that of a file in any other folder
         similar = nearest(name, {*installed("camera"), *installed("mirror")})
         if not kinds and name not in files and not importable and (similar or not module.isidentifier()):
             found.append(

@@ -79,13 +79,13 @@ class DriverWatch:
         self._hanging = hanging
         self._calls = self._checked_call = self._checks = self._consecutive = self._series = 0
         self._in_call = False
-        self._kind, self._reported_ns = "", 0
+        self._kind, self._reported_ns, self._fields = "", 0, wire.Health()
         self._closed = threading.Event()
         self._ending = threading.Lock()  # a call does not end while it is being reported as hanging
 
     @contextmanager
-    def over(self, close: Callable[[], None]) -> Iterator[None]:
-        """Watch on a separate thread; close the driver at the end of the block in any case."""
+    def over(self, close: Callable[[], None], fill: Callable[[wire.Health], None]) -> Iterator[None]:
+        """Watch on a separate thread; at the end of the block, call `fill` for the last Health and close the driver."""
         threading.Thread(target=self._run_checks, name="driver's watch", daemon=True).start()
         try:
             yield
@@ -93,6 +93,8 @@ class DriverWatch:
             self.timeout_s = max(self.timeout_s, CLOSE_S)
             self.begin()
             try:
+                with suppress(LowfcError):
+                    self.fill(fill, wire.Health())
                 close()
                 self.returned()
             except Exception as fault:
@@ -126,11 +128,12 @@ class DriverWatch:
         except Exception as fault:
             self._report(fault)
 
-    def last_fields(self, fill: Callable[[wire.Health], None]) -> Callable[[wire.Health], None]:
-        """Call the driver's `fill` for the last time; the result adds its fields to a Health after `close`."""
-        last = wire.Health()
-        self.call(fill, last)
-        return lambda health: health.MergeFrom(last)
+    def fill(self, fill: Callable[[wire.Health], None], health: wire.Health) -> None:
+        """Add the driver's fields to a Health; once the driver is closed, the last ones."""
+        if not self._closed.is_set():
+            self._fields.Clear()
+            self.call(fill, self._fields)
+        health.MergeFrom(self._fields)
 
     def failed(self, fault: Exception) -> None:
         """Note that a call raised or returned an invalid result; a `LowfcError`, for the user, is raised again."""

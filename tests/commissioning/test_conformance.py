@@ -468,20 +468,14 @@ def test_an_interrupted_check_returns_the_mirror_to_its_shape() -> None:
 
 
 @pytest.mark.parametrize(("dead", "untested"), [([9, 17], {}), ([*range(24), *range(25, 42)], {"stroke": WARNING})])
-def test_configured_dead_and_stuck_actuators_are_no_fault(dead: list[int], untested: dict[str, str]) -> None:
-    config = load(None, {**SMALL, "mirror.dead": dead, "mirror.stuck_nm": {"24": 30.0}})
-    free = Mirror()
+def test_actuators_configured_as_fixed_are_no_fault(dead: list[int], untested: dict[str, str], tmp_path: Path) -> None:
+    active, file = np.arange(42).reshape(6, 7) % 7 < 5, str(tmp_path / "active.npy")
+    np.save(file, active.astype(float))
+    config = load(None, SMALL | {"mirror.dead": dead, "mirror.stuck_nm": {"24": 30.0}, "mirror.active": file})
+    free = Mirror(state=shaped(lambda shape: shape * active))
     free.mirror = Simulated(config)
     free.status = free.mirror.initial
     assert of_mirror(free, config) == untested
-
-
-def test_inactive_actuators_are_no_fault(tmp_path: Path) -> None:
-    active = np.ones((6, 7), np.float32)
-    active[:, 4:] = 0
-    np.save(tmp_path / "active.npy", active)
-    config = load(None, {**SMALL, "mirror.active": str(tmp_path / "active.npy")})
-    assert of_mirror(Mirror(state=shaped(lambda shape: shape * active)), config) == {}
 
 
 def test_the_report_has_advice_for_failed_checks(capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from threading import Event, Thread, Timer
+from threading import Timer
 from typing import Any
 from unittest.mock import Mock, patch
 
@@ -386,23 +386,12 @@ def test_a_mirror_starts_from_the_position_that_its_driver_reads() -> None:
 
 
 def test_a_driver_is_closed_after_its_last_command_and_called_no_more() -> None:
-    mirror, calls, begun, end = Mirror(), list[str](), Event(), Event()
+    mirror, calls = Mirror(), list[str]()
     mirror.fill = lambda _: calls.append("fill")  # type: ignore[attr-defined]
     mirror.close = lambda: calls.append("close")  # type: ignore[method-assign]
     bench = Bench(mirror)
-
-    def slow(shape: Single) -> Single:
-        begun.set()
-        end.wait(5)
-        calls.append("applied")
-        return shape
-
-    mirror.plan = [slow]
-    commanding = Thread(target=bench.command, args=(30.0,))
-    commanding.start()
-    begun.wait(5)
     bench.service.stop("the test")
-    Timer(0.1, end.set).start()
+    bench.loop._turn.acquire()  # a command is with the driver
+    Timer(0.1, lambda: (calls.append("applied"), bench.loop._turn.release())).start()
     bench.loop.run()
-    commanding.join()
-    assert calls[-3:] == ["applied", "fill", "close"]
+    assert calls[-3:] == ["fill", "applied", "close"]

@@ -81,14 +81,13 @@ def test_settings_default_to_the_configuration() -> None:
 class Buffers:
     """Stand-in for a stream of aravis: buffers of 2 x 3 pixels with the given frame numbers; 0 for a failed buffer."""
 
-    def __init__(self, *numbers: int) -> None:
-        self.numbers, self.pushed, self.waiting = list(numbers), 0, 0
+    def __init__(self, *numbers: int, later: int = 99) -> None:
+        self.numbers, self.pushed, self.later = list(numbers), 0, later
 
     def timeout_pop_buffer(self, wait_us: int) -> Any:
         if not self.numbers:
             return None
         number = self.numbers.pop(0)
-        self.waiting -= 1
         data = np.arange(6, dtype="<u2").tobytes()
         methods = {
             "get_status": "whole" if number else "missing-packets",
@@ -101,15 +100,14 @@ class Buffers:
         return SimpleNamespace(**{name: lambda value=value: value for name, value in methods.items()})
 
     def get_n_buffers(self) -> tuple[int, int]:
-        return 32, max(0, self.waiting)
+        return 32, len(self.numbers) - self.later
 
     def push_buffer(self, buffer: Any) -> None:
         self.pushed += 1
 
 
 def test_gige_frame_numbers_wrap_to_one_and_buffers_are_returned() -> None:
-    driver, stream = object.__new__(AravisCamera), Buffers(65531, 65532, 65533, 65534, 65535, 0, 2)
-    stream.waiting = 5  # after a stall
+    driver, stream = object.__new__(AravisCamera), Buffers(65531, 65532, 65533, 65534, 65535, 0, 2, later=2)
     driver._aravis = SimpleNamespace(BufferStatus=SimpleNamespace(SUCCESS="whole"))
     driver._settings, driver._stream = GenicamOptions(rows=2, columns=3).settings(CONFIG), stream
     driver._camera = SimpleNamespace(start_acquisition=lambda: None, stop_acquisition=lambda: None)

@@ -44,7 +44,7 @@ class OtherChannels:
         self._grid = grid
         self._streams: dict[Path, Stream] = {}
         self._searched_s = -_SEARCH_S
-        self._counts: dict[Stream, int] = {}
+        self._counts: dict[Stream, tuple[int, bool]] = {}
         self._shapes: dict[Stream, Single | None] = {}
         self._sum: Single = np.zeros(grid, np.float32)
         self._misfits: list[str] = []
@@ -75,7 +75,7 @@ class OtherChannels:
                 except StreamError as fault:
                     self._misfits.append(str(fault))
         self._streams = current
-        counts = {stream: _complete_count(stream) for stream in self._streams.values()}
+        counts = {stream: (stream.count, stream.writing) for stream in self._streams.values()}
         if counts != self._counts:
             self._shapes = {
                 stream: complete_shape(stream, self._shapes.get(stream, stream.data[0].astype(np.float32)))
@@ -102,12 +102,6 @@ def opened(path: Path, grid: tuple[int, int]) -> Stream:
 def fits(stream: Stream, grid: tuple[int, int]) -> bool:
     """Whether a stream holds float32 shapes (rows, columns)."""
     return stream.layout.dtype == np.float32 and stream.layout.shape == (1, *grid)
-
-
-def _complete_count(stream: Stream) -> int:
-    """Number of images written; -1 while one is being written: `sum` reads it once it is complete."""
-    count = stream.count
-    return -1 if stream.writing else count
 
 
 def complete_shape(stream: Stream, otherwise: Single | None = None) -> Single | None:

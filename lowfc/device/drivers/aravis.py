@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.device import CameraSettings, Configuration, ConfigurationError, Exposure, Need
-from lowfc.device.drivers.genicam import WAIT_MS, GenicamOptions
+from lowfc.device.drivers.genicam import QUEUED, WAIT_MS, GenicamOptions
 
 ADVICE = (
     "Debian: apt install gir1.2-aravis-0.8 python3-gi; then make the package gi visible to this Python, with an "
@@ -15,8 +15,6 @@ ADVICE = (
     "with a link to /usr/lib/python3/dist-packages/gi in its site-packages"
 )
 _BUFFERS = 32
-_QUEUED = 2
-"""Frames read after a stall; older ones are dropped and counted as lost: all of them saw the same mirror shape."""
 
 
 def _aravis() -> Any:
@@ -73,7 +71,7 @@ class AravisCamera:
         buffer = self._stream.timeout_pop_buffer(WAIT_MS * 1000)
         if buffer is None:
             return None
-        while self._stream.get_n_buffers()[1] >= _QUEUED:  # those that wait to be read
+        while self._stream.get_n_buffers()[1] >= QUEUED:
             self._stream.push_buffer(buffer)
             buffer = self._stream.timeout_pop_buffer(0)
         try:

@@ -12,6 +12,8 @@ FRAME_ID_WRAP = 65535
 """GigE Vision counts frames from 1 to 65535, then from 1 again; 64-bit numbers are reduced modulo 65535."""
 WAIT_MS = 500
 """Longest wait for a frame."""
+QUEUED = 2
+"""Frames read after the process was stopped; older ones are dropped and counted: all saw the same mirror shape."""
 
 
 class GenicamOptions(DriverOptions):

@@ -20,8 +20,6 @@ Setting = Literal[
 ]
 _INTEGERS = ("region_row", "region_column")
 _WAIT_S = 0.5
-_SILENT_PERIODS = 2
-"""Periods without an image, and at least `_WAIT_S`, after which the stream is reported as silent."""
 _FULL_DN = 65535
 
 
@@ -98,8 +96,7 @@ class IsioCamera:
         """Next image of the stream."""
         image = self._reader.next(_WAIT_S)
         if image is None:
-            silent_s = time.monotonic() - self._image_s
-            if not self._silent and silent_s >= _SILENT_PERIODS * self._settings.period_ns * 1e-9:
+            if not self._silent and time.monotonic() - self._image_s >= 2e-9 * self._settings.period_ns:
                 self._silent = True
                 self._service.event("STREAM_SILENT", stream=self._options.stream, why=self._reader.silence_cause())
             return None

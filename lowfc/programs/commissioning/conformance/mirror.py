@@ -176,8 +176,7 @@ def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wir
         return ok(f"within {float(off_nm.max()):.2g} nm")
     got = f"{away.size} of {off_nm.size} actuators off, by {float(off_nm.max()):.3g} nm at most"
     if away.size <= off_nm.size // 10:
-        named = ", ".join(map(str, away[:8]))
-        return warning(got, f"are they dead? Exclude them in the map mirror.active (row * columns + column): {named}")
+        return warning(got, f"are they dead? Exclude them in the map mirror.active: {', '.join(map(str, away[:8]))}")
     return wrong(got, _difference(base_nm, commanded_nm, where_nm))
 
 

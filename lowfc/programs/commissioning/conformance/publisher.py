@@ -7,7 +7,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import nearest
-from lowfc.contract.messages import EVENT, HEALTH, TOPICS, from_timestamp, topic_of, wire
+from lowfc.contract.messages import EVENT, HEALTH, TOPICS, from_timestamp, wire
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.connection import NS, Collected
@@ -122,16 +122,9 @@ def _health(device: Collected) -> Check:
 @PROCESS.check("topics", "only keys of the table of topics")
 def _topics(device: Collected) -> Check:
     keys = {message.key for message in device.messages}
-    unknown = sorted(key for key in keys if not _known(key))
+    unknown = sorted(key for key in keys if not any(topic.matches(key) for topic in TOPICS))
     if not unknown:
         return ok(f"{len(keys)} keys")
     known = [topic.key for topic in TOPICS if topic is not EVENT]  # a short key, near to many unknown ones
     got = ", ".join(f"{key}{nearest(key, known)}" for key in unknown)
     return wrong(got, "publish under the keys of the table; no process subscribes to others")
-
-
-def _known(key: str) -> bool:
-    try:
-        return bool(topic_of(key))
-    except KeyError:
-        return False
