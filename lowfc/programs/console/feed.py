@@ -111,7 +111,7 @@ class Feed(Monitor):
 
     def _extend_trend(self, state: RunState, host_ns: int) -> None:
         if host_ns - self._point_ns >= _TREND_STEP_NS:
-            self._point_ns = host_ns
+            self._point_ns = host_ns - host_ns % _TREND_STEP_NS  # readings do not fall on whole seconds
             residual_nm = None if state.wavefront is None else state.wavefront.residual_nm
             light = state.flux if state.frame_silent_s is None else None
             self._trend.append((nan if residual_nm is None else residual_nm, nan if light is None else light))
