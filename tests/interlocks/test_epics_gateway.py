@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -92,15 +93,11 @@ def pvs(monkeypatch: pytest.MonkeyPatch) -> Variables:
 
 
 def received(value: Any, kind: str = "epics:nt/NTScalar:1.0", severity: int = 0, **fields: Any) -> Any:
-    """Update of a monitor; a text in bytes is decoded when it is read, as by p4p."""
+    """Update of a monitor."""
 
     class Raw(dict[str, Any]):
         def getID(self) -> str:
             return kind
-
-        def __getitem__(self, name: str) -> Any:
-            found = super().__getitem__(name)
-            return found.decode() if isinstance(found, bytes) else found
 
     return Raw({"value": value, "alarm.severity": severity, **fields})
 
@@ -198,7 +195,7 @@ def test_a_put_is_a_request_and_fails_with_its_refusal(pvs: Variables) -> None:
         (received([1, 2]), None),
         (received(2.0, severity=3), None),
         (received({}, "epics:nt/NTTable:1.0"), None),
-        (received(b"\xb0C"), None),
+        (Mock(get=lambda *_: b"\xb0C".decode()), None),
         (TimeoutError("disconnected"), None),
     ],
 )

@@ -136,8 +136,6 @@ class _PutHandler:
 
 def _value_of(value: Any) -> Value | None:
     """The bench value of a monitor's update; None if the PV is disconnected, invalid, not a scalar or too long."""
-    if isinstance(value, Exception):
-        return None
     plain: Any
     try:
         if value.get("alarm.severity", 0) >= _INVALID:
@@ -147,7 +145,7 @@ def _value_of(value: Any) -> Value | None:
             plain = str(choices[index]) if 0 <= index < len(choices) else None
         else:
             plain = value["value"]
-    except (LookupError, TypeError, ValueError):  # a structure without a value, or a text that is not UTF-8
+    except (AttributeError, LookupError, TypeError, ValueError):  # an Exception, a structure, or not UTF-8
         return None
     if isinstance(plain, bool):
         return plain

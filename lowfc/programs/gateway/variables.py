@@ -71,9 +71,7 @@ READINGS = (
     Variable("holding", Kind.TEXT, "", "Why a closed loop holds its command.", _status("holding", "")),
     Variable("interlocks", Kind.TEXT, "", "Interlocks that are tripped.", lambda _, status: interlocks(status)),
     Variable("reserved_for", Kind.TEXT, "", "Holder of the loop's reservation.", _status("reserved_for", "")),
-    Variable(
-        "residual", Kind.NUMBER, "nm", "Modal error with noise, rms of a second.", _status("residual_rms_nm", nan)
-    ),
+    Variable("residual", Kind.NUMBER, "nm", "Modal error with noise, rms of 1 s.", _status("residual_rms_nm", nan)),
     Variable("flux", Kind.NUMBER, "", "Flux relative to the calibration.", _status("flux_fraction", nan)),
     Variable("rate", Kind.NUMBER, "Hz", "Frame rate.", _status("rate_hz", 0.0)),
     Variable("frames_missing", Kind.NUMBER, "", "Frames that never arrived.", _status("frames_missing", 0)),
