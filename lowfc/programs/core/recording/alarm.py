@@ -68,7 +68,7 @@ class Alarm:
             command = subprocess.Popen(  # noqa: S603  # configured by the user
                 ["/bin/sh", "-c", self._command],
                 stdin=subprocess.DEVNULL,
-                env={**os.environ, **arguments},
+                env={**os.environb, **{key.encode(): value.encode() for key, value in arguments.items()}},  # any locale
                 start_new_session=True,
             )
             if status := command.wait(TIMEOUT_S):
