@@ -190,6 +190,8 @@ def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame
     for health, seconds in ((watch.health["camera"], 10), (watch.health["controller"], 17)):
         health.timestamp.FromSeconds(seconds)
     assert status_line(watch, 17.0) == "   17 s  closed  the camera has been silent for 7 s"
+    hung = Watch(watch.health | {"controller": wire.Health(process="controller")}, [])
+    assert status_line(hung, 17.0).endswith("the controller has been silent for 10 s")
     watch.health["controller"].holding = "reserved for [/b]"
     with Console(width=120, file=io.StringIO(), record=True) as console:
         console.print(screen(watch, load(None, {"sensor.kind": "zwfs"}), None, 17.0))

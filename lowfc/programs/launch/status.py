@@ -78,10 +78,11 @@ def _closed_for(controller: wire.Health, rate_hz: float) -> str:
 
 
 def _silence_notice(watch: Watch) -> str:
-    """A notice if the camera stopped sending Health, so that its statistics are out of date; otherwise empty."""
-    silent_s = watch.silent_s(Role.CAMERA)
-    reported = bool(watch.health_of(Role.CAMERA).process)
-    return f"the camera has been silent for {silent_s:.0f} s" if reported and silent_s > SILENT_S else ""
+    """A notice if controller or camera stopped sending Health, so that its values are out of date; otherwise empty."""
+    for name in (Role.CONTROLLER, Role.CAMERA):
+        if watch.health_of(name).process and (silent_s := watch.silent_s(name)) > SILENT_S:
+            return f"the {name} has been silent for {silent_s:.0f} s"
+    return ""
 
 
 def _wavefront_in_words(camera: wire.Health) -> str:

@@ -55,7 +55,6 @@ def events(run: Run) -> list[Results]:
 
 def requests(run: Run) -> list[Results]:
     """Requests, also the controller's own, and their answers, without those that change nothing and are periodic."""
-    steps = run.history.steps
     found = [one for one in run.history.requests if one.name not in ("status", "configuration", "renew")]
     return [
         {
@@ -67,7 +66,7 @@ def requests(run: Run) -> list[Results]:
             "reply": one.reply,
         }
         for one in found
-        if steps.sequence.size
+        if run.history.steps.sequence.size
     ]
 
 
