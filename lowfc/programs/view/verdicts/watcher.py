@@ -101,7 +101,7 @@ class Watcher:
         if wavefront is None and stopped:
             wavefront, true = _rms(self._last_active)
         active, reported = self._last_active if stopped else now, snapshot.controller
-        cause = printable(reported.mode_cause) if reported is not None and reported.mode == self._mode else ""
+        cause = printable(reported.mode_cause) if reported and _MODES.get(int(reported.mode)) is self._mode else ""
         durations_us = np.concatenate([np.zeros(0), *(one.durations_ns / 1e3 for one in active)])
         return RunState(
             snapshot=snapshot,
