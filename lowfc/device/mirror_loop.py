@@ -143,9 +143,11 @@ class MirrorLoop:
     def _close(self) -> None:
         self._leave()
         free = self._turn.acquire(timeout=CLOSE_S)  # over a router, a command may still be with the driver
-        self._driver.close()
-        if free:
-            self._turn.release()
+        try:
+            self._driver.close()
+        finally:
+            if free:
+                self._turn.release()
 
     def _arrived(self, sample: Sample) -> None:
         """Handle a command on the receive thread; superseded commands are skipped."""
