@@ -141,6 +141,8 @@ def test_the_continuous_residual_is_recovered_from_instants() -> None:
     assert np.isfinite(found).all()
     assert found.mean() == pytest.approx(residual_power(law, np.array([omega]), timing)[0, 0], rel=0.01)
     assert np.mean((wave + mirror)[500:-100] ** 2) < 0.8 * found.mean()
+    earlier = continuous_residual_nm2(wave[:, None], mirror[:, None], 0.5)[500:-100].mean()
+    assert earlier == pytest.approx(residual_power(law, np.array([omega]), Timing(1, 0.5, 0.0))[0, 0], rel=0.01)
 
 
 def test_the_held_residual_is_recovered_from_noisy_measurements() -> None:

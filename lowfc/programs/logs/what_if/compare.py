@@ -123,7 +123,8 @@ def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> tuple[dict[str, Array
             found[f"true_{name}"] = rms(after_nm, known)
         squares = np.full(after_nm.shape, np.nan)
         for piece in np.split(np.arange(len(rows)), np.flatnonzero(run.missing)):
-            squares[piece] = continuous_residual_nm2(disturbance_nm[piece], (after_nm - disturbance_nm)[piece])
+            mirror_nm = (after_nm - disturbance_nm)[piece]
+            squares[piece] = continuous_residual_nm2(disturbance_nm[piece], mirror_nm, run.moves_at)
         with_squares = rows & np.isfinite(squares).all(axis=1)
         if with_squares.any():
             found[f"continuous_{name}"] = np.sqrt(squares[with_squares].mean(axis=0))

@@ -129,10 +129,19 @@ class LoggedRun:
     @property
     def timing(self) -> Timing:
         """Times of the exposures and of the mirror's moves, see `History.timing`."""
+        return self._timing(self.delay_frames)
+
+    @property
+    def moves_at(self) -> float:
+        """Time at which the mirror moves, periods after the start of an exposure: 1 in a lockstep log."""
+        timing = self._timing(float(np.ceil(self.delay_frames)))
+        return timing.applied - timing.delay + 1
+
+    def _timing(self, delay_frames: float) -> Timing:
         exposure = self.history.exposure_fraction
         if exposure is None:
             exposure = (self.history.configuration or Configuration()).camera.exposure_fraction
-        return self.history.timing(self.delay_frames, exposure)
+        return self.history.timing(delay_frames, exposure)
 
     def rows_to_compare(self, laws: list[Integrator], usable: Mask) -> tuple[Mask, int, str]:
         """Usable steps to compare, the settling time of the laws in frames, and a description."""
