@@ -162,11 +162,11 @@ class History:
         camera, other = (self.health.get(name, wire.Health()) for name in (Role.CAMERA, process))
         return camera.router_offset_ns - other.router_offset_ns
 
-    def timing(self, delay_frames: float, exposure: float) -> Timing:
-        """Times of the exposures, which are a fraction of a period long, and of the mirror's moves.
-
-        A lockstep log has no times of application: commands are then applied with the first exposure wholly with them.
-        """
+    def timing(self, delay_frames: float) -> Timing:
+        """Times of exposures and of the mirror's moves; a lockstep log has none of the latter, see `Timing.of`."""
+        exposure = self.exposure_fraction
+        if exposure is None:
+            exposure = (self.configuration or Configuration()).camera.exposure_fraction
         applied = self.mirror.sequence, self.mirror.publish_time_ns - self.camera_lag_ns(Role.RECORDER)
         return measured_timing(Timing.of(delay_frames, exposure), self.steps, *applied, self.rate_hz)
 

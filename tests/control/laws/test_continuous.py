@@ -143,6 +143,7 @@ def test_the_continuous_residual_is_recovered_from_instants() -> None:
     assert np.mean((wave + mirror)[500:-100] ** 2) < 0.8 * found.mean()
     earlier = continuous_residual_nm2(wave[:, None], mirror[:, None], 0.5)[500:-100].mean()
     assert earlier == pytest.approx(residual_power(law, np.array([omega]), Timing(1, 0.5, 0.0))[0, 0], rel=0.01)
+    assert Timing.measured(1.0, 0.5, 0.6) == Timing.of(1.0, 0.5)  # too late for a delay of one frame
 
 
 def test_the_held_residual_is_recovered_from_noisy_measurements() -> None:

@@ -92,7 +92,7 @@ def longest_stretch(run: Run) -> Stretch | None:
         signals += [true.disturbance_nm[rows], true.residual_nm[rows], true.sensed_nm[rows]]
         residual_ms_nm2 = np.nanmean(true.modes_residual_rms_nm[rows].astype(float) ** 2, axis=0)
         if true.continuous and history.exposure_fraction is not None:
-            timing = history.timing(in_force.delay_frames, history.exposure_fraction)
+            timing = history.timing(in_force.delay_frames)
     frames = time_series(steps.sequence[rows], np.hstack(signals))
     noll = tuple(range(2, 2 + gain.size))  # only their number is used
     rate_hz = history.rate_hz or 1.0  # unknown, and unused, for a single step

@@ -13,7 +13,6 @@ from lowfc.arrays import Integers, Mask, Sequences, Single
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.codecs.law_codec import integrator_of
 from lowfc.contract.codecs.state_codec import calibration_in_use
-from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME, Role, floats, wire
 from lowfc.control.calibration.calibration import Calibration
@@ -128,20 +127,14 @@ class LoggedRun:
 
     @property
     def timing(self) -> Timing:
-        """Times of the exposures and of the mirror's moves, see `History.timing`."""
-        return self._timing(self.delay_frames)
+        """Times of the exposures and of the mirror's moves."""
+        return self.history.timing(self.delay_frames)
 
     @property
     def moves_at(self) -> float:
         """Time at which the mirror moves, periods after the start of an exposure: 1 in a lockstep log."""
-        timing = self._timing(float(np.ceil(self.delay_frames)))
+        timing = self.history.timing(float(np.ceil(self.delay_frames)))
         return timing.applied - timing.delay + 1
-
-    def _timing(self, delay_frames: float) -> Timing:
-        exposure = self.history.exposure_fraction
-        if exposure is None:
-            exposure = (self.history.configuration or Configuration()).camera.exposure_fraction
-        return self.history.timing(delay_frames, exposure)
 
     def rows_to_compare(self, laws: list[Integrator], usable: Mask) -> tuple[Mask, int, str]:
         """Usable steps to compare, the settling time of the laws in frames, and a description."""
