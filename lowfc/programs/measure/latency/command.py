@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 _RATE_HZ = 1000.0
 _LEAK = 0.01
-_MAX_RESULT_BYTES = 1 << 28
 
 
 class Kernels(StrEnum):
@@ -192,7 +191,7 @@ def _compare(files: tuple[Path, Path]) -> dict[str, Any]:
 
 def _result(file: Path) -> dict[str, Any]:
     try:
-        found = json.loads(input_file.read_whole(file, _MAX_RESULT_BYTES))
+        found = json.loads(input_file.read_whole(file, 1 << 28))
     except OSError as fault:
         raise DataFileError(f"{file} cannot be read: {fault.strerror}") from None
     except (ValueError, RecursionError) as fault:  # not UTF-8, or not JSON
