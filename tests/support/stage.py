@@ -170,11 +170,10 @@ class Tape:
         times_ns = np.array(index.as_arrow_array().cast("int64"))
         self.rows[path].append((times_ns, np.array(values_of(next(iter(columns))), float)))
 
-    def flush(self) -> None:
-        pass
-
     def disconnect(self) -> None:
         pass
+
+    flush = disconnect
 
     @property
     def paths(self) -> set[str]:
