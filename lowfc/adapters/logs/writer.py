@@ -122,7 +122,7 @@ class LogWriter:
                 self._writer.add_attachment(
                     create_time=time_ns,
                     log_time=time_ns,
-                    name=attachment.name,
+                    name=encodable(attachment.name),
                     media_type=attachment.media_type,
                     data=attachment.data,
                 )

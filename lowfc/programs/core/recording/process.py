@@ -17,7 +17,6 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.events import Level
 from lowfc.contract.messages import Role, wire
-from lowfc.contract.printable import encodable
 from lowfc.programs.core.recording.alarm import Alarm
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
@@ -92,6 +91,6 @@ def _launched_processes(run: Run) -> AbstractSet[str]:
 
 def _attachment(path: Path, media_type: str) -> Attachment:
     try:
-        return Attachment(encodable(path.name), media_type, input_file.read_whole(path, _MAX_ATTACHMENT_BYTES))
+        return Attachment(path.name, media_type, input_file.read_whole(path, _MAX_ATTACHMENT_BYTES))
     except OSError as fault:
         raise DataFileError(f"{path} cannot be read for the log: {fault.strerror}") from fault
