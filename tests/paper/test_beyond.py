@@ -137,7 +137,7 @@ class Loops:
         self.commands = []
 
     def run(self, command, cwd, **_):
-        (*_, lowfc), (name, *words, as_json) = command[:3], command[3:]
+        (*_, lowfc), (name, *words, as_json) = command[:4], command[4:]
         assert (lowfc, as_json) == ("lowfc", "--json")
         options = dict(pairwise(words))
         config = load(cwd / options["--config"] if "--config" in options else None)

@@ -77,6 +77,7 @@ def test_a_refused_step_or_an_interrupt_ends_the_loop(
         raise fault
 
     monkeypatch.setattr(dark_hole, "COMMAND", "silent")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(dark_hole, "running", lambda: ["run"] * (tmp_path / "ready").exists())
     monkeypatch.setattr(dark_hole, "new_run_id", lambda: "run")
     monkeypatch.setattr(dark_hole, "Client", refuse)
