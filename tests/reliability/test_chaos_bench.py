@@ -207,7 +207,7 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], 
 
 
 def test_a_console_has_its_own_terminal_until_it_is_closed(program: Callable[[str], None]) -> None:
-    program('stty size; echo "loop CLOSED in $4 of $TERM"; read line; echo "[$line]"; exec sleep 60')
+    program('stty size; echo "loop CLOSED in $5 of $TERM"; read line; echo "[$line]"; exec sleep 60')
     with TerminalConsole("bench") as shown:
         until(lambda: shown.drew(rb"30 100\s+loop CLOSED in --run of xterm-256color"))
         shown.press(b"gain\n")
