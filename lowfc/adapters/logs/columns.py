@@ -134,8 +134,8 @@ class Columns:
         return True
 
     def values(self, name: str) -> npt.NDArray[Any]:
-        """Array of one column, (rows,) or (rows, width)."""
-        column = np.array(self._columns[name])
+        """Array of one column, (rows,) or (rows, width), not a copy: no row can be added while it exists."""
+        column = np.asarray(self._columns[name])
         return column.reshape(self._rows, self._widths[name]) if name in self._widths else column
 
     def _truncate(self) -> None:
