@@ -26,7 +26,7 @@ class Alarmed:
         )
         self.events: list[str] = []
         self.camera.bus.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload).message))
-        Alarm(self.recorder, command, Level.WARNING, min_interval_s)
+        self.alarm = Alarm(self.recorder, command, Level.WARNING, min_interval_s)
 
     def failures(self) -> list[str]:
         return [event for event in self.events if event.startswith("ON_EVENT_FAILED")]
@@ -64,6 +64,8 @@ def test_the_command_runs_in_the_normal_scheduling_class_and_at_most_once_per_in
     assert len(lines) == 3
     assert ("SCHED_IDLE" if os.sched_getscheduler(0) == os.SCHED_IDLE else "SCHED_OTHER") in policy
     assert niceness == str(min(os.nice(0) + 5, 19)), "the niceness of the alarm's thread, not of the recorder"
+    run.alarm.close()
+    assert len(notes.read_text().splitlines()) == 6, "the waiting event runs it when the recorder ends"
 
 
 def test_a_command_that_fails_or_hangs_raises_an_event_that_does_not_run_it_again(monkeypatch) -> None:

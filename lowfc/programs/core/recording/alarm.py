@@ -2,10 +2,12 @@
 
 The recorder runs it, because a run has at most one, which receives every event and is not in the loop; a console may
 be closed, or open twice. A thread in the normal scheduling class starts the command, which inherits that class. Events
-during the command, and for `recorder.on_event_every_s` after it, wait; then it is run once, for the worst of them.
+during the command, and for `recorder.on_event_every_s` after it, wait; then, or when the recorder ends, it is run once,
+for the worst of them.
 """
 
 import contextlib
+import math
 import os
 import signal
 import subprocess
@@ -23,6 +25,8 @@ from lowfc.contract.printable import printable
 TIMEOUT_S = 60.0
 """Time after which a command is killed."""
 _MAX_WAITING_EVENTS = 1000
+_POLL_S = 0.02
+_END_S = 2.0  # a service manager then kills it, and a launcher kills the recorder after 5 s
 _LEVELS: dict[int, str] = {level.value: level.name.lower() for level in Level}
 _OWN = EVENTS["ON_EVENT_FAILED"].name
 
@@ -34,9 +38,17 @@ class Alarm:
         """Run the command from the next event on; its failure is published as an event that does not trigger it."""
         self._command, self._level, self._min_interval_s, self._service = command, level, min_interval_s, service
         self._waiting: deque[Log] = deque(maxlen=_MAX_WAITING_EVENTS)
-        self._arrived = threading.Event()
+        self._arrived, self._ended, self._ends_s = threading.Event(), threading.Event(), math.inf
         service.bus.subscribe(EVENT, self._receive)
-        threading.Thread(target=self._work, name="on-event", daemon=True).start()
+        self._thread = threading.Thread(target=self._work, name="on-event", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Run the command for the events that wait, after one that runs; wait up to `_END_S` for its end."""
+        self._ends_s = time.monotonic() + _END_S
+        self._ended.set()
+        self._arrived.set()
+        self._thread.join(2 * _END_S)
 
     def _receive(self, sample: Sample) -> None:
         event = Log.FromString(sample.payload)
@@ -51,7 +63,9 @@ class Alarm:
             events = [self._waiting.popleft() for _ in range(len(self._waiting))]
             if events:
                 self._run(max(events, key=lambda event: event.level), len(events) - 1)
-                time.sleep(self._min_interval_s)
+                self._ended.wait(self._min_interval_s)
+            if self._ended.is_set() and not self._waiting:
+                return
 
     def _run(self, event: Log, others: int) -> None:
         name, _, text = printable(event.message).partition(" ")
@@ -71,13 +85,16 @@ class Alarm:
                 env={**os.environb, **{key.encode(): value.encode() for key, value in arguments.items()}},  # any locale
                 start_new_session=True,
             )
-            if status := command.wait(TIMEOUT_S):
+            due_s = time.monotonic() + TIMEOUT_S
+            while (status := command.poll()) is None and time.monotonic() < min(due_s, self._ends_s):
+                time.sleep(_POLL_S)
+            if status:
                 self._fail(f"it ended with exit status {status}")
-        except subprocess.TimeoutExpired:
-            with contextlib.suppress(OSError):  # it has ended, or runs as another user
-                os.killpg(command.pid, signal.SIGKILL)
-            command.wait()
-            self._fail(f"it was killed after {TIMEOUT_S:g} s")
+            elif status is None and not self._ended.is_set():
+                with contextlib.suppress(OSError):  # it has ended, or runs as another user
+                    os.killpg(command.pid, signal.SIGKILL)
+                command.wait()
+                self._fail(f"it was killed after {TIMEOUT_S:g} s")
         except OSError as fault:
             self._fail(f"it cannot be run: {fault.strerror}")
 

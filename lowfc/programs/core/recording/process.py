@@ -1,5 +1,6 @@
 """The recorder's process: joins a run and records it until stopped."""
 
+import contextlib
 import sys
 from collections.abc import Set as AbstractSet
 from pathlib import Path
@@ -51,8 +52,9 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
     )
     clock = clock_of(config)
     origin = {**provenance(run.run_id, config.seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}
-    bus = ZenohBus(run.links, Role.RECORDER, clock)
-    try:
+    with contextlib.ExitStack() as held:
+        bus = ZenohBus(run.links, Role.RECORDER, clock)
+        held.callback(bus.close)
         recorder = Recorder(
             bus,
             clock,
@@ -71,10 +73,9 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
         recorder.catch_signals()
         recorder.service.announces = True
         if log.on_event:
-            Alarm(recorder.service, log.on_event, Level[log.on_event_level.upper()], log.on_event_every_s)
+            alarm = Alarm(recorder.service, log.on_event, Level[log.on_event_level.upper()], log.on_event_every_s)
+            held.callback(alarm.close)
         return recorder.run()
-    finally:
-        bus.close()
 
 
 def log_limits(config: Configuration) -> LogLimits:
