@@ -734,7 +734,7 @@ def test_a_log_that_cannot_be_created_is_refused_and_can_be_requested_again(
     moved = bench.folder.with_name("elsewhere")
     bench.folder.rename(moved)
     bench.folder.write_text("a file")
-    with pytest.raises(RequestRefusedError, match="cannot be created"):
+    with pytest.raises(RequestRefusedError, match="is no folder"):
         operator.record(True)
     bench.folder.unlink()
     moved.rename(bench.folder)

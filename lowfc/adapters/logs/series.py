@@ -211,10 +211,12 @@ def shortage(folder: Path, min_free_bytes: int) -> str:
     """Sentence if a folder's disk has too little free space; empty otherwise.
 
     Raises:
-        DataFileError: the folder cannot be accessed.
+        DataFileError: the folder cannot be accessed, or is none.
     """
+    if not (there := existing(folder)).is_dir():
+        raise DataFileError(f"no log can be recorded in {folder}: {there} is no folder; name another (recorder.folder)")
     try:
-        free_bytes = shutil.disk_usage(existing(folder)).free
+        free_bytes = shutil.disk_usage(there).free
     except OSError as fault:
         raise DataFileError(f"{folder} cannot be accessed: {fault.strerror}") from fault
     if free_bytes >= min_free_bytes:
