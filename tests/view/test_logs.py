@@ -319,6 +319,9 @@ def test_logs_of_two_runs_are_not_drawn_together(tmp_path: Path, monkeypatch: py
     for other in others:
         with pytest.raises(DataFileError, match="one run at a time"):
             drawn(logs[0], other)
+    lockstep.samples = [one._replace(receive_time_ns=one.receive_time_ns - 3 * 10**9) for one in lockstep.samples]
+    with pytest.raises(DataFileError, match="order of recording"):
+        drawn(others[1], lockstep.write(tmp_path / "earlier.mcap"))
 
 
 # Events from before the start of the view.

@@ -61,6 +61,8 @@ from lowfc.control.laws.continuous import Timing
 
 LAST_NS = (1 << 63) - 1
 """Latest time of a message that is read, in the year 2262; a later one does not fit an array of times."""
+REORDERING_NS = 2_000_000_000
+"""Time by which messages in a log may be out of order."""
 _DECODED = {STEP, TRUTH, MIRROR_STATE, TIMING, CALIBRATION, CONTROLLER_STATE, CAMERA_STATE, REQUEST, HEALTH, EVENT}
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.logs.history import LAST_NS, attached_configuration
+from lowfc.adapters.logs.history import LAST_NS, REORDERING_NS, attached_configuration
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import in_words, missing_end_text
 from lowfc.adapters.logs.writer import PART
@@ -48,11 +48,11 @@ def draw_logs(
     """Draw consecutive logs.
 
     Raises:
-        DataFileError: a file is not a log, the logs are of several runs, or they have nothing to show.
+        DataFileError: a file is not a log, the logs are of several runs or not in order, or they have nothing to show.
     """
     drawn, accumulator = Drawn(), Accumulator()
     renderer: Renderer | None = None
-    due_ns = first_ns = last_ns = earlier_bytes = 0
+    due_ns = first_ns = last_ns = ended_ns = earlier_bytes = 0
     newest_frame = last_frame = -1, 0  # sequence and publish time, so far and in the logs before
     damaged, no_end, run, host = 0, "", "", ""
     stroke_nm: float | None = None
@@ -78,6 +78,8 @@ def draw_logs(
                         f"{log} is of run {run!r}, and the log before it of {previous_run!r}: show one run at a time"
                     )
             topic = topic_of(message.key)
+            if not topic.queryable and message.receive_time_ns < ended_ns - REORDERING_NS:
+                raise DataFileError(f"{log} begins before the previous log ends; name each once, in order of recording")
             if topic is FRAME:
                 sent = message.sequence, message.publish_time_ns
                 same_start = start_of(sent[0]) == start_of(last_frame[0])
@@ -107,7 +109,7 @@ def draw_logs(
                 due_ns = last_ns + _PERIOD_NS
             if number % _STRIDE == 0:
                 progress(earlier_bytes + reader.position)
-        earlier_bytes, last_frame = earlier_bytes + reader.size, newest_frame
+        earlier_bytes, ended_ns, last_frame = earlier_bytes + reader.size, last_ns, newest_frame
         damaged += len(reader.damage)
         drawn.remarks += [f"{log.name}: left out {in_words(damage)}" for damage in reader.damage]
         if missing := missing_end_text([log], finished=reader.finished):

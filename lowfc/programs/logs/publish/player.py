@@ -17,7 +17,7 @@ from rich.progress import BarColumn, TextColumn
 from lowfc.adapters.bus.bus import Publisher, Sample, name_in
 from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.logs.history import LAST_NS
+from lowfc.adapters.logs.history import LAST_NS, REORDERING_NS
 from lowfc.adapters.logs.parts import WholeLog, titled
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import faults, missing_parts
@@ -40,7 +40,6 @@ _MAX_SLEEP_NS = 100_000_000
 _PROGRESS_NS = 200_000_000
 _SETTLE_S = 0.5  # programs without a port retry their connection every 0.2 s
 _WAIT_FOR_S = 2.0
-_REORDERING_NS = 2_000_000_000  # by which messages in a log may be out of order
 
 
 def publish(
@@ -154,8 +153,8 @@ class Player:
             # A log begins with the calibration and the states then in force, which may be old.
             self._initial_keys.add(message.key)
             publisher.put(message.payload, None, message.sequence)
-        elif not is_state and message.receive_time_ns < self._last_log_ns - _REORDERING_NS:
-            raise DataFileError("a log begins before the previous one ends; give them in the order of recording")
+        elif not is_state and message.receive_time_ns < self._last_log_ns - REORDERING_NS:
+            raise DataFileError("a log begins before the previous one ends; name each once, in order of recording")
         else:
             self._send(publisher, message)
 
