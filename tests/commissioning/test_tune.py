@@ -21,7 +21,7 @@ from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.codecs.law_codec import driving
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
-from lowfc.contract.messages import wire
+from lowfc.contract.messages import TRUTH, wire
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import check_stable
@@ -88,7 +88,9 @@ def test_each_law_is_tuned_from_a_closed_loop(
 def test_the_true_residual_over_all_time_is_read_from_the_log(tmp_path: Path) -> None:
     night = SyntheticLog()
     night.instants = 4
-    run = telemetry_from_log(LogReader(night.request("close").frames(2100).write(tmp_path / "night.mcap")))
+    night.request("close").frames(2100)
+    del night.samples[next(row for row in range(9000, 9010) if TRUTH.matches(night.samples[row].key))]  # a lost one
+    run = telemetry_from_log(LogReader(night.write(tmp_path / "night.mcap")))
     assert run.true_nm2 is not None
     np.testing.assert_allclose(run.continuous_rms_nm, 2 * np.sqrt(np.diag(run.true_nm2)), rtol=1e-5)
 

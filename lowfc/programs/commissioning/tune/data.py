@@ -231,7 +231,8 @@ def _telemetry(
             f"sequence of good frames has {_longest(pol)}"
         )
     contrast = contrast_of(config) if config is not None and config.noll == calibration.noll else None
-    true_nm, rms_nm = (None if each is None or not np.isfinite(each[rows]).all() else each[rows] for each in true)
+    known = [None if each is None else each[rows & np.isfinite(each).all(axis=1)] for each in true]
+    true_nm, rms_nm = (each if each is not None and len(each) else None for each in known)
     return Telemetry(
         source=source,
         noll=calibration.noll,
