@@ -306,6 +306,9 @@ def test_each_log_of_a_run_can_be_read_alone(bench: Bench) -> None:
         assert messages[0].key == CALIBRATION.key
         # The second calibration was lost, and queried when the second log was begun.
         assert (second in bodies_of(messages, CALIBRATION)) == (number > 0)
+    for start_s, time_ns in ((200, 10), (100, 20)):  # of two publishers, the value published last is in force
+        peers.store(Sample("lowfc/bench/cover", b"", sequence_of(start_s, 0), time_ns, time_ns))
+    assert peers.newest["lowfc/bench/cover"].publish_time_ns == 20
 
 
 def message(topic: Topic, size: int) -> tuple[Topic, Sample]:

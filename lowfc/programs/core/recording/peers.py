@@ -37,9 +37,10 @@ class Peers:
     def store(self, sample: Sample) -> bool:
         """Store a calibration or state unless a newer one is known; return whether it is new."""
         kept = self.newest.get(sample.key)
-        if kept is None or kept.sequence <= sample.sequence:
+        newer = kept is None or (kept.publish_time_ns, kept.sequence) < (sample.publish_time_ns, sample.sequence)
+        if newer:
             self.newest[sample.key] = sample
-        return kept is None or kept.sequence < sample.sequence
+        return newer
 
     def camera(self) -> wire.CameraState | None:
         """The camera's newest state; None if there is none, or if it cannot be read."""
