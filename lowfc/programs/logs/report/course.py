@@ -137,5 +137,5 @@ def _request_time_s(run: Run, request: wire.Request) -> float:
     steps = run.history.steps
     later = steps.sequence >= request.frame_sequence
     if not start_of(request.frame_sequence):  # no frame since the controller's start, or since `clear`
-        later = steps.time_ns + run.history.camera_lag_ns(Role.CONTROLLER) >= from_timestamp(request.timestamp)
+        later = steps.time_ns + run.history.camera_lag_ns(Role.CONTROLLER) > from_timestamp(request.timestamp)
     return float(run.step_s[int(np.argmax(later)) if later.any() else -1])
