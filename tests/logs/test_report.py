@@ -56,7 +56,6 @@ def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     night.frames(50)
     night.start_camera()
     night.frames(100)
-    night.request("safe").request("clear").request("note", text="camera off")
     counts = [wire.TopicCount(topic=FRAME.key, received=2244, skipped=4, missing=2)]
     night.health("controller", topics=counts, state="stopped")
     night.health("camera", commands_late=43, state="stopped")
@@ -73,10 +72,9 @@ def test_modes_laws_and_requests_are_listed(eventful: dict[str, Any]) -> None:
         (pytest.approx(2.1), [0.4, 0.4, 0.2]),
     ]
     requests = eventful["requests"]
-    assert [one["name"] for one in requests] == ["open", "close", "gain", "gain", "safe", "clear", "note"]
-    assert [one["accepted"] for one in requests] == [True, True, True, False, True, True, True]
-    end_s = eventful["run"]["steps_s"]
-    assert [one["time_s"] for one in requests] == pytest.approx([0, 0.3, 1.8, 2.0, *[end_s] * 3], abs=1e-3)
+    assert [one["name"] for one in requests] == ["open", "close", "gain", "gain"]
+    assert [one["accepted"] for one in requests] == [True, True, True, False]
+    assert [one["time_s"] for one in requests] == pytest.approx([0, 0.3, 1.8, 2.0], abs=1e-3)
     assert eventful["run"]["steps"] == 2244
     assert eventful["run"]["host"] == "bench"
     assert eventful["run"]["versions"] == {"lowfc": "0.1.0", "numpy": "2.0"}
@@ -300,9 +298,9 @@ def test_imperfections_of_the_simulated_world_are_named(tmp_path: Path) -> None:
 
 def test_a_loop_in_safe_mode_is_not_a_good_run(tmp_path: Path) -> None:
     night = uneventful(SyntheticLog())
-    night.request("safe")
-    night.frames(50)
-    found = results(night.write(tmp_path / "x.mcap"))
+    night.request("safe").frames(50).request("clear")
+    found = results(night.request("note", text="camera off").write(tmp_path / "x.mcap"))
+    assert [one["time_s"] for one in found["requests"]] == pytest.approx([0.3, 0.349, 0.349])
     assert found["verdict"]["level"] == "bad"
     assert {check["name"] for check in found["verdict"]["checks"] if check["level"] == "bad"} == {"loop", "events"}
     assert [event["name"] for event in found["events"] if event["level"] == "error"] == ["SAFED"]
@@ -365,7 +363,7 @@ def test_frames_before_a_calibration_of_other_modes_led_to_commands_too(tmp_path
 
 def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
     night, other = SyntheticLog(), replace(TOYS, reconstructor=0.9 * TOYS.reconstructor)
-    night.frames(550)
+    night.frames(500).request("open").frames(50).request("close")
     night.load(identified(other))
     why = results(night.write(tmp_path / "before.mcap"))["spectra"]["why_not"]
     assert why == "the loop was closed only under an earlier calibration than the last one of this log"
@@ -373,6 +371,7 @@ def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
     stretch = results(night.write(tmp_path / "x.mcap"))["closed_stretch"]
     assert stretch["from_s"] > 0.549
     assert stretch["frames"] + stretch["steps_settling"] == 300
+    assert results(tmp_path / "x.mcap")["residual"]["steps_open"] == 0, "those of the earlier calibration"
     night.start_controller()  # with the first calibration; its first state with a frame follows after 50 frames
     found = results(night.request("gain", (0.2,)).frames(300).write(tmp_path / "restarted.mcap"))
     assert found["requests"][-1]["time_s"] == pytest.approx(0.85)

@@ -17,11 +17,12 @@ from lowfc.programs.logs.report.source import Results, Run
 def residual_results(run: Run, stretch: Stretch | None) -> Results:
     """Rms in nm of each mode and signal, and of tip and tilt per axis in mas; None for signals not in the log.
 
-    Closed loop: over the longest stretch under one law, after settling. Open loop: over all its steps.
+    Closed loop: over the longest stretch under one law, after settling. Open loop: over all its steps under the last
+    calibration.
     """
     history = run.history
     steps = history.steps
-    opened = np.flatnonzero(steps.mode == LoopMode.OPEN)
+    opened = np.flatnonzero((steps.mode == LoopMode.OPEN) & history.under_calibration)
     closed = np.arange(steps.sequence.size)[stretch.rows] if stretch is not None else opened[:0]
     noll = history.calibration.noll if history.calibration is not None else ()
     true = history.true or TruthRows(0).values()
