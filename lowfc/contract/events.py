@@ -69,7 +69,7 @@ EVENTS: dict[str, Event] = {
         Event("FRAMES_REFUSED", Level.WARNING, "frames refused: {reason}"),
         Event("FRAMES_ACCEPTED", Level.INFO, "frames accepted again; {refused:frame} refused: {reason}"),
         Event("NO_FRAMES", Level.WARNING, "no frame for {silent_ms:.0f} ms; {action}"),
-        Event("FRAMES_BACK", Level.INFO, "frames are back after {silent_ms:.0f} ms"),
+        Event("FRAMES_BACK", Level.INFO, "frames are back, the first exposed {silent_ms:.0f} ms after the last"),
         Event("FRAMES_MISSING", Level.WARNING, "{count:frame} missing or skipped before frame {number}"),
         Event("STREAM_SILENT", Level.WARNING, "no image in stream {stream}: {why}"),
         Event("STREAM_RENEWED", Level.WARNING, "stream {stream} was recreated: {columns} x {rows} pixels"),

@@ -98,7 +98,7 @@ def test_events_are_published_and_warnings_printed(
         ("controller", "REALTIME_REFUSED", 3),
         ("controller", "FRAMES_BACK", 2),
     ]
-    assert listener.messages(EVENT)[-1].message == "FRAMES_BACK frames are back after 12 ms"
+    assert listener.messages(EVENT)[-1].message == "FRAMES_BACK frames are back, the first exposed 12 ms after the last"
     assert from_timestamp(listener.messages(EVENT)[-1].timestamp) == clock.now_ns()
     printed = capsys.readouterr().err
     assert printed == "controller: REALTIME_REFUSED the host refused SCHED_FIFO: a longer tail\n"
