@@ -406,12 +406,17 @@ def test_a_task_runs_in_its_own_session_and_reports_its_end() -> None:
 
 def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
     found: list[object] = []
-    monkeypatch.setattr(feed, "configuration_of", lambda _: found[0] if found else Mock(side_effect=BusError)())
+    ask = Mock(side_effect=lambda _: found[0] if found else Mock(side_effect=BusError)())
+    monkeypatch.setattr(feed, "configuration_of", ask)
     monkeypatch.setattr(monitor, "_QUERY_AGAIN_NS", 100_000_000)
     screen = feed.Feed(run.bus("operator"), RUN, run.clock)
     until(lambda: len(screen.read().state.snapshot.health) == 3 and screen.read().state.snapshot.calibration)
     found.append(CONFIG)
-    until(lambda: screen.read() and screen._config is CONFIG)
+    until(lambda: screen.read() and screen._configured)
+    asked = ask.call_count
+    screen._query()  # as again and again without a calibration
+    until(lambda: not any(thread.name == "query" for thread in threading.enumerate()))
+    assert (ask.call_count, screen._config) == (asked, CONFIG), "each query is a request in the log"
 
 
 def test_a_request_is_in_the_log_of_every_console(run: LiveRun) -> None:

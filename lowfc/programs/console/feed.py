@@ -16,7 +16,7 @@ from lowfc.arrays import Pixels, Single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BadMessageError, LowfcError
-from lowfc.contract.messages import REQUEST, checked_time_ns, wire
+from lowfc.contract.messages import REQUEST, Role, checked_time_ns, wire
 from lowfc.control.loop.wording import AUTO
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.view.monitor import Monitor, import_late_modules
@@ -75,6 +75,7 @@ class Feed(Monitor):
         super().__init__(bus, clock)
         self._run_id, self._requests = run_id, bus.ring(REQUEST, 200)
         self._config: Configuration | None = None
+        self._configured: set[tuple[str, int]] = set()  # start of its controller
         self._frame: Pixels | None = None
         self._command_nm = np.zeros(0, np.float32)
         self._trend: deque[tuple[float, float]] = deque(maxlen=TREND_S)
@@ -120,13 +121,16 @@ class Feed(Monitor):
         return None not in (found.calibration, self._config)
 
     def _query(self) -> None:
-        """Query in a thread: a frozen process delays the answer."""
+        """Query in a thread, as a frozen process delays the answer; the configuration, a logged request, once."""
         query = super()._query
 
         def queries() -> None:
             with contextlib.suppress(LowfcError):  # the console ends, or there is no controller that sends Health yet
                 query()
-                self._config = configuration_of(Client(self._run_id, bus=self._bus))
+                controller = {known for known in self._known if known[0] == Role.CONTROLLER}
+                if self._config is None or controller != self._configured:
+                    self._config = configuration_of(Client(self._run_id, bus=self._bus))
+                    self._configured = controller
 
         threading.Thread(target=queries, name="query", daemon=True).start()
 
