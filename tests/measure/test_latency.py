@@ -133,6 +133,9 @@ def test_frames_without_command_are_counted_as_crowded_out_only_in_a_burst() -> 
     found = repeat_statistics(frames(put_ns, command_us, (put_ns - due_ns) / 1e3))
     assert (found["frames_without_command"], found["frames_crowded_out"]) == (3, 2)
     assert found["frames_sent_late"] == 1  # one by 2 ms, the other by less than a period
+    put_ns[900:] += 3600 * 10**9  # the camera waited for its trigger
+    found = repeat_statistics(frames(put_ns, command_us))
+    assert (found["frames_crowded_out"], found["rate_hz"]) == (2, pytest.approx(1000, abs=5))
 
 
 def test_a_histogram_counts_values_beyond_its_edges_in_the_outermost_bins() -> None:

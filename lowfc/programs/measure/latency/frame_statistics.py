@@ -65,6 +65,8 @@ COUNTS = {
 _BINS_PER_OCTAVE = 8
 _LOWEST_US, _OCTAVES = 1.0, 20
 _TIME_PARTS = 200
+_PAUSE = 1000
+"""Multiple of the median period above which the camera paused, as when it waits for its trigger."""
 _BURST = 0.5
 """Fraction of the mean period: frames closer together came in a burst."""
 
@@ -153,8 +155,9 @@ def repeat_statistics(frames: Frames) -> dict[str, Any]:
     put_ns, commanded = frames.put_ns[counted], frames.commanded[counted]
     spans = {span: column[counted] for span, column in frames.spans_us.items()}
     count = put_ns.size
-    span_ns = int(put_ns[-1] - put_ns[0]) if count > 1 else 0
-    period_ns = span_ns / (count - 1) if span_ns else 0.0
+    between_ns = np.diff(put_ns)
+    between_ns = between_ns[between_ns <= _PAUSE * np.median(between_ns)] if count > 1 else between_ns
+    period_ns = float(between_ns.mean()) if between_ns.any() else 0.0
     next_ns = np.append(np.diff(put_ns), np.iinfo(np.int64).max)
     found = {span: percentiles(values) for span, values in spans.items()}
     return {
