@@ -144,12 +144,7 @@ def named_logs(names: Sequence[Path], out: Path | None = None, *, as_json: bool 
 
 
 def named_log(names: Sequence[Path]) -> Parts:
-    """The single log named on a command line; see `named_logs`.
-
-    Raises:
-        ConfigurationError: several logs are named.
-        DataFileError: the folder contains no log.
-    """
+    """The single log named on a command line; ConfigurationError if several are named; see `named_logs`."""
     found = named_logs(names)
     if len(found) > 1:
         raise ConfigurationError(f"this command reads one log: name one, not {_listed(found)}; the newest is `{LAST}`")
@@ -199,11 +194,7 @@ def _files(names: Sequence[Path]) -> Iterator[Path]:
 
 
 def _newest(folder: Path) -> list[Path]:
-    """Files of the newest log of a folder, in order; the newest is found by its name, which begins with the time.
-
-    Raises:
-        DataFileError: there is no log.
-    """
+    """Files of the newest log of a folder, in order; the newest is found by its name, which begins with the time."""
     hint = f"that of another folder is FOLDER/{LAST}"
     try:
         files = {path: match for path in folder.iterdir() if (match := _NAMED.fullmatch(path.name))}

@@ -161,11 +161,7 @@ class LogReader:
         return messages
 
     def _messages(self, content: bytes) -> list[Sample]:
-        """Decode the messages of a chunk that are to be delivered, and store its declarations.
-
-        Raises:
-            UnsoundError: its records are inconsistent, or contradict earlier ones.
-        """
+        """Decode the messages of a chunk to deliver, and store its declarations; UnsoundError if inconsistent."""
         found: list[Sample] = []
         delivered, at, end = self._delivered, 0, len(content)
         read_head, read_message, logged = HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, Sample._make

@@ -242,11 +242,7 @@ class LogFile:
         return True
 
     def _part(self, opcode: int, body: bytes, at: int) -> Chunk | Metadata | Attachment | None:
-        """Decode and check a record of the data section; None for an index or header.
-
-        Raises:
-            UnsoundError: the record is damaged or not permitted here.
-        """
+        """Decode a record of the data section; None for an index or header, UnsoundError if it is damaged."""
         if opcode not in (Opcode.CHUNK, Opcode.ATTACHMENT) and _BEGIN in body:
             raise UnsoundError("a record is cut off")
         match opcode:

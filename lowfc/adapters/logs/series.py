@@ -37,7 +37,8 @@ _STEADY_S = 10.0  # before, the metadata and attachments at the start of the log
 class LogSeries:
     """Writes the log files of recordings to a folder.
 
-    A full file is finished on a separate thread, as the disk may need seconds to store it.
+    A full file is finished on a separate thread, as the disk may need seconds to store it. If the disk refuses, methods
+    raise DataFileError; see `give_up`.
 
     Attributes:
         files: paths of the files so far: final names, or names with ".part" of those that could not be finished.
@@ -99,11 +100,7 @@ class LogSeries:
         return self._finishing is not None and not self._finishing[1].done()
 
     def begin(self, first: Iterable[Sample], *, new_recording: bool = True) -> None:
-        """Begin a file of a new or of the present recording with the messages `first`, on which later ones depend.
-
-        Raises:
-            DataFileError: the file cannot be created, or the disk refuses; see `give_up`.
-        """
+        """Begin a file of a new or of the present recording with the messages `first`, on which later ones depend."""
         now_ns = self._clock.host_ns()
         try:
             path = log_path(self._folder, now_ns)
@@ -120,33 +117,21 @@ class LogSeries:
             self._log.write(sample)
 
     def write(self, sample: Sample) -> bool:
-        """Write a message; False if no file is open.
-
-        Raises:
-            DataFileError: the disk refuses; see `give_up`.
-        """
+        """Write a message; False if no file is open."""
         if self._log is None:
             return False
         self._log.write(sample)
         return True
 
     def flush(self) -> None:
-        """Flush the file.
-
-        Raises:
-            DataFileError: the disk refuses, also if the previous file could not be finished; see `give_up`.
-        """
+        """Flush the file; DataFileError also if the previous file could not be finished."""
         if self._log is not None:
             self._log.flush()
         if self._finishing is not None and self._finishing[1].done():
             self._await_finished()
 
     def end(self, totals: Mapping[str, str], *, wait: bool = True) -> None:
-        """Finish the file, with `totals` as its "recording" metadata; without `wait`, return before it is finished.
-
-        Raises:
-            DataFileError: the disk refuses; see `give_up`.
-        """
+        """Finish the file, with `totals` as its "recording" metadata; without `wait`, return before it is finished."""
         self._await_finished()
         if self._log is not None:
             self._log.flush()
@@ -156,11 +141,7 @@ class LogSeries:
             self._await_finished()
 
     def remove(self) -> None:
-        """Remove the files, all finished; the caller knows that they hold no messages of other processes.
-
-        Raises:
-            DataFileError: the disk refuses.
-        """
+        """Remove the files, all finished; the caller knows that they hold no messages of other processes."""
         while self.files:
             try:
                 self.files[-1].unlink(missing_ok=True)
@@ -208,11 +189,7 @@ def _finish(log: LogWriter, totals: Mapping[str, str]) -> int:
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str:
-    """Sentence if a folder's disk has too little free space; empty otherwise.
-
-    Raises:
-        DataFileError: the folder cannot be accessed, or is none.
-    """
+    """Sentence if a folder's disk has too little space; else empty. DataFileError if it is no accessible folder."""
     if not (there := existing(folder)).is_dir():
         raise DataFileError(f"no log can be recorded in {folder}: {there} is no folder; name another (recorder.folder)")
     try:

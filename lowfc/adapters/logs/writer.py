@@ -79,7 +79,7 @@ class _File(FileIO):
 
 
 class LogWriter:
-    """Writes one log.
+    """Writes one log; if the disk refuses, methods raise DataFileError, and the log is closed as at the last flush.
 
     Attributes:
         path: final name of the log.
@@ -136,12 +136,7 @@ class LogWriter:
         return self._raw.longest_write_ns
 
     def write(self, sample: Sample) -> None:
-        """Add a message with its payload unchanged.
-
-        Raises:
-            DataFileError: the disk refuses; the log is closed as at the last flush.
-            KeyError: the topic does not exist.
-        """
+        """Add a message with its payload unchanged; KeyError if the topic does not exist."""
         try:
             self._writer.add_message(
                 channel_id=self._channel(sample),
@@ -155,22 +150,14 @@ class LogWriter:
         self.messages += 1
 
     def flush(self) -> None:
-        """Pass everything to the operating system; flushed data survive a kill -9 of this process.
-
-        Raises:
-            DataFileError: as for `write`, or the file has been removed.
-        """
+        """Pass everything to the operating system; flushed data survive a kill -9 of this process."""
         try:
             self._flush()
         except OSError as fault:
             raise self._refused(fault) from fault
 
     def finish(self, metadata: Mapping[str, Mapping[str, str]]) -> Path:
-        """Write the final metadata, close the log, and rename it once it is on the disk.
-
-        Raises:
-            DataFileError: as for `write`.
-        """
+        """Write the final metadata, close the log, and rename it once it is on the disk."""
         try:
             self._flush()
             self._describe(metadata)

@@ -25,7 +25,6 @@ from lowfc.contract.printable import printable
 TIMEOUT_S = 60.0
 """Time after which a command is killed."""
 _MAX_WAITING_EVENTS = 1000
-_POLL_S = 0.02
 _END_S = 2.0  # a service manager then kills it, and a launcher kills the recorder after 5 s
 _LEVELS: dict[int, str] = {level.value: level.name.lower() for level in Level}
 _OWN = EVENTS["ON_EVENT_FAILED"].name
@@ -87,7 +86,7 @@ class Alarm:
             )
             due_s = time.monotonic() + TIMEOUT_S
             while (status := command.poll()) is None and time.monotonic() < min(due_s, self._ends_s):
-                time.sleep(_POLL_S)
+                time.sleep(0.02)
             if status:
                 self._fail(f"it ended with exit status {status}")
             elif status is None and not self._ended.is_set():

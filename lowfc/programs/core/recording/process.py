@@ -52,9 +52,7 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
     )
     clock = clock_of(config)
     origin = {**provenance(run.run_id, config.seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}
-    with contextlib.ExitStack() as held:
-        bus = ZenohBus(run.links, Role.RECORDER, clock)
-        held.callback(bus.close)
+    with contextlib.closing(ZenohBus(run.links, Role.RECORDER, clock)) as bus, contextlib.ExitStack() as held:
         recorder = Recorder(
             bus,
             clock,
