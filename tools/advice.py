@@ -49,10 +49,7 @@ ADVICE: dict[str, Advice] = {
         "relaxes to flat.",
         "remove the cause, then `lowfc ctl clear`; the loop is open afterwards, and `lowfc ctl close` closes it.",
     ),
-    "FRAMES_REFUSED": Advice(
-        "frames arrive and are not used; the command is held.",
-        "see the table of reasons.",
-    ),
+    "FRAMES_REFUSED": Advice("frames arrive and are not used; the command is held.", "see the table of reasons."),
     "FRAMES_ACCEPTED": Advice("frames are used again.", _NOTHING),
     "NO_FRAMES": Advice(
         "no frame for `control.frame_timeout_ms`: the camera has stopped, waits for a trigger, or its link is down.",

@@ -59,11 +59,7 @@ def measure(sensors: tuple[str, ...] = SENSORS, seconds: float = SECONDS) -> Res
 
 
 def _configured(sensor: str, magnitude: float, keys: dict[str, Any]) -> Configuration:
-    base: dict[str, Any] = {
-        "disturbance.preset": PRESET,
-        "star.magnitude": float(magnitude),
-        "camera.rate_hz": RATE_HZ,
-    }
+    base: dict[str, Any] = {"disturbance.preset": PRESET, "star.magnitude": float(magnitude), "camera.rate_hz": RATE_HZ}
     return configured(sensor, **base | {"control.start_mode": "closed"} | keys)
 
 

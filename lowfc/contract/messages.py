@@ -174,14 +174,7 @@ SURFACE = Topic(
     latest_only=True,
     optional=True,
 )
-TRUTH = Topic(
-    "lowfc/sim/truth",
-    wire.Truth,
-    Rate.LOOP,
-    _CAMERA,
-    "The true wavefront of the simulation.",
-    optional=True,
-)
+TRUTH = Topic("lowfc/sim/truth", wire.Truth, Rate.LOOP, _CAMERA, "The true wavefront of the simulation.", optional=True)
 OFFLOAD = Topic(
     "lowfc/control/offload",
     wire.ModalOffload,

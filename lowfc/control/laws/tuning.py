@@ -17,13 +17,7 @@ from lowfc.control.laws.linear_law import Block, LinearLaw, integrator, integrat
 from lowfc.control.laws.margins import sensitivity
 from lowfc.control.laws.pi_notch import Notch, pi_notch
 from lowfc.control.laws.spectra import Spectrum, TimeSeries, floor_nm2_hz, spectrum
-from lowfc.control.laws.stability import (
-    LOWEST_GAIN,
-    MIN_GAIN_MARGIN,
-    MIN_PHASE_MARGIN_DEG,
-    delay_weights,
-    highest_gain,
-)
+from lowfc.control.laws.stability import LOWEST_GAIN, MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG, delay_weights, highest_gain
 from lowfc.control.laws.vibration import FEWEST, Model, identify, resolution_hz
 from lowfc.control.laws.what_if import counterfactual, driven_by
 

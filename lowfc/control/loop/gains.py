@@ -9,13 +9,7 @@ import numpy.typing as npt
 
 from lowfc.arrays import Mask, Single
 from lowfc.control.laws.integrator import Integrator
-from lowfc.control.laws.stability import (
-    LOWEST_GAIN,
-    MIN_GAIN_MARGIN,
-    MIN_PHASE_MARGIN_DEG,
-    highest_gain,
-    limiting_gain,
-)
+from lowfc.control.laws.stability import LOWEST_GAIN, MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG, highest_gain, limiting_gain
 from lowfc.control.loop.inputs import PendingEvent, Request
 from lowfc.control.loop.safety import MAX_LIMIT_NM
 from lowfc.control.loop.state import ActiveLoop, Settings, Weighting

@@ -17,8 +17,7 @@ def controller(
     run: RunId = DEFAULT_RUN,
     config: ConfigFile = None,
     calibration: Annotated[
-        Path | None,
-        typer.Option(help="Calibration file (FITS), or `none`; default: computed from the configuration."),
+        Path | None, typer.Option(help="Calibration file (FITS), or `none`; default: computed from the configuration.")
     ] = None,
     camera: Annotated[
         str | None,

@@ -134,13 +134,7 @@ def _paper_name(sensor: Prepared) -> str:
 
 
 def _rows(
-    sensor: Prepared,
-    exposure: Exposure,
-    key: tuple[int, str],
-    linear: Fit,
-    mas: int,
-    mean_e: Array,
-    found: Array,
+    sensor: Prepared, exposure: Exposure, key: tuple[int, str], linear: Fit, mas: int, mean_e: Array, found: Array
 ) -> Iterator[Row]:
     (modes, kind), trials = key, len(found)
     predicted, bound = predicted_mas(linear, mean_e), bound_mas(linear)
