@@ -137,20 +137,12 @@ def mean_contrast(
     return float(image[wedge_samples(wedge, columns, rows, samples_per)].mean())
 
 
-def contrast_curve(
-    coronagraph: Coronagraph,
-    opd_nm: Array,
-    wavelength_nm: float,
-    edges: Array,
-    wedge: Wedge = DARK_ZONE,
-    samples_per: int = 4,
-) -> Array:
-    """Contrast (rings,) averaged in azimuth within a wedge's opening, Fig. 1(c); other arguments as for `contrast`.
+def contrast_curve(coronagraph: Coronagraph, opd_nm: Array, wavelength_nm: float, edges: Array) -> Array:
+    """Contrast (rings,) averaged in azimuth within the opening of `DARK_ZONE`, Fig. 1(c); arguments as for `contrast`.
 
-    `edges` (rings + 1,) are the radii between the rings, in lambda / D, spaced by at least one sample. Only the wedge's
-    opening is used.
+    `edges` (rings + 1,) are the radii between the rings, in lambda / D, spaced by at least one sample.
     """
-    sector = Wedge(0.0, float(edges[-1]), wedge.half_opening_deg)
+    sector, samples_per = Wedge(0.0, float(edges[-1]), DARK_ZONE.half_opening_deg), 4
     columns, rows = _extent(sector, samples_per)
     inside = wedge_samples(sector, columns, rows, samples_per)
     radius = np.hypot(image_axis(rows, samples_per)[:, None], image_axis(columns, samples_per))[inside]

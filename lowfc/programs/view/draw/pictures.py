@@ -61,9 +61,9 @@ class Picture:
 class SignedPicture(Picture):
     """Pictures of signed values: blue below zero, orange above, the range in the caption."""
 
-    def __init__(self, path: str, least: float, unit: str) -> None:
+    def __init__(self, path: str, unit: str) -> None:
         super().__init__(path)
-        self._scale, self._unit = Scale(least), unit
+        self._scale, self._unit = Scale(1.0), unit
 
     def show_values(self, stream: rr.RecordingStream, time_ns: int, values: npt.NDArray[np.floating]) -> None:
         """Show values (rows, columns)."""

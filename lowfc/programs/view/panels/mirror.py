@@ -24,7 +24,7 @@ class Mirror(Panel):
     plots = (STROKE,)
 
     def __init__(self) -> None:
-        self._command, self._surface = SignedPicture(COMMAND, 1.0, "nm"), SignedPicture(SURFACE, 1.0, "nm")
+        self._command, self._surface = SignedPicture(COMMAND, "nm"), SignedPicture(SURFACE, "nm")
         self._limited = False
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:

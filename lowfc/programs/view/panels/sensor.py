@@ -24,7 +24,7 @@ class Sensor(Panel):
         self._calibration: Calibration | None = None
         self._difference = np.zeros(0, np.float32)
         self._frame, self._reference = Picture(FRAME), Picture(REFERENCE)
-        self._change = SignedPicture(DIFFERENCE, 1.0, "DN")
+        self._change = SignedPicture(DIFFERENCE, "DN")
         self._brightest = Scale(10.0)
         self._raw_due_ns = 0
 
