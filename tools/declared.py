@@ -11,7 +11,8 @@ from typing import Any, get_args
 
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
-from lowfc.client import requests, stream
+from lowfc.client import stream
+from lowfc.client.requests import DECLARED as REQUESTS
 from lowfc.contract.codecs.codec import MAX_BYTES
 from lowfc.contract.configuration import Acceptance
 from lowfc.contract.events import EVENTS, Event, Level
@@ -161,10 +162,19 @@ def one_line(text: str | None) -> str:
     return " ".join((text or "").split()).removesuffix(".")
 
 
+def requests() -> str:
+    """Every request."""
+    rows = []
+    for one in REQUESTS:
+        contents = "; ".join(f"`{name}`: {what}" for name, what in one.fields)
+        rows.append((f"`{one.key}`", contents, one.description, f"`{one.example}`" if one.example else ""))
+    return markdown(("query", "fields of the request", "what it does", "`lowfc ctl`"), rows)
+
+
 def buttons() -> str:
     """The console's buttons."""
-    rows = [f"| `{one.key}` | {one.name} | {one.description} |" for one in (SAFE, *ACTIONS)]
-    return "\n".join(["| key | button | what it does |", "|---|---|---|", *rows]) + "\n"
+    rows = ((f"`{one.key}`", one.name, one.description) for one in (SAFE, *ACTIONS))
+    return markdown(("key", "button", "what it does"), rows)
 
 
 def events(*levels: Level) -> str:
@@ -188,7 +198,7 @@ def reasons() -> str:
 
 
 DECLARED: dict[str, Callable[[], str]] = {
-    "requests": requests.table,
+    "requests": requests,
     "buttons": buttons,
     "reasons": reasons,
     "warnings": partial(events, Level.ERROR, Level.WARNING),

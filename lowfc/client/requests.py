@@ -142,13 +142,3 @@ DECLARED: tuple[Declaration, ...] = (
 
 BY_NAME = {one.key.partition("/")[2].removeprefix("request/"): one for one in DECLARED}
 """Declarations by name, such as "gain" and "record/start"."""
-
-
-def table() -> str:
-    """Markdown table of all requests."""
-    lines = ["| query | fields of the request | what it does | `lowfc ctl` |", "|---|---|---|---|"]
-    for one in DECLARED:
-        fields = "; ".join(f"`{name}`: {what}" for name, what in one.fields)
-        example = f"`{one.example}`" if one.example else ""
-        lines.append(f"| `{one.key}` | {fields} | {one.description} | {example} |")
-    return "\n".join(lines) + "\n"
