@@ -64,7 +64,6 @@ class FaultyFrames:
         return Envelope(sequence_of(self._start_s, index), now_ns)
 
     def _message(self, index: int, good: RawImage) -> bytes:
-        """A frame's message with the fault."""
         frame = np.frombuffer(good.data, "<u2").reshape(good.height, good.width)
         before = frame if self._before is None else self._before
         self._before = self._fault.pixels(index, frame, before, self._dark, self._highest)

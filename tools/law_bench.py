@@ -105,7 +105,6 @@ class Bench:
         self._path = MirrorPath(self._status.surface_nm, self.world.camera.delay_frames - 1)
 
     def _begin(self, config: Configuration, first: Input) -> None:
-        """Start the controller."""
         self.config, self.frames_refused, self._index = config, 0, 0
         self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
         self.events: list[tuple[int, PendingEvent]] = []

@@ -62,7 +62,6 @@ class Measurement(NamedTuple):
 
 
 def _command_measurement(command: str, render: Callable[[Results], str], has_provenance: bool = False) -> Measurement:
-    """The measurement made by one command."""
     return Measurement((command,), partial(json_of, command), render, has_provenance)
 
 

@@ -190,5 +190,4 @@ def render(results: Results) -> str:
 
 
 def _magnitudes(rows: list[Results]) -> str:
-    """The magnitudes of rows, each once, as text."""
     return ", ".join(f"{one:g}" for one in sorted({row["magnitude"] for row in rows}))

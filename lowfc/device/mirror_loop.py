@@ -197,7 +197,6 @@ class MirrorLoop:
         return actuators_nm if reached_nm is None else reached_nm
 
     def _read_shape(self) -> Single | None:
-        """Read the mirror's shape from its driver; None if it cannot be read."""
         position = getattr(self._driver, "position", None)
         return None if position is None else self._call(position)
 

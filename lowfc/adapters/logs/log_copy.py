@@ -64,7 +64,6 @@ class LogCopy:
     def _add_records(
         self, records: Sequence[Metadata | Attachment], include_record: Callable[[Metadata | Attachment], bool]
     ) -> None:
-        """Copy metadata and attachments."""
         for record in filter(include_record, records):
             if isinstance(record, Metadata):
                 self._writer.add_metadata(record.name, record.metadata)

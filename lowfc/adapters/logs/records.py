@@ -229,7 +229,6 @@ class LogFile:
         return data_end if data_end > at else self.size
 
     def _chunk_at(self, at: int) -> bool:
-        """Whether an intact chunk begins at `at`."""
         _, length = HEAD.unpack(self._read(at, HEAD.size))
         at += HEAD.size
         if at + length > self.size or length > min(MAX_BYTES, self._bytes_to_try):
@@ -284,7 +283,6 @@ class LogFile:
 
     @cached_property
     def _unchunked(self) -> bool:
-        """Whether messages may be outside chunks."""
         statistics = (parsed(Statistics, one[HEAD.size :]) for one in self._in_summary(Opcode.STATISTICS))
         return not self._by_lowfc or any(not one.chunk_count for one in statistics)
 

@@ -167,7 +167,6 @@ class LogSeries:
         return log
 
     def _await_finished(self) -> None:
-        """Wait for the file that is being finished."""
         if self._finishing is None:
             return
         (log, growth_bytes), self._finishing = self._finishing, None

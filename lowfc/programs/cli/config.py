@@ -65,7 +65,6 @@ def _assignment(name: str, value: object) -> list[str]:
 
 
 def _inline(value: object) -> str:
-    """A value on one line."""
     if isinstance(value, list):
         return f"[{', '.join(map(_inline, value))}]"
     if isinstance(value, dict):
