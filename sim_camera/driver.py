@@ -12,6 +12,7 @@ from pydantic import Field
 from lowfc.adapters.bus.bus import Publisher, Sample
 from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.files import factory
+from lowfc.adapters.files.twin_cache import load_or_fit_mirror
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Single
 from lowfc.contract.codecs.codec import actuators, latency
@@ -83,7 +84,7 @@ def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scen
     disturbance = disturbance_of(config) if disturbance is None else disturbance
     return Scene(
         optics,
-        factory.true_mirror_on_twin(config, optics, ignore),
+        load_or_fit_mirror(factory.sensor(config, ignore), optics, factory.true_mirror(config), notice=ignore),
         detector,
         factory.electrons_per_exposure(config),
         disturbance,

@@ -73,15 +73,13 @@ class Wheel:
 
     def modes_nm(self, time_s: Array) -> Array:
         """Contribution to the modes (instants, modes), nm of wavefront rms."""
-        return np.asarray((self._heights(time_s) * self._phases(time_s) @ self.amplitude_nm).real)
+        phases = np.exp(2j * np.pi * np.outer(self.turns(time_s), ORDERS))
+        return np.asarray((self._heights(time_s) * phases @ self.amplitude_nm).real)
 
     def lines(self) -> tuple[Array, Array]:
         """Frequencies (harmonics,) at time 0, Hz, and the variance of each in each mode (harmonics, modes), nm^2."""
         variance_nm2 = np.abs(self._heights(np.zeros(1)).T * self.amplitude_nm) ** 2 / 2
         return np.array(ORDERS) * self.start_hz, variance_nm2
-
-    def _phases(self, time_s: Array) -> Complex:
-        return np.asarray(np.exp(2j * np.pi * np.outer(self.turns(time_s), ORDERS)))
 
     def _heights(self, time_s: Array) -> Array:
         """Amplitudes (instants, harmonics), relative to those at high speed."""

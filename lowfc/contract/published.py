@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from google.protobuf.message import DecodeError
 
 from lowfc.contract.codecs.calibration_codec import decode_calibration
-from lowfc.contract.codecs.law_codec import law_of, table_of
-from lowfc.contract.messages import CALIBRATION, LAW, PLAY, Topic, wire
+from lowfc.contract.codecs.law_codec import law_of
+from lowfc.contract.messages import CALIBRATION, LAW, PLAY, Topic, floats, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.loop.command_channels import PlayTable
+from lowfc.control.loop.command_channels import PlayTable, play_table
 
 TOPICS = (CALIBRATION, LAW, PLAY)
 
@@ -33,5 +33,6 @@ class Published:
                 law = law_of(wire.LinearLaw.FromString(payload))
                 self.laws[law.id] = law
             elif topic is PLAY:
-                table = table_of(wire.Play.FromString(payload))
+                play = wire.Play.FromString(payload)
+                table = play_table(play.target, floats(play.table, -1, play.columns or 1), floats(play.basis, -1))
                 self.plays[table.id] = table

@@ -47,7 +47,8 @@ def grant(role: str) -> Grant:
     part, _, name = role.partition("-")
     kind = Role(part)
     published = [topic for topic in TOPICS if kind in topic.publishers]
-    received = [topic for topic in TOPICS if kind in _receivers(topic)]
+    receiver = Role.VIEWER if kind is Role.OPERATOR else kind  # an operator's own programs receive what viewers receive
+    received = [topic for topic in TOPICS if {kind, receiver} & topic.subscribers]
     answered = [topic for topic in published if topic.queryable]
     answers = [_own(topic, role, name) for topic in answered]
     queried = [topic.at(ALL) for topic in answered]
@@ -104,11 +105,6 @@ def _rules(rights: Grant) -> list[dict[str, Any]]:
         for what, flow, messages, keys in lines
         if keys
     ]
-
-
-def _receivers(topic: Topic) -> frozenset[Role]:
-    """Roles that may receive a topic; an operator's own programs receive what viewers receive."""
-    return topic.subscribers | ({Role.OPERATOR} if Role.VIEWER in topic.subscribers else frozenset())
 
 
 def _own(topic: Topic, role: str, name: str) -> str:

@@ -129,11 +129,6 @@ def mirror_on_twin(config: Configuration, optics: Twin, warn: Callable[[str], No
     return load_or_fit_mirror(sensor(config, warn), optics, mirror(config), notice=warn)
 
 
-def true_mirror_on_twin(config: Configuration, optics: Twin, warn: Callable[[str], None]) -> TwinMirror:
-    """Wavefront of the simulated mirror at the twin's nodes, with its registration errors."""
-    return load_or_fit_mirror(sensor(config, warn), optics, true_mirror(config), notice=warn)
-
-
 def mirror_limits(config: Configuration) -> Limits:
     """The mirror's own limits, nm of surface."""
     return Limits(config.mirror.stroke_nm / 2, config.mirror.slew_nm, config.mirror.neighbour_nm)
@@ -199,8 +194,7 @@ def analytic_calibration(
     camera = detector(config)
     highest_dn = float(saturation_dn(camera))
     nolls = config.noll
-    radii = node_radii(optics)
-    I0, H = reference(optics, opd_nm), response(optics, zernikes(nolls, *radii), opd_nm)
+    I0, H = reference(optics, opd_nm), response(optics, zernikes(nolls, *node_radii(optics)), opd_nm)
     shape = I0.shape
     good = np.ones(I0.size)
     flux_e = electrons_per_exposure(config) * float(I0.sum())

@@ -179,11 +179,6 @@ class Stream:
         """Header fields of the newest image."""
         return Newest._make(NEWEST.unpack_from(self._mapping, NEWEST_START))
 
-    @property
-    def written_ns(self) -> int:
-        """Write time of the newest image, ns since the epoch."""
-        return _since_epoch_ns(*self._header["writetime"][0].tolist())
-
     def keywords(self) -> dict[str, float | str]:
         """Values of the stream's keywords, by name."""
         words = np.frombuffer(self._mapping, KEYWORD, self.layout.keywords, self.layout.starts["keywords"]).copy()
@@ -247,7 +242,8 @@ class Stream:
     def _wrote(self, pid: int) -> bool:
         """Whether that process wrote, and not a later one with the same process id."""
         try:
-            return alive(pid) and psutil.Process(pid).create_time() * _NS <= self.written_ns + _NS
+            written_ns = _since_epoch_ns(*self._header["writetime"][0].tolist())
+            return alive(pid) and psutil.Process(pid).create_time() * _NS <= written_ns + _NS
         except psutil.Error:
             return alive(pid)
 

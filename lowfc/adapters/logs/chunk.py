@@ -52,11 +52,6 @@ class Chunk(NamedTuple):
     content: bytes
 
 
-def _lz4(data: memoryview, size: int) -> bytes:
-    found: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
-    return found
-
-
 def _zstd(data: memoryview, size: int) -> bytes:
     with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as stream:
         return stream.read(size)
@@ -64,7 +59,7 @@ def _zstd(data: memoryview, size: int) -> bytes:
 
 # Decompressor of each compression, and the largest ratio of sizes that its format allows (zstd: any).
 _COMPRESSIONS: dict[bytes, tuple[Callable[[memoryview, int], bytes], int]] = {
-    b"lz4": (_lz4, 255),
+    b"lz4": (lambda data, size: lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size), 255),
     b"zstd": (_zstd, MAX_BYTES),
     b"": (lambda data, size: bytes(data[:size]), 1),
 }

@@ -302,7 +302,8 @@ class _HistoryBuilder:
         elif isinstance(body, wire.ControlTiming):
             self._timings.add(body)
         elif isinstance(body, wire.Calibration):
-            self._store_calibration(body)
+            self._calibration = body
+            self._set_modes(len(body.noll))
         elif isinstance(body, wire.ControllerState):
             history.controllers.append(body)
         elif isinstance(body, wire.CameraState):
@@ -334,10 +335,6 @@ class _HistoryBuilder:
             extremes.highest_nm, extremes.lowest_nm = surface.copy(), surface.copy()
         np.maximum(extremes.highest_nm, surface, out=extremes.highest_nm)
         np.minimum(extremes.lowest_nm, surface, out=extremes.lowest_nm)
-
-    def _store_calibration(self, calibration: wire.Calibration) -> None:
-        self._calibration = calibration
-        self._set_modes(len(calibration.noll))
 
     def _set_modes(self, modes: int) -> None:
         """Set the number of modes; leave out the rows so far if they have another."""

@@ -180,7 +180,9 @@ class LogReader:
                     elif number not in delivered:
                         self.unreadable += 1
                 elif opcode == Opcode.SCHEMA:
-                    self._declare_schema(parsed(Schema, content[begin + head_bytes : at]))
+                    schema = parsed(Schema, content[begin + head_bytes : at])
+                    if self.schemas.setdefault(schema.id, schema) != schema:
+                        raise UnsoundError(f"schema {schema.id} is declared a second time, differently")
                 elif opcode == Opcode.CHANNEL:
                     self._declare_channel(parsed(Channel, content[begin + head_bytes : at]))
         except struct.error as fault:
@@ -188,10 +190,6 @@ class LogReader:
         if at > end:
             raise UnsoundError("a record in a chunk is longer than the chunk")
         return found
-
-    def _declare_schema(self, schema: Schema) -> None:
-        if self.schemas.setdefault(schema.id, schema) != schema:
-            raise UnsoundError(f"schema {schema.id} is declared a second time, differently")
 
     def _declare_channel(self, channel: Channel) -> None:
         if self._declared.setdefault(channel.id, channel) != channel:

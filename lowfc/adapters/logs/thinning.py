@@ -17,15 +17,12 @@ from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import topic_of
 
 
-def thinned_path(source: Path, requested: Selection) -> Path:
-    """Default path of the thinned copy, next to the log."""
-    return source.parent / f"{stem_of(source)}-every-{requested.interval_frames}.mcap"
-
-
 def thin(
-    log: Parts, out: Path, requested: Selection, progress: Callable[[int, int], None] | None = None
+    log: Parts, out: Path | None, requested: Selection, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, Any]:
     """Write a thinned log from all files of a log, with its selection in the metadata; return the results for JSON.
+
+    By default it is written next to the log.
 
     Raises:
         DataFileError: a file is not a log, none has messages, `out` exists already, or it cannot be written.
@@ -46,6 +43,7 @@ def thin(
         copied_names.add(record.name)
         return not known
 
+    out = out or log[0].parent / f"{stem_of(log[0])}-every-{requested.interval_frames}.mcap"
     with new_log(out, log[0]) as file:
         copy = LogCopy(file)
         for name, entries in combined.metadata.items():

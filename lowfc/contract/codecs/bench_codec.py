@@ -6,7 +6,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import checked_time_ns, from_timestamp, timestamp, wire
-from lowfc.control.loop.interlocks import MAX_TEXT_LENGTH, Acting, Action, BenchReport, Interlock, Value
+from lowfc.control.loop.interlocks import MAX_TEXT_LENGTH, Action, BenchReport, Interlock, Value
 
 MAX_BYTES = 4 * MAX_TEXT_LENGTH + 200
 """Largest size of a bench value: a text of up to four bytes per character, and the other fields."""
@@ -63,8 +63,7 @@ def _checked(message: wire.BenchValue) -> Value:
 def wire_report(report: BenchReport) -> wire.BenchReport:
     """Message of a value as received."""
     value = None if report.value is None else wire_value(report.value)
-    time = timestamp(report.time_ns)
-    return wire.BenchReport(timestamp=time, name=report.name, value=value, age_ns=report.age_ns)
+    return wire.BenchReport(timestamp=timestamp(report.time_ns), name=report.name, value=value, age_ns=report.age_ns)
 
 
 def report_of(message: wire.BenchReport) -> BenchReport:
@@ -82,13 +81,3 @@ def interlock_of(message: wire.Interlock) -> Interlock:
     """Interlock of a message; ValueError if it has no valid value or its action is unknown."""
     value, action = value_of(message.value), Action(message.action)
     return Interlock(message.name, message.test, value, action, message.max_age_ns, message.acts_when_old)
-
-
-def wire_acting(acting: Acting) -> wire.ActingInterlock:
-    """Message of an acting interlock."""
-    return wire.ActingInterlock(**acting._asdict())
-
-
-def acting_of(message: wire.ActingInterlock) -> Acting:
-    """Acting interlock of a message; ValueError if its action is unknown."""
-    return Acting(message.number, Action(message.action), message.why)

@@ -10,7 +10,7 @@ from lowfc.arrays import Single
 from lowfc.contract.messages import fields_of, floats, timestamp, wire
 from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw, matrix_shapes
-from lowfc.control.loop.command_channels import Channel, CommandChannels, Play, PlayTable, play_table
+from lowfc.control.loop.command_channels import Channel, CommandChannels, Play, PlayTable
 from lowfc.control.loop.guard import NAMES
 
 _PLAIN = ("name", "signal", "delay_frames", "rate_hz")  # fields of the same name in law and message
@@ -18,8 +18,7 @@ _PLAIN = ("name", "signal", "delay_frames", "rate_hz")  # fields of the same nam
 
 def law_header(law: LinearLaw) -> wire.LinearLaw:
     """Message of a law without its matrices, which follow from its identity."""
-    plain = fields_of(law, _PLAIN)
-    return wire.LinearLaw(noll=law.noll, states=len(law.transition), id=law.id, **plain)
+    return wire.LinearLaw(noll=law.noll, states=len(law.transition), id=law.id, **fields_of(law, _PLAIN))
 
 
 def wire_law(law: LinearLaw, time_ns: int = 0) -> wire.LinearLaw:
@@ -52,8 +51,7 @@ def driving(state: wire.ControllerState | None, laws: Mapping[str, LinearLaw]) -
 
 def overruled(state: wire.ControllerState) -> list[str]:
     """Groups of modes that the integrator drives instead of the law."""
-    groups = state.guard.groups
-    return [name for name, group in zip(NAMES, groups, strict=False) if group.overruled]
+    return [name for name, group in zip(NAMES, state.guard.groups, strict=False) if group.overruled]
 
 
 def integrator_of(state: wire.ControllerState) -> Integrator:
@@ -73,11 +71,6 @@ def wire_play(table: PlayTable, time_ns: int) -> wire.Play:
         frames=len(table.rows),
         timestamp=timestamp(time_ns),
     )
-
-
-def table_of(message: wire.Play) -> PlayTable:
-    """The table of a message; ValueError if it is incomplete."""
-    return play_table(message.target, floats(message.table, -1, message.columns or 1), floats(message.basis, -1))
 
 
 def put_command_channels(message: wire.ControllerState, command_channels: CommandChannels) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.contract.codecs.bench_codec import acting_of, interlock_of, wire_acting, wire_interlock
+from lowfc.contract.codecs.bench_codec import interlock_of, wire_interlock
 from lowfc.contract.codecs.calibration_codec import camera_settings, wire_camera
 from lowfc.contract.codecs.codec import wire_mode, wire_reasons
 from lowfc.contract.codecs.law_codec import command_channels_of, integrator_of, law_header, law_of, put_command_channels
@@ -20,6 +20,7 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.estimator import Estimate
 from lowfc.control.loop.guard import Group, LawGuard
+from lowfc.control.loop.interlocks import Acting, Action
 from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, reason_of
 from lowfc.control.loop.state import ActiveLoop, Conditions, LawRunner, Settings, State, Weighting
@@ -56,7 +57,7 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         lease=None if lease is None else wire.Lease(until=timestamp(lease.until_ns), **fields_of(lease, _LEASE)),
         measured_nm=() if estimate is None else estimate.error_nm.tolist(),
         flux_dn=0.0 if estimate is None else estimate.flux_dn,
-        interlocks_acting=map(wire_acting, conditions.acting),
+        interlocks_acting=[wire.ActingInterlock(**one._asdict()) for one in conditions.acting],
         **fields_of(state, _STATE),
         **fields_of(conditions, _CONDITIONS),
     )
@@ -158,7 +159,7 @@ def decode_state(
             lease=Lease(until_ns=from_timestamp(message.lease.until), **fields_of(message.lease, _LEASE))
             if message.HasField("lease")
             else None,
-            acting=tuple(map(acting_of, message.interlocks_acting)),
+            acting=tuple(Acting(one.number, Action(one.action), one.why) for one in message.interlocks_acting),
             **fields_of(message, _CONDITIONS),
         ),
         **fields_of(message, _STATE),

@@ -278,11 +278,6 @@ class _Whittle:
         spacing = self.spacing_hz
         corner = np.isfinite(model.cutoff_hz)
 
-        def parameters_of(one: Model) -> Array:
-            floor = [np.log(one.drift_nm2), np.log(one.noise_nm2)] + ([np.log(one.cutoff_hz)] if corner else [])
-            lines = [[0.0, np.log(line.width_hz), np.log(line.variance_nm2)] for line in one.lines]
-            return np.concatenate([floor, *lines])
-
         def model_of(parameters: Array) -> Model:
             floor, rest = parameters[: 2 + corner], parameters[2 + corner :].reshape(-1, 3)
             lines = tuple(
@@ -302,7 +297,9 @@ class _Whittle:
             one = model_of(parameters)
             return self.misfit(power, one.spectrum_nm2(omega) + one.noise_nm2, counts)
 
-        start = parameters_of(model)
+        floor = [np.log(model.drift_nm2), np.log(model.noise_nm2)] + ([np.log(model.cutoff_hz)] if corner else [])
+        lines = [[0.0, np.log(line.width_hz), np.log(line.variance_nm2)] for line in model.lines]
+        start = np.concatenate([floor, *lines])
         wide = [(value - 3, value + 3) for value in start[: 2 + corner]]
         for line, (_, width, variance) in zip(model.lines, start[2 + corner :].reshape(-1, 3), strict=True):
             reach = max(1.0, line.width_hz / spacing)

@@ -59,19 +59,6 @@ def fresnel_distance(defocus_mm: float, focal_ratio: float, wavelength_nm: float
     return defocus_mm * 1e6 / (wavelength_nm * focal_ratio**2)
 
 
-def least_distance(reach: float, samples_per: int) -> float:
-    """Shortest distance of a `Defocus` whose chirp the samples resolve, in (lambda0/D)^2.
-
-    The sum over the focal plane aliases where the phase of chirp times field advances by a wave per sample.
-
-    Args:
-        reach: Distance from the edge of the detector to the far edge of the focal-plane mask, in lambda0 / D.
-        samples_per: Samples per lambda0 / D.
-    """
-    spare = 2.0  # margin, cycles: half for the bandwidth of the pupil's light, the rest for short wavelengths
-    return reach / (samples_per - spare)
-
-
 @lru_cache(maxsize=16)
 def direct_kernel(
     relay: Defocus | PupilImage, samples: int, focal_samples: int, samples_per: int, scale: float

@@ -9,7 +9,7 @@ from lowfc.arrays import Array, Complex
 from lowfc.optics.chain.band import Band, monochromatic
 from lowfc.optics.chain.fourier import to_image, to_pupil
 from lowfc.optics.chain.grid import OPEN_AREA, image_axis, pupil_axis
-from lowfc.optics.chain.relay import ApertureMask, Defocus, PupilImage, Relay, direct_kernel, least_distance
+from lowfc.optics.chain.relay import ApertureMask, Defocus, PupilImage, Relay, direct_kernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,9 @@ class Sensor:
             raise ValueError(f"the focal-plane mask must be square, got shape {self.focal_mask.shape}")
         if isinstance(self.relay, Defocus):
             reach = (self.pixels * self.binning + self.focal_mask.shape[0]) / (2.0 * self.samples_per)
-            least = least_distance(reach, self.samples_per)
+            # The sum over the focal plane aliases where the phase of chirp times field advances by a wave per sample.
+            spare = 2.0  # margin, cycles: half for the bandwidth of the pupil's light, the rest for short wavelengths
+            least = reach / (self.samples_per - spare)
             if self.relay.distance < least:
                 raise ValueError(
                     f"{self.samples_per} samples per lambda/D resolve a defocus of at least {least:.3g} (lambda/D)^2, "
