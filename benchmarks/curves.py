@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.load import shares, watched
 from benchmarks.runner import Lines, Report, Result, add_times, ranged, us
-from benchmarks.sizes import FRAMES, Size, configuration, random_calibration, run_loop
+from benchmarks.sizes import FRAMES, Size, configuration, prepared_run, random_calibration
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.realtime import set_up
 from lowfc.contract.errors import ConfigurationError, LowfcError
@@ -31,6 +31,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.measure.control_step import ControlStep
 from lowfc.programs.measure.frame_source import Payloads
 from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S
+from lowfc.programs.measure.latency.run import LatencyOptions, run_repeats
 
 AXES = {
     "pixels": ((32, 48, 64, 80, 128, 192, 256, 384, 512), "side", "sides of square frames: 80 is 80 x 80 pixels"),
@@ -91,8 +92,8 @@ def loop_latency(size: Size, rate_hz: float, seconds: float) -> Result:
     cpu is the processor time of the controller for each frame.
     """
     try:
-        with watched() as moments:
-            found = run_loop(size, configuration(size, rate_hz), seconds)
+        with watched() as moments, prepared_run(size, config := configuration(size, rate_hz)) as run:
+            (found,) = run_repeats(LatencyOptions(config, seconds, 1), run, lambda _: None)
     except LowfcError as fault:
         return {"failure": str(fault)}
     latency_us = {name: found["latency_us"]["frame_to_command"][name] for name in ("p50", "p99")}

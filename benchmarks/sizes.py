@@ -20,7 +20,7 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.programs.measure.frame_source import FRAMES_FILE
-from lowfc.programs.measure.latency.run import LatencyOptions, prepared, run_repeats
+from lowfc.programs.measure.latency.run import prepared
 
 Single = npt.NDArray[np.float32]
 Frames = npt.NDArray[np.uint16]
@@ -117,16 +117,6 @@ def prepared_run(size: Size, config: Configuration) -> Iterator[Run]:
 
     with prepared(config, fill) as run:
         yield run
-
-
-def run_loop(size: Size, config: Configuration, seconds: float) -> dict[str, Any]:
-    """Run the loop of that size once, then the bare echo (its messages without computation).
-
-    Returns the statistics of one repeat, as `run_repeats`.
-    """
-    with prepared_run(size, config) as run:
-        (found,) = run_repeats(LatencyOptions(config, seconds, 1), run, lambda _: None)
-    return found
 
 
 def _random(rng: np.random.Generator, shape: tuple[int, int], scale: float) -> Single:

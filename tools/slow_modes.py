@@ -9,7 +9,6 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.arrays import Array
 from lowfc.contract.configuration import FIXED_GAINS, Configuration
-from lowfc.control.calibration.calibration import Calibration
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.optics.chain.zernike import mode_name
 from tools.law_bench import Bench, calibrated, configured
@@ -56,7 +55,8 @@ def case(config: Configuration) -> Results:
         command_nm = np.mean([step.command_nm for step in bench.steps], axis=0, dtype=np.float64)
         mirror_nm[window] = residual_nm[window] - drift_nm[window] - command_nm
     light_e = calibration.flux_dn * config.camera.gain_e_per_dn
-    bound_nm = photon_bound_nm(calibration, light_e * frames)
+    H, I0 = (array.astype(np.float64) * (light_e * frames) for array in (calibration.response, calibration.reference))
+    bound_nm = np.sqrt(np.diag(cramer_rao(H, variance_e(I0, 0.0))))
     noise_nm = frame_noise_nm(config, calibration) / np.sqrt(frames)
     columns = {
         "drift_nm": _rms(drift_nm),
@@ -75,12 +75,6 @@ def case(config: Configuration) -> Results:
             for place, noll in enumerate(config.noll)
         },
     }
-
-
-def photon_bound_nm(calibration: Calibration, light_e: float) -> Array:
-    """Least standard deviation (modes,) of an unbiased estimate from this number of electrons, nm."""
-    H, I0 = calibration.response.astype(np.float64) * light_e, calibration.reference.astype(np.float64) * light_e
-    return np.asarray(np.sqrt(np.diag(cramer_rao(H, variance_e(I0, 0.0)))))
 
 
 def _rms(windows: Array) -> Array:

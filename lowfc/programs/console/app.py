@@ -30,7 +30,7 @@ from lowfc.programs.console.keys import IMMEDIATE_KEY, OrderedKeys
 from lowfc.programs.console.lines import Lines
 from lowfc.programs.console.phrases import phrased
 from lowfc.programs.console.task import Task
-from lowfc.programs.view.verdicts.tile import FILL, INK, Level
+from lowfc.programs.view.verdicts.tile import FILL, INK
 
 READ_PERIOD_S = 0.2
 """Time between two readings."""
@@ -283,7 +283,9 @@ class Console(OrderedKeys):
 
     def _show(self, reading: Reading) -> None:
         level, headline = panels.verdict(reading, self._run_id)
-        self._colour(level)
+        for name in ("#verdict", "#clock"):
+            styles = self._static(name).styles
+            styles.background, styles.color = Color(*FILL[level]), Color(*INK[level])
         self._show_text("verdict", Text(headline))
         self._show_text("clock", Text(f"{panels.clock(reading.state.snapshot.host_ns)}\nUTC"))
         self.screen_stack[0].query_one("#readings").set_class(not reading.connected, "disconnected")
@@ -311,11 +313,6 @@ class Console(OrderedKeys):
             self._answer(task.status_line, ok=not task.status)
         self._static("#tasks").display = bool(self._tasks)
         self._show_text("tasks", Text("\n".join(task.status_line for task in self._tasks)))
-
-    def _colour(self, level: Level) -> None:
-        for name in ("#verdict", "#clock"):
-            styles = self._static(name).styles
-            styles.background, styles.color = Color(*FILL[level]), Color(*INK[level])
 
     def _show_text(self, name: str, text: Text) -> None:
         if self._shown.get(name) != text:

@@ -98,11 +98,6 @@ class Comparison(Result):
     same_commands: bool = result_field("same commands")
 
 
-def rejected_path(out: Path) -> Path:
-    """Path of a calibration that is not recommended; it differs from `out`, so that an existing file is kept."""
-    return out.with_name(f"{out.stem}.rejected{out.suffix}")
-
-
 def finish_calibration(
     calibrator: Calibrator, request: CalibrationRequest, data: CalibrationData, computed: Calibration
 ) -> tuple[Calibration, CalibrationResult]:
@@ -113,7 +108,8 @@ def finish_calibration(
     noise = computed_noise_nm(config, calibration, computed)
     ratio = None if noise is None else factory.frame_noise_nm(config, calibration) / noise
     verdict = judge(request.snr, data.measured.cycles, data.measured.error, check, ratio, calibration.noll)
-    file = rejected_path(request.out) if verdict.faults else request.out
+    out = request.out  # a calibration that is not recommended does not replace it
+    file = out.with_name(f"{out.stem}.rejected{out.suffix}") if verdict.faults else out
     result = result_of(config, calibration, quality, request.method, file, data, computed, verdict)
     calibration_file.save(calibration, file)
     configured = configured_delay(config)

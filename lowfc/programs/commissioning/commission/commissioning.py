@@ -31,7 +31,7 @@ from lowfc.programs.commissioning.calibrate.result import finish_calibration
 from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of, stored_cycles
 from lowfc.programs.commissioning.calibrate.tasks import images
 from lowfc.programs.commissioning.commission.first_calibration import aligned, first_delay, linear_nm, poked
-from lowfc.programs.commissioning.commission.first_light import camera_fits, darkened, referenced, without_dark
+from lowfc.programs.commissioning.commission.first_light import Sensor, camera_fits, darkened, referenced
 
 METHOD = "hadamard"
 DEFAULT_SNR = 50.0
@@ -208,7 +208,8 @@ class Commissioning:
         frames = list(self._loop.frames(CAMERA_FRAMES))
         camera = camera_fits(self._config, self._loop.camera_state(), frames, self._report)
         self._step("dark and bad pixels")
-        options, sensor = self._options, without_dark(camera)
+        options, pixels = self._options, camera.shape[0] * camera.shape[1]
+        sensor = Sensor(camera, np.full(pixels, float(camera.bias_dn)), np.ones(pixels), measured=False)
         if options.dark is not None:
             sensor = darkened(camera, images(options.dark), self._report)
         elif options.no_dark:

@@ -81,12 +81,6 @@ def camera_fits(
     return replace(camera_settings(state), start_s=0)
 
 
-def without_dark(camera: CameraSettings) -> Sensor:
-    """A sensor without a measured dark: the camera's bias for all pixels, no bad pixels."""
-    pixels = camera.shape[0] * camera.shape[1]
-    return Sensor(camera, np.full(pixels, float(camera.bias_dn)), np.ones(pixels), measured=False)
-
-
 def darkened(camera: CameraSettings, frames: npt.NDArray[np.number], report: Report) -> Sensor:
     """A sensor with dark and bad pixels from dark frames (frames, rows, columns)."""
     if frames.shape[1:] != camera.shape:

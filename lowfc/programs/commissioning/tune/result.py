@@ -48,11 +48,6 @@ def tuned(run: Telemetry, controller: str) -> tuple[Tuned, Gains]:
             return tune_lqg(run.pol, models, gains, run.noll, leak, run.timing), gains
 
 
-def present_law(run: Telemetry) -> LinearLaw:
-    """The control law in force at the end of the run."""
-    return run.driving or integrator(run.law.gain, run.law.leak, run.noll, run.timing.delay, run.rate_hz)
-
-
 class TunedMode(Result):
     """A mode: residual now and with the tuned law, nm rms of wavefront, and the margins of the tuned law."""
 
@@ -121,7 +116,7 @@ class TuneResult(Result):
 
 def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> TuneResult:
     """Predicted residual of a tuned law, with the residual of the run."""
-    now = present_law(run)
+    now = run.driving or integrator(run.law.gain, run.law.leak, run.noll, run.timing.delay, run.rate_hz)
     leak = run.law.leak.astype(np.float64)
     integrator_nm = tune_integrator(best.models, gains, run.noll, leak, run.timing).predicted_nm
     now_nm = predicted_nm(now, best.models, run.timing) if margins.margins(now, run.timing.delay).stable else None
@@ -185,8 +180,7 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
 
     drawing = figure_class()(figsize=(10, 8), layout="constrained")
     found = spectrum(run.pol, run.rate_hz)
-    if found is None:  # cannot happen: tuning needs more frames than a spectrum
-        return b""
+    assert found is not None  # noqa: S101  # tuning needs more frames than a spectrum
     largest = np.argsort(-found.variance_nm2())[:2]
     for axes, place in zip(drawing.subplots(2, 1, sharex=True), largest.tolist(), strict=False):
         model = best.models[place]

@@ -175,7 +175,9 @@ class Recorder:
                 return
             self._queries.popleft()
             path = encodable(str(self._series.files[-1].absolute())) if self._series.files else ""
-            estimate = self._estimate() if query.name == "start" and not refusal else ""
+            growth = self._series.bytes_per_s or self._expected_bytes_per_s
+            started = query.name == "start" and not refusal
+            estimate = growth_in_words(growth, self._folder, self._min_free_bytes) if started and growth else ""
             answer = wire.Request(
                 timestamp=timestamp(self._clock.now_ns()),
                 name=query.name,
@@ -290,11 +292,6 @@ class Recorder:
                 self._peers.query_soon()
         except DataFileError as fault:
             self._fail(fault)
-
-    def _estimate(self) -> str:
-        """Sentence on the disk space used, from the growth so far or as expected; empty if unknown."""
-        growth = self._series.bytes_per_s or self._expected_bytes_per_s
-        return growth_in_words(growth, self._folder, self._min_free_bytes) if growth else ""
 
     def _note_flush(self) -> None:
         self._account.mark_flushed()

@@ -63,7 +63,7 @@ def export(
     from rich.console import Console
 
     from lowfc.adapters.logs.parts import named_logs
-    from lowfc.adapters.logs.thinning import thin, thinned_path
+    from lowfc.adapters.logs.thinning import thin
     from lowfc.adapters.process.progress import reading_bar
 
     if (decimate is None and topics) or (decimate is not None and (to is not None or frames or force)):
@@ -76,7 +76,7 @@ def export(
         if decimate is not None:
             chosen = selection(decimate, topics or ())
             with reading_bar(console) as count:
-                results = thin(log, out or thinned_path(log[0], chosen), chosen, partial(count, "copying"))
+                results = thin(log, out, chosen, partial(count, "copying"))
             print_result(results, render_copy(results), as_json=as_json)
         else:
             results = export_log(log, to or Format.FITS, out, frames=frames, force=force, console=console)

@@ -6,7 +6,7 @@ import numpy as np
 
 from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.history import History
-from lowfc.arrays import Long, Single
+from lowfc.arrays import Long
 from lowfc.contract.envelope import start_of
 from lowfc.contract.events import Level
 from lowfc.contract.messages import Role, from_timestamp, wire
@@ -33,8 +33,7 @@ def mode_spans(run: Run) -> list[Results]:
 
 def mode_steps(history: History) -> dict[str, int]:
     """Steps in each loop mode."""
-    counted = Counter(history.steps.mode.tolist())
-    return {mode_name(number): count for number, count in sorted(counted.items())}
+    return {mode_name(number): count for number, count in sorted(Counter(history.steps.mode.tolist()).items())}
 
 
 def events(run: Run) -> list[Results]:
@@ -115,11 +114,6 @@ def mirror_results(history: History) -> Results:
         "limits_at_controller": _limits(history.steps.reasons),
         "limits_at_mirror": _limits(mirror.limits),
     }
-
-
-def actuator_extremes_nm(history: History) -> Single:
-    """Largest deviation from flat of each actuator (rows, columns) over the run."""
-    return np.maximum(np.abs(history.mirror.highest_nm), np.abs(history.mirror.lowest_nm))
 
 
 def _limits(reasons: Long) -> dict[str, int]:

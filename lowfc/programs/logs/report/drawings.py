@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Array, Long
+from lowfc.arrays import Array
 from lowfc.contract.printable import printable
 from lowfc.control.loop.safety import Limit
-from lowfc.programs.logs.report.course import actuator_extremes_nm
 from lowfc.programs.logs.report.residual import bin_starts, binned_rms
 from lowfc.programs.logs.report.results import Report
 from lowfc.programs.logs.report.svg import COLOURS, svg
@@ -104,18 +103,14 @@ def _intervals(figure: "Figure", report: Report) -> bool:
     styles = ("-", "--", "-.", ":", "-", "--")
     for (name, values), colour, style in zip(stages.items(), colours, styles, strict=False):
         ordered = np.sort(values)
-        keep = _spread(ordered.size)
+        places = np.geomspace(1, ordered.size, min(400, ordered.size)).astype(np.int64)
+        keep = ordered.size - np.unique(places)[::-1]  # denser towards the end, which is included
         beyond = 1 - keep / ordered.size
         right.plot(np.maximum(ordered[keep], 0.1), beyond, label=name.replace("_", " "), color=colour, linestyle=style)
     if stages:
         right.set(xscale="log", yscale="log", xlabel="latency, µs", ylabel="fraction of frames that take longer")
         right.legend(loc="lower left")
     return True
-
-
-def _spread(size: int, most: int = 400) -> Long:
-    """Ascending indices into a sorted column, denser towards its end, which is included."""
-    return size - np.unique(np.geomspace(1, size, min(most, size)).astype(np.int64))[::-1]
 
 
 def _residual(figure: "Figure", report: Report) -> bool:
@@ -297,7 +292,7 @@ def _stroke(figure: "Figure", report: Report) -> bool:
             plot.axhline(limit_nm, color=COLOURS["error"], linestyle="--")
     plot.set(ylabel="largest |actuator|, nm of surface", xlabel=_SECONDS, title=title)
     plot.set_ylim(bottom=0)
-    extremes = actuator_extremes_nm(history)
+    extremes = np.maximum(np.abs(history.mirror.highest_nm), np.abs(history.mirror.lowest_nm))  # from flat
     shown = image.imshow(extremes, cmap="cividis", vmin=0, interpolation="nearest", origin="lower")
     figure.colorbar(shown, ax=image, label="nm of surface")
     share = f",\nat most {results['stroke_most_share']:.1%} of the limit" if limit_nm is not None else ""

@@ -183,13 +183,11 @@ def _children(options: LatencyOptions, run: Run) -> list[Child]:
         arguments = ["-m", "lowfc.programs.measure.frame_source", *_options(run), "--seconds", str(seconds), *waits]
         children[0] = program(str(Role.CAMERA), arguments, run.path / f"{Role.CAMERA}.stderr")
     if options.trace:
-        children[1:1] = [_bare_loop(run, role, seconds) for role in TRACED]
+        for role in reversed(TRACED):
+            arguments = ["-m", bare_loop.__name__, str(role), *_options(run), "--seconds", str(seconds)]
+            name = f"bare loop beside the {role}"
+            children.insert(1, program(name, arguments, run.path / f"bare-{role}.stderr"))
     return children
-
-
-def _bare_loop(run: Run, role: Role, seconds: float) -> Child:
-    arguments = ["-m", bare_loop.__name__, str(role), *_options(run), "--seconds", str(seconds)]
-    return program(f"bare loop beside the {role}", arguments, run.path / f"bare-{role}.stderr")
 
 
 def _write_pids(run: Run, children: list[Child]) -> None:
