@@ -132,6 +132,11 @@ def test_an_interlock_that_refuses_to_close_opens_a_loop_that_starts_closed(acti
     for value in (None, True):
         state, _ = feed(setup, loaded(setup), mask(value))
         assert state.mode is (LoopMode.SAFE if action is Action.SAFE else LoopMode.OPEN)
+    measuring = settings(interlocks=setup.interlocks, auto_gain=(True, True))
+    close = Request(9, "close", text="auto: the gains were measured")
+    for value, mode in ((False, LoopMode.CLOSED), (True, state.mode)):
+        after, _ = feed(measuring, loaded(measuring), mask(value), mask(False), frame(1), close)
+        assert after.mode is mode
 
 
 def test_a_loop_that_starts_closed_is_held_by_a_hold_that_acts_before_or_after_it_loads() -> None:

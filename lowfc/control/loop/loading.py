@@ -11,7 +11,7 @@ from lowfc.control.loop.command_channels import ADOPTED, Channel
 from lowfc.control.loop.inputs import MirrorReport, MirrorShape, Outputs, PendingEvent
 from lowfc.control.loop.interlocks import IN_WORDS, Action, BenchReport, judged, refusal
 from lowfc.control.loop.safety import LoopMode, limit
-from lowfc.control.loop.state import ActiveLoop, Conditions, Settings, State
+from lowfc.control.loop.state import ActiveLoop, Settings, State
 from lowfc.control.loop.wording import CAMERA_MISFIT, MEASURED_FIRST
 
 ADOPTED_NM = 1.0
@@ -67,8 +67,6 @@ def loaded(
     mode = settings.start_mode if before_mode is LoopMode.IDLE else before_mode
     if mode is LoopMode.SAFE:
         cause = LATCHED
-    elif before_mode is LoopMode.IDLE and mode is LoopMode.CLOSED and loop.automatic.any():
-        mode, cause = LoopMode.OPEN, MEASURED_FIRST
     state = state._replace(loop=loop)
     acting = tuple(one for one in state.conditions.acting if one.action is not Action.HOLD)  # a held loop stays closed
     if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
@@ -77,9 +75,11 @@ def loaded(
         mode, cause = LoopMode.OPEN, f"{CAMERA_MISFIT}: {wrong}"
     elif mode is LoopMode.CLOSED and (wrong := refusal(acting, "close")):
         mode, cause = LoopMode.OPEN, wrong
+    elif before_mode is LoopMode.IDLE and mode is LoopMode.CLOSED and loop.automatic.any():
+        mode, cause = LoopMode.OPEN, MEASURED_FIRST
     if mode is not before_mode:
         events.append(mode_event(before_mode, mode, cause))
-        state = state._replace(mode=mode, conditions=_since(state, time_ns, cause))
+        state = in_mode(state, mode, time_ns, cause)
     return state, events
 
 
@@ -133,7 +133,7 @@ def interlock_or_permit_cause(state: State) -> str:
 def bench_reported(settings: Settings, state: State, report: BenchReport) -> tuple[State, Outputs]:
     """Evaluate the interlocks on a bench value; one that begins to act makes the loop safer, and none closes it.
 
-    Before the first used frame, `refuse_close` also opens a loop that started closed.
+    Before the first used frame, and while the gains are measured, `refuse_close` also opens a loop that started closed.
     """
     before = state.conditions.acting
     after = judged(settings.interlocks, before, report)
@@ -144,13 +144,15 @@ def bench_reported(settings: Settings, state: State, report: BenchReport) -> tup
     still = {one.number for one in after}
     events += [PendingEvent("INTERLOCK_CLEARED", {"why": one.why}) for one in before if one.number not in still]
     state = state._replace(conditions=state.conditions._replace(acting=after))
-    opening = (Action.OPEN,) if state.frames_used else (Action.OPEN, Action.REFUSE_CLOSE)
+    opening = (Action.OPEN,) if state.frames_used and not state.waits else (Action.OPEN, Action.REFUSE_CLOSE)
     for one in begun:
         mode, cause = state.mode, f"an interlock acts: {one.why}"
         if one.action is Action.SAFE:
             mode = LoopMode.SAFE
         elif one.action in opening and mode is LoopMode.CLOSED:
             mode = LoopMode.OPEN
+        elif one.action in opening and state.waits:  # it does not close by itself
+            state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
         state = _changed(state, mode, report.time_ns, cause, events)
     return state, Outputs(events=events, changed=True)
 
@@ -242,6 +244,8 @@ def camera_reported(settings: Settings, state: State, camera: CameraSettings) ->
     if wrong and wrong != misfit(state):
         events.append(PendingEvent("CAMERA_CHANGED", {"what": wrong}))
         cause = f"{CAMERA_MISFIT}: {wrong}"
+        if after.waits:
+            after = after._replace(conditions=after.conditions._replace(mode_cause=cause))
     if mode is not LoopMode.SAFE and uncalibrated(after) and not after.frames_used:
         mode = LoopMode.IDLE
     elif (mode is LoopMode.CLOSED and wrong) or (mode is LoopMode.IDLE and not uncalibrated(after)):
@@ -273,10 +277,6 @@ def _expected(loop: ActiveLoop, camera: CameraSettings) -> CameraSettings:
     return replace(camera, shape=calibration.shape, saturation_dn=calibration.saturation_dn)
 
 
-def _since(state: State, time_ns: int, cause: str) -> Conditions:
-    return state.conditions._replace(mode_since_ns=time_ns, mode_cause=cause)
-
-
 def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[PendingEvent]]:
     """Make a shape's deviation (rows, columns) from the modal command a channel, unless it is the driver's rounding."""
     rest_nm = shape_nm.copy()
@@ -305,8 +305,8 @@ def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
             loop = loop._replace(command_channels=restarted_from_flat)
         if loop.law_runner is not None and mode is LoopMode.CLOSED:
             loop = loop._replace(law_runner=loop.law_runner.taking_over())
-    same = mode is state.mode
-    conditions = state.conditions if same else _since(state, time_ns, cause)
+    same, conditions = mode is state.mode, state.conditions
+    conditions = conditions if same else conditions._replace(mode_since_ns=time_ns, mode_cause=cause)
     return state._replace(
         mode=mode, loop=loop, steps_left=0, returning_to_zero=state.returning_to_zero and same, conditions=conditions
     )

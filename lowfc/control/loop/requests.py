@@ -19,7 +19,7 @@ from lowfc.control.loop.loading import holding_cause, in_mode, loaded, misfit, m
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, permit, release, renew
 from lowfc.control.loop.safety import MAX_LIMIT_NM, Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
-from lowfc.control.loop.wording import MAX_NOTE_LENGTH, MEASURED_FIRST, PAUSED, counted
+from lowfc.control.loop.wording import AUTO, MAX_NOTE_LENGTH, PAUSED, counted
 
 MAX_STEPS = 1 << 32  # most frames of a request `step`
 MAX_REPLY_LENGTH = 1000
@@ -104,8 +104,9 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
         reply = "the loop is open already, and holds the command"
     if request.name == "close" and state.mode is LoopMode.CLOSED and not state.steps_left:
         reply = "the loop stays closed"
-    waits = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
-    if (request.name == "open" and paused) or (after is LoopMode.OPEN and waits):  # it stays open
+    if request.name == "close" and request.text.startswith(f"{AUTO}: ") and not state.waits:
+        raise ValueError("the loop no longer waits for its gains")
+    if (request.name == "open" and paused) or (after is LoopMode.OPEN and state.waits):  # it stays open
         state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
     if after is LoopMode.CLOSED and state.loop is not None and state.loop.calibration.provisional:
         reply += (

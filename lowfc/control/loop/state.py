@@ -22,6 +22,7 @@ from lowfc.control.loop.guard import LawGuard
 from lowfc.control.loop.interlocks import Acting, Interlock
 from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, Reason, Rejection
+from lowfc.control.loop.wording import MEASURED_FIRST
 
 SETTLING_FRAMES = 100
 """Frames for which a new linear law is updated but does not drive the mirror."""
@@ -336,3 +337,13 @@ class State(NamedTuple):
     identical_frames: int = 0
     conditions: Conditions = Conditions()
     input_number: int = 0
+
+    @property
+    def may_command(self) -> bool:
+        """Whether commands may be sent: except in safe mode, not the first to a mirror with a fault: it might jump."""
+        return self.commanded or not self.conditions.mirror_fault or self.mode is LoopMode.SAFE
+
+    @property
+    def waits(self) -> bool:
+        """Whether the loop is open only until its gains are measured."""
+        return self.mode is LoopMode.OPEN and self.conditions.mode_cause == MEASURED_FIRST

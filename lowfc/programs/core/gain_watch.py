@@ -11,7 +11,7 @@ from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.loop.inputs import COUNT_BITS, PendingEvent, Request, Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import ActiveLoop, Settings, State, Weighting
-from lowfc.control.loop.wording import AUTO, MEASURED_FIRST
+from lowfc.control.loop.wording import AUTO
 
 FIRST_S = 2.0
 """Length of the first window, all modes."""
@@ -222,8 +222,7 @@ class GainWatch:
         if loop.automatic.any() and (initial or not np.array_equal(gain, loop.integrator.gain)):
             requests.append(self._gain_request(step, loop, gain))
         self.closing_harm = "" if state.mode is LoopMode.CLOSED else self._closing_harm(gain, loop)
-        close_pending = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
-        if close_pending and all(group.verdict is not None for group in self._groups):
+        if state.waits and all(group.verdict is not None for group in self._groups):
             requests.append(
                 Request(step.time_ns, "close", text=f"{AUTO}: the gains were measured", requester=REQUESTER)
             )
