@@ -51,12 +51,8 @@ def test_moving_back_keeps_the_slew_limit() -> None:
     moved_nm = np.abs(outputs.command.actuators_nm - state.loop.actuators_nm).max()
     assert 0 < moved_nm < DEFAULTS.limits.slew_nm
     np.testing.assert_array_equal(after.loop.actuators_nm, outputs.command.actuators_nm)
-
-
-def test_a_shape_of_another_grid_moves_nothing() -> None:
-    state = running()
-    other = MirrorShape(0, np.zeros((2, 2), np.float32), np.zeros(0, np.float32))
-    after, _ = feed(DEFAULTS, state, MirrorReport(0, LOST.fault, other))
+    far = MirrorShape(0, np.zeros((2, 2), np.float32), np.zeros(0, np.float32))  # of another grid
+    after, _ = feed(DEFAULTS, state, MirrorReport(0, LOST.fault, far))
     np.testing.assert_array_equal(after.loop.actuators_nm, state.loop.actuators_nm)
 
 
@@ -101,6 +97,11 @@ def test_a_mirror_gets_no_command_before_it_reports_and_does_not_jump() -> None:
     command = all_outputs[-1].command
     assert isinstance(command, Command)
     assert 0 < np.abs(command.actuators_nm - 20).max() < 15, "one step from its shape"
+    channel = Request(0, "channel", text="flat", actuators_nm=np.full(20, 10, np.float32))
+    early = feed(
+        DEFAULTS, loaded(DEFAULTS), Request(0, "open"), absent, channel, *frames(1, 2), shape, BACK, *frames(3)
+    )
+    np.testing.assert_allclose(early[1][-1].command.actuators_nm, 30)
     in_safe_mode = feed(DEFAULTS, loaded(DEFAULTS), LOST, Request(0, "safe"), *frames(1))[1][-1]
     assert in_safe_mode.command.safe
 

@@ -399,15 +399,19 @@ def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration:
         controller.run()
 
 
-def test_the_flat_map_waits_for_a_mirror_that_starts_later(tmp_path: Path) -> None:
+def test_the_flat_map_waits_for_a_mirror_that_starts_later(calibration: Calibration, tmp_path: Path) -> None:
     np.save(tmp_path / "flat.npy", np.ones(GRID, np.float32))
     flat = configured(lockstep=False, mirror__flat=str(tmp_path / "flat.npy"))
-    hub, _, controller = alone(None, Latch([tmp_path / "safe"]), flat)
-    controller._send_start_requests()
-    shape = wire.MirrorState(rows=GRID[0], columns=GRID[1], actuators=bytes(4 * GRID[0] * GRID[1]))
-    MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
-    controller._between_frames(None)
-    assert [one.name for one in controller._state.loop.command_channels.channels] == ["flat"]
+    for first in (None, calibration):
+        hub, _, controller = alone(first, Latch([tmp_path / "safe"]), flat)
+        controller._report_mirror()
+        controller._send_start_requests()
+        assert controller._start_pending
+        shape = wire.MirrorState(rows=GRID[0], columns=GRID[1], actuators=bytes(4 * GRID[0] * GRID[1]))
+        MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
+        controller._report_mirror()
+        controller._between_frames(None)
+        assert [one.name for one in controller._state.loop.command_channels.channels] == ["flat"]
 
 
 def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: Calibration, tmp_path: Path) -> None:

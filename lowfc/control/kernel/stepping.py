@@ -141,9 +141,10 @@ def next_command(
         return step_to_flat(settings, loop), (), False
     channels, returning_to_zero = loop.command_channels, state.returning_to_zero
     closed = state.mode is LoopMode.CLOSED
-    # If a limit acted on the last command, the channels have not been reached yet.
-    if not closed and not returning_to_zero and (channels is None or not (channels.moving or state.limits_hit)):
-        return loop.holding_command(1), (), False
+    # If a limit acted on the last command, the channels have not been reached yet; without commands, none is.
+    still = channels is None or not (channels.moving or state.limits_hit)
+    if not state.may_command or not (closed or returning_to_zero or not still):
+        return loop.holding_command(1), (), returning_to_zero
     command_nm, clipped = loop.history_nm[0], False
     if returning_to_zero:
         command_nm = np.zeros_like(command_nm)

@@ -94,7 +94,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     if reasons != state.limits_hit:
         _limit_events(state.limits_hit, reasons, events)
     shown = (*reasons, Limit.LAW_OVERRULED) if _overruled(state, loop) else reasons
-    mode, command_nm, commanded = state.mode, loop.history_nm[0], _may_command(state)
+    mode, command_nm, commanded = state.mode, loop.history_nm[0], state.may_command
     steps_left, stepped = max(state.steps_left - 1, 0), state.steps_left == 1
     if stepped:
         events += [PendingEvent("LOOP_STEPPED", {}), mode_event(mode, LoopMode.OPEN, STEPPED)]
@@ -128,11 +128,6 @@ def _command_message(state: State, loop: ActiveLoop, command_nm: Single) -> Comm
     # Before the first frame, the mirror may know a newer sequence: a new identity makes it forget that.
     clear_id = conditions.clear_id or (0 if state.frame_sequence else conditions.mode_since_ns)
     return Command(*newest, loop.actuators_nm, command_nm, safe, clear_id)
-
-
-def _may_command(state: State) -> bool:
-    """Whether commands may be sent: not the first to a mirror with a fault, which might jump, except in safe mode."""
-    return state.commanded or not state.conditions.mirror_fault or state.mode is LoopMode.SAFE
 
 
 def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[State, ActiveLoop | None]:
@@ -243,7 +238,7 @@ def _refuse(
         refused_count=state.refused_count + 1,
         limits_hit=hit,
         returning_to_zero=returning_to_zero,
-        commanded=loop is not None and _may_command(state),
+        commanded=loop is not None and state.may_command,
         counts=_counted(state.counts, reasons),
         input_number=state.input_number + 1,
     )
