@@ -13,9 +13,9 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.command_channels import ADOPTED, EXTERNAL, FLAT, MAX_CHANNELS, MIRROR, OFFSET
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Outputs, Reply, Request
 from lowfc.control.loop.safety import Limits, LoopMode
-from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings
+from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, Weighting
 from tests.support.theory import law_of, linear
-from tests.support.toy import GRID, NOLL, START, TOY, calibration, frame, frame_sequence, loaded, settings
+from tests.support.toy import CAMERA, GRID, NOLL, START, TOY, calibration, frame, frame_sequence, loaded, settings
 
 DEFAULTS = settings()
 DISTURBED = np.array([10.0, -5.0, 3.0])
@@ -174,9 +174,11 @@ def test_a_probe_sequence_larger_than_the_slew_limit_leaves_no_offset() -> None:
 
 def test_the_last_step_ends_a_probe_sequence() -> None:
     loop = ToyLoop(mode=LoopMode.OPEN)
+    play = {"text": MIRROR, "table": np.ones((50, 1), np.float32), "actuators_nm": dark_hole(5.0).reshape(-1)}
+    assert not loop.ask("play", **play).accepted, "no frame has arrived"
     loop.run(2, np.zeros(3))
     loop.ask("step", values=(5,))
-    loop.ask("play", text=MIRROR, table=np.ones((50, 1), np.float32), actuators_nm=dark_hole(5.0).reshape(-1))
+    assert loop.ask("play", **play).accepted
     loop.run(8, np.zeros(3))
     assert loop.state.loop.command_channels.play is None
 
@@ -186,12 +188,6 @@ def test_channels_whose_sum_exceeds_the_stroke_are_refused() -> None:
     assert loop.ask("channel", text="a", actuators_nm=shape).accepted
     assert not loop.ask("channel", text="b", actuators_nm=shape).accepted
     assert loop.ask("channel", text="b", actuators_nm=-shape).accepted
-
-
-def test_no_probe_sequence_starts_before_the_first_frame() -> None:
-    loop = ToyLoop()
-    table = np.ones((5, 1), np.float32)
-    assert not loop.ask("play", text=MIRROR, table=table, actuators_nm=dark_hole(5.0).reshape(-1)).accepted
 
 
 @pytest.mark.parametrize("end", ["stop", "safe", "close", "limit", "restart", "load"])
@@ -450,13 +446,11 @@ def test_loading_another_calibration_moves_nothing() -> None:
     assert np.allclose(loop.surfaces[-1], before + dark_hole(1.0), atol=1.1)
 
 
-def test_an_offset_of_zero_changes_nothing() -> None:
+def test_another_weighting_of_r_is_no_step_of_a_channel_at_rest() -> None:
     loop = ToyLoop()
-    loop.run(20)
-    assert loop.state.loop.command_channels is None
-    loop.ask("offset", values=(0.0,))
-    plain = ToyLoop()
-    plain.run(20)
-    for each in (loop, plain):
-        each.run(20)
-    assert all(np.array_equal(one, other) for one, other in zip(loop.surfaces, plain.surfaces, strict=True))
+    loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(20.0).reshape(-1))
+    loop.run(60)
+    active_loop = loop.state.loop._replace(camera=CAMERA)
+    channels = active_loop.with_weighting(Weighting(np.float32([0, 0, 100]), 2e3)).command_channels
+    assert np.abs(channels.shift_nm - loop.state.loop.command_channels.shift_nm).max() > 0.5
+    np.testing.assert_allclose(channels.shifts_nm, [channels.shift_nm] * len(channels.shifts_nm), atol=1e-4)

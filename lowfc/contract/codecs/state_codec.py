@@ -135,16 +135,17 @@ def decode_state(
             law_runner = LawRunner(found, x, message.law_frames, guard)
             if x.shape != linear_law.at_rest(law_runner.law).shape or law_runner.law.noll != calibration.noll:
                 raise ValueError("the law of the controller's state does not fit")
+        if message.HasField("camera_expected"):
+            loop = loop._replace(camera=camera_settings(message.camera_expected))
+        if prior_nm2.size:  # first: it changes the past shifts of channels
+            loop = loop.with_weighting(Weighting(prior_nm2, message.weighting_flux_dn))
         loop = loop._replace(
-            camera=camera_settings(message.camera_expected) if message.HasField("camera_expected") else loop.camera,
             law_runner=law_runner,
             command_channels=command_channels_of(message, loop.channels_or_empty(), loop.to_modes, plays),
             history_nm=tuple(history),
             actuators_nm=actuators,
             automatic=np.array(message.automatic or [False] * modes, bool),
         ).with_gains(law)
-        if prior_nm2.size:
-            loop = loop.with_weighting(Weighting(prior_nm2, message.weighting_flux_dn))
     state = State(
         mode=LoopMode(message.mode),
         loop=loop,

@@ -179,11 +179,14 @@ class CommandChannels(NamedTuple):
         if before is None and shape_nm.any() and len(self.channels) >= MAX_CHANNELS:
             raise ValueError(f"there are {MAX_CHANNELS} channels already, which is the most: remove one")
         if name == EXTERNAL:
-            after = self.with_one(Channel(name, shape_nm, shape_nm), to_modes)
-            more_nm = after.shift_nm - self.shift_nm
-            return after._replace(shifts_nm=tuple(one + more_nm for one in self.shifts_nm))
+            return self.with_one(Channel(name, shape_nm, shape_nm), to_modes).at_once(self)
         reached_nm = np.zeros_like(shape_nm) if before is None else before.reached_nm
         return self.with_one(Channel.of(name, shape_nm, reached_nm), to_modes)
+
+    def at_once(self, before: "CommandChannels") -> "CommandChannels":
+        """A copy that differs from `before` in the shifts of the last frames as in the present one."""
+        more_nm = self.shift_nm - before.shift_nm
+        return self._replace(shifts_nm=tuple(one + more_nm for one in self.shifts_nm))
 
     def channel(self, name: str) -> Channel | None:
         """The channel of that name."""

@@ -231,7 +231,7 @@ class ActiveLoop(NamedTuple):
             weighting=weighting,
             estimator=Estimator.of(calibration, self.estimator.kernel),
             to_modes=to_modes,
-            command_channels=None if channels is None else channels.with_all(channels.channels, to_modes),
+            command_channels=channels and channels.with_all(channels.channels, to_modes).at_once(channels),
         )
 
     def channels_or_empty(self) -> CommandChannels:
