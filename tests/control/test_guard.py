@@ -17,7 +17,7 @@ from lowfc.control.laws.stability import LOWEST_GAIN, highest_gain
 from lowfc.control.laws.vibration import Line, Model
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.guard import BETTER_S, LAW_RETURNS, MAX_TAKEOVERS, WORSE_BLOCKS, Group, Spans
-from lowfc.control.loop.inputs import Request
+from lowfc.control.loop.inputs import MirrorReport, Request
 from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
 from lowfc.programs.cli import status
@@ -171,6 +171,7 @@ def test_closing_and_loading_reset_the_guard() -> None:
     for requests in ([Request(0, "open"), Request(0, "close")], [Request(0, "law", law=BAD_TILT)]):
         reset, _ = feed(SETUP, state, *requests)
         assert [group.takeovers for group in reset.loop.law_runner.guard.groups] == [0, 0]
+    assert overruled(feed(SETUP, state, MirrorReport(0, "does not answer"))[0])[0]
 
 
 def test_missing_and_refused_frames_hold_the_virtual_command() -> None:

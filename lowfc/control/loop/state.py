@@ -104,8 +104,8 @@ class LawRunner(NamedTuple):
         return cls(law, linear_law.at_rest(law), 0, LawGuard.of(law) if guarded else None)
 
     def restarted(self) -> "LawRunner":
-        """The same law, at rest."""
-        return self.at_rest(self.law, guarded=self.guard is not None)
+        """The same law, at rest; modes in which it is overruled stay so."""
+        return LawRunner(self.law, linear_law.at_rest(self.law), 0, self.guard and self.guard.at_rest())
 
     def advanced(self, error_nm: Single, pol_nm: Single, command_nm: Single) -> "LawRunner":
         """A copy advanced by one frame, from error and POL (modes,) relative to the target, and the last command."""
@@ -135,8 +135,7 @@ class LawRunner(NamedTuple):
 
     def taking_over(self) -> "LawRunner":
         """A copy for a loop that has just been closed: the law fades in."""
-        guard = None if self.guard is None else self.guard.reset()
-        return self._replace(frames=min(self.frames, SETTLING_FRAMES), guard=guard)
+        return self._replace(frames=min(self.frames, SETTLING_FRAMES), guard=self.guard and self.guard.reset())
 
 
 class Weighting(NamedTuple):
