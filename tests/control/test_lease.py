@@ -246,10 +246,12 @@ def test_removing_a_channel_and_a_missing_one() -> None:
 def test_the_refusal_of_an_offset_names_its_mode() -> None:
     _, reply = answer(loaded(DEFAULTS), "offset", 80.0, modes=(4,))
     assert (reply.accepted, reply.text) == (False, "offset of mode 4: at most its limit, 50 nm; asked for 80 nm")
-    loop = (state := loaded(DEFAULTS)).loop
-    truncated = replace(loop.calibration, actuators_to_modes=np.zeros_like(loop.calibration.modes_to_actuators.T))
-    _, reply = answer(state._replace(loop=loop._replace(calibration=truncated)), "offset", 5.0, modes=(4,))
-    assert "offset of mode 4: R measures it only in part" in reply.text
+    whole = loaded(DEFAULTS).loop.calibration
+    truncated = replace(whole, actuators_to_modes=np.zeros_like(whole.modes_to_actuators.T))
+    load, offset = Request(1, "load", calibration=truncated), Request(1, "offset", (4,), (5.0,))
+    for order in ((load, offset), (offset, load)):  # the later one is refused
+        *_, outputs = feed(DEFAULTS, loaded(DEFAULTS), Request(0, "open"), *order)[1]
+        assert "offset of mode 4: R measures it only in part" in outputs.reply.text
 
 
 def test_events_use_singular_and_plural() -> None:

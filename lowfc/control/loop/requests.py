@@ -281,6 +281,8 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
     if not safe_pending(settings, state):  # an idle loop opens, whatever the configured mode
         settings = replace(settings, start_mode=LoopMode.OPEN)
     after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
+    loop = _active_loop(after)  # a limit may be below its offset
+    check_offset(loop, np.minimum(np.abs(loop.channels_or_empty().offset_nm), loop.integrator.limit_nm))
     others = (event for event in events if event.name != "MODE_CHANGED")  # `answer` adds it
     return after, f"calibration {request.calibration.id[:12]}", *others
 
