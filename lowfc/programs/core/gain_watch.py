@@ -98,7 +98,7 @@ class GainWatch:
             return NOTHING
         self._newest = newest
         same_camera = newest >> COUNT_BITS == before >> COUNT_BITS
-        held = newest - before - 1 if same_camera and newest > before else 0  # it may be lower after a clear
+        held = newest - before - 1 if same_camera and newest > before else 1  # it may be lower after a clear
         added = loop.command_channels
         playing = added is not None and added.play is not None
         if (
@@ -170,7 +170,7 @@ class GainWatch:
             for mask, cross_talk, window_s in ((tilt, None, TILT_S), (~tilt, both, OTHERS_S))
             if mask.any()
         ]
-        self._former_flux_dn = 0.0
+        self._former_flux_dn, self.closing_harm = 0.0, ""
 
     def _flux_change(self, flux_dn: float) -> float:
         """Ratio of the flux to the former flux if it has changed in two consecutive averages; else 0."""
