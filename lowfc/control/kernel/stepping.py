@@ -6,7 +6,6 @@ from lowfc.arrays import Single
 from lowfc.control.kernel.tables import Tables
 from lowfc.control.laws import linear_law
 from lowfc.control.laws.integrator import integrate
-from lowfc.control.loop.guard import LawGuard
 from lowfc.control.loop.inputs import PendingEvent
 from lowfc.control.loop.safety import Limit, LoopMode, Reason, limit
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, ActiveLoop, LawRunner, Settings, State
@@ -108,29 +107,21 @@ def _update_guard(
     events: list[PendingEvent],
 ) -> ActiveLoop:
     """The loop with its advanced law and guard; error and POL (modes,) are relative to the loop's target."""
-    if advanced.guard is not None:
-        guard, more = _guarded(state, loop, advanced, advanced.guard, error_nm, pol_from_target_nm)
+    guard, channels, closed = advanced.guard, loop.command_channels, state.mode is LoopMode.CLOSED
+    if guard is not None:
+        probed = state.returning_to_zero or (channels is not None and channels.play is not None)
+        fading = closed and SETTLING_FRAMES < advanced.frames < SETTLING_FRAMES + FADING_FRAMES
+        if probed or fading or not (closed or state.mode is LoopMode.OPEN):
+            guard = guard.at_rest()
+        elif advanced.frames <= SETTLING_FRAMES or not closed:
+            guard = guard.observed(pol_from_target_nm, advanced.frames)
+        else:  # virtual commands have the modal limit, too
+            limited = any(reason is not Limit.MODAL_LIMIT for reason in state.limits_hit)
+            commands = advanced.law, advanced.x, loop.integrator, loop.delay_weights, loop.history_nm
+            guard, more = guard.judged(*commands, error_nm, pol_from_target_nm, limited=limited)
+            events += more
         advanced = advanced._replace(guard=guard)
-        events += more
     return loop._replace(law_runner=advanced)
-
-
-def _guarded(
-    state: State, loop: ActiveLoop, law: LawRunner, guard: LawGuard, error_nm: Single, pol_from_target_nm: Single
-) -> tuple[LawGuard, list[PendingEvent]]:
-    """The guard after a frame, and its events; `law` is advanced, error and POL (modes,) are relative to the target."""
-    closed, channels = state.mode is LoopMode.CLOSED, loop.command_channels
-    probed = state.returning_to_zero or (channels is not None and channels.play is not None)
-    if probed or not (closed or state.mode is LoopMode.OPEN):
-        return guard.at_rest(), []
-    if law.frames <= SETTLING_FRAMES or not closed:
-        return guard.observed(pol_from_target_nm, law.frames), []
-    if law.frames < SETTLING_FRAMES + FADING_FRAMES:
-        return guard.at_rest(), []
-    # Virtual commands have the modal limit, too.
-    limited = any(reason is not Limit.MODAL_LIMIT for reason in state.limits_hit)
-    integrator = loop.integrator, loop.delay_weights, loop.history_nm
-    return guard.judged(law.law, law.x, *integrator, error_nm, pol_from_target_nm, limited=limited)
 
 
 def next_command(

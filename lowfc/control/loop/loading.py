@@ -257,15 +257,10 @@ def camera_reported(settings: Settings, state: State, camera: CameraSettings) ->
 def _with_camera(state: State, camera: CameraSettings) -> State:
     """The state with newly received camera settings; the same object if they are unchanged."""
     loop, known = state.loop, state.conditions
-    if (
-        loop is not None
-        and loop.calibration.noll
-        and loop.camera is None
-        and not changes(camera, _expected(loop, camera))
-    ):
-        state = state._replace(loop=loop._replace(camera=camera))
     if camera != known.camera or known.camera_awaited:
         state = state._replace(conditions=known._replace(camera=camera, camera_awaited=False))
+    if loop is not None and loop.calibration.noll and loop.camera is None and not misfit(state):
+        state = state._replace(loop=loop._replace(camera=camera))
     return state
 
 

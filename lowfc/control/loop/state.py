@@ -246,9 +246,7 @@ class ActiveLoop(NamedTuple):
 
     def stopped(self, sequence: int) -> "ActiveLoop":
         """A copy whose probe sequence ends after this frame."""
-        if self.play is None or self.command_channels is None:
-            return self
-        return self._replace(command_channels=self.command_channels.stopped(sequence))
+        return self._replace(command_channels=self.command_channels and self.command_channels.stopped(sequence))
 
     def with_command(self, command_nm: Single, actuators_nm: Single) -> "ActiveLoop":
         """A copy advanced by one frame, with this command."""
@@ -258,11 +256,9 @@ class ActiveLoop(NamedTuple):
 
     def holding_command(self, frames: int) -> "ActiveLoop":
         """A copy advanced by some frames in which the command is held."""
-        held = min(frames, len(self.history_nm))
+        held, channels = min(frames, len(self.history_nm)), self.command_channels
         history_nm = (self.history_nm[:1] * held + self.history_nm)[: len(self.history_nm)]
-        if self.command_channels is None:
-            return self._replace(history_nm=history_nm)
-        return self._replace(history_nm=history_nm, command_channels=self.command_channels.passed(frames))
+        return self._replace(history_nm=history_nm, command_channels=channels and channels.passed(frames))
 
     def missed(self, frames: int) -> "ActiveLoop":
         """A copy advanced by some frames without measurements."""
