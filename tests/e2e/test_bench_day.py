@@ -46,7 +46,7 @@ CONFIG = """
 sam = "sam27d10_bal14"
 modes = 6
 [camera]
-rate_hz = 100.0
+rate_hz = 125.0
 [star]
 magnitude = 0.0
 [disturbance]
