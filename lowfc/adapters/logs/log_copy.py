@@ -104,7 +104,11 @@ def refuse_existing(path: Path) -> None:
 
 @contextlib.contextmanager
 def new_log(path: Path, source: Path) -> Iterator[IO[bytes]]:
-    """Yield a file with the permissions of `source` that is renamed to `path` on success and removed on failure."""
+    """Yield a file with the permissions of `source` that is renamed to `path` on success and removed on failure.
+
+    Raises:
+        DataFileError: the file exists already, or cannot be written.
+    """
     refuse_existing(path)
     with being_written(path, source) as part, part.open("wb") as file:
         yield file

@@ -144,7 +144,12 @@ def named_logs(names: Sequence[Path], out: Path | None = None, *, as_json: bool 
 
 
 def named_log(names: Sequence[Path]) -> Parts:
-    """The single log named on a command line; ConfigurationError if several are named; see `named_logs`."""
+    """The single log named on a command line; see `named_logs`.
+
+    Raises:
+        ConfigurationError: several logs are named.
+        DataFileError: the folder contains no log.
+    """
     found = named_logs(names)
     if len(found) > 1:
         raise ConfigurationError(f"this command reads one log: name one, not {_listed(found)}; the newest is `{LAST}`")

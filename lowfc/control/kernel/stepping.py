@@ -133,8 +133,8 @@ def next_command(
     channels, returning_to_zero = loop.command_channels, state.returning_to_zero
     closed = state.mode is LoopMode.CLOSED
     # If a limit acted on the last command, the channels have not been reached yet; without commands, none is.
-    still = channels is None or not (channels.moving or state.limits_hit)
-    if not state.may_command or not (closed or returning_to_zero or not still):
+    channels_move = channels is not None and bool(channels.moving or state.limits_hit)
+    if not (state.may_command and (closed or returning_to_zero or channels_move)):
         return loop.holding_command(1), (), returning_to_zero
     command_nm, clipped = loop.history_nm[0], False
     if returning_to_zero:
