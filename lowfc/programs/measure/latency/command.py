@@ -6,10 +6,9 @@ import os
 import shlex
 import sys
 import time
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -27,19 +26,8 @@ _RATE_HZ = 1000.0
 _LEAK = 0.01
 
 
-class Kernels(StrEnum):
-    """Implementation of the control step; both: in turns."""
-
-    NUMPY = "numpy"
-    FUSED = "fused"
-    BOTH = "both"
-
-
-class Camera(StrEnum):
-    """Source of the frames."""
-
-    PREPARED = "prepared"
-    SIMULATED = "simulated"
+Kernels = Literal["numpy", "fused", "both"]
+Camera = Literal["prepared", "simulated"]
 
 
 def latency(
@@ -47,7 +35,7 @@ def latency(
     logs: LogsOrMeasure = None,
     duration: Annotated[float, typer.Option(min=0.5, max=1e5, help="Duration of each repeat, seconds.")] = 10.0,
     rate: Annotated[float | None, typer.Option(help="Frames per second; default: the file's, or 1000.")] = None,
-    camera: Annotated[Camera, typer.Option(help="Prepared frames, or the simulated camera.")] = Camera.PREPARED,
+    camera: Annotated[Camera, typer.Option(help="Prepared frames, or the simulated camera.")] = "prepared",
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="Number of repeats of loop and references.")] = 1,
     record: Annotated[bool, typer.Option("--record/--no-record", help="Run the recorder, too.")] = False,
     view: Annotated[bool, typer.Option("--view/--no-view", help="Run a view for a browser, too.")] = False,
@@ -97,8 +85,8 @@ def latency(
         from lowfc.control.kernel.tables import FUSED, KERNELS
         from lowfc.programs.measure.latency.run import LatencyOptions
 
-        simulated = camera is Camera.SIMULATED
-        kernels = KERNELS if kernel is Kernels.BOTH else (str(kernel),) if kernel is not None else ()
+        simulated = camera == "simulated"
+        kernels = KERNELS if kernel == "both" else (kernel,) if kernel is not None else ()
         if FUSED in kernels and not compiled.available():
             raise ConfigurationError(compiled.missing())
         if trace and simulated:
@@ -122,12 +110,12 @@ def _configuration(file: Path | None, rate: float | None, camera: Camera, *, pla
     from lowfc.contract.configuration import FIXED_GAINS
 
     overrides: dict[str, Any] = {"camera.rate_hz": rate, "lockstep": False}
-    if camera is Camera.PREPARED:  # without a leak, the integrator would accumulate noise
+    if camera == "prepared":  # without a leak, the integrator would accumulate noise
         overrides |= {"control.tilt_leak": _LEAK, "control.leak": _LEAK}
     if plain:
         overrides |= {"realtime.priority": 0, "realtime.lock_memory": False, "realtime.disable_cpu_idle": False}
         overrides |= {f"realtime.{role}_cpus": [] for role in ("camera", "controller", "mirror", "recorder")}
-    pinning = spread(os.sched_getaffinity(0), simulated=camera is Camera.SIMULATED)
+    pinning = spread(os.sched_getaffinity(0), simulated=camera == "simulated")
     defaults = {"control.start_mode": "closed", **FIXED_GAINS, "camera.rate_hz": _RATE_HZ, **pinning}
     return configuration(file, overrides, defaults)
 
@@ -152,7 +140,7 @@ def _measure(options: "LatencyOptions") -> dict[str, Any]:
         "settings": {
             "rate_hz": options.config.camera.rate_hz,
             **{name: getattr(options, name) for name in ("duration_s", "repeats", "record", "view", "trace")},
-            "camera": str(Camera.SIMULATED if options.simulated else Camera.PREPARED),
+            "camera": "simulated" if options.simulated else "prepared",
             "realtime": options.config.realtime.model_dump(),
         },
         "logs": [log for one in done for log in one["logs"]],
