@@ -399,7 +399,7 @@ def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration:
         controller.run()
 
 
-def test_the_flat_map_waits_for_a_mirror_that_starts_later(calibration: Calibration, tmp_path: Path) -> None:
+def test_start_requests_wait_for_the_mirror_and_the_cameras_settings(calibration: Calibration, tmp_path: Path) -> None:
     np.save(tmp_path / "flat.npy", np.ones(GRID, np.float32))
     flat = configured(lockstep=False, mirror__flat=str(tmp_path / "flat.npy"))
     for first in (None, calibration):
@@ -410,7 +410,11 @@ def test_the_flat_map_waits_for_a_mirror_that_starts_later(calibration: Calibrat
         shape = wire.MirrorState(rows=GRID[0], columns=GRID[1], actuators=bytes(4 * GRID[0] * GRID[1]))
         MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
         controller._report_mirror()
-        controller._between_frames(None)
+        for awaited in (True, False):
+            conditions = controller._state.conditions._replace(camera_awaited=awaited)
+            controller._state = controller._state._replace(conditions=conditions)
+            controller._between_frames(None)
+            assert controller._start_pending is awaited
         assert [one.name for one in controller._state.loop.command_channels.channels] == ["flat"]
 
 

@@ -345,8 +345,9 @@ class Controller:
             self._apply_report(MirrorReport(self._service.clock.now_ns(), fault, self._mirror.last()))
 
     def _send_start_requests(self) -> None:
-        """Once the mirror's shape is known, request its configured shapes and control law, as an operator would."""
-        if self._state.loop is None or not (self._start_pending and self._state.may_command):
+        """Once mirror and camera are known, request the configured shapes and control law, as an operator would."""
+        state = self._state
+        if state.loop is None or state.conditions.camera_awaited or not (self._start_pending and state.may_command):
             return
         self._start_pending = False
         for request in self._start_up.requests(self._state, self._service.clock.now_ns()):
