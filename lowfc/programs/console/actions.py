@@ -174,7 +174,7 @@ ACTIONS = (
             Field("method", "method: poke, hadamard, in-loop", lambda: "hadamard"),
             Field("snr", "snr: signal-to-noise ratio to reach", lambda: "70"),
             _OUT,
-            _LOAD,
+            _LOAD._replace(label="load: load it into the loop (yes, no)"),
         ),
         task=("calibrate",),
     ),
