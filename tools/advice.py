@@ -21,8 +21,8 @@ ADVICE: dict[str, Advice] = {
     "STARTED": Advice("a process has started.", _NOTHING),
     "STOPPED": Advice("a process has ended, for the named reason.", "start it again if nobody meant to stop it."),
     "CLOCK_OFF": Advice(
-        "the wall clock was set after boot; all times of the run keep the offset until the next boot.",
-        "let a time server set the clock before the loop starts; `lowfc doctor` shows the difference.",
+        "the wall clock was set after the first run since boot; the times of all runs are off by as much.",
+        "let a time server set the clock before the first run; `lowfc doctor` shows how to correct it later.",
     ),
     "REALTIME_REFUSED": Advice(
         "the host does not grant a real-time measure (SCHED_FIFO, locked memory, disabled CPU idle states).",
@@ -37,7 +37,7 @@ ADVICE: dict[str, Advice] = {
     "CALIBRATION_LOADED": Advice("a calibration is in use, at the start or after `load`.", _NOTHING),
     "NOT_CALIBRATED": Advice(
         "the controller started without a calibration.",
-        "`lowfc ctl load FILE`, `lowfc calibrate` or `lowfc commission`; frames are not used until then.",
+        "`lowfc ctl load FILE` or `lowfc commission`; frames are not used until then.",
     ),
     "CAMERA_CHANGED": Advice(
         "size, region, bias, saturation or gain of the camera differ from the calibration; a closed loop opens.",
@@ -154,7 +154,7 @@ ADVICE: dict[str, Advice] = {
         "set the clocks of both hosts and start the sender again; `lowfc ctl clear` resets a wrong frame number.",
     ),
     "LATCH_FAILED": Advice(
-        "the file that keeps safe mode across restarts cannot be written.",
+        "a file that keeps safe mode across restarts cannot be read or written.",
         "make the directory named in the event writable; safe mode itself is in force.",
     ),
     "COMMANDS_LATE": Advice(
