@@ -178,7 +178,7 @@ class Realtime(Section):
     disable_cpu_idle: bool = True
     """Keep processors out of deep idle states while the loop runs: lower latency, more power."""
     cache_warmup: bool = True
-    """Repeat the control step just before the next frame to keep the caches warm; not above 2 kHz."""
+    """Repeat the control step just before the next frame to keep the caches warm; only below 2 kHz."""
     kernel: KernelName = "numpy"
     """Implementation of the control step: numpy, or the fused step compiled by numba (extra `fast`)."""
     threads: int = Field(1, ge=1, le=8)
