@@ -32,7 +32,7 @@ REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.AHEAD: ("camera clock ahead", "set the clocks of both hosts and restart the camera"),
     Rejection.CAMERA_UNKNOWN: ("camera settings unknown", "the camera restarted and sends no settings; restart it"),
     Rejection.NO_MIRROR: ("no mirror", "the mirror does not follow; check it"),
-    Rejection.HELD: ("loop held", "an interlock or a lease holds the loop"),
+    Rejection.HELD: ("loop held", "an interlock or a permit holds the loop"),
 }
 """Reasons for refusing a frame: text and advice."""
 _FRAME_REASONS = [reason for reason in REFUSED if reason not in (Rejection.NO_MIRROR, Rejection.HELD)]
