@@ -12,6 +12,7 @@ from lowfc.control.loop.interlocks import Action, BenchReport, Interlock, Value
 from lowfc.control.loop.loading import holding_cause
 from lowfc.control.loop.safety import LoopMode, Rejection
 from lowfc.control.loop.state import Settings, State
+from lowfc.control.loop.wording import MEASURED_FIRST
 from tests.support.toy import GRID, SOME, calibration, check_reply, feed, frame, loaded, names, settings
 
 S = 1_000_000_000
@@ -186,6 +187,8 @@ def test_a_permit_holds_a_closed_loop_for_its_duration() -> None:
     state = running(setup)
     _, outputs = permit(setup, state)
     check_reply(outputs, False, "the loop is closed")
+    waiting = state.conditions._replace(mode_cause=MEASURED_FIRST)
+    check_reply(permit(setup, state._replace(mode=LoopMode.OPEN, conditions=waiting))[1], False, "closes once")
     state, outputs = permit(setup, state, 0.01)
     check_reply(outputs, True, "granted for 0.01 s: the loop holds its command")
     state, all_outputs = feed(setup, state, *(frame(count, SOME) for count in range(6, 18)))
