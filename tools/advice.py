@@ -208,7 +208,7 @@ REASONS: dict[str, Advice] = {
     "OUT_OF_ORDER": Advice("an older frame than the last one", "nothing, unless two cameras publish in one run"),
     "REPEATED": Advice("the frame was used before", "nothing, unless frequent"),
     "LATE": Advice(
-        "older than `control.max_frame_age_ms`, or than 5 ms and three periods, or superseded by a newer frame",
+        "older than `control.max_frame_age_ms`, or than both 5 ms and three periods, or superseded by a newer frame",
         "`lowfc doctor`; check the clocks of the hosts",
     ),
     "SATURATED": Advice("more than `control.max_saturated_pixels` at full well", "shorter exposure, lower gain"),

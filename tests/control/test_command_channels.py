@@ -21,6 +21,7 @@ DEFAULTS = settings()
 DISTURBED = np.array([10.0, -5.0, 3.0])
 ACTUATORS = GRID[0] * GRID[1]
 STEP_NM = DEFAULTS.limits.kept_slew_nm / 2
+"""Largest move of a channel in a frame: half the slew limit with its margin."""
 LOAD_OTHER = Request(0, "load", calibration=replace(calibration(scale=1.01), id="other"))
 
 
@@ -86,7 +87,7 @@ def test_a_channel_is_applied_within_the_slew_limit_and_not_undone() -> None:
 
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.5, 2.0])
-def test_the_zero_point_shifts_with_the_delay_of_the_mirror(delay_frames: float) -> None:
+def test_the_shift_of_the_zero_point_is_delayed_like_the_mirror(delay_frames: float) -> None:
     """While a channel is approached, no frame measures an error, whatever the delay."""
     setup = replace(DEFAULTS, delay_frames=delay_frames)
     loop = ToyLoop(setup, LoopMode.OPEN)
@@ -172,7 +173,7 @@ def test_a_probe_sequence_larger_than_the_slew_limit_leaves_no_offset() -> None:
     assert loop.state.limits_hit == ()
 
 
-def test_the_last_step_ends_a_probe_sequence() -> None:
+def test_a_probe_sequence_ends_with_the_last_frame_of_a_step_request() -> None:
     loop = ToyLoop(mode=LoopMode.OPEN)
     play = {"text": MIRROR, "table": np.ones((50, 1), np.float32), "actuators_nm": dark_hole(5.0).reshape(-1)}
     assert not loop.ask("play", **play).accepted, "no frame has arrived"
@@ -342,8 +343,8 @@ def test_a_law_takes_over_and_returns_control_without_a_jump() -> None:
     for each in (loop, plain):
         each.ask("gain", values=(0.4,))
         each.ask("limit", values=(50.0,))
-    stable = linear(law)
-    assert loop.ask("law", law=stable).accepted
+    linear_law = linear(law)
+    assert loop.ask("law", law=linear_law).accepted
     assert not loop.ask("gain", values=(0.3,)).accepted
     frames = SETTLING_FRAMES + FADING_FRAMES + 50
     for each in (loop, plain):
@@ -409,16 +410,16 @@ def test_an_offset_moves_the_loop_but_not_the_pseudo_open_loop_modes(signal: Sig
 def test_a_law_for_another_loop_is_refused() -> None:
     loop = ToyLoop()
     law = law_of(1.2)
-    stable = linear(law)
-    assert loop.ask("law", law=stable).accepted
+    linear_law = linear(law)
+    assert loop.ask("law", law=linear_law).accepted
     unit = np.eye(3, dtype=np.float32)
     delayed = ToyLoop(replace(DEFAULTS, delay_frames=2.0))
     one_frame_law = LinearLaw("pol", 0.6 * unit, 0.4 * unit, 0 * unit, unit, -unit, "smooth", NOLL, 1.0, 1000.0)
     assert "delay" in delayed.ask("law", law=one_frame_law).text
-    assert not delayed.ask("law", law=stable).accepted
+    assert not delayed.ask("law", law=linear_law).accepted
     assert not loop.ask("law", law=linear(law, (2, 3, 5))).accepted
     slow = ToyLoop(replace(DEFAULTS, rate_hz=500.0))
-    assert "1000 Hz" in slow.ask("law", law=stable).text
+    assert "1000 Hz" in slow.ask("law", law=linear_law).text
     assert slow.ask("law", law=linear(law, rate_hz=501.0)).accepted
 
 
@@ -446,7 +447,7 @@ def test_loading_another_calibration_moves_nothing() -> None:
     assert np.allclose(loop.surfaces[-1], before + dark_hole(1.0), atol=1.1)
 
 
-def test_another_weighting_of_r_is_no_step_of_a_channel_at_rest() -> None:
+def test_another_weighting_of_r_changes_the_shift_of_a_channel_at_rest_at_once() -> None:
     loop = ToyLoop()
     loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(20.0).reshape(-1))
     loop.run(60)

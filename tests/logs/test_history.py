@@ -20,6 +20,7 @@ from lowfc.contract.messages import (
     STEP,
     TIMING,
     TRUTH,
+    Log,
     Message,
     Topic,
     wire,
@@ -71,7 +72,7 @@ def test_late_commands_after_a_restart_of_the_camera_are_counted(tmp_path: Path)
     night = SyntheticLog()
     for start_s, count, late in ((START, 0, 40), (START, 1, 43), (START + 60, 0, 4), (START + 60, 1, 6)):
         night.put(HEALTH, wire.Health(process="camera", commands_late=late), sequence_of(start_s, count), "camera")
-    assert history_of(night, tmp_path / "x.mcap").commands_late == 3 + 6
+    assert history_of(night, tmp_path / "x.mcap").commands_late == 3 + 6  # 40 precede the log
 
 
 def test_the_attached_calibration_replaces_a_lost_message(tmp_path: Path) -> None:
@@ -132,13 +133,13 @@ def test_an_invalid_message_is_left_out_of_every_column(
 
 def test_a_message_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
     night = SyntheticLog().frames(STEPS)
-    night.put(EVENT, wire.Tick(), late_ns=(1 << 63) - night.now_ns)
+    night.put(EVENT, Log(), late_ns=(1 << 63) - night.now_ns)
     history = history_of(night, tmp_path / "x.mcap")
     assert history.excluded_messages == 1
     assert history.span_ns[1] < 1 << 62
 
 
-def test_a_log_begins_with_its_first_message_that_is_no_older_state(tmp_path: Path) -> None:
+def test_a_log_begins_with_its_first_message_that_is_not_retained(tmp_path: Path) -> None:
     night = SyntheticLog()
     state = next(sample for sample in night.samples if CAMERA_STATE.matches(sample.key))
     night.samples = []

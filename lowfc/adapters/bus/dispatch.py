@@ -18,8 +18,8 @@ class Dispatch(Arrivals):
     """Passes messages to a handler in their order of arrival and identifies superseded ones.
 
     Messages queue while the process stands still. A queued message is superseded if it is at least a period old when
-    dispatched, and any message if it is 5 ms and three periods old. So that a slow handler cannot fall further and
-    further behind, messages that still wait after `MAX_IN_A_ROW` back to back are skipped.
+    dispatched, and any message at 5 ms or three periods, whichever is longer. So that a slow handler cannot fall
+    further and further behind, messages that still wait after `MAX_IN_A_ROW` back to back are skipped.
     """
 
     def __init__(

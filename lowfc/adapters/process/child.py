@@ -20,7 +20,7 @@ ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG, which exec keeps
 if os.getppid() == parent:  # the parent is still alive
     os.execvp(sys.argv[3], sys.argv[3:])
 """
-"""Program that requests the death signal, then executes the child's command; no code may run between fork and exec."""
+"""Program that requests the death signal, then executes the child's command (`preexec_fn` is unsafe with threads)."""
 
 
 @dataclass(slots=True)

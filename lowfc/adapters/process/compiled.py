@@ -57,7 +57,7 @@ class Pool:
     """Threads that share the pass over large frames and sleep in between; they inherit this process's scheduling."""
 
     def __init__(self, measure: Callable[..., float], measure_blocks: Callable[..., None], threads: int) -> None:
-        """Start the threads; the calling thread is the first of `threads`."""
+        """Start the threads; the calling thread is one of `threads`."""
         self._measure = measure
         self._measure_blocks = measure_blocks
         self._work: tuple[Any, ...] = ()
@@ -121,13 +121,13 @@ def _compiled() -> list[Any]:
 
     real, flag, single, whole = types.float64, types.boolean, types.float32, types.int64
     counts, line, plane = array(types.uint16, 1), array(single, 1), array(single, 2)
-    result, surface = array(single, 1, readonly=False), array(single, 2, readonly=False)
+    line_out, plane_out = array(single, 1, readonly=False), array(single, 2, readonly=False)
     law, totals = (plane, line, plane, plane, flag), array(types.uint64, 2, readonly=False)
-    frame = counts, counts, line, plane, result
+    frame = counts, counts, line, plane, line_out
     signatures = {
-        functions.measure: real(*frame, surface, totals, line, whole, real, real, result),
-        functions.respond: flag(*(line,) * 5, *law, *(plane,) * 3, *(real,) * 3, result, surface),
-        functions.measure_blocks: types.void(*frame, whole, whole, surface, totals),
+        functions.measure: real(*frame, plane_out, totals, line, whole, real, real, line_out),
+        functions.respond: flag(*(line,) * 5, *law, *(plane,) * 3, *(real,) * 3, line_out, plane_out),
+        functions.measure_blocks: types.void(*frame, whole, whole, plane_out, totals),
     }
     options: dict[str, Any] = {"fastmath": set(FASTMATH), "error_model": "numpy"}
     for called in (functions.scan, functions.measure_blocks):

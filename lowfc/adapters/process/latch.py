@@ -45,14 +45,15 @@ class Latch:
     """
 
     def __init__(self, files: Sequence[Path], failed: Callable[[str], None] = lambda why: None) -> None:
-        """Read the files; `failed` is called with the reason if a file cannot be read or written, once until it can."""
+        """Read the files; `failed` is called with the reason, once until the file works again."""
         self._files = tuple(files)
         self._failed = failed
         self._reported: set[Path] = set()
+        # Lists, as every file is tried: `any` and `all` would stop earlier.
         self.safe = True in [self._exists(file) for file in self._files]
         self.writable = True in [self._try(_probe, file) for file in self._files]
         self._target = self.safe
-        self._done: bool | None = None if self.safe else False  # one file exists: write the others, too
+        self._stored: bool | None = None if self.safe else False  # None: the files may differ
         self._ended = False
         self._changed = threading.Condition()
         self._keeper = threading.Thread(target=self._keep, name="latch", daemon=True)
@@ -86,12 +87,12 @@ class Latch:
         """Write or remove the files until all agree with the state; runs on its own thread."""
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._ended or self._target is not self._done)
+                self._changed.wait_for(lambda: self._ended or self._target is not self._stored)
                 ended, target = self._ended, self._target
-            if target is not self._done:
-                self._done = None  # only some of the files may be written
+            if target is not self._stored:
+                self._stored = None
                 if False not in [self._try(_write if target else _remove, file) for file in self._files]:
-                    self._done = target
+                    self._stored = target
                 elif not ended:
                     with self._changed:
                         self._changed.wait_for(lambda: self._ended, RETRY_S)

@@ -71,7 +71,7 @@ class Traffic:
         return sum(publisher.published for service in self._services for publisher in service.publishers)
 
     def wait_for(self, name: str, timeout_s: float) -> bool:
-        """Whether a process became ready in time and has received from all three roles."""
+        """Wait until a process is ready and has received Health from all three roles; False after the timeout."""
         deadline_s = time.monotonic() + timeout_s
         while sum(len(service.wait_for([name], _WAIT_S)) for service in self._services):
             if time.monotonic() >= deadline_s:

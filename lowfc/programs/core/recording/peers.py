@@ -63,12 +63,12 @@ class Peers:
         """Query at the next opportunity: a message may have been lost."""
         self._new_processes = True
 
-    def query_meanwhile(self, *, more: bool) -> list[Sample]:
-        """With `more`, query if a process is new; return the new messages among the answers since the last call.
+    def query_in_background(self, *, start: bool) -> list[Sample]:
+        """With `start`, query if a process is new; return the new messages among the answers since the last call.
 
         A thread does the query, because a frozen process answers late.
         """
-        if more and self._new_processes and self._answers is None:
+        if start and self._new_processes and self._answers is None:
             self._answers = self._thread.submit(self._query_all)
             self._new_processes = False
         if self._answers is None or not self._answers.done():

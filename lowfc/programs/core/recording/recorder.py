@@ -66,7 +66,7 @@ class Recorder:
         """Subscribe to everything; `run` starts the recording. Each log starts with `metadata` and `attachments`.
 
         Recording starts once each of the `awaited` processes has sent Health, or after a timeout. If none is named, it
-        awaits all on the bus; across hosts any one, because the bus counts only the router. `expected_bytes_per_s` is
+        awaits all peers; across hosts only one, as the router is then the only peer. `expected_bytes_per_s` is
         called before the first log begins, with the camera's state or None; its result counts until growth is measured.
         """
         self._awaited = awaited
@@ -76,7 +76,7 @@ class Recorder:
         self._account = LossAccount()
         self._selection = selection
         self._folder, self._min_free_bytes = folder, limits.min_free_bytes
-        self._present_folder = encodable(str(Path.cwd()))  # it may be removed later
+        self._working_folder = encodable(str(Path.cwd()))  # it may be removed later
         self._expect, self._expected_bytes_per_s = expected_bytes_per_s, 0.0
         self._series = LogSeries(folder, clock, {**metadata, **selection.metadata}, attachments, limits)
         self._peers = Peers(bus)
@@ -86,7 +86,7 @@ class Recorder:
         self._begun_ns = self._oldest_ns = 0
         self._messages_before, self._lost_before = 0, dict[str, int]()  # of earlier recordings
         self._longest_wait_ns = self._longest_unflushed_ns = self._slowest_ns = 0
-        # Before the service subscribes to Health: a peer that knows of this subscription knows of all others.
+        # Before the service subscribes to Health: a peer that knows of that subscription knows of all these.
         for topic in TOPICS:
             bus.subscribe(topic, partial(self._backlog.put, topic))
         self.service = Service(Role.RECORDER, run_id, clock, bus, granted=granted, fill=self._fill_health)
@@ -147,7 +147,7 @@ class Recorder:
     def _iterate(self) -> None:
         """Write what has arrived; periodically flush, report and rotate; carry out an operator's request."""
         self._write_waiting()
-        for sample in self._peers.query_meanwhile(more=self.service.running):
+        for sample in self._peers.query_in_background(start=self.service.running):
             self._write(sample)
         if self._clock.host_ns() >= self._flush_due_ns:
             self._maintain()
@@ -358,7 +358,7 @@ class Recorder:
         lost = self._account.lost()
         health.recording.files.extend(encodable(str(file)) for file in self._series.files[-MAX_HEALTH_LOGS:])
         health.recording.file = health.recording.files[-1] if health.recording.files else ""
-        health.recording.folder = self._present_folder
+        health.recording.folder = self._working_folder
         health.recording.messages = self._series.messages
         health.recording.lost = sum(lost.values())
         health.recording.failure = encodable(self._failure)

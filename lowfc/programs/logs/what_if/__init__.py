@@ -1,1 +1,1 @@
-"""`lowfc what-if`: a log with other gains, another reconstructor or another controller."""
+"""`lowfc what-if`: predict from a log the residual with other gains, another reconstructor or another controller."""

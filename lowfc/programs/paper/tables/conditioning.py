@@ -42,7 +42,7 @@ QUANTUM = (
 )
 SHARE = "Median over the modes of the ratio of variances, quantum limit over Cramer-Rao bound."
 CLAIMS = {
-    "open": "Sect. 4: extremely high. limit: above 1e12 is singular in double precision.",
+    "open": "Sect. 4: extremely high. limit: from there H is singular in double precision.",
     "bar": "Sect. 4: below 1000 (the limit here), an order of magnitude above the sparse aperture mask's.",
     "holes": "Sect. 4: smaller holes lower it, for the 14 modes that the mask was designed for.",
     "sensor": "limit: an order of magnitude below the bar's.",

@@ -17,11 +17,11 @@ from lowfc.programs.paper.cases import DEFAULT_SAM, Context, Prepared, Row, prep
 OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned", "bar", "lyot", "aplc")
 """Sensors in addition to the packaged sparse apertures."""
 ITERATIONS = (0, 1, 2)
-WITH_NUISANCES = "weighted, flux and shear fitted along"
+WITH_NUISANCES = "weighted, flux and shear also fitted"
 EVEN = (
     "If pupil and masks are real and the pupil is symmetric, flux and shear change the image by an even function of "
-    "position and every mode by an odd one: fitting them too costs a sparse aperture mask nothing. CLOWFS and the "
-    "Zernike sensor mistake shear for tilt."
+    "position, and every mode changes it by an odd one: fitting them too costs a sparse aperture mask nothing. CLOWFS "
+    "and the Zernike sensor mistake shear for tilt."
 )
 
 INPUT_PV_WAVES = {14: 0.097, 20: 0.11}
@@ -44,7 +44,7 @@ ESTIMATORS = ("pinv", *(label("weighted", iterations) for iterations in ITERATIO
 
 @dataclass(frozen=True)
 class Input:
-    """An interpretation of Sect. 3.1: bounds of random wavefronts for radial degrees 1 and 2, and above, waves rms."""
+    """An interpretation of Sect. 3.1: largest random coefficients of degrees 1 and 2 (`low`) and above, waves rms."""
 
     name: str
     low: float
