@@ -193,6 +193,7 @@ class MirrorLoop:
             return self._status.surface_nm
         else:
             reached_nm = self._call(self._driver.apply, actuators_nm)
+        self.watch.worked()  # not after other calls: a failing `apply` would be retried without pauses
         self._driven_nm = actuators_nm
         return actuators_nm if reached_nm is None else reached_nm
 
@@ -217,7 +218,6 @@ class MirrorLoop:
                 if not np.isfinite(np.vdot(flat, flat)):
                     raise ValueError("it returned positions that are NaN or infinite, expected nm of surface")
             if self.watch.returned():
-                self.watch.worked()
                 return found_nm
         except Exception as fault:
             self.watch.failed(fault)
