@@ -34,7 +34,7 @@ def test_a_run_has_ports_a_secret_and_private_files(monkeypatch: pytest.MonkeyPa
     assert len(set(run.links.ports.values())) == 5
     assert len(run.links.secret) == 64
     assert run.path.stat().st_mode & 0o777 == 0o700
-    assert {path.stat().st_mode & 0o777 for path in run.path.iterdir()} == {0o600}
+    assert {path.stat().st_mode & 0o7777 for path in run.path.iterdir()} == {0o1600}, "kept by systemd-tmpfiles"
     assert run.links.secret_file.read_text() == f"lowfc:{run.links.secret}\n"
     assert run.links.secret not in repr(run)
     other = open_run(new_run_id())

@@ -36,6 +36,7 @@ _MAX_START_LENGTH = 20  # characters
 _LATEST_START_S = (1 << 32) - 3  # latest start that fits a sequence
 _MAX_SOCKET_PATH_BYTES = 107  # bytes of a Unix socket's address
 _PORT_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
+MODE = 0o1600  # of a run's files: private, and sticky, so that systemd-tmpfiles keeps old ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +257,8 @@ def write_once(path: Path, text: str) -> str:
     """Write a file unless it exists, and return its text; simultaneous writers get the same text."""
     with contextlib.suppress(FileNotFoundError):
         return path.read_text(errors="replace")
-    with tempfile.NamedTemporaryFile("w", prefix=f".{path.name}-", dir=path.parent) as draft:  # mode 0600
+    with tempfile.NamedTemporaryFile("w", prefix=f".{path.name}-", dir=path.parent) as draft:
+        os.fchmod(draft.fileno(), MODE)
         draft.write(text)
         draft.flush()
         with contextlib.suppress(FileExistsError):
@@ -288,7 +290,7 @@ def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], netw
     draft = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))  # mode 0700
     try:
         for name, text in ((_LINKS, json.dumps(links, indent=2)), (_CREDENTIALS, f"{_USER}:{secrets.token_hex(32)}\n")):
-            (draft / name).touch(mode=0o600)
+            (draft / name).touch(MODE)
             (draft / name).write_text(text)
         draft.rename(path)
     except OSError:

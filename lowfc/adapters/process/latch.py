@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from lowfc.adapters.bus.run import Run
+from lowfc.adapters.bus.run import MODE, Run
 from lowfc.contract.messages import Role
 
 NAME = "safe"
@@ -118,7 +118,7 @@ class Latch:
 
 
 def _write(file: Path) -> None:
-    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT, 0o600)
+    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT, MODE)
     try:
         os.fsync(descriptor)
     finally:
