@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import Run, mirror_role, new_run_id, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.files.whole_file import write_whole
+from lowfc.adapters.files.whole_file import being_written, write_whole
 from lowfc.adapters.logs.columns import Columns, TimingRows
 from lowfc.adapters.process.child import Child
 from lowfc.adapters.process.clock import HostClock
@@ -66,7 +66,8 @@ def fill(config: Configuration, run: Run) -> None:
     """Write the files that the processes share to the run's directory: calibration, configuration, frames."""
     with threadpool_limits(limits=1):  # more threads would spin, and wait for those without a processor
         prepare(config, run, Console(stderr=True))
-        np.save(run.path / FRAMES_FILE, prepared_frames(config))
+        with being_written(run.path / FRAMES_FILE) as part, part.open("wb") as file:
+            np.save(file, prepared_frames(config))
 
 
 @contextlib.contextmanager
@@ -87,7 +88,7 @@ def run_repeats(options: LatencyOptions, run: Run, progress: Callable[[str], Non
         for kernel in kernels[:: -1 if number % 2 else 1]:
             realtime = options.config.realtime.model_copy(update={"kernel": kernel})
             turn = replace(options, config=options.config.model_copy(update={"realtime": realtime}))
-            (run.path / "config.toml").write_text(turn.config.to_toml(), encoding="utf-8")
+            write_whole(run.path / "config.toml", turn.config.to_toml().encode())
             progress(f"{number + 1} of {options.repeats}: the loop by {kernel}")
             loop = one_loop(turn, run)
             progress(f"{number + 1} of {options.repeats}: the bare echo, the step by {kernel} and the timer")
