@@ -35,6 +35,9 @@ def test_a_gap_counts_as_missing_and_a_new_start_does_not() -> None:
     box.put(sample(41, start_s=101))  # a late message is delivered and closes its gap
     assert (box.missing, box.last_sequence) == (2, sequence_of(101, 42))
     assert box.take(0.0) == sample(41, start_s=101)
+    for count in (2**32 - 1, 2**32, 2**32 + 2):  # 50 days at 1 kHz: the count carries into the start
+        box.put(sample(count, start_s=102))
+    assert box.missing == 3
 
 
 def test_wake_ends_the_wait_at_once_and_only_once() -> None:

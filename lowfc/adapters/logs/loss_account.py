@@ -10,7 +10,7 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.names import MAX_NAME_LENGTH, MAX_NAMES, Names
 from lowfc.adapters.logs.selection import EVERYTHING, Selection
 from lowfc.adapters.logs.sequence_gaps import Gaps
-from lowfc.contract.envelope import count_of, start_of
+from lowfc.contract.envelope import COUNT_BITS, count_of, start_of
 from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, topic_of, wire
 
 MAX_STARTS = 8
@@ -117,7 +117,7 @@ class LossAccount:
                     tally.before = count.missing if tally.gaps.first else 0
                 tally.never = count.missing - tally.before
                 if health.state == "stopped":
-                    tally.published = count.published
+                    tally.published = min(count.published, 1 << COUNT_BITS)  # later ones have another start
 
     def mark_flushed(self) -> None:
         """Note that everything recorded so far has been flushed."""

@@ -68,7 +68,7 @@ class Arrivals:
     def count(self, sample: Sample) -> None:
         """Count a received message."""
         sequence = sample.sequence
-        if sequence == self.last_sequence + 1 and self.received:  # the usual case in the loop
+        if sequence == self.last_sequence + 1 and self.received and count_of(sequence):  # the usual case in the loop
             self.last_sequence = sequence
             self._gaps.next += 1
             self.received += 1
