@@ -106,14 +106,16 @@ def test_latencies_are_those_of_the_controllers_timing_messages() -> None:
     assert times.drain() == {}
 
 
-def test_a_loop_that_is_not_closed_at_the_end_fails(tmp_path: Path) -> None:
+def test_a_loop_that_is_not_closed_or_not_recorded_at_the_end_fails(tmp_path: Path) -> None:
     outcome = SimpleNamespace(mode=wire.LOOP_MODE_CLOSED, measurements={})
     bus = MemoryBus(MemoryHub(), "launcher", HostClock())
     stub: Any = SimpleNamespace(bus=bus, outcome=outcome, folder=tmp_path, health={}, children={})
     soak = run._Soak(stub)
     assert soak.results(60.0, 1.0, [])["why"] == []
     soak.mode = wire.LOOP_MODE_OPEN
-    assert soak.results(60.0, 1.0, [])["why"] == ["the loop should be closed at the end, its mode is open"]
+    stub.health["recorder"] = wire.Health(recording=wire.Recording(failure="the disk is full"))
+    not_closed = "the loop should be closed at the end, its mode is open"
+    assert soak.results(60.0, 1.0, [])["why"] == ["the recording ended: the disk is full", not_closed]
 
 
 def test_a_slow_loop_has_time_to_settle() -> None:

@@ -106,6 +106,7 @@ class _Soak:
         }
         why = [f"growth of the {name}'s {what}" for name, one in processes.items() for what in one["grows"]]
         why += [f"{found[key]} {text}" for key, text in _MUST_BE_ZERO.items() if found[key]]
+        why += [f"the recording ended: {recording.failure}"] * bool(recording.failure)
         why += [f"{name} was not finished" for name in unfinished]
         if self.mode != wire.LOOP_MODE_CLOSED:
             mode = wire.LoopMode.Name(self.mode).removeprefix("LOOP_MODE_").lower()
