@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 from lowfc.adapters.process.child import Child
+from lowfc.contract.messages import Role
 
 
 def program(name: str, arguments: list[str], stderr_path: Path) -> Child:
@@ -12,7 +13,7 @@ def program(name: str, arguments: list[str], stderr_path: Path) -> Child:
     return Child(name, [sys.executable, "-P", *arguments], stderr_path)
 
 
-def stop_all(children: list[Child], timeout_s: float = 5.0) -> None:
-    """Stop all, one after the other, in the order of the list."""
+def stop_all(children: list[Child]) -> None:
+    """Stop all, one after the other, in the order of the list; a recorder has time to write to a slow disk."""
     for child in children:
-        child.stop(timeout_s)
+        child.stop(60.0 if child.name == Role.RECORDER else 5.0)
