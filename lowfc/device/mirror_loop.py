@@ -111,7 +111,7 @@ class MirrorLoop:
         with contextlib.suppress(_LostError):
             self._start(flat_nm)
         service.fill = self._fill
-        self._leave = service.dispatch(COMMAND, self._arrived, name, period_ns=config.period_ns)
+        service.dispatch(COMMAND, self._arrived, name, period_ns=config.period_ns)
         service.awaited = lambda: "" if self._status.received_ns else "a controller"
         service.state = "ready"
 
@@ -141,8 +141,8 @@ class MirrorLoop:
         service.finish()
 
     def _close(self) -> None:
-        self._leave()
-        free = self._turn.acquire(timeout=CLOSE_S)  # over a router, a command may still be with the driver
+        self._service.stop(self._service.why)  # also after a fault: no further command is passed to the driver
+        free = self._turn.acquire(timeout=CLOSE_S)  # one may still be with it, and never return
         try:
             self._driver.close()
         finally:

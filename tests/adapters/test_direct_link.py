@@ -153,6 +153,14 @@ def test_a_message_in_transit_during_the_switch_is_delivered_once(reader: Reader
     assert reader.got == [1, 2]
 
 
+def test_a_reader_is_closed_although_a_handler_never_returns(reader: ReaderOnTwoPaths) -> None:
+    reader.reader._turn.acquire()
+    closing = threading.Thread(target=reader.reader.close, daemon=True)
+    closing.start()
+    closing.join(PATIENCE_S)
+    assert not closing.is_alive()
+
+
 @pytest.mark.parametrize("direct_only", [False, True])
 def test_messages_that_a_publisher_repeats_or_reorders_are_delivered_as_they_were_published(
     reader: ReaderOnTwoPaths, direct_only: bool

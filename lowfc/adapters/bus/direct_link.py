@@ -158,15 +158,14 @@ class DirectReader:
         self._leave()
 
     def close(self) -> None:
-        """Stop forwarding; not to be called on a forwarding thread."""
-        with self._turn:
-            if self._closed:
-                return
-            self._closed = True
+        """Stop forwarding, without a wait for a handler that never returns; not to be called on a forwarding thread."""
+        if self._closed:
+            return
+        self._closed = True
         _shut_down(self._listener)
-        self._accepting.join()
-        if self._leave_bus is not None:
-            self._leave_bus()
+        self._accepting.join(1)
+        self._both = True
+        self._leave()
 
     def _by_bus(self, sample: Sample) -> None:
         with self._turn:
