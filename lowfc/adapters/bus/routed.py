@@ -169,9 +169,10 @@ class RouterWatch:
             except BusError as fault:
                 why = str(fault)
         if why != self._reported:
-            text = f"no link to the router at {self._network.router}: {why}" if why else "the router is back"
-            sys.stderr.write(f"{self._role}: {text}\n")
             self._reported = why
+            text = f"no link to the router at {self._network.router}: {why}" if why else "the router is back"
+            with contextlib.suppress(OSError):  # a closed terminal must not end the comparison of clocks
+                sys.stderr.write(f"{self._role}: {text}\n")
 
 
 def certificate_files(network: Network, role: str) -> tuple[Path, Path, Path]:
