@@ -7,7 +7,6 @@ writes a file with the time at which each frame was due and sent.
 import math
 from array import array
 from contextlib import closing
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -18,7 +17,6 @@ from lowfc.adapters.files import factory
 from lowfc.adapters.files.whole_file import being_written, write_whole
 from lowfc.adapters.process.join import join
 from lowfc.adapters.process.realtime import let_send
-from lowfc.adapters.process.service import Service
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
@@ -82,59 +80,41 @@ def frame_source(
     seconds: Annotated[float, typer.Option(help="Duration, seconds.")] = 10.0,
     wait_for: Annotated[list[str] | None, typer.Option(help="Process to wait for; repeat for several.")] = None,
 ) -> None:
-    """Send the frames in the run's directory as its camera, and write there when each was due and sent."""
+    """Send the frames in the run's directory as its camera, and write there when each was due and sent.
+
+    Each frame is sent when it is due, or at once if that is past; none is left out.
+    """
     settings = configuration(config)
-    folder = open_run(run, (settings.mirror.name,)).path
+    folder, period_ns = open_run(run, (settings.mirror.name,)).path, settings.period_ns
     payloads = Payloads(np.load(folder / FRAMES_FILE))
     service = join(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
     service.catch_signals()
+    sequence, put_ns, due_ns = array("Q"), array("q"), array("q")
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
-        Source(settings, service, payloads).run(seconds, tuple(wait_for or ()), folder)
-
-
-class Source:
-    """Sends frames on a schedule for a time, or until it is stopped."""
-
-    def __init__(self, config: Configuration, service: Service, payloads: Payloads) -> None:
-        self._config = config
-        self._service = service
-        self._payloads = payloads
-        self._frames = service.publisher(FRAME)
-        self._settings = service.publisher(CAMERA_STATE)
-        self._sequence, self._put_ns, self._due_ns = array("Q"), array("q"), array("q")
-
-    def run(self, seconds: float, wait_for: tuple[str, ...], folder: Path) -> None:
-        """Wait for these processes, send frames, and write their times to `folder`."""
-        service = self._service
+        frames, states, clock = service.publisher(FRAME), service.publisher(CAMERA_STATE), service.clock
         service.state = "ready"
-        service.require(wait_for, _WAIT_S, "no frame is sent without")
-        state = camera_state(CameraSettings.configured(self._config, *self._payloads.shape), service.clock.now_ns())
-        self._settings.put(state.SerializeToString())
+        service.require(wait_for or (), _WAIT_S, "no frame is sent without")
+        state = camera_state(CameraSettings.configured(settings, *payloads.shape), clock.now_ns())
+        states.put(state.SerializeToString())
         service.state = "running"
-        begin_ns = service.clock.now_ns() + _LEAD_PERIODS * self._config.period_ns
+        begin_ns = clock.now_ns() + _LEAD_PERIODS * period_ns
         write_whole(folder / BEGIN_FILE, str(begin_ns).encode())
-        self._send_frames(begin_ns, math.ceil(seconds * self._config.camera.rate_hz))
-        with being_written(folder / SENT_FILE) as part, part.open("wb") as file:
-            put_ns, due_ns = np.array(self._put_ns), np.array(self._due_ns)
-            np.savez(file, sequence=np.array(self._sequence), put_ns=put_ns, due_ns=due_ns)
-        service.finish()
-
-    def _send_frames(self, begin_ns: int, frames: int) -> None:
-        """Send each frame when it is due, or at once if that is past; no frame is left out."""
-        clock, period_ns = self._service.clock, self._config.period_ns
-        for index in range(frames):
-            due_ns = begin_ns + index * period_ns
-            payload = self._payloads.at(index, due_ns)
-            clock.sleep_until_ns(due_ns)
-            if not self._service.running:
+        for index in range(math.ceil(seconds * settings.camera.rate_hz)):
+            next_ns = begin_ns + index * period_ns
+            payload = payloads.at(index, next_ns)
+            clock.sleep_until_ns(next_ns)
+            if not service.running:
                 break
-            envelope = self._frames.put(payload)
+            envelope = frames.put(payload)
             let_send()
-            self._due_ns.append(due_ns)
-            self._sequence.append(envelope.sequence)
-            self._put_ns.append(envelope.publish_time_ns)
-            self._service.work += 1
-            self._service.beat()
+            due_ns.append(next_ns)
+            sequence.append(envelope.sequence)
+            put_ns.append(envelope.publish_time_ns)
+            service.work += 1
+            service.beat()
+        with being_written(folder / SENT_FILE) as part, part.open("wb") as file:
+            np.savez(file, sequence=np.array(sequence), put_ns=np.array(put_ns), due_ns=np.array(due_ns))
+        service.finish()
 
 
 if __name__ == "__main__":
