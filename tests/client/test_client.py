@@ -376,6 +376,8 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
             ours = [one for one in other_loops() if f"(process {process.pid})" in one[0] or name in one[0]]
             message = none_here()
             with monkeypatch.context() as patch:
+                patch.setattr("lowfc.adapters.bus.other_loops._START_S", 0.0)
+                late = none_here()
                 patch.setattr(os, "geteuid", lambda: 4_000_000_000)
                 patch.setenv("XDG_RUNTIME_DIR", there)
                 theirs = list(other_loops())
@@ -387,6 +389,7 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
         assert ours == [(f"you run {loop}{'' if starting else where}", starting)] * found
         assert ((f"user {own_runtime.owner()} runs {loop}{where}", False) in theirs) == found
         assert message.endswith("starting or ending: try again in a few seconds") == (found and starting)
+        assert (f"{loop}, but its directory is gone" in late) == (found and starting)
 
 
 # The mirror.

@@ -5,6 +5,7 @@ import itertools
 import os
 import pwd
 import re
+import time
 from collections.abc import Iterator, Sequence
 
 import psutil
@@ -15,6 +16,7 @@ _PROGRAMS = ("controller", "sim-loop")
 _MAX_LISTED = 3
 _MAX_NAME_LENGTH = 48  # characters of a run's name
 _FOLDER = "XDG_RUNTIME_DIR"
+_START_S = 600.0  # the first start computes the optical model
 
 
 def none_here() -> str:
@@ -34,7 +36,7 @@ def none_here() -> str:
 def other_loops() -> Iterator[tuple[str, bool]]:
     """Yield, for each simulated loop and each separate controller on this host, of any user, a sentence and a flag.
 
-    The flag is set for a loop of this user in this runtime directory, which is then starting or ending.
+    The flag is set for a new loop of this user in this runtime directory, which is then starting or ending.
     """
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):  # it has ended, or is not readable
@@ -59,7 +61,7 @@ def _program(words: Sequence[str]) -> str:
 
 
 def _where(process: psutil.Process, owner: int) -> tuple[str, bool]:
-    """Clause on the runtime directory of a process, and whether it is this user's own, which needs no clause.
+    """Clause on the runtime directory of a process, and whether it is new and in this user's, which needs no clause.
 
     The clause is also empty for another user's process that is not readable.
     """
@@ -68,7 +70,8 @@ def _where(process: psutil.Process, owner: int) -> tuple[str, bool]:
     except psutil.Error:
         return "", False
     if owner == os.geteuid() and there == os.environ.get(_FOLDER, ""):
-        return "", True
+        starting = time.time() - process.create_time() < _START_S
+        return "" if starting else ", but its directory is gone, as after a logout: stop and restart it", starting
     return f", with {_FOLDER}={there}" if there else f", without {_FOLDER}", False
 
 
