@@ -135,7 +135,7 @@ def _judged(outcome: "Outcome", case: "Case") -> dict[str, Any]:
 
 def _in_one_line(error: Exception, folder: Path) -> str:
     """An error in one line; its traceback is written to the case's folder."""
-    with (folder / "error.txt").open("a") as file:
+    with contextlib.suppress(OSError), (folder / "error.txt").open("a") as file:  # the disk may be full
         traceback.print_exception(error, file=file)
     return str(error) if isinstance(error, LowfcError) else f"{type(error).__name__}: {error}"
 
