@@ -122,7 +122,7 @@ def _timed(
     """Durations of the step, of the product and of each stage, ns, a third of the time for each."""
 
     def alone(work: Callable[[bytes], object]) -> Long:
-        return time_alone(work, payloads, HostClock(), seconds / 3, period_ns).step_ns
+        return time_alone(work, payloads, HostClock(), seconds / 3, period_ns)[1]
 
     durations: dict[str, list[int]] = {stage: [] for stage in STAGES}
     found = {STEP: alone(step), PRODUCT: alone(product)}

@@ -317,11 +317,12 @@ def test_the_step_alone_uses_every_prepared_frame() -> None:
     assert RawImage.FromString(payload) == image(pixels[1], 123, "lowfc_camera")
     clock = HostClock()
     step = ControlStep(config, calibration, clock.host_ns())
-    paced, hot = time_alone(step, payloads, clock, 0.1, MS), time_alone(step, payloads, clock, 0.05, None)
-    assert 0 < paced.timer_ns.size == paced.step_ns.size <= 101
-    assert hot.timer_ns.size == 0
-    assert paced.timer_ns.min() >= 0
-    assert step.state.frames_used == paced.step_ns.size + hot.step_ns.size  # none was refused
+    timer_ns, paced_ns = time_alone(step, payloads, clock, 0.1, MS)
+    no_timer_ns, hot_ns = time_alone(step, payloads, clock, 0.05, None)
+    assert 0 < timer_ns.size == paced_ns.size <= 101
+    assert no_timer_ns.size == 0
+    assert timer_ns.min() >= 0
+    assert step.state.frames_used == paced_ns.size + hot_ns.size  # none was refused
     assert not step.state.counts
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -37,22 +36,13 @@ class ControlStep:
         return codec.encode_command(outputs.command, self._valid_ns, CHANNEL, self.state.input_number)
 
 
-class Alone(NamedTuple):
-    """Times without a bus, ns, (frames,).
-
-    Attributes:
-        timer_ns: wake-up latency of the host's timer; empty without a schedule.
-        step_ns: duration of the control step.
-    """
-
-    timer_ns: Long
-    step_ns: Long
-
-
 def time_alone(
     step: Callable[[bytes], object], payloads: Payloads, clock: HostClock, seconds: float, period_ns: int | None
-) -> Alone:
-    """Time the control step for `seconds`: once per period after a sleep, or back to back if `period_ns` is None."""
+) -> tuple[Long, Long]:
+    """Time the control step for `seconds`: once per period after a sleep, or back to back if `period_ns` is None.
+
+    Returns the wake-up latencies of the host's timer, empty without a period, and the durations of the step, ns.
+    """
     timer_ns: list[int] = []
     step_ns: list[int] = []
     due_ns = clock.host_ns()
@@ -71,4 +61,4 @@ def time_alone(
             timer_ns.append(begun_ns - due_ns)
         else:
             due_ns = done_ns
-    return Alone(np.array(timer_ns, np.int64), np.array(step_ns, np.int64))
+    return np.array(timer_ns, np.int64), np.array(step_ns, np.int64)

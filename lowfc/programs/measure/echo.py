@@ -34,7 +34,7 @@ from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S
 ECHO_FILE = "echo.npz"
 """File in the run's directory: round_trip_ns of every frame after the warm-up, -1 without an answer."""
 ALONE_FILE = "alone.npz"
-"""File in the run's directory: timer_ns and step_ns as in `Alone`, and hot_step_ns, the step back to back."""
+"""File in the run's directory: timer_ns and step_ns as from `time_alone`, and hot_step_ns, the step back to back."""
 
 _READY_S = 30.0
 _POLL_S = 0.02
@@ -71,10 +71,10 @@ def answer(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds
     clock = HostClock()
     step = ControlStep(settings, calibration, clock.host_ns())
     _answer(settings, joined, step(payloads.at(0, clock.host_ns())))
-    hot = time_alone(step, payloads, clock, _HOT_S, None)
-    alone = time_alone(step, payloads, clock, seconds, settings.period_ns)
+    _, hot_ns = time_alone(step, payloads, clock, _HOT_S, None)
+    timer_ns, step_ns = time_alone(step, payloads, clock, seconds, settings.period_ns)
     with being_written(joined.path / ALONE_FILE) as part, part.open("wb") as file:
-        np.savez(file, timer_ns=alone.timer_ns, step_ns=alone.step_ns, hot_step_ns=hot.step_ns)
+        np.savez(file, timer_ns=timer_ns, step_ns=step_ns, hot_step_ns=hot_ns)
 
 
 def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) -> Long:
