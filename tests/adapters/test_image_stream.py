@@ -208,6 +208,10 @@ def test_a_recreated_stream_is_reopened(path: Path) -> None:
     made(path, version=b"1.00")
     with pytest.raises(StreamError, match="layout version"):
         reader.next(0.02)
+    writer = made(path, version=b"")
+    writer.map[writer.semaphores + 8] ^= 1
+    writer.map[:4] = b"2.00"
+    assert reader.next(0) is None, "it may be in creation"
     made(path).write(image(4))
     newest(reader)
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, alive
+from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, StreamError, alive
 
 _CHECK_S = 0.1
 _ABSENT_CHECK_S = 0.005
@@ -39,7 +39,7 @@ class StreamReader:
         """
         self.stream: Stream | None = None
         self.generation = 0
-        self._path = path
+        self._path, self._fault = path, ""
         self._last_number = self._semaphore = 0
         self._open()
 
@@ -85,6 +85,12 @@ class StreamReader:
             stream = Stream(self._path)
         except StreamAbsentError:
             return False
+        except StreamError as fault:  # some versions of the C library write the version before the rest
+            if not self.generation or str(fault) == self._fault:
+                raise
+            self._fault = str(fault)
+            return False
+        self._fault = ""
         self._semaphore = stream.take_semaphore()
         self._last_number = 0 if self.generation else stream.count
         self.generation += 1
