@@ -80,11 +80,12 @@ def disturbance_of(config: Configuration) -> Disturbance:
 
 def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scene:
     """The scene of a configuration, its twin from the cache; `disturbance` replaces the configured one if given."""
-    optics, detector, camera = factory.twin(config, None, ignore), factory.detector(config), config.camera
+    sensor = factory.sensor(config, lambda _: None)  # `lowfc sim-loop` prints the warnings of the optics
+    optics, detector, camera = factory.twin(config, None, lambda _: None), factory.detector(config), config.camera
     disturbance = disturbance_of(config) if disturbance is None else disturbance
     return Scene(
         optics,
-        load_or_fit_mirror(factory.sensor(config, ignore), optics, factory.true_mirror(config), notice=ignore),
+        load_or_fit_mirror(sensor, optics, factory.true_mirror(config), notice=lambda _: None),
         detector,
         factory.electrons_per_exposure(config),
         disturbance,
@@ -104,10 +105,6 @@ def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scen
         ),
         factory.shear_slopes(config) if disturbance.shear is not None else None,
     )
-
-
-def ignore(warning: str) -> None:
-    """Drop a warning of the optics, which `lowfc sim-loop` prints."""
 
 
 def _centred_region(name: str, size: int, of: int) -> tuple[int, int]:

@@ -91,7 +91,7 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) ->
         sample.payload.to_bytes()
         round_trip_ns[index] = now_ns - time_ns
 
-    session = _session(run, Role.CAMERA)
+    session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(run.links, Role.CAMERA))))
     try:
         publisher = declare_publisher(session, FRAME, FRAME.key)
         subscriber = session.declare_subscriber(COMMAND.at(config.mirror.name), Callback(received, indirect=False))
@@ -122,7 +122,7 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) ->
 
 def _answer(config: Configuration, run: Run, command: bytes) -> None:
     done = threading.Event()
-    session = _session(run, Role.CONTROLLER)
+    session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(run.links, Role.CONTROLLER))))
     publisher = declare_publisher(session, COMMAND, COMMAND.at(config.mirror.name))
 
     def received(sample: zenoh.Sample) -> None:
@@ -144,10 +144,6 @@ def _join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Run
     run = open_run(run_id, (config.mirror.name,))
     ports = {str(role): run.links.ports[role] for role in (Role.CAMERA, Role.CONTROLLER)}
     return dataclasses.replace(run, links=dataclasses.replace(run.links, ports=ports))
-
-
-def _session(run: Run, role: Role) -> zenoh.Session:
-    return zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(run.links, role))))
 
 
 if __name__ == "__main__":
