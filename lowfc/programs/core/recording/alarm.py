@@ -25,7 +25,7 @@ from lowfc.contract.printable import printable
 TIMEOUT_S = 60.0
 """Time after which a command is killed."""
 _MAX_WAITING_EVENTS = 1000
-_END_S = 2.0  # a service manager then kills it, and a launcher kills the recorder after 5 s
+_END_S = 2.0  # a service manager then kills it
 _LEVELS: dict[int, str] = {level.value: level.name.lower() for level in Level}
 _OWN = EVENTS["ON_EVENT_FAILED"].name
 
