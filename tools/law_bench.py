@@ -26,7 +26,7 @@ from lowfc.device.mirror_protection import Command, Status, apply_command
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.core.gain_watch import GainWatch
 from sim_camera.disturbance import LINES_HZ, Disturbance
-from sim_camera.driver import ignore, scene
+from sim_camera.driver import scene
 from sim_camera.path import MirrorPath
 from sim_camera.scene import Truth
 from sim_dm.driver import SimulatedMirror
@@ -50,8 +50,8 @@ def configured(
 
 def calibrated(config: Configuration) -> Calibration:
     """The analytic calibration of a configuration."""
-    optics = factory.twin(config, None, ignore)
-    return factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, ignore))
+    optics = factory.twin(config, None, lambda _: None)
+    return factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, lambda _: None))
 
 
 def with_lines_moved(disturbance: Disturbance, factor: float) -> Disturbance:
