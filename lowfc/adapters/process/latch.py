@@ -118,7 +118,8 @@ class Latch:
 
 
 def _write(file: Path) -> None:
-    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT, MODE)
+    mode = MODE if file.name == NAME else 0o600  # a home directory's file server may refuse the sticky bit
+    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT, mode)
     try:
         os.fsync(descriptor)
     finally:
