@@ -30,7 +30,7 @@ class Names:
             return name
         if len(name) > MAX_NAME_LENGTH:
             raise BadMessageError(f"a name has up to {MAX_NAME_LENGTH} characters, got {len(name)}: {name[:40]!r}...")
-        if name not in frozenset(Role):
+        if name not in _ROLES:
             if len(known) >= MAX_NAMES:
                 raise BadMessageError(f"{MAX_NAMES} names are known on this topic, and there is no room for {name!r}")
             known.add(name)
@@ -45,3 +45,6 @@ class Names:
             raise BadMessageError(f"a Health has up to {MAX_HEALTH_BYTES} bytes, got {len(payload)}")
         health = wire.Health.FromString(payload)
         return self.admit(HEALTH, key), health
+
+
+_ROLES = frozenset(Role)
