@@ -3,6 +3,7 @@
 Processes and commands use it, so that all of them interpret the keys in the same way.
 """
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -15,7 +16,7 @@ from lowfc.adapters.files.twin_cache import load_or_build, load_or_fit_mirror
 from lowfc.arrays import Array, single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import CalibrationError, ConfigurationError
+from lowfc.contract.errors import CalibrationError, ConfigurationError, LowfcError
 from lowfc.contract.messages import fields_of
 from lowfc.contract.sections import InterlockSection, SensorSection
 from lowfc.control.calibration.calibration import Calibration, noise_nm2, normalise_flux, reconstructor, unnormalised
@@ -35,6 +36,7 @@ from lowfc.optics.twin.twin_mirror import TwinMirror, poke_wavefronts_nm
 
 Progress = Callable[[int, int], None]
 
+_log = logging.getLogger(__name__)
 _SHARED = ("bias_dn", "gain_e_per_dn", "em_gain", "read_noise_e")
 _TWINS = {spec.nodes: spec for spec in (FAST, ACCURATE)}
 
@@ -69,6 +71,15 @@ def contrast_of(config: Configuration) -> ModalContrast:
     """Contrast that the modes add in the dark zone; takes 0.1 s, 0.5 s with a Lyot stop; cached if no file is read."""
     key = config.sensor, config.noll, config.star.wavelength_nm
     return _contrast_of(*key) if config.sensor.pupil.endswith(".npz") else _cached_contrast_of(*key)  # files change
+
+
+def known_contrast(config: Configuration | None) -> ModalContrast | None:
+    """`contrast_of` a log or another process's loop; None, with a warning, if the file of its pupil is not here."""
+    try:
+        return None if config is None else contrast_of(config)
+    except LowfcError as error:
+        _log.warning("the contrast added to the dark zone is not computed: %s", error)
+        return None
 
 
 def _contrast_of(section: SensorSection, noll: tuple[int, ...], wavelength_nm: float) -> ModalContrast:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lowfc.adapters.files.factory import contrast_of, frame_noise_nm2
+from lowfc.adapters.files.factory import frame_noise_nm2, known_contrast
 from lowfc.adapters.logs.columns import Steps, steps_as_columns
 from lowfc.adapters.logs.history import measured_timing, read_history
 from lowfc.adapters.logs.reader import LogReader
@@ -230,7 +230,7 @@ def _telemetry(
             f"{source}: tuning requires at least {FEWEST} consecutive frames, {FEWEST / rate_hz:.2g} s; the longest "
             f"sequence of good frames has {_longest(pol)}"
         )
-    contrast = contrast_of(config) if config is not None and config.noll == calibration.noll else None
+    contrast = known_contrast(config) if config is not None and config.noll == calibration.noll else None
     known = [None if each is None else each[rows & np.isfinite(each).all(axis=1)] for each in true]
     true_nm, rms_nm = (each if each is not None and len(each) else None for each in known)
     return Telemetry(

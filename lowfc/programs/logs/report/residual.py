@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lowfc.adapters.files.factory import contrast_of
+from lowfc.adapters.files.factory import known_contrast
 from lowfc.adapters.logs.columns import TruthRows, Truths
 from lowfc.arrays import Array, Integers, Single
 from lowfc.contract.configuration import Configuration
@@ -94,7 +94,7 @@ def bin_starts(rows: int, most: int) -> Integers:
 def _contrast(true: Truths, rows: Integers, config: Configuration | None) -> Results | None:
     """Contrast added to the dark zone by the disturbance (open) and by the residual (closed) of these steps.
 
-    None without truth or configuration, or for a coronagraph without a science image.
+    None without truth or configuration, or if the file of the coronagraph's pupil is not here.
     """
     covariances = {}
     for name, rms_nm, sampled_nm in (
@@ -106,7 +106,7 @@ def _contrast(true: Truths, rows: Integers, config: Configuration | None) -> Res
             return None
         known_nm = sampled_nm[rows][np.isfinite(sampled_nm[rows]).all(axis=1)].astype(float)
         covariances[name] = with_variances(known_nm.T @ known_nm / len(known_nm), modes_nm)
-    return added_contrast(contrast_of(config), covariances) if config is not None else None
+    return added_contrast(known_contrast(config), covariances)
 
 
 def _rms(values: Single, rows: Integers) -> Array | None:
