@@ -360,6 +360,9 @@ def test_a_brighter_dark_zone_is_brighter_in_the_picture() -> None:
     assert shown[star, star] == shown[star, second + star] == shown.max()  # both stars
     drawn(panel, tape, science.Science.period_ns)  # nothing new, nothing drawn
     assert len(tape.rows[science.CONTRAST.path]) == 1
+    further_out = science.Science(Coronagraph(load_pupil(), Wedge(11.0, 16.0)), NM)
+    drawn(further_out, tape, 0, truths=truths(0 * open_nm, open_nm))
+    assert len(tape.rows[science.CONTRAST.path]) == 2
 
 
 def test_the_trail_has_at_most_400_points_the_last_of_which_is_the_newest() -> None:

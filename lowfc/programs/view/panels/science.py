@@ -25,7 +25,7 @@ _AVERAGED = 5
 """Number of wavefronts averaged in one image, each the newest of a snapshot."""
 _DARKEST, _BRIGHTEST = -10, -4
 """Range of the colour scale, log10 of contrast."""
-_HALF_WIDTH, _SAMPLING = 12, 4  # of an image, lambda / D; samples per lambda / D
+_HALF_WIDTH, _SAMPLING = 12, 4  # of an image, lambda / D; samples per lambda / D, fewer for a zone further out
 _SAMPLES = 2 * _HALF_WIDTH * _SAMPLING
 _GAP, _BAR = 6, 5  # samples between the pictures, and across the colour scale
 _SECOND = _SAMPLES + _GAP  # start of the second picture; `_SCALE`: start of the colour scale
@@ -50,6 +50,7 @@ class Science(Panel):
         self._coronagraph = coronagraph
         zone = coronagraph.dark_zone
         self._wedge = Wedge(zone.inner, min(zone.inner + _ZONE_WIDTH, zone.outer), zone.half_opening_deg)
+        self._sampling = max(min(_SAMPLING, int(_SAMPLES / (2 * self._wedge.outer))), 1)
         self._wavelength_nm = wavelength_nm
         self._noll: tuple[int, ...] = ()
         self._camera: ScienceCamera | None = None
@@ -62,7 +63,8 @@ class Science(Panel):
 
     def begin(self, stream: rr.RecordingStream) -> None:
         """Draw the static parts: the edge of the mask, the zone of the mean contrast, and the colour scale."""
-        lines = [line + np.array([start, 0]) for start in (0, _SECOND) for line in _outlines(self._wedge)]
+        outlined = _outlines(self._wedge, self._sampling)
+        lines = [line + np.array([start, 0]) for start in (0, _SECOND) for line in outlined]
         outlines = rr.LineStrips2D(lines, colors=[GREY], radii=rr.Radius.ui_points(0.7))
         stream.log(f"{IMAGE}/outlines", outlines, static=True)
         decades = range(_DARKEST, _BRIGHTEST + 1)
@@ -76,7 +78,8 @@ class Science(Panel):
         noll = snapshot.calibration.noll
         if self._camera is None or noll != self._noll:  # wavefronts of other modes are dropped
             self._noll = noll
-            self._camera = ScienceCamera(self._coronagraph, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLING)
+            half_width = _SAMPLES // (2 * self._sampling)
+            self._camera = ScienceCamera(self._coronagraph, noll, self._wavelength_nm, half_width, self._sampling)
             self._flat = self._camera.mean_contrast(self._camera.image(np.zeros(len(noll))), self._wedge)
             self._clear()
         for source, wavefronts in self._wavefronts.items():
@@ -121,13 +124,13 @@ def _side_by_side(now: Single, flat: Single) -> Rgb:
     return sequential(shares)
 
 
-def _outlines(wedge: Wedge) -> list[Array]:
+def _outlines(wedge: Wedge, sampling: int) -> list[Array]:
     """Lines (points, 2) in pixels of one image: the mask's edge, and the wedge on either side of the star."""
     angle = np.linspace(0, 2 * np.pi, 97)
     opening = np.deg2rad(wedge.half_opening_deg) * np.linspace(-1, 1, 33)
     arcs = [radius * _directions(opening) for radius in (wedge.inner, wedge.outer)]
     right = np.concatenate([arcs[0], arcs[1][::-1], arcs[0][:1]])
-    return [_SAMPLES / 2 + _SAMPLING * line for line in (wedge.inner * _directions(angle), right, -right)]
+    return [_SAMPLES / 2 + sampling * line for line in (wedge.inner * _directions(angle), right, -right)]
 
 
 def _directions(angle: Array) -> Array:
