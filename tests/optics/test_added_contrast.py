@@ -71,6 +71,7 @@ def test_contrast_is_summed_by_group_and_large_tilt_is_beyond_quadratic(shaped: 
     groups = by_group(NOLL, each)
     assert groups["coma"] == pytest.approx(each[coma] + each[coma - 1])
     assert costliest(groups) == ("coma", pytest.approx(groups["coma"] / each.sum()))
+    assert costliest({"coma": 3.0, "focus": 1.0, "tilt": -9.0}) == ("coma", 0.75)
     assert not modal.is_beyond_quadratic(0.3**2 * np.eye(len(NOLL)))
     assert modal.is_beyond_quadratic(20**2 * np.diag(np.eye(len(NOLL))[tilt]))
 

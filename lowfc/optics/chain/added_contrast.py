@@ -65,9 +65,9 @@ def by_group(noll: Sequence[int], each: Array) -> dict[str, float]:
 
 
 def costliest(groups: Mapping[str, float]) -> tuple[str, float]:
-    """The kind of modes that adds most contrast, and its share of the total; `groups` is a result of `by_group`."""
-    name, most = next(iter(groups.items()))
-    return name, most / (sum(groups.values()) or 1.0)
+    """The kind of modes that adds most contrast, and its share of all that adds; `groups` is a result of `by_group`."""
+    added = [max(each, 0.0) for each in groups.values()]  # behind a classical Lyot coronagraph tilt takes light away
+    return next(iter(groups)), added[0] / (sum(added) or 1.0)
 
 
 def contrast_form(coronagraph: Coronagraph, noll: tuple[int, ...], wavelength_nm: float) -> Array:
