@@ -169,6 +169,8 @@ def test_misspelt_sensor_name_gets_a_suggestion():
         ({"kind": "clowfs", "defocus_mm": 1.0, "focal_ratio": 100.0}, "increase the distance"),
         ({"kind": "clowfs", "inner_radius": 1.0, "focal_mask": "bowtie"}, "bowtie has neither"),
         ({"kind": "zwfs", "focal_mask": "bowtie"}, "bowtie has neither"),
+        ({"kind": "zwfs", "spot_diameter": 0.01}, "0.01 lambda/D delays none or all"),
+        ({"kind": "zwfs", "spot_diameter": 8.0, "focal_radius": 1.0}, "8.0 lambda/D delays none or all"),
     ],
 )
 def test_wrong_sensor_keys_are_refused(keys, complaint):

@@ -189,7 +189,10 @@ def _focal_mask(section: SensorSection) -> NDArray[np.inexact]:
             raise ValueError("a bowtie has neither a phase spot nor an inner radius; set focal_mask = 'disk'")
         return bowtie(radius=section.focal_radius)
     if section.kind == "zwfs":
-        return phase_spot(radius=section.focal_radius, spot_diameter=section.spot_diameter)
+        mask = phase_spot(radius=section.focal_radius, spot_diameter=section.spot_diameter)
+        if not np.ptp(mask.imag[mask != 0]):
+            raise ValueError(f"a spot of {section.spot_diameter} lambda/D delays none or all of the light on the disk")
+        return mask
     if section.kind == "clowfs":
         if not section.inner_radius < section.focal_radius:
             raise ValueError(
