@@ -91,8 +91,9 @@ def test_dask_cluster_gives_the_same_result(scheduler, uninterrupted, tmp_path):
     assert out.read_text() == uninterrupted[1]
 
 
-def test_interrupted_search_writes_its_best_and_resumes(uninterrupted, tmp_path):
-    result, out = run(search_with(), tmp_path, Interrupted(3))
+@pytest.mark.parametrize("blocks", [1, 3])
+def test_interrupted_search_writes_its_best_and_resumes(blocks, uninterrupted, tmp_path):
+    result, out = run(search_with(), tmp_path, Interrupted(blocks))
     assert result["interrupted"]
     assert result["steps"] < 2 * SMALL["steps"]
     load_layout(str(out))
@@ -135,7 +136,9 @@ def test_lost_workers_are_reported_and_the_search_resumes(uninterrupted, tmp_pat
     ):
         run(search_with(), tmp_path, Broken(0))
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(LowfcError, match=r"workers were lost .*abruptly.*\); continue with --resume .*state\.json"):
+    with pytest.raises(
+        LowfcError, match=r"workers were lost .*abruptly.*\); continue with --resume .*state\.json --out .*mask\.json"
+    ):
         run(search_with(), tmp_path, Broken(2))
     search, chains = read_state(tmp_path / "state.json", program.pupil_digest())
     _, out = run(search, tmp_path, InProcessExecutor(), chains)
@@ -187,7 +190,7 @@ def test_the_command_does_not_overwrite_an_interrupted_search(tmp_path, monkeypa
     state = tmp_path / "mask.json.state.json"
     program.write_state(state, search_with(), program.pupil_digest(), program.begin(search_with()))
     before = state.read_bytes()
-    assert f"continue with --resume {state.name}, or delete it" in refusal(
+    assert f"continue with --resume {state.name} --out mask.json, or delete it" in refusal(
         "design", "sam", "--out", "mask.json", kind=ConfigurationError
     )
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == {state: before}

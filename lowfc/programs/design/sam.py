@@ -78,7 +78,7 @@ def design_sam(
             run_chains(search, chains, executor, on_block)
         except (KeyboardInterrupt, Exception) as error:
             interrupted = isinstance(error, KeyboardInterrupt)
-            advice = _store_or_remove(state, search, pupil, chains)
+            advice = _store_or_remove(state, search, pupil, chains, out)
             if is_lost(error):
                 raise LowfcError(f"the workers were lost ({error!r}); {advice}") from error
             if interrupted and advice == _NOTHING:
@@ -111,13 +111,13 @@ def design_sam(
 _NOTHING = f"no chain had finished its first {BLOCK} steps: nothing was found, nothing is written"
 
 
-def _store_or_remove(state: Path, search: Search, pupil: str, chains: list[Chain]) -> str:
+def _store_or_remove(state: Path, search: Search, pupil: str, chains: list[Chain], out: Path) -> str:
     """Write the state if any chain has advanced, otherwise remove it; return what to do next."""
     if not any(chain.step for chain in chains):
         state.unlink()
         return _NOTHING
     write_state(state, search, pupil, chains)
-    return f"continue with --resume {state}"
+    return f"continue with --resume {state} --out {out}"
 
 
 def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block: Callable[[], None]) -> None:
@@ -137,8 +137,9 @@ def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block
                     running[executor.submit(advance_block, search, chains[i], pupil)] = i
             on_block()
     finally:
-        for future in running:
-            future.cancel()
+        for future, i in running.items():
+            if not future.cancel() and future.done() and future.exception() is None:
+                chains[i] = future.result()
 
 
 def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:

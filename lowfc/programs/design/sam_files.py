@@ -49,7 +49,8 @@ def check_files(out: Path, resume: Path | None, *others: Path | None) -> Path:
     state = resume if resume is not None else out.with_name(f"{out.name}.state.json")
     require_folder(out, state, *others)
     if resume is None and state.exists():
-        raise ConfigurationError(f"{state} holds an interrupted search: continue with --resume {state}, or delete it")
+        advice = f"continue with --resume {state} --out {out}, or delete it"
+        raise ConfigurationError(f"{state} holds an interrupted search: {advice}")
     return state
 
 
