@@ -21,7 +21,7 @@ from lowfc.arrays import Array, Complex, Integers, Single
 class TwinSpec:
     """Degree of compression; the default is accurate to 1e-4 of the image for every named sensor.
 
-    For other combinations of pupil, focal-plane mask and relay, errors of up to 5e-4 were found.
+    For other combinations of pupil, focal-plane mask and relay, errors of up to 2e-3 were found.
 
     Attributes:
         nodes: Pupil nodes across the diameter.

@@ -94,7 +94,7 @@ def design_sam(
     if plot_file is not None:
         write_plot(plot_file, points, search)
     if not interrupted:
-        state.unlink()
+        state.unlink(missing_ok=True)
     return {
         "command": command,
         "file": str(out),
@@ -114,7 +114,7 @@ _NOTHING = f"no chain had finished its first {BLOCK} steps: nothing was found, n
 def _store_or_remove(state: Path, search: Search, pupil: str, chains: list[Chain], out: Path) -> str:
     """Write the state if any chain has advanced, otherwise remove it; return what to do next."""
     if not any(chain.step for chain in chains):
-        state.unlink()
+        state.unlink(missing_ok=True)
         return _NOTHING
     write_state(state, search, pupil, chains)
     return f"continue with --resume {state} --out {out}"
@@ -193,8 +193,8 @@ def render(result: dict[str, Any]) -> str:
                 fits = "  ".join(f"{modes} modes x {x:.3f} y {y:.3f}" for modes, (x, y) in tilts.items())
                 lines.append(f"    Table 4  {estimator:<9} {fits} mas")
             lines.append(
-                f"    noise of 14 modes {predicted['noise_nm']:.3g} nm, which adds {predicted['contrast_noise']:.2e} "
-                f"to the contrast; {predicted['quantum_share']:.1%} of the quantum limit"
+                f"    weighted noise of 14 modes {predicted['noise_nm']:.3g} nm, which adds "
+                f"{predicted['contrast_noise']:.2e} of contrast; {predicted['quantum_share']:.1%} of the quantum limit"
             )
     lines.append(
         "all values are predicted; 'bound' is the Cramer-Rao bound, which the weighted estimator attains in Table 4"
