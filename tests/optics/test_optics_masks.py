@@ -12,7 +12,7 @@ from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.sections import SensorSection
 from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge
-from lowfc.optics.chain.sam import Layout, check, equal_holes, is_even_symmetric, transmission
+from lowfc.optics.chain.sam import Layout, check, is_even_symmetric, transmission
 from lowfc.programs.core.start_up import check_files
 
 TWO = {"purpose": "two holes", "hole_diameter": 0.1, "holes": [[0.1, 0.2], [-0.3, 0.0]]}
@@ -53,9 +53,9 @@ def test_hole_positions_follow_x_and_y():
 @pytest.mark.parametrize(
     ("holes", "message"),
     [
-        (equal_holes(((0.0, 0.0), (0.09, 0.0)), 0.1), r"holes 0 at \(0.0, 0.0\) and 1 at \(0.09, 0.0\) overlap"),
+        (((0.0, 0.0, 0.1), (0.09, 0.0, 0.1)), r"holes 0 at \(0.0, 0.0\) and 1 at \(0.09, 0.0\) overlap"),
         (((0.0, 0.0, 0.1), (0.1, 0.0, 0.2)), "overlap by 0.0500 D"),
-        (equal_holes(((0.0, 0.0), (0.0, 0.46)), 0.1), "hole 1 at .* reaches 0.5100 D"),
+        (((0.0, 0.0, 0.1), (0.0, 0.46, 0.1)), "hole 1 at .* reaches 0.5100 D"),
         ((), "at least one hole"),
         (((0.0, 0.0, 0.0),), "hole diameters"),
         (((float("nan"), 0.0, 0.1),), "finite"),
@@ -71,7 +71,7 @@ def test_holes_may_touch():
 
 
 def test_even_symmetric_mask_gives_a_warning(tmp_path):
-    even = Layout("even", "", equal_holes(((0.2, 0.1), (-0.2, -0.1), (0.0, 0.0)), 0.1))
+    even = Layout("even", "", ((0.2, 0.1, 0.1), (-0.2, -0.1, 0.1), (0.0, 0.0, 0.1)))
     assert is_even_symmetric(even)
     assert not is_even_symmetric(replace(even, holes=(*even.holes, (0.3, 0.2, 0.1))))
     assert not is_even_symmetric(replace(even, holes=((0.2, 0.1, 0.05), *even.holes[1:])))
@@ -144,6 +144,7 @@ def test_the_dark_zone_of_a_pupil_file_is_that_of_its_request(tmp_path):
         ('{"inner": 4, "outer": 8}', "half_angle_deg"),
         ('{"inner": 8, "outer": 4, "half_angle_deg": 30}', "inner < outer"),
         ('{"inner": 4, "outer": 1e9, "half_angle_deg": 30}', "256 lambda/D"),
+        ('{"inner": 4, "outer": 12, "half_angle_deg": 1}', "too thin"),
         (np.array("{}", dtype=object), "`made_by` must be the request of `lowfc design spc`, a text .*Object arrays"),
     ):
         np.savez(path, quarter=quarter, made_by=made_by)

@@ -71,6 +71,8 @@ def load_dark_zone(file: Traversable) -> Wedge:
             zone = Wedge(*(float(request[key]) for key in ("inner", "outer", "half_angle_deg")))
             if zone.outer > SAMPLES / 2:
                 raise ValueError(f"the outer radius must be at most {SAMPLES // 2} lambda/D, got {zone.outer:g}")
+            if not zone.is_sampled:
+                raise ValueError("the dark zone is too thin for a science image of two samples per lambda/D")
         except Exception as error:  # anything may be stored here
             raise DataFileError(
                 f"{file}: `made_by` must be the request of `lowfc design spc`, a text with `inner`, `outer` and "

@@ -33,6 +33,12 @@ class Wedge:
                 f"a wedge needs 0 <= inner < outer and an opening of at most 90 degrees to either side, got {self}"
             )
 
+    @property
+    def is_sampled(self) -> bool:
+        """Whether a mean of contrast, at two samples per lambda / D, has a sample in the wedge."""
+        side = 4 * int(np.ceil(self.outer))
+        return bool(wedge_samples(self, side, side, 2).any())
+
 
 DARK_ZONE = Wedge()
 

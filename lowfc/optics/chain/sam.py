@@ -1,6 +1,5 @@
 """The sparse aperture mask: circular holes in the relay pupil, eqs. (1) and (2)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,11 +21,6 @@ class Layout:
     name: str
     purpose: str
     holes: tuple[tuple[float, float, float], ...]
-
-
-def equal_holes(centres: Sequence[Sequence[float]], diameter: float) -> tuple[tuple[float, float, float], ...]:
-    """Holes of one diameter at centres (x, y)."""
-    return tuple((float(x), float(y), float(diameter)) for x, y in centres)
 
 
 def check(layout: Layout) -> None:
@@ -51,20 +45,15 @@ def check(layout: Layout) -> None:
             f"{layout.name}: {outside.size} hole(s) reach outside the pupil, the worst is hole {worst} at "
             f"{layout.holes[worst][:2]}, which reaches {reach[worst]:.4f} D from the centre; the edge is at 0.5 D"
         )
-    gaps = separations(centres) - (diameters[:, None] + diameters) / 2.0
+    distances = np.hypot(*(centres[:, None] - centres).transpose(2, 0, 1))
+    gaps = distances - (diameters[:, None] + diameters) / 2.0
+    np.fill_diagonal(gaps, np.inf)
     first, second = np.unravel_index(np.argmin(gaps), gaps.shape)
     if gaps[first, second] < -tolerance:
         raise ValueError(
             f"{layout.name}: holes {first} at {layout.holes[first][:2]} and {second} at {layout.holes[second][:2]} "
             f"overlap by {-gaps[first, second]:.4f} D"
         )
-
-
-def separations(centres: Array) -> Array:
-    """Distances (holes, holes) between centres (holes, 2), in their unit; infinite from a hole to itself."""
-    distances = np.hypot(*(centres[:, None] - centres).transpose(2, 0, 1))
-    np.fill_diagonal(distances, np.inf)
-    return np.asarray(distances)
 
 
 def is_even_symmetric(layout: Layout) -> bool:

@@ -77,6 +77,8 @@ def design_spc(request: Request, out: Path, plot: Path | None, console: Console)
         figure_class()
     if out.suffix != ".npz":
         raise ConfigurationError(f"--out must end in .npz, the only type read as a pupil file; got {out}")
+    if not request.zone.is_sampled:
+        raise ConfigurationError("the dark zone is too thin for a science image of two samples per lambda/D: widen it")
     require_folder(out, plot)
     with console.status("solving linear programs"):
         rounds = _interruptibly(lambda: _rounds(request, console))

@@ -70,7 +70,7 @@ def _with_holes(diameter: float) -> Prepared | Row:
     """The default layout with holes of another diameter, or a row that states that they would overlap."""
     layout = load_layout(SensorSection().sam)
     name = f"default layout with holes of {100 * diameter:g} %"
-    shrunk = sams.Layout(name, layout.purpose, sams.equal_holes([hole[:2] for hole in layout.holes], diameter))
+    shrunk = sams.Layout(name, layout.purpose, tuple((x, y, diameter) for x, y, _ in layout.holes))
     try:
         sams.check(shrunk)
     except ValueError:
