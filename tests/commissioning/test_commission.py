@@ -115,6 +115,8 @@ def test_commissioning_closes_a_loop_with_another_frame_size(commissioned: tuple
     assert list(state.automatic) == [True, True, False]
     made = calibration_file.load(bench.out)
     assert made.shape == (64, 64)
+    modelled = computed(DISTURBED.to_toml()).actuators_to_modes  # also of shapes outside the modes
+    assert np.linalg.norm(made.actuators_to_modes - modelled) < 0.2 * np.linalg.norm(modelled)
     assert made.saturation_dn == 2**14 - 1
     assert not provisional_path(bench.out).exists()
     assert not partial_of(bench.out).exists()

@@ -24,6 +24,7 @@ from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrat
 MAX_NOISE_RATIO = 1.5
 """Largest accepted ratio of the noise of the measured R to that of the computed R, at the same flux. A sensor far from
 its zero point exceeds it."""
+_OTHER_SENSOR = 0.5  # error of an element of R H from which on a model is that of another sensor or orientation
 DELAY_TOLERANCE_FRAMES = 0.1
 """Largest difference between measured and configured delay without a warning, frames."""
 
@@ -286,21 +287,28 @@ def comparison(one: Calibration, other: Calibration) -> Comparison:
 
 
 def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array, response: Array) -> Array:
-    """Modes (modes, actuators) that R measures of each actuator: modal shapes measured, others modelled."""
-    commands = before.modes_to_actuators.astype(np.float64)
-    inverse = np.linalg.pinv(commands)
-    # Without a model: other shapes are projected onto the modal shapes. R H is the identity unless R is regularised.
-    measured = matrix @ response @ inverse
+    """Modes (modes, actuators) that R measures of each actuator: modal shapes measured, others modelled.
+
+    For a sensor of another size or orientation than the model's, the others are those of the calibration before, or
+    projected onto the modal shapes.
+    """
+    commands, own = before.modes_to_actuators.astype(np.float64), before.actuators_to_modes.astype(np.float64)
+    inverse, product = np.linalg.pinv(commands), matrix @ response  # R H is the identity unless R is regularised
+    known = matrix @ np.linalg.pinv(before.reconstructor.astype(np.float64)) @ own if own.size else product @ inverse
     optics = factory.twin(config, None, lambda _: None)
     light = twin_reference(optics)
-    if light.shape != before.shape:
-        return measured
-    on_nodes = factory.mirror_on_twin(config, optics, lambda _: None)
-    good = before.good.astype(np.float64)
-    modelled = factory.actuators_to_modes(matrix, light.reshape(-1), good, optics, on_nodes)
-    if before.actuators_to_modes.size:
-        modelled[:, ~before.actuators_to_modes.any(axis=0)] = 0  # actuators that are not active
-    return np.asarray(measured + modelled - (modelled @ commands) @ inverse)
+    candidates = [known]
+    if light.shape == before.shape:
+        on_nodes = factory.mirror_on_twin(config, optics, lambda _: None)
+        modelled = factory.actuators_to_modes(matrix, light.reshape(-1), before.good.astype(float), optics, on_nodes)
+        if own.size:
+            modelled[:, ~own.any(axis=0)] = 0  # actuators that are not active
+        candidates.insert(0, modelled)
+    for found in candidates:
+        error = found @ commands - product
+        if np.abs(error).max() < _OTHER_SENSOR:
+            return np.asarray(found - error @ inverse)
+    return np.asarray(product @ inverse)
 
 
 def _span(calibration: Calibration) -> str:
