@@ -259,6 +259,9 @@ def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:
     made = calibration_file.load(Path("there.fits"))
     assert np.abs(cross_talk(made.reconstructor, made.response)).max() < 1e-3
     assert np.array_equal(made.response, loop.calibration().response)
+    loop.offset(5.0, [4])  # a loop with this zero point would go on by as much
+    done = CliRunner().invoke(calibrate_app, ["reference", "--frames", "16"], catch_exceptions=False)
+    assert "the new reference image contains the offset" in " ".join(done.stderr.split())
     loop.ask("lease", values=60.0, text="somebody", lease_id=2)
     with pytest.raises(RequestRefusedError, match="reserved for somebody"):
         json_of("reference", "--frames", "200", "--out", "there.fits")

@@ -12,6 +12,7 @@ from lowfc.arrays import Array, Integers, Long, Mask, Pixels
 from lowfc.client import Client, Frame, MirrorWatch
 from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import CalibrationError, LowfcError
+from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay, NotSeenError, measure_delay
 from lowfc.control.calibration.poke_plan import Plan, seen, usable
@@ -145,6 +146,18 @@ def check_size(shape: tuple[int, ...], before: Calibration) -> None:
             f"the frames have {shape[0]} x {shape[1]} pixels and are refused as WRONG_SIZE: the calibration in use, "
             f"with its dark and bad pixels, is for {before.shape[0]} x {before.shape[1]}: load one for these frames, "
             "or measure one with `lowfc commission`"
+        )
+
+
+def warn_of_additions(loop: Client, report: Report) -> None:
+    """Report the offset and the channels that a new reference image contains, since the loop adds them to it."""
+    state = loop.status().state or wire.ControllerState()
+    added = [f"channel {one.name}" for one in state.channels if one.shifts]
+    added += ["the offset"] * any(state.offset_nm)
+    if added:
+        report(
+            f"warning: the new reference image contains {', '.join(added)}, and a loop with it adds that again: set "
+            "the offset to zero, and remove the channels, or keep their shapes on the channel flat"
         )
 
 

@@ -37,7 +37,7 @@ from lowfc.control.calibration.response_fit import (
 from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, check_cycles
-from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size
+from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size, warn_of_additions
 
 _MIN_CORRELATION = 0.3
 """Smallest correlation of the first poke's image with the calibration in use without a warning."""
@@ -88,6 +88,8 @@ class Calibrator:
         self._computed = computed
         self.noise_nm = factory.frame_noise_nm(self.config, self.before)
         self._closed = request.method == "in-loop"
+        if not self._closed:  # which keeps the reference image
+            warn_of_additions(loop, report)
         self.pokes = Pokes(self.config, self.before, self.noise_nm, request)
         self._progress = progress
         self._player = Player(loop, self.before, report, self._closed)

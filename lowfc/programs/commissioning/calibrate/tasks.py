@@ -30,7 +30,7 @@ from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.analytic import WavefrontFunction, analytic
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
-from lowfc.programs.commissioning.calibrate.recording import Report, check_size, next_frames
+from lowfc.programs.commissioning.calibrate.recording import Report, check_size, next_frames, warn_of_additions
 from lowfc.programs.commissioning.calibrate.result import (
     CalibrationResult,
     compute_reconstructor,
@@ -168,6 +168,7 @@ def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> Re
     """Write the calibration in use with the present image as its reference."""
     require_folder(out)
     with Client(run) as loop, loop.reserved("lowfc calibrate reference"), _in_use(loop) as (before, noise):
+        warn_of_additions(loop, reporter(Console(stderr=True)))
         cube = next_frames(loop, frames)
         loop.check_lease()  # another shape of the mirror is another zero point
         check_size(cube.shape[1:], before)
