@@ -159,6 +159,8 @@ def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench,
     with pytest.raises(CalibrationError, match="the loop went from closed to open"):
         bench.steps()._measured_nm(10, 1, 1.0)
     bench.actions.clear()
+    late = np.where(np.arange(2000) == 1500, np.nan, 1.0)[:, None]
+    assert commissioning._rms_nm(late, 1000) == 1.0, "a refused frame does not end it, also at 1 kHz"
 
 
 @pytest.mark.parametrize("reversed_modes", [[0], [0, 1, 2]])

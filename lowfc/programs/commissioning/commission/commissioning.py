@@ -328,6 +328,6 @@ class Commissioning:
 def _rms_nm(error_nm: Single, settling: int) -> float:
     """Root mean square of the measured error of all modes, noise included, after the settling frames."""
     used = np.isfinite(error_nm).all(axis=1) & (np.arange(len(error_nm)) >= settling)
-    if used.sum() < settling:
+    if used.sum() < MIN_PREDICTED / 2:  # a few may be refused, such as late ones
         raise ValueError(f"{int(used.sum())} frames after {settling} of settling are too few for a residual")
     return float(np.linalg.norm(rms(error_nm, used)))
