@@ -240,6 +240,12 @@ def test_a_request_disturbs_a_measurement_unless_a_limit_ended_it_before(name: s
     assert response.limits_hit == ["MODAL_LIMIT"]
 
 
+def test_a_disturbed_test_that_was_repeated_does_not_count(tmp_path: Path) -> None:
+    night, text = SyntheticLog(), 'acceptance {"test": "noise-floor", "loop": "open", "frames": 50}'
+    log = night.frames(20).request("note", text=text).frames(20).request("reset").request("note", text=text).frames(60)
+    assert len(logged_responses(read_history(LogReader(log.write(tmp_path / "night.mcap"))), noise.KIND)) == 1
+
+
 def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_of_its_time(tmp_path: Path) -> None:
     night = SyntheticLog().frames(20)
     night.request("note", text='acceptance {"test": "noise-floor", "loop": "open", "frames": 50}').frames(60)

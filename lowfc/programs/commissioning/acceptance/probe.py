@@ -228,7 +228,9 @@ def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[
             if request.accepted:
                 found.append((what, request))
             what = None
-    return found
+    # the last of each, so that one that was stopped and repeated does not count
+    latest = {str([what.get(key) for key in ("noll", "level_nm", "loop")]): (what, request) for what, request in found}
+    return list(latest.values())
 
 
 def probe_response(
