@@ -116,6 +116,7 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, Prob
         (replace(one, mode=other), "became open"),
         (replace(one, reasons=limited), r"SLEW\) and ended the probe: use a smaller amplitude"),
         (replace(one, reasons=limited, target=""), r"SLEW\): measure when"),
+        (replace(one, reasons=one.reasons | 1 << Limit.LAW_OVERRULED), "in place of the law"),
         (replace(one, error_nm=missing), f"10 of {len(one.table)}"),
     ):
         with pytest.raises(AcceptanceError, match=why):

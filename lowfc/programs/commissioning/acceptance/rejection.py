@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from lowfc.adapters.logs.columns import count_reasons
 from lowfc.arrays import Array, Integers
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.excitation import lines, multisine, with_lead_in
@@ -13,7 +14,7 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.transfer_function import Departure, Lines, departure, measure_lines, seen_of_mirror
 from lowfc.control.loop.command_channels import MIRROR, OFFSET
-from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import Result, result_field
@@ -131,6 +132,11 @@ def play(
 def transfer_function(response: ProbeResponse) -> Lines:
     """Measured transfer functions on the lines of the multisine; AcceptanceError if the loop was disturbed."""
     response.check(LoopMode.CLOSED)
+    if Limit.LAW_OVERRULED in count_reasons(response.reasons):
+        raise AcceptanceError(
+            f"the integrator drove in place of the law {response.loop.name!r} (LAW_OVERRULED): load the law again, or "
+            "`lowfc ctl law integrator`, then measure again"
+        )
     period = response.table[-response.what["period_frames"] :].astype(float)
     added = -period if response.target == OFFSET else seen_of_mirror(period, delay_weights(response.loop.delay_frames))
     return measure_lines(response.filled(response.error_nm)[-len(period) :], added)

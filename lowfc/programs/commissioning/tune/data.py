@@ -26,7 +26,7 @@ from lowfc.control.laws.spectra import TimeSeries, time_series
 from lowfc.control.laws.vibration import FEWEST
 from lowfc.control.laws.what_if import delay_from_times, exposed, missing_before
 from lowfc.control.loop.inputs import Step
-from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -230,6 +230,8 @@ def _telemetry(
             f"{source}: tuning requires at least {FEWEST} consecutive frames, {FEWEST / rate_hz:.2g} s; the longest "
             f"sequence of good frames has {_longest(pol)}"
         )
+    if (steps.reasons[rows] & (1 << Limit.LAW_OVERRULED)).any():
+        warnings = [*warnings, "in some of these frames the integrator drove in place of a law (LAW_OVERRULED)"]
     contrast = known_contrast(config) if config is not None and config.noll == calibration.noll else None
     known = [None if each is None else each[rows & np.isfinite(each).all(axis=1)] for each in true]
     true_nm, rms_nm = (each if each is not None and len(each) else None for each in known)
