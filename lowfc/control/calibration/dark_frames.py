@@ -65,8 +65,7 @@ def measure_dark(frames: npt.NDArray[np.number]) -> Dark:
             f"{hot.mean():.0%} of the pixels are much brighter than the median of {level:.1f} DN: these frames are not "
             "dark; block the star, or switch it off"
         )
-    dead = noise < 0.05 * typical
-    return Dark(mean, noise, hot, noise > typical + _SIGMAS * noise_spread, dead)
+    return Dark(mean, noise, hot, noise > typical + _SIGMAS * noise_spread, noise < 0.05 * typical)
 
 
 def check_dark(dark_dn: Array, reference: Array, flux_dn: float) -> None:
@@ -85,10 +84,11 @@ def check_dark(dark_dn: Array, reference: Array, flux_dn: float) -> None:
 def light_in(dark_dn: Array, reference: Array) -> float:
     """Flux of the star in supposedly dark frames (pixels,), DN, from its reference image (pixels,) in flux fractions.
 
-    It uses all pixels, since those with light appear to be hot and noisy.
+    It is the median of the brightest pixels of the reference, of which some may be hot.
     """
-    shape = reference - reference.mean()
-    return float(shape @ dark_dn / (shape @ shape))
+    bright = np.argsort(reference)[-max(reference.size // 128, 8) :]
+    above_dn, above = dark_dn[bright] - np.median(dark_dn), reference[bright] - np.median(reference)
+    return float(np.median(above_dn / above))
 
 
 def _spread(values: Array) -> float:
