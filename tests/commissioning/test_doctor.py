@@ -93,8 +93,6 @@ NAMED: dict[str, object] = {
     "realtime.recorder_cpus": [0],  # not one of the isolated: the recorder can wait
 }
 UNASKED = load(None, {"realtime.priority": 0, "realtime.recorder_priority": 0, "realtime.lock_memory": False})
-
-
 REFUSED = {
     "priority": ("SCHED_FIFO priority 50 (no)", "frames come late"),
     "lock_memory": ("locked", "stalls"),

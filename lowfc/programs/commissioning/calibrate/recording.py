@@ -37,7 +37,7 @@ ATTEMPTS = 5
 """Attempts at a sequence if frames are lost or a device restarts."""
 DITHER_SLOWEST = 1 / 16
 """Lowest frequency of a dither that is used, cycles per frame; most of the disturbance is below it."""
-_LIMITS = frozenset(Limit) - {Limit.MODAL_LIMIT, Limit.LAW_OVERRULED}  # those that end a probe sequence
+_LIMITS = frozenset(Limit) - {Limit.LAW_OVERRULED}  # those that end a probe sequence
 
 
 class PlayInterruptedError(CalibrationError):
@@ -184,8 +184,8 @@ def _check(loop: Client, step: Step, before: LoopMode | None, *, over: bool) -> 
     limits = [reason.name for reason in step.reasons if reason in _LIMITS]
     if limits and not over:
         raise CalibrationError(
-            f"a limit of the mirror acted on the pokes ({', '.join(limits)}), which ended them: use a smaller "
-            "--amplitude, or bring the mirror closer to flat"
+            f"a limit acted on the pokes ({', '.join(limits)}), which ended them: use a smaller --amplitude, or bring "
+            "the mirror closer to flat"
         )
     return step.mode
 
