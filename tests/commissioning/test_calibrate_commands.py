@@ -219,15 +219,6 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
     assert done.stdout.endswith("not loaded\n")
 
 
-def test_progress_without_a_terminal_is_a_line_every_10_s() -> None:
-    lines, times = list[str](), iter(np.arange(0.0, 100.0, 0.5))
-    count = progress_lines(lines.append, lambda: float(next(times)))
-    for done in range(0, 2000, 20):
-        count("hadamard cycle 3 of 8", done, 4000)
-    assert lines[0] == "hadamard cycle 3 of 8: 10%, about 90 s to go"
-    assert len(lines) == 4
-
-
 def test_work_before_the_first_cycle_does_not_affect_the_time_to_go() -> None:
     lines, times = list[str](), iter([0.0, 7.0, 10.0, 13.0])
     count = progress_lines(lines.append, lambda: next(times))
@@ -240,7 +231,7 @@ def test_work_before_the_first_cycle_does_not_affect_the_time_to_go() -> None:
     assert "reading [/b].mcap" in shown.getvalue()
 
 
-def test_progress_of_several_tasks_in_turn_has_the_time_to_go_of_each() -> None:
+def test_progress_without_a_terminal_is_a_line_every_10_s_with_the_time_to_go_of_each_task() -> None:
     lines, times = list[str](), iter(np.arange(0.0, 100.0, 5.0))
     count = progress_lines(lines.append, lambda: float(next(times)))
     for task, begin in (("first", 0), ("second", 0), ("third", 1)):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files import calibration_file
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import camera_settings, identified
 from lowfc.contract.configuration import Configuration, Control
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
@@ -24,6 +24,7 @@ from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.commission import commissioning
 from lowfc.programs.commissioning.commission.commissioning import Commissioning, CommissionOptions, provisional_path
 from lowfc.programs.commissioning.commission.first_calibration import linear_nm
+from lowfc.programs.commissioning.commission.first_light import Sensor, referenced
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, Agreement, agreement_checks
 from tests.support.in_process_loop import InProcessLoop, computed
 from tests.support.loops import lowfc, refusal
@@ -296,6 +297,15 @@ def test_the_operator_is_asked_to_block_and_unblock_the_star(tmp_path: Path) -> 
     assert bench.questions == ["block the star; is it dark?", "unblock the star; is it visible?"]
 
 
+def test_a_hot_pixel_at_full_well_is_not_the_star() -> None:
+    camera, frames = camera_settings(configured(CONFIG)), np.full((16, 80, 80), 200)
+    frames[:, 0, 0] = camera.saturation_dn
+    sensor = Sensor(camera, np.full(6400, 100.0), (np.arange(6400) > 0).astype(float), measured=False)
+    assert referenced(sensor, frames, computed(CONFIG.to_toml()), str).flux_dn == 6399 * 100
+    with pytest.raises(CalibrationError, match="the brightest good pixel is at 16383 of 16383 DN"):
+        referenced(sensor._replace(good=np.ones(6400)), frames, computed(CONFIG.to_toml()), str)
+
+
 def test_a_camera_that_differs_from_the_configuration_is_refused(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     wrong = {"camera": Camera(rate_hz=250.0, gain_e_per_dn=3.0), "control": Control(frame_timeout_ms=12.0)}
@@ -355,14 +365,12 @@ def test_an_existing_calibration_is_replaced_only_with_force(own_runtime: Path) 
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "max_frame_age_ms", "frame_timeout_ms"),
+    ("rate_hz", "age_ms", "timeout_ms"),
     [(1000, 20, 50), (250, 20, 50), (100, 20, 50), (50, 40, 100), (5, 400, 1000)],
 )
-def test_frame_age_and_timeout_follow_the_rate(
-    rate_hz: float, max_frame_age_ms: float, frame_timeout_ms: float
-) -> None:
+def test_frame_age_and_timeout_follow_the_rate(rate_hz: float, age_ms: float, timeout_ms: float) -> None:
     config = Configuration(camera=Camera(rate_hz=rate_hz))
-    assert (config.max_frame_age_ns, config.frame_timeout_ns) == (max_frame_age_ms * 1e6, frame_timeout_ms * 1e6)
+    assert (config.max_frame_age_ns, config.frame_timeout_ns) == (age_ms * 1e6, timeout_ms * 1e6)
     assert "control.frame_timeout_ms" not in faults(config, configured(config))
 
 

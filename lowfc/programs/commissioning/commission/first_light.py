@@ -63,12 +63,6 @@ def camera_fits(
         faults.append(
             f"rate: the camera reports {_NS / state.period_ns:.5g} Hz, its frames arrive at {_NS / period_ns:.5g} Hz"
         )
-    brightest = max(int(image.pixels.max()) for image in images)
-    if brightest > _FULL * state.saturation_dn:
-        faults.append(
-            f"light: the brightest pixel is at {brightest} of {state.saturation_dn:g} DN; shorten the exposure until "
-            "it is below half of full well"
-        )
     if faults:
         raise CalibrationError("the camera cannot be used:\n" + "\n".join(f"  {fault}" for fault in faults))
     for check in checks:
@@ -76,7 +70,7 @@ def camera_fits(
             report(f"remark: {check.name}: the camera has {check.got}, expected {check.expected}")
     report(
         f"{state.rows} x {state.columns} pixels of {state.bit_depth} bits at {_NS / period_ns:.5g} Hz, brightest pixel "
-        f"{brightest} of {state.saturation_dn:g} DN"
+        f"{max(int(image.pixels.max()) for image in images)} of {state.saturation_dn:g} DN"
     )
     return replace(camera_settings(state), start_s=0)
 
@@ -98,9 +92,16 @@ def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibra
 
     Its modes and the mirror's commands are those of a computed calibration.
     """
-    image = frames.reshape(len(frames), -1).astype(np.float64).mean(axis=0) - sensor.dark_dn
+    pixels, saturation_dn = frames.reshape(len(frames), -1), float(sensor.camera.saturation_dn)
+    brightest_dn = int((pixels.max(axis=0) * (sensor.good > 0)).max())
+    if brightest_dn > _FULL * saturation_dn:
+        raise CalibrationError(
+            f"the brightest good pixel is at {brightest_dn} of {saturation_dn:g} DN; shorten the exposure until it is "
+            "below half of full well; hot pixels are excluded by a dark, but not with --no-dark"
+        )
+    image = pixels.astype(np.float64).mean(axis=0) - sensor.dark_dn
     flux_dn = float(image @ sensor.good)
-    noise_dn = float(np.std(frames.reshape(len(frames), -1).astype(np.float64) @ sensor.good)) / np.sqrt(len(frames))
+    noise_dn = float(np.std(pixels.astype(np.float64) @ sensor.good)) / np.sqrt(len(frames))
     if not flux_dn > max(10 * noise_dn, 0.0):
         raise CalibrationError(
             f"no flux above the dark: {flux_dn:.4g} DN in total, with a noise of "
@@ -123,7 +124,7 @@ def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibra
         dark=sensor.dark_dn.astype(np.float32),
         shape=sensor.camera.shape,
         flux_dn=flux_dn,
-        saturation_dn=float(sensor.camera.saturation_dn),
+        saturation_dn=saturation_dn,
         estimator="none",
         operator_hash="",
         id="",
