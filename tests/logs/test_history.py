@@ -23,10 +23,11 @@ from lowfc.contract.messages import (
     Log,
     Message,
     Topic,
+    timestamp,
     wire,
 )
 from tests.support.report_log import TOYS, SyntheticLog
-from tests.support.toy import NOLL, START, calibration
+from tests.support.toy import NOLL, PERIOD_NS, START, calibration
 
 STEPS = 20
 
@@ -73,6 +74,14 @@ def test_late_commands_after_a_restart_of_the_camera_are_counted(tmp_path: Path)
     for start_s, count, late in ((START, 0, 40), (START, 1, 43), (START + 60, 0, 4), (START + 60, 1, 6)):
         night.put(HEALTH, wire.Health(process="camera", commands_late=late), sequence_of(start_s, count), "camera")
     assert history_of(night, tmp_path / "x.mcap").commands_late == 3 + 6  # 40 precede the log
+
+
+def test_the_camera_is_that_of_most_steps_and_the_others_are_told_apart(tmp_path: Path) -> None:
+    night = SyntheticLog().frames(STEPS)
+    night.put(CAMERA_STATE, wire.CameraState(timestamp=timestamp(night.now_ns), period_ns=2 * PERIOD_NS))
+    history = history_of(night.frames(5), tmp_path / "x.mcap")
+    assert history.rate_hz == 1e9 / PERIOD_NS
+    assert history.under_calibration.tolist() == [True] * STEPS + [False] * 5
 
 
 def test_the_attached_calibration_replaces_a_lost_message(tmp_path: Path) -> None:

@@ -424,7 +424,7 @@ def test_steps_under_another_calibration_give_a_warning() -> None:
     loaded.frame_sequence = toy.frame_sequence(14)
     known.controllers = [first, loaded, last]
     warnings = "\n".join(what_if(LoggedRun(known), WhatIf())["warnings"])
-    assert "another calibration was in use for 15 steps" in warnings
+    assert "another calibration or camera setting was in use for 15 steps" in warnings
 
 
 def test_too_few_frames_to_compare_are_an_error() -> None:

@@ -51,6 +51,7 @@ from lowfc.contract.messages import (
     Log,
     Role,
     Topic,
+    from_timestamp,
     topic_of,
     wire,
 )
@@ -58,11 +59,13 @@ from lowfc.contract.published import TOPICS, Published
 from lowfc.contract.recorded_configuration import recorded
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
+from lowfc.control.loop.safety import LoopMode
 
 LAST_NS = (1 << 63) - 1
 """Latest time of a message that is read, in the year 2262; a later one does not fit an array of times."""
 REORDERING_NS = 2_000_000_000
 """Time by which messages in a log may be out of order."""
+_CAMERA_SETTINGS = ("period_ns", "exposure_ns", "gain_e_per_dn", "read_noise_e", "em_gain")
 _DECODED = {STEP, TRUTH, MIRROR_STATE, TIMING, CALIBRATION, CONTROLLER_STATE, CAMERA_STATE, REQUEST, HEALTH, EVENT}
 
 
@@ -102,7 +105,8 @@ class History:
         remarks: sentences on parts of the configuration that this version cannot use, and on the calibration if its
             message is lost; each names the log.
         calibration: the last one; if its message is lost, the attached one, if a controller reported to use it.
-        controllers, camera: states of the controllers, in order; last state of the camera.
+        controllers, camera: states of the controllers, in order; state of the camera in most steps under `calibration`,
+            in closed loop if there are any. `under_camera`: whether each step (steps,) has its settings.
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
         command_publish_ns: publish time of every mirror command in the log.
         stepped_sequence: frame sequence of every step in the log, also of those that `steps` leaves out.
@@ -126,6 +130,7 @@ class History:
     calibration: Calibration | None = None
     controllers: list[wire.ControllerState] = field(default_factory=list)
     camera: wire.CameraState | None = None
+    under_camera: Mask | bool = True
     frame_sequence: Sequences = field(default_factory=_SEQUENCES)
     frame_publish_ns: Long = field(default_factory=_INTEGERS)
     command_publish_ns: Long = field(default_factory=_INTEGERS)
@@ -154,11 +159,6 @@ class History:
         """See `frame_rate_hz`."""
         return frame_rate_hz(self.camera, self.steps)
 
-    @property
-    def exposure_fraction(self) -> float | None:
-        """See `columns.exposure_fraction`."""
-        return exposure_fraction(self.camera)
-
     def camera_lag_ns(self, process: str) -> int:
         """Time to add to a frame's time for another process's clock; publish times are of the recorder's clock."""
         camera, other = (self.health.get(name, wire.Health()) for name in (Role.CAMERA, process))
@@ -166,22 +166,21 @@ class History:
 
     def timing(self, delay_frames: float) -> Timing:
         """Times of exposures and of the mirror's moves; a lockstep log has none of the latter, see `Timing.of`."""
-        exposure = self.exposure_fraction
-        if exposure is None:
+        if (exposure := exposure_fraction(self.camera)) is None:
             exposure = (self.configuration or Configuration()).camera.exposure_fraction
         applied = self.mirror.sequence, self.mirror.publish_time_ns - self.camera_lag_ns(Role.RECORDER)
         return measured_timing(Timing.of(delay_frames, exposure), self.steps, *applied, self.rate_hz)
 
     @property
     def under_calibration(self) -> Mask:
-        """Whether each step (steps,) came after the last change of calibration in the log."""
+        """Whether each step (steps,) came after the last change of calibration in the log, and is `under_camera`."""
         steps, states = self.steps, self.controllers
         own = ("", self.calibration.id if self.calibration is not None else "")
-        others = [number for number, state in enumerate(states) if state.calibration_id not in own]
-        if not others:
-            return np.ones(steps.sequence.shape, np.bool_)
+        if not (others := [number for number, state in enumerate(states) if state.calibration_id not in own]):
+            return np.ones(steps.sequence.shape, np.bool_) & self.under_camera
         last, *later = (state.frame_sequence for state in states[others[-1] :])  # one is published at every change
-        return steps.sequence > max(last, next(filter(None, later), 0))  # that of a start or a `clear` has no frame
+        first = max(last, next(filter(None, later), 0))  # that of a start or a `clear` has no frame
+        return (steps.sequence > first) & self.under_camera
 
     @cached_property
     def true(self) -> Truths | None:
@@ -254,6 +253,7 @@ class _HistoryBuilder:
     def __init__(self, history: History) -> None:
         self._history = history
         self._calibration: wire.Calibration | None = None
+        self._cameras: list[wire.CameraState] = []  # with other settings than the one before
         self._frames = Columns(sequence="Q", publish_ns="q")
         self._commands = Columns(publish_ns="q")
         self._stepped = Columns(sequence="Q")
@@ -307,7 +307,9 @@ class _HistoryBuilder:
         elif isinstance(body, wire.ControllerState):
             history.controllers.append(body)
         elif isinstance(body, wire.CameraState):
-            history.camera = body
+            settings = [[getattr(one, name) for name in _CAMERA_SETTINGS] for one in (*self._cameras[-1:], body)]
+            if len(settings) < 2 or not np.allclose(settings[0], settings[1], rtol=0.01, atol=0):
+                self._cameras.append(body)
         elif isinstance(body, wire.Request):
             history.requests.append(body)
         elif isinstance(body, wire.Health):
@@ -318,8 +320,7 @@ class _HistoryBuilder:
             history.events.append((message.receive_time_ns, body))
 
     def _mirror_state(self, state: wire.MirrorState, publish_time_ns: int) -> None:
-        surface = actuators(state)
-        if surface is None:
+        if (surface := actuators(state)) is None:
             return
         if not np.isfinite(surface).all():
             self._history.excluded_messages += 1
@@ -364,6 +365,14 @@ class _HistoryBuilder:
         for name in ("sequence", "publish_time_ns", "stroke_nm", "limits"):
             setattr(history.mirror, name, self._mirror.values(name))
         history.timed_sequence, history.stages_ns = self._timings.values()
+        if self._cameras:
+            steps, counted = history.steps, history.under_calibration
+            if (closed := counted & (steps.mode == LoopMode.CLOSED)).any():
+                counted = closed
+            begun_ns = np.maximum.accumulate([float(from_timestamp(one.timestamp)) for one in self._cameras])
+            numbers = np.maximum(np.searchsorted(begun_ns, steps.time_ns) - 1, 0)
+            most = int(np.bincount(numbers[counted]).argmax()) if counted.any() else -1
+            history.camera, history.under_camera = self._cameras[most], numbers == most
 
     def _last_calibration(self) -> Calibration | None:
         history = self._history

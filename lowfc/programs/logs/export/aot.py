@@ -39,6 +39,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import name_in
 from lowfc.adapters.files.fits_file import header_text
+from lowfc.adapters.logs.columns import exposure_fraction
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Single
 from lowfc.contract.codecs.codec import actuators
@@ -175,7 +176,7 @@ class _System:
         if any(COMMAND.matches(key) for key in self._history.counts):
             loop.commands = aotpy.Image(_COMMANDS, np.zeros((1, 1), np.float32), "m", time=clock)
         if state is not None and len(state.gain) == len(calibration.noll):
-            exposure = self._history.exposure_fraction
+            exposure = exposure_fraction(self._history.camera)
             loop.delay = state.delay_frames + (0.0 if exposure is None else (1 - exposure) / 2)
             if not state.HasField("law"):  # a linear law is not a filter of each mode
                 gain, leak = np.array(state.gain, np.float32), np.array(state.leak, np.float32)

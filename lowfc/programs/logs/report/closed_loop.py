@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from lowfc.adapters.logs.columns import exposure_fraction
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Array, Mask
 from lowfc.contract.codecs.state_codec import calibration_in_use
@@ -73,8 +74,7 @@ def longest_stretch(run: Run) -> Stretch | None:
     overruled = linear[laws] & (steps.reasons >> Limit.LAW_OVERRULED & 1 == 1)  # the next state names it
     closed = (steps.mode == LoopMode.CLOSED) & known[laws] & ~overruled & history.under_calibration
     edges = np.flatnonzero(np.diff(np.where(closed, laws, -1), prepend=-1, append=-1))
-    spans = [(first, last) for first, last in pairwise(edges.tolist()) if closed[first]]
-    if not spans:
+    if not (spans := [(first, last) for first, last in pairwise(edges.tolist()) if closed[first]]):
         return None
     first, last = max(spans, key=lambda span: int(np.isfinite(steps.error_nm[span[0] : span[1], :1]).sum()))
     in_force = run.laws[laws[first]]
@@ -91,7 +91,7 @@ def longest_stretch(run: Run) -> Stretch | None:
     if true is not None and np.isfinite(true.residual_nm[rows]).any():
         signals += [true.disturbance_nm[rows], true.residual_nm[rows], true.sensed_nm[rows]]
         residual_ms_nm2 = np.nanmean(true.modes_residual_rms_nm[rows].astype(float) ** 2, axis=0)
-        if true.continuous and history.exposure_fraction is not None:
+        if true.continuous and exposure_fraction(history.camera) is not None:
             timing = history.timing(in_force.delay_frames)
     frames = time_series(steps.sequence[rows], np.hstack(signals))
     noll = tuple(range(2, 2 + gain.size))  # only their number is used

@@ -252,29 +252,25 @@ def _log_warnings(run: LoggedRun) -> list[str]:
     acted = [f"{reason.name.lower()} at {counted(count, 'frame')}" for reason, count in counts if reason in _LIMITS]
     if acted:
         found.append(f"limits acted in the logged run ({', '.join(acted)}); in the what-if only modal limits act")
-    count = np.count_nonzero(run.history.mirror.limits)
-    if count:
+    if count := np.count_nonzero(run.history.mirror.limits):
         recorded = "" if log.selection.records_all(MIRROR_STATE) else f" (recorded: {log.selection.description})"
         found.append(
             f"the mirror's own limits acted on {counted(int(count), 'command')}{recorded}: pseudo-open-loop modes are "
             "wrong there"
         )
-    changes = sum(one.accepted and one.name in LAW_KEYS for one in run.history.requests)
-    if changes:
+    if changes := sum(one.accepted and one.name in LAW_KEYS for one in run.history.requests):
         found.append(f"gain or leak was changed {counted(changes, 'time')} in the logged run; the last ones are shown")
-    laws = sorted({state.law.name for state in run.history.controllers if state.HasField("law")})
-    if laws:
+    if laws := sorted({state.law.name for state in run.history.controllers if state.HasField("law")}):
         found.append(
             f"a linear law ({', '.join(laws)}) was in use in the logged run: gains and settling time as logged are "
             "those of the integrator in reserve"
         )
-    before = np.count_nonzero(~run.history.under_calibration)
-    if before:
+    if before := np.count_nonzero(~run.history.under_calibration):
         found.append(
-            f"another calibration was in use for {counted(int(before), 'step')}: the modes shown are those of the last"
+            f"another calibration or camera setting was in use for {counted(int(before), 'step')}: modes and rate are "
+            "those of the others"
         )
-    torn = np.count_nonzero(run.torn)
-    if torn:
+    if torn := np.count_nonzero(run.torn):
         found.append(
             f"the log lacks some commands: {counted(int(torn), 'frame')} exposed with a missing one, and the settling "
             "time after each, are left out"

@@ -83,7 +83,7 @@ class LoggedRun:
             any.
         continuous_rms_nm: rms of the true residual (steps, modes) over each period; None if the log does not have it.
         calibration: calibration of the log.
-        used: (steps,) whether the frame was used; `under_calibration`: whether `calibration` was in use.
+        used: (steps,) whether the frame was used; `under_calibration`: that of the history.
         law: last law of the run.
         controller_delay: delay assumed by the controller, frames; `measured_delay`, from `measured_from`, is None if
             it cannot be measured; the comparison uses `delay_frames`, with `weights`.
