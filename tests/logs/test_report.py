@@ -344,7 +344,7 @@ def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
     night._state = State()
     night.frames(300)
     found = results(night.write(tmp_path / "x.mcap"))
-    assert found["mode_steps"] == {"idle": 300}
+    assert (found["mode_steps"], found["run"]["simulated"]) == ({"idle": 300}, True)
     check = found["verdict"]["checks"][2]
     assert (check["level"], check["text"]) == ("unknown", "the loop was not closed in this log")
     check = found["verdict"]["checks"][3]

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from lowfc.contract.messages import TRUTH
 from lowfc.programs.logs.report import course
 from lowfc.programs.logs.report.budget import budget_results
 from lowfc.programs.logs.report.closed_loop import (
@@ -89,7 +90,7 @@ def _number(text: str) -> int | None:
 def _run(run: Run) -> Results:
     history = run.history
     about = history.log.metadata.get("lowfc", {})
-    (first_ns, last_ns), simulated = history.span_ns, bool(history.truths.sequence.size)
+    (first_ns, last_ns), simulated = history.span_ns, TRUTH.key in history.counts
     calibration, configuration, steps = history.calibration, history.configuration, history.steps
     began = datetime.fromtimestamp(first_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     return {

@@ -6,7 +6,7 @@ from lowfc.adapters.logs.columns import STAGES, rows_of
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long
 from lowfc.contract.envelope import start_of
-from lowfc.contract.messages import FRAME, Role, wire
+from lowfc.contract.messages import FRAME, TRUTH, Role, wire
 from lowfc.programs.logs.report.source import Results, Run
 
 _END_NS = 50_000_000
@@ -82,6 +82,6 @@ def frame_counts(history: History) -> Results:
         "at_the_end": int(at_the_end.sum()),
         "skipped_by_controller": None if counts is None else counts.skipped,
         "missing_at_controller": None if counts is None else counts.missing,
-        "commands_late": history.commands_late if history.truths.sequence.size else None,
+        "commands_late": history.commands_late if TRUTH.key in history.counts else None,
         "camera_starts": len({start_of(int(sequence)) for sequence in frames}),
     }
