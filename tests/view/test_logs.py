@@ -260,7 +260,7 @@ def test_a_log_begins_with_its_first_frame_and_not_with_an_older_calibration(tmp
     made = SyntheticLog().frames(100)
     calibration = next(one for one in made.samples if one.key == CALIBRATION.key)
     earlier_ns = calibration.receive_time_ns - 3600 * 10**9
-    made.samples = [calibration._replace(receive_time_ns=earlier_ns), *made.samples]
+    made.samples = [calibration._replace(receive_time_ns=ns) for ns in (earlier_ns, made.now_ns)] + made.samples
     done, tape = drawn(made.write(tmp_path / "night.mcap"))
     assert done.log_s == pytest.approx(0.1, abs=0.01)
     assert min(tape.logged[tiles.TILES])[0] > earlier_ns + 3599 * 10**9

@@ -99,7 +99,7 @@ def draw_logs(
                     stroke_nm = used_nm if stroke_nm is None else max(stroke_nm, used_nm)
             last_ns = max(last_ns, message.receive_time_ns)
             if not topic.queryable:  # states requested at the log's start may be hours old
-                first_ns = first_ns or last_ns
+                first_ns = first_ns or message.receive_time_ns
             if first_ns and last_ns >= due_ns:
                 snapshot = accumulator.snapshot(last_ns, complete=drawn.snapshots % PICTURES_PER_COMPLETE == 0)
                 renderer.draw(snapshot)
