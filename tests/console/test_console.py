@@ -413,6 +413,7 @@ def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatc
     until(lambda: len(screen.read().state.snapshot.health) == 3 and screen.read().state.snapshot.calibration)
     found.append(CONFIG)
     until(lambda: screen.read() and screen._configured)
+    assert not screen._complete(Mock(controller=None)), "its state is queried again, too"
     asked = ask.call_count
     screen._query()  # as again and again without a calibration
     until(lambda: not any(thread.name == "query" for thread in threading.enumerate()))

@@ -105,7 +105,7 @@ class Feed(Monitor):
             judge(state, per_mas),
             self._frame,
             self._command_nm,
-            [one for one in requests if one is not None and not _hidden(one)],
+            [one for one in requests if one is not None],
             [residual for residual, _ in self._trend],
             [light for _, light in self._trend],
         )
@@ -118,7 +118,7 @@ class Feed(Monitor):
             self._trend.append((nan if residual_nm is None else residual_nm, nan if light is None else light))
 
     def _complete(self, found: Snapshot) -> bool:
-        return None not in (found.calibration, self._config)
+        return super()._complete(found) and self._config is not None
 
     def _query(self) -> None:
         """Query in a thread, as a frozen process delays the answer; the configuration, a logged request, once."""
@@ -135,17 +135,12 @@ class Feed(Monitor):
         threading.Thread(target=queries, name="query", daemon=True).start()
 
 
-def _hidden(request: wire.Request) -> bool:
-    """Whether a request is not shown: it changes nothing, or sets automatic gains, which an event reports."""
-    return request.name in _HIDDEN_REQUESTS or (
-        request.name == "gain" and request.text == AUTO and bool(request.values)
-    )
-
-
 def _request(sample: Sample) -> wire.Request | None:
+    """A request; None if it is unreadable, changes nothing, or sets automatic gains, which an event reports."""
     try:
         request = wire.Request.FromString(sample.payload)
         checked_time_ns(request.timestamp)
     except (DecodeError, BadMessageError):
         return None
-    return request
+    automatic = request.name == "gain" and request.text == AUTO and bool(request.values)
+    return None if automatic or request.name in _HIDDEN_REQUESTS else request
