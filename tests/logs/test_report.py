@@ -389,12 +389,15 @@ def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -
 
 
 def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
-    found = results(SyntheticLog().frames(200, dark=range(200)).write(tmp_path / "x.mcap"))
+    night = SyntheticLog().frames(200, dark=range(200))
+    found = results(night.write(tmp_path / "x.mcap"))
     assert found["closed_stretch"]["frames"] == 0
     assert "has 0 frames" in found["spectra"]["why_not"]
     assert {term["missing"] for term in found["error_budget"]["terms"]} == {True}
     assert found["light"]["refused"] == {"dark": 200}
     assert found["verdict"]["checks"][2]["level"] == "look"  # the true wavefront is uncorrected
+    found = results(night.request("offset", (20.0, 0.0, 0.0)).write(tmp_path / "offset.mcap"))
+    assert found["verdict"]["checks"][2]["text"].endswith("(true, with the shapes of offset and channels)")
 
 
 @pytest.mark.parametrize("logged", [True, False])

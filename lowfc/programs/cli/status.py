@@ -10,6 +10,7 @@ import numpy.typing as npt
 from lowfc.contract.codecs.law_codec import overruled
 from lowfc.contract.envelope import count_of
 from lowfc.contract.messages import FRAME, Role, from_timestamp, wire
+from lowfc.control.loop.command_channels import FLAT
 from lowfc.control.loop.safety import Limit, Rejection, reason_name
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.control.loop.wording import PAUSED, counted, mode_word
@@ -188,6 +189,11 @@ def interlocks(known: dict[str, Any]) -> str:
         return "; ".join(f"{one['why']} ({one['action'].replace('_', ' ')})" for one in known["interlocks"])
     count = known["interlocks_configured"]
     return f"none of {count} acts" if count else "none"
+
+
+def shaped(state: wire.ControllerState | None) -> bool:
+    """Whether the loop holds a shape on purpose, so that the true wavefront is not its residual."""
+    return state is not None and (any(state.offset_nm) or any(one.name != FLAT for one in state.channels))
 
 
 def recording_state(recorder: wire.Health) -> str:

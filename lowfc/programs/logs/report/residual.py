@@ -10,6 +10,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.contrast import added_contrast, with_variances
+from lowfc.programs.cli.status import shaped
 from lowfc.programs.logs.report.closed_loop import Stretch, noise_of
 from lowfc.programs.logs.report.source import Results, Run
 
@@ -63,6 +64,7 @@ def residual_results(run: Run, stretch: Stretch | None) -> Results:
         },
         "open_pupil": open_pupil,
         "truth": "none" if history.true is None else "continuous" if true.continuous else "sampled only",
+        "shaped": any(map(shaped, history.controllers)),
         "steps_open": int(opened.size),
         "steps_closed": int(closed.size),
     }
@@ -101,8 +103,7 @@ def _contrast(true: Truths, rows: Integers, config: Configuration | None) -> Res
         ("open", true.modes_disturbance_rms_nm, true.disturbance_nm),
         ("closed", true.modes_residual_rms_nm, true.residual_nm),
     ):
-        modes_nm = _rms(rms_nm, rows)
-        if modes_nm is None:
+        if (modes_nm := _rms(rms_nm, rows)) is None:
             return None
         known_nm = sampled_nm[rows][np.isfinite(sampled_nm[rows]).all(axis=1)].astype(float)
         covariances[name] = with_variances(known_nm.T @ known_nm / len(known_nm), modes_nm)

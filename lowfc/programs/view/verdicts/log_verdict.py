@@ -11,6 +11,7 @@ from lowfc.adapters.logs.columns import Steps
 from lowfc.control.durations import Durations
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted
+from lowfc.programs.cli.status import shaped
 from lowfc.programs.view.snapshot import LogEnd, Snapshot
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
 from lowfc.programs.view.verdicts.facts import facts
@@ -19,7 +20,7 @@ from lowfc.programs.view.verdicts.span_means import SpanMeans
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, hertz, rounded, worst_of
 from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, stroke
 from lowfc.programs.view.verdicts.watcher import FRAMES_SILENT_S
-from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR, WORSE, shaped
+from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR, WORSE
 
 _MODES = {mode.value: mode for mode in LoopMode}
 _NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", None: "without frames"}
@@ -157,8 +158,7 @@ def _frames(state: RunState) -> Tile:
 def _mirror(state: RunState, ended: LogEnd) -> Tile:
     value, of = stroke(ended.stroke_nm or 0.0, state.snapshot.stroke_nm)
     used = f"{value} {of} at most" if ended.stroke_nm is not None else "stroke not known"
-    acted = {words: state.totals[reason] for reason, words in LIMITS.items() if state.totals[reason]}
-    if acted:
+    if acted := {words: state.totals[reason] for reason, words in LIMITS.items() if state.totals[reason]}:
         named = ", ".join(f"{words}: {counted(count, 'time')}" for words, count in acted.items())
         advice = f"The mirror was at a limit ({named}): the disturbance was larger than it can correct."
         return Tile("MIRROR", "AT LIMIT", f"{named}; {used}", Level.WARNING, advice)

@@ -5,7 +5,7 @@ from math import hypot, sqrt
 
 from lowfc.contract.messages import wire
 from lowfc.contract.printable import printable
-from lowfc.control.loop.command_channels import FLAT
+from lowfc.programs.cli.status import shaped
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.steady import ResidualComparison
 from lowfc.programs.view.verdicts.tile import Level, Tile, rounded, short
@@ -81,11 +81,6 @@ def merit(reduction: float, comparison: ResidualComparison | None) -> tuple[Leve
         return Level.GOOD, ""
     best = comparison.residual_nm <= NEAR_BEST * comparison.best_nm
     return Level.NEUTRAL, ": little is corrected" + (", and other gains would not correct more" if best else "")
-
-
-def shaped(state: wire.ControllerState | None) -> bool:
-    """Whether the loop holds a shape on purpose, so that the true wavefront is not its residual."""
-    return state is not None and (any(state.offset_nm) or any(one.name != FLAT for one in state.channels))
 
 
 def _without_noise(residual_nm: float, comparison: ResidualComparison) -> str:
