@@ -16,7 +16,7 @@ from lowfc.adapters.logs.recovery import recover
 from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, REQUEST, TRUTH, Log, wire
+from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, REQUEST, STEP, TRUTH, Log, wire
 from lowfc.control.laws.error_budget import sensor_noise
 from lowfc.control.loop.state import State
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -376,6 +376,19 @@ def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
     found = results(night.request("gain", (0.2,)).frames(300).write(tmp_path / "restarted.mcap"))
     assert found["requests"][-1]["time_s"] == pytest.approx(0.85)
     assert found["closed_stretch"]["frames"] + found["closed_stretch"]["steps_settling"] == 250
+
+
+def test_a_camera_ahead_and_a_clear_for_a_lower_start_move_no_law_and_no_request(tmp_path: Path) -> None:
+    night = SyntheticLog()
+    step = wire.ControlStep(frame_sequence=2 * report_log.START << 32, command_nm=[0] * 3, reasons=[wire.REASON_AHEAD])
+    step.timestamp.seconds = report_log.START + 3600
+    night.put(STEP, step)
+    night.frames(50).request("gain", (0.2,)).frames(50).request("safe").request("clear")
+    night._camera_start -= 60
+    found = results(night.frames(10).request("gain", (0.1,)).frames(10).write(tmp_path / "x.mcap"))
+    assert [one["from_s"] for one in found["laws"]] == pytest.approx([0, 0.05, 0.11])
+    assert [one["time_s"] for one in found["requests"]] == pytest.approx([0.05, 0.099, 0.1, 0.11], abs=0.0011)
+    assert (found["run"]["steps_s"], found["light"]["refused"]) == (pytest.approx(0.119), {"ahead": 1})
 
 
 def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -> None:

@@ -67,8 +67,8 @@ ERROR, POL, DISTURBANCE, RESIDUAL, SENSED = range(5)
 
 def longest_stretch(run: Run) -> Stretch | None:
     """The longest stretch; None if there is none, for the reasons of `why_none`."""
-    history, laws = run.history, run.law_rows()
-    steps = history.steps
+    history, steps = run.history, run.history.steps
+    laws = np.searchsorted([law.first for law in run.laws], np.arange(steps.sequence.size), side="right") - 1
     known = np.array([*(law.known for law in run.laws), False])  # the last for steps before the first law
     linear = np.array([*(law.linear is not None for law in run.laws), False])
     overruled = linear[laws] & (steps.reasons >> Limit.LAW_OVERRULED & 1 == 1)  # the next state names it

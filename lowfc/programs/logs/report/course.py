@@ -7,11 +7,10 @@ import numpy as np
 from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long
-from lowfc.contract.envelope import start_of
 from lowfc.contract.events import Level
-from lowfc.contract.messages import Role, from_timestamp, wire
+from lowfc.contract.messages import wire
 from lowfc.control.loop.safety import Limit, mode_name
-from lowfc.programs.logs.report.source import Results, Run
+from lowfc.programs.logs.report.source import Results, Run, row_after
 
 _FIRST_LIMIT = Limit.MODAL_LIMIT
 _LEVELS = {level.value: level.name.lower() for level in Level}
@@ -128,8 +127,5 @@ def _limits(reasons: Long) -> dict[str, int]:
 
 def _request_time_s(run: Run, request: wire.Request) -> float:
     """Time of the first step with a request in force, or of the last step before it."""
-    steps = run.history.steps
-    later = steps.sequence >= request.frame_sequence
-    if not start_of(request.frame_sequence):  # no frame since the controller's start, or since `clear`
-        later = steps.time_ns + run.history.camera_lag_ns(Role.CONTROLLER) > from_timestamp(request.timestamp)
-    return float(run.step_s[int(np.argmax(later)) if later.any() else -1])
+    row = row_after(run.history, max(request.frame_sequence - 1, 0), request.timestamp)
+    return float(run.step_s[min(row, run.history.steps.sequence.size - 1)])

@@ -56,16 +56,10 @@ def fixed(value: float | str, decimals: int = 3) -> str:
     return f"< {least:.{decimals}f}" if 0 < value < least / 2 else f"{value:.{decimals}f}"
 
 
-def _finalized(value: Any) -> Any:
-    """Value for the page; control characters in text from the log are escaped."""
-    return printable(value, keep=LINES) if type(value) is str else value  # a drawing is Markup
-
-
 def _environment() -> Any:
     with package_required("the HTML page, unlike --json, requires jinja2", "plots"):
         from jinja2 import Environment, StrictUndefined
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_finalized
-    )
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.finalize = lambda value: printable(value, keep=LINES) if type(value) is str else value  # else Markup
     environment.filters |= {"n": number, "fixed": fixed}
     return environment

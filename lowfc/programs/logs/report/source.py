@@ -7,15 +7,17 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from lowfc.adapters.logs.columns import rows_of
 from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
-from lowfc.arrays import Array, Long
+from lowfc.arrays import Array
 from lowfc.contract.codecs.law_codec import driving, overruled
 from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop import guard
+from lowfc.control.loop.safety import Rejection
 
 Results = dict[str, Any]
 """Results by their names in `--json`; NaN becomes null there."""
@@ -59,11 +61,6 @@ class Run:
     history: History
     laws: tuple[InForce, ...]
 
-    def law_rows(self) -> Long:
-        """Index of the law of each step; -1 if unknown."""
-        firsts = np.array([law.first for law in self.laws])
-        return np.searchsorted(firsts, np.arange(self.history.steps.sequence.size), side="right").astype(np.int64) - 1
-
     def seconds(self, host_ns: npt.ArrayLike) -> Array:
         """Convert host times to frame time, seconds since the first step.
 
@@ -81,17 +78,13 @@ class Run:
             (host - published[0]) * 1e-9, (published - published[0]) * 1e-9, (frame_ns - frame_ns[0]) * 1e-9
         )
         outside = np.minimum(host - published[0], 0) + np.maximum(host - published[-1], 0)
-        return np.asarray(inside + outside * 1e-9 + (frame_ns[0] - self.begun_ns) * 1e-9, dtype=np.float64)
-
-    @property
-    def begun_ns(self) -> int:
-        """Frame time of the first step; 0 without any."""
-        return int(self.history.steps.time_ns[0]) if self.history.steps.time_ns.size else 0
+        return np.asarray(inside + outside * 1e-9 + (frame_ns[0] - history.steps.time_ns[0]) * 1e-9, dtype=np.float64)
 
     @property
     def step_s(self) -> Array:
         """Time of each step since the first one."""
-        return np.asarray((self.history.steps.time_ns - self.begun_ns) * 1e-9)
+        time_ns = self.history.steps.time_ns
+        return np.asarray((time_ns - time_ns[:1]) * 1e-9)
 
 
 def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None) -> Run:
@@ -99,7 +92,20 @@ def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None
     log = WholeLog(files, skip_damaged=True)
     log.progress = progress
     history = read_history(log)
+    history.true  # noqa: B018  # cached, as joined by the frames' own sequences
+    steps, known = history.steps, np.flatnonzero(history.steps.reasons >> Rejection.AHEAD & 1 == 0)
+    if 0 < known.size < steps.sequence.size:  # those of a camera whose clock is ahead count as the step before
+        rows = known[np.maximum(np.searchsorted(known, np.arange(steps.sequence.size), "right") - 1, 0)]
+        history.steps = replace(steps, sequence=steps.sequence[rows], time_ns=steps.time_ns[rows])
     return Run(history, _laws_in_force(history))
+
+
+def row_after(history: History, frame_sequence: int, time: Timestamp) -> int:
+    """Row after the last step of a frame, or, without one, after this time of the controller."""
+    rows = np.flatnonzero(history.steps.sequence == frame_sequence)
+    if not rows.size:  # no frame since the controller's start or a `clear`, or a lost one
+        rows = np.flatnonzero(history.steps.time_ns + history.camera_lag_ns(Role.CONTROLLER) <= from_timestamp(time))
+    return int(rows[-1]) + 1 if rows.size else 0
 
 
 def _laws_in_force(history: History) -> tuple[InForce, ...]:
@@ -109,11 +115,7 @@ def _laws_in_force(history: History) -> tuple[InForce, ...]:
     for state in history.controllers:
         if len(state.gain) != steps.command_nm.shape[1] or not steps.sequence.size:
             continue
-        if state.frame_sequence:
-            later = steps.sequence > state.frame_sequence
-        else:  # a controller that has just started
-            later = steps.time_ns + history.camera_lag_ns(Role.CONTROLLER) > from_timestamp(state.timestamp)
-        first = int(np.argmax(later)) if later.any() else int(steps.sequence.size)
+        first = row_after(history, state.frame_sequence, state.timestamp)
         law = InForce(first, _shortest(state.gain), _shortest(state.leak), _shortest([state.delay_frames])[0])
         if state.HasField("law"):
             law = _with_linear_law(law, state, history.published.laws)
