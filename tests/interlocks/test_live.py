@@ -56,7 +56,7 @@ def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) ->
     assert process.returncode == 0, complaints
     results = json.loads(out)
     assert results["frames_missing"] == results["messages_lost"] == 0
-    assert results["frames_skipped"] <= 3, "a stall of the host skips a few, a flood would skip hundreds"
+    assert results["frames_skipped"] < FLOOD_S * RATE_HZ / 5, "stalls of the host skip some, a flood would skip most"
     log = tmp_path / results["log"]
     replayed = json.loads(output_of(tmp_path, f"lowfc replay --json {log}"))
     assert replayed["identical"]
