@@ -107,6 +107,8 @@ def test_screens_have_the_structure_function_of_a_periodic_kolmogorov_screen():
     assert np.all(expected < 6.88 * r ** (5 / 3))
     slope = np.polyfit(np.log(r), np.log(found), 1)[0]
     assert slope == pytest.approx(5 / 3, abs=0.1)
+    with pytest.raises(ValueError, match="at least as wide"):
+        kolmogorov(np.random.default_rng(1), 32, 0)
 
 
 RING = Wedge(4.0, 6.0)

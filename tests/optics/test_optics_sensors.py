@@ -93,6 +93,8 @@ def test_bands_have_the_wavelengths_of_section_3_3():
     np.testing.assert_allclose(np.dot(gauss_legendre(550.0).wavelengths_nm, gauss_legendre(550.0).weights), 550)
     with pytest.raises(ValueError, match="sum to 1"):
         Band((550.0, 560.0), (0.5, 0.6))
+    with pytest.raises(ValueError, match="one weight per wavelength"):
+        Band((550.0,), ())
 
 
 @pytest.mark.parametrize(
@@ -296,6 +298,10 @@ def test_unresolved_defocus_is_refused():
         replace(optics, relay=Defocus(2.3))
     shortest = replace(optics, relay=Defocus(14 / 6))
     assert light_budget(shortest).sensor == pytest.approx(1, abs=0.01)  # no repeated image on the detector
+    with pytest.raises(ValueError, match="behind the focal-plane mask"):
+        Defocus(0.0)
+    with pytest.raises(ValueError, match="must have a width"):
+        PupilImage(0.0)
 
 
 @pytest.mark.parametrize("name", ["sam", "bar", "lyot"])

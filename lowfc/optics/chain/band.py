@@ -18,6 +18,11 @@ class Band:
     weights: tuple[float, ...]
 
     def __post_init__(self) -> None:
+        if not self.wavelengths_nm or len(self.wavelengths_nm) != len(self.weights):
+            raise ValueError(
+                f"a band needs one weight per wavelength, got {len(self.wavelengths_nm)} wavelengths and "
+                f"{len(self.weights)} weights"
+            )
         if min(self.wavelengths_nm) <= 0 or min(self.weights) <= 0 or abs(sum(self.weights) - 1.0) > 1e-9:
             raise ValueError(
                 f"wavelengths and weights must be positive and the weights must sum to 1, got {self.wavelengths_nm} "

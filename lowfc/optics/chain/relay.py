@@ -31,6 +31,10 @@ class Defocus:
 
     distance: float
 
+    def __post_init__(self) -> None:
+        if not self.distance > 0:
+            raise ValueError(f"the detector must be behind the focal-plane mask, got a distance of {self.distance}")
+
 
 @dataclass(frozen=True)
 class PupilImage:
@@ -41,6 +45,10 @@ class PupilImage:
     """
 
     width: float = 1.1
+
+    def __post_init__(self) -> None:
+        if not self.width > 0:
+            raise ValueError(f"the image of the pupil must have a width, got {self.width}")
 
 
 Relay = ApertureMask | Defocus | PupilImage

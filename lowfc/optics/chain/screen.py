@@ -18,8 +18,13 @@ def kolmogorov(rng: np.random.Generator, samples: int, width: int = 4) -> Array:
     Args:
         rng: Generator of all random numbers.
         samples: Points across the pupil.
-        width: Width of the periodic screen, in pupil diameters, at least 1.
+        width: Width of the periodic screen, in pupil diameters.
+
+    Raises:
+        ValueError: The periodic screen would be narrower than the pupil.
     """
+    if width < 1:
+        raise ValueError(f"the periodic screen must be at least as wide as the pupil, got {width} pupil diameters")
     count = width * samples
     fx, fy = scipy.fft.rfftfreq(count, 1.0 / samples), scipy.fft.fftfreq(count, 1.0 / samples)
     f2 = fy[:, None] ** 2 + fx**2
