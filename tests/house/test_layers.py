@@ -41,6 +41,7 @@ PURE_LAYERS = ("lowfc.arrays", "lowfc.optics", "lowfc.control", "lowfc.design")
 PURE_MODULES = (
     "lowfc.device.mirror_protection",
     "sim_dm.actuators",
+    "sim_camera.contrast",
     "sim_camera.path",
     "sim_camera.pixels",
     "sim_camera.scene",

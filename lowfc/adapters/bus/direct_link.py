@@ -96,8 +96,8 @@ class DirectReader:
     A copy is recognised by its envelope; the sequence alone is not enough, as two publishers may have started in the
     same second. The bus is unsubscribed while the only publisher of a topic uses the socket; its messages that arrive
     over the bus after a newer one from the socket are dropped as late. The socket keeps the publisher's order: a
-    message that arrives through it out of order, or repeated, was published so and is forwarded. On a topic with
-    several publishers the bus stays subscribed, and a message that only the bus carried may come after a newer one.
+    message out of order is forwarded, and so, while the bus is unsubscribed, is a repetition of the newest. On a topic
+    with several publishers the bus stays subscribed, and a message that only the bus carried may follow a newer one.
     """
 
     def __init__(

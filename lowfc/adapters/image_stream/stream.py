@@ -268,7 +268,7 @@ def _text(raw: bytes) -> str:
 
 
 def _since_epoch_ns(seconds: int, nanoseconds: int) -> int:
-    """Convert a header's time; the C library writes TAI, which is ahead if the host knows the leap seconds."""
+    """Convert a header's recent time: TAI, as the C library writes it, if far enough in the future, otherwise UTC."""
     time_ns, ahead_ns = seconds * _NS + nanoseconds, _tai_ahead_ns()
     return time_ns - ahead_ns if ahead_ns and time_ns > time.time_ns() + ahead_ns // 2 else time_ns
 

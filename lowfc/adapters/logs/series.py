@@ -31,7 +31,7 @@ class LogLimits:
 
 
 STANDARD = LogLimits()
-_STEADY_S = 10.0  # before, the metadata and attachments at the start of the log would falsify its growth
+_STEADY_S = 10.0  # in a shorter time, the metadata and attachments at the log's start falsify its growth
 
 
 class LogSeries:
@@ -183,8 +183,8 @@ class LogSeries:
 def _finish(log: LogWriter, totals: Mapping[str, str]) -> int:
     """Finish a file; return its growth in bytes."""
     before_bytes = log.bytes_written
-    log.finish({"recording": totals})  # as soon as it has its name, another program may move the file
-    return log.bytes_written - before_bytes
+    log.finish({"recording": totals})
+    return log.bytes_written - before_bytes  # another program may have moved the finished file
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str:

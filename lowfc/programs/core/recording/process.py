@@ -77,7 +77,7 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
 
 
 def log_limits(config: Configuration) -> LogLimits:
-    """Size and duration of a log, free disk space to leave, and file mode."""
+    """Size and duration of a log file, free disk space to leave, and file mode."""
     log = config.recorder
     return LogLimits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6), int(log.file_mode, 8))
 

@@ -35,7 +35,7 @@ QUEUE_MESSAGES = 20_000
 QUEUE_BYTES = 256_000_000
 """Largest total size of payloads waiting for the disk."""
 MAX_CHANNELS = 4096
-"""Number of publisher starts after which the next log is begun: each is a channel of the log and costs memory."""
+"""Number of publisher starts after which the next file is begun: each is a channel of the file and costs memory."""
 
 _ITERATION_S = 0.02
 _FLUSH_NS = 250_000_000
@@ -67,7 +67,7 @@ class Recorder:
 
         Recording starts once each of the `awaited` processes has sent Health, or after a timeout. If none is named, it
         awaits all peers; across hosts only one, as the router is then the only peer. `expected_bytes_per_s` is
-        called before the first log begins, with the camera's state or None; its result counts until growth is measured.
+        called before the first log begins, with the camera's state or None; its result holds until growth is measured.
         """
         self._awaited = awaited
         self._bus = bus
@@ -224,7 +224,7 @@ class Recorder:
         return ""
 
     def _maintain(self) -> None:
-        """Flush, begin the next log if it is due, report losses, publish Health."""
+        """Flush, begin the next file if it is due, report losses, publish Health."""
         self._flush()
         self._flush_due_ns = self._clock.host_ns() + _FLUSH_NS
         if not self._failure:  # otherwise every message is lost, which is reported at the end
@@ -276,7 +276,7 @@ class Recorder:
         return max(sample.receive_time_ns, self._begun_ns)
 
     def _flush(self) -> None:
-        """Flush; begin the next log if this one is full, and end the recording if the disk is nearly full."""
+        """Flush; begin the next file if this one is full, and end the recording if the disk is nearly full."""
         try:
             self._series.flush()
             self._note_flush()
