@@ -37,28 +37,25 @@ pitches_per_pupil = 10
 @pytest.mark.parametrize("rate_hz", [50, pytest.param(250, marks=pytest.mark.slow)])
 def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_path: Path, rate_hz: int) -> None:
     """Automatic gains are inputs, identical in both runs and in a replay."""
-    logs, infos = [], []
-    for name in ("one", "two", "other"):
+    logs, infos, frames = [], [], round(2.4 * rate_hz)
+    for name in ("one", "two"):
         folder = tmp_path / name
         folder.mkdir()
-        seed, frames = ("8", 50) if name == "other" else ("7", round(2.4 * rate_hz))
-        length = ("--rate", str(rate_hz), "--duration", str(frames / rate_hz), "--seed", seed)
+        length = ("--rate", str(rate_hz), "--duration", "2.4", "--seed", "7")
         results = loop(folder, "--lockstep", *length, "--disturbance", "bench")
         assert results["frames_published"] == results["commands_applied"] == frames
         assert results["messages_lost"] == 0
         logs.append(payloads(results["log"]))
         infos.append(json.loads(output_of(folder, "lowfc info last --digest --json")))
-    digests = [info["digest"] for info in infos]
-    assert digests[0] == digests[1] != digests[2]
+    assert infos[0]["digest"] == infos[1]["digest"]
     assert {key for key, line in infos[0]["topics"].items() if "digest" not in line} == {
         key for key in infos[0]["topics"] if not topic_of(key).deterministic
     }
     assert "lowfc/event" not in {key for key, line in infos[0]["topics"].items() if "digest" in line}
-    one, two, other = ({t: p for t, p in log.items() if topic_of(t[1:]).deterministic} for log in logs)
+    one, two = ({t: p for t, p in log.items() if topic_of(t[1:]).deterministic} for log in logs)
     assert one.keys() == two.keys()
     for topic, values in one.items():
         assert values == two[topic], topic
-    assert one["/lowfc/camera/frame"][:50] != other["/lowfc/camera/frame"]
     requests = [wire.Request.FromString(payload) for payload in one["/lowfc/control/request"]]
     assert [(request.name, request.accepted) for request in requests[:2]] == [("gain", True), ("close", True)]
     assert {request.requester for request in requests[:2]} == {"automatic gains"}

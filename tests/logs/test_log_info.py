@@ -14,6 +14,7 @@ from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME,
 from lowfc.programs.logs import info, survey
 from tests.support.loops import json_of, lowfc
 from tests.support.mutated_logs import flipped
+from tests.support.report_log import SyntheticLog
 
 START_S = 1_767_225_600  # 2026-01-01T00:00:00Z
 START_NS = START_S * 10**9
@@ -109,6 +110,8 @@ def test_only_the_digest_of_a_run_known_not_to_be_lockstep_has_a_remark(log: Pat
     contents = survey.survey(log, digest=True)
     texts = [info.render(contents | {"lockstep": lockstep}) for lockstep in (True, None, False)]
     assert ["(not a lockstep run" in text for text in texts] == [False, False, True]
+    longer = SyntheticLog().frames(20).write(log.parent / "longer.mcap")
+    assert survey.survey(longer, digest=True)["digest"] != contents["digest"]
 
 
 def test_the_text_has_the_same_numbers(log: Path) -> None:
