@@ -29,10 +29,15 @@ class MirrorPath:
     def over(self, start: float, instants: Array) -> tuple[list[Single], Single]:
         """Shapes (rows, columns) in effect from `start` on, and the weight of each (instants, shapes).
 
-        `instants` (instants,) are relative to `start`. Earlier shapes are dropped once the mirror has settled.
+        `instants` (instants,) are relative to `start`. Earlier shapes are dropped once the mirror has settled; those of
+        a slow mirror are replaced by its position at the last move before `start`.
         """
         while len(self._moves) > 1 and self._moves[1][0] + 20 * self._settling <= start:
             self._moves.popleft()
+        while len(self._moves) > 2 and self._moves[2][0] <= start:
+            (_, before_nm), (moment, target_nm) = self._moves.popleft(), self._moves.popleft()
+            remaining = np.exp((moment - self._moves[0][0]) / self._settling)
+            self._moves.appendleft((-np.inf, target_nm + np.float32(remaining) * (before_nm - target_nm)))
         moves = [move for move in self._moves if move[0] < start + 1]
         weights = np.zeros((len(instants), len(moves)), np.float32)
         weights[:, 0] = 1

@@ -53,12 +53,14 @@ def test_instants_long_before_a_shape_do_not_overflow() -> None:
     assert heights(path, 0) == [0, 0, 1]
 
 
-def test_settled_shapes_are_dropped() -> None:
-    path = MirrorPath(FLAT, settling=0.1)
+@pytest.mark.parametrize("settling", [0.1, 300.0])
+def test_number_of_shapes_is_bounded(settling: float) -> None:
+    path = MirrorPath(FLAT, settling=settling)
     for moment in range(1000):
         path.applied(moment, ONE)
         path.over(moment, INSTANTS)
     assert len(path.over(1000, INSTANTS)[0]) < 5
+    assert heights(path, 1000) == pytest.approx(1 - np.exp(-(1000 + INSTANTS) / settling), abs=1e-4)
 
 
 def test_time_before_the_previous_shape_is_replaced_by_its_time() -> None:
