@@ -98,14 +98,10 @@ def preset_disturbance(
         line_width: width of the reaction wheel's lines between half-power points, as a fraction of their frequency.
 
     Raises:
-        ValueError: unknown preset, or a static mode that is not among the modes.
+        ValueError: unknown preset.
     """
     modes = len(noll)
-    static = np.zeros(modes)
-    for index, amplitude in (static_nm or {}).items():
-        if index not in noll:
-            raise ValueError(f"the static mode Z{index} is not one of Z{noll[0]} to Z{noll[-1]}")
-        static[noll.index(index)] = amplitude
+    static = np.array([(static_nm or {}).get(index, 0.0) for index in noll])
     rng = np.random.default_rng([seed, 1])
     tilt = np.array([index in TIP_TILT for index in noll])
     tilt_nm = scale * nm_per_mas * tilt
@@ -162,13 +158,7 @@ def with_sources(
         drift_slope: slope of the drift's spectrum; 2 for a random walk.
         jitter_nm: rms of tip and of tilt, white from 0.5 to 1.5 times the frame rate.
         shear: rms of the beam's slow wander on the sensor's masks along each axis, pupil diameters.
-
-    Raises:
-        ValueError: a mode of the drift is not among the modes.
     """
-    if unknown := set(drift_nm) - set(disturbance.noll):
-        first, last = disturbance.noll[0], disturbance.noll[-1]
-        raise ValueError(f"the drifting mode Z{min(unknown)} is not one of Z{first} to Z{last}")
     waves = [(disturbance.frequency_hz, disturbance.amplitude_nm)]
     if drift_nm:
         per_root_s = np.array([drift_nm.get(index, 0.0) for index in disturbance.noll])

@@ -46,35 +46,32 @@ _REMEMBERED = 256  # mirror states, and publication times of frames
 
 
 def disturbance_of(config: Configuration) -> Disturbance:
-    """The disturbance of a configuration; ConfigurationError if its modes or wheels are impossible."""
+    """The disturbance of a configuration."""
     section, nm_per_mas = config.disturbance, tilt_nm_per_mas(config.star.diameter_m)
-    try:
-        found = preset_disturbance(
-            section.preset,
-            config.noll,
-            config.seed,
-            nm_per_mas,
-            config.star.wavelength_nm,
-            section.scale,
-            {int(index): amplitude for index, amplitude in section.static_nm.items()},
-            section.line_width,
-        )
-        found = with_sources(
-            found,
-            config.camera.rate_hz,
-            {int(index): per_root_s for index, per_root_s in section.drift_nm.items()},
-            section.drift_slope,
-            section.jitter_mas * nm_per_mas,
-            section.shear,
-        )
-        if not section.wheel_hz:
-            return found
-        speeds_hz = section.wheel_hz, section.wheel_hz + section.second_wheel_hz
-        rms_nm = np.where(np.isin(config.noll, TIP_TILT), section.wheel_mas * nm_per_mas, 0.0)
-        count = 2 if section.second_wheel_hz else 1
-        spinning = wheels(config.seed, speeds_hz[:count], rms_nm, section.wheel_course, section.wheel_change)
-    except ValueError as error:
-        raise ConfigurationError(f"disturbance: {error}") from None
+    found = preset_disturbance(
+        section.preset,
+        config.noll,
+        config.seed,
+        nm_per_mas,
+        config.star.wavelength_nm,
+        section.scale,
+        {int(index): amplitude for index, amplitude in section.static_nm.items()},
+        section.line_width,
+    )
+    found = with_sources(
+        found,
+        config.camera.rate_hz,
+        {int(index): per_root_s for index, per_root_s in section.drift_nm.items()},
+        section.drift_slope,
+        section.jitter_mas * nm_per_mas,
+        section.shear,
+    )
+    if not section.wheel_hz:
+        return found
+    speeds_hz = section.wheel_hz, section.wheel_hz + section.second_wheel_hz
+    rms_nm = np.where(np.isin(config.noll, TIP_TILT), section.wheel_mas * nm_per_mas, 0.0)
+    count = 2 if section.second_wheel_hz else 1
+    spinning = wheels(config.seed, speeds_hz[:count], rms_nm, section.wheel_course, section.wheel_change)
     return replace(found, wheels=spinning)
 
 
@@ -138,7 +135,7 @@ class SimulatedCamera:
         """File (JSON) of a fault to inject into the frames; empty for none."""
 
     def __init__(self, options: Options, config: Configuration, optics: Scene | None = None) -> None:
-        """Build the optics, unless `optics` is given; ConfigurationError if region, disturbance or fault is invalid."""
+        """Build the optics, unless `optics` is given; ConfigurationError if region or fault is invalid."""
         self._config = config
         self._scene = scene(config) if optics is None else optics
         row, rows = _centred_region("rows", options.rows, self._scene.shape[0])

@@ -90,12 +90,7 @@ class Wheel:
 def wheels(
     seed: int, speeds_hz: tuple[float, ...], rms_nm: Array, course: str = "ramp", change: float = 0.0
 ) -> tuple[Wheel, ...]:
-    """Equal wheels, one for each speed at time 0; `rms_nm` (modes,) is that of the first harmonic at high speed.
-
-    ValueError if a wheel that runs down would speed up, or does not turn forward.
-    """
-    if course == "run-down" and (change < 0 or min(speeds_hz) <= 0):
-        raise ValueError("wheels that run down have speeds above 0 and a wheel_change of 0 or more")
+    """Equal wheels, one for each speed at time 0; `rms_nm` (modes,) is that of the first harmonic at high speed."""
     found = []
     for number, start_hz in enumerate(speeds_hz):
         rng = np.random.default_rng([seed, 7, number])

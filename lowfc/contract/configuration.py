@@ -247,6 +247,9 @@ class Configuration(Section):
                 f"realtime.recorder_priority, {self.realtime.recorder_priority}, must be below the loop's "
                 f"realtime.priority, {self.realtime.priority}"
             )
+        for key in (*self.disturbance.static_nm, *self.disturbance.drift_nm):
+            if int(key) not in self.noll:
+                raise ValueError(f"disturbance: Z{key} is not one of the sensor's modes, Z2 to Z{self.noll[-1]}")
         actuators = self.mirror.rows * self.mirror.columns
         for key in map(str, (*self.mirror.dead, *self.mirror.stuck_nm)):
             if not key.isdecimal() or int(key) >= actuators:

@@ -211,11 +211,14 @@ class Disturbance(Section):
     """Initial excess speed of a second, identical wheel, so that the two beat; 0 for no second wheel."""
 
     @model_validator(mode="after")
-    def _noll_indices(self) -> "Disturbance":
+    def _possible(self) -> "Disturbance":
         for name in ("static_nm", "drift_nm"):
             for key in getattr(self, name):
                 if not key.isdecimal() or int(key) < 2:
                     raise ValueError(f"{name}: {key!r} is not a Noll index of 2 or more")
+        speeds_hz = self.wheel_hz, self.wheel_hz + self.second_wheel_hz
+        if self.wheel_hz and self.wheel_course == "run-down" and (self.wheel_change < 0 or min(speeds_hz) <= 0):
+            raise ValueError("wheels that run down have speeds above 0 and a wheel_change of 0 or more")
         return self
 
 

@@ -220,6 +220,8 @@ def test_each_error_has_its_own_line(tmp_path: Path) -> None:
         ({"mirror.stroke_nm": 2e6, "mirror.slew_nm": 31.0}, ("mirror.slew_nm", "16 bits", "30.5")),
         ({"disturbance.static_nm": {"focus": 3.0}}, ("focus", "Noll")),
         ({"disturbance.static_nm": {"1": 3.0}}, ("'1'", "Noll")),
+        ({"disturbance.static_nm": {"16": 3.0}}, ("disturbance", "Z16", "Z15")),
+        ({"disturbance.drift_nm": {"4": 3.0}, "sensor.modes": 2}, ("disturbance", "Z4", "Z3")),
     ],
 )
 def test_contradicting_values_are_refused(overrides: dict[str, Any], words: tuple[str, ...]) -> None:
