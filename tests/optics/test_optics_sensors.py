@@ -358,5 +358,7 @@ def test_the_noise_of_a_frame_includes_rounding_to_whole_dn():
 def test_saturating_star_and_no_light_are_refused():
     with pytest.raises(CalibrationError, match=r"the star saturates the sensor: \d+ e- in the brightest pixel"):
         calibrated(sensor__kind="zwfs", star__magnitude=-1.0)
+    with pytest.raises(CalibrationError, match="the sensor saturates without light: a pixel has 60100 DN"):
+        calibrated(camera__dark_current_e_s=3e7)
     with pytest.raises(CalibrationError, match="no light reaches the sensor"):
         calibrated(camera__exposure_fraction=1e-9)

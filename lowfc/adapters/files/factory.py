@@ -289,12 +289,17 @@ def _check_exposure(config: Configuration, light: Array) -> None:
     """Raise CalibrationError if a pixel of the reference image saturates: its response is then not linear."""
     camera = detector(config)
     charge_e = float(light.max()) * electrons_per_exposure(config) * camera.em_gain
-    full_dn = float(saturation_dn(camera))
-    if _dark_dn(camera) + charge_e / camera.gain_e_per_dn >= full_dn:
+    dark_dn, full_dn = _dark_dn(camera), float(saturation_dn(camera))
+    if dark_dn >= full_dn:
+        raise CalibrationError(
+            f"the sensor saturates without light: a pixel has {dark_dn:.0f} DN in an exposure, its largest value is "
+            f"{full_dn:.0f} DN; check bias, dark current, clock-induced charge, gains and full well in [camera]"
+        )
+    if dark_dn + charge_e / camera.gain_e_per_dn >= full_dn:
         raise CalibrationError(
             f"the star saturates the sensor: {charge_e:.0f} e- in the brightest pixel of the reference image, which "
-            f"holds {(full_dn - _dark_dn(camera)) * camera.gain_e_per_dn:.0f} e-; shorten camera.exposure_fraction or "
-            "raise camera.rate_hz"
+            f"holds {(full_dn - dark_dn) * camera.gain_e_per_dn:.0f} e-; shorten camera.exposure_fraction or raise "
+            "camera.rate_hz"
         )
 
 
