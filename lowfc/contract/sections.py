@@ -154,7 +154,7 @@ class Camera(Section):
     bit_depth: int = Field(16, ge=8, le=16)
     """Bits of the converter."""
     em_gain: float = Field(1.0, ge=1, le=5000)
-    """Electron-multiplying gain; 1 for a conventional detector."""
+    """Electron-multiplying gain; 1 for a conventional detector. Read noise, gain and full well are those after it."""
     clock_induced_charge_e: NotNegative = 0.0
     """Spurious electrons per pixel and frame before multiplication."""
     dark_current_e_s: NotNegative = 0.0
