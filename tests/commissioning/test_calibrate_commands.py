@@ -470,6 +470,19 @@ def test_the_noise_of_a_mode_is_compared_with_its_own_limit(config: Configuratio
     assert "more than its modal limit of 0.001 nm" in printed.getvalue()
 
 
+@pytest.mark.parametrize(
+    ("keys", "why"), [({"bias_dn": 0.0}, "raise camera.bias_dn"), ({"gain_e_per_dn": 10.0}, "rounded down"), ({}, "")]
+)
+def test_frames_that_cannot_have_the_flux_of_the_light_are_named(keys: dict[str, float], why: str) -> None:
+    printed = StringIO()
+    analytic(
+        load(None, {"star.magnitude": 6.0} | {f"camera.{key}": value for key, value in keys.items()}),
+        Console(file=printed),
+    )
+    assert why in printed.getvalue()
+    assert bool(why) == ("of the light's" in printed.getvalue())
+
+
 def test_a_loop_with_a_calibration_at_a_wavefront_converges_to_it() -> None:
     few = load(None, BRIGHT | {"sensor.modes": 6})
     world = load(None, BRIGHT | {"sensor.modes": 6, "disturbance.static_nm": {"4": 35.0, "6": 20.0}})

@@ -11,8 +11,11 @@ from lowfc.adapters.process.progress import counting_bar
 from lowfc.arrays import Array
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.optics.detector.detector import expose
 from lowfc.optics.twin.twin import Twin
 from lowfc.optics.twin.twin_mirror import TwinMirror
+
+_FRAMES = 100  # exposed to compare their flux with the light's
 
 WavefrontFunction = Callable[[Twin, TwinMirror], Array]
 """Computes the wavefront at the used nodes, nm, from a twin and the mirror on its nodes."""
@@ -42,4 +45,16 @@ def analytic(config: Configuration, console: Console, at: WavefrontFunction | No
             f"Z{calibration.noll[worst]}: noise is {noise_nm[worst]:.0f} nm rms per frame, more than its modal "
             f"limit of {limit_nm[worst]:g} nm: the star is too faint, or the mask cannot distinguish so many modes"
         )
+    camera, flux_dn = factory.detector(config), calibration.flux_dn
+    light_e = calibration.reference * flux_dn * camera.gain_e_per_dn / camera.em_gain
+    frames = expose(camera, np.tile(light_e, (_FRAMES, 1)), np.random.Generator(np.random.SFC64(1)))
+    shares = (frames - calibration.dark).sum(axis=1) / flux_dn
+    share = float(shares.mean())
+    if abs(share - 1) > 0.1 + 3 * shares.std() / np.sqrt(_FRAMES):
+        why = (
+            "dark pixels are cut off at 0 DN: raise camera.bias_dn"
+            if share > 1
+            else "faint pixels are rounded down to whole DN: camera.gain_e_per_dn is too large for the read noise"
+        )
+        warn(f"the frames' flux is {100 * share:.0f} % of the light's, which distorts the modes: {why}")
     return calibration
