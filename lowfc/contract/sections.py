@@ -111,7 +111,8 @@ class SensorSection(Section):
     nodes: Literal[32, 64] = 32
     """Pupil nodes across the diameter in the real-time twin."""
     rank: int = Field(60, ge=20, le=200)
-    """Rank of the compressed optical operator in the real-time twin."""
+    """Rank of the compressed optical operator in the real-time twin. Error of an image relative to its peak: 1e-4 at
+    60, 5e-3 at 40, 0.2 at 20."""
 
 
 SENSORS: dict[str, dict[str, Any]] = {
