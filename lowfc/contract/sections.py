@@ -249,7 +249,8 @@ class Mirror(Section):
     driver_bits: int = Field(16, ge=8, le=24)
     """Bits of the driver over the full range."""
     settling_us: NotNegative = 50.0
-    """Simulated mirror: time constant of an actuator's first-order response."""
+    """Simulated mirror: time constant of an actuator's first-order response; without lockstep, at most a
+    fifth of the period."""
     dead: list[int] = Field(default_factory=list)
     """Actuators that stay flat: row * columns + column."""
     stuck_nm: dict[str, float] = Field(default_factory=dict)
