@@ -17,7 +17,7 @@ from lowfc.programs.paper.cases import DEFAULT_SAM, Context, Prepared, Row, prep
 OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned", "bar", "lyot", "aplc")
 """Sensors in addition to the packaged sparse apertures."""
 ITERATIONS = (0, 1, 2)
-WITH_NUISANCES = "weighted, flux and shear also fitted"
+WITH_NUISANCES = "weighted, flux and shear fitted along"
 EVEN = (
     "If pupil and masks are real and the pupil is symmetric, flux and shear change the image by an even function of "
     "position, and every mode changes it by an odd one: fitting them too costs a sparse aperture mask nothing. CLOWFS "
