@@ -78,10 +78,15 @@ def test_late_commands_after_a_restart_of_the_camera_are_counted(tmp_path: Path)
 
 def test_the_camera_is_that_of_most_steps_and_the_others_are_told_apart(tmp_path: Path) -> None:
     night = SyntheticLog().frames(STEPS)
-    night.put(CAMERA_STATE, wire.CameraState(timestamp=timestamp(night.now_ns), period_ns=2 * PERIOD_NS))
-    history = history_of(night.frames(5), tmp_path / "x.mcap")
+    settings = next(wire.CameraState.FromString(one.payload) for one in night.samples if CAMERA_STATE.matches(one.key))
+    for factor, frames in ((2, 5), (1, 5)):
+        settings.timestamp.CopyFrom(timestamp(night.now_ns))
+        settings.period_ns = factor * PERIOD_NS
+        night.put(CAMERA_STATE, settings)
+        night.frames(frames)
+    history = history_of(night, tmp_path / "x.mcap")
     assert history.rate_hz == 1e9 / PERIOD_NS
-    assert history.under_calibration.tolist() == [True] * STEPS + [False] * 5
+    assert history.under_calibration.tolist() == [True] * STEPS + [False] * 5 + [True] * 5
 
 
 def test_the_attached_calibration_replaces_a_lost_message(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from lowfc.adapters.logs.columns import (
 )
 from lowfc.adapters.logs.parts import WholeLog
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.arrays import Integers, Long, Mask, Sequences, Single
+from lowfc.arrays import Array, Integers, Long, Mask, Sequences, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
@@ -65,7 +65,7 @@ LAST_NS = (1 << 63) - 1
 """Latest time of a message that is read, in the year 2262; a later one does not fit an array of times."""
 REORDERING_NS = 2_000_000_000
 """Time by which messages in a log may be out of order."""
-_CAMERA_SETTINGS = ("period_ns", "exposure_ns", "gain_e_per_dn", "read_noise_e", "em_gain")
+_CAMERA_SETTINGS = ("period_ns", "exposure_ns", "gain_e_per_dn", "bias_dn", "read_noise_e", "em_gain")
 _DECODED = {STEP, TRUTH, MIRROR_STATE, TIMING, CALIBRATION, CONTROLLER_STATE, CAMERA_STATE, REQUEST, HEALTH, EVENT}
 
 
@@ -253,7 +253,7 @@ class _HistoryBuilder:
     def __init__(self, history: History) -> None:
         self._history = history
         self._calibration: wire.Calibration | None = None
-        self._cameras: list[wire.CameraState] = []  # with other settings than the one before
+        self._cameras: list[tuple[Array, wire.CameraState]] = []  # with other settings than the one before
         self._frames = Columns(sequence="Q", publish_ns="q")
         self._commands = Columns(publish_ns="q")
         self._stepped = Columns(sequence="Q")
@@ -307,9 +307,9 @@ class _HistoryBuilder:
         elif isinstance(body, wire.ControllerState):
             history.controllers.append(body)
         elif isinstance(body, wire.CameraState):
-            settings = [[getattr(one, name) for name in _CAMERA_SETTINGS] for one in (*self._cameras[-1:], body)]
-            if len(settings) < 2 or not np.allclose(settings[0], settings[1], rtol=0.01, atol=0):
-                self._cameras.append(body)
+            settings = np.nan_to_num([getattr(body, name) for name in _CAMERA_SETTINGS])
+            if not self._cameras or not np.allclose(settings, self._cameras[-1][0], rtol=0.01, atol=0):
+                self._cameras.append((settings, body))
         elif isinstance(body, wire.Request):
             history.requests.append(body)
         elif isinstance(body, wire.Health):
@@ -369,10 +369,14 @@ class _HistoryBuilder:
             steps, counted = history.steps, history.under_calibration
             if (closed := counted & (steps.mode == LoopMode.CLOSED)).any():
                 counted = closed
-            begun_ns = np.maximum.accumulate([float(from_timestamp(one.timestamp)) for one in self._cameras])
-            numbers = np.maximum(np.searchsorted(begun_ns, steps.time_ns) - 1, 0)
-            most = int(np.bincount(numbers[counted]).argmax()) if counted.any() else -1
-            history.camera, history.under_camera = self._cameras[most], numbers == most
+            begun_ns = np.maximum.accumulate([float(from_timestamp(one.timestamp)) for _, one in self._cameras])
+            known = np.array([settings for settings, _ in self._cameras])
+            # The first with the same settings, to which a camera may have returned.
+            first = np.array([np.isclose(known, one, rtol=0.01, atol=0).all(axis=1).argmax() for one in known])
+            numbers = first[np.maximum(np.searchsorted(begun_ns, steps.time_ns) - 1, 0)]
+            most = np.bincount(numbers[counted]).argmax() if counted.any() else first[-1]
+            history.camera = self._cameras[np.flatnonzero(first == most)[-1]][1]
+            history.under_camera = numbers == most
 
     def _last_calibration(self) -> Calibration | None:
         history = self._history
