@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.live import Live
 
-from lowfc.adapters.bus.run import Run, free_ports, mirror_role, new_run_id, open_run
+from lowfc.adapters.bus.run import MODE, Run, free_ports, mirror_role, new_run_id, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files import calibration_file
 from lowfc.adapters.files.whole_file import write_whole
@@ -101,7 +101,7 @@ def _new_run(config: Configuration, name: str | None) -> Run:
 def prepare(config: Configuration, run: Run, console: Console) -> None:
     """Write calibration and configuration to the run's directory."""
     calibration_file.save(analytic(config, console), run.path / "calibration.fits")
-    write_whole(run.path / "config.toml", config.to_toml().encode())
+    write_whole(run.path / "config.toml", config.to_toml().encode(), mode=MODE)
 
 
 def children_of(config: Configuration, run: Run, duration_s: float | None, record: bool) -> list[Child]:

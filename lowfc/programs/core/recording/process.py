@@ -5,7 +5,7 @@ import sys
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 
-from lowfc.adapters.bus.run import Run
+from lowfc.adapters.bus.run import MODE, Run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.logs.series import LogLimits, shortage
@@ -67,7 +67,7 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
             awaited=_launched_processes(run),
         )
         if shared is not None:
-            write_whole(run.path / "config.toml", shared)
+            write_whole(run.path / "config.toml", shared, mode=MODE)
         recorder.catch_signals()
         recorder.service.announces = True
         if log.on_event:
