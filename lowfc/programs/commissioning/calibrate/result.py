@@ -289,8 +289,9 @@ def comparison(one: Calibration, other: Calibration) -> Comparison:
 def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array, response: Array) -> Array:
     """Modes (modes, actuators) that R measures of each actuator: modal shapes measured, others modelled.
 
-    For a sensor of another size or orientation than the model's, the others are those of the calibration before, or
-    projected onto the modal shapes.
+    A common factor between model and measurement, as of the mirror's stroke, applies to the others, too. For a sensor
+    of another size or orientation than the model's, the others are those of the calibration before, or projected onto
+    the modal shapes.
     """
     commands, own = before.modes_to_actuators.astype(np.float64), before.actuators_to_modes.astype(np.float64)
     inverse, product = np.linalg.pinv(commands), matrix @ response  # R H is the identity unless R is regularised
@@ -305,9 +306,11 @@ def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Arra
             modelled[:, ~own.any(axis=0)] = 0  # actuators that are not active
         candidates.insert(0, modelled)
     for found in candidates:
-        error = found @ commands - product
+        modes = found @ commands
+        factor = max(float(np.vdot(modes, product)), 0.0) / (float(np.vdot(modes, modes)) or 1.0)
+        error = factor * modes - product
         if np.abs(error).max() < _OTHER_SENSOR:
-            return np.asarray(found - error @ inverse)
+            return np.asarray(factor * found - error @ inverse)
     return np.asarray(product @ inverse)
 
 
