@@ -358,6 +358,21 @@ def test_closing_a_session_leaves_a_slow_reader_only_complete_messages(reader: R
     assert whole > 15  # content of queue and socket
 
 
+def test_a_session_ends_although_a_handler_never_returns(run: Run, join: Join, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lowfc.adapters.bus.zenoh_bus.CLOSE_S", 0.1)
+    free = threading.Event()
+    handler = Mock(side_effect=lambda _: free.wait())
+    mirror, frames = join(run, "mirror-dm"), join(run, "camera").publisher(FRAME)
+    mirror.subscribe(FRAME, handler)
+    until(lambda: handler.called, each=lambda: frames.put(b"frame"))
+    freed = threading.Timer(PATIENCE_S, free.set)
+    freed.start()
+    mirror.close()
+    freed.cancel()
+    assert not free.is_set()
+    free.set()
+
+
 def test_a_session_ends_soon_beside_a_process_that_is_stopped(run: Run) -> None:
     """As `lowfc ctl safe` while a camera's process is stopped: the host accepts connections in its name."""
     with socket.create_server(("127.0.0.1", run.links.ports["camera"])):

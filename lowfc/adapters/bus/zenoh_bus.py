@@ -32,6 +32,8 @@ ROLE_CHECK_S = 0.5
 """Timeout for an answer of the router, or of another process with this role."""
 FLUSH_S = 2.0
 """Time that a closing session waits for peers that have not received everything yet."""
+CLOSE_S = 5.0
+"""Time that a closing session waits for a handler that does not return."""
 
 
 def declare_publisher(session: zenoh.Session, topic: Topic, key: str, *, lockstep: bool = False) -> zenoh.Publisher:
@@ -336,6 +338,11 @@ class ZenohBus:
                 self.get(HEALTH.at(ALL), timeout_s=FLUSH_S, priority=zenoh.Priority.BACKGROUND)
         for close in self._closers:
             close()
+        closing = threading.Thread(target=self._close_session, daemon=True)
+        closing.start()
+        closing.join(CLOSE_S)
+
+    def _close_session(self) -> None:
         with contextlib.suppress(zenoh.ZError):
             self._session.close()  # type: ignore[no-untyped-call]
 
