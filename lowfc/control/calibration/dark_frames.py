@@ -84,11 +84,13 @@ def check_dark(dark_dn: Array, reference: Array, flux_dn: float) -> None:
 def light_in(dark_dn: Array, reference: Array) -> float:
     """Flux of the star in supposedly dark frames (pixels,), DN, from its reference image (pixels,) in flux fractions.
 
-    It is the median of the brightest pixels of the reference, of which some may be hot.
+    It is the median of the pixels' fluxes, weighted by the reference: some of the brightest pixels may be hot.
     """
-    bright = np.argsort(reference)[-max(reference.size // 128, 8) :]
-    above_dn, above = dark_dn[bright] - np.median(dark_dn), reference[bright] - np.median(reference)
-    return float(np.median(above_dn / above))
+    above_dn, above = dark_dn - np.median(dark_dn), reference - np.median(reference)
+    above_dn, above = above_dn[above != 0], above[above != 0]
+    order = np.argsort(above_dn / above)
+    weights = np.cumsum(np.abs(above[order]))
+    return float((above_dn / above)[order[np.searchsorted(weights, weights[-1] / 2)]])
 
 
 def _spread(values: Array) -> float:
