@@ -391,6 +391,18 @@ def test_a_camera_ahead_and_a_clear_for_a_lower_start_move_no_law_and_no_request
     assert (found["run"]["steps_s"], found["light"]["refused"]) == (pytest.approx(0.119), {"ahead": 1})
 
 
+def test_a_law_whose_step_is_lost_is_found_also_with_another_clock_of_the_camera(tmp_path: Path) -> None:
+    night = SyntheticLog().frames(50).request("gain", (0.2,)).frames(50)
+    del night.samples[[row for row, one in enumerate(night.samples) if STEP.matches(one.key)][49]]
+    for row, one in enumerate(night.samples):
+        if STEP.matches(one.key):
+            step = wire.ControlStep.FromString(one.payload)
+            step.timestamp.seconds -= 3600
+            night.samples[row] = one._replace(payload=step.SerializeToString())
+    found = results(night.write(tmp_path / "x.mcap"))
+    assert (found["laws"][-1]["from_s"], found["requests"][-1]["time_s"]) == pytest.approx((0.05, 0.05))
+
+
 def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -> None:
     night = SyntheticLog().frames(300)
     night.samples = [sample for sample in night.samples if sample.key != CONTROLLER_STATE.key]

@@ -14,6 +14,7 @@ from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
 from lowfc.arrays import Array
 from lowfc.contract.codecs.law_codec import driving, overruled
+from lowfc.contract.envelope import COUNT_BITS
 from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop import guard
@@ -101,9 +102,16 @@ def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None
 
 
 def row_after(history: History, frame_sequence: int, time: Timestamp) -> int:
-    """Row after the last step of a frame, or, without one, after this time of the controller."""
-    rows = np.flatnonzero(history.steps.sequence == frame_sequence)
-    if not rows.size:  # no frame since the controller's start or a `clear`, or a lost one
+    """Row after the last step of a frame; without it the first later one, or by the controller's time.
+
+    The camera's frames may have the time of another clock.
+    """
+    sequence = history.steps.sequence
+    rows = np.flatnonzero(sequence == frame_sequence)
+    if not rows.size:  # a lost one, or none since the controller's start or a `clear`
+        later = (sequence > frame_sequence) & (sequence >> COUNT_BITS == frame_sequence >> COUNT_BITS)
+        if later.any():
+            return int(np.argmax(later))
         rows = np.flatnonzero(history.steps.time_ns + history.camera_lag_ns(Role.CONTROLLER) <= from_timestamp(time))
     return int(rows[-1]) + 1 if rows.size else 0
 
