@@ -100,9 +100,10 @@ def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, 
     assert np.allclose(made.actuators_to_modes @ made.modes_to_actuators, np.eye(len(made.noll)), atol=1e-4)
     difference = made.actuators_to_modes - before.actuators_to_modes
     assert np.linalg.norm(difference) < 0.1 * np.linalg.norm(before.actuators_to_modes)
-    half = data.measured._replace(response=0.5 * data.measured.response)  # the mirror moves half as far as its model
-    weak, _ = measured_calibration(loop.config, before, half, CalibrationRequest(method, OUT, 50.0))
-    assert np.allclose(weak.actuators_to_modes, made.actuators_to_modes, atol=1e-3)
+    for factor in (0.5, -2.0):  # the mirror moves half as far as its model, or twice as far and the other way
+        other = data.measured._replace(response=factor * data.measured.response)
+        scaled, _ = measured_calibration(loop.config, before, other, CalibrationRequest(method, OUT, 50.0))
+        assert np.allclose(scaled.actuators_to_modes, made.actuators_to_modes, atol=1e-3)
     assert made.id != before.id
     assert made.estimator == f"weighted+{method}"
     first = data.measured._replace(initial=data.measured.initial._replace(estimator=f"weighted+{method}+first"))

@@ -16,6 +16,7 @@ from lowfc.control.calibration.calibration import FIRST, Calibration, comparable
 from lowfc.control.calibration.regularised import Reconstruction, advice, reconstruct
 from lowfc.control.calibration.response_fit import MAX_ELEMENT, MAX_ELEMENT_RMS, Check, Measured, cross_talk
 from lowfc.control.loop.wording import counted
+from lowfc.optics.chain.zernike import noll_to_orders
 from lowfc.optics.twin.twin import reference as twin_reference
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cycles_for
@@ -289,9 +290,10 @@ def comparison(one: Calibration, other: Calibration) -> Comparison:
 def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array, response: Array) -> Array:
     """Modes (modes, actuators) that R measures of each actuator: modal shapes measured, others modelled.
 
-    A common factor between model and measurement, as of the mirror's stroke, applies to the others, too. For a sensor
-    of another size or orientation than the model's, the others are those of the calibration before, or projected onto
-    the modal shapes.
+    A common factor between model and measurement, as of the mirror's stroke or sign, applies to the others, too. A
+    negative one counts only if focus or spherical has it: what reverses these reverses all shapes, but half a turn of
+    most sensors reverses tip and tilt alone. For a sensor of another size or orientation than the model's, the others
+    are those of the calibration before, or projected onto the modal shapes.
     """
     commands, own = before.modes_to_actuators.astype(np.float64), before.actuators_to_modes.astype(np.float64)
     inverse, product = np.linalg.pinv(commands), matrix @ response  # R H is the identity unless R is regularised
@@ -305,11 +307,12 @@ def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Arra
         if own.size:
             modelled[:, ~own.any(axis=0)] = 0  # actuators that are not active
         candidates.insert(0, modelled)
+    symmetric = any(noll_to_orders(index)[1] == 0 for index in before.noll)
     for found in candidates:
         modes = found @ commands
-        factor = max(float(np.vdot(modes, product)), 0.0) / (float(np.vdot(modes, modes)) or 1.0)
+        factor = float(np.vdot(modes, product)) / (float(np.vdot(modes, modes)) or 1.0)
         error = factor * modes - product
-        if np.abs(error).max() < _OTHER_SENSOR:
+        if (factor > 0 or symmetric) and np.abs(error).max() < _OTHER_SENSOR:
             return np.asarray(factor * found - error @ inverse)
     return np.asarray(product @ inverse)
 
