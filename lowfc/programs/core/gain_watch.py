@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lowfc.arrays import Array, Mask, Single, single
-from lowfc.control.calibration.map_reconstructor import noise_covariance_nm2
+from lowfc.arrays import Array, Mask, Single
+from lowfc.control.calibration.map_reconstructor import map_rows, noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import CONFIDENCE, GainBank, Verdict, injected, uncorrected_prior_nm2
 from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.loop.inputs import COUNT_BITS, PendingEvent, Request, Step
@@ -89,10 +89,12 @@ class GainWatch:
             return NOTHING
         self._restart_if_changed(loop)
         if loop.weighting is not self._weighting:
-            self._weighting = loop.weighting
-            response = single(loop.estimator.rows[:-1] @ loop.calibration.response)
+            self._weighting = weighting = loop.weighting
+            of_own = np.eye(len(loop.calibration.noll), dtype=np.float32)
+            if weighting is not None:
+                (of_own,) = map_rows(loop.calibration, *weighting, loop.camera, of_own)
             for group in self._groups:
-                group.bank.use_reconstructor(response[np.ix_(group.mask, group.mask)])
+                group.bank.use_reconstructor(of_own[np.ix_(group.mask, group.mask)])
         newest, before = state.frame_sequence, self._newest
         if step.frame_sequence != newest or newest == before:  # not a new exposure
             return NOTHING
