@@ -23,7 +23,7 @@ from lowfc.contract.configuration import load
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import TRUTH, wire
 from lowfc.control.laws.continuous import Timing
-from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.margins import check_stable
 from lowfc.control.laws.tuning import Gains, Tuned
 from lowfc.control.loop.inputs import Step
@@ -362,20 +362,21 @@ def test_tune_needs_either_a_log_or_a_running_loop() -> None:
         tune("x.mcap", "--run", "bench")
 
 
-@pytest.mark.parametrize("name", LAWS)
-def test_a_law_is_unchanged_after_saving_and_loading(name: str, tmp_path: Path) -> None:
-    law_file.save(LAWS[name], tmp_path / "law.fits")
+@pytest.mark.parametrize("law", [*LAWS.values(), integrator([0.1] * 20, [0.0] * 20, tuple(range(2, 22)), 1.0, 1e3)])
+def test_a_law_is_unchanged_after_saving_and_loading(law: LinearLaw, tmp_path: Path) -> None:
+    law_file.save(law, tmp_path / "law.fits")
     again = law_file.load(tmp_path / "law.fits")
-    assert again.id == LAWS[name].id
-    assert (again.name, again.noll, again.delay_frames) == (LAWS[name].name, LAWS[name].noll, 1.0)
+    assert again.id == law.id
+    assert (again.name, again.noll, again.delay_frames) == (law.name, law.noll, 1.0)
 
 
 def test_a_damaged_law_file_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "law.fits"
     with pytest.raises(DataFileError, match="there is no such law file: make one with `lowfc tune"):
         law_file.load(path)
-    with pytest.raises(DataFileError, match="printable ASCII"):
-        law_file.save(replace(LAWS["notch"], name="é"), path)
+    for name in ("é", "ends with a space "):
+        with pytest.raises(DataFileError, match="printable ASCII"):
+            law_file.save(replace(LAWS["notch"], name=name), path)
     law_file.save(LAWS["notch"], path)
     with fits.open(path, mode="update") as units:
         units["MEASUREMENT_GAIN"].data[0, 0] += 1

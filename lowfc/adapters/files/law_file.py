@@ -25,9 +25,11 @@ _EXTENSIONS = (
 
 
 def to_bytes(law: LinearLaw) -> bytes:
-    """Encode a law as a FITS file; DataFileError if its name is not printable ASCII."""
-    if not (law.name.isascii() and law.name.isprintable()):
-        raise DataFileError(f"the name of a law in a file is printable ASCII, got {law.name!r}")
+    """Encode a law as a FITS file; DataFileError for a name that a header does not hold."""
+    if not (law.name.isascii() and law.name.isprintable()) or law.name.endswith(" "):
+        raise DataFileError(
+            f"the name of a law in a file is printable ASCII without a space at its end, got {law.name!r}"
+        )
     primary = fits_file.primary_hdu(KIND)
     header = primary.header
     header["LAWID"] = law.id
