@@ -238,7 +238,7 @@ class LawGuard(NamedTuple):
             return LawGuard(spans, self.members, groups, frames, sums_nm2, void, virtual_nm, virtual_x), []
         means_nm2 = (sums_nm2 / frames).T.tolist()
         judged = [group.judged(means, spans, void=void) for group, means in zip(groups, means_nm2, strict=True)]
-        after, events = self.with_groups([group for group, _ in judged]), _events(law.name, judged)
+        after, events = self.with_groups([group for group, _ in judged]), _events(law, spans, judged)
         if events:  # the comparison restarts once the new controller drives alone
             return after.at_rest(), events
         return after._replace(virtual_nm=virtual_nm, x=virtual_x), []
@@ -250,17 +250,17 @@ def _faded(group: Group, spans: Spans) -> Group:
     return group._replace(faded=faded, blocks=0)
 
 
-def _events(law: str, judged: Sequence[tuple[Group, str]]) -> list[PendingEvent]:
+def _events(law: LinearLaw, spans: Spans, judged: Sequence[tuple[Group, str]]) -> list[PendingEvent]:
     events = []
     for modes, (group, why) in zip(NAMES, judged, strict=True):
         if why == LAW_RETURNS:
-            events.append(PendingEvent("LAW_BACK", {"law": law, "modes": modes}))
+            events.append(PendingEvent("LAW_BACK", {"law": law.name, "modes": modes}))
         elif why:
-            wait_s = BETTER_S * 2 ** (group.takeovers - 1)
+            wait_s = spans.better * spans.block / law.rate_hz * 2 ** (group.takeovers - 1)
             until = (
                 "until the law is loaded again or the loop is closed again"
                 if group.final
-                else f"until the law would be far better for {wait_s:g} s"
+                else f"until the law would be far better for {wait_s:.3g} s"
             )
-            events.append(PendingEvent("LAW_OVERRULED", {"law": law, "modes": modes, "why": why, "until": until}))
+            events.append(PendingEvent("LAW_OVERRULED", {"law": law.name, "modes": modes, "why": why, "until": until}))
     return events
