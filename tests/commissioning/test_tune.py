@@ -208,12 +208,12 @@ PROBE = wire.Play(first_sequence=frame_sequence(3050), frames=100, id="probe")
 class SteppedLoop(StreamedLoop):
     """A loop with these steps, whose mirror reports each command `report_periods` after the end of the exposure.
 
-    If `probed`, the state has the probe sequence once, at the request after 3100 steps, and from then on other gains.
+    With a `later_gain` the state has the probe sequence once, at the request after 3100 steps, and then this gain.
     """
 
-    def __init__(self, steps: list[Step], report_periods: float = 0.2, *, probed: bool = False) -> None:
+    def __init__(self, steps: list[Step], report_periods: float = 0.2, *, later_gain: float = 0.0) -> None:
         super().__init__(CONFIG)
-        self.recorded, self.report_ns, self.probed = steps, round(report_periods * PERIOD_NS), probed
+        self.recorded, self.report_ns, self.later_gain = steps, round(report_periods * PERIOD_NS), later_gain
         self.requested = 0
 
     def steps(self, count: int | None = None, patience_s: float = 0.0) -> StepStream:
@@ -224,10 +224,10 @@ class SteppedLoop(StreamedLoop):
     def status(self) -> Answer:
         answer = super().status()
         self.requested += 1
-        if self.probed and self.requested == 1 + 31:
+        if self.later_gain and self.requested == 1 + 31:
             answer.state.play.CopyFrom(PROBE)
-        if self.probed and self.requested > 31:
-            answer.state.gain[:] = [0.3, 0.3, 0.3]
+        if self.later_gain and self.requested > 31:
+            answer.state.gain[:] = [self.later_gain] * 3
         return answer
 
     def mirror_watch(self) -> Any:
@@ -256,14 +256,15 @@ def test_a_longer_delay_is_measured_on_a_running_loop(report_periods: float, del
     assert [warning.startswith(warned) for warning in run.warnings] == [True] * (delay_frames - 1)
 
 
-def test_probe_sequences_on_a_running_loop_are_excluded() -> None:
-    """The loop settles for half a second again after the sequence."""
+@pytest.mark.parametrize(("gain", "settling"), [(0.3, 500), (1 / 160, 800)])  # 0.5 s, or five time constants
+def test_probe_sequences_on_a_running_loop_are_excluded(gain: float, settling: int) -> None:
+    """The loop settles again after the sequence."""
     disturbance_nm = np.random.default_rng(5).standard_normal((6000, 3)).astype(np.float32)
     disturbance_nm[3050 : 3050 + PROBE.frames] += 100
-    run = telemetry_from_run(SteppedLoop(closed_loop(disturbance_nm, 1), probed=True), 60.0)
-    assert run.pol.frames == pytest.approx(6000 - 500 - PROBE.frames - 500, abs=10)
+    run = telemetry_from_run(SteppedLoop(closed_loop(disturbance_nm, 1), later_gain=gain), 60.0)
+    assert run.pol.frames == pytest.approx(6000 - settling - PROBE.frames - settling, abs=10)
     assert np.abs(run.pol.joined()).max() < 20
-    assert run.law.gain == pytest.approx(0.3), "the law is the last one"
+    assert run.law.gain == pytest.approx(gain), "the law is the last one"
 
 
 def test_a_too_short_live_time_is_refused_at_once() -> None:

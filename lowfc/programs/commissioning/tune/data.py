@@ -19,20 +19,23 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import Role, wire
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws import margins
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.spectra import TimeSeries, time_series
+from lowfc.control.laws.stability import settling_frames
 from lowfc.control.laws.vibration import FEWEST
 from lowfc.control.laws.what_if import delay_from_times, exposed, missing_before
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import Limit, LoopMode
+from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.what_if.run import LoggedRun, SeenCommands, during_probe
 
-_SETTLING_S = 0.5  # time excluded after the loop was closed
+_SETTLING_S = 0.5  # least time excluded after the loop was closed
 _POLL_FRAMES = 100  # between two requests for the state of a running loop
 
 
@@ -217,7 +220,11 @@ def _telemetry(
     was_closed, index = steps.mode == LoopMode.CLOSED, np.arange(len(steps.mode))
     opened = np.flatnonzero(~was_closed)
     last_opened = np.concatenate([[-1], opened])[np.searchsorted(opened, index)]
-    closed, rows = True, usable & was_closed & (index - last_opened > _SETTLING_S * rate_hz)
+    settling, frames_closed = settling_frames(laws[0].gain, laws[0].leak), index - last_opened
+    if laws[1] is not None:
+        settling = SETTLING_FRAMES + FADING_FRAMES + margins.settling_frames(laws[1], timing.delay)
+    settling = min(settling, int(frames_closed.max()) - FEWEST)  # enough frames are left
+    closed, rows = True, usable & was_closed & (frames_closed > max(settling, _SETTLING_S * rate_hz))
     pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if _longest(pol) < FEWEST:
         closed, rows = False, usable
