@@ -281,7 +281,11 @@ class _Whittle:
         def model_of(parameters: Array) -> Model:
             floor, rest = parameters[: 2 + corner], parameters[2 + corner :].reshape(-1, 3)
             lines = tuple(
-                Line(line.frequency_hz + float(shift) * spacing, float(np.exp(width)), float(np.exp(variance)))
+                Line(
+                    min(max(line.frequency_hz + float(shift) * spacing, spacing), self.rate_hz / 2 - spacing),
+                    float(np.exp(width)),
+                    float(np.exp(variance)),
+                )
                 for line, (shift, width, variance) in zip(model.lines, rest, strict=True)
             )
             cutoff = float(np.exp(floor[2])) if corner else np.inf
@@ -305,7 +309,7 @@ class _Whittle:
             reach = max(1.0, line.width_hz / spacing)
             wide += [(-reach, reach), (np.log(1e-3 * spacing), width + 2), (variance - 2, variance + 2)]
         found = minimize(cost, start, method="L-BFGS-B", bounds=wide, options={"maxiter": 60})
-        fitted = model_of(found.x) if found.fun < cost(start) else model
+        fitted = model_of(found.x if found.fun < cost(start) else start)
         fitted = replace(fitted, lines=tuple(self._with_its_power(line, fitted) for line in fitted.lines))
         return replace(fitted, drift_nm2=max(fitted.drift_nm2, _MIN_DRIFT * fitted.noise_nm2))
 

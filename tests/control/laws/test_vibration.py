@@ -46,6 +46,12 @@ def test_width_and_power_of_damped_lines_are_identified() -> None:
     assert model.noise_nm2 == pytest.approx(0.5, rel=0.05)
 
 
+def test_a_wide_line_stays_below_half_of_the_frame_rate() -> None:
+    truth = Model(1e-8, np.inf, (Line(485, 120, 25.0),), 0.09, RATE_HZ)
+    (line,) = identify(TimeSeries((realised(truth, 4096, 13),), 0), RATE_HZ).lines
+    assert 450 < line.frequency_hz < RATE_HZ / 2
+
+
 def test_no_line_is_identified_in_noise() -> None:
     for seed in range(5):
         noise = np.random.default_rng(seed).standard_normal((4096, 1))
