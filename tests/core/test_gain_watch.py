@@ -22,7 +22,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.core.gain_watch import MIN_FRAMES, GainWatch
 from tests.support.in_process_loop import SMALL_MIRROR
-from tests.support.toy import CAMERA, FLUX_DN, frame, frame_sequence, loaded, settings
+from tests.support.toy import CAMERA, FLUX_DN, feed, frame, frame_sequence, loaded, settings
 from tests.support.toy import calibration as toy_calibration
 from tools.law_bench import Bench, calibrated, configured
 from tools.modal_bench import ModalBench
@@ -343,15 +343,12 @@ def test_a_mode_can_have_a_manual_gain_and_return_to_automatic() -> None:
 
 
 def test_a_truncated_reconstructor_is_weighted_without_an_inverse_of_its_response() -> None:
-    R = toy_calibration().reconstructor * np.array([[1], [1], [0]], np.float32)
-    setup, state = settings(), advance(settings(), State(), CAMERA)[0]
-    state, _ = advance(setup, state, Load(0, replace(toy_calibration(), reconstructor=R), "test"))
-    uncorrected = {"values": (0.0, 0.4, 0.1), "prior_nm2": (4.0, 0.0, 0.0), "flux_dn": FLUX_DN}
-    for request in (Request(0, "gain", text="auto"), Request(0, "gain", text="auto", **uncorrected)):
-        state, _ = advance(setup, state, request)
-    state, outputs = advance(setup, state, frame(1))
+    setup, R = settings(auto_gain=(True, True)), toy_calibration().reconstructor * np.array([[1], [1], [0]], np.float32)
+    load = Load(0, replace(toy_calibration(), reconstructor=R), "test")
+    gains = Request(0, "gain", (), (0.0, 0.4, 0.1), "auto", prior_nm2=(4.0, 0.0, 0.0), flux_dn=FLUX_DN)
+    state, all_outputs = feed(setup, State(), CAMERA, load, gains, frame(1))
     assert state.loop.weighting is not None
-    assert GainWatch(setup, "warn").observe(outputs.step, state).requests == ()
+    assert GainWatch(setup, "warn").observe(all_outputs[-1].step, state).requests == ()
 
 
 def watched(*inputs: Input) -> list[str]:

@@ -275,18 +275,14 @@ class _Whittle:
     def fit_all(self, model: Model) -> Model:
         """Fit all parameters together, starting from a nearly right model."""
         omega, power, counts = self.grouped(model.lines, robust=False)
-        spacing = self.spacing_hz
-        corner = np.isfinite(model.cutoff_hz)
+        spacing, corner = self.spacing_hz, np.isfinite(model.cutoff_hz)
+        allowed_hz = spacing, self.rate_hz / 2 - spacing
 
         def model_of(parameters: Array) -> Model:
             floor, rest = parameters[: 2 + corner], parameters[2 + corner :].reshape(-1, 3)
             lines = tuple(
-                Line(
-                    min(max(line.frequency_hz + float(shift) * spacing, spacing), self.rate_hz / 2 - spacing),
-                    float(np.exp(width)),
-                    float(np.exp(variance)),
-                )
-                for line, (shift, width, variance) in zip(model.lines, rest, strict=True)
+                Line(float(np.clip(line.frequency_hz + shift * spacing, *allowed_hz)), *np.exp(others).tolist())
+                for line, (shift, *others) in zip(model.lines, rest, strict=True)
             )
             cutoff = float(np.exp(floor[2])) if corner else np.inf
             return replace(
