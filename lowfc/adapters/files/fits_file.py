@@ -63,8 +63,7 @@ def extension(name: str, array: npt.NDArray[np.generic], description: str, unit:
 def to_bytes(primary: fits.PrimaryHDU, extensions: list[fits.ImageHDU]) -> bytes:
     """Encode a file, with checksums."""
     stream = io.BytesIO()
-    # a card of 18 modes has no room for its comment
-    with warnings.catch_warnings(action="ignore", category=fits.verify.VerifyWarning):
+    with warnings.catch_warnings(action="ignore", category=fits.verify.VerifyWarning):  # of a comment cut off
         fits.HDUList([primary, *extensions]).writeto(stream, checksum=True)
     return stream.getvalue()
 

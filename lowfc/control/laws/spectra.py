@@ -33,6 +33,11 @@ class TimeSeries:
         """Frames of all pieces."""
         return sum(len(piece) for piece in self.values)
 
+    @property
+    def longest(self) -> int:
+        """Frames of the longest piece; 0 without pieces."""
+        return max((len(piece) for piece in self.values), default=0)
+
     def columns(self, which: slice) -> "TimeSeries":
         """The same frames, some of the columns."""
         return TimeSeries(tuple(piece[:, which] for piece in self.values), self.interpolated)
@@ -108,12 +113,11 @@ def spectrum(run: TimeSeries, rate_hz: float) -> Spectrum | None:
     Each segment's mean is subtracted, and Hann's window applied; its length, a power of two, follows from the longest
     piece.
     """
-    longest = max((len(piece) for piece in run.values), default=0)
-    if longest < SHORTEST:
+    if run.longest < SHORTEST:
         return None
     from scipy.signal import welch  # takes half a second to import
 
-    frames = min(LONGEST, max(SHORTEST, 1 << ((longest // _SEGMENT_SHARE).bit_length() - 1)))
+    frames = min(LONGEST, max(SHORTEST, 1 << ((run.longest // _SEGMENT_SHARE).bit_length() - 1)))
     total = np.zeros((frames // 2 + 1, run.values[0].shape[1]))
     segments = 0
     for piece in run.values:

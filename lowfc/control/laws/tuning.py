@@ -81,8 +81,7 @@ def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> 
 
     fine, coarse = _whole_spectrum(run, rate_hz), spectrum(run, rate_hz)
     if fine is None or coarse is None:
-        longest = max((len(piece) for piece in run.values), default=0)
-        raise ValueError(f"a law is tuned from at least {FEWEST} frames in a row, the longest run has {longest}")
+        raise ValueError(f"a law is tuned from at least {FEWEST} frames in a row, the longest run has {run.longest}")
     noise_nm2 = floor_nm2_hz(coarse) * rate_hz / 2
     omega = 2 * np.pi * fine.frequency_hz[1:] / rate_hz  # an integrator without leak has no value at 0 Hz
     gains, residual_nm2, sensed_nm2 = np.zeros(len(leak)), np.zeros(len(leak)), np.zeros(len(leak))

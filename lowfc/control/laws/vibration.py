@@ -120,13 +120,12 @@ def identify(run: TimeSeries, rate_hz: float) -> Model | None:
     model = whittle.fit_all(replace(model, lines=lines))
     needed = whittle.needed(model)
     model = model if needed == model.lines else whittle.fit_all(replace(model, lines=needed))
-    return replace(model, lowest_hz=rate_hz / max(map(len, run.values)))
+    return replace(model, lowest_hz=rate_hz / run.longest)
 
 
 def resolution_hz(run: TimeSeries, rate_hz: float) -> float:
     """Frequency spacing of the periodogram that `identify` fits; 0 if there is none."""
-    longest = max((len(piece) for piece in run.values), default=0)
-    return rate_hz / min(longest, _LONGEST) if longest >= FEWEST else 0.0
+    return rate_hz / min(run.longest, _LONGEST) if run.longest >= FEWEST else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +139,7 @@ class _Whittle:
 
     @classmethod
     def of(cls, run: TimeSeries, rate_hz: float) -> "_Whittle | None":
-        longest = max((len(piece) for piece in run.values), default=0)
-        frames = min(longest, _LONGEST)
+        frames = min(run.longest, _LONGEST)
         if frames < FEWEST:
             return None
         window = np.hanning(frames + 2)[1:-1]

@@ -226,13 +226,13 @@ def _telemetry(
     settling = min(settling, int(frames_closed.max()) - FEWEST)  # enough frames are left
     closed, rows = True, usable & was_closed & (frames_closed > max(settling, _SETTLING_S * rate_hz))
     pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
-    if _longest(pol) < FEWEST:
+    if pol.longest < FEWEST:
         closed, rows = False, usable
         pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
-    if _longest(pol) < FEWEST:
+    if pol.longest < FEWEST:
         raise DataFileError(
             f"{source}: tuning requires at least {FEWEST} consecutive frames, {FEWEST / rate_hz:.2g} s; the longest "
-            f"sequence of good frames has {_longest(pol)}"
+            f"sequence of good frames has {pol.longest}"
         )
     if (steps.reasons[rows] & (1 << Limit.LAW_OVERRULED)).any():
         warnings = [*warnings, "in some of these frames the integrator drove in place of a law (LAW_OVERRULED)"]
@@ -256,7 +256,3 @@ def _telemetry(
         noise_nm2=frame_noise_nm2(config, calibration) if config is not None and contrast is not None else None,
         warnings=tuple(warnings),
     )
-
-
-def _longest(run: TimeSeries) -> int:
-    return max((len(piece) for piece in run.values), default=0)

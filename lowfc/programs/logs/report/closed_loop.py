@@ -163,7 +163,7 @@ def spectra_results(run: Run, stretch: Stretch | None, found: Spectra | None) ->
     if stretch is None:
         return {"why_not": why_none(run)}
     if found is None:
-        longest = max((len(piece) for piece in stretch.frames.values), default=0)
+        longest = stretch.frames.longest
         return {"why_not": f"the longest gap-free stretch has {longest} frames, but a spectrum requires {SHORTEST}"}
     calibration = run.history.calibration
     groups = groups_of(calibration.noll if calibration is not None else ())
