@@ -98,9 +98,10 @@ class Client:
         """
         self.run_id = the_run(run) if bus is None else run or DEFAULT_RUN
         self._requester = by_this_process(program_name())
-        self._own = None
+        self._own = self._joined = None
         if bus is None:
-            bus = self._own = ZenohBus(open_run(self.run_id, ()).links, Role.OPERATOR, HostClock())
+            self._joined = open_run(self.run_id, ())
+            bus = self._own = ZenohBus(self._joined.links, Role.OPERATOR, HostClock())
             deadline_s = time.monotonic() + CONNECT_S
             while not bus.peers() and time.monotonic() < deadline_s:
                 time.sleep(0.01)
@@ -379,6 +380,8 @@ class Client:
                     "the log and `lowfc ctl status` show whether the request was carried out"
                 )
             if now_s >= deadline_s:
+                if self._joined is not None and self._joined.restarted():
+                    raise BusError(f"run {self.run_id!r} was started again: join it again, with a new Client")
                 raise BusError(absence(self.run_id, role))
             time.sleep(0.05)
 

@@ -357,6 +357,15 @@ def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., 
         the_run("noo")
 
 
+def test_a_client_of_a_run_that_was_started_again_says_so(listen: Callable[..., None]) -> None:
+    listen("night", "controller")
+    with Client("night") as loop:
+        open_run("night").remove()
+        open_run("night")
+        with pytest.raises(BusError, match="run 'night' was started again: join it again, with a new Client"):
+            loop.status()
+
+
 def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With owner, process and, if readable, runtime directory; the user's own loop in this directory is starting."""
     name = f"night-{os.getpid()}"

@@ -87,7 +87,10 @@ class ZenohPublisher:
         handed = self._direct_link is not None and self._direct_link.send(envelope.encode(), payload)
         if handed:
             self.handed_ns = self._host_ns()
-        self._publisher.put(payload, attachment=self._sent(envelope))
+        try:
+            self._publisher.put(payload, attachment=self._sent(envelope))
+        except zenoh.ZError as fault:
+            raise _refused(self.key, fault) from None
         if not handed:
             self.handed_ns = self._host_ns()
         return envelope
@@ -117,11 +120,14 @@ class ZenohRing:
         """See `Ring.drain`."""
         found: list[Sample] = []
         now_ns = self._bus.clock.host_ns()
-        while (sample := self._subscriber.try_recv()) is not None:
-            try:
-                found.append(self._bus.read(sample, now_ns, self._key))
-            except Exception as fault:
-                self._bus.faults.add(f"{self._bus.role}: ring of", self._expression, fault)
+        try:
+            while (sample := self._subscriber.try_recv()) is not None:
+                try:
+                    found.append(self._bus.read(sample, now_ns, self._key))
+                except Exception as fault:
+                    self._bus.faults.add(f"{self._bus.role}: ring of", self._expression, fault)
+        except zenoh.ZError as fault:
+            raise _refused(self._expression, fault) from None
         return found
 
     def close(self) -> None:
@@ -140,7 +146,7 @@ def receive_in_one_thread() -> None:
 
 
 class ZenohBus:
-    """One process's zenoh session; see `Bus`.
+    """One process's zenoh session; see `Bus`. Once closed, its publishers and rings, and new ones, raise BusError.
 
     Attributes:
         offset: offset of the router's clock, in a run on several hosts. Envelopes on the network have the router's
@@ -222,7 +228,10 @@ class ZenohBus:
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
         """See `Bus.publisher`."""
         key = topic.at(name)
-        publisher = ZenohPublisher(self, self._session, topic, key, self._direct_writer(topic, name, key))
+        try:
+            publisher = ZenohPublisher(self, self._session, topic, key, self._direct_writer(topic, name, key))
+        except zenoh.ZError as fault:
+            raise _refused(key, fault) from None
         self._closers.append(publisher.close)
         self._publishers.append(publisher)
         return publisher
@@ -262,7 +271,10 @@ class ZenohBus:
 
     def ring(self, topic: Topic, capacity: int) -> "ZenohRing":
         """See `Bus.ring`; zenoh's threads keep the messages without waking Python."""
-        return ZenohRing(self, self._session.declare_subscriber(topic.at(ALL), RingChannel(capacity)))
+        try:
+            return ZenohRing(self, self._session.declare_subscriber(topic.at(ALL), RingChannel(capacity)))
+        except zenoh.ZError as fault:
+            raise _refused(topic.at(ALL), fault) from None
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
         """See `Bus.queryable`."""
@@ -373,6 +385,10 @@ class ZenohBus:
                 query.reply(key, body, attachment=self.sent(envelope))
 
         return reply
+
+
+def _refused(key: str, fault: zenoh.ZError) -> BusError:
+    return BusError(f"{key} cannot be used: {plain(fault)}")
 
 
 def _reader(topic: Topic, name: str) -> str | None:
