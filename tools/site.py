@@ -17,7 +17,7 @@ from typer.main import get_command
 import lowfc.programs
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.former_names import FIELDS, KEYS, LAW_EXTENSIONS, VALUES
-from lowfc.contract.messages import TOPICS
+from lowfc.contract.messages import EVERYBODY, TOPICS
 from lowfc.contract.network import Section
 from lowfc.contract.sections import InterlockSection
 from lowfc.contract.wire import lowfc_pb2
@@ -92,9 +92,13 @@ def topics() -> str:
         full = one.message.DESCRIPTOR.full_name
         own = full.startswith("lowfc.")
         message = f"[`{full}`](messages.md#{full.rpartition('.')[2].lower()})" if own else f"`{full}`"
-        publisher = "any" if len(one.publishers) > 2 else ", ".join(sorted(map(str, one.publishers)))
-        rows.append((f"`{one.key}`", message, when, publisher, one.description))
-    return markdown(("topic", "message", "when", "published by", ""), rows)
+        publisher, receiver = (
+            "any" if roles == EVERYBODY else ", ".join(sorted(map(str, roles)))
+            for roles in (one.publishers, one.subscribers)
+        )
+        about = f"{one.description}{' The last one is returned on query.' if one.queryable else ''}"
+        rows.append((f"`{one.key}`", message, when, publisher, receiver, about))
+    return markdown(("topic", "message", "when", "published by", "received by", ""), rows)
 
 
 def messages() -> str:
