@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from operator import index
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -56,7 +56,7 @@ from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.interlocks import Value
 from lowfc.control.loop.wording import AUTO
 
-Modes = int | Sequence[int]
+Modes = int | np.integer[Any] | Sequence[int] | npt.NDArray[np.integer[Any]]
 M = TypeVar("M", bound=Message)
 
 CONNECT_S = 1.0

@@ -771,8 +771,10 @@ def test_contrast_is_estimated_for_a_real_camera_and_true_for_a_simulated_one() 
     assert "estimated" not in text(simulated)
 
 
-def test_a_configuration_with_a_date_is_printed_as_json(monkeypatch: pytest.MonkeyPatch) -> None:
-    loop = SimpleNamespace(run_id="bench", configuration=lambda: "[drivers.own]\nsince = 2026-01-31\n")
+def test_a_configuration_with_values_that_json_lacks_is_printed_as_json(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = SimpleNamespace(run_id="bench", configuration=lambda: "[drivers.own]\nsince = 2026-01-31\nlimit = -inf\n")
     monkeypatch.setattr("lowfc.programs.cli.ctl._client", lambda run: contextlib.nullcontext(loop))
     done = lowfc("ctl", "configuration", "--json")
-    assert json.loads(done.stdout) == {"drivers": {"own": {"since": "2026-01-31"}}}, done.exception
+    assert json.loads(done.stdout) == {"drivers": {"own": {"since": "2026-01-31", "limit": "-Infinity"}}}, (
+        done.exception
+    )

@@ -149,7 +149,8 @@ def _configuration(run: AnyRun = None, as_json: Json = False) -> None:
 
     with _client(run) as loop:
         text = loop.configuration()
-    known = json.loads(json.dumps(tomllib.loads(text), default=str))  # dates of a driver's options as text
+    # dates, inf and nan of a driver's options as text, which JSON lacks
+    known = json.loads(json.dumps(tomllib.loads(text), default=str), parse_constant=str)
     print_result(known, f"# run {loop.run_id}\n{text.rstrip()}", as_json=as_json)
 
 
