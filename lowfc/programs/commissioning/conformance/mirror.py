@@ -76,7 +76,7 @@ def _idle(mirror: Dialogue) -> Iterator[Check]:
         yield wrong(f"frame_sequence {sequence}", advice)._replace(name="state", expected="a valid frame_sequence")
     check, rate_hz = ok(f"{len(states) / IDLE_S:.0f} a second"), len(states) / IDLE_S
     if not states:
-        advice = "publish it: a starting controller waits one second for the mirror's shape, then assumes flat"
+        advice = "publish it: a controller sends no command before it has received the mirror's shape"
         check = wrong(f"none in {IDLE_S:g} s; received: {mirror.keys}", advice)
     elif rate_hz < 4:
         advice = "publish it ten times a second: a starting controller waits for one"
