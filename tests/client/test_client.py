@@ -325,7 +325,7 @@ def test_a_wait_for_an_empty_run_reports_the_other_runs(listen: Callable[..., No
     assert waiting_message("bnch").endswith("on this host yet; running: bench (did you mean 'bench'?)")
 
 
-def test_the_message_about_an_absent_process_says_whether_it_is_starting_or_stopped(
+def test_the_message_about_an_absent_process_says_whether_it_is_starting_stopped_or_of_a_former_run(
     listen: Callable[..., None],
 ) -> None:
     open_run("night", listeners=(Role.LAUNCHER,))
@@ -340,6 +340,11 @@ def test_the_message_about_an_absent_process_says_whether_it_is_starting_or_stop
     listen("bench", "camera")
     for run in ("bench", "noon"):  # not started by sim-loop
         assert absence(run, Role.CONTROLLER).startswith(f"no controller is there in run '{run}': start one")
+    with Client("bench") as loop:
+        open_run("bench").remove()
+        open_run("bench")
+        with pytest.raises(BusError, match="run 'bench' was started again: join it again, with a new Client"):
+            loop.status()
 
 
 def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., None]) -> None:
@@ -355,15 +360,6 @@ def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., 
     open_run("noo")  # which is stopped: the request is not for another run
     with pytest.raises(BusError, match="there is no run 'noo'"):
         the_run("noo")
-
-
-def test_a_client_of_a_run_that_was_started_again_says_so(listen: Callable[..., None]) -> None:
-    listen("night", "controller")
-    with Client("night") as loop:
-        open_run("night").remove()
-        open_run("night")
-        with pytest.raises(BusError, match="run 'night' was started again: join it again, with a new Client"):
-            loop.status()
 
 
 def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -87,10 +87,7 @@ class ZenohPublisher:
         handed = self._direct_link is not None and self._direct_link.send(envelope.encode(), payload)
         if handed:
             self.handed_ns = self._host_ns()
-        try:
-            self._publisher.put(payload, attachment=self._sent(envelope))
-        except zenoh.ZError as fault:
-            raise _refused(self.key, fault) from None
+        self._publisher.put(payload, attachment=self._sent(envelope))
         if not handed:
             self.handed_ns = self._host_ns()
         return envelope
@@ -120,14 +117,12 @@ class ZenohRing:
         """See `Ring.drain`."""
         found: list[Sample] = []
         now_ns = self._bus.clock.host_ns()
-        try:
+        with _usable(self._expression):
             while (sample := self._subscriber.try_recv()) is not None:
                 try:
                     found.append(self._bus.read(sample, now_ns, self._key))
                 except Exception as fault:
                     self._bus.faults.add(f"{self._bus.role}: ring of", self._expression, fault)
-        except zenoh.ZError as fault:
-            raise _refused(self._expression, fault) from None
         return found
 
     def close(self) -> None:
@@ -146,7 +141,7 @@ def receive_in_one_thread() -> None:
 
 
 class ZenohBus:
-    """One process's zenoh session; see `Bus`. Once closed, its publishers and rings, and new ones, raise BusError.
+    """One process's zenoh session; see `Bus`. Once closed, its rings, and new publishers and rings, raise BusError.
 
     Attributes:
         offset: offset of the router's clock, in a run on several hosts. Envelopes on the network have the router's
@@ -228,10 +223,8 @@ class ZenohBus:
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
         """See `Bus.publisher`."""
         key = topic.at(name)
-        try:
+        with _usable(key):
             publisher = ZenohPublisher(self, self._session, topic, key, self._direct_writer(topic, name, key))
-        except zenoh.ZError as fault:
-            raise _refused(key, fault) from None
         self._closers.append(publisher.close)
         self._publishers.append(publisher)
         return publisher
@@ -271,10 +264,8 @@ class ZenohBus:
 
     def ring(self, topic: Topic, capacity: int) -> "ZenohRing":
         """See `Bus.ring`; zenoh's threads keep the messages without waking Python."""
-        try:
+        with _usable(topic.at(ALL)):
             return ZenohRing(self, self._session.declare_subscriber(topic.at(ALL), RingChannel(capacity)))
-        except zenoh.ZError as fault:
-            raise _refused(topic.at(ALL), fault) from None
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
         """See `Bus.queryable`."""
@@ -306,7 +297,7 @@ class ZenohBus:
             except Exception as fault:
                 self.faults.add(f"{self.role}: answer to", key, fault)
 
-        try:
+        with _usable(key):  # it may be invalid
             self._session.get(
                 key,
                 Callback(answered, done.set, indirect=False),
@@ -318,8 +309,6 @@ class ZenohBus:
                 # A request waits for room in the queue, or a large one would be lost; other queries are empty.
                 congestion_control=zenoh.CongestionControl.BLOCK if payload else zenoh.CongestionControl.DROP,
             )
-        except zenoh.ZError as fault:  # the key is invalid, or the session was closed
-            raise BusError(f"{key} cannot be queried: {plain(fault)}") from None
         done.wait(timeout_s + 1.0)
         return list(answers)
 
@@ -387,8 +376,13 @@ class ZenohBus:
         return reply
 
 
-def _refused(key: str, fault: zenoh.ZError) -> BusError:
-    return BusError(f"{key} cannot be used: {plain(fault)}")
+@contextlib.contextmanager
+def _usable(key: str) -> Iterator[None]:
+    """Raise BusError in place of zenoh's error, as for a session that was closed."""
+    try:
+        yield
+    except zenoh.ZError as fault:
+        raise BusError(f"{key} cannot be used: {plain(fault)}") from None
 
 
 def _reader(topic: Topic, name: str) -> str | None:

@@ -149,8 +149,7 @@ def _configuration(run: AnyRun = None, as_json: Json = False) -> None:
 
     with _client(run) as loop:
         text = loop.configuration()
-    # dates, inf and nan of a driver's options as text, which JSON lacks
-    known = json.loads(json.dumps(tomllib.loads(text), default=str), parse_constant=str)
+    known = json.loads(json.dumps(tomllib.loads(text), default=str), parse_constant=str)  # dates, inf and nan as text
     print_result(known, f"# run {loop.run_id}\n{text.rstrip()}", as_json=as_json)
 
 
