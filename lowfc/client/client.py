@@ -265,13 +265,10 @@ class Client:
 
     def calibration(self) -> Calibration:
         """The calibration in use; BusError if there is none, or the answer is not a calibration."""
-        try:
-            sample = self._get(CALIBRATION.key, b"", ANSWER_S)
-        except BusError:
-            if self._get_message(CONTROLLER_STATE, wire.ControllerState, Role.CONTROLLER).calibration_id:
-                raise
+        if not self._get_message(CONTROLLER_STATE, wire.ControllerState, Role.CONTROLLER).calibration_id:
             remedy = "`lowfc ctl load FILE` loads one, `lowfc commission` measures one"
-            raise BusError(f"no calibration is loaded in run {self.run_id!r}: {remedy}") from None
+            raise BusError(f"no calibration is loaded in run {self.run_id!r}: {remedy}")
+        sample = self._get(CALIBRATION.key, b"", ANSWER_S)  # without one in use, the last one was refused
         try:
             return decode_calibration(wire.Calibration.FromString(sample.payload))
         except (DecodeError, ValueError) as fault:

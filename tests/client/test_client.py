@@ -259,7 +259,6 @@ def test_an_absent_and_a_silent_controller_give_different_errors(controller: Fak
 
 
 def test_a_controller_without_a_calibration_accepts_a_channel_of_the_mirrors_grid(controller: FakeController) -> None:
-    controller.calibrations.last = None
     controller.states.put(wire.ControllerState(mirror_rows=4, mirror_columns=5).SerializeToString())
     loop = controller.join()
     assert loop.mirror_grid() == (4, 5)
@@ -541,6 +540,7 @@ def test_an_invalid_answer_is_an_error_message(payload: bytes) -> None:
     controller = MemoryBus(hub, "controller", HostClock())
     controller.queryable(REQUEST_KEY.format(name="*"), lambda query: query.reply(b"\xff"))
     controller.publisher(CALIBRATION).put(payload)
+    controller.publisher(CONTROLLER_STATE).put(wire.ControllerState(calibration_id="abc").SerializeToString())
     loop = Client(bus=MemoryBus(hub, "operator", HostClock()))
     with pytest.raises(BusError, match=r"the answer to safe is not a lowfc\.v1\.Request"):
         loop.safe()

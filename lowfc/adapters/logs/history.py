@@ -301,7 +301,7 @@ class _HistoryBuilder:
             self._mirror_state(body, message.publish_time_ns)
         elif isinstance(body, wire.ControlTiming):
             self._timings.add(body)
-        elif isinstance(body, wire.Calibration):
+        elif isinstance(body, wire.Calibration) and body.noll:  # a former controller wrote one without modes
             self._calibration = body
             self._set_modes(len(body.noll))
         elif isinstance(body, wire.ControllerState):

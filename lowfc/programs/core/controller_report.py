@@ -147,11 +147,11 @@ class Arrays:
         loop = state.loop
         if loop is None:
             return
-        play = loop.play
+        play, calibrated = loop.play, bool(loop.calibration.noll)
         in_use = Request(
             refused.time_ns,
             refused.name,
-            calibration=loop.calibration if refused.calibration is not None else None,
+            calibration=loop.calibration if refused.calibration is not None and calibrated else None,
             law=loop.law_runner.law if refused.law is not None and loop.law_runner is not None else None,
             played=play.table if refused.played is not None and play is not None else None,
         )
