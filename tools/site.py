@@ -92,11 +92,9 @@ def topics() -> str:
         full = one.message.DESCRIPTOR.full_name
         own = full.startswith("lowfc.")
         message = f"[`{full}`](messages.md#{full.rpartition('.')[2].lower()})" if own else f"`{full}`"
-        by, to = (
-            "any" if roles == EVERYBODY else ", ".join(sorted(roles)) for roles in (one.publishers, one.subscribers)
-        )
+        who = ["any" if roles == EVERYBODY else ", ".join(sorted(roles)) for roles in (one.publishers, one.subscribers)]
         about = f"{one.description}{' The last one is returned on query.' if one.queryable else ''}"
-        rows.append((f"`{one.key}`", message, when, by, to, about))
+        rows.append((f"`{one.key}`", message, when, *who, about))
     return markdown(("topic", "message", "when", "published by", "received by", ""), rows)
 
 

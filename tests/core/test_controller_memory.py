@@ -19,7 +19,6 @@ from lowfc.adapters.process.clock import HostClock, SimulatedClock
 from lowfc.adapters.process.latch import Latch
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels
-from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.codecs.law_codec import wire_law
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
@@ -48,7 +47,7 @@ from lowfc.contract.published import Published
 from lowfc.control import cache_warmup
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import integrator
-from lowfc.control.loop.inputs import MirrorShape, Request
+from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.device import DriverOptions
@@ -59,7 +58,6 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.driver import scene as configured_scene
 from sim_camera.scene import Scene, Wavefront
 from sim_dm.driver import SimulatedMirror
-from tests.support import toy
 from tests.support.in_process_loop import SMALL_MIRROR
 from tests.support.loops import until
 from tools.law_bench import calibrated
@@ -418,17 +416,6 @@ def test_start_requests_wait_for_the_mirror_and_the_cameras_settings(calibration
             controller._between_frames(None)
             assert controller._start_pending is awaited
         assert [one.name for one in controller._state.loop.command_channels.channels] == ["flat"]
-
-
-def test_after_a_refused_calibration_without_one_in_use_no_empty_one_is_published(tmp_path: Path) -> None:
-    """A log that ended with it could not be read."""
-    hub, _, controller = alone(None, Latch([tmp_path / "safe"]), configured(lockstep=False))
-    published: list[Sample] = []
-    MemoryBus(hub, "operator", HostClock()).subscribe(CALIBRATION, published.append)
-    controller._apply_report(MirrorShape(START_NS, np.zeros(GRID, np.float32), np.zeros(0, np.float32)))
-    refused = identified(toy.calibration())  # of another mirror
-    assert not controller._carry_out_internal(Request(START_NS, "load", calibration=refused)).accepted
-    assert [wire.Calibration.FromString(one.payload).id for one in published] == [refused.id]
 
 
 def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: Calibration, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import io
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,13 +14,14 @@ from lowfc.contract.codecs.state_codec import controller_state
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.messages import FRAME, Log, timestamp, wire
 from lowfc.control.loop.camera import CameraSettings
-from lowfc.control.loop.inputs import Request, Step
+from lowfc.control.loop.inputs import MirrorShape, Request, Step
 from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.state import State
 from lowfc.programs.cli import status
-from lowfc.programs.core.controller_report import LastSecond, NotClosed, Offload
+from lowfc.programs.core.controller_report import Arrays, LastSecond, NotClosed, Offload
 from lowfc.programs.launch.status import screen, status_line, summary_text
 from lowfc.programs.launch.watch import Watch, summary
-from tests.support.toy import DARK_DN, SATURATION_DN, SHAPE, START, feed, frame, loaded, settings
+from tests.support.toy import DARK_DN, GRID, SATURATION_DN, SHAPE, START, calibration, feed, frame, loaded, settings
 
 USUAL = settings()
 CAMERA = CameraSettings(START * 10**9, SHAPE, DARK_DN, SATURATION_DN)
@@ -210,6 +212,13 @@ def test_frames_published_after_the_last_received_one_count_as_lost(received: in
     camera = wire.Health(topics=[wire.TopicCount(topic=FRAME.key, published=500)])
     results = summary(Watch({"recorder": recorder, "camera": camera}, []), record=True)
     assert (results["messages_lost"], results["lost"].get(FRAME.key, 0)) == (lost, lost)
+
+
+def test_after_a_refused_calibration_without_one_in_use_no_empty_one_is_published() -> None:
+    published = Mock()
+    state, _ = feed(USUAL, State(), MirrorShape(1, np.zeros(GRID, np.float32), np.zeros(0, np.float32)))
+    Arrays(published, published, published).publish_in_use(Request(1, "load", calibration=calibration()), state)
+    published.put.assert_not_called()
 
 
 def test_the_mean_modal_command_is_published_for_offload() -> None:

@@ -378,7 +378,6 @@ class ZenohBus:
 
 @contextlib.contextmanager
 def _usable(key: str) -> Iterator[None]:
-    """Raise BusError in place of zenoh's error, as for a session that was closed."""
     try:
         yield
     except zenoh.ZError as fault:
