@@ -220,10 +220,6 @@ def test_a_ring_that_is_closed_has_no_subscriber(run: Run, join: Join) -> None:
     ring.close()
     until(lambda: not frames._publisher.matching_status.matching)
     ring.close()
-    camera.close()
-    for use in (ring.drain, lambda: camera.publisher(TRUTH), lambda: camera.ring(FRAME, 1)):
-        with pytest.raises(BusError, match="cannot be used: "):
-            use()
 
 
 def test_a_listening_role_runs_only_once(run: Run, join: Join) -> None:

@@ -340,10 +340,11 @@ def test_the_message_about_an_absent_process_says_whether_it_is_starting_stopped
     for run in ("bench", "noon"):  # not started by sim-loop
         assert absence(run, Role.CONTROLLER).startswith(f"no controller is there in run '{run}': start one")
     with Client("bench") as loop:
-        open_run("bench").remove()
-        open_run("bench")
+        (open_run("bench").path / "links.json").touch()
         with pytest.raises(BusError, match="run 'bench' was started again: join it again, with a new Client"):
             loop.status()
+    with pytest.raises(BusError, match="lowfc/camera/frame cannot be used: session closed"):
+        loop.frames()
 
 
 def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., None]) -> None:

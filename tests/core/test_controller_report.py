@@ -4,7 +4,6 @@ import io
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from lowfc.contract.messages import FRAME, Log, timestamp, wire
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.inputs import MirrorShape, Request, Step
 from lowfc.control.loop.safety import LoopMode
-from lowfc.control.loop.state import State
 from lowfc.programs.cli import status
 from lowfc.programs.core.controller_report import Arrays, LastSecond, NotClosed, Offload
 from lowfc.programs.launch.status import screen, status_line, summary_text
@@ -215,10 +213,11 @@ def test_frames_published_after_the_last_received_one_count_as_lost(received: in
 
 
 def test_after_a_refused_calibration_without_one_in_use_no_empty_one_is_published() -> None:
-    published = Mock()
-    state, _ = feed(USUAL, State(), MirrorShape(1, np.zeros(GRID, np.float32), np.zeros(0, np.float32)))
-    Arrays(published, published, published).publish_in_use(Request(1, "load", calibration=calibration()), state)
-    published.put.assert_not_called()
+    published: list[bytes] = []
+    shape, arrays = np.zeros(GRID, np.float32), Arrays(*[SimpleNamespace(put=published.append)] * 3)
+    state, _ = feed(USUAL, loaded(USUAL)._replace(loop=None), MirrorShape(1, shape, np.zeros(0, np.float32)))
+    arrays.publish_in_use(Request(1, "load", calibration=calibration()), state)
+    assert published == []
 
 
 def test_the_mean_modal_command_is_published_for_offload() -> None:

@@ -30,6 +30,7 @@ from tests.support.loops import json_of, lowfc
 from tests.support.mutated_logs import flipped
 from tests.support.report_log import READ_NOISE_E, TOYS, SyntheticLog
 from tests.support.theory import noise_gain, rejection
+from tests.support.toy import NOLL, calibration
 
 RATE_HZ = 1000.0
 
@@ -351,14 +352,17 @@ def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
     assert (check["name"], check["level"]) == ("commands", "unknown")
 
 
-def test_frames_before_a_calibration_of_other_modes_led_to_commands_too(tmp_path: Path) -> None:
+def test_frames_before_other_modes_led_to_commands_and_a_refused_calibration_loses_none(tmp_path: Path) -> None:
     night = SyntheticLog().frames(100)
-    night.put(CALIBRATION, wire.Calibration(noll=[2, 3]))  # refused, so that the one in use is published again
+    two = encode_calibration(identified(calibration(NOLL[:2])), night.now_ns)
+    night.put(CALIBRATION, two)  # refused, so that the one in use is published again
     night.put(CALIBRATION, encode_calibration(night.calibration, night.now_ns))
     night.frames(100)
-    found = results(night.write(tmp_path / "x.mcap"))
-    assert (found["run"]["steps"], found["log"]["steps_left_out"]) == (100, 100)
-    assert found["timing"]["frames"]["without_command"] == 0
+    for steps in (200, 0):
+        found = results(night.write(tmp_path / f"{steps}.mcap"))
+        assert (found["run"]["steps"], found["log"]["steps_left_out"]) == (steps, 200 - steps)
+        assert found["timing"]["frames"]["without_command"] == 0
+        night.put(CALIBRATION, two)
 
 
 def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:

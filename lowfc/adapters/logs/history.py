@@ -259,7 +259,8 @@ class _HistoryBuilder:
         self._stepped = Columns(sequence="Q")
         self._timings = TimingRows()
         self._mirror = Columns(sequence="Q", publish_time_ns="q", stroke_nm="f", limits="q")
-        self._steps, self._truths = StepRows(0), TruthRows(0)
+        self._rows: dict[int, tuple[StepRows, TruthRows]] = {}  # by number of modes
+        self._set_modes(0)
         self._late: tuple[int, int] | None = None
 
     def add(self, message: Sample) -> None:
@@ -338,10 +339,8 @@ class _HistoryBuilder:
         np.minimum(extremes.lowest_nm, surface, out=extremes.lowest_nm)
 
     def _set_modes(self, modes: int) -> None:
-        """Set the number of modes; leave out the rows so far if they have another."""
-        if modes != self._steps.modes:
-            self._history.excluded_messages += len(self._steps)
-            self._steps, self._truths = StepRows(modes), TruthRows(modes)
+        """Go on with the rows of this number of modes; a calibration that was refused does not lose the others."""
+        self._steps, self._truths = self._rows.setdefault(modes, (StepRows(modes), TruthRows(modes)))
 
     def _count_late(self, start_s: int, count: int) -> None:
         """Add the camera's late commands since its previous Health; a restarted camera counts from 0."""
@@ -358,6 +357,7 @@ class _HistoryBuilder:
         history.command_publish_ns = self._commands.values("publish_ns")
         history.calibration = self._last_calibration()
         self._set_modes(len(history.calibration.noll) if history.calibration is not None else 0)
+        history.excluded_messages += sum(len(steps) for steps, _ in self._rows.values() if steps is not self._steps)
         history.stepped_sequence = self._stepped.values("sequence")
         history.steps, history.truths = self._steps.values(), self._truths.values()
         for rows, kept in ((self._steps, history.steps), (self._truths, history.truths)):
