@@ -378,9 +378,7 @@ class Client:
                     "the log and `lowfc ctl status` show whether the request was carried out"
                 )
             if now_s >= deadline_s:
-                if self._joined is not None and self._joined.restarted():
-                    raise BusError(f"run {self.run_id!r} was started again: join it again, with a new Client")
-                raise BusError(absence(self.run_id, role))
+                raise BusError(absence(self.run_id, role, self._joined))
             time.sleep(0.05)
 
     def _get_message(self, topic: Topic, kind: type[M], role: Role) -> M:

@@ -36,6 +36,7 @@ class MirrorWatch:
         # by name: start of its process, frame of its command, whether it follows commands
         self._mirrors: dict[str, tuple[int, int, bool]] = {}
         deadline_s = time.monotonic() + SILENT_S
+        self.read()
         while not self._mirrors:
             if time.monotonic() >= deadline_s:
                 raise BusError(f"no mirror state came within {SILENT_S:g} s: is the mirror's process running?")

@@ -1,7 +1,7 @@
 """Find the runs on this host."""
 
 from lowfc.adapters.bus.other_loops import none_here
-from lowfc.adapters.bus.run import open_run, run_path, runtime_base
+from lowfc.adapters.bus.run import Run, open_run, run_path, runtime_base
 from lowfc.contract.errors import BusError, DataFileError, nearest
 from lowfc.contract.messages import Role
 
@@ -51,8 +51,13 @@ def waiting_message(name: str) -> str:
     return f"waiting for run {name!r}, which has no other process on this host yet; {there}"
 
 
-def absence(name: str, role: Role) -> str:
-    """Message about a run's process to which there is no link: it is starting, stopped or absent."""
+def absence(name: str, role: Role, joined: Run | None = None) -> str:
+    """Message about a run's process to which there is no link: it is starting, stopped or absent; or of another run.
+
+    `joined` is the run as it was joined, if it was.
+    """
+    if joined is not None and joined.restarted():
+        return f"run {name!r} was started again: join it again, with a new Client"
     roles = live_runs().get(name, set())
     if role in roles and not open_run(name, ()).links.network.router:  # across hosts, only the router is seen
         return (

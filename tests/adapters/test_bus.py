@@ -380,5 +380,5 @@ def test_a_session_ends_soon_beside_a_process_that_is_stopped(run: Run) -> None:
         begun_s = time.monotonic()
         operator.close()
     assert time.monotonic() - begun_s < 6.0
-    with pytest.raises(BusError, match="lowfc/request/safe cannot be queried: session closed"):
+    with pytest.raises(BusError, match="lowfc/request/safe cannot be used: session closed"):
         operator.get(REQUEST_KEY.format(name="safe"))

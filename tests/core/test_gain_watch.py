@@ -289,7 +289,7 @@ def test_a_harmful_loop_opens_if_configured() -> None:
     loop.run(1149, record=False)
     loop.run(1)
     assert loop.steps[-1].mode is LoopMode.OPEN
-    assert named(loop, "MODE_CHANGED")[-1]["why"] == "auto: the loop made it worse"
+    assert named(loop, "MODE_CHANGED")[-1]["why"] == "auto: the loop increased the residual"
 
 
 def harmful() -> ModalBench:

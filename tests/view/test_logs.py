@@ -283,7 +283,7 @@ def test_a_frame_of_a_camera_whose_clock_is_ahead_does_not_move_the_time_line(tm
     assert max(drawn_ns) < end_ns + 10**9  # no picture or row at the time of the camera's clock
 
 
-def test_the_largest_stroke_of_a_log_is_that_of_every_mirror_state(tmp_path: Path, shown: Shown) -> None:
+def test_the_largest_stroke_of_a_log_is_taken_over_all_mirror_states(tmp_path: Path, shown: Shown) -> None:
     made = SyntheticLog().frames(300)
     number = [place for place, one in enumerate(made.samples) if MIRROR_STATE.matches(one.key)][101]
     state = wire.MirrorState.FromString(made.samples[number].payload)

@@ -6,7 +6,6 @@ Monitors connect by Unix socket and get `latest_only` topics at a lower rate; ac
 
 import contextlib
 import json
-import os
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -20,8 +19,13 @@ from lowfc.adapters.bus.bus import ALL, Faults, Query, Sample
 from lowfc.adapters.bus.direct_link import DirectCall, DirectReader, DirectWriter
 from lowfc.adapters.bus.routed import RouterWatch, open_by_router, require_certificate
 from lowfc.adapters.bus.run import Links, mirror_role
-from lowfc.adapters.bus.zenoh_fault import plain
-from lowfc.adapters.bus.zenoh_session import close_links_at_once, keep_thread_state, session_config
+from lowfc.adapters.bus.zenoh_fault import plain, usable
+from lowfc.adapters.bus.zenoh_session import (
+    close_links_at_once,
+    keep_thread_state,
+    receive_in_one_thread,
+    session_config,
+)
 from lowfc.adapters.process.clock import Clock
 from lowfc.adapters.process.clock_offset import ClockAsker, ClockOffset
 from lowfc.contract.envelope import Envelope, sequence_of
@@ -108,8 +112,7 @@ class ZenohRing:
     """See `Ring`."""
 
     def __init__(self, bus: "ZenohBus", subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]") -> None:
-        self._bus = bus
-        self._subscriber = subscriber
+        self._bus, self._subscriber = bus, subscriber
         self._expression = str(subscriber.key_expr)
         self._key = _known_key(self._expression)
 
@@ -117,7 +120,7 @@ class ZenohRing:
         """See `Ring.drain`."""
         found: list[Sample] = []
         now_ns = self._bus.clock.host_ns()
-        with _usable(self._expression):
+        with usable(self._expression):
             while (sample := self._subscriber.try_recv()) is not None:
                 try:
                     found.append(self._bus.read(sample, now_ns, self._key))
@@ -129,15 +132,6 @@ class ZenohRing:
         """See `Ring.close`."""
         with contextlib.suppress(zenoh.ZError):
             self._subscriber.undeclare()  # type: ignore[no-untyped-call]
-
-
-def receive_in_one_thread() -> None:
-    """Make zenoh receive and decode messages in one thread; call it before the first session.
-
-    It saves waking a second thread in a process that blocks on input; in one that computes meanwhile it would delay
-    messages. Child processes inherit it.
-    """
-    os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
 
 
 class ZenohBus:
@@ -223,7 +217,7 @@ class ZenohBus:
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
         """See `Bus.publisher`."""
         key = topic.at(name)
-        with _usable(key):
+        with usable(key):
             publisher = ZenohPublisher(self, self._session, topic, key, self._direct_writer(topic, name, key))
         self._closers.append(publisher.close)
         self._publishers.append(publisher)
@@ -264,7 +258,7 @@ class ZenohBus:
 
     def ring(self, topic: Topic, capacity: int) -> "ZenohRing":
         """See `Bus.ring`; zenoh's threads keep the messages without waking Python."""
-        with _usable(topic.at(ALL)):
+        with usable(topic.at(ALL)):
             return ZenohRing(self, self._session.declare_subscriber(topic.at(ALL), RingChannel(capacity)))
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
@@ -297,7 +291,7 @@ class ZenohBus:
             except Exception as fault:
                 self.faults.add(f"{self.role}: answer to", key, fault)
 
-        with _usable(key):  # it may be invalid
+        with usable(key):  # it may be invalid
             self._session.get(
                 key,
                 Callback(answered, done.set, indirect=False),
@@ -374,14 +368,6 @@ class ZenohBus:
                 query.reply(key, body, attachment=self.sent(envelope))
 
         return reply
-
-
-@contextlib.contextmanager
-def _usable(key: str) -> Iterator[None]:
-    try:
-        yield
-    except zenoh.ZError as fault:
-        raise BusError(f"{key} cannot be used: {plain(fault)}") from None
 
 
 def _reader(topic: Topic, name: str) -> str | None:

@@ -1,8 +1,12 @@
 """Readable text of zenoh's errors."""
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import zenoh
+
+from lowfc.contract.errors import BusError
 
 _LONGEST = 200  # characters
 _PLACE = re.compile(r"\s*\bat /?\S+\.rs:\d+\.?")
@@ -13,3 +17,12 @@ def plain(fault: zenoh.ZError) -> str:
     text = _PLACE.sub("", str(fault).partition("\n")[0])
     cause = text.rpartition("[")[2].partition("]")[0] or text
     return cause.strip(" .[]")[:_LONGEST]
+
+
+@contextmanager
+def usable(key: str) -> Iterator[None]:
+    """Turn zenoh's error in the block, as of an invalid key or a closed session, into BusError."""
+    try:
+        yield
+    except zenoh.ZError as fault:
+        raise BusError(f"{key} cannot be used: {plain(fault)}") from None

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import os
 import socket
 import struct
 import threading
@@ -134,3 +135,12 @@ def _address(links: Links, role: str) -> str:
 def _socket(links: Links, role: str) -> str | None:
     path = links.socket(role)
     return None if path is None else f"{_SOCKET}/{path}"
+
+
+def receive_in_one_thread() -> None:
+    """Make zenoh receive and decode messages in one thread; call it before the first session.
+
+    It saves waking a second thread in a process that blocks on input; in one that computes meanwhile it would delay
+    messages. Child processes inherit it.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")

@@ -35,7 +35,7 @@ class StreamReader:
     def __init__(self, path: Path) -> None:
         """Open the stream at `path`, which may be created later; its present image does not count as new.
 
-        StreamError if it has another layout, or no free semaphore.
+        StreamError if its layout is not supported, or no semaphore is free.
         """
         self.stream: Stream | None = None
         self.generation = 0

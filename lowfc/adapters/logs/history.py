@@ -255,9 +255,7 @@ class _HistoryBuilder:
         self._calibration: wire.Calibration | None = None
         self._cameras: list[tuple[Array, wire.CameraState]] = []  # with other settings than the one before
         self._frames = Columns(sequence="Q", publish_ns="q")
-        self._commands = Columns(publish_ns="q")
-        self._stepped = Columns(sequence="Q")
-        self._timings = TimingRows()
+        self._commands, self._stepped, self._timings = Columns(publish_ns="q"), Columns(sequence="Q"), TimingRows()
         self._mirror = Columns(sequence="Q", publish_time_ns="q", stroke_nm="f", limits="q")
         self._rows: dict[int, tuple[StepRows, TruthRows]] = {}  # by number of modes
         self._set_modes(0)
@@ -375,8 +373,7 @@ class _HistoryBuilder:
             first = np.array([np.isclose(known, one, rtol=0.01, atol=0).all(axis=1).argmax() for one in known])
             numbers = first[np.maximum(np.searchsorted(begun_ns, steps.time_ns) - 1, 0)]
             most = np.bincount(numbers[counted]).argmax() if counted.any() else first[-1]
-            history.camera = self._cameras[np.flatnonzero(first == most)[-1]][1]
-            history.under_camera = numbers == most
+            history.camera, history.under_camera = self._cameras[np.flatnonzero(first == most)[-1]][1], numbers == most
 
     def _last_calibration(self) -> Calibration | None:
         history = self._history

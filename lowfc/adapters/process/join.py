@@ -1,7 +1,8 @@
 """Set-up of a process of the loop: real-time measures, then clock, bus and service."""
 
 from lowfc.adapters.bus.run import open_run
-from lowfc.adapters.bus.zenoh_bus import ZenohBus, receive_in_one_thread
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.bus.zenoh_session import receive_in_one_thread
 from lowfc.adapters.process.clock import Clock, HostClock, SimulatedClock
 from lowfc.adapters.process.realtime import Granted, set_up
 from lowfc.adapters.process.service import Service

@@ -29,7 +29,7 @@ def provenance(run_id: str = "", seed: int | None = None) -> dict[str, str]:
     Returns:
         Versions by library, and lowfc, python, host, kernel, processor, processors, cpu_features (the processor's
         vector instructions) and blas (library, version and the kernel chosen for this processor); numba, run, seed and
-        git (commit of a checkout) where there is one.
+        git (`git describe` of a checkout) where there is one.
     """
     found = {
         "lowfc": __version__,

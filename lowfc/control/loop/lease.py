@@ -34,8 +34,8 @@ class Lease(NamedTuple):
         id: identity in the holder's requests; above 0.
         holder: the holder and its purpose, for people.
         until_ns: end by the controller's clock, unless it is renewed.
-        last_sequence: sequence of the last frame for which it is in force; its number of frames if it was granted
-            before the first frame; 0 if the frame rate is unknown.
+        last_sequence: sequence of the last frame for which it is in force; its duration in frames if it was
+            granted before the first frame; 0 if the frame rate is unknown.
         ended: cause of its end; empty while it is in force.
         holds: whether it is a permit: a closed loop holds its command while it is in force.
     """
@@ -71,9 +71,9 @@ class Lease(NamedTuple):
 def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
     """Why a request is refused; empty if it is granted.
 
-    Other clients' requests are refused while a lease is in force, and those of a former holder after it: the client
-    that ended a lease decides. `lease` is the last one, in force or ended; `lease_id` is the request's, 0 for none;
-    the time is the controller's.
+    Other clients' requests are refused while a lease is in force, and a former holder's after it, so that it does not
+    act against the client that ended the lease. `lease` is the last one, in force or ended; `lease_id` is the
+    request's, 0 for none; the time is the controller's.
     """
     if name in ENDED_BY or name in UNRELATED:
         return ""

@@ -24,7 +24,7 @@ STAR_STEP = 0.2
 HARMFUL_WINDOWS = 3
 """Consecutive windows in which an open loop would have had a smaller residual, before this is reported."""
 CAUTIOUS_GAIN = 0.05
-"""Highest gain of the other modes after a window with uncorrected tip and tilt, whose squares look like other modes."""
+"""Highest gain of the other modes after a window with uncorrected tip and tilt, which resemble them in second order."""
 MIN_FRAMES = 50
 """Smallest number of frames in a window."""
 REQUESTER = "automatic gains"
@@ -46,7 +46,7 @@ class _Group:
     """Modes that are evaluated together: tip and tilt, or the others."""
 
     def __init__(self, mask: Mask, tilt: Mask | None, settings: Settings, loop: ActiveLoop, window_s: float) -> None:
-        """Evaluate the modes in `mask` (modes,); `tilt` (modes,): tip and tilt, if their squares look like these."""
+        """Evaluate the modes in `mask` (modes,); `tilt` (modes,): tip and tilt, if their cross-talk counts."""
         rate_hz = settings.rate_hz or 1.0
         frames = [max(round(seconds * rate_hz), MIN_FRAMES) for seconds in (FIRST_S, window_s)]
         self.mask, self.tilt = mask, tilt
@@ -64,7 +64,7 @@ class _Group:
 
 
 class GainWatch:
-    """Observes the steps of one controller; a step never depends on it.
+    """Observes the steps of one controller; it acts on the loop by requests only.
 
     `closing_harm` is a sentence on the harm of closing at the present gains; empty without harm, or once closed.
     """
@@ -90,11 +90,11 @@ class GainWatch:
         self._restart_if_changed(loop)
         if loop.weighting is not self._weighting:
             self._weighting = weighting = loop.weighting
-            of_own = np.eye(len(loop.calibration.noll), dtype=np.float32)
+            from_own_modes = np.eye(len(loop.calibration.noll), dtype=np.float32)
             if weighting is not None:
-                (of_own,) = map_rows(loop.calibration, *weighting, loop.camera, of_own)
+                (from_own_modes,) = map_rows(loop.calibration, *weighting, loop.camera, from_own_modes)
             for group in self._groups:
-                group.bank.use_reconstructor(of_own[np.ix_(group.mask, group.mask)])
+                group.bank.use_reconstructor(from_own_modes[np.ix_(group.mask, group.mask)])
         newest, before = state.frame_sequence, self._newest
         if step.frame_sequence != newest or newest == before:  # not a new exposure
             return NOTHING
@@ -230,7 +230,7 @@ class GainWatch:
             )
         if events and (reaction := self._reaction(loop)):
             requests.append(
-                Request(step.time_ns, reaction, text=f"{AUTO}: the loop made it worse", requester=REQUESTER)
+                Request(step.time_ns, reaction, text=f"{AUTO}: the loop increased the residual", requester=REQUESTER)
             )
         return Actions(tuple(requests), tuple(events))
 
@@ -250,9 +250,9 @@ class GainWatch:
             added = f"{np.diag(self._contrast) @ harm_nm2:.1e} of contrast, "
         names, indices = ", ".join(f"Z{index}" for index in harmful_modes), ",".join(map(str, harmful_modes))
         return (
-            f"closing adds {added}{harm_nm2.sum() ** 0.5:.3g} nm rms at this star: the noise of {names} exceeds "
-            f"their disturbance; `lowfc ctl gain auto --modes {indices}` chooses their gains, 0 in place of auto "
-            "does not correct them"
+            f"closing adds {added}{harm_nm2.sum() ** 0.5:.3g} nm rms at this star and these gains, of {names}: "
+            f"`lowfc ctl gain auto --modes {indices}` chooses their gains, `lowfc ctl gain 0 --modes {indices}` leaves "
+            "them uncorrected"
         )
 
     def _noise_nm2(self, loop: ActiveLoop) -> Array | None:
@@ -294,7 +294,7 @@ class GainWatch:
         noise_nm2 = self._noise_nm2(loop)
         noise = 0.0 if noise_nm2 is None else float(noise_nm2[group.mask].sum())
         open_nm2 = max(float(verdict.power_nm2.sum()) - noise, 0.0)
-        culprits = verdict.loop_nm2 > 2 * verdict.loop_error_nm2
+        culprits = (verdict.loop_nm2 > 2 * verdict.loop_error_nm2) | (verdict.loop_nm2 == verdict.loop_nm2.max())
         noll = np.array(loop.calibration.noll)[group.mask]
         details: dict[str, object] = {
             "modes": ", ".join(f"Z{index}" for index in noll[culprits]),

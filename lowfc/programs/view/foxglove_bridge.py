@@ -1,8 +1,8 @@
 """The bus as a Foxglove WebSocket server, for Foxglove and Lichtblick.
 
 Payloads are passed on unchanged; the schemas are those of the log. A channel hands its message to the server's threads
-and returns at once, so the bus's threads log directly. A client that does not read loses its oldest messages: at most
-1024 wait for it.
+and returns at once, so the bus's threads call its `log` directly. A client that does not read loses its oldest
+messages: at most 1024 wait for it.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from lowfc.adapters.logs.writer import declaration
 from lowfc.adapters.process.clock import Clock
 from lowfc.adapters.process.extras import package_required
 from lowfc.adapters.process.service import Service
-from lowfc.contract.errors import BusError
+from lowfc.contract.errors import BadMessageError, BusError
 from lowfc.contract.messages import TOPICS, Role, Topic
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class FoxgloveBridge:
         """Subscribe to a run, in place of an earlier one of its name, whose bus is closed."""
         self._bus, self._names = bus, Names()
         self.last_states.clear()
-        # Before the service, which subscribes to Health: peers take that subscription to mean that all others exist.
+        # Before the service, which subscribes to Health: peers take that to mean that it has all subscriptions.
         for topic in SHOWN:
             bus.subscribe(topic, partial(self._publish, topic))
         self.service = Service(Role.VIEWER, self._run_id, self._clock, bus)
@@ -94,7 +94,10 @@ class FoxgloveBridge:
                 for topic, sample in states(self._bus, SHOWN, _PATIENCE_S):  # published before the connection
                     last = self.last_states.get(sample.key)
                     if last is None or last.sequence < sample.sequence:
-                        self._publish(topic, sample)
+                        try:
+                            self._publish(topic, sample)
+                        except BadMessageError as error:
+                            self.service.unreadable(sample.key, error)
             self.service.work = self._messages
             self.service.beat()
             time.sleep(_POLL_S)

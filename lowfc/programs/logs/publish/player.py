@@ -58,7 +58,7 @@ def publish(
         run_id: name of the run; created if it does not exist.
         speed: 2 is twice as fast, a large number as fast as possible. Subscribers that do not keep up lose messages, as
             with a live camera.
-        topics: keys or shell patterns of keys; if empty, all topics except commands.
+        topics: keys or shell patterns of keys; if empty, all but commands, of the loop's roles that are not live.
         allow_commands: publish commands too, and frames even if they would move a live mirror.
         wait_for: roles that must be running and connected before the first message; their topics are not published.
 

@@ -26,7 +26,7 @@ BARS = ((0.05, 20.0), (0.1, 20.0), (0.2, 20.0), (0.1, 0.0), (0.1, 45.0), (0.1, 9
 """Width in pupil diameters and angle in degrees."""
 HOLES = (0.09, 0.08, 0.07, 0.06, 0.05, 0.04, 0.03)
 
-MONOCHROMATIC = "H at the central wavelength, in nm rms of each mode over the circle."
+MONOCHROMATIC = "H at the central wavelength, per nm rms of each mode over the full circle."
 FIXED_STAR = (
     f"Cramer-Rao bound at the central wavelength: V = {STAR.magnitude}, {STAR.diameter_m:g} m, {TABLE4_EXPOSURE_S} s, "
     "our own masks. Smaller holes are better conditioned but noisier: the condition number ignores the light."
@@ -37,12 +37,12 @@ NOISE = (
     "latter in four Gauss-Legendre wavelengths."
 )
 QUANTUM = (
-    "limit: quantum Fisher information of the light behind the pupil's mask, 4 N Cov of the modes' phases: no sensor "
+    "limit: quantum Fisher information of the light after the shaped pupil, 4 N Cov of the modes' phases: no sensor "
     "of this light has less noise."
 )
 SHARE = "Median over the modes of the ratio of variances, quantum limit over Cramer-Rao bound."
 CLAIMS = {
-    "open": "Sect. 4: extremely high. limit: from there H is singular in double precision.",
+    "open": "Sect. 4: extremely high. limit: a condition number above it counts as singular.",
     "bar": "Sect. 4: below 1000 (the limit here), an order of magnitude above the sparse aperture mask's.",
     "holes": "Sect. 4: smaller holes lower it, for the 14 modes that the mask was designed for.",
     "sensor": "limit: an order of magnitude below the bar's.",
@@ -67,14 +67,16 @@ def _bar(width: float, angle_deg: float) -> Prepared:
 
 
 def _with_holes(diameter: float) -> Prepared | Row:
-    """The default layout with holes of another diameter, or a row that states that they would overlap."""
+    """The default layout with holes of another diameter, or a row that states that they would not fit."""
     layout = load_layout(SensorSection().sam)
     name = f"default layout with holes of {100 * diameter:g} %"
     shrunk = sams.Layout(name, layout.purpose, tuple((x, y, diameter) for x, y, _ in layout.holes))
     try:
         sams.check(shrunk)
     except ValueError:
-        return Row(name, "condition number", "", None, modes=14, assumption="These holes would overlap.")
+        return Row(
+            name, "condition number", "", None, modes=14, assumption="These holes would reach outside the pupil."
+        )
     sensor = prepared("sam").sensor
     relay = ApertureMask(sams.transmission(shrunk, len(sensor.pupil)))
     return Prepared(name, SensorSection(), replace(sensor, relay=relay))

@@ -82,7 +82,7 @@ class Plot:
 
 
 class Axes:
-    """A box with its own linear axes: rerun's plots have no logarithmic axes and drop the oldest points."""
+    """A box with axes and ticks of its own, for logarithms too: rerun's plots have none, and drop the oldest points."""
 
     def __init__(self, path: str, width: float) -> None:
         self.path = path
