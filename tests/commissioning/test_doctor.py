@@ -82,9 +82,7 @@ OF_THE_HOST = [
     *("clock source", "wake-up", "load", "scheduling class", "locked memory", "swap", "huge pages"),
     *("socket buffers", "open files"),
 ]
-DMI = "sys/class/dmi/id"
-QEMU = {"proc/cpuinfo": "flags : hypervisor", f"{DMI}/sys_vendor": "QEMU\n", f"{DMI}/product_name": "Standard PC\n"}
-XEN = {"sys/hypervisor/type": "xen\n", "stolen_share": 0.1}
+DMI = ("sys/class/dmi/id/sys_vendor", "sys/class/dmi/id/product_name")
 DYNAMIC = {"proc/version": "Linux version 6.1.0 (gcc) #1 SMP PREEMPT_DYNAMIC Thu"}
 NAMED: dict[str, object] = {
     "realtime.camera_cpus": [4],
@@ -166,8 +164,18 @@ def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
         ("kernel", "note", "hidden", DYNAMIC),
         ("kernel", "ok", "full", DYNAMIC | {"proc/cmdline": "quiet preempt=full"}),
         ("kernel", "warning", "voluntary", DYNAMIC | {"sys/kernel/debug/sched/preempt": "none (voluntary) full\n"}),
-        ("virtualisation", "warning", "QEMU Standard PC", QEMU),
-        ("virtualisation", "warning", "10.00 % of its time stolen since boot; that is much", XEN),
+        (
+            "virtualisation",
+            "warning",
+            "QEMU Standard PC",
+            {"proc/cpuinfo": "flags\t: fpu hypervisor\n"} | dict(zip(DMI, ("QEMU\n", "Standard PC\n"), strict=True)),
+        ),
+        (
+            "virtualisation",
+            "warning",
+            "10.00 % of its time stolen since boot; that is much",
+            {"sys/hypervisor/type": "xen\n", "stolen_share": 0.1},
+        ),
         ("clock source", "warning", "hpet", {CLOCKSOURCE: "hpet\n"}),
         ("load", "warning", "9.50 in the last minute", {"load": 9.5}),
         ("swap", "ok", "1 MB in use of 2097 MB; the loop's memory is locked", {"swap": (2_097_152_000, 1_048_576)}),
@@ -175,7 +183,12 @@ def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
         ("socket buffers", "warning", "550 kB", {"proc/sys/net/ipv4/tcp_rmem": "4096 131072 550000\n"}),
         ("socket buffers", "ok", "560 kB", {"proc/sys/net/ipv4/tcp_rmem": "4096 131072 560000\n"}),
         ("open files", "warning", "64", {"open_files": 64}),
-        ("synchronisation", "ok", "12 us to correct", {"synchronisation": Synchronisation(True, 12e-6, 0.001)}),
+        (
+            "synchronisation",
+            "ok",
+            "synchronised; 12 us to correct",
+            {"synchronisation": Synchronisation(True, 12e-6, 0.001)},
+        ),
         ("synchronisation", "warning", "not synchronised", {"synchronisation": Synchronisation(False, 12e-6, 0.001)}),
         ("wake-up", "warning", "max 4100 us", {"trial": trial(fifo_ns=[1000] * 999 + [4_100_000])}),
         ("wake-up", "warning", "a frame period is 4000 us", {"trial": trial(REFUSED, normal_ns=[500_000], fifo_ns=[])}),

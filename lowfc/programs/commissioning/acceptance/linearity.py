@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from lowfc.arrays import Array, Integers
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.excitation import build_staircase
 from lowfc.control.calibration.linearity import SURE, gains, levels
@@ -101,13 +102,8 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> L
     for response in {one.what["noll"]: one for one in responses}.values():  # the last one of each mode
         response.check(LoopMode.OPEN)
         what, noll = response.what, response.loop.noll
-        stairs, averaged = response.table[:, 0].astype(float), what["averaged"]
-        edges = np.flatnonzero(np.diff(stairs, prepend=np.nan, append=np.nan))
-        hold = min(frames for frames in np.diff(edges).tolist() if frames > 1)  # a value between levels lasts for one
-        starts = np.concatenate([np.arange(at, end - hold + 1, hold) for at, end in pairwise(edges)])
-        starts = starts[stairs[starts] != 0]  # of each level; it ends at zero
-        error_nm, ends = response.filled(response.error_nm), starts + hold
-        found = gains(error_nm, noll.index(what["noll"]), stairs[starts], ends - averaged, averaged)
+        levels_nm, starts = _levels(response.table[:, 0].astype(float), what["averaged"])
+        found = gains(response.filled(response.error_nm), noll.index(what["noll"]), levels_nm, starts, what["averaged"])
         within = found.within(required.gain_error, required.crosstalk)
         rows = []
         for row, amplitude_nm in enumerate(found.amplitude_nm.tolist()):
@@ -144,6 +140,15 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> L
         required_crosstalk=required.crosstalk,
         modes=modes,
     )
+
+
+def _levels(stairs: Array, averaged: int) -> tuple[Array, Integers]:
+    """Levels (levels,) of a staircase (frames,), and the first of the last `averaged` frames (levels,) at each."""
+    edges = np.flatnonzero(np.diff(stairs, prepend=np.nan, append=np.nan))
+    hold = min(frames for frames in np.diff(edges).tolist() if frames > 1)  # a value between levels lasts for one
+    starts = np.concatenate([np.arange(at, end - hold + 1, hold) for at, end in pairwise(edges)])
+    starts = starts[stairs[starts] != 0]  # it ends at zero
+    return stairs[starts], starts + hold - averaged
 
 
 def draw(found: dict[str, Any], figure: Any) -> None:

@@ -77,11 +77,7 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> N
         noise_nm2 = frame_noise_nm2(configuration, response.loop.calibration)
         expected[name] = np.sqrt(np.diag(noise_nm2))
         residual_nm2[name] = error_nm.T @ error_nm / len(error_nm) - noise_nm2
-        unfiltered = TimeSeries((response.filled(response.pol_nm),), 0)  # the loop filters only the errors
-        power = spectrum(unfiltered, response.loop.rate_hz)
-        if power is None:
-            raise AcceptanceError(f"{len(error_nm)} frames are too few for a spectrum, {SHORTEST} are needed")
-        floors[name] = np.sqrt(floor_nm2_hz(power) * response.loop.rate_hz / 2)
+        floors[name] = _floor_nm(response)
         rms[name] = np.nanstd(response.error_nm, axis=0)
     loop = by_loop["closed"].loop
     gain = np.sqrt(margins.noise_gain(loop.linear, loop.delay_frames))
@@ -121,3 +117,11 @@ def draw(found: dict[str, Any], figure: Any) -> None:
     ax.set_ylabel("nm rms of wavefront per frame")
     ax.grid(alpha=0.3)
     ax.legend()
+
+
+def _floor_nm(response: ProbeResponse) -> Array:
+    """White noise (modes,) per frame, nm, from the pseudo-open-loop modes, which the loop does not filter."""
+    power = spectrum(TimeSeries((response.filled(response.pol_nm),), 0), response.loop.rate_hz)
+    if power is None:
+        raise AcceptanceError(f"{len(response.pol_nm)} frames are too few for a spectrum, {SHORTEST} are needed")
+    return np.asarray(np.sqrt(floor_nm2_hz(power) * response.loop.rate_hz / 2))

@@ -14,7 +14,7 @@ from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
-from lowfc.control.calibration.alignment import Geometry, align, onto
+from lowfc.control.calibration.alignment import Alignment, Geometry, align, onto
 from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.analytic import analytic
@@ -115,3 +115,14 @@ def computed_scale(config: Configuration) -> float:
     """Pixels per lambda/D of the computed image; per pupil diameter for a pupil-plane sensor."""
     optics = factory.sensor(config, lambda _: None)
     return 1 / (optics.pitch * optics.binning)
+
+
+def in_words(found: Alignment, scale: float) -> str:
+    """Text of the image's geometry and its residual; `scale` in pixels per lambda/D."""
+    geometry = found.geometry
+    return (
+        f"{scale:.4f} pixels per lambda/D, centre at row {geometry.row:.2f}, column "
+        f"{geometry.column:.2f}, rotation {geometry.rotation_deg:.2f} degrees, "
+        f"{'reflected' if geometry.parity < 0 else 'not reflected'}; {found.residual:.1%} of the image differs from "
+        f"the computed one ({found.other_parity:.1%} with the other parity)"
+    )

@@ -17,6 +17,7 @@ import numpy as np
 from lowfc.adapters.files import factory, fits_file
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.process.progress import Counted
+from lowfc.arrays import Array
 from lowfc.client import Client, configuration_of
 from lowfc.contract.errors import CalibrationError, DataFileError, LowfcError
 from lowfc.contract.messages import wire
@@ -165,7 +166,17 @@ class Calibrator:
         plan = self.pokes.delay(mode)
         self._show("detecting pokes", max(self.pokes.cycles(), self.completed), self.completed)
         found = self._player.first_poke(mode, plan)
-        like = correlation(found.response, self.before.response[:, mode].astype(np.float64))
+        self._compare_response(found.response, mode)
+        self._report(
+            f"pokes of Z{self.before.noll[mode]} are detected after {found.delay_frames:.3f} +- "
+            f"{found.error_frames:.3f} frames, {found.delay_frames * self.config.period_ns * 1e-6:.3g} ms (from the "
+            "end of an exposure to the end of the exposure that sees the resulting command)"
+        )
+        return found
+
+    def _compare_response(self, response: Array, mode: int) -> None:
+        known = self.before.response[:, mode].astype(np.float64)
+        like = correlation(response, known)
         if abs(like) < _MIN_CORRELATION:
             self._report(
                 f"warning: the image of Z{self.before.noll[mode]} differs from that of the calibration in use "
@@ -176,12 +187,6 @@ class Calibrator:
                 f"warning: Z{self.before.noll[mode]} has the opposite sign of the calibration in use: the mirror or "
                 "the camera is reflected or rotated; do not close the loop with that calibration"
             )
-        self._report(
-            f"pokes of Z{self.before.noll[mode]} are detected after {found.delay_frames:.3f} +- "
-            f"{found.error_frames:.3f} frames, {found.delay_frames * self.config.period_ns * 1e-6:.3g} ms (from the "
-            "end of an exposure to the end of the exposure that sees the resulting command)"
-        )
-        return found
 
     def _cycles(self, delay: Delay) -> Measured:
         pokes, request = self.pokes, self._request

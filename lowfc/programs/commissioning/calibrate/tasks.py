@@ -123,23 +123,28 @@ def zero_point(config: Configuration, text: str) -> tuple[str, WavefrontFunction
     if "=" not in text and Path(text).suffix:
         shape = shape_of(config, "--at", text)
         return ("a shape", lambda _, mirror: wavefront_nm(mirror, shape).astype(np.float64))
-    modes_nm: dict[int, float] = {}
+    modes_nm = _modes(text)
+
+    def of_modes(optics: Twin, _: TwinMirror) -> Array:
+        return np.array(list(modes_nm.values())) @ zernikes(list(modes_nm), *node_radii(optics))
+
+    return ",".join(f"{mode}={amplitude_nm:g}" for mode, amplitude_nm in modes_nm.items()), of_modes
+
+
+def _modes(text: str) -> dict[int, float]:
+    found: dict[int, float] = {}
     for part in text.split(","):
         index, _, value = part.partition("=")
         try:
             mode, amplitude_nm = int(index), float(value)
         except ValueError:
             raise ConfigurationError(f"--at must be modes in nm, as in 4=15,7=-10, or a file; got {part!r}") from None
-        if mode < 2 or mode in modes_nm or not np.isfinite(amplitude_nm):
+        if mode < 2 or mode in found or not np.isfinite(amplitude_nm):
             raise ConfigurationError(
                 f"--at: {part!r} is not a Noll index of 2 or more, named once, and its amplitude in nm"
             )
-        modes_nm[mode] = amplitude_nm
-
-    def of_modes(optics: Twin, _: TwinMirror) -> Array:
-        return np.array(list(modes_nm.values())) @ zernikes(list(modes_nm), *node_radii(optics))
-
-    return ",".join(f"{mode}={amplitude_nm:g}" for mode, amplitude_nm in modes_nm.items()), of_modes
+        found[mode] = amplitude_nm
+    return found
 
 
 def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, load: bool) -> DarkResult:
@@ -172,8 +177,10 @@ def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> Re
         image = light.mean(axis=0)
         calibration = write(with_reference(before, image, float(flux.mean()), *noise), out, loop if load else None)
     shift = before.reconstructor.astype(np.float64) @ (image - before.reference)
-    noll, flux_dn = list(calibration.noll), calibration.flux_dn
-    return ReferenceResult(frames=frames, noll=noll, reference_shift_nm=shift.tolist(), flux_dn=flux_dn, file=str(out))
+    shift_nm, noll = shift.tolist(), list(calibration.noll)
+    return ReferenceResult(
+        frames=frames, noll=noll, reference_shift_nm=shift_nm, flux_dn=calibration.flux_dn, file=str(out)
+    )
 
 
 @contextlib.contextmanager

@@ -1,7 +1,6 @@
 """The command `lowfc commission`: command-line arguments."""
 
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -67,7 +66,10 @@ def commission(
     console = Console(stderr=True)
     report = reporter(console)
     options = CommissionOptions(out, frames, dark, no_dark, snr, cycles, resume, close)
-    confirm = partial(typer.confirm, default=True, abort=True, err=True)
+
+    def confirm(what: str) -> None:
+        typer.confirm(what, default=True, abort=True, err=True)
+
     with Client(run) as loop, loop.reserved("lowfc commission") as lease, percentage_bar(console) as shown:
         config = configuration_of(loop)
         progress = lease.expecting(shown, config.camera.rate_hz)

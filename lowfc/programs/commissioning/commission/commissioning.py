@@ -83,7 +83,7 @@ class Commissioning:
         options: CommissionOptions,
         report: Report,
         progress: Counted,
-        confirm: Callable[[str], object],
+        confirm: Callable[[str], None],
     ) -> None:
         """Commission the loop that `loop` is connected to; `computed` is the calibration of the optical model."""
         self._loop, self._config, self._computed, self._options = loop, config, computed, options

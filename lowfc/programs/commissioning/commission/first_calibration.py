@@ -14,7 +14,7 @@ from lowfc.control.calibration.alignment import align
 from lowfc.control.calibration.calibration import FIRST, Calibration
 from lowfc.control.calibration.delay_fit import Delay
 from lowfc.control.calibration.response_fit import correlation
-from lowfc.programs.commissioning.calibrate.align import computed_scale, on_sensor
+from lowfc.programs.commissioning.calibrate.align import computed_scale, in_words, on_sensor
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, first_poke_plan, largest_nm
 from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError, Report
 from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
@@ -78,20 +78,15 @@ def aligned(
         found = replace(found, geometry=found.geometry.rotated_180())
         calibration = on_sensor(config, computed, found.geometry, before.flux_dn, before)
         like = correlation(poke.response, calibration.response[:, 0])
-    geometry, scale = found.geometry, found.geometry.scale * computed_scale(config)
-    report(
-        f"{scale:.4f} pixels per lambda/D, centre at row {geometry.row:.2f}, column {geometry.column:.2f}, rotation "
-        f"{geometry.rotation_deg:.2f} degrees, {'reflected' if geometry.parity < 0 else 'not reflected'}; "
-        f"{found.residual:.1%} of the image differs from the computed one ({found.other_parity:.1%} with the other "
-        f"parity); the poke's image correlates by {like:.2f} with the computed one"
-    )
+    scale = found.geometry.scale * computed_scale(config)
+    report(f"{in_words(found, scale)}; the poke's image correlates by {like:.2f} with the computed one")
     if found.residual > MAX_MISFIT or like < MIN_LIKENESS:
         report("this is not the configured sensor: the response is measured without the optical model")
         return None
     results |= {
         "pixels_per_lambda_d": scale,
-        "rotation_deg": geometry.rotation_deg,
-        "parity": geometry.parity,
+        "rotation_deg": found.geometry.rotation_deg,
+        "parity": found.geometry.parity,
         "image_residual": found.residual,
         "poke_correlation": like,
     }

@@ -1,6 +1,5 @@
 """Requirements of a driver on this host: `lowfc doctor --device`."""
 
-import contextlib
 from collections.abc import Iterator
 
 from lowfc.contract.configuration import Configuration
@@ -42,8 +41,12 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
 def _kinds(name: str) -> list[plugins.Kind]:
     """Kinds of driver installed under this name, or implemented by the class of this name; the first kind if none."""
     found = [kind for kind in plugins.KINDS if name in plugins.installed(kind)]
-    for kind in () if found else plugins.KINDS:
-        with contextlib.suppress(ConfigurationError):
-            plugins.load(kind, name)
-            found.append(kind)
-    return found or [*plugins.KINDS[:1]]
+    return found or [kind for kind in plugins.KINDS if _loads(kind, name)] or [*plugins.KINDS[:1]]
+
+
+def _loads(kind: plugins.Kind, name: str) -> bool:
+    try:
+        plugins.load(kind, name)
+    except ConfigurationError:
+        return False
+    return True

@@ -139,13 +139,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
             break
     stream.close()
     states.append(_state(loop))
-    steps = steps_as_columns(received, len(calibration.noll))
-    rows = exposed(steps.reasons)
-    used = rows & np.isfinite(steps.error_nm).all(axis=1)
-    if not used.any():
-        raise DataFileError(f"run {loop.run_id!r}: no frame was used; `lowfc ctl status` gives the reason")
-    rows[: int(np.argmax(used))] = False  # before it, the disturbance is unknown
-    steps = steps.at(rows)
+    steps = _from_first_used(loop.run_id, steps_as_columns(received, len(calibration.noll)))
     reports = np.array(() if watch is None else watch.applied, np.int64).reshape(-1, 2)
     applied, applied_ns = reports[:, 0].astype(np.uint64), reports[:, 1]
     if watch is not None and watch.offset is not None:  # on the clock of the camera's host, as the times of frames are
@@ -184,6 +178,15 @@ def _state(loop: Client) -> wire.ControllerState:
     if state is None or not state.gain:
         raise DataFileError(f"run {loop.run_id!r} has no calibration: load one with `lowfc ctl load`")
     return state
+
+
+def _from_first_used(run_id: str, steps: Steps) -> Steps:
+    rows = exposed(steps.reasons)
+    used = rows & np.isfinite(steps.error_nm).all(axis=1)
+    if not used.any():
+        raise DataFileError(f"run {run_id!r}: no frame was used; `lowfc ctl status` gives the reason")
+    rows[: int(np.argmax(used))] = False
+    return steps.at(rows)
 
 
 def _without_probes(steps: Steps, seen: SeenCommands, assumed: float, played: Mask) -> tuple[Steps, Mask]:
