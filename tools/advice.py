@@ -88,7 +88,7 @@ ADVICE: dict[str, Advice] = {
     "LAW_BACK": Advice("the law's virtual residual was far smaller for some time; the law is active again.", _NOTHING),
     "NOTE": Advice("an operator wrote a note.", _NOTHING),
     "CLOSING_HARMS": Advice(
-        "at these gains, closing adds more noise to some modes than it removes of their disturbance.",
+        "at these gains, closing would increase the residual of some modes: by their noise, or by amplification.",
         "`lowfc ctl gain auto`, or lower gains of the modes that the event names.",
     ),
     "GAINS_CHANGED": Advice("automatic gains changed.", _NOTHING),

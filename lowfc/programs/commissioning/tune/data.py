@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lowfc.adapters.files.factory import frame_noise_nm2, known_contrast
-from lowfc.adapters.logs.columns import Steps, steps_as_columns
+from lowfc.adapters.logs.columns import Steps, count_reasons, steps_as_columns
 from lowfc.adapters.logs.history import measured_timing, read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask, Single
@@ -237,7 +237,7 @@ def _telemetry(
             f"{source}: tuning requires at least {FEWEST} consecutive frames, {FEWEST / rate_hz:.2g} s; the longest "
             f"sequence of good frames has {pol.longest}"
         )
-    if (steps.reasons[rows] & (1 << Limit.LAW_OVERRULED)).any():
+    if Limit.LAW_OVERRULED in count_reasons(steps.reasons[rows]):
         warnings = [*warnings, "in some of these frames the integrator drove in place of a law (LAW_OVERRULED)"]
     contrast = known_contrast(config) if config is not None and config.noll == calibration.noll else None
     known = [None if each is None else each[rows & np.isfinite(each).all(axis=1)] for each in true]
