@@ -39,18 +39,18 @@ class Envelope(NamedTuple):
         return cls(*_LAYOUT.unpack(data))
 
     @classmethod
-    def decode_checked(cls, data: bytes) -> "Envelope":
-        """Decode a received envelope, with a check of its numbers.
+    def decode_checked(cls, data: bytes) -> tuple[int, int]:
+        """Sequence and publication time of a received envelope; faster than `decode`.
 
         BadMessageError as for `decode`, and if the sequence is not below 2^64 - 2^33 or the time is above 2^62 ns.
         """
-        sequence, publish_time_ns = found = cls.decode(data)
+        sequence, publish_time_ns = _LAYOUT.unpack(data) if len(data) == _LAYOUT.size else cls.decode(data)
         if sequence >= SEQUENCE_BOUND or publish_time_ns > LATEST_NS:
             raise BadMessageError(
                 f"an envelope's sequence is below 2^64 - 2^33 and its time at most 2^62 ns, got {sequence} and "
                 f"{publish_time_ns} ns; the sequence is the publisher's start in unix seconds << 32 | its count"
             )
-        return found
+        return sequence, publish_time_ns
 
 
 def sequence_of(start_s: int, count: int) -> int:

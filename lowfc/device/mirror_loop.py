@@ -28,7 +28,7 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
-from lowfc.control.loop.safety import Limits, Reason, Rejection
+from lowfc.control.loop.safety import Limits, Reason, Rejection, finite
 from lowfc.device.driver import Mirror, MirrorExtras, geometry
 from lowfc.device.mirror_protection import Command, MirrorProtection, Status, apply_command, tick
 from lowfc.device.watch import CLOSE_S, DriverWatch
@@ -167,11 +167,13 @@ class MirrorLoop:
         before, refused_before = self._status, self._refused
         refused: Reason | None = Rejection.NO_MIRROR
         if not self._returning:
-            with contextlib.suppress(_LostError):
+            try:  # faster than `suppress`
                 others_nm = None if self._beside is None else self._call(self._beside)
                 self._status, refused = apply_command(
                     self._protection, before, command, clock.now_ns(), self._drive, others_nm
                 )
+            except _LostError:
+                pass
         self._refused = refused
         self._publish(self._status.time_ns or clock.now_ns())
         self._service.work += 1
@@ -212,10 +214,9 @@ class MirrorLoop:
             found_nm = method(*arguments)
             if found_nm is not None:
                 found_nm = np.array(found_nm, np.float32, order="C")  # a driver may use its array again
-                flat = found_nm.reshape(-1)
                 if found_nm.shape != self._protection.grid:
                     raise ValueError(f"it returned {found_nm.shape} actuators, expected {self._protection.grid}")
-                if not np.isfinite(np.vdot(flat, flat)):
+                if not finite(found_nm):
                     raise ValueError("it returned positions that are NaN or infinite, expected nm of surface")
             if self.watch.returned():
                 return found_nm

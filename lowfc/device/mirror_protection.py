@@ -13,7 +13,7 @@ import numpy as np
 
 from lowfc.arrays import Single
 from lowfc.control.loop.command_channels import MAX_CHANNELS, MAX_NAME_LENGTH
-from lowfc.control.loop.safety import Limit, Limited, Limits, Reason, Rejection, expired, limit
+from lowfc.control.loop.safety import Limit, Limited, Limits, Reason, Rejection, expired, finite, limit
 
 _NONE: Single = np.zeros(0, np.float32)
 
@@ -149,7 +149,7 @@ def apply_command(
 
 def _limited(protection: MirrorProtection, previous_nm: Single, target_nm: Single, others_nm: Single | None) -> Limited:
     """Limit the command so that its sum with other programs' shape is within the stroke, or exceeds it no further."""
-    if others_nm is None or not others_nm.any() or not np.isfinite(target_nm).all():
+    if others_nm is None or not others_nm.any() or not finite(target_nm):
         return limit(protection.tighter, previous_nm, target_nm)
     stroke_nm = np.float32(protection.tighter.kept_stroke_nm)
     room_nm = np.clip(target_nm, np.minimum(-stroke_nm - others_nm, 0), np.maximum(stroke_nm - others_nm, 0))
@@ -174,7 +174,7 @@ def tick(protection: MirrorProtection, status: Status, now_ns: int, move: Move) 
 def _refusal(protection: MirrorProtection, status: Status, command: Command) -> Reason | None:
     if command.actuators_nm is None or command.actuators_nm.shape != protection.grid:
         return Limit.WRONG_GRID
-    if not (np.isfinite(command.actuators_nm).all() and np.isfinite(command.command_nm).all()):
+    if not (finite(command.actuators_nm) and finite(command.command_nm)):
         return Limit.NOT_FINITE
     if command.ahead:
         return Rejection.AHEAD

@@ -155,7 +155,8 @@ class DirectReader:
                     self._forward(sample)
         except Exception as fault:
             self._failed(fault)
-        self._leave()
+        if self._both:
+            self._leave()
 
     def close(self) -> None:
         """Stop forwarding, without a wait for a handler that never returns; not to be called on a forwarding thread."""
@@ -187,12 +188,13 @@ class DirectReader:
 
     def _forward(self, sample: Sample) -> None:
         if not self._closed:
-            self._newest = max(self._newest, sample.sequence)
+            if sample.sequence > self._newest:
+                self._newest = sample.sequence
             self._handler(sample)
 
     def _leave(self) -> None:
-        """Unsubscribe from the bus once messages arrive over both paths; called after each message of the socket."""
-        if self._both and self._leave_bus is not None:
+        """Unsubscribe from the bus, as messages arrive over both paths."""
+        if self._leave_bus is not None:
             self._leave_bus()
             self._leave_bus, self._both = None, False
 

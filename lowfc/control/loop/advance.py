@@ -124,10 +124,10 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
 def _command_message(state: State, loop: ActiveLoop, command_nm: Single) -> Command:
     """The command of the newest frame."""
     safe = state.mode is LoopMode.SAFE
-    newest, conditions = (state.frame_sequence, state.frame_time_ns), state.conditions
+    sequence, conditions = state.frame_sequence, state.conditions
     # Before the first frame, the mirror may know a newer sequence: a new identity makes it forget that.
-    clear_id = conditions.clear_id or (0 if state.frame_sequence else conditions.mode_since_ns)
-    return Command(*newest, loop.actuators_nm, command_nm, safe, clear_id)
+    clear_id = conditions.clear_id or (0 if sequence else conditions.mode_since_ns)
+    return Command(sequence, state.frame_time_ns, loop.actuators_nm, command_nm, safe, clear_id)
 
 
 def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[State, ActiveLoop | None]:

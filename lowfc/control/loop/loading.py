@@ -127,7 +127,10 @@ def interlock_or_permit_cause(state: State) -> str:
     acting, lease = state.conditions.acting, state.conditions.lease
     if lease is not None and lease.holds and not lease.ended:
         return f"it is held for {lease.holder}"
-    return next((f"an interlock acts: {one.why}" for one in acting if one.action is Action.HOLD), "")
+    for one in acting:
+        if one.action is Action.HOLD:
+            return f"an interlock acts: {one.why}"
+    return ""
 
 
 def bench_reported(settings: Settings, state: State, report: BenchReport) -> tuple[State, Outputs]:

@@ -188,6 +188,11 @@ def _shorten(limits: Limits, previous_nm: Single, kept_nm: Single) -> Single:
     return previous_nm + np.float32(fraction) * (kept_nm - previous_nm)
 
 
+def finite(values: Single) -> bool:
+    """Whether all values (of any shape) are finite, whatever their unit."""
+    return int(np.count_nonzero(np.isfinite(values))) == values.size  # faster than `all`
+
+
 def _range_nm(actuators_nm: Single) -> tuple[float, float]:
     """Lowest and highest value; not finite if any value is not."""
     flat = actuators_nm.ravel()  # both functions propagate NaN
