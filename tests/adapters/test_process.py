@@ -258,4 +258,7 @@ def test_zenohs_errors_are_shown_without_source_locations() -> None:
         "(os error 98) at /root/.cargo/git/zenoh/io/tcp.rs:61.] at /root/.cargo/git/zenoh/unicast.rs:338."
     )
     assert plain(zenoh.ZError(text)) == "127.0.0.1:4: Address already in use (os error 98)"
+    assert plain(zenoh.ZError(text.replace("127.0.0.1", "[::1]"))) == "[::1]:4: Address already in use (os error 98)"
     assert plain(zenoh.ZError("invalid configuration at zenoh/src/api/session.rs:12.\nmore")) == "invalid configuration"
+    timeout = "Unable to connect to any of [Single(tcp/127.0.0.1:99)]. Timeout!"
+    assert plain(zenoh.ZError(f"{timeout} at /root/zenoh/orchestrator.rs:388.")) == timeout
