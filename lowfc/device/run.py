@@ -63,9 +63,15 @@ def run_camera(
 
     Raises:
         BusError: the run has a camera already, or one of `wait_for` did not appear.
+        ConfigurationError: the run is in lockstep, and the driver does not wait for the mirror.
         LowfcError: the driver cannot be started, or reported a fault that a user has to correct.
     """
     with closed_on_fault(driver.close):
+        if config.lockstep and not hasattr(driver, "step"):
+            raise ConfigurationError(
+                "in lockstep a camera waits for the mirror after each frame, and this driver has no method `step` that "
+                "does; leave out lockstep"
+            )
         service = join(config, run, Role.CAMERA, config.realtime.camera_cpus)
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
         with closed_on_fault(driver.close), opening("the camera cannot be started"):

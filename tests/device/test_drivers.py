@@ -300,6 +300,13 @@ def test_lockstep_refuses_a_camera_in_the_controllers_process() -> None:
         pass
 
 
+def test_lockstep_refuses_a_camera_that_does_not_wait_for_the_mirror() -> None:
+    camera = Ramp(Ramp.Options(), CONFIG)
+    with pytest.raises(ConfigurationError, match="in lockstep a camera waits for the mirror"):
+        run_camera(camera, load(None, {"lockstep": True}), "none")
+    assert camera.closed
+
+
 def test_options_in_a_section_named_after_the_class_are_refused() -> None:
     config = load(None, {"drivers.Ramp.level": 3})
     with pytest.raises(ConfigurationError, match=rf"are in \[drivers.{__name__}\], got \[drivers.Ramp\]"):
