@@ -15,7 +15,7 @@ import pytest
 from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.contract.codecs.codec import decode_mirror
 from lowfc.contract.configuration import load
-from lowfc.contract.envelope import count_of, start_of
+from lowfc.contract.envelope import count_of, sequence_of, start_of
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, HEALTH, MIRROR_STATE, wire
 from lowfc.control.loop.safety import Limit, Rejection
@@ -235,8 +235,9 @@ class Bench:
         self._commands = MemoryBus(hub, "controller", self.clock).publisher(COMMAND, "dm")
         self._numbers: Iterator[int] = count(1)
 
-    def command(self, height_nm: float, grid: tuple[int, int] = (4, 5)) -> wire.MirrorState:
-        message = wire.MirrorCommand(frame_sequence=next(self._numbers), rows=grid[0], columns=grid[1])
+    def command(self, height_nm: float, grid: tuple[int, int] = (4, 5), start_s: int = 0) -> wire.MirrorState:
+        sequence = sequence_of(start_s, next(self._numbers))
+        message = wire.MirrorCommand(frame_sequence=sequence, rows=grid[0], columns=grid[1])
         message.valid_for_ns, message.actuators = 10**9, np.full(grid, height_nm, np.float32).tobytes()
         self._commands.put(message.SerializeToString())
         return self.state()
@@ -263,6 +264,17 @@ def test_commands_are_limited_and_the_mirror_goes_flat_after_the_command_timeout
     bench.tick()
     assert mirror.heights_nm[2:] == [0.0], "a mirror at rest gets no further call"
     assert bench.listener.events()[-1] == "COMMAND_EXPIRED"
+
+
+def test_the_mirror_refuses_a_command_whose_sender_started_in_the_future_and_follows_the_next_valid_one() -> None:
+    mirror = Mirror()
+    bench = Bench(mirror)
+    start_s = bench.clock.start_s
+    assert bench.command(50.0, start_s=start_s).refused == 0
+    assert bench.command(90.0, start_s=start_s + 25 * 3600).refused == Rejection.AHEAD
+    assert bench.command(60.0, start_s=start_s).refused == 0, "the refused sequence did not become the newest"
+    assert mirror.heights_nm[1:] == [50.0, 60.0]
+    assert "START_AHEAD" in bench.listener.events()
 
 
 @pytest.mark.parametrize(
