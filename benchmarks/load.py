@@ -77,7 +77,7 @@ def _moment() -> Moment:
 
 
 def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
-    """Use by each role in the last 0.8 `seconds` before the processes end; `seconds` is the duration of the frames.
+    """Use by each role over the last 80 % of `seconds`, the duration of the frames, before the processes end.
 
     `share`: processor time of all threads over that of one processor. Empty with fewer than two samples in that time.
     """

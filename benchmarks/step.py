@@ -42,7 +42,7 @@ STAGES: dict[str, tuple[Any, str]] = {
     "limits": (stepping, "limit"),
     "encode": (codec, "encode_command"),
 }
-REST, STEP, PRODUCT = "modes to actuators, state, step message", "the whole step", "one product R x"
+REMAINDER, STEP, PRODUCT = "modes to actuators, state, step message", "the whole step", "one product R x"
 _WARM_UP = 200
 _TRACED = 1000
 
@@ -100,7 +100,7 @@ def tables(found: Result) -> list[Lines]:
     """A row for each stage."""
     columns = [(name, at) for name in ("hot_us", "paced_us") for at in ("p50", "p99")]
     head = ["us", "back to back p50", "p99", f"at {found['rate_hz']:g} Hz p50", "p99"]
-    stages = (*STAGES, REST, STEP, PRODUCT)
+    stages = (*STAGES, REMAINDER, STEP, PRODUCT)
     return [[head, *([stage, *(f"{found[name][stage][at]:.1f}" for name, at in columns)] for stage in stages)]]
 
 
@@ -129,7 +129,7 @@ def _timed(
     with _clocked(durations):
         timed_step_ns = alone(step)
     stages = {stage: np.array(each, np.int64) for stage, each in durations.items()}
-    return found | stages | {REST: timed_step_ns - np.sum([*stages.values()], axis=0)}
+    return found | stages | {REMAINDER: timed_step_ns - np.sum([*stages.values()], axis=0)}
 
 
 @contextmanager

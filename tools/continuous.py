@@ -31,8 +31,8 @@ def table() -> str:
         ],
     }
     rows = [
-        (name, *(f"{_residual_mas(law, t):.3f}" for law, t in zip(made, _CASES, strict=True)))
-        for name, made in laws.items()
+        (name, *(f"{_residual_mas(law, t):.3f}" for law, t in zip(by_timing, _CASES, strict=True)))
+        for name, by_timing in laws.items()
     ]
     floor = float(np.sqrt(np.square(LINES_MAS) @ hold_floor(_omega())))
     rows.append(("lower bound for a command held for a period", *(f"{floor:.3f}" for _ in _CASES)))
@@ -52,8 +52,8 @@ def _kalman(timing: Timing, start: float, length: float) -> LinearLaw:
     """Kalman filter of the exact lines; its command nulls the mean over [start, start + length] periods."""
     lines = tuple(Line(hz, _NO_WIDTH_HZ, mas**2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
     model = Model(_NO_DRIFT_NM2, np.inf, lines, _NO_NOISE_NM2, RATE_HZ)
-    foreseen = model.mean_over(start, length) @ np.linalg.inv(model.mean_over(0.0, timing.exposure))
-    return replace(lqg([model], (2,), timing), output=(-model.states()[2] @ foreseen)[None].astype(np.float32))
+    predicted_mean = model.mean_over(start, length) @ np.linalg.inv(model.mean_over(0.0, timing.exposure))
+    return replace(lqg([model], (2,), timing), output=(-model.states()[2] @ predicted_mean)[None].astype(np.float32))
 
 
 def _residual_mas(law: LinearLaw, timing: Timing) -> float:

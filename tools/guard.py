@@ -22,7 +22,7 @@ from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.driver import disturbance_of
 from tools.law_bench import RATE_HZ, calibrated, configured, timing_of, tuned
 from tools.modal_bench import ModalBench
-from tools.shared import Results, columns
+from tools.shared import Results, formatted_table
 
 SEEDS = tuple(range(1, 21))
 MOVED = (("reaction-wheel-ideal", 1.02), ("reaction-wheel", 1.05), ("reaction-wheel", 1.10))
@@ -74,9 +74,11 @@ class Case:
         return bench
 
 
-def moved(case: Case, factor: float, seed: int, *, guard: bool = True, law: bool = True) -> tuple[float, list[float]]:
+def tilt_after_move(
+    case: Case, factor: float, seed: int, *, with_guard: bool = True, with_law: bool = True
+) -> tuple[float, list[float]]:
     """Tilt from 1 s to 3 s after lines have moved, mas rms per axis, and times of LAW_OVERRULED, s after the move."""
-    bench = case.bench(case.configured(seed, **{"control.guard": guard}), case.law if law else None)
+    bench = case.bench(case.configured(seed, **{"control.guard": with_guard}), case.law if with_law else None)
     bench.run(_BEFORE)
     if any(event.name == "LAW_OVERRULED" for _, event in bench.events):
         raise RuntimeError(f"the law was overruled before its lines moved: {bench.events}")
@@ -89,7 +91,7 @@ def moved(case: Case, factor: float, seed: int, *, guard: bool = True, law: bool
     ]
 
 
-def undisturbed(case: Case, seed: int, minutes: float = MINUTES) -> int:
+def times_overruled(case: Case, seed: int, minutes: float = MINUTES) -> int:
     """Number of times a good law is overruled, with steps and lines that wander within their width."""
     bench = case.bench(case.configured(seed), case.law, STEPS_MAS)
     bench.run(round(minutes * 60 * RATE_HZ), record=False)
@@ -106,15 +108,15 @@ def measure() -> Results:
         good = {}
         for magnitude in MAGNITUDES:
             case = Case("reaction-wheel", magnitude)
-            good[f"{magnitude:g}"] = [undisturbed(case, seed) for seed in track(SEEDS, f"V = {magnitude:g}")]
+            good[f"{magnitude:g}"] = [times_overruled(case, seed) for seed in track(SEEDS, f"V = {magnitude:g}")]
     return {"moved": rows, "good": good, "minutes": MINUTES, "cost_us": cost_us(cases["reaction-wheel"].law)}
 
 
 def cost_us(law: LinearLaw) -> dict[str, float]:
     """Least time that the guard adds to a frame, while the law drives and while it is virtual."""
     modes = len(law.noll)
-    rest, value_nm = np.zeros(modes, np.float32), np.ones(modes, np.float32)
-    loop = Integrator(rest + np.float32(0.5), rest, rest + np.float32(150)), ((0, np.float32(1)),), (rest,)
+    zeros, value_nm = np.zeros(modes, np.float32), np.ones(modes, np.float32)
+    loop = Integrator(zeros + np.float32(0.5), zeros, zeros + np.float32(150)), ((0, np.float32(1)),), (zeros,)
     driving, x = LawGuard.of(law), at_rest(law)
     virtual = LawGuard.of(law, [Group(True, driving.spans.faded, 1)] * 2)
     found = {}
@@ -126,16 +128,16 @@ def cost_us(law: LinearLaw) -> dict[str, float]:
 
 
 def _row(case: Case, preset: str, factor: float) -> Results:
-    guarded = [moved(case, factor, seed) for seed in SEEDS]
-    alone = np.array([moved(case, factor, seed, guard=False)[0] for seed in SEEDS])
-    integrator = np.array([moved(case, factor, seed, law=False)[0] for seed in SEEDS])
+    guarded = [tilt_after_move(case, factor, seed) for seed in SEEDS]
+    unguarded = np.array([tilt_after_move(case, factor, seed, with_guard=False)[0] for seed in SEEDS])
+    integrator = np.array([tilt_after_move(case, factor, seed, with_law=False)[0] for seed in SEEDS])
     guarded_mas = np.array([mas for mas, _ in guarded])
     times = [times_s[0] for _, times_s in guarded if times_s]
     return {
         "preset": preset,
         "percent": 100 * (factor - 1),
         "guarded_mas": float(guarded_mas.mean()),
-        "alone_mas": float(alone.mean()),
+        "alone_mas": float(unguarded.mean()),
         "integrator_mas": float(integrator.mean()),
         "worst_ratio": float((guarded_mas / integrator).max()),
         "overruled": len(times),
@@ -146,7 +148,7 @@ def _row(case: Case, preset: str, factor: float) -> Results:
 
 def render(results: Results) -> str:
     """A row for each case, and the result for good laws."""
-    rows = columns(
+    rows = formatted_table(
         {
             "disturbance, frequency shift of its lines": "`{preset}`, {percent:.0f} %",
             "guarded law, mas rms per axis": "**{guarded_mas:.2f}**",

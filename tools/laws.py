@@ -80,7 +80,7 @@ def case(config: Configuration) -> Results:
             "phase_margin_deg": float(one.margins.phase_margin_deg[:2].min()),
         }
     results["optimum_mas"] = optimum_mas(config, calibration)
-    results["moved"] = moved(config, calibration, laws["lqg"].law)
+    results["moved"] = moved_lines_mas(config, calibration, laws["lqg"].law)
     return results
 
 
@@ -89,7 +89,7 @@ def tilts(run: TimeSeries, frames: int) -> TimeSeries:
     return TimeSeries((run.values[0][-frames:, :2],), 0)
 
 
-def moved(config: Configuration, calibration: Calibration, law: LinearLaw) -> dict[str, float]:
+def moved_lines_mas(config: Configuration, calibration: Calibration, law: LinearLaw) -> dict[str, float]:
     """Residual with lines 2 % higher: with the former law, and after identification from that closed loop."""
     bench = Bench(config, calibration, with_lines_moved(disturbance_of(config), 1.02))
     bench.load(law)

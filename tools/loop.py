@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lowfc.contract.configuration import load
 from tools.prediction import tilt_residual_mas
-from tools.shared import Results, columns, json_of
+from tools.shared import Results, formatted_table, json_of
 
 LOOP = "lowfc sim-loop --disturbance reaction-wheel --star-magnitude 2 --sensor sam27d10_bal14 --duration 20"
 KEYS = {"disturbance.preset": "reaction-wheel", "star.magnitude": 2.0, "sensor.sam": "sam27d10_bal14"}
@@ -31,11 +31,11 @@ LOG_COMMANDS = (*(f"{RECORDED} {seconds}" for seconds in RECORDED_S), "lowfc rep
 def measure() -> Results:
     """Run the loop once for each of `RUNS`."""
     runs = {}
-    for name, rate_hz, more, toml in RUNS:
+    for name, rate_hz, option, toml in RUNS:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "run.toml"
             file.write_text(toml)
-            run = json_of(f"{LOOP} --rate {rate_hz}{more} --config run.toml", folder) | {"log": None, "logs": []}
+            run = json_of(f"{LOOP} --rate {rate_hz}{option} --config run.toml", folder) | {"log": None, "logs": []}
             # One frame of delay, two if the command was late.
             delay = 1 + run["commands_late"] / run["frames_published"]
             config = load(file, KEYS | {"camera.rate_hz": float(rate_hz)})
@@ -77,7 +77,7 @@ def short(results: Results) -> str:
     """Rate, latency and residual of the runs with real-time scheduling."""
     runs = results["runs"].items()
     rows = (run | {"name": name.partition(",")[0]} for name, run in runs if "SCHED_FIFO" in name)
-    return f"{columns(SHORT_COLUMNS, rows)}\n{SHORT_NOTE}\n"
+    return f"{formatted_table(SHORT_COLUMNS, rows)}\n{SHORT_NOTE}\n"
 
 
 def render(results: Results) -> str:
@@ -89,8 +89,9 @@ def render(results: Results) -> str:
         for name, run in results["runs"].items()
     )
     return (
-        f"{columns(LOOP_COLUMNS, rows)}\nThe rate is by the host's clock. Latencies are p50 / p99 / p99.9. Frame to "
-        "command ends when the controller's send returns; the mirror may have received the command before. The "
+        f"{formatted_table(LOOP_COLUMNS, rows)}\n"
+        "The rate is by the host's clock. Latencies are p50 / p99 / p99.9. Frame to command "
+        "ends when the controller's send returns; the mirror may have received the command before. The "
         "prediction is for the disturbance's expected spectrum and the measured delay, without lost frames; a run is "
         "one realisation."
     )
@@ -107,14 +108,14 @@ def measure_logs() -> Results:
         for seconds in RECORDED_S:
             run = json_of(f"{RECORDED} {seconds}", folder)
             files = " ".join(run["logs"])
-            alone, most_bytes = _with_memory(folder, f"replay --jobs 1 --json {files}")
+            alone, peak_bytes = _json_and_peak_bytes(folder, f"replay --jobs 1 --json {files}")
             paths = [Path(folder) / log for log in run["logs"]]
             logs[str(seconds)] = {
                 "log_bytes": sum(log.stat().st_size for log in paths),
                 **{key: run[key] for key in ("messages_recorded", "messages_lost", "frames_processed")},
                 **{key: alone[key] for key in ("frames", "commands", "states", "unchecked", "identical")},
                 "largest_difference_nm": alone["largest_difference_nm"],
-                "replay_bytes": most_bytes,
+                "replay_bytes": peak_bytes,
                 "speed_one": alone["speed"],
                 "speed_all": json_of(f"lowfc replay {files}", folder)["speed"],
             }
@@ -123,7 +124,7 @@ def measure_logs() -> Results:
     return {"recording": recording, "logs": logs}
 
 
-def _with_memory(folder: str, words: str) -> tuple[Results, int]:
+def _json_and_peak_bytes(folder: str, words: str) -> tuple[Results, int]:
     """JSON printed by a command with --json, and its peak memory, bytes."""
     process = subprocess.Popen(
         [sys.executable, "-m", "lowfc", *words.split()], cwd=folder, stdout=subprocess.PIPE, text=True
@@ -167,7 +168,7 @@ def render_logs(results: Results) -> str:
     )
     rates = (rate | {"cpu_percent": 100 * rate["cpu_share"]} for rate in results["recording"]["rates"])
     return (
-        f"{columns(LOG_COLUMNS, logs)}\n{columns(RECORDER_COLUMNS, rates)}\n"
+        f"{formatted_table(LOG_COLUMNS, logs)}\n{formatted_table(RECORDER_COLUMNS, rates)}\n"
         "Replay speed is relative to real time. The recorder's processor time is of one processor, all its threads; "
         "times to write and to flush are from a message's arrival until it is written, and until it survives a kill."
     )

@@ -38,7 +38,7 @@ from tools import (
     world,
 )
 from tools.declared import DECLARED
-from tools.shared import ROOT, Results, host, json_of, where
+from tools.shared import ROOT, Results, host, json_of, provenance_text
 
 MEASURED = ROOT / "tools" / "measured"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
@@ -118,7 +118,7 @@ def table(name: str) -> str:
     if measurement.has_provenance:
         return text
     between = "" if text.endswith("\n") else " "
-    return f"{text}{between}{where(name, results)}\n"
+    return f"{text}{between}{provenance_text(name, results)}\n"
 
 
 def measured(name: str) -> Results:
@@ -140,15 +140,15 @@ def generated(page: Path) -> str:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made = {"pictures": pictures.make, "console": console.make, "layouts": layouts.make}
-    known = (*MEASUREMENTS, *made)
+    makers = {"pictures": pictures.make, "console": console.make, "layouts": layouts.make}
+    known = (*MEASUREMENTS, *makers)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"any of {', '.join(known)}")
     names = parser.parse_args().names
     if unknown := [name for name in names if name not in known]:
         parser.error(f"there is no {unknown[0]!r}; there are {', '.join(known)}")
     for name in names:
-        if name in made:
-            made[name]()
+        if name in makers:
+            makers[name]()
         else:
             about = {"host": host(), "commands": MEASUREMENTS[name].commands}
             results = about | MEASUREMENTS[name].measure()

@@ -15,7 +15,7 @@ from lowfc.contract.configuration import FIXED_GAINS, Configuration
 from lowfc.contract.errors import CalibrationError
 from tools.law_bench import Bench, calibrated, configured
 from tools.modal_bench import ModalBench
-from tools.shared import Results, columns
+from tools.shared import Results, formatted_table
 
 PRESETS = ("bench", "thermal", "reaction-wheel", "quiet")
 MAGNITUDES = tuple(range(-1, 9))
@@ -177,8 +177,9 @@ def render(results: Results) -> str:
         f"`{name}`": f"{{{name}}}" for name in PRESETS if name != "quiet"
     }
     return (
-        f"{columns(heads, table)}\nTrue wavefront, open to closed with automatic gains, nm rms over the second half "
-        f"of {results['seconds']:g} s at {results['rate_hz']:g} Hz, mean of {results['seeds']} seeds. "
+        f"{formatted_table(heads, table)}\n"
+        f"True wavefront, open to closed with automatic gains, nm rms over the second half of "
+        f"{results['seconds']:g} s at {results['rate_hz']:g} Hz, mean of {results['seeds']} seeds. "
         f"Number of cases: {len(rows)} (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them "
         f"with every image simulated), without {saturated} in which the star saturates the detector. Added contrast is "
         "without the terms between modes. A case counts as harmful if closing adds more contrast than "

@@ -15,7 +15,7 @@ from lowfc.control.loop.wording import counted
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.command import counts
 from lowfc.programs.reliability.soak.evaluation import TOO_SHORT, latency_in_words, verdict
-from tools.shared import ROOT, Results, columns, host, host_in_words, json_of, markdown
+from tools.shared import ROOT, Results, formatted_table, host, host_in_words, json_of, markdown
 
 CHAOS = "lowfc chaos --all --seed N"
 SEEDS = (1, 2, 3, 4, 5)
@@ -42,7 +42,7 @@ def _run(cases: str, seed: int) -> Results:
 
 
 def measure_again(results: Results, seed: int, names: Sequence[str]) -> Results:
-    """Run cases of a seed, those named or those without a result; return its run with all results."""
+    """Run cases with a seed, those named or those without a result; return all results of that seed."""
     run: Results = next(one for one in results["runs"] if one["seed"] == seed)
     kept = {case["name"]: case for case in run["cases"] if case["name"] in CASES}
     if missing := list(names) or [name for name in CASES if name not in kept]:
@@ -124,7 +124,7 @@ def _stalls(by_name: dict[str, list[Results]]) -> list[str]:
     rows = []
     for name, cases in by_name.items():
         for each in (case["figures"] for case in cases if name.startswith("stall-")):
-            if "p99_during_over_calm" in each:  # a case that failed early has not measured all three
+            if "p99_during_over_calm" in each:  # a case that failed early lacks some of the three spans
                 spans = ", ".join(f"{each['frame_to_command'][span]['p99_us']:.0f}" for span in _STALL)
                 rows.append((name.removeprefix("stall-"), spans, each["p99_during_over_calm"]))
     head = "stopped for 10 s", "frame to command, p99, us: before, during, after", "during / mean of before and after"
@@ -171,7 +171,7 @@ def render_soak(results: Results) -> str:
         f"{ended} {results['hours']:g} h at {results['rate_hz']:.0f} Hz: {results['frames_published']} frames, "
         f"{results['frames_skipped']} skipped, {results['frames_missing']} missing; {results['messages_recorded']} "
         f"messages in {results['logs']} logs, {results['messages_lost']} lost, {results['gaps']} gaps. "
-        f"Frame to command: {latency_in_words(results['latency'])}.\n\n{columns(SOAK_COLUMNS, rows)}\n"
+        f"Frame to command: {latency_in_words(results['latency'])}.\n\n{formatted_table(SOAK_COLUMNS, rows)}\n"
     )
 
 

@@ -71,10 +71,10 @@ def alone(name: str) -> Results:
     if name != "open":
         on_nodes = factory.mirror_on_twin(config, twin, sys.exit)
         plain = factory.analytic_calibration(config, twin, on_nodes)
-        beside_shear = configured(name, **{"control.nuisance": ["shear"]})
+        with_shear = configured(name, **{"control.nuisance": ["shear"]})
         results["noise_mas"] = tilt_noise_mas(config, plain)
         results["noise_with_shear_mas"] = tilt_noise_mas(
-            beside_shear, factory.analytic_calibration(beside_shear, twin, on_nodes)
+            with_shear, factory.analytic_calibration(with_shear, twin, on_nodes)
         )
         in_band = configured(name, **{"sensor.wavelengths": 4})
         results["noise_in_band_mas"] = tilt_noise_mas(in_band, calibrated(in_band))

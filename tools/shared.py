@@ -56,12 +56,12 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return f"{first}{'|---' * len(head)}|\n{''.join(lines)}"
 
 
-def columns(formats: dict[str, str], rows: Iterable[Results]) -> str:
+def formatted_table(formats: dict[str, str], rows: Iterable[Results]) -> str:
     """A table in Markdown: heading of each column, and the format of its cells from the results of a row."""
     return markdown([*formats], ([cell.format(**row) for cell in formats.values()] for row in rows))
 
 
-def where(name: str, results: Results) -> str:
+def provenance_text(name: str, results: Results) -> str:
     """Date, host and commands of a measurement, as a sentence."""
     about = results["host"]
     *most, last = [f"`{command}`" for command in results["commands"]] or [""]

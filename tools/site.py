@@ -144,7 +144,7 @@ def _subclasses(kind: type[Result]) -> set[type[Result]]:
     return {one for one in below if one.model_fields and one.__module__.startswith("lowfc.")}
 
 
-def upgrade() -> str:
+def former_names() -> str:
     """The names of release 0.1 and their successors."""
     tables = {
         "configuration key": KEYS,
@@ -176,7 +176,7 @@ BUILT: dict[str, Callable[[], str]] = {
     "topics": topics,
     "messages": messages,
     "json": json_objects,
-    "former names": upgrade,
+    "former names": former_names,
     **{f"api {one}": partial(api, f"lowfc.{one}") for one in API},
 }
 """The generated tables, by the names used in the pages."""

@@ -16,32 +16,32 @@ class Target(NamedTuple):
     """A target for one quantity.
 
     Attributes:
-        what: the quantity.
-        most: largest value that meets the target.
+        quantity: its name.
+        limit: largest value that meets the target.
         values: measured, one for each turn.
         form: format of a value.
-        floor: lower bound for any program of this kind, in words.
-        where: what takes the time above that bound.
+        bound: lower bound for any program of this kind, in words.
+        excess: what takes the time above that bound.
     """
 
-    what: str
-    most: float
+    quantity: str
+    limit: float
     values: list[float]
     form: str
-    floor: str
-    where: str
+    bound: str
+    excess: str
 
     def row(self) -> list[str]:
         """The row of the table."""
         reached = median(self.values)
         spread = f" ({self.form.format(min(self.values))} to {self.form.format(max(self.values))})"
         return [
-            self.what,
-            f"at most {self.form.format(self.most)}",
+            self.quantity,
+            f"at most {self.form.format(self.limit)}",
             self.form.format(reached) + (spread if len(self.values) > 1 else ""),
-            "yes" if reached <= self.most else "no",
-            self.floor,
-            self.where,
+            "yes" if reached <= self.limit else "no",
+            self.bound,
+            self.excess,
         ]
 
 
@@ -55,12 +55,14 @@ def render(measured: Callable[[str], Results]) -> str:
 
 
 def _steps(results: Results) -> Iterator[Target]:
-    for size, (other, most) in zip(results["sizes"], (("product", 2.4), ("memory", 1.4), ("memory", 1.3)), strict=True):
+    for size, (other, limit) in zip(
+        results["sizes"], (("product", 2.4), ("memory", 1.4), ("memory", 1.3)), strict=True
+    ):
         side = round(size["pixels"] ** 0.5)
         unit = "products R x" if other == "product" else "reads of its bytes"
-        where = OBJECTS if other == "product" else "two copies of the frame's bytes by protobuf; " + OBJECTS
+        excess = OBJECTS if other == "product" else "two copies of the frame's bytes by protobuf; " + OBJECTS
         ratios = size["ratios"][f"fused over {other}"]
-        yield Target(f"step, fused, {side} x {side}, in {unit}", most, ratios, "{:.2f}", "1", where)
+        yield Target(f"step, fused, {side} x {side}, in {unit}", limit, ratios, "{:.2f}", "1", excess)
 
 
 def _comparison(results: Results) -> Iterator[Target]:
@@ -71,16 +73,16 @@ def _comparison(results: Results) -> Iterator[Target]:
         return [(mine["frame_to_command"][at], its["frame_to_command"][at]) for mine, its in both if mine and its]
 
     shared = "the parts common to both: transport of the frame, wake-up, transport of the command"
-    for at, most in (("p50", 0.72), ("p99", 0.75)):
+    for at, limit in (("p50", 0.72), ("p99", 0.75)):
         ratios = [mine / its for mine, its in pairs(NUMPY, at)]
-        yield Target(f"frame to command, fused over numpy, {at}", most, ratios, "{:.2f}", shared, OBJECTS)
+        yield Target(f"frame to command, fused over numpy, {at}", limit, ratios, "{:.2f}", shared, OBJECTS)
     ways = "sockets wake two Python processes; the C chain waits on semaphores in shared memory"
     for other, targets in (("C chain", {"p50": 40.0, "p99": 80.0}), ("pyrtcao, fused", {"p50": 0.0, "p99": 0.0})):
-        for at, most in targets.items():
+        for at, limit in targets.items():
             differences = [mine - its for mine, its in pairs(other, at)]
-            what = f"frame to command, fused minus {other}, {at}, us"
-            where = ways if other == "C chain" else "the same; also checks, limits and messages that pyrtcao lacks"
-            yield Target(what, most, differences, "{:+.0f}", "0 for the same work in C", where)
+            quantity = f"frame to command, fused minus {other}, {at}, us"
+            excess = ways if other == "C chain" else "the same; also checks, limits and messages that pyrtcao lacks"
+            yield Target(quantity, limit, differences, "{:+.0f}", "0 for the same work in C", excess)
 
 
 def _stalls(results: Results) -> Iterator[Target]:
@@ -96,5 +98,5 @@ def _stalls(results: Results) -> Iterator[Target]:
     )
     for name, mb in results["memory_mb"].items():
         process = "source of frames" if name == "camera" else name
-        where = "Python, numpy, zenoh, protobuf" + ("; numba and LLVM" if name == "controller" else "")
-        yield Target(f"memory of the {process}, locked, MB", 200, [mb], "{:.0f}", "", where)
+        excess = "Python, numpy, zenoh, protobuf" + ("; numba and LLVM" if name == "controller" else "")
+        yield Target(f"memory of the {process}, locked, MB", 200, [mb], "{:.0f}", "", excess)

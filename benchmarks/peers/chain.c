@@ -75,8 +75,8 @@ static void filter(void)
 {
     float *command = output.array.F;
     for (int mode = 0; mode < MODES; mode++) {
-        float wanted = (1 - (float)LEAK) * command[mode] - (float)GAIN * input.array.F[mode];
-        command[mode] = fminf(fmaxf(wanted, -(float)LIMIT_NM), (float)LIMIT_NM);
+        float unlimited = (1 - (float)LEAK) * command[mode] - (float)GAIN * input.array.F[mode];
+        command[mode] = fminf(fmaxf(unlimited, -(float)LIMIT_NM), (float)LIMIT_NM);
     }
 }
 

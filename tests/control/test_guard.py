@@ -24,7 +24,7 @@ from lowfc.programs.cli import status
 from sim_camera.disturbance import LINE_WIDTH, LINES_HZ, LINES_MAS
 from tests.support.in_process_loop import SMALL_MIRROR
 from tests.support.toy import NOLL, calibration, feed, frame, loaded, names, run_toy, settings
-from tools.guard import MOVED, SEEDS, Case, identified_law, moved, undisturbed
+from tools.guard import MOVED, SEEDS, Case, identified_law, tilt_after_move, times_overruled
 from tools.law_bench import Bench, calibrated, configured, timing_of
 from tools.modal_bench import ModalBench
 
@@ -265,13 +265,13 @@ def test_modal_noise_agrees_with_images() -> None:
 
 def test_with_shifted_lines_the_residual_is_at_most_a_tenth_above_the_integrators(short_settling: None) -> None:
     preset, factor = MOVED[0]
-    got_mas, overruled_s = moved(case(preset, known=True), factor, 1)
+    got_mas, overruled_s = tilt_after_move(case(preset, known=True), factor, 1)
     assert len(overruled_s) == 1
-    assert got_mas < 1.1 * moved(case(preset, known=True), factor, 1, law=False)[0]
+    assert got_mas < 1.1 * tilt_after_move(case(preset, known=True), factor, 1, with_law=False)[0]
 
 
 def test_steps_of_the_disturbance_do_not_overrule_the_law(short_settling: None) -> None:
-    assert undisturbed(case("reaction-wheel", known=True), 1, minutes=0.07) == 0
+    assert times_overruled(case("reaction-wheel", known=True), 1, minutes=0.07) == 0
 
 
 def test_a_wrong_delay_is_detected_as_amplification() -> None:
@@ -294,7 +294,11 @@ def test_with_shifted_lines_the_residual_is_at_most_a_tenth_above_the_integrator
     preset: str, factor: float
 ) -> None:
     ratios: Array = np.array(
-        [moved(case(preset), factor, seed)[0] / moved(case(preset), factor, seed, law=False)[0] for seed in SEEDS]
+        [
+            tilt_after_move(case(preset), factor, seed)[0]
+            / tilt_after_move(case(preset), factor, seed, with_law=False)[0]
+            for seed in SEEDS
+        ]
     )
     assert ratios.max() < 1.1
 
@@ -303,4 +307,4 @@ def test_with_shifted_lines_the_residual_is_at_most_a_tenth_above_the_integrator
 @pytest.mark.parametrize("magnitude", [0.0, 2.0, 5.0])
 def test_a_good_law_is_never_overruled(magnitude: float) -> None:
     """For ten minutes; `python -m tools.measure guard` measures ten minutes for each of twenty seeds in some hours."""
-    assert undisturbed(case("reaction-wheel", magnitude), 21) == 0
+    assert times_overruled(case("reaction-wheel", magnitude), 21) == 0

@@ -75,7 +75,7 @@ def test_the_stages_are_those_of_a_step_and_add_up(monkeypatch: pytest.MonkeyPat
     found = step.measure(Namespace(seconds=0.2), lambda _: None)
     assert stepping.limit is original
     (lines,) = step.tables(found)
-    assert [line[0] for line in lines[1:]] == [*step.STAGES, step.REST, step.STEP, step.PRODUCT]
+    assert [line[0] for line in lines[1:]] == [*step.STAGES, step.REMAINDER, step.STEP, step.PRODUCT]
     assert all(float(cell) >= 0 for line in lines[1:] for cell in line[1:])
     over = found["hot_us"][step.STEP]["p50"] / found["hot_us"][step.PRODUCT]["p50"]
     assert f"{over:.1f} times" in step.about(found)
