@@ -226,7 +226,9 @@ REASONS: dict[str, Advice] = {
     "HELD": Advice("an interlock or a permit holds the loop", "wait, or remove the cause of the interlock"),
     "MODAL_LIMIT": Advice("a modal command reached its limit", "`lowfc ctl limit`; offload; centre the star"),
     "STROKE": Advice("an actuator reached its stroke", "a better flat map, or smaller channels"),
-    "SLEW": Advice("an actuator reached its slew limit in one command", "nothing after closing; else lower gains"),
+    "SLEW": Advice(
+        "an actuator reached its slew limit in one command", "nothing if the loop has just closed; else lower gains"
+    ),
     "NEIGHBOUR": Advice("neighbouring actuators would be too far apart", "smaller channels; look for a stuck actuator"),
     "NOT_FINITE": Advice("a value was not finite; the previous command is kept", "check calibration and law"),
     "WRONG_GRID": Advice("the grid differs from the mirror's", "load the calibration of this mirror"),
