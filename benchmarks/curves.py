@@ -57,8 +57,8 @@ def step_times(size: Size, seconds: float) -> Result:
     config = configuration(size, RATE_HZ)
     calibration, frames = random_calibration(size, config)
     step = ControlStep(config, calibration, HostClock().host_ns())
-    made = Payloads(frames)
-    payloads = cycle([made.at(index, HostClock().host_ns()) for index in range(FRAMES)])
+    prepared = Payloads(frames)
+    payloads = cycle([prepared.at(index, HostClock().host_ns()) for index in range(FRAMES)])
     times: Result = {"step_us": timed(lambda: step(next(payloads)), seconds)}
     if step.state.mode is not LoopMode.CLOSED or step.state.counts:
         raise RuntimeError(f"{size}: loop {step.state.mode.name.lower()}, refused or limited: {step.state.counts}")
@@ -93,18 +93,18 @@ def loop_latency(size: Size, rate_hz: float, seconds: float) -> Result:
     """
     try:
         with watched() as moments, prepared_run(size, config := configuration(size, rate_hz)) as run:
-            (found,) = run_repeats(LatencyOptions(config, seconds, 1), run, lambda _: None)
+            (measured,) = run_repeats(LatencyOptions(config, seconds, 1), run, lambda _: None)
     except LowfcError as fault:
         return {"failure": str(fault)}
-    latency_us = {name: found["latency_us"]["frame_to_command"][name] for name in ("p50", "p99")}
+    latency_us = {name: measured["latency_us"]["frame_to_command"][name] for name in ("p50", "p99")}
     used = shares(moments, WARM_UP_S + seconds)
     if "controller" in used:
-        latency_us["cpu"] = used["controller"]["share"] * 1e6 / found["rate_hz"]
+        latency_us["cpu"] = used["controller"]["share"] * 1e6 / measured["rate_hz"]
     return {
         "frame_to_command_us": latency_us,
-        "echo_us": {name: found["echo_us"][name] / 2 for name in ("p50", "p99")},
-        "frames": found["frames"],
-        "frames_without_command": found["frames_without_command"],
+        "echo_us": {name: measured["echo_us"][name] / 2 for name in ("p50", "p99")},
+        "frames": measured["frames"],
+        "frames_without_command": measured["frames_without_command"],
     }
 
 
@@ -145,17 +145,17 @@ def measure(options: argparse.Namespace, report: Report) -> Result:
 
 def point(size: Size, repeats: Sequence[Result]) -> Result:
     """One point of a curve: medians over the repeats, and the lowest and highest p50."""
-    made: Result = {name: getattr(size, name) for name in ("pixels", "modes", "actuators", "bytes")} | asdict(size)
+    values: Result = {name: getattr(size, name) for name in ("pixels", "modes", "actuators", "bytes")} | asdict(size)
     for name in (*_STEP, *_LOOP):
         if each := [repeat[name] for repeat in repeats if name in repeat]:
             kinds = set.intersection(*map(set, each))
-            made[name] = {kind: round(median(one[kind] for one in each), 2) for kind in sorted(kinds)}
-            made[name]["spread"] = [round(end(one["p50"] for one in each), 2) for end in (min, max)]
+            values[name] = {kind: round(median(one[kind] for one in each), 2) for kind in sorted(kinds)}
+            values[name]["spread"] = [round(end(one["p50"] for one in each), 2) for end in (min, max)]
     for name in ("frames", "frames_without_command"):
         if any(name in repeat for repeat in repeats):
-            made[name] = sum(repeat.get(name, 0) for repeat in repeats)
-    made["failures"] = [repeat["failure"] for repeat in repeats if "failure" in repeat]
-    return made
+            values[name] = sum(repeat.get(name, 0) for repeat in repeats)
+    values["failures"] = [repeat["failure"] for repeat in repeats if "failure" in repeat]
+    return values
 
 
 HEADINGS = (
@@ -184,31 +184,31 @@ def tables(result: Result) -> list[Lines]:
     ]
 
 
-def _label(name: str, one: Result) -> str:
-    side = one[AXES[name][1]]
-    return str(side) if AXES[name][1] == name else f"{one[name]} ({side} x {side})"
+def _label(name: str, point: Result) -> str:
+    side = point[AXES[name][1]]
+    return str(side) if AXES[name][1] == name else f"{point[name]} ({side} x {side})"
 
 
-def _cells(one: Result) -> list[str]:
-    step, stream_us, loop = one["step_us"], one["stream_us"]["p50"], one.get("frame_to_command_us")
-    made = [
+def _cells(point: Result) -> list[str]:
+    step, stream_us, loop = point["step_us"], point["stream_us"]["p50"], point.get("frame_to_command_us")
+    cells = [
         ranged([step["p50"], *step["spread"]]),
         *(us(step[kind]) for kind in ("p99", "cpu")),
-        us(one["products_us"]["p50"]),
-        f"{one['bytes'] / 1e6:.2f}",
-        f"{one['bytes'] / stream_us / 1e3:.0f}",
+        us(point["products_us"]["p50"]),
+        f"{point['bytes'] / 1e6:.2f}",
+        f"{point['bytes'] / stream_us / 1e3:.0f}",
         us(stream_us),
         f"{step['p50'] / stream_us:.1f}",
     ]
     if loop is None:
-        return [*made, "failed" if one["failures"] else "", *[""] * 4]
+        return [*cells, "failed" if point["failures"] else "", *[""] * 4]
     return [
-        *made,
+        *cells,
         ranged([loop["p50"], *loop["spread"]]),
         us(loop["p99"]),
         us(loop["cpu"]) if "cpu" in loop else "",
-        us(one["echo_us"]["p50"]),
-        f"{one['frames_without_command']} of {one['frames']}",
+        us(point["echo_us"]["p50"]),
+        f"{point['frames_without_command']} of {point['frames']}",
     ]
 
 

@@ -38,7 +38,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 def measure(options: argparse.Namespace, report: Report) -> Result:
     """Measure each size in turns: p50 of numpy, fused, product and memory in us, and their ratios."""
     set_up(None, None, lock_memory=False, disable_cpu_idle=False)
-    found = []
+    sizes = []
     for side in options.side:
         size = Size(side)
         calls = _timed_calls(size)
@@ -51,8 +51,8 @@ def measure(options: argparse.Namespace, report: Report) -> Result:
             f"{one} over {other}": [turn[one] / turn[other] for turn in turns] for one, other in (*pairs, KERNELS[::-1])
         }
         numbers = {"pixels": size.pixels, "modes": size.modes, "actuators": size.actuators}
-        found.append(numbers | {"turns": turns, "ratios": ratios})
-    return {"sizes": found}
+        sizes.append(numbers | {"turns": turns, "ratios": ratios})
+    return {"sizes": sizes}
 
 
 def tables(found: Result) -> list[Lines]:
@@ -77,8 +77,8 @@ def about(found: Result) -> str:
 
 def _timed_calls(size: Size) -> dict[str, Callable[[], object]]:
     calibration, frames = random_calibration(size, configuration(size, RATE_HZ))
-    made = Payloads(frames)
-    payloads = cycle([made.at(index, HostClock().host_ns()) for index in range(FRAMES)])
+    prepared = Payloads(frames)
+    payloads = cycle([prepared.at(index, HostClock().host_ns()) for index in range(FRAMES)])
     R, x = calibration.reconstructor, np.random.default_rng(1).standard_normal(size.pixels, np.float32)
     one_half, other_half = np.ones((2, size.bytes // 8), np.float32)
 

@@ -65,7 +65,7 @@ def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> Result:
     found = run_lowfc(["latency", *words, "--rate", f"{rate_hz:g}"], seconds)
     if "failure" in found:
         return {"requested_hz": rate_hz, "failure": found["failure"]}
-    own = {
+    values = {
         "requested_hz": rate_hz,
         "rate_hz": found["rate_hz"],
         "frames": found["frames"],
@@ -75,22 +75,22 @@ def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> Result:
         "usage": found["usage"],
     }
     if found["commands_late"] is not None:
-        own["commands_late_fraction"] = found["commands_late"] / (found["frames"] + found["warm_up_frames"])
-    return own
+        values["commands_late_fraction"] = found["commands_late"] / (found["frames"] + found["warm_up_frames"])
+    return values
 
 
 def complaints(run: Result) -> list[str]:
     """Why this rate was not sustained; empty if it was."""
     if "failure" in run:
         return [run["failure"]]
-    found = []
+    reasons = []
     if abs(run["rate_hz"] - run["requested_hz"]) > RATE_WITHIN * run["requested_hz"]:
-        found.append(f"{run['rate_hz']:.0f} frames a second")
+        reasons.append(f"{run['rate_hz']:.0f} frames a second")
     if run["without_command"] > MAX_WITHOUT_COMMAND * run["frames"]:
-        found.append(f"{100 * run['without_command'] / run['frames']:.2g} % of the frames without a command")
+        reasons.append(f"{100 * run['without_command'] / run['frames']:.2g} % of the frames without a command")
     if run["messages_lost"]:
-        found.append(f"{run['messages_lost']} messages lost")
-    return found
+        reasons.append(f"{run['messages_lost']} messages lost")
+    return reasons
 
 
 def grid(lowest_hz: float, highest_hz: float, step: float) -> list[float]:

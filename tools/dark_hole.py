@@ -19,9 +19,9 @@ def measure() -> Results:
     runs = {}
     for step_rms_nm in track(STEP_RMS_NM, "dark holes"):
         with tempfile.TemporaryDirectory() as folder:
-            found = dark_hole(Path(folder), step_rms_nm)
+            result = dark_hole(Path(folder), step_rms_nm)
         run: Results = {"together_nm": step_rms_nm * STEPS**0.5}
-        for name, channel in found.channels.items():
+        for name, channel in result.channels.items():
             undone, error = channel.undone()
             run[name] = {"undone": undone, "error": error, "left_nm": channel.residual_nm.tolist()}
             run["seen_nm"] = float(np.linalg.norm(channel.channel_nm[-1]))

@@ -90,13 +90,13 @@ def packages() -> str:
 
 def offered(package: str) -> str:
     """Exported names of a package of the Python API, or its modules, with the first paragraph of their docstrings."""
-    top = import_module(package)
-    if hasattr(top, "__all__"):
-        found = [(name, _about(getattr(top, name))) for name in top.__all__]
+    root = import_module(package)
+    if hasattr(root, "__all__"):
+        documented = [(name, _about(getattr(root, name))) for name in root.__all__]
     else:
-        modules = [one.name for one in walk_packages(top.__path__, f"{package}.") if not one.ispkg]
-        found = [(name, import_module(name).__doc__) for name in modules]
-    rows = ((f"`{name}`", one_line((text or "").split("\n\n")[0])) for name, text in found)
+        modules = [module.name for module in walk_packages(root.__path__, f"{package}.") if not module.ispkg]
+        documented = [(name, import_module(name).__doc__) for name in modules]
+    rows = ((f"`{name}`", one_line((text or "").split("\n\n")[0])) for name, text in documented)
     return markdown(("name", ""), rows)
 
 
@@ -122,9 +122,10 @@ def agreement() -> str:
     """Camera settings that must agree with the configuration."""
     head = ("camera setting", "configuration key", "tolerance", "needed", "used for")
     rows = []
-    for one in AGREEMENTS:
-        needed, tolerance = "yes" if one.needed else "no", f"{one.tolerance:.0%}" if one.tolerance else "exactly equal"
-        rows.append((f"`{one.field}`", f"`{one.key}`", tolerance, needed, one.use))
+    for setting in AGREEMENTS:
+        needed = "yes" if setting.needed else "no"
+        tolerance = f"{setting.tolerance:.0%}" if setting.tolerance else "exactly equal"
+        rows.append((f"`{setting.field}`", f"`{setting.key}`", tolerance, needed, setting.use))
     return markdown(head, rows)
 
 
@@ -165,21 +166,23 @@ def one_line(text: str | None) -> str:
 def requests() -> str:
     """Every request."""
     rows = []
-    for one in REQUESTS:
-        contents = "; ".join(f"`{name}`: {what}" for name, what in one.fields)
-        rows.append((f"`{one.key}`", contents, one.description, f"`{one.example}`" if one.example else ""))
+    for request in REQUESTS:
+        contents = "; ".join(f"`{name}`: {what}" for name, what in request.fields)
+        rows.append(
+            (f"`{request.key}`", contents, request.description, f"`{request.example}`" if request.example else "")
+        )
     return markdown(("query", "fields of the request", "what it does", "`lowfc ctl`"), rows)
 
 
 def buttons() -> str:
     """The console's buttons."""
-    rows = ((f"`{one.key}`", one.name, one.description) for one in (SAFE, *ACTIONS))
+    rows = ((f"`{action.key}`", action.name, action.description) for action in (SAFE, *ACTIONS))
     return markdown(("key", "button", "what it does"), rows)
 
 
 def events(*levels: Level) -> str:
     """Every event of these levels: text, cause, remedy."""
-    return "\n".join(_event(one) for one in EVENTS.values() if one.level in levels)
+    return "\n".join(_event(event) for event in EVENTS.values() if event.level in levels)
 
 
 def _event(event: Event) -> str:

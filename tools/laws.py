@@ -66,18 +66,18 @@ def case(config: Configuration) -> Results:
         str(frames): float(np.hypot(*theory_mas(config, calibration, tuned(tilts(run, frames), config)["lqg"].law)))
         for frames in SHORTER
     }
-    for kind, one in laws.items():
-        bench.load(one.law)
+    for kind, tuned_law in laws.items():
+        bench.load(tuned_law.law)
         bench.new_record()
         bench.run(SETTLE + MEASURE)
-        disturbance_mas, noise_mas = theory_mas(config, calibration, one.law)
+        disturbance_mas, noise_mas = theory_mas(config, calibration, tuned_law.law)
         results["laws"][kind] = {
             "got_mas": bench.tilt_mas(MEASURE),
-            "predicted_mas": float(np.sqrt(np.mean(one.predicted_nm[:2] ** 2)) / bench.nm_per_mas),
+            "predicted_mas": float(np.sqrt(np.mean(tuned_law.predicted_nm[:2] ** 2)) / bench.nm_per_mas),
             "disturbance_mas": disturbance_mas,
             "noise_mas": noise_mas,
-            "gain_margin": float(one.margins.gain_margin[:2].min()),
-            "phase_margin_deg": float(one.margins.phase_margin_deg[:2].min()),
+            "gain_margin": float(tuned_law.margins.gain_margin[:2].min()),
+            "phase_margin_deg": float(tuned_law.margins.phase_margin_deg[:2].min()),
         }
     results["optimum_mas"] = optimum_mas(config, calibration)
     results["moved"] = moved_lines_mas(config, calibration, laws["lqg"].law)
@@ -142,11 +142,11 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
             passed = residual_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing)[:, 0]
             return float(power @ passed + variance * noise_gain(law, timing.delay)[0])
 
-        found = minimize(residual, (-2.0, 0.7), method="Nelder-Mead", bounds=_DRIFT_BOUNDS, options={"xatol": 0.02})
-        (step, corner), ((least, most), (lowest, _)) = found.x, _DRIFT_BOUNDS
+        minimum = minimize(residual, (-2.0, 0.7), method="Nelder-Mead", bounds=_DRIFT_BOUNDS, options={"xatol": 0.02})
+        (step, corner), ((least, most), (lowest, _)) = minimum.x, _DRIFT_BOUNDS
         if min(step - least, most - step, corner - lowest) < 0.05:
-            raise RuntimeError(f"no minimum within {_DRIFT_BOUNDS}: ended at {found.x}")
-        return float(found.fun)
+            raise RuntimeError(f"no minimum within {_DRIFT_BOUNDS}: ended at {minimum.x}")
+        return float(minimum.fun)
 
     return float(np.sqrt(np.mean([best_nm2(0), best_nm2(1)])) / tilt_nm_per_mas(config.star.diameter_m))
 

@@ -47,8 +47,8 @@ def measure_again(results: Results, seed: int, names: Sequence[str]) -> Results:
     kept = {case["name"]: case for case in run["cases"] if case["name"] in CASES}
     if missing := list(names) or [name for name in CASES if name not in kept]:
         about = host()
-        found = _run(" ".join(f"--case {name}" for name in missing), seed)["cases"]
-        kept |= {case["name"]: {**case, "host": about} for case in found}
+        new_cases = _run(" ".join(f"--case {name}" for name in missing), seed)["cases"]
+        kept |= {case["name"]: {**case, "host": about} for case in new_cases}
     return run | counts(cases := list(kept.values())) | {"cases": cases}
 
 

@@ -43,10 +43,10 @@ def configured(name: str, **changed: Any) -> Configuration:
 def measure() -> Results:
     """Measure every sensor, alone and in the loop."""
     with threadpool_limits(1):
-        found = {name: alone(name) for name in track(NAMES, "sensors alone")}
+        by_name = {name: alone(name) for name in track(NAMES, "sensors alone")}
     for name in track(NAMES, "sensors in the loop"):
-        found[name]["loop"] = {} if name == "open" else {preset: in_the_loop(name, preset) for preset in PRESETS}
-    return {"sensors": found}
+        by_name[name]["loop"] = {} if name == "open" else {preset: in_the_loop(name, preset) for preset in PRESETS}
+    return {"sensors": by_name}
 
 
 def alone(name: str) -> Results:

@@ -41,13 +41,13 @@ def json_of(command: str, folder: Path | str = ROOT) -> Results:
         RuntimeError: the command printed nothing.
     """
     words = shlex.split(command.removeprefix("python -m "))
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-m", *words, "--json"], cwd=folder, stdout=subprocess.PIPE, text=True, check=False
     )
-    if not done.stdout:
-        raise RuntimeError(f"`{command}` ended with {done.returncode} and printed nothing")
-    found: Results = json.loads(done.stdout)
-    return found
+    if not completed.stdout:
+        raise RuntimeError(f"`{command}` ended with {completed.returncode} and printed nothing")
+    results: Results = json.loads(completed.stdout)
+    return results
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -54,11 +54,13 @@ def _contexts(context: typer.Context) -> Iterator[typer.Context]:
 def configuration() -> str:
     """Every key of the configuration, by section."""
     sections = {name: type(value) for name, value in Configuration() if isinstance(value, Section)}
-    found = [_keys("Top level", "", Configuration, "")]
-    found += [_keys(f"[{name}]", f"{one_line(one.__doc__)}.", one, f"{name}.") for name, one in sections.items()]
+    parts = [_keys("Top level", "", Configuration, "")]
+    parts += [
+        _keys(f"[{name}]", f"{one_line(section.__doc__)}.", section, f"{name}.") for name, section in sections.items()
+    ]
     about = f"{one_line(InterlockSection.__doc__)}. One table for each interlock."
-    found.append(_keys("[[interlocks]]", about, InterlockSection, "interlocks."))
-    return "\n".join(found)
+    parts.append(_keys("[[interlocks]]", about, InterlockSection, "interlocks."))
+    return "\n".join(parts)
 
 
 def _keys(heading: str, about: str, section: type[Section], prefix: str) -> str:
@@ -87,34 +89,38 @@ def _bound(text: str) -> str:
 def topics() -> str:
     """Every topic."""
     rows = []
-    for one in TOPICS:
-        when = f"{one.rate:g} Hz" if isinstance(one.rate, float) else str(one.rate)
-        full = one.message.DESCRIPTOR.full_name
+    for topic in TOPICS:
+        when = f"{topic.rate:g} Hz" if isinstance(topic.rate, float) else str(topic.rate)
+        full = topic.message.DESCRIPTOR.full_name
         own = full.startswith("lowfc.")
         message = f"[`{full}`](messages.md#{full.rpartition('.')[2].lower()})" if own else f"`{full}`"
-        who = ["any" if roles == EVERYBODY else ", ".join(sorted(roles)) for roles in (one.publishers, one.subscribers)]
-        about = f"{one.description}{' The last one is returned on query.' if one.queryable else ''}"
-        rows.append((f"`{one.key}`", message, when, *who, about))
+        who = [
+            "any" if roles == EVERYBODY else ", ".join(sorted(roles)) for roles in (topic.publishers, topic.subscribers)
+        ]
+        about = f"{topic.description}{' The last one is returned on query.' if topic.queryable else ''}"
+        rows.append((f"`{topic.key}`", message, when, *who, about))
     return markdown(("topic", "message", "when", "published by", "received by", ""), rows)
 
 
 def messages() -> str:
     """Every message with its fields, every enumeration with its values."""
     file = lowfc_pb2.DESCRIPTOR
-    found = [f"## {name}\n\n{fields(name)}" for name in file.message_types_by_name]
-    for name, one in file.enum_types_by_name.items():
-        found.append(f"## {name}\n\n{markdown(('value', 'number'), ((f'`{v.name}`', v.number) for v in one.values))}")
-    return "\n".join(found)
+    parts = [f"## {name}\n\n{fields(name)}" for name in file.message_types_by_name]
+    for name, enumeration in file.enum_types_by_name.items():
+        parts.append(
+            f"## {name}\n\n{markdown(('value', 'number'), ((f'`{v.name}`', v.number) for v in enumeration.values))}"
+        )
+    return "\n".join(parts)
 
 
 def json_objects() -> str:
     """Every typed `--json` object."""
     rows = []
-    for one in sorted(_subclasses(Result), key=lambda each: f"{each.__module__}.{each.__name__}"):
-        *_, package, module = one.__module__.split(".")
+    for result in sorted(_subclasses(Result), key=lambda each: f"{each.__module__}.{each.__name__}"):
+        *_, package, module = result.__module__.split(".")
         command = module if package == "cli" else package  # every other command is a package
-        about = f"{one_line(one.__doc__)}. Printed by `lowfc {command}`."
-        rows.append(f"### {one.__name__}\n\n{about}\n\n{_field_table(one)}")
+        about = f"{one_line(result.__doc__)}. Printed by `lowfc {command}`."
+        rows.append(f"### {result.__name__}\n\n{about}\n\n{_field_table(result)}")
     return "\n".join(rows)
 
 

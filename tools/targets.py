@@ -86,15 +86,15 @@ def _comparison(results: Results) -> Iterator[Target]:
 
 
 def _stalls(results: Results) -> Iterator[Target]:
-    found = results["stalls"]
-    bare = ", ".join(f"{one['stalled']} next to the {one['beside']}" for one in found["bare"])
+    stalls = results["stalls"]
+    bare = ", ".join(f"{loop['stalled']} next to the {loop['beside']}" for loop in stalls["bare"])
     yield Target(
-        f"frames without a command, of {found['frames']}",
+        f"frames without a command, of {stalls['frames']}",
         0,
         [float(results["frames_without_command"])],
         "{:.0f}",
         f"{bare}: wake-ups of the bare loops more than a period late",
-        f"the host caused {found['of_host']} of the {found['stalled']} stalls",
+        f"the host caused {stalls['of_host']} of the {stalls['stalled']} stalls",
     )
     for name, mb in results["memory_mb"].items():
         process = "source of frames" if name == "camera" else name

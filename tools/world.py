@@ -51,10 +51,10 @@ def measure(sensors: tuple[str, ...] = SENSORS, seconds: float = SECONDS) -> Res
     rows = []
     with threadpool_limits(1):
         for name, keys in track(CASES.items(), "cases"):
-            for again in (False, True) if name in CALIBRATED else (False,):
+            for calibrate_detector in (False, True) if name in CALIBRATED else (False,):
                 pairs = [(sensor, magnitude) for sensor in sensors for magnitude in MAGNITUDES]
-                found = [_residual(*pair, keys, seconds, again) | {"of": pair} for pair in pairs]
-                rows.append({"name": name, "keys": keys, "calibrated": again, "figures": found})
+                figures = [_residual(*pair, keys, seconds, calibrate_detector) | {"of": pair} for pair in pairs]
+                rows.append({"name": name, "keys": keys, "calibrated": calibrate_detector, "figures": figures})
     return {"rows": rows, "seconds": seconds}
 
 
@@ -74,11 +74,14 @@ def _gains(sensor: str, magnitude: float) -> tuple[float, ...]:
     return tuple(bench.state.loop.integrator.gain.tolist())
 
 
-def _residual(sensor: str, magnitude: float, keys: dict[str, Any], seconds: float, again: bool) -> Results:
-    """Residual wavefront over the open pupil and added contrast, continuous, over the second half of the run."""
+def _residual(sensor: str, magnitude: float, keys: dict[str, Any], seconds: float, calibrate_detector: bool) -> Results:
+    """Residual wavefront over the open pupil and added contrast, continuous, over the second half of the run.
+
+    With `calibrate_detector`, dark and reference image are measured on the detector of the case.
+    """
     config = _configured(sensor, magnitude, keys)
     calibration = calibrated(config)
-    bench = Bench(config, _measured(config, calibration) if again else calibration)
+    bench = Bench(config, _calibrated_on_detector(config, calibration) if calibrate_detector else calibration)
     bench.ask("gain", modes=config.noll, values=_gains(sensor, magnitude))
     frames = round(seconds * RATE_HZ)
     bench.run(frames)
@@ -93,7 +96,7 @@ def _residual(sensor: str, magnitude: float, keys: dict[str, Any], seconds: floa
     }
 
 
-def _measured(config: Configuration, calibration: Calibration) -> Calibration:
+def _calibrated_on_detector(config: Configuration, calibration: Calibration) -> Calibration:
     """The calibration with dark and reference image averaged from frames of this detector."""
     quiet = config.disturbance.model_copy(update={"preset": "quiet"})
     flat = np.zeros(calibration.grid, np.float32)
