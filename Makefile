@@ -3,9 +3,9 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
 VENV := .venv
 BIN := $(VENV)/bin
-# Only what is imported is compiled, when it is. The newest pip finds the packages in half the time of the one that comes with Python.
+# --no-compile: a module is compiled when it is first imported. The newest pip finds the packages in half the time of the one that comes with Python.
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
-export PYTHONDONTWRITEBYTECODE :=  # rewriting and compiling every test anew takes 5 s of each interpreter that collects them
+export PYTHONDONTWRITEBYTECODE :=  # cleared: without cached bytecode each interpreter that collects the tests needs 5 s more
 .PHONY: help sim-loop test test-all bench lint types format proto node docs release clean
 
 help:  ## list the targets

@@ -11,7 +11,7 @@ from lowfc.device import Configuration, Single, VoltMap, VoltOptions, geometry
 
 
 class BostonMirror:
-    """Values are fractions of the voltage range, 0 to 1."""
+    """A mirror whose values are fractions of the voltage range, 0 to 1."""
 
     class Options(VoltOptions):
         """Options in addition to the maps."""

@@ -9,7 +9,7 @@ from lowfc.device import CameraSettings, Configuration, DriverOptions, Exposure
 
 
 class MyCamera:
-    """Frames of 80 x 80 pixels."""
+    """A camera of 80 x 80 pixels."""
 
     def __init__(self, options: DriverOptions, config: Configuration) -> None:
         """Open the camera."""

@@ -14,7 +14,7 @@ STEP = 0.01
 
 
 class MyMirror:
-    """A mirror with units of `mirror.nm_per_unit`."""
+    """A mirror whose hardware has units of `mirror.nm_per_unit` nm of surface."""
 
     def __init__(self, options: DriverOptions, config: Configuration) -> None:
         """Open the mirror; its actuators and limits are those of [mirror]."""

@@ -1,4 +1,4 @@
-"""A camera that uses only zenoh, protobuf and the compiled messages, as in another language.
+"""A camera that uses only zenoh, protobuf and the compiled messages, like a program in another language.
 
 It publishes a numpy file of frames (frames, rows, columns) uint16 in a loop.
 
@@ -61,22 +61,22 @@ session = zenoh.open(zenoh.Config.from_file(str(SESSION)))
 frames, states = Publisher(session, "lowfc/camera/frame"), Publisher(session, "lowfc/camera/state", queryable=True)
 health = Publisher(session, "lowfc/health/camera", queryable=True)
 _, rows, columns = FRAMES.shape
-picture = RawImage(encoding="mono16", height=rows, width=columns, step=2 * columns, frame_id="my_camera")
+image = RawImage(encoding="mono16", height=rows, width=columns, step=2 * columns, frame_id="my_camera")
 settings = CameraState(rows=rows, columns=columns, exposure_ns=EXPOSURE_NS, period_ns=PERIOD_NS, bit_depth=16)
 settings.gain_e_per_dn, settings.bias_dn, settings.saturation_dn, settings.em_gain = 1.0, 100.0, 40_100.0, 1.0
-report = Health(process="camera", state="running")
-end_ns, due_ns = now_ns(), 0
+health_message = Health(process="camera", state="running")
+end_ns, settings_due_ns = now_ns(), 0
 while True:
     end_ns = max(end_ns + PERIOD_NS, now_ns())
     time.sleep(max(0, end_ns - now_ns()) * 1e-9)
-    picture.timestamp.FromNanoseconds(end_ns)
-    picture.data = FRAMES[frames.count % len(FRAMES)].astype("<u2").tobytes()
-    frames.put(picture.SerializeToString())
-    if end_ns >= due_ns:
+    image.timestamp.FromNanoseconds(end_ns)
+    image.data = FRAMES[frames.count % len(FRAMES)].astype("<u2").tobytes()
+    frames.put(image.SerializeToString())
+    if end_ns >= settings_due_ns:
         settings.timestamp.FromNanoseconds(end_ns)
         states.put(settings.SerializeToString())
-        report.timestamp.FromNanoseconds(now_ns())
-        del report.topics[:]
-        report.topics.add(topic=frames.key, published=frames.count)
-        health.put(report.SerializeToString())
-        due_ns = end_ns + SETTINGS_PERIOD_NS
+        health_message.timestamp.FromNanoseconds(now_ns())
+        del health_message.topics[:]
+        health_message.topics.add(topic=frames.key, published=frames.count)
+        health.put(health_message.SerializeToString())
+        settings_due_ns = end_ns + SETTINGS_PERIOD_NS

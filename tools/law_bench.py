@@ -124,8 +124,8 @@ class Bench:
         self.steps: list[Step] = []
         self.truths: list[Truth] = []
 
-    def star(self, magnitude: float) -> None:
-        """Point at another star."""
+    def change_star(self, magnitude: float) -> None:
+        """Point at a star of this V magnitude."""
         star = self.config.star.model_copy(update={"magnitude": magnitude})
         self.scene = scene(self.world.model_copy(update={"star": star}), self._other_disturbance)
 

@@ -76,7 +76,7 @@ class ModalBench(Bench):
         self._begin(config, Load(0, _differential_calibration(config.noll), "bench"))
         self.watch = GainWatch(self.settings, config.control.on_harm) if watch else None
         self._disturbance = disturbance_of(config) if disturbance is None else disturbance
-        self._sampler = self._sampled()
+        self._sampler = self._new_sampler()
         self._mix = np.linalg.cholesky(covariance_nm2).T.astype(np.float32)
         self._noise = np.random.Generator(np.random.SFC64(np.random.SeedSequence([config.seed, 3])))
         self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
@@ -87,7 +87,7 @@ class ModalBench(Bench):
         super().new_record()
         self._squares: list[Single] = []
 
-    def _sampled(self) -> Sampler:
+    def _new_sampler(self) -> Sampler:
         instants = np.concatenate([self.config.camera.exposure_fraction * GAUSS_LEGENDRE, _TRUTH_SAMPLES])
         return Sampler(self._disturbance, instants, self.config.camera.rate_hz)
 
@@ -99,7 +99,7 @@ class ModalBench(Bench):
         phase_cycles = (self._disturbance.frequency_hz - moved.frequency_hz) * self._index / self.config.camera.rate_hz
         amplitude_nm = self._disturbance.amplitude_nm * np.exp(2j * np.pi * phase_cycles)[:, None]
         self._disturbance = replace(moved, amplitude_nm=amplitude_nm)
-        before, self._sampler = self._sampler, self._sampled()
+        before, self._sampler = self._sampler, self._new_sampler()
         old, new = vars(before)["_lines"], vars(self._sampler)["_lines"]
         for name in ("_rng", "_next", "_vector") if new is not None else ():  # damped lines keep their state
             setattr(new, name, getattr(old, name))

@@ -63,7 +63,7 @@ def source(part: RoleProcess) -> None:
 
     payloads = [pixels.tobytes() for pixels in RunData(part.folder).frames]
     put = join(part, record_command)
-    for number in part.frames():
+    for number in part.frame_numbers():
         published[number] = now_ns()
         put(number, payloads[number % len(payloads)])
 

@@ -39,7 +39,7 @@ class Sensor(WavefrontSensor):
     def run(self) -> None:
         """Publish all frames of a run, then end the process."""
         run_data, published = RunData(self.part.folder), self.part.time_stamps("published")
-        for number in self.part.frames():
+        for number in self.part.frame_numbers():
             self.data = run_data.frame(number)
             published[number] = time.monotonic_ns()
             self.expose()  # pyrtcao numbers frames from 1, too
@@ -196,6 +196,6 @@ if __name__ == "__main__":
     own.reduce_jitter()
     component = _component(own)
     component.start()
-    if own.role != "source":  # the source reports ready in `frames`
+    if own.role != "source":  # the source reports ready in `frame_numbers`
         own.ready()
     threading.Event().wait()

@@ -70,7 +70,7 @@ class RoleProcess:
         """Report that this process is ready."""
         ready_file(self.folder, self.role).touch()
 
-    def frames(self) -> Iterator[int]:
+    def frame_numbers(self) -> Iterator[int]:
         """Report ready, wait for the start, then yield each frame's number at its absolute time; none is skipped.
 
         After the last it sleeps for 50 ms, so that the last command can arrive.

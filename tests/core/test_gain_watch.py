@@ -381,7 +381,7 @@ def test_another_star_lowers_the_gains_and_restarts_their_measurement() -> None:
     loop = bench(2.0)
     loop.run(560, record=False)
     bright = gains(loop)
-    loop.star(3.5)
+    loop.change_star(3.5)
     loop.run(150, record=False)
     assert named(loop, "STAR_CHANGED")[0]["ratio"] == pytest.approx(0.25, rel=0.1)
     assert (gains(loop) <= 0.5 * bright).all()
