@@ -27,7 +27,7 @@ MODULES = {
 LOOP = {"camera", "controller", "mirror"}
 
 _EVERY_S = 0.2
-_PART = 0.8
+_FRACTION = 0.8  # of the duration, at its end, over which the use is averaged
 _START_S, _TIMEOUT_RATIO = 60.0, 12.0
 
 
@@ -82,7 +82,7 @@ def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
     `share`: processor time of all threads over that of one processor. Empty with fewer than two samples in that time.
     """
     complete = [moment for moment in moments if moment.roles.keys() >= LOOP][:-1]
-    inside = [moment for moment in complete if moment.at_s >= complete[-1].at_s - _PART * seconds]
+    inside = [moment for moment in complete if moment.at_s >= complete[-1].at_s - _FRACTION * seconds]
     if len(inside) < 2:
         return {}
     first, last = inside[0], inside[-1]

@@ -42,6 +42,7 @@ STAGES: dict[str, tuple[Any, str]] = {
     "limits": (stepping, "limit"),
     "encode": (codec, "encode_command"),
 }
+"""Stages of the step: the owner and the name of the function that is timed."""
 REMAINDER, STEP, PRODUCT = "modes to actuators, state, step message", "the whole step", "one product R x"
 _WARM_UP = 200
 _TRACED = 1000

@@ -127,7 +127,7 @@ def tables(result: Result) -> list[Lines]:
 def about(result: Result) -> str:
     """Definitions of the measured quantities."""
     turns = result["turns"]
-    before, read = (
+    camera_process, controller = (
         ranged([turn[name]["stream_to_camera"]["p50"] for turn in turns]) for name in (CAMERA_PROCESS, IN_CONTROLLER)
     )
     return (
@@ -135,6 +135,6 @@ def about(result: Result) -> str:
         f"Hz; {SIZE.side} x {SIZE.side} pixels, {SIZE.modes} modes, {SIZE.actuators} actuators. Latency "
         "begins just before the writer sets the stream's write flag, or just before the frame is sent over the direct "
         "link; it ends just after the controller's send, or just before the mirror publishes its state. Over "
-        f"ImageStreamIO, {before} us (p50) of the latency pass before the camera process publishes the frame; if the "
-        f"controller reads the stream itself, {read} us before it has the frame."
+        f"ImageStreamIO, {camera_process} us (p50) of the latency pass before the camera process publishes the frame; "
+        f"if the controller reads the stream itself, {controller} us before it has the frame."
     )

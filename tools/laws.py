@@ -90,7 +90,7 @@ def tilts(run: TimeSeries, frames: int) -> TimeSeries:
 
 
 def moved_lines_mas(config: Configuration, calibration: Calibration, law: LinearLaw) -> dict[str, float]:
-    """Residual with lines 2 % higher: with the former law, and after identification from that closed loop."""
+    """Residual with lines 2 % higher, mas rms per axis: with the former law, and with one identified from that loop."""
     bench = Bench(config, calibration, with_lines_moved(disturbance_of(config), 1.02))
     bench.load(law)
     bench.settle(SETTLE)
