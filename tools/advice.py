@@ -66,7 +66,8 @@ ADVICE: dict[str, Advice] = {
         "start the writer; the driver resumes by itself.",
     ),
     "STREAM_RENEWED": Advice(
-        "the writer recreated the stream.", "nothing, unless the size changed: then load a calibration of this size."
+        "another process recreated the camera's stream or the mirror's channel.",
+        "nothing, unless the size of the camera's frames changed: then load a calibration of this size.",
     ),
     "CAMERA_RESTARTED": Advice(
         "the camera's frame numbers restarted; frames are not used until its settings are received.",
