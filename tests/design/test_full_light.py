@@ -25,7 +25,8 @@ from lowfc.programs.design.full_light_request import Spot
 from tests.support.loops import json_of, refusal
 
 LIGHT_E = electrons(STAR, TABLE4_EXPOSURE_S)
-# Noise of 14 modes in nm, and the share of the quantum limit, from an independent calculation; None: not compared.
+# Noise of 14 modes together, nm, and the median over modes of quantum limit over Cramer-Rao bound (variances), both
+# from an independent calculation; None: not compared.
 EXPECTED = {
     "sam": (None, 0.006),
     "sam18_sized": (None, 0.013),
@@ -39,8 +40,6 @@ EXPECTED = {
     "lyot": (None, None),
     "aplc": (None, None),
 }
-
-
 SLOW = ("sam18_sized", "sam27d10_bal14", "bowtie", "lyot", "aplc")
 SENSORS = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in EXPECTED]
 
@@ -75,24 +74,24 @@ def test_quantum_information_of_two_holes_is_that_of_their_fringe_at_quadrature(
     pupil[32, 8], pupil[32, 56] = 1.0, 1.0
     mode = np.zeros((1, n, n))
     mode[0, 32, 8], mode[0, 32, 56] = 1.0, -1.0
-    found = quantum_information(pupil, mode, 2 * np.pi, light_e=n * n * np.pi / 4.0)  # 1 photon in each hole
-    assert found.item() == pytest.approx(4 * 2 * 1.0)  # N = 2, phases +1 and -1 per unit of the mode
+    information = quantum_information(pupil, mode, 2 * np.pi, light_e=n * n * np.pi / 4.0)  # 1 photon in each hole
+    assert information.item() == pytest.approx(4 * 2 * 1.0)  # N = 2, phases +1 and -1 per unit of the mode
 
 
 @pytest.mark.parametrize("name", ["zwfs_tuned", "clowfs_tuned"])
 def test_prediction_of_a_candidate_agrees_with_the_full_chain(name, focal_light, modes):
     sensor = sensor_named(name)
-    one = FullLight(sensor, focal_light)
-    central = one.central()
+    candidate = FullLight(sensor, focal_light)
+    central = candidate.central()
     assert np.allclose(central.I0, reference(sensor).ravel(), rtol=1e-9, atol=1e-15)
     assert np.allclose(central.H[:, 7], response(sensor, modes[7:8])[:, 0], rtol=1e-9, atol=1e-15)
     bound = cramer_rao(central.H[:, :14] * LIGHT_E, variance_e(central.I0 * LIGHT_E, 1.0))
     expected = np.sum(contrast_form(Coronagraph(sensor.pupil), NOLLS_14, 550.0) * bound)
-    assert contrast_noise(one.forms, central, "weighted") == pytest.approx(expected, rel=0.01)
-    assert merit(one, Goal("contrast", "weighted")) == contrast_noise(one.forms, central, "weighted")
+    assert contrast_noise(candidate.forms, central, "weighted") == pytest.approx(expected, rel=0.01)
+    assert merit(candidate, Goal("contrast", "weighted")) == contrast_noise(candidate.forms, central, "weighted")
     measured = {"zwfs_tuned": 9.0e-4, "clowfs_tuned": 1.4e-3}[name]  # second order alone, plain pseudo-inverse
-    assert one.nonlinearity_waves(14) == pytest.approx(measured, rel=0.2)
-    assert predictions(one)["table3_waves"]["pinv"]["14"] > one.nonlinearity_waves(14)
+    assert candidate.nonlinearity_waves(14) == pytest.approx(measured, rel=0.2)
+    assert predictions(candidate)["table3_waves"]["pinv"]["14"] > candidate.nonlinearity_waves(14)
 
 
 def test_sweep_finds_the_minimum_between_its_values():
@@ -102,7 +101,7 @@ def test_sweep_finds_the_minimum_between_its_values():
     assert sweep(abs, 2.0, 2.0, 5)[1] == 2.0
 
 
-def test_the_command_writes_the_keys_of_the_best(tmp_path, monkeypatch):
+def test_the_command_writes_the_configuration_keys_of_the_best_sensor(tmp_path, monkeypatch):
     monkeypatch.setattr("lowfc.programs.design.full_light._POINTS", 3)
     out = tmp_path / "clowfs.toml"
     found = json_of("design", "clowfs", "--defocus", "3.2:4.2", "--out", out)
@@ -145,5 +144,5 @@ def test_sampling_of_the_holes_changes_image_and_response_by_under_1_percent():
     sensors = [sensor_from(SensorSection(hole_samples=points)) for points in (1, 4)]
     basis = zernikes(NOLLS_14, *pupil_radii(sensors[0]))
     for quantity, expected in ((reference, 0.0035), (lambda sensor: response(sensor, basis), 0.0049)):
-        one, other = map(quantity, sensors)
-        assert np.linalg.norm(one - other) / np.linalg.norm(other) == pytest.approx(expected, rel=0.2)
+        with_centres, with_fine = map(quantity, sensors)
+        assert np.linalg.norm(with_centres - with_fine) / np.linalg.norm(with_fine) == pytest.approx(expected, rel=0.2)

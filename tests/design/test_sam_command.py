@@ -96,7 +96,7 @@ def test_interrupted_search_writes_its_best_and_resumes(blocks, uninterrupted, t
     result, out = run(search_with(), tmp_path, Interrupted(blocks))
     assert result["interrupted"]
     assert result["steps"] < 2 * SMALL["steps"]
-    load_layout(str(out))
+    load_layout(str(out))  # the best layout so far is valid
     text = program.render(result)
     assert f"--resume {result['resume']}" in text
     assert "reproduced" not in text
@@ -168,7 +168,7 @@ def is_running(pid):
         return False
 
 
-def test_workers_ignore_ctrl_c_and_their_death_is_told_from_an_error_in_the_search(tmp_path, monkeypatch):
+def test_workers_ignore_ctrl_c_and_their_death_is_distinguished_from_an_error_in_the_search(tmp_path, monkeypatch):
     with open_executor(2, None) as executor:
         assert signal.SIGINT in executor.submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result()
         assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
@@ -227,7 +227,7 @@ def test_state_files_are_read_or_refused(tmp_path):
         read_state(state, "another")
 
 
-def test_front_is_written_and_plotted(tmp_path):
+def test_pareto_front_is_written_and_plotted(tmp_path):
     search = search_with(merit="pareto", chains=3, steps=60, name="edge", estimator="pinv")
     table, picture = tmp_path / "front.csv", tmp_path / "front.png"
     result, out = run(search, tmp_path, InProcessExecutor(), front_file=table, plot_file=picture)

@@ -31,18 +31,23 @@ SMALL = Request(outer=8.0, cells=16)
 PACKAGED = resources.files("lowfc") / "data" / "spc_quarter128.npz"
 
 
-def last(request):
+def designed(request):
+    """Result of the last linear program."""
     return list(exchange(request))[-1]
 
 
 def field_of(quarter, samples_per, extent):
-    """Field by the sensor's transform, at half-integer offsets: with 30 samples, at no point of the fine grid."""
+    """Field by the sensor's transform, at half-integer offsets.
+
+    With 30 samples per lambda/D, none is a point at which the design is checked.
+    """
     pupil = from_quarter(quarter, SAMPLES)
     axis = image_axis(2 * extent * samples_per, samples_per)
     return axis, to_image(pupil.astype(complex), axis.size, samples_per, 1.0) / pupil.mean()
 
 
 def in_zone(request, axis, margin=0.0):
+    """Whether each point of the grid of an axis, lambda/D, is in the dark zone, by at least a margin."""
     radius, angle = np.hypot(axis[:, None], axis), np.rad2deg(np.arctan2(np.abs(axis)[:, None], np.abs(axis)))
     return (
         (radius >= request.inner + margin)
@@ -82,17 +87,17 @@ def test_first_program_has_the_same_optimum_as_another_formulation_and_solver():
     square = np.cos(2 * np.pi * np.outer(x, samples)).mean(1) * np.cos(2 * np.pi * np.outer(y, samples)).mean(1)
     fields = [np.cos(2 * np.pi * (np.outer(x, h) + np.outer(side * y, v))) * square[:, None] for side in (-1, 1)]
     field, level = np.vstack(fields), np.sqrt(request.contrast)
-    other = linprog(
+    alternative = linprog(
         -np.ones(v.size),
         A_ub=np.vstack([field - level, -field - level]),
         b_ub=np.zeros(4 * x.size),
         bounds=(0, 1),
         method="highs-ipm",
     )
-    assert -other.fun / 32**2 / OPEN_AREA == pytest.approx(first.open_area, abs=1e-6)
+    assert -alternative.fun / 32**2 / OPEN_AREA == pytest.approx(first.open_area, abs=1e-6)
 
 
-def test_command_writes_a_mask_that_meets_the_contrast_between_the_points(tmp_path):
+def test_command_writes_a_mask_that_meets_the_contrast_between_the_points_of_its_design(tmp_path):
     path, picture = tmp_path / "spc.npz", tmp_path / "spc.png"
     result = json_of("design", "spc", "--outer", 8, "--cells", 64, "--out", path, "--plot", picture)
     assert result["open_area_fraction"] == pytest.approx(0.5317, abs=5e-4)
@@ -116,22 +121,22 @@ def test_command_writes_a_mask_that_meets_the_contrast_between_the_points(tmp_pa
 
 
 def test_design_is_reproducible():
-    first, again = last(SMALL), last(SMALL)
+    first, again = designed(SMALL), designed(SMALL)
     assert first.contrast <= SMALL.contrast
     np.testing.assert_array_equal(first.quarter, again.quarter)
 
 
 def test_octant_symmetry_is_as_open_as_quarter_symmetry():
     request = replace(SMALL, half_angle_deg=90.0, limit=0.98)
-    octant = last(replace(request, symmetry="octant"))
+    octant = designed(replace(request, symmetry="octant"))
     np.testing.assert_array_equal(octant.quarter, octant.quarter.T)
     assert octant.contrast <= request.contrast
-    assert octant.open_area == pytest.approx(last(request).open_area, abs=1e-4)
+    assert octant.open_area == pytest.approx(designed(request).open_area, abs=1e-4)
 
 
 def test_mask_is_stored_in_the_shortest_type_that_meets_the_contrast():
-    found = last(SMALL)
-    kinds = {stored(found.quarter, replace(SMALL, contrast=contrast)).dtype for contrast in (1e-9, 1e-7)}
+    mask = designed(SMALL)
+    kinds = {stored(mask.quarter, replace(SMALL, contrast=contrast)).dtype for contrast in (1e-9, 1e-7)}
     assert kinds == {np.dtype(np.float32), np.dtype(np.float16)}
 
 
@@ -146,7 +151,7 @@ def test_infeasible_request_reports_the_nearest_feasible_one(tmp_path):
     assert is_feasible(replace(request, inner=inner))
     assert not is_feasible(replace(request, inner=inner - 0.1))
     assert is_feasible(replace(request, contrast=contrast))
-    assert not is_feasible(replace(request, contrast=contrast / 10**0.1))
+    assert not is_feasible(replace(request, contrast=contrast / 10**0.1))  # the steps of the search
     assert not path.exists()
 
 
@@ -202,19 +207,20 @@ def test_ctrl_c_stops_within_a_program_and_leaves_no_file(tmp_path):
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert "cells, program  1" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
-        _, rest = process.communicate()
+        _, stderr = process.communicate()
     assert process.returncode == 130
-    assert rest.endswith("interrupted\n")
+    assert stderr.endswith("interrupted\n")
     assert list(tmp_path.iterdir()) == []
 
 
-def recorded():
+def packaged():
+    """Quarter of the packaged mask, and the request that it records."""
     with PACKAGED.open("rb") as stream, np.load(stream) as file:
         return file["quarter"].astype(float), Request(**json.loads(str(file["made_by"])))
 
 
 def test_packaged_mask_meets_its_recorded_request():
-    quarter, request = recorded()
+    quarter, request = packaged()
     assert request == Request()
     found = properties(quarter, request)
     assert found.max_contrast <= request.contrast == 1e-9
@@ -224,8 +230,8 @@ def test_packaged_mask_meets_its_recorded_request():
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_recorded_request_reproduces_the_packaged_mask():
-    quarter, request = recorded()
-    again = last(request)
+    quarter, request = packaged()
+    again = designed(request)
     assert again.contrast <= request.contrast
     assert again.open_area == pytest.approx(quarter.mean() / OPEN_AREA, abs=1e-4)
     assert (np.abs(again.quarter - quarter) > 0.5).mean() < 1e-3

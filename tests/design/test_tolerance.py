@@ -34,11 +34,11 @@ def test_residual_of_a_drift_agrees_with_the_continuous_theory(gain):
 @pytest.mark.parametrize("noise", [1e-3, 0.3, 30.0])
 def test_tolerated_drift_leaves_the_allowed_residual_at_the_best_gain(noise):
     for kind in ("integrator", "lqg"):
-        found = tolerated_drift(0.5, noise, EXPOSURE, kind)
-        assert drift_residual_nm2(found.step_nm2, noise, EXPOSURE, found.gain) == pytest.approx(0.5)
-    best = best_gain(found.step_nm2, noise, EXPOSURE)
-    assert found.gain == pytest.approx(best)
-    assert min(drift_residual_nm2(found.step_nm2, noise, EXPOSURE, best * f) for f in (0.9, 1.1)) > 0.5
+        tolerated = tolerated_drift(0.5, noise, EXPOSURE, kind)
+        assert drift_residual_nm2(tolerated.step_nm2, noise, EXPOSURE, tolerated.gain) == pytest.approx(0.5)
+    best = best_gain(tolerated.step_nm2, noise, EXPOSURE)
+    assert tolerated.gain == pytest.approx(best)
+    assert min(drift_residual_nm2(tolerated.step_nm2, noise, EXPOSURE, best * f) for f in (0.9, 1.1)) > 0.5
 
 
 def test_margins_bound_the_gain_of_an_integrator_if_frames_are_exposed_all_the_time():
@@ -50,8 +50,8 @@ def test_margins_bound_the_gain_of_an_integrator_if_frames_are_exposed_all_the_t
 
 def test_residual_of_a_slow_loop_is_the_root_of_drift_times_noise():
     """Kalman and Bucy: at low gain the residual variance is sqrt(D n)."""
-    found = tolerated_drift(1.0, 1e4, EXPOSURE)
-    assert found.step_nm2 * 1e4 == pytest.approx(1.0, rel=1e-3)
+    tolerated = tolerated_drift(1.0, 1e4, EXPOSURE)
+    assert tolerated.step_nm2 * 1e4 == pytest.approx(1.0, rel=1e-3)
 
 
 def test_lqg_with_the_line_tolerates_more_than_an_integrator():
@@ -66,6 +66,7 @@ def test_lqg_with_the_line_tolerates_more_than_an_integrator():
 def test_quartic_term_limits_a_mode_with_a_small_quadratic_term():
     assert tolerated_variance(2e-12, 0.0, 1e-10) == pytest.approx(50.0)
     variance = tolerated_variance(1e-15, 1e-14, 1e-10)
+    # The mean fourth power of a normal amplitude is three times its squared variance.
     assert 1e-15 * variance + 3e-14 * variance**2 == pytest.approx(1e-10)
 
 
@@ -78,9 +79,9 @@ def test_star_colour_does_not_shift_the_zero_point_of_an_aperture_mask():
 def coarse(monkeypatch):
     """Make one Zernike sensor of 16 x 16 pixels the only one of the check by simulation."""
     sensor = Sensor(circle(64), phase_spot(samples_per=4), PupilImage(), samples_per=4, pixels=16)
-    made = Prepared("coarse", SensorSection(), sensor)
-    made.twin = build(sensor, TwinSpec(nodes=24, order=6, rank=40, guards=4))
-    monkeypatch.setattr(tolerance, "prepared", lambda name: made)
+    prepared = Prepared("coarse", SensorSection(), sensor)
+    prepared.twin = build(sensor, TwinSpec(nodes=24, order=6, rank=40, guards=4))
+    monkeypatch.setattr(tolerance, "prepared", lambda name: prepared)
     monkeypatch.setattr(tolerance, "CHECKED_SENSORS", ("coarse",))
     monkeypatch.setattr(tolerance, "CHECKED_MAGNITUDES", (2.0,))
     monkeypatch.setattr(tolerance, "CHECKED_MODES", (4, 8))
