@@ -60,7 +60,7 @@ class Ramp:
         self.closed = True
 
 
-class Follower:
+class IdleMirror:
     """Mirror that does nothing."""
 
     def __init__(self, options: DriverOptions, config: Configuration) -> None:
@@ -86,7 +86,7 @@ def test_a_camera_publishes_what_its_driver_returns() -> None:
 
 
 def test_the_tighter_of_driver_and_configured_limits_applies() -> None:
-    driver = Follower(DriverOptions(), load(None, {"mirror.rows": 4, "mirror.columns": 5, "mirror.slew_nm": 30.0}))
+    driver = IdleMirror(DriverOptions(), load(None, {"mirror.rows": 4, "mirror.columns": 5, "mirror.slew_nm": 30.0}))
     assert protection_of(driver, CONFIG).limits.slew_nm == 30.0
     with pytest.raises(ConfigurationError, match=r"4 x 5 actuators; .* say 34 x 34"):
         protection_of(driver, Configuration())
@@ -101,8 +101,8 @@ def test_options_come_from_configuration_and_command_line() -> None:
     assert plugins.opened("camera", "ramp", config, (), Ramp).level == 3
     assert plugins.opened("camera", "both:Class", config, (), Ramp).level == 4
     for table, words in (({"level": 3}, ("--level", "5", "--ports=[1, 2]")), ({"level": 5, "ports": [1, 2]}, ())):
-        found = plugins.options(Ramp, table, words)
-        assert (found.level, found.ports) == (5, (1, 2))
+        options = plugins.options(Ramp, table, words)
+        assert (options.level, options.ports) == (5, (1, 2))
     assert plugins._parsed(("--total", "", "--stream=")) == {"total": "", "stream": ""}
     nested = load(None, {"drivers": {"package": {"module": {"level": 6}}}})
     assert plugins.opened("camera", "package.module:Class", nested, (), Ramp).level == 6
@@ -166,11 +166,12 @@ def test_driver_sections_of_a_configuration_are_checked(tmp_path: Path) -> None:
     good = {"drivers.sim": {"camera": {"fault": ""}}, "drivers.json": {"any": 1}, "drivers.mine.level": 1}
     assert plugins.faults(load(None, good | {"drivers.in_another_folder.level": 1}), tmp_path) == []
     bad = {"drivers.sim": {"camera": {"falt": ""}}, "drivers.sin.x": 1, "drivers.my/file": {"x": 1}}
-    wrong = plugins.faults(load(None, bad), tmp_path)
-    assert ["'falt'" in wrong[0], "did you mean 'sim'" in wrong[1], len(wrong)] == [True, True, 3]
+    unknown_option, unknown_driver, _ = plugins.faults(load(None, bad), tmp_path)
+    assert "'falt'" in unknown_option
+    assert "did you mean 'sim'" in unknown_driver
 
 
-class Sized(Ramp):
+class RequiredOption(Ramp):
     class Options(DriverOptions):
         frame_rows: int
 
@@ -216,31 +217,31 @@ def test_doctor_checks_the_requirements_of_a_driver(monkeypatch: pytest.MonkeyPa
     assert [check.advice for check in checks[1:3]] == ["", "switch it on"]
 
 
-def test_doctor_checks_a_mirror_of_a_module_and_a_fault_in_its_requirements(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Follower, "needs", lambda options: 1 / 0, raising=False)
-    checks = list(device_checks(f"{__name__}:Follower", CONFIG))
+def test_doctor_reports_a_fault_in_the_requirements_of_a_users_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(IdleMirror, "needs", lambda options: 1 / 0, raising=False)
+    checks = list(device_checks(f"{__name__}:IdleMirror", CONFIG))
     assert [f"{check.name.split()[0]} {check.status}" for check in checks] == ["mirror ok", "mirror wrong"]
     assert "requirements cannot be checked: ZeroDivisionError" in checks[1].got
-    (unset,) = device_checks(f"{__name__}:Sized", CONFIG)
-    assert f"[drivers.{__name__}]" in unset.advice
+    (missing_option,) = device_checks(f"{__name__}:RequiredOption", CONFIG)
+    assert f"[drivers.{__name__}]" in missing_option.advice
 
 
-class Unset(Ramp):
+class FailingSettings(Ramp):
     def settings(self) -> CameraSettings:
         raise RuntimeError("no link")
 
 
-class Unopened(Ramp):
+class FailingInit(Ramp):
     def __init__(self, options: DriverOptions, config: Configuration) -> None:
         raise ValueError("serial 7 is not there")
 
 
-class Unchecked(Ramp):
+class UncheckedOptions(Ramp):
     class Options:
         level: int = 7
 
 
-class Half:
+class Incomplete:
     """A driver without the required methods."""
 
     def expose(self) -> None:
@@ -252,10 +253,13 @@ class Half:
     [
         ("nowhere/half.py:Half", "there is no file nowhere/half.py"),
         (f"{'a' * 300}.py:Half", "File name too long"),
-        (f"{__name__}:Sized", "frame_rows is missing: --frame-rows VALUE, or frame_rows in"),
-        (f"{__name__}:Unchecked", "derive its class Options from lowfc.device.DriverOptions"),
-        (f"{__name__}:Half", "is no camera: it has no settings and no close"),
-        (f"{__name__}:Unopened", r"cannot be opened: ValueError: serial 7 is not there \(test_drivers.py, line \d+\)"),
+        (f"{__name__}:RequiredOption", "frame_rows is missing: --frame-rows VALUE, or frame_rows in"),
+        (f"{__name__}:UncheckedOptions", "derive its class Options from lowfc.device.DriverOptions"),
+        (f"{__name__}:Incomplete", "is no camera: it has no settings and no close"),
+        (
+            f"{__name__}:FailingInit",
+            r"cannot be opened: ValueError: serial 7 is not there \(test_drivers.py, line \d+\)",
+        ),
     ],
 )
 def test_a_driver_that_cannot_be_opened_gives_one_sentence(name: str, message: str) -> None:
@@ -264,9 +268,9 @@ def test_a_driver_that_cannot_be_opened_gives_one_sentence(name: str, message: s
 
 
 def test_a_fault_in_the_first_settings_gives_one_sentence() -> None:
-    camera = Unset(Unset.Options(), CONFIG)
+    camera = FailingSettings(FailingSettings.Options(), CONFIG)
     message = r"the camera cannot be started: RuntimeError: no link \(test_drivers.py, line \d+\)"
-    # the scheduling class of a thread of its own ends with it
+    # run_camera changes the scheduling class of its thread, which ends with the test
     with ThreadPoolExecutor(1) as thread, pytest.raises(ConfigurationError, match=message):
         thread.submit(run_camera, camera, CONFIG, "unset").result()
     assert camera.closed

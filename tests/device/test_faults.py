@@ -38,13 +38,13 @@ class Camera:
     """Camera whose exposures are returned by functions, in turn."""
 
     def __init__(self, clock: FakeClock, *exposures: Callable[[], Any], settings: CameraSettings = SETTINGS) -> None:
-        self.clock, self.exposures, self.now = clock, iter(exposures), settings
+        self.clock, self.exposures, self.current = clock, iter(exposures), settings
 
     def settings(self) -> CameraSettings:
-        return self.now
+        return self.current
 
     def expose(self) -> Exposure | None:
-        self.clock.advance(self.now.period_ns)
+        self.clock.advance(self.current.period_ns)
         return next(self.exposures)()
 
     def close(self) -> None: ...
@@ -55,6 +55,8 @@ def good(**fields: Any) -> Callable[[], Exposure]:
 
 
 class CameraBench:
+    """A camera in its loop, and a listener to its messages."""
+
     def __init__(self, *exposures: Callable[[], Any], frames: int = 1, settings: CameraSettings = SETTINGS) -> None:
         self.clock = FakeClock()
         self.listener = Listener(MemoryHub(), self.clock, FRAME, CAMERA_STATE, HEALTH)
@@ -62,7 +64,8 @@ class CameraBench:
         self.loop = CameraLoop(self.camera, self.listener.service("camera"), frames)
 
 
-def exposed(*exposures: Callable[[], Any], frames: int, settings: CameraSettings = SETTINGS) -> Listener:
+def run_camera_loop(*exposures: Callable[[], Any], frames: int, settings: CameraSettings = SETTINGS) -> Listener:
+    """Run a camera until it has published this number of frames."""
     bench = CameraBench(*exposures, frames=frames, settings=settings)
     bench.loop.run()
     assert len(bench.listener.messages(FRAME)) == frames
@@ -87,7 +90,7 @@ def exposed(*exposures: Callable[[], Any], frames: int, settings: CameraSettings
 )
 def test_camera_failures_are_reported_once_counted_and_retried(bad: Callable[[], Any], message: str) -> None:
     recovered = [good()] * 251  # more than 1 s at 250 Hz
-    listener = exposed(good(), bad, bad, bad, *recovered, frames=252)
+    listener = run_camera_loop(good(), bad, bad, bad, *recovered, frames=252)
     assert listener.events() == ["STARTED", "DRIVER_FAILED", "DRIVER_BACK", "STOPPED"]
     assert message in listener.event_texts("DRIVER_FAILED")[0]
     assert "after 3 failures" in listener.event_texts("DRIVER_BACK")[0]
@@ -98,7 +101,8 @@ def test_a_failing_camera_is_retried_after_increasing_pauses() -> None:
     bench = CameraBench(*[Mock(side_effect=OSError("the cable"))] * 9, good())
     begun_ns = bench.clock.now_ns()
     bench.loop.run()
-    assert bench.clock.now_ns() - begun_ns == pytest.approx(7.8e9 + 2 * 4e9, abs=0.1e9)
+    pauses_s = 0 + 0.1 + 0.2 + 0.5 + 1 + 2 + 4 + 4 + 4  # after each of nine failures
+    assert bench.clock.now_ns() - begun_ns == pytest.approx(pauses_s * 1e9, abs=0.1e9)
     assert bench.listener.events().count("DRIVER_FAILED") == 2  # repeated after 10 s
 
 
@@ -111,12 +115,12 @@ def test_a_failing_camera_does_not_advance_simulated_time(tmp_path: Path) -> Non
 
 def test_a_configuration_error_of_a_driver_ends_the_process() -> None:
     with pytest.raises(ConfigurationError, match="another layout"):
-        exposed(Mock(side_effect=ConfigurationError("another layout")), frames=1)
+        run_camera_loop(Mock(side_effect=ConfigurationError("another layout")), frames=1)
 
 
 def test_a_hanging_camera_is_reported_while_it_hangs() -> None:
     def hang() -> Exposure:
-        for _ in range(11):
+        for _ in range(11):  # a check each 0.1 s: one notes the call, ten are the timeout of 1 s
             bench.loop.watch.check()
         assert bench.listener.events() == ["STARTED", "DRIVER_HANGS"]
         return Exposure(GOOD)
@@ -131,7 +135,7 @@ def test_a_close_that_hangs_is_reported() -> None:
     bench = CameraBench(good())
 
     def close() -> None:
-        for _ in range(52):
+        for _ in range(52):  # more than the 5 s in which a driver must close
             bench.loop.watch.check()
 
     bench.camera.close = close  # type: ignore[method-assign]
@@ -155,7 +159,7 @@ def test_settings_that_cannot_be_true_are_named(setting: dict[str, Any], message
 
 
 def test_expose_returning_none_is_not_a_failure() -> None:
-    assert exposed(lambda: None, lambda: None, good(), frames=1).events() == ["STARTED", "STOPPED"]
+    assert run_camera_loop(lambda: None, lambda: None, good(), frames=1).events() == ["STARTED", "STOPPED"]
 
 
 def test_exposure_times_are_converted_from_the_clock_in_the_settings(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,13 +169,13 @@ def test_exposure_times_are_converted_from_the_clock_in_the_settings(monkeypatch
     start_ns = FakeClock().now_ns()
     for clock, behind_ns in (("monotonic", 5 * 10**9), ("realtime", 2 * 10**9)):
         settings = CameraSettings(3, 4, 2 * MS, 4 * MS, clock=clock)
-        listener = exposed(good(end_ns=start_ns + MS - behind_ns), good(), frames=2, settings=settings)
+        listener = run_camera_loop(good(end_ns=start_ns + MS - behind_ns), good(), frames=2, settings=settings)
         times = [frame.timestamp.ToNanoseconds() - start_ns for frame in listener.messages(FRAME)]
         assert times == [MS, 8 * MS], "the second frame is timed at its reception"
 
 
 def numbered(*numbers: int | np.uint16) -> Listener:
-    return exposed(*[good(number=number) for number in numbers], frames=len(numbers))
+    return run_camera_loop(*[good(number=number) for number in numbers], frames=len(numbers))
 
 
 def counts(listener: Listener) -> list[int]:
@@ -182,13 +186,13 @@ def test_frame_numbers_are_unwrapped_and_gaps_count_as_lost_frames() -> None:
     listener = numbered(65_533, np.uint16(65_534), np.uint16(1), 2, 5)
     assert counts(listener) == [0, 1, 4, 5, 8]
     assert len({start_of(sample.sequence) for sample in listener.samples[FRAME]}) == 1
-    last = next(one for one in listener.messages(HEALTH)[-1].topics if one.topic == FRAME.key)
-    assert (last.published, last.missing) == (9, 4)
+    frames = next(count for count in listener.messages(HEALTH)[-1].topics if count.topic == FRAME.key)
+    assert (frames.published, frames.missing) == (9, 4)
     assert listener.event_texts("FRAMES_LOST") == ["FRAMES_LOST 2 frames lost by the camera"] * 2, "the last at the end"
 
 
 def test_lost_frames_without_numbers_are_counted() -> None:
-    assert counts(exposed(good(), good(lost=3), good(), frames=3)) == [0, 4, 5]
+    assert counts(run_camera_loop(good(), good(lost=3), good(), frames=3)) == [0, 4, 5]
 
 
 def test_restarted_frame_numbers_are_a_new_start_even_twice_in_a_second() -> None:
@@ -202,7 +206,7 @@ def test_restarted_frame_numbers_are_a_new_start_even_twice_in_a_second() -> Non
 
 def test_a_changed_region_is_published_before_its_first_frame() -> None:
     def cropped() -> Exposure:
-        bench.camera.now = CameraSettings(2, 4, 2 * MS, 4 * MS)
+        bench.camera.current = CameraSettings(2, 4, 2 * MS, 4 * MS)
         return Exposure(GOOD[1:])
 
     bench = CameraBench(good(), cropped, frames=2)
@@ -226,7 +230,9 @@ class Mirror:
     def close(self) -> None: ...
 
 
-class Bench:
+class MirrorBench:
+    """A mirror in its loop, a sender of commands, and the mirror's reported states."""
+
     def __init__(self, mirror: Mirror) -> None:
         hub, self.clock = MemoryHub(), FakeClock()
         self.listener = Listener(hub, self.clock, MIRROR_STATE)
@@ -253,7 +259,7 @@ class Bench:
 
 def test_commands_are_limited_and_the_mirror_goes_flat_after_the_command_timeout() -> None:
     mirror = Mirror()
-    bench = Bench(mirror)
+    bench = MirrorBench(mirror)
     assert mirror.heights_nm == [0.0], "driven to flat at the start: its position is unknown"
     bench.command(200.0)
     assert mirror.heights_nm[1:] == [150.0], "the slew limit of [mirror]"
@@ -288,7 +294,7 @@ def test_the_mirror_refuses_a_command_whose_sender_started_in_the_future_and_fol
 )
 def test_a_failed_mirror_goes_flat_before_it_follows_commands_again(bad: Any, message: str) -> None:
     mirror = Mirror()
-    bench = Bench(mirror)
+    bench = MirrorBench(mirror)
     bench.command(140.0)
     bench.command(280.0)
     mirror.plan = [bad, bad]
@@ -319,7 +325,7 @@ def test_a_failed_mirror_goes_flat_before_it_follows_commands_again(bad: Any, me
 @pytest.mark.parametrize("dtype", [np.float64, np.int32, np.float32])
 def test_positions_of_any_number_type_are_copied_as_float32(dtype: type) -> None:
     mirror, reached = Mirror(), np.full((4, 5), 100, dtype)
-    bench = Bench(mirror)
+    bench = MirrorBench(mirror)
     mirror.plan = [lambda _: reached]
     shape = decode_mirror(bench.command(140.0).SerializeToString())
     assert shape is not None
@@ -330,11 +336,11 @@ def test_positions_of_any_number_type_are_copied_as_float32(dtype: type) -> None
 
 def test_a_hanging_mirror_reports_no_position_and_goes_flat_before_the_next_command() -> None:
     mirror = Mirror()
-    bench = Bench(mirror)
+    bench = MirrorBench(mirror)
     bench.command(100.0)
 
     def hang(shape: Single) -> Single:
-        for _ in range(6):
+        for _ in range(6):  # one notes the call, five are the timeout of 0.5 s
             bench.loop.watch.check()
         state = bench.state()
         assert (state.actuators, state.status) == (b"", wire.MIRROR_STATUS_EXPIRED)
@@ -369,7 +375,7 @@ def test_a_call_that_returns_while_it_is_reported_as_hanging_ends_after_the_repo
 def test_a_mirror_that_fails_at_the_start_is_retried() -> None:
     mirror = Mirror()
     mirror.plan = [lambda _: 1 / 0]
-    bench = Bench(mirror)
+    bench = MirrorBench(mirror)
     assert bench.command(30.0).refused == Rejection.NO_MIRROR
     bench.tick()
     assert bench.command(30.0).refused == 0
@@ -380,7 +386,7 @@ def test_a_mirror_that_fails_at_the_start_is_retried() -> None:
 def test_a_fault_in_the_shape_of_other_programs_is_a_failure_of_the_driver(fault: Callable[[], Any]) -> None:
     mirror = Mirror()
     mirror.beside = fault  # type: ignore[attr-defined]
-    bench = Bench(mirror)
+    bench = MirrorBench(mirror)
     assert bench.command(30.0).refused == Rejection.NO_MIRROR
     assert bench.listener.events() == ["STARTED", "DRIVER_FAILED", "COMMAND_REFUSED"]
 
@@ -388,7 +394,7 @@ def test_a_fault_in_the_shape_of_other_programs_is_a_failure_of_the_driver(fault
 def test_a_mirror_starts_from_the_position_that_its_driver_reads() -> None:
     mirror = Mirror()
     mirror.position = lambda: np.full((4, 5), 200, np.float32)  # type: ignore[attr-defined]
-    bench = Bench(mirror)
+    bench = MirrorBench(mirror)
     bench.command(190.0)
     assert mirror.heights_nm == [190.0], "no jump to flat"
     mirror.plan = [lambda _: 1 / 0] * 3
@@ -402,7 +408,7 @@ def test_a_driver_is_closed_after_its_last_command_and_called_no_more() -> None:
     mirror, calls = Mirror(), list[str]()
     mirror.fill = lambda _: calls.append("fill")  # type: ignore[attr-defined]
     mirror.close = lambda: calls.append("close")  # type: ignore[method-assign]
-    bench = Bench(mirror)
+    bench = MirrorBench(mirror)
     bench.service.stop("the test")
     bench.loop._turn.acquire()  # a command is with the driver
     Timer(0.1, lambda: (calls.append("applied"), bench.loop._turn.release())).start()

@@ -31,7 +31,7 @@ from tests.support.image_streams.plain import PlainStream
 CONFIG = Configuration()
 ROWS, COLUMNS = 6, 8
 GRID = (CONFIG.mirror.rows, CONFIG.mirror.columns)
-UINT16, INT32, FLOAT32 = 3, 6, 9
+UINT16, INT32, FLOAT32 = 3, 6, 9  # codes of ImageStreamIO
 AT_NS = 1_700_000_000_000_000_000
 
 
@@ -61,8 +61,8 @@ def shape_nm(seed: int) -> np.ndarray:
 
 
 def channel(folder: Path, name: str = "dm00disp03", *, make: bool = False) -> PlainStream:
-    made = PlainStream.make if make else PlainStream
-    return made(folder / f"{name}.im.shm", GRID[1], GRID[0], FLOAT32)
+    create_or_open = PlainStream.make if make else PlainStream
+    return create_or_open(folder / f"{name}.im.shm", GRID[1], GRID[0], FLOAT32)
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_a_silent_or_recreated_stream_is_reported_once(folder: Path, monkeypatch
     path = folder / "camnsv.im.shm"
     writer = PlainStream.make(path, COLUMNS, ROWS, UINT16)
     driver, events = camera()
-    driver._image_s += 9.0  # two periods have not passed
+    driver._image_s += 9.0  # as if the last image were newer than two periods
     assert driver.expose() is None
     assert events.events() == ["STARTED"]
     driver._image_s -= 9.0
@@ -235,7 +235,7 @@ class Sum(threading.Thread):
         self.total = channel(folder, "dm00disp", make=True)
         self.others = channel(folder, "dm00disp00", make=True)
         self.own, self.limit, self.running = channel(folder), limit, True
-        self.own.take(4)
+        self.own.take(4)  # its semaphore
         self.start()
 
     def run(self) -> None:
@@ -334,9 +334,9 @@ def test_a_channel_read_between_its_counter_and_its_flag_is_read_again(folder: P
     others = OtherChannels(other_channel_names("dm00disp03"), GRID)
     assert not others.sum().any()
     dark_hole.begin(shape_nm(1) / 1000)
-    dark_hole.pack("<Q", 264, dark_hole.count + 1)
+    dark_hole.pack("<Q", 264, dark_hole.count + 1)  # cnt0
     assert not others.sum().any()
-    dark_hole.pack("B", 288, 0)
+    dark_hole.pack("B", 288, 0)  # write
     assert np.allclose(1000 * others.sum(), shape_nm(1), atol=1e-3)
 
 
@@ -414,7 +414,7 @@ def test_the_stroke_limit_applies_to_the_sum_of_channels() -> None:
     assert not status.limits_hit
 
 
-def test_a_prefix_that_gives_no_name_of_a_stream_is_refused_at_the_start(folder: Path) -> None:
+def test_a_prefix_that_gives_an_invalid_stream_name_is_refused_at_the_start(folder: Path) -> None:
     bus, clock = MemoryBus(MemoryHub(), "operator", FakeClock()), FakeClock()
     for prefix in ("a/b", "x" * 72):
         with pytest.raises(StreamError, match="a stream's name has 1 to 79 characters without '/'"):
@@ -443,7 +443,7 @@ def test_a_refused_report_of_other_channels_is_repeated_every_two_seconds(
     for tick in range(100):
         now_s = tick * 0.1
         others.pass_on()
-    assert requested_s == [0.0, 2.0, 4.0, 6.0]
+    assert requested_s == [0.0, 2.0, 4.0, 6.0], "refused three times, then accepted"
 
 
 def test_a_shape_of_other_channels_is_removed_only_if_the_controller_has_one(folder: Path) -> None:

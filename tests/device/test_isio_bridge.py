@@ -20,7 +20,7 @@ from tests.support.image_streams.plain import PlainStream
 from tests.support.loops import lowfc, refusal
 from tests.support.toy import GRID, calibration
 
-FLOAT32 = 9
+FLOAT32 = 9  # code of ImageStreamIO
 AT_NS = 1_700_000_000_000_000_000
 
 
@@ -31,8 +31,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def stream(folder: Path, name: str, columns: int, rows: int = 1, *, make: bool = False) -> PlainStream:
-    made = PlainStream.make if make else PlainStream
-    return made(folder / f"{name}.im.shm", columns, rows, FLOAT32)
+    create_or_open = PlainStream.make if make else PlainStream
+    return create_or_open(folder / f"{name}.im.shm", columns, rows, FLOAT32)
 
 
 class Run:
@@ -55,15 +55,16 @@ def test_each_step_is_an_image_of_one_row(folder: Path) -> None:
     run.step(error_nm=[3, -4], command_nm=[1, 2], flux_dn=500)
     error, command = (stream(folder, f"night_{name}", 2) for name in ("error", "command"))
     residual, flux = (stream(folder, f"night_{name}", 1) for name in ("residual", "flux"))
-    assert [one.pixels.ravel().tolist() for one in (error, command, residual, flux)] == [[3, -4], [1, 2], [5], [500]]
+    values = [image.pixels.ravel().tolist() for image in (error, command, residual, flux)]
+    assert values == [[3, -4], [1, 2], [5], [500]]
     run.step(command_nm=[1, 3], flux_dn=0)  # a refused frame has no error
     run.steps.put(b"\xff")
     run.streams.pass_on()
-    assert [one.count for one in (error, command, residual, flux)] == [1, 2, 1, 2]
+    assert [image.count for image in (error, command, residual, flux)] == [1, 2, 1, 2]
     assert command.pixels.ravel().tolist() == [1, 3]
     run.step(error_nm=[1, 2, 2], command_nm=[0, 0, 0], flux_dn=1)  # another calibration: the stream is created again
-    again = stream(folder, "night_error", 3)
-    assert (again.count, again.pixels.ravel().tolist(), error.count) == (1, [1, 2, 2], 1)
+    recreated = stream(folder, "night_error", 3)
+    assert (recreated.count, recreated.pixels.ravel().tolist(), error.count) == (1, [1, 2, 2], 1)
 
 
 def test_an_existing_stream_is_adopted_unless_another_process_writes_it(folder: Path) -> None:
@@ -105,13 +106,13 @@ def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkey
     stream(folder, "dm00disp03", GRID[1], GRID[0], make=True).write(np.full(GRID, 9, np.float32))  # the loop's own
     stream(folder, "dm00disp04", GRID[1], GRID[0], make=True).write(np.full(GRID, np.nan, np.float32))
     stream(folder, "dm00disp05", 7, 6, make=True)
-    plain, rounds = bridge.Client.channel, 0
+    real_channel, rounds = bridge.Client.channel, 0
     restarts = iter([False] * 4 + [case == "again"])
 
     def channel(client: bridge.Client, name: str, shape_nm: Any) -> Any:
         if case == "busy" and rounds < 5:
             raise BusError("busy")
-        return plain(client, name, shape_nm)
+        return real_channel(client, name, shape_nm)
 
     def pause(seconds: float) -> None:
         nonlocal rounds
@@ -144,7 +145,7 @@ def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkey
     assert removed.size == 0
     left_out = [line for line in done.stderr.splitlines() if line.startswith("other channels: dm00disp01")]
     assert len(left_out) == (2 if case == "again" else 1)
-    assert all(f"stream 'dm00disp0{one}" in left_out[0] for one in ("5' has 7 x 6", "4' has values that are not"))
+    assert all(f"stream 'dm00disp0{cause}" in left_out[0] for cause in ("5' has 7 x 6", "4' has values that are not"))
     assert done.stderr.count("other channels: not reported to the loop: busy") == (case == "busy")
     assert done.stderr.count("not reported to the loop: no controller") == (case == "late")
 

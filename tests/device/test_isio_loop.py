@@ -28,6 +28,7 @@ pytestmark = [pytest.mark.exclusive, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 GRID = (34, 34)
+UINT16, FLOAT32 = 3, 9  # codes of ImageStreamIO
 CHANNEL = f"{TOTAL}03"
 BENCH = """{cpus}
 [camera]
@@ -52,7 +53,7 @@ MIRROR = "lowfc mirror isio --run bench --config bench.toml"
 CAMERA_DRIVER = "lowfc camera isio --run bench --config bench.toml"
 CONTROLLER = "lowfc controller --run bench --config bench.toml"
 BRIDGE = "lowfc bridge isio --run bench --beside dm00disp03"
-LOOP, LOOP_OF_ONE = (CAMERA_DRIVER, CONTROLLER), (f"{CONTROLLER} --camera isio",)
+LOOP_OF_TWO, LOOP_OF_ONE = (CAMERA_DRIVER, CONTROLLER), (f"{CONTROLLER} --camera isio",)
 DOCUMENTED = (MIRROR, CAMERA_DRIVER, CONTROLLER, BRIDGE, *LOOP_OF_ONE)
 """Commands documented in docs/howto/cacao.md; all are run here."""
 
@@ -83,7 +84,8 @@ class Bench:
         self.process.stdin.write(f"{word}\n")
         self.process.stdin.flush()
 
-    def stopped(self) -> dict[str, float]:
+    def stop(self) -> dict[str, float]:
+        """Stop the bench; return its number of frames and its residual."""
         results: dict[str, float] = json.loads(self.process.communicate("stop\n", timeout=60)[0])
         return results
 
@@ -92,7 +94,7 @@ class Bench:
         self.process.communicate()
 
     def stream(self, name: str) -> PlainStream:
-        return PlainStream(file_of(self.folder, name), GRID[1], GRID[0], 9)
+        return PlainStream(file_of(self.folder, name), GRID[1], GRID[0], FLOAT32)
 
     @contextmanager
     def listening(self) -> Iterator[None]:
@@ -119,7 +121,7 @@ def folder(tmp_path: Path, own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -
     return tmp_path
 
 
-@pytest.mark.parametrize("loop", [LOOP, LOOP_OF_ONE], ids=["two processes", "one process"])
+@pytest.mark.parametrize("loop", [LOOP_OF_TWO, LOOP_OF_ONE], ids=["two processes", "one process"])
 def test_a_loop_runs_on_streams_with_other_mirror_channels(folder: Path, loop: tuple[str, ...]) -> None:
     (folder / "bench.toml").write_text(bench_of(rate_hz=200, preset="quiet", tilt_nm=15))
     with closing(Bench(folder)) as bench, in_background(folder, MIRROR), bench.listening():
@@ -134,7 +136,7 @@ def test_a_loop_runs_on_streams_with_other_mirror_channels(folder: Path, loop: t
         assert other_channel.pixels.any()
 
 
-@pytest.mark.parametrize("loop", [LOOP, LOOP_OF_ONE], ids=["two processes", "one process"])
+@pytest.mark.parametrize("loop", [LOOP_OF_TWO, LOOP_OF_ONE], ids=["two processes", "one process"])
 def test_stream_faults_are_reported_and_recovered_from(folder: Path, loop: tuple[str, ...]) -> None:
     (folder / "bench.toml").write_text(bench_of(rate_hz=200, preset="quiet", tilt_nm=15))
     with closing(Bench(folder)) as bench, in_background(folder, MIRROR, *loop), bench.listening():
@@ -162,11 +164,12 @@ def test_stream_faults_are_reported_and_recovered_from(folder: Path, loop: tuple
 
 
 def _a_stopped_reader_resumes_with_the_newest_image(bench: Bench) -> None:
-    stream = PlainStream(file_of(bench.folder, CAMERA), 80, 80, 3)
+    stream = PlainStream(file_of(bench.folder, CAMERA), 80, 80, UINT16)
     with Client("bench") as client:
         pid = client.processes()["camera"].pid
     os.kill(pid, signal.SIGSTOP)
     try:
+        # No reader takes an image: every semaphore reaches its highest value.
         until(lambda: min(stream.value(index) for index in range(10)) == 10)
         count = stream.count
         until(lambda: stream.count > count + 5)
@@ -181,7 +184,7 @@ def _other_channels_are_not_undone(bench: Bench) -> None:
     with in_background(bench.folder, BRIDGE), Client("bench") as client:
         calibration = client.calibration()
         until(lambda: all(file_of(bench.folder, f"lowfc_{name}").exists() for name in ("flux", "error")))
-        error = PlainStream(file_of(bench.folder, "lowfc_error"), len(calibration.noll), 1, 9)
+        error = PlainStream(file_of(bench.folder, "lowfc_error"), len(calibration.noll), 1, FLOAT32)
         until(lambda: error.count > 20)
         dark_hole = np.random.default_rng(3).standard_normal(GRID) * 0.02
         before = bench.stream(CHANNEL).pixels[0].copy()
@@ -211,7 +214,7 @@ def test_a_minute_at_500_hz_loses_no_frame_and_matches_the_simulated_loop(folder
                 state = client.status().state
         assert not [event for event in bench.events if "FRAMES" in event and "LATE" not in event]
         assert sum(one.count for one in state.counts) < 0.01 * state.frames_used  # late frames
-        results = bench.stopped()
+        results = bench.stop()
     config = '[disturbance]\npreset = "bench"\n[control]\ntilt_gain = 0.5\ngain = 0.2\n'
     direct = loop(folder, "--no-record", "--rate", "500", "--duration", "60", config=config)
     assert results["residual_rms_nm"] == pytest.approx(direct["residual_rms_nm"], rel=0.05)

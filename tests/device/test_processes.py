@@ -26,7 +26,7 @@ from lowfc.device import CameraSettings, Exposure
 
 class Dying:
     def __init__(self, options, config):
-        self.number, self.lives = 0, os.path.exists("died")
+        self.number, self.restarted = 0, os.path.exists("died")
 
     def settings(self):
         return CameraSettings(8, 8, exposure_ns=5_000_000, period_ns=10_000_000)
@@ -34,7 +34,7 @@ class Dying:
     def expose(self):
         time.sleep(0.01)
         self.number += 1
-        if self.number == 30 and not self.lives:
+        if self.number == 30 and not self.restarted:
             open("died", "w").close()
             os._exit(7)
         return Exposure(np.full((8, 8), self.number, np.uint16), None, self.number)
@@ -130,10 +130,11 @@ class Bench:
         (self.folder / "fault").rename(self.folder / name)  # renamed when complete: the driver must not read it empty
         until(lambda: not (self.folder / name).exists())
 
-    def named(self, process: str, event: str) -> int:
+    def count_of(self, process: str, event: str) -> int:
+        """Number of these events since the last injected fault."""
         return self.events.count((process, event))
 
-    def settled(self) -> None:
+    def wait_until_settled(self) -> None:
         """Wait for fifty frames in a row without a rejection and with small errors in closed loop."""
         self.steps.clear()
 
@@ -144,7 +145,7 @@ class Bench:
 
         until(holds, 60)
 
-    def commanded(self, command_nm: list[float]) -> bool:
+    def is_commanded(self, command_nm: list[float]) -> bool:
         """Whether the last command is this one, up to noise."""
         return bool(np.allclose(self.steps[-1].command_nm, command_nm, rtol=0, atol=3))
 
@@ -157,21 +158,21 @@ class Bench:
 def bench(tmp_path: Path, own_runtime: Path) -> Iterator[Bench]:
     (tmp_path / "faulty.py").write_text(FAULTY)
     (tmp_path / "bench.toml").write_text(STILL)
-    made = Bench(tmp_path)
-    with made.listening(), in_background(tmp_path, CONTROLLER, CAMERA):
-        yield made
+    bench = Bench(tmp_path)
+    with bench.listening(), in_background(tmp_path, CONTROLLER, CAMERA):
+        yield bench
 
 
 @pytest.mark.slow
 @pytest.mark.exclusive
 def test_a_camera_hang_of_five_seconds_is_reported_and_the_loop_holds_and_resumes(bench: Bench) -> None:
     with in_background(bench.folder, MIRROR):
-        bench.settled()
+        bench.wait_until_settled()
         bench.inject("camera", "hang")
-        until(lambda: bench.named("camera", "DRIVER_HANGS") and bench.named("controller", "NO_FRAMES"))
-        until(lambda: bench.named("controller", "FRAMES_BACK") and bench.named("camera", "DRIVER_BACK"))
-        assert bench.named("camera", "DRIVER_HANGS") == 1
-        bench.settled()
+        until(lambda: bench.count_of("camera", "DRIVER_HANGS") and bench.count_of("controller", "NO_FRAMES"))
+        until(lambda: bench.count_of("controller", "FRAMES_BACK") and bench.count_of("camera", "DRIVER_BACK"))
+        assert bench.count_of("camera", "DRIVER_HANGS") == 1
+        bench.wait_until_settled()
     assert len(bench.starts) == 1, "its process has not restarted"
 
 
@@ -179,21 +180,21 @@ def test_a_camera_hang_of_five_seconds_is_reported_and_the_loop_holds_and_resume
 @pytest.mark.exclusive
 def test_a_mirror_hang_of_five_seconds_blocks_commands_and_the_mirror_goes_flat_before_the_next(bench: Bench) -> None:
     with in_background(bench.folder, MIRROR):
-        bench.settled()
+        bench.wait_until_settled()
         bench.inject("mirror", "hang")
         begun_s = time.monotonic()
-        until(lambda: bench.named("mirror-dm", "DRIVER_HANGS") and bench.named("controller", "MIRROR_LOST"))
+        until(lambda: bench.count_of("mirror-dm", "DRIVER_HANGS") and bench.count_of("controller", "MIRROR_LOST"))
         before = bench.calls_nm()
         assert min(before[-20:]) > 1, "the mirror has a shape to return from"
         assert (bench.states[-1].actuators, bench.states[-1].status) == (b"", wire.MIRROR_STATUS_EXPIRED)
         until(lambda: list(bench.steps[-1].reasons) == [wire.REASON_NO_MIRROR])
         until(lambda: len(bench.calls_nm()) > len(before))
         assert time.monotonic() - begun_s > 4, "no command arrived while it hung"
-        until(lambda: bench.named("mirror-dm", "DRIVER_BACK") and bench.named("controller", "MIRROR_BACK"))
+        until(lambda: bench.count_of("mirror-dm", "DRIVER_BACK") and bench.count_of("controller", "MIRROR_BACK"))
         repeated_nm, idle_nm = bench.calls_nm()[len(before) :][:2]
         assert (repeated_nm, idle_nm) == (pytest.approx(before[-1], abs=1), 0), "its last shape, then flat"
-        assert bench.named("mirror-dm", "DRIVER_HANGS") == bench.named("controller", "MIRROR_LOST") == 1
-        bench.settled()
+        assert bench.count_of("mirror-dm", "DRIVER_HANGS") == bench.count_of("controller", "MIRROR_LOST") == 1
+        bench.wait_until_settled()
 
 
 @pytest.mark.exclusive
@@ -205,12 +206,12 @@ def test_a_hanging_camera_in_the_controllers_process_does_not_block_the_controll
     bench = Bench(tmp_path)
     both = f"{CONTROLLER} --camera faulty.py:Camera"
     with bench.listening(), in_background(tmp_path, MIRROR, both), ExitStack() as stack:
-        bench.settled()
+        bench.wait_until_settled()
         client = stack.enter_context(Client("bench"))
         processes = client.processes()
         assert processes["camera"].pid == processes["controller"].pid
         bench.inject("camera", "hang")
-        until(lambda: bench.named("camera", "DRIVER_HANGS") and bench.named("controller", "NO_FRAMES"))
+        until(lambda: bench.count_of("camera", "DRIVER_HANGS") and bench.count_of("controller", "NO_FRAMES"))
         client.safe()
         assert client.status().state.mode == wire.LOOP_MODE_SAFE
         ending_s = time.monotonic()
@@ -231,19 +232,19 @@ def test_a_fault_of_the_controllers_camera_gives_an_error_message(tmp_path: Path
 def test_a_dead_mirror_process_is_reported_and_the_loop_holds_until_its_restart(bench: Bench) -> None:
     with subprocess.Popen([*LOWFC, *MIRROR.split()[1:]], cwd=bench.folder) as process:
         try:
-            bench.settled()
+            bench.wait_until_settled()
             time.sleep(1.2)  # two Health messages: the controller returns to the command of the last but one
             before_nm = list(bench.steps[-1].command_nm)
             bench.inject("mirror", "die")
             assert process.wait(10) == 7, "a failure: the units in deploy restart it"
         finally:
             process.kill()
-    until(lambda: bench.named("controller", "MIRROR_LOST"))
-    until(lambda: list(bench.steps[-1].reasons) == [wire.REASON_NO_MIRROR] and bench.commanded(before_nm))
+    until(lambda: bench.count_of("controller", "MIRROR_LOST"))
+    until(lambda: list(bench.steps[-1].reasons) == [wire.REASON_NO_MIRROR] and bench.is_commanded(before_nm))
     calls = len(bench.calls_nm())
     with in_background(bench.folder, MIRROR):
-        until(lambda: bench.named("controller", "MIRROR_BACK"))
+        until(lambda: bench.count_of("controller", "MIRROR_BACK"))
         assert bench.calls_nm()[calls] == 0, "its idle state comes first"
-        bench.settled()
-        assert bench.commanded(before_nm)
-    assert bench.named("controller", "MIRROR_LOST") == 1
+        bench.wait_until_settled()
+        assert bench.is_commanded(before_nm)
+    assert bench.count_of("controller", "MIRROR_LOST") == 1

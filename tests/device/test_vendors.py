@@ -79,7 +79,10 @@ def test_settings_default_to_the_configuration() -> None:
 
 
 class Buffers:
-    """Stand-in for a stream of aravis: buffers of 2 x 3 pixels with the given frame numbers; 0 for a failed buffer."""
+    """Stand-in for a stream of aravis: buffers of 2 x 3 pixels with the given frame numbers; 0 for a failed buffer.
+
+    The last `later` of them are not yet in the queue.
+    """
 
     def __init__(self, *numbers: int, later: int = 99) -> None:
         self.numbers, self.pushed, self.later = list(numbers), 0, later
@@ -121,7 +124,7 @@ def test_gige_frame_numbers_wrap_to_one_and_buffers_are_returned() -> None:
 def test_a_disconnected_camera_is_opened_again(kind: Any) -> None:
     driver, opened = object.__new__(kind), list[str]()
 
-    def again(name: str) -> None:
+    def open_at_the_third_attempt(name: str) -> None:
         opened.append(name)
         if len(opened) < 3:
             raise OSError("no such device")
@@ -130,7 +133,7 @@ def test_a_disconnected_camera_is_opened_again(kind: Any) -> None:
     silent = SimpleNamespace(IsValid=lambda: False)
     driver._camera = SimpleNamespace(IsCameraDeviceRemoved=lambda: not opened, RetrieveResult=lambda *_: silent)
     driver._pylon, driver.start = SimpleNamespace(TimeoutHandling_Return=1), lambda: opened.append("started")
-    driver._open, driver._serial, driver._name, driver._stream = again, "7", "7", Buffers()
+    driver._open, driver._serial, driver._name, driver._stream = open_at_the_third_attempt, "7", "7", Buffers()
     if kind is AravisCamera:
         driver._lose(None)  # the library's signal
     for _ in range(2):
@@ -200,15 +203,15 @@ def fake_camera(request: pytest.FixtureRequest) -> Iterator[None]:
     if program is None:
         pytest.skip("needs arv-fake-gv-camera-0.8 (Debian: apt install aravis-tools)")
     try:
-        found = aravis._aravis()
+        library = aravis._aravis()
     except ConfigurationError as fault:
         pytest.skip(str(fault))
     words = [program, "-i", "127.0.0.1", "-s", "LOWFC", "-r", str(getattr(request, "param", 5))]
     with subprocess.Popen(words) as process:
         try:
             for _ in range(50):
-                found.update_device_list()
-                if found.get_n_devices():
+                library.update_device_list()
+                if library.get_n_devices():
                     break
                 time.sleep(0.1)
             yield
@@ -243,15 +246,15 @@ def test_an_aravis_camera_is_configured_and_incomplete_frames_count_as_lost(fake
 @contextmanager
 def _healths(run_id: str) -> Iterator[dict[str, wire.Health]]:
     """Newest Health of each process of a run, by name."""
-    found: dict[str, wire.Health] = {}
+    newest: dict[str, wire.Health] = {}
 
     def received(sample: Sample) -> None:
         health = wire.Health.FromString(sample.payload)
-        found[health.process] = health
+        newest[health.process] = health
 
     with closing(ZenohBus(open_run(run_id).links, Role.OPERATOR, HostClock())) as bus:
         bus.subscribe(HEALTH, received)
-        yield found
+        yield newest
 
 
 FAILING = """
@@ -309,10 +312,10 @@ def test_a_closed_loop_counts_every_failed_buffer(emulated: None, tmp_path: Path
         time.sleep(1.0)  # wait for a Health of the controller after the last frame
         with Client("failing") as client:
             status = client.status().state
-    (sent,) = (one for one in health["camera"].topics if one.topic == FRAME.key)
-    (received,) = (one for one in health["controller"].topics if one.topic == FRAME.key)
+    (sent,) = (count for count in health["camera"].topics if count.topic == FRAME.key)
+    (received,) = (count for count in health["controller"].topics if count.topic == FRAME.key)
     refusals = (wire.REASON_LATE, wire.REASON_SATURATED, wire.REASON_DARK, wire.REASON_STUCK)
-    refused = sum(one.count for one in status.counts if one.reason in refusals)
+    refused = sum(entry.count for entry in status.counts if entry.reason in refusals)
     failed = int((tmp_path / "failed").read_text())
     print(
         f"{health['camera'].mean_rate_hz:.0f} Hz: {sent.published} frames, {sent.missing} lost, {failed} buffers failed"
@@ -382,6 +385,6 @@ def _conforms(folder: Path, driver: str, options: str, rate_hz: float) -> None:
     words = "--run vendor --config bench.toml"
     with _healths("vendor") as health, in_background(folder, f"lowfc camera {driver} {words}"):
         until(lambda: "camera" in health and health["camera"].state == "running")
-        found = json.loads(command(folder, f"lowfc conformance camera {words} --json"))
-    wrong = [check for check in found["checks"] if check["status"] == "wrong"]
+        results = json.loads(command(folder, f"lowfc conformance camera {words} --json"))
+    wrong = [check for check in results["checks"] if check["status"] == "wrong"]
     assert not wrong

@@ -77,7 +77,7 @@ class BmcDm:
         return 0
 
 
-def test_the_boston_mirror_example(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_boston_mirror_example_sends_values_and_raises_the_vendors_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "bmc", SimpleNamespace(BmcDm=BmcDm, NO_ERR=0))
     monkeypatch.setattr(sys, "path", list(sys.path))
     name = f"{ROOT}/examples/boston_mirror.py:BostonMirror"
