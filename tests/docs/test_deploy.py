@@ -96,7 +96,8 @@ def analyze(folder: Path, *words: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(["systemd-analyze", *words], cwd=folder, capture_output=True, text=True, check=False)
 
 
-def exposure(folder: Path, name: str) -> float:
+def exposure_score(folder: Path, name: str) -> float:
+    """Score of a unit in `systemd-analyze security`, 0 (safe) to 10."""
     done = analyze(folder, "security", "--offline=yes", "--no-pager", name)
     return float(re.search(rf"exposure level for {name}: ([\d.]+)", done.stdout)[1])  # type: ignore[index]
 
@@ -114,9 +115,11 @@ def test_systemd_accepts_the_units(units: Path) -> None:
 
 @needs_systemd
 def test_the_units_are_hardened(units: Path, tmp_path: Path) -> None:
-    assert {name: exposure(units, name) for name in UNITS if exposure(units, name) >= MAX_EXPOSURE_SCORE} == {}
+    assert {
+        name: exposure_score(units, name) for name in UNITS if exposure_score(units, name) >= MAX_EXPOSURE_SCORE
+    } == {}
     shutil.copy(units / UNITS[0], tmp_path)
-    assert exposure(tmp_path, UNITS[0]) > 3 * MAX_EXPOSURE_SCORE  # without the common drop-in
+    assert exposure_score(tmp_path, UNITS[0]) > 3 * MAX_EXPOSURE_SCORE  # without the common drop-in
 
 
 @needs_systemd
@@ -151,8 +154,8 @@ def test_the_units_match_the_programs_and_the_configuration() -> None:
         assert unit["Type"] == ["notify"]
         assert unit["Restart"] == ["on-failure"]
         assert unit["After"][-1] == "network.target time-sync.target"
-        controls = command(name)[:2] == ["lowfc", "controller"]  # compiles the fused step, if configured
-        assert ("MemoryDenyWriteExecute" in unit) != controls
+        is_controller = command(name)[:2] == ["lowfc", "controller"]  # compiles the fused step, if configured
+        assert ("MemoryDenyWriteExecute" in unit) != is_controller
         assert f"NUMBA_CACHE_DIR=/var/cache/{unit['CacheDirectory'][0]}/numba" in unit["Environment"]
         assert unit["WantedBy"] == unit["PartOf"] == ["lowfc.target"]
         priority = {"lowfc-recorder.service": realtime.recorder_priority, "lowfc-viewer.service": 0}.get(
@@ -228,12 +231,13 @@ def test_the_containers_run_the_commands_of_the_units() -> None:
     assert program(services["controller"]["healthcheck"]["test"][1:]) == "ctl"
     for name in ("controller", "recorder"):  # latch and logs; the root is read-only
         assert any(volume.endswith(":/var/lib/lowfc") for volume in services[name]["volumes"])
-    built = (DEPLOY / "Containerfile").read_text()
-    last = built.rpartition("\nFROM ")[2]
-    assert re.search(r"^USER [1-9]\d*:[1-9]\d*$", last, re.MULTILINE)
-    assert all(":" in image and "latest" not in image for image in re.findall(r"^FROM (\S+)", built, re.MULTILINE))
-    for word in re.findall(r"^COPY (?!--)(.+) \S+$", built, re.MULTILINE):
-        assert all((DEPLOY.parent / source).exists() or source == "build/dist/" for source in word.split())
+    containerfile = (DEPLOY / "Containerfile").read_text()
+    last_stage = containerfile.rpartition("\nFROM ")[2]
+    assert re.search(r"^USER [1-9]\d*:[1-9]\d*$", last_stage, re.MULTILINE)
+    images = re.findall(r"^FROM (\S+)", containerfile, re.MULTILINE)
+    assert all(":" in image and "latest" not in image for image in images)
+    for sources in re.findall(r"^COPY (?!--)(.+) \S+$", containerfile, re.MULTILINE):
+        assert all((DEPLOY.parent / source).exists() or source == "build/dist/" for source in sources.split())
 
 
 class Manager:
@@ -307,12 +311,13 @@ class Supervised:
 def test_processes_notify_ready_watchdog_and_stopping(tmp_path: Path) -> None:
     with contextlib.ExitStack() as stack:
         names = ("recorder", "sim-mirror", "controller", "sim-camera")
-        found = {name: stack.enter_context(contextlib.closing(Supervised(name, tmp_path))) for name in names}
-        for one in found.values():
+        processes = {name: stack.enter_context(contextlib.closing(Supervised(name, tmp_path))) for name in names}
+        for one in processes.values():
             until(lambda one=one: "READY=1" in one.manager.notifications and one.manager.beats > 5)
-            most = (time.monotonic() - one.manager.begun_s) / (WAIT_S / 2) + 2
-            assert one.manager.beats <= most, f"{one.name} sends WATCHDOG=1 too often"
-        controller, mirror = found["controller"], found["sim-mirror"]
+            # One in half of the timeout, as systemd advises, and two more.
+            most_beats = (time.monotonic() - one.manager.begun_s) / (WAIT_S / 2) + 2
+            assert one.manager.beats <= most_beats, f"{one.name} sends WATCHDOG=1 too often"
+        controller, mirror = processes["controller"], processes["sim-mirror"]
         until(lambda: re.fullmatch(r"running, open, \d+ Hz", controller.manager.status()))
 
         def quiet() -> bool:
@@ -333,20 +338,23 @@ def test_processes_notify_ready_watchdog_and_stopping(tmp_path: Path) -> None:
         controller.process.send_signal(signal.SIGABRT)  # as by systemd
         assert controller.process.wait(20) == -signal.SIGABRT
         assert "advance_or_hang" in controller.stderr_file.read_text()  # the journal shows where it hung
-        stopped = [one for one in found.values() if one is not controller]
-        for one in stopped:
+        remaining = [one for one in processes.values() if one is not controller]
+        for one in remaining:
             assert "STOPPING=1" not in one.manager.notifications
             one.process.send_signal(signal.SIGTERM)
+        # A list, so that each round reads every queue: a full one would drop the last notifications.
         until(
-            lambda: False not in [bool(one.manager.notifications) and one.process.poll() is not None for one in stopped]
+            lambda: (
+                False not in [bool(one.manager.notifications) and one.process.poll() is not None for one in remaining]
+            )
         )
-        for one in stopped:
+        for one in remaining:
             assert one.process.returncode == 0, one.stderr_file.read_text()
             assert one.manager.notifications.count("READY=1") == one.manager.notifications.count("STOPPING=1") == 1
             assert one.manager.status().startswith("stopped")
 
 
-def test_a_watchdog_of_another_process_and_a_missing_manager_are_ignored(tmp_path: Path) -> None:
+def test_a_watchdog_of_another_process_and_a_missing_service_manager_are_ignored(tmp_path: Path) -> None:
     variables = {"NOTIFY_SOCKET": str(tmp_path / "nobody"), "WATCHDOG_USEC": "1000000"}
     assert Supervisor(variables | {"WATCHDOG_PID": str(os.getpid())}).period_ns == 500_000_000
     no_timeout = variables | {"WATCHDOG_USEC": "0"}
@@ -359,7 +367,7 @@ def test_a_watchdog_of_another_process_and_a_missing_manager_are_ignored(tmp_pat
         unsupervised.send_status(wire.Health())
 
 
-def test_the_loop_does_not_wait_for_a_manager_that_does_not_read() -> None:
+def test_the_loop_does_not_wait_for_a_service_manager_that_does_not_read() -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind("")  # an abstract socket, as systemd may use
         name = manager.getsockname().decode().replace("\0", "@", 1)
@@ -369,7 +377,7 @@ def test_the_loop_does_not_wait_for_a_manager_that_does_not_read() -> None:
         assert manager.recv(4096) == b"WATCHDOG=1"
 
 
-def test_a_managers_socket_may_have_an_at_sign_in_its_name(tmp_path: Path) -> None:
+def test_the_service_managers_socket_may_have_an_at_sign_in_its_name(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "user@1.sock"))
         manager.setblocking(False)

@@ -144,14 +144,14 @@ LOGS = (
 
 @pytest.mark.exclusive
 @pytest.mark.slow
-def test_the_loop(tmp_path: Path) -> None:
+def test_the_documented_loop_runs_and_writes_one_log(tmp_path: Path) -> None:
     assert "frame to command" in run(tmp_path, LOOP)
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
 
 
 @pytest.mark.exclusive
 @pytest.mark.slow
-def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
+def test_the_documented_requests_are_answered(tmp_path: Path, own_runtime: Path) -> None:
     loop = start(tmp_path, "sim-loop", "--rate", "100", "--no-record")
     try:
         status = [sys.executable, "-m", "lowfc", "ctl", "status"]
@@ -174,7 +174,7 @@ def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
 @pytest.mark.exclusive
 @pytest.mark.slow
 @pytest.mark.parametrize("recorder", [BY_HAND[3], RECORD_SELECTED])
-def test_the_processes_started_separately(tmp_path: Path, recorder: str) -> None:
+def test_the_documented_processes_start_separately(tmp_path: Path, recorder: str) -> None:
     with in_background(tmp_path, *BY_HAND[:3], recorder) as all_stderr:
         status = [sys.executable, "-m", "lowfc", "ctl", "status", "--run", "bench"]
         until(lambda: subprocess.run(status, cwd=tmp_path, capture_output=True, check=False).returncode == 0, 120)
@@ -188,14 +188,14 @@ def test_the_processes_started_separately(tmp_path: Path, recorder: str) -> None
 
 @pytest.mark.exclusive
 @pytest.mark.slow
-def test_the_bench(tmp_path: Path) -> None:
+def test_the_documented_benchmarks_print_their_results(tmp_path: Path) -> None:
     assert "rank" in run(tmp_path, BENCH[0])
     assert "longest wait" in run(tmp_path, BENCH[1])
 
 
 @pytest.mark.slow
 @on_screen
-def test_the_views(tmp_path: Path) -> None:
+def test_the_documented_views_open_and_save_files(tmp_path: Path) -> None:
     loop = start(tmp_path, *UNTIL_INTERRUPTED[0].split()[1:], "--rate", "100")
     try:
         until(lambda: recorded_bytes(tmp_path) > 4e6)
@@ -221,14 +221,14 @@ def view_and_interrupt(folder: Path, line: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_validation(tmp_path: Path) -> None:
+def test_the_documented_validation_prints_its_tables(tmp_path: Path) -> None:
     printed = run(tmp_path, VALIDATE[0])
     assert "tilt" in printed
     assert "peak" in printed
 
 
 @pytest.mark.slow
-def test_the_loop_runs_with_the_designs(tmp_path: Path) -> None:
+def test_the_loop_runs_with_the_documented_designs(tmp_path: Path) -> None:
     for line in DESIGN:
         run(tmp_path, line)
     (tmp_path / "own.toml").write_text('[sensor]\npupil = "pupil.npz"\nsam = "mask.json"\n')
@@ -236,7 +236,7 @@ def test_the_loop_runs_with_the_designs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_logs(tmp_path: Path) -> None:
+def test_the_documented_commands_read_a_log(tmp_path: Path) -> None:
     run(tmp_path, "lowfc sim-loop --lockstep --rate 200 --duration 2 --json")
     printed = [run(tmp_path, line) for line in LOGS]
     assert "lowfc/camera/frame" in printed[0]
@@ -251,7 +251,7 @@ def test_the_logs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_configuration(tmp_path: Path) -> None:
+def test_the_documented_configuration_is_written_checked_and_used(tmp_path: Path) -> None:
     for line in FILES[:-1]:
         output_of(tmp_path, line)
     run(tmp_path, FILES[-1])

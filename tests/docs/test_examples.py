@@ -26,22 +26,27 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
     return in_this_process
 
 
-def test_photon_budget(run: Callable[..., list[str]]) -> None:
+def test_the_photon_budget_of_a_fainter_star_has_less_light_and_more_tilt_noise(run: Callable[..., list[str]]) -> None:
     rows = [[float(word) for word in line.split()] for line in run("photon_budget")[2:]]
     (magnitude, light_e, tilt_mas, _), (fainter, less_e, more_mas, _) = rows
-    assert (magnitude, fainter) == (2, 5)
+    assert (magnitude, fainter) == (2, 5)  # a factor of 10^(0.4 x 3) in light
     assert light_e / less_e == pytest.approx(10**1.2, rel=0.02)
     assert 10**0.6 < more_mas / tilt_mas < 10**1.2  # between photon noise alone and read noise alone
 
 
-def test_loop_design(run: Callable[..., list[str]]) -> None:
+def test_the_loop_design_lists_limiting_gains_and_residuals_that_grow_with_the_delay(
+    run: Callable[..., list[str]],
+) -> None:
     rows = [[float(word) for word in line.split()] for line in run("loop_design")[2:]]
-    assert [row[1] for row in rows if row[0] in (1, 2)] == [2, 1]  # 2 sin(pi / (2 (2d - 1)))
+    assert [row[1] for row in rows if row[0] in (1, 2)] == [
+        2,
+        1,
+    ]  # limiting gain of a delay d: 2 sin(pi / (2 (2d - 1)))
     residuals = [row[3] for row in rows]
     assert residuals == sorted(residuals)
 
 
-def test_log_to_pandas(run: Callable[..., list[str]]) -> None:
+def test_a_log_becomes_a_data_frame_with_a_column_for_each_mode(run: Callable[..., list[str]]) -> None:
     rows = [line.split() for line in run("log_to_pandas", str(ROOT / "tests/golden/0.1/night.mcap"))[1:]]
     assert [row[0] for row in rows] == [
         *(f"{name}_z{noll}_nm" for name in ("error", "pol", "command") for noll in (2, 3)),
@@ -51,7 +56,7 @@ def test_log_to_pandas(run: Callable[..., list[str]]) -> None:
     assert rows[-1][1] == "163.0"
 
 
-def test_compare_nights(run: Callable[..., list[str]]) -> None:
+def test_a_night_compared_with_itself_is_the_same(run: Callable[..., list[str]]) -> None:
     log = str(ROOT / "tests/golden/0.1/night.mcap")
     lines = run("compare_nights", f"{log} {log}")
     assert lines[:3] == ["verdict", "    Not a good run", "    Not a good run"]

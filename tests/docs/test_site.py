@@ -43,7 +43,7 @@ def without_collector() -> Iterator[None]:
 def test_the_site_has_every_page_and_every_declared_name(
     complete: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Broken links and pages outside an index are warnings.
+    """Broken links and pages outside an index are warnings, and a warning fails the build.
 
     Only the complete site includes docstrings, every row of the longest page, and the index of the search.
     """

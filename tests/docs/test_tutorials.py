@@ -1,6 +1,7 @@
 """Tutorials: the commands of each page in order, except real-time loops and views.
 
-The last tests and `test_docs` run those. Only the short form of the first page and the bad night are fast.
+The last tests here and `test_docs` run real-time loops and views. Only the short form of the first page and the bad
+night are fast.
 """
 
 import re
@@ -35,9 +36,9 @@ def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str
     for name, content in re.findall(r"Save this as `(\S+)`.*?```\w+\n(.*?)```", text, re.DOTALL):
         (folder / name).write_text(content)
     printed = {}
-    for found in re.findall(r"^    (\S.*)$", text, re.MULTILINE):
-        line = found.split("  #")[0].strip()
-        if not NOT_FOLLOWED.search(line):  # it ends by itself and needs no loop
+    for with_comment in re.findall(r"^    (\S.*)$", text, re.MULTILINE):
+        line = with_comment.split("  #")[0].strip()
+        if not NOT_FOLLOWED.search(line):  # the command ends by itself and needs no loop
             short = line.replace("--duration 20", "--duration 0.5") if shorter else line
             printed[line] = (output_of if _IN_THIS_PROCESS.match(line) else command)(folder, short)
     return printed
@@ -49,7 +50,7 @@ def tilt_mas(summary: str) -> float:
 
 
 @pytest.mark.parametrize("shorter", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_first_loop(tmp_path: Path, shorter: bool, request: pytest.FixtureRequest) -> None:
+def test_the_first_loop_tutorial_runs_as_written(tmp_path: Path, shorter: bool, request: pytest.FixtureRequest) -> None:
     if shorter:
         request.getfixturevalue("without_drawings")
     first, info, report, replay, what_if, digest = followed(tmp_path, "first_loop", shorter=shorter).values()
@@ -62,7 +63,7 @@ def test_first_loop(tmp_path: Path, shorter: bool, request: pytest.FixtureReques
 
 
 @pytest.mark.slow
-def test_tuned_law(tmp_path: Path) -> None:
+def test_the_tuned_law_tutorial_gives_the_pages_numbers(tmp_path: Path) -> None:
     computed, integrator, tuned, law = followed(tmp_path, "tuned_law").values()
     assert "computed.fits" in computed
     assert "written: lqg.fits" in tuned
@@ -70,7 +71,7 @@ def test_tuned_law(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_design_mask(tmp_path: Path) -> None:
+def test_the_design_mask_tutorial_runs_as_written(tmp_path: Path) -> None:
     design, *loops = followed(tmp_path, "design_mask").values()
     assert "written to mask.json" in design
     assert len(loops) == 3
@@ -78,9 +79,9 @@ def test_design_mask(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_drawings")  # `test_golden` has those of this log
-def test_bad_night(tmp_path: Path) -> None:
+def test_the_bad_night_tutorial_runs_as_written(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "tests" / "golden", tmp_path / "tests" / "golden")
-    info, report, replay, killed, recovered, whole = followed(tmp_path, "bad_night").values()
+    info, report, replay, killed, recovered, recovered_info = followed(tmp_path, "bad_night").values()
     assert "FRAMES_REFUSED 6, NO_FRAMES 3" in info
     assert report.startswith("Not a good run: ")
     assert (tmp_path / "night.html").is_file()
@@ -88,12 +89,12 @@ def test_bad_night(tmp_path: Path) -> None:
     assert "rule changed" in replay
     assert "completes it" in killed
     assert "whole.mcap" in recovered
-    assert re.search(r"^state +complete$", whole, re.MULTILINE)
+    assert re.search(r"^state +complete$", recovered_info, re.MULTILINE)
 
 
 @pytest.mark.slow
 @pytest.mark.exclusive
-def test_tuned_law_with_a_real_time_loop(tmp_path: Path, own_runtime: Path) -> None:
+def test_the_tuned_law_tutorial_runs_with_a_real_time_loop(tmp_path: Path, own_runtime: Path) -> None:
     command(tmp_path, "lowfc calibrate --method analytic --out computed.fits")
     loop = start(tmp_path, *LIVE[0].split()[1:])
     try:
@@ -108,7 +109,7 @@ def test_tuned_law_with_a_real_time_loop(tmp_path: Path, own_runtime: Path) -> N
 
 @pytest.mark.slow
 @pytest.mark.exclusive
-def test_bad_night_with_an_injected_fault(tmp_path: Path, own_runtime: Path) -> None:
+def test_the_bad_night_tutorial_keeps_the_log_of_an_injected_fault(tmp_path: Path, own_runtime: Path) -> None:
     command(tmp_path, CHAOS)
     assert list((tmp_path / "bad").rglob("*.mcap"))
 
@@ -116,7 +117,7 @@ def test_bad_night_with_an_injected_fault(tmp_path: Path, own_runtime: Path) -> 
 @pytest.mark.basler
 @pytest.mark.slow
 @pytest.mark.exclusive
-def test_your_camera_with_the_vendors_emulation(
+def test_the_your_camera_tutorial_passes_with_the_vendors_emulation(
     tmp_path: Path, own_runtime: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = (PAGES / "your_camera.md").read_text()
