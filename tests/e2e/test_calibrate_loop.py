@@ -32,8 +32,8 @@ disable_cpu_idle = false
 @pytest.mark.slow
 def test_an_interrupted_calibration_of_a_running_loop_is_resumed(tmp_path: Path) -> None:
     (tmp_path / "test.toml").write_text(CONFIG)
-    how = ("--config", "test.toml", "--no-record", "--open", "--lockstep")  # nothing is late on a busy host
-    loop = start(tmp_path, "sim-loop", *how)
+    options = ("--config", "test.toml", "--no-record", "--open", "--lockstep")  # nothing is late on a busy host
+    loop = start(tmp_path, "sim-loop", *options)
     try:
         until(running)
         calibrating = start(tmp_path, "calibrate", "--cycles", "400", "--out", "night.fits")
@@ -46,23 +46,23 @@ def test_an_interrupted_calibration_of_a_running_loop_is_resumed(tmp_path: Path)
         done = run(tmp_path, "calibrate", "--cycles", "5", "--resume", "--out", "night.fits", "--json")
         assert done.returncode == 0, done.stderr
         assert "continuing after" in done.stderr
-        found = json.loads(done.stdout)
-        assert {"method", "modes", "condition_number", "delay_frames", "noise_gain_nm", "file"} <= found.keys()
-        assert found["delay_frames"] == pytest.approx(1.5, abs=0.05)
-        assert found["cross_talk"] < 0.02 + 4 * found["cross_talk_error"]
-        assert found["recommended"]
+        results = json.loads(done.stdout)
+        assert {"method", "modes", "condition_number", "delay_frames", "noise_gain_nm", "file"} <= results.keys()
+        assert results["delay_frames"] == pytest.approx(1.5, abs=0.05)
+        assert results["cross_talk"] < 0.02 + 4 * results["cross_talk_error"]
+        assert results["recommended"]
         assert not (tmp_path / "night.fits.part.npz").exists()
-        made = calibration_file.load(tmp_path / "night.fits")
+        calibration = calibration_file.load(tmp_path / "night.fits")
         with Client() as client:
             assert flat(client)
-            talk = cross_talk(made.reconstructor, client.calibration().response)
-            assert np.abs(talk).max() == np.float64(found["cross_talk"])
-            client.load(made)
-            assert client.calibration().id == made.id
+            talk = cross_talk(calibration.reconstructor, client.calibration().response)
+            assert np.abs(talk).max() == np.float64(results["cross_talk"])
+            client.load(calibration)
+            assert client.calibration().id == calibration.id
             client.close_loop()
             time.sleep(0.5)
             state = client.status().state
-            assert np.abs(np.array(state.command_history_nm)).max() < 5
+            assert np.abs(np.array(state.command_history_nm)).max() < 5, "without a disturbance there is little to do"
     finally:
         interrupt(loop)
 
@@ -73,7 +73,7 @@ def flat(client: Client) -> bool:
     return not np.frombuffer(state.actuators, np.float32).any()
 
 
-TOML = """
+REJECTION_CONFIG = """
 [star]
 magnitude = -1.0
 [sensor]
@@ -91,7 +91,7 @@ lowest_hz = 1.5
 
 @pytest.mark.slow
 def test_rejection_of_a_running_loop_and_of_its_log(tmp_path: Path) -> None:
-    (tmp_path / "loop.toml").write_text(TOML)
+    (tmp_path / "loop.toml").write_text(REJECTION_CONFIG)
     words = ("--duration", "4", "--lines", "8", "--json", "--plot", "live.png")
     loop = start(tmp_path, "sim-loop", "--config", "loop.toml", "--lockstep")  # nothing is late on a busy host
     try:

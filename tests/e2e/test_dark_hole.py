@@ -14,7 +14,7 @@ from tests.support.loops import payloads, run
 pytestmark = pytest.mark.slow
 
 GRID = (34, 34)
-DEAD = (352, 561, 595, 757)
+DEAD = (352, 561, 595, 757)  # indices of actuators, row by row
 STEP_RMS_NM = 2.0
 
 
@@ -55,7 +55,7 @@ def test_without_the_shift_the_loop_undoes_the_steps(dark_hole_run: DarkHoleRun)
     assert undone == pytest.approx(1, abs=0.1)
 
 
-def test_the_residual_is_as_small_as_before(dark_hole_run: DarkHoleRun) -> None:
+def test_the_residual_grows_by_less_than_a_fifth(dark_hole_run: DarkHoleRun) -> None:
     before_nm, after_nm = dark_hole_run.channels[SHIFTED].residual_nm
     assert before_nm < 3
     assert after_nm < 1.2 * before_nm
@@ -68,9 +68,11 @@ def test_commands_contain_the_flat_map_and_leave_dead_actuators_at_zero(logged: 
     messages = [wire.MirrorCommand.FromString(body) for body in logged[f"/{COMMAND.at('dm')}"][:300]]
     assert len(messages) == 300
     for message in messages:
-        beside = np.frombuffer(message.actuators, "<f4") - calibration.modes_to_actuators @ message.command_nm
+        other_channels_nm = (
+            np.frombuffer(message.actuators, "<f4") - calibration.modes_to_actuators @ message.command_nm
+        )
         assert not np.frombuffer(message.actuators, "<f4")[list(DEAD)].any()
-        np.testing.assert_allclose(beside, expected, atol=1e-3)
+        np.testing.assert_allclose(other_channels_nm, expected, atol=1e-3)
 
 
 def test_the_mean_command_is_published_once_a_second(logged: dict[str, list[bytes]]) -> None:
@@ -92,7 +94,7 @@ def test_the_mean_command_is_published_once_a_second(logged: dict[str, list[byte
 def test_the_run_is_replayed_to_the_bit(dark_hole_run: DarkHoleRun) -> None:
     done = run(dark_hole_run.log.parent, "replay", "--json", str(dark_hole_run.log))
     assert done.returncode == 0, done.stdout + done.stderr
-    found = json.loads(done.stdout)
-    assert found["identical"]
-    assert found["largest_difference_nm"] == 0
-    assert found["requests"] > STEPS
+    results = json.loads(done.stdout)
+    assert results["identical"]
+    assert results["largest_difference_nm"] == 0
+    assert results["requests"] > STEPS

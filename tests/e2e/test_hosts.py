@@ -41,22 +41,23 @@ router = "tls/{ROUTER_ADDRESS}:{PORT}"
 certificates = "CERTIFICATES"
 """
 SHIFTS_NS = {"camera": 37_000_000, "controller": -250_000_000, "mirror": 3_000_000_000, "desk": -1_000_000}
+"""Offset of each host's clock."""
 PLACES = {"camera": "camera", "controller": "controller", "mirror-dm": "mirror", "recorder": "desk"}
-"""Process -> host."""
+"""Host of each process."""
 SUPPORT = Path(__file__).parents[1] / "support"
 ROLES = roles(["mirror-dm"])
 
 
-def copy_certificates(host: Host, authority: Path, *given: str) -> None:
+def copy_certificates(host: Host, authority: Path, *roles_of_host: str) -> None:
     """Copy the certificates of these roles to a host."""
     folder = host.folder / "certs"
     folder.mkdir(mode=0o700, exist_ok=True)
-    for name in ("ca.pem", *(f"{role}.{kind}" for role in given for kind in ("pem", "key"))):
+    for name in ("ca.pem", *(f"{role}.{kind}" for role in roles_of_host for kind in ("pem", "key"))):
         (folder / name).write_bytes((authority / name).read_bytes())
 
 
 class Bench:
-    """The loop on its hosts, and what an observer on the router's host receives of it."""
+    """The loop on its hosts, and an observer of its messages on the router's host."""
 
     def __init__(self, folder: Path) -> None:
         self.authority = folder / "authority"
@@ -89,25 +90,25 @@ class Bench:
         self.lab.middle.start("observer", str(SUPPORT / "host_observer.py"), RUN, config, "viewer")
 
     def begin(self, host: Host, name: str) -> None:
-        host.start(name, *self.line(host, name))
+        host.start(name, *self.arguments(host, name))
 
-    def line(self, host: Host, name: str) -> list[str]:
+    def arguments(self, host: Host, name: str) -> list[str]:
         """Arguments of Python for a process on a host."""
         words = [word.format(folder=host.folder) for word in self.words[name]]
         return [*words, "--run", RUN, "--config", str(host.folder / "lowfc.toml")]
 
-    def seen(self) -> list[dict[str, Any]]:
-        """Everything that the observer printed so far."""
+    def reports(self) -> list[dict[str, Any]]:
+        """Every report of the observer so far, one each tenth of a second."""
         lines = self.lab.middle.stderr("observer").splitlines()
-        found = []
+        reports = []
         for line in lines:
             with contextlib.suppress(json.JSONDecodeError):
-                found.append(json.loads(line))
-        return found
+                reports.append(json.loads(line))
+        return reports
 
     def newest(self) -> dict[str, Any]:
-        seen = self.seen()
-        return seen[-1] if seen else {"good": 0, "following": 0, "status": "", "events": {}}
+        reports = self.reports()
+        return reports[-1] if reports else {"good": 0, "following": 0, "status": "", "events": {}}
 
     def events(self, name: str) -> int:
         return int(self.newest()["events"].get(name, 0))
@@ -121,10 +122,10 @@ class Bench:
 
     def wait_until_settled(self, timeout_s: float = 40) -> None:
         """Wait for more than 20 consecutive good frames and mirror states, received from now on."""
-        start = len(self.seen())
+        start = len(self.reports())
 
         def good() -> bool:
-            new = self.seen()[start:]
+            new = self.reports()[start:]
             received = all(sum(one[what] for one in new) > 30 for what in ("steps", "states"))
             return received and new[-1]["good"] > 20 and new[-1]["following"] > 20
 
@@ -196,7 +197,7 @@ def test_a_log_of_several_hosts_states_the_clock_error_of_its_latencies(bench: B
     results = json.loads(done.stdout)
     bound_us = results["host"]["clock_error_us"]
     assert bound_us > 0
-    # by the hosts' own clocks, frames would come 287 ms before they are sent, and the mirror 3 s after them
+    # By the hosts' own clocks, frames would arrive 287 ms before they are sent, and the mirror would move 3 s later.
     for span in ("frame_to_command", "frame_to_mirror", "command_to_mirror"):
         assert -bound_us < results["latency_us"][span]["p50"] < 100_000
     text = desk.run("-m", "lowfc", "latency", str(log), timeout_s=90)
@@ -209,9 +210,9 @@ def test_without_the_cameras_link_the_command_is_held_and_repeated(bench: Bench)
     before = bench.events("controller NO_FRAMES")
     with bench.lab.cut("camera"):
         bench.wait(lambda: bench.events("controller NO_FRAMES") > before, "NO_FRAMES")
-        start = len(bench.seen())
-        bench.wait(lambda: len(bench.seen()) > start + 15, "output of a second and a half")
-        during = bench.seen()[start + 5 :]
+        start = len(bench.reports())
+        bench.wait(lambda: len(bench.reports()) > start + 15, "output of a second and a half")
+        during = bench.reports()[start + 5 :]
         # the controller repeats the held command, so that it does not expire at the mirror
         assert all(one["steps"] == 0 for one in during)
         assert all(one["status"] == "MIRROR_STATUS_FOLLOWING" for one in during)
@@ -228,9 +229,9 @@ def test_without_the_mirrors_link_its_command_timeout_acts(bench: Bench) -> None
     with bench.lab.cut("mirror"):
         bench.wait(lambda: mirror.stderr("mirror-dm").count("COMMAND_EXPIRED") > before, "COMMAND_EXPIRED")
         assert "relaxing to flat" in mirror.stderr("mirror-dm")
-        start = len(bench.seen())
-        bench.wait(lambda: len(bench.seen()) > start + 10, "output of a second")
-        assert sum(one["states"] for one in bench.seen()[start + 5 :]) == 0
+        start = len(bench.reports())
+        bench.wait(lambda: len(bench.reports()) > start + 10, "output of a second")
+        assert sum(one["states"] for one in bench.reports()[start + 5 :]) == 0
     bench.wait_until_settled()
 
 
@@ -250,18 +251,18 @@ def test_without_the_desks_link_the_loop_continues(bench: Bench) -> None:
     bench.wait_until_settled()
     events = ("controller NO_FRAMES", "mirror-dm COMMAND_EXPIRED")
     before, lost = [bench.events(name) for name in events], bench.events("recorder MESSAGES_LOST")
-    start = len(bench.seen())
+    start = len(bench.reports())
     with bench.lab.cut("desk"):
-        bench.wait(lambda: len(bench.seen()) > start + 40, "output of four seconds")
+        bench.wait(lambda: len(bench.reports()) > start + 40, "output of four seconds")
         assert [bench.events(name) for name in events] == before
-        during = bench.seen()[start:]
+        during = bench.reports()[start:]
         assert sum(one["steps"] for one in during) > 0.8 * 4 * bench.rate_hz
         assert sum("FOLLOWING" in one["status"] for one in during) > 0.9 * len(during)
     bench.wait(lambda: bench.events("recorder MESSAGES_LOST") > lost, "report of the recorder's losses")
     bench.wait_until_settled()
 
 
-def test_the_router_may_die_and_come_back(bench: Bench) -> None:
+def test_the_loop_recovers_after_a_restart_of_the_router(bench: Bench) -> None:
     bench.wait_until_settled()
     router = bench.lab.middle.children.pop("router")
     router.process.kill()
@@ -332,7 +333,7 @@ def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(be
     bench.wait(
         lambda: (
             bench.events("mirror-dm COMMAND_REFUSED") > before
-            or any(one["highest_nm"] > 90 for one in bench.seen()[-30:])
+            or any(one["highest_nm"] > 90 for one in bench.reports()[-30:])
         ),
         "forged command at the mirror",
     )
@@ -350,13 +351,13 @@ def test_a_forger_gets_nothing_and_moves_nothing(bench: Bench, tmp_path: Path) -
     make_certificates(tmp_path, ROLES, [])
     copy_certificates(desk, bench.authority, "stranger")
     before = bench.events("mirror-dm COMMAND_REFUSED")
-    start = len(bench.seen())
+    start = len(bench.reports())
     assert forge(camera, camera.folder / "certs" / "camera") in ("[] []", "['lowfc/event'] []")  # events are for all
     assert forge(desk, desk.folder / "certs" / "stranger") == "[] []"
     for certificate, protocol in ((tmp_path / "controller", "tls"), (None, "tls"), (None, "tcp")):
         assert forge(desk, certificate, protocol) == "refused"
-    seen = bench.seen()[start:]
-    assert len(seen) > 3
-    assert all(one["highest_nm"] < 50 for one in seen)
+    reports = bench.reports()[start:]
+    assert len(reports) > 3
+    assert all(report["highest_nm"] < 50 for report in reports)
     assert bench.events("mirror-dm COMMAND_REFUSED") == before
     bench.wait_until_settled()

@@ -23,7 +23,7 @@ GENTLE = """
 rate_hz = 1000
 [disturbance]
 preset = "reaction-wheel"
-scale = 0.3571428
+scale = 0.3571428  # 5 mas of 14 mas rms per axis
 [control]
 tilt_gain = 1.0
 gain = 0.05
@@ -38,7 +38,7 @@ pitches_per_pupil = 10
 def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_path: Path, rate_hz: int) -> None:
     """Automatic gains are inputs, identical in both runs and in a replay."""
     logs, infos, frames = [], [], round(2.4 * rate_hz)
-    for name in ("one", "two"):
+    for name in ("first", "second"):
         folder = tmp_path / name
         folder.mkdir()
         length = ("--rate", str(rate_hz), "--duration", "2.4", "--seed", "7")
@@ -52,14 +52,16 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
         key for key in infos[0]["topics"] if not topic_of(key).deterministic
     }
     assert "lowfc/event" not in {key for key, line in infos[0]["topics"].items() if "digest" in line}
-    one, two = ({t: p for t, p in log.items() if topic_of(t[1:]).deterministic} for log in logs)
-    assert one.keys() == two.keys()
-    for topic, values in one.items():
-        assert values == two[topic], topic
-    requests = [wire.Request.FromString(payload) for payload in one["/lowfc/control/request"]]
+    first, second = (
+        {topic: bodies for topic, bodies in log.items() if topic_of(topic[1:]).deterministic} for log in logs
+    )
+    assert first.keys() == second.keys()
+    for topic, bodies in first.items():
+        assert bodies == second[topic], topic
+    requests = [wire.Request.FromString(payload) for payload in first["/lowfc/control/request"]]
     assert [(request.name, request.accepted) for request in requests[:2]] == [("gain", True), ("close", True)]
     assert {request.requester for request in requests[:2]} == {"automatic gains"}
-    assert json.loads(output_of(tmp_path / "one", "lowfc replay last --json"))["identical"] is True
+    assert json.loads(output_of(tmp_path / "first", "lowfc replay last --json"))["identical"] is True
 
 
 @pytest.mark.parametrize("frames", [1_200, pytest.param(20_000, marks=pytest.mark.slow)])
@@ -90,7 +92,7 @@ def test_a_lockstep_run_ends_and_names_a_stopped_process(tmp_path: Path) -> None
 
 
 STATIC_NM = dict(zip(range(2, 16), (12, -9, 8, -7, 6, 5, -5, 4, -4, 3, -3, 3, -3, 3), strict=True))
-STILL = f"""
+STATIC_WAVEFRONT = f"""
 [star]
 magnitude = 1
 [mirror]
@@ -108,7 +110,7 @@ static_nm = {{ {", ".join(f'"{noll}" = {nm}' for noll, nm in STATIC_NM.items())}
 
 @pytest.mark.parametrize("sensor", ["zwfs", *(pytest.param(one, marks=pytest.mark.slow) for one in ("clowfs", "bar"))])
 def test_every_mode_of_a_static_wavefront_is_removed(tmp_path: Path, sensor: str) -> None:
-    results = loop(tmp_path, "--lockstep", "--duration", "0.6", "--sensor", sensor, config=STILL)
+    results = loop(tmp_path, "--lockstep", "--duration", "0.6", "--sensor", sensor, config=STATIC_WAVEFRONT)
     assert results["frames_published"] == results["commands_applied"] == 150
     truths = [wire.Truth.FromString(payload) for payload in payloads(results["log"])["/lowfc/sim/truth"]]
     first, last = truths[0], truths[-50:]

@@ -73,26 +73,26 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
     process = start(
         folder, "sim-loop", "--config", "test.toml", "--rate", "100", "--json", "--disturbance", "bench", "--seed", "4"
     )
-    made = Night(folder, process)
+    night = Night(folder, process)
     try:
         until(lambda: "controller" in children(process.pid) and set(running()) - before)
-        (made.name,) = set(running()) - before
-        _ready(made)
+        (night.name,) = set(running()) - before
+        _prepare(night)
         for command in COMMANDS:
-            made.ctl(command)
+            night.ctl(command)
         for number, program in enumerate(PROGRAMS):
-            made.outputs[f"program {number}"] = _program(made, program)
-        _requests_beyond_the_document(made)
-        made.end()
-        yield made
+            night.outputs[f"program {number}"] = _run_program(night, program)
+        _make_requests_beyond_the_document(night)
+        night.end()
+        yield night
     finally:
         if process.poll() is None:
             process.kill()
             process.communicate()
 
 
-def _ready(night: Night) -> None:
-    """Wait for frames, and leave the files that the document's commands read."""
+def _prepare(night: Night) -> None:
+    """Wait for frames, and write the files that the document's commands read."""
     with Client(night.name) as loop:
         until(lambda: loop.status().state.frames_used)  # type: ignore[union-attr]
         loop.steps(1, patience_s=20)
@@ -106,8 +106,8 @@ def _ready(night: Night) -> None:
     np.save(night.folder / "shape.npy", 3.0 * np.sin(rows / 3) * np.cos(columns / 4))
 
 
-def _program(night: Night, program: str) -> str:
-    """A program of the document, in this process; only the run has another name."""
+def _run_program(night: Night, program: str) -> str:
+    """Run a program of the document in this process; return its output. Only the run has another name."""
     printed = io.StringIO()
     words = program.replace('"bench"', repr(night.name)).replace("Client()", f"Client({night.name!r})")
     words = words.replace('"lowfc", "config"', f"{sys.executable!r}, '-m', 'lowfc', 'config'")
@@ -116,8 +116,8 @@ def _program(night: Night, program: str) -> str:
     return printed.getvalue()
 
 
-def _requests_beyond_the_document(night: Night) -> None:
-    """Requests without a command in the document: probe sequences, refusals, a lease; commands with other options."""
+def _make_requests_beyond_the_document(night: Night) -> None:
+    """Make requests that the document has no command for: probe sequences, a lease, refusals, other options."""
     with Client(night.name) as loop:
         grid = loop.calibration().grid
         loop.open_loop()
@@ -132,7 +132,7 @@ def _requests_beyond_the_document(night: Night) -> None:
         loop.close_loop()
         assert loop.play_offset(np.ones((5000, 14))).frame_sequence > first
         loop.stop()
-        for ask, why in (
+        for request, why in (
             (lambda: loop.gain(9.0), "becomes unstable"),
             (lambda: loop.offset(np.nan), "finite"),
             (lambda: loop.channel("Dark Hole", np.zeros(grid)), "letter first"),
@@ -142,7 +142,7 @@ def _requests_beyond_the_document(night: Night) -> None:
             (lambda: loop.record(True), "already in progress"),
         ):
             with pytest.raises(RequestRefusedError, match=why):
-                ask()
+                request()
         with loop.reserved("a test", 30.0), Client(night.name) as other:
             with pytest.raises(RequestRefusedError, match=r"reserved for a test by .*, about \d+ s to go"):
                 other.gain(0.1)
@@ -177,17 +177,17 @@ def _requests_beyond_the_document(night: Night) -> None:
 
 
 def test_every_request_is_made_by_a_command_of_the_document() -> None:
-    names = {command.split()[2] for command in COMMANDS} - {"bench"}  # a value, not a request
+    names = {command.split()[2] for command in COMMANDS} - {"bench"}  # publishes a value and makes no request
     assert names == {one.example.split()[0] for one in DECLARED if one.example}
 
 
-def test_the_commands_say_what_they_did(night: Night) -> None:
+def test_the_commands_print_what_they_did(night: Night) -> None:
     outputs = night.outputs
-    well = (
+    status_of_a_closed_loop = (
         r"closed · residual [\d.]+ nm rms, noise included( \(true [\d.]+\))? · light \d+ % · "
         r"\d+ frames? lost · recording "
     )
-    assert re.match(well, outputs["lowfc ctl status"])
+    assert re.match(status_of_a_closed_loop, outputs["lowfc ctl status"])
     assert "loop           closed" in outputs["lowfc ctl status"]
     assert 'preset = "bench"' in outputs["lowfc ctl configuration"]
     assert "loop closed for 50 frames, from frame" in outputs["lowfc ctl step 50"]
@@ -209,10 +209,15 @@ def test_the_commands_say_what_they_did(night: Night) -> None:
     assert (status["run"], status["paused"], status["recording"]) == (night.name, False, "recording")
     paused, stopped = json.loads(outputs["while paused"]), json.loads(outputs["while stopped"])
     assert (paused["mode"], paused["paused"], stopped["recording"]) == ("open", True, "stopped")
-    (run,) = json.loads(outputs["runs"])["runs"]
-    assert (run["run"], run["mode"], run["holding"], run["recording"]) == (night.name, "closed", None, "recording")
-    assert run.keys() == {"run", "mode", "holding", "rate_hz", "uptime_s", "processes", "recording", "log"}
-    processes = [(one["process"], one["state"]) for one in run["processes"]]
+    (listed,) = json.loads(outputs["runs"])["runs"]
+    assert (listed["run"], listed["mode"], listed["holding"], listed["recording"]) == (
+        night.name,
+        "closed",
+        None,
+        "recording",
+    )
+    assert listed.keys() == {"run", "mode", "holding", "rate_hz", "uptime_s", "processes", "recording", "log"}
+    processes = [(one["process"], one["state"]) for one in listed["processes"]]
     names = ("camera", "controller", "mirror-dm", "recorder")
     assert [name for name, _ in processes] == list(names)
     assert all(name in outputs["hosts"] for name in names)
@@ -237,7 +242,7 @@ def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
     assert night.results["recording_failure"] is None
     assert len(night.logs) == 3, "the recording was stopped and started twice"
     messages = [payloads(log) for log in night.logs]
-    requests = [wire.Request.FromString(body) for found in messages for body in found.get(f"/{REQUEST.key}", [])]
+    requests = [wire.Request.FromString(body) for log in messages for body in log.get(f"/{REQUEST.key}", [])]
     counts = Counter((request.name, request.accepted) for request in requests)
     assert {name for name, accepted in counts if accepted} == set(REQUESTS)
     refused = {name for name, accepted in counts if not accepted}
@@ -247,7 +252,7 @@ def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
         assert name in ("record", "bench") or sum(counts[name, good] for good in (True, False)) >= count
     input_numbers = [request.input_number for request in requests if request.input_number]
     assert input_numbers == sorted(input_numbers)
-    events = [Log.FromString(body).message for found in messages for body in found[f"/{EVENT.key}"]]
+    events = [Log.FromString(body).message for log in messages for body in log[f"/{EVENT.key}"]]
     for expected in (
         "RECORDING_STOPPED recording stopped: operator asked",
         "NOTE HD 209458, seeing 0.8 arcsec",
@@ -259,8 +264,8 @@ def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
 def test_every_command_keeps_the_actuator_limits(night: Night) -> None:
     limits = Limits(700.0, 100.0, 400.0)
     shapes = []
-    for found in map(payloads, night.logs):
-        commands = [wire.MirrorCommand.FromString(body) for body in found[f"/{COMMAND.at('dm')}"]]
+    for messages in map(payloads, night.logs):
+        commands = [wire.MirrorCommand.FromString(body) for body in messages[f"/{COMMAND.at('dm')}"]]
         shapes.append([np.frombuffer(one.actuators, "<f4").reshape(one.rows, one.columns) for one in commands])
     assert sum(map(len, shapes)) > 500
     for log in shapes:
@@ -273,10 +278,10 @@ def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
     for log in night.logs:
         done = run(night.folder, "replay", "--json", str(log))
         assert done.returncode == 0, done.stdout + done.stderr
-        found = json.loads(done.stdout)
-        assert found["identical"]
-        assert found["largest_difference_nm"] == 0
-        commands += found["commands"]
+        results = json.loads(done.stdout)
+        assert results["identical"]
+        assert results["largest_difference_nm"] == 0
+        commands += results["commands"]
     frames = night.results["frames_processed"]
     assert isinstance(frames, int)
     assert commands > 0.6 * frames, "all but those before the first state of each later log"

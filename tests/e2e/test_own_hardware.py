@@ -106,7 +106,7 @@ def test_the_loop_closes_with_a_users_camera_and_mirror(folder: Path) -> None:
         conformance(folder, *CONFORMANCE)
         errors_nm: list[list[float]] = []
 
-        def note(sample: Sample) -> None:
+        def keep_error(sample: Sample) -> None:
             errors_nm.append(list(wire.ControlStep.FromString(sample.payload).error_nm))
 
         def rms_nm() -> float:
@@ -114,7 +114,7 @@ def test_the_loop_closes_with_a_users_camera_and_mirror(folder: Path) -> None:
             measured = [error for error in errors_nm[-100:] if error]
             return float(np.linalg.norm(np.mean(measured, axis=0))) if len(measured) == 100 else np.nan
 
-        bus.subscribe(STEP, note)
+        bus.subscribe(STEP, keep_error)
         with in_background(folder, LOOP[0]):
             until(lambda: np.isfinite(rms_nm()))
             before_nm = rms_nm()
@@ -156,11 +156,12 @@ COMMISSIONING = re.findall(r"^    ((?:python|lowfc) .*)$", TEXT, flags=re.MULTIL
 
 def block(language: str, page: str = TEXT) -> str:
     """The page's listing in this language."""
-    (found,) = re.findall(rf"^```{language}\n(.*?)^```$", page, flags=re.MULTILINE | re.DOTALL)
-    return str(found)
+    (listing,) = re.findall(rf"^```{language}\n(.*?)^```$", page, flags=re.MULTILINE | re.DOTALL)
+    return str(listing)
 
 
-def closed(folder: Path) -> bool:
+def close_loop(folder: Path) -> bool:
+    """Ask the loop to close; return whether it accepted."""
     process = started(folder, "lowfc ctl close --run bench")
     process.communicate(timeout=20)
     return process.returncode == 0
@@ -212,4 +213,4 @@ def test_a_loop_with_a_camera_of_another_size_is_commissioned(folder: Path, own:
             assert state.mode_cause == "asked to close for lowfc commission"
         assert calibration_file.load(folder / "calibration.fits").shape == (64, 64)
     with in_background(folder, *devices, LATER):
-        until(lambda: closed(folder), 60)
+        until(lambda: close_loop(folder), 60)

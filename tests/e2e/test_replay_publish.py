@@ -47,11 +47,11 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def logged(log: Path) -> dict[str, list[Sample]]:
-    found = defaultdict(list)
+    messages = defaultdict(list)
     for message in LogReader(log):
-        found[message.key].append(message)
-    assert len(found[FRAME.key]) > 80
-    return found
+        messages[message.key].append(message)
+    assert len(messages[FRAME.key]) > 80
+    return messages
 
 
 class Tool:
@@ -66,9 +66,9 @@ class Tool:
 
 @pytest.fixture
 def tool(run: Run) -> Iterator[Tool]:
-    made = Tool(run, FRAME, STEP, MIRROR_STATE, COMMAND, EVENT, HEALTH)
-    yield made
-    made.bus.close()
+    tool = Tool(run, FRAME, STEP, MIRROR_STATE, COMMAND, EVENT, HEALTH)
+    yield tool
+    tool.bus.close()
 
 
 def start(log: Path, run: Run, *options: str) -> "subprocess.Popen[str]":
@@ -133,8 +133,8 @@ def test_a_truncated_log_is_published_faster_and_with_commands(log: Path, run: R
     results = results_of(start(cut, run, "--speed", "4", "--topics", "/lowfc/mirror/*", "--allow-commands"))
     for key in (COMMAND.at("dm"), MIRROR_STATE.at("dm")):
         assert [sample.payload for sample in tool.received[key]] == recorded[key]
-    others = {HEALTH.at("replay"), EVENT.key, COMMAND.at("dm"), MIRROR_STATE.at("dm")}
-    assert {key for key in tool.received if tool.received[key]} <= others
+    permitted = {HEALTH.at("replay"), EVENT.key, COMMAND.at("dm"), MIRROR_STATE.at("dm")}
+    assert {key for key in tool.received if tool.received[key]} <= permitted
     assert not results["finished"]
     assert results["took_s"] < results["span_s"] * 0.9 or results["messages_behind"]
 

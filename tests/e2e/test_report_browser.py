@@ -41,8 +41,8 @@ MEASURE = """(async () => {
 
 
 def measured(page: Page) -> dict[str, Any]:
-    found = page.call("Runtime.evaluate", expression=MEASURE, awaitPromise=True, returnByValue=True)
-    return dict(found["result"]["value"])
+    answer = page.call("Runtime.evaluate", expression=MEASURE, awaitPromise=True, returnByValue=True)
+    return dict(answer["result"]["value"])
 
 
 @pytest.fixture(scope="module")
@@ -113,13 +113,13 @@ def test_the_pictures_are_visible_in_light_and_dark_mode(
     (artefacts / f"report-{scheme}.png").write_bytes(picture)
     shown = pixels(picture)
     assert shown.shape == (seen["height"], WIDTH, 3)
-    paper = float(shown[2, 2].mean())
-    assert (paper < 40) == (scheme == "dark")
+    background = float(shown[2, 2].mean())
+    assert (background < 40) == (scheme == "dark")
     for name, (left, top, width, height) in seen["pictures"].items():
         region = shown[int(top) : int(top + height), int(left) : int(left + width)]
         brightness = region.mean(axis=2, dtype=np.float32)
         # Lines and letters cover a part of the picture, in contrast to the background.
-        drawn = np.abs(brightness - paper) > 60
+        drawn = np.abs(brightness - background) > 60
         assert 0.005 < drawn.mean() < 0.9, name
         assert drawn.any(axis=1).mean() > 0.5, f"{name} is empty over half of its height"
         assert drawn.any(axis=0).mean() > 0.5, f"{name} is empty over half of its width"

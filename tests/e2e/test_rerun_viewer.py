@@ -57,12 +57,12 @@ def test_an_image_that_was_logged_is_on_the_screen(headless: RerunViewer, tmp_pa
 def test_a_picture_is_taken_although_the_viewer_abandons_a_query(
     headless: RerunViewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plain, faults = RerunViewer._ask, [ViewerError("deadline expired"), ViewerError("dropped the request")]
+    real_ask, faults = RerunViewer._ask, [ViewerError("deadline expired"), ViewerError("dropped the request")]
 
     def ask(viewer: RerunViewer, question: Any) -> Any:
         if faults:
             raise faults.pop()
-        return plain(viewer, question)
+        return real_ask(viewer, question)
 
     stream = _two_colours(headless)
     monkeypatch.setattr(RerunViewer, "_ask", ask)
@@ -121,7 +121,7 @@ def test_a_stopped_viewer_dies_with_its_parent() -> None:
     )
     parent = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     assert parent.returncode == -signal.SIGKILL, parent.stderr
-    until(lambda: not _runs(int(parent.stdout)))
+    until(lambda: not _is_running(int(parent.stdout)))
 
 
 @pytest.mark.parametrize(
@@ -169,6 +169,7 @@ def _two_colours(viewer: RerunViewer) -> rr.RecordingStream:
 
 
 def _mean_row(shown: Any, colour: tuple[int, int, int]) -> float:
+    """Mean row of the pixels with a colour, up to 12 of 255 in each channel."""
     return float(np.nonzero(np.all(np.abs(shown.astype(int) - colour) <= 12, axis=2))[0].mean())
 
 
@@ -176,17 +177,17 @@ def _state(pid: int) -> str:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
 
 
-def _runs(pid: int) -> bool:
+def _is_running(pid: int) -> bool:
     return Path(f"/proc/{pid}").exists() and _state(pid) != "Z"
 
 
 @pytest.fixture(scope="module")
 def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log with messages of most topics."""
-    made = SyntheticLog().frames(100)
-    made.put(SURFACE, image(np.random.default_rng(1).normal(size=(6, 9)).astype(np.float32), made.now_ns, "dm"))
-    made.health("recorder", state="running")
-    return made.write(tmp_path_factory.mktemp("log") / "night.mcap")
+    log = SyntheticLog().frames(100)
+    log.put(SURFACE, image(np.random.default_rng(1).normal(size=(6, 9)).astype(np.float32), log.now_ns, "dm"))
+    log.health("recorder", state="running")
+    return log.write(tmp_path_factory.mktemp("log") / "night.mcap")
 
 
 def read_by_rerun(log: Path, column: str) -> dict[str, list[Any]]:

@@ -99,12 +99,12 @@ ORDERS = list(itertools.permutations(["camera", "controller", "mirror"]))
 @pytest.fixture(scope="module", params=[ORDERS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in ORDERS[1:])])
 def bench(folder: Path, request: pytest.FixtureRequest) -> Iterator[ManualRun]:
     """Each process is up before the next starts; the parameters are all start orders."""
-    made = ManualRun(folder)
+    bench = ManualRun(folder)
     for name in request.param:
-        made.start(name)
-        until(lambda: all(_alive(made, process) for process in made.running))
-    yield made
-    made.stop()
+        bench.start(name)
+        until(lambda: all(_alive(bench, process) for process in bench.running))
+    yield bench
+    bench.stop()
 
 
 def test_the_loop_closes_in_any_start_order(bench: ManualRun) -> None:
@@ -121,8 +121,8 @@ def test_the_loop_recovers_from_kill_and_restart_of_each_process(bench: ManualRu
         until(lambda: len(bench.shapes) > 20)
         bench.wait_until_settled()
         shapes = np.array(bench.shapes.copy())
-        moves = np.abs(np.diff(shapes, axis=0)).max()
-        assert moves < 100, "no jump beyond the controller's slew limit"
+        largest_move_nm = np.abs(np.diff(shapes, axis=0)).max()
+        assert largest_move_nm < 100, "no jump beyond the controller's slew limit"
         np.testing.assert_allclose(shapes[-1], before, atol=5)
         if name == "controller":  # it starts from where the mirror is: nothing moves but noise
             assert np.abs(shapes - before).max() < 12

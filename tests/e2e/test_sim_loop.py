@@ -120,22 +120,22 @@ def test_frame_step_command_and_state_join(topics: dict[str, list[bytes]]) -> No
 
 def test_npm_mcap_core_reads_the_same_messages(live: dict[str, Any], topics: dict[str, list[bytes]]) -> None:
     """npm's @mcap/core: same counts, valid CRCs, all attachments."""
-    (found,) = foxglove([live["log"]])
-    assert found["messages"] == found["counted"] == live["messages_recorded"]
-    assert found["counts"] == {topic: len(values) for topic, values in topics.items()}
-    assert set(found["attachments"]) == {"config.toml", "calibration.fits"}
-    assert "lowfc" in found["metadata"]
+    (read,) = foxglove([live["log"]])
+    assert read["messages"] == read["counted"] == live["messages_recorded"]
+    assert read["counts"] == {topic: len(values) for topic, values in topics.items()}
+    assert set(read["attachments"]) == {"config.toml", "calibration.fits"}
+    assert "lowfc" in read["metadata"]
 
 
 def test_a_signal_makes_the_loop_safe_and_a_process_that_dies_is_named(tmp_path: Path) -> None:
     """The documented pattern finds the controller, and the log has the signal as a request."""
-    pattern = re.search(r"pkill -USR1 -f '(.*)'", SIGNAL)
+    (pattern,) = re.findall(r"pkill -USR1 -f '(.*)'", SIGNAL)
     process = start(tmp_path, "sim-loop", "--rate", "200", "--duration", "60")
     until(lambda: recorded_bytes(tmp_path) > 4e6)
     controller = children(process.pid)["controller"]
     command = Path(f"/proc/{controller}/cmdline").read_text().replace("\0", " ")
-    assert re.search(pattern[1], command)
-    assert not re.search(pattern[1], f"bash -c {command}")
+    assert re.search(pattern, command)
+    assert not re.search(pattern, f"bash -c {command}")
     os.kill(controller, signal.SIGUSR1)
     until(lambda: "in safe mode" in lowfc("ctl", "status").stdout)
     os.kill(children(process.pid)["sim_dm"], signal.SIGKILL)
@@ -171,7 +171,7 @@ def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_log_at_the_file_size_limit_does_not_stop_the_loop(tmp_path: Path) -> None:
     words = [*LOWFC, "sim-loop", "--rate", "200", "--duration", "1", "--json"]
-    small = (3_000_000, 3_000_000)
+    file_size_limit = (3_000_000, 3_000_000)
     done = subprocess.run(
         words,
         cwd=tmp_path,
@@ -179,7 +179,7 @@ def test_a_log_at_the_file_size_limit_does_not_stop_the_loop(tmp_path: Path) -> 
         text=True,
         timeout=60,
         check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, small),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, file_size_limit),
     )
     results = json.loads(done.stdout)
     assert done.returncode == 1, done.stderr

@@ -60,9 +60,9 @@ def test_the_loop_continues_when_its_view_is_killed(tmp_path: Path) -> None:
     view = children(process.pid)["view"]
     until(psutil.Process(view).children)
     os.kill(view, signal.SIGKILL)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 0, err
-    assert "the loop continues without a view" in err
+    out, stderr = process.communicate(timeout=60)
+    assert process.returncode == 0, stderr
+    assert "the loop continues without a view" in stderr
     results = json.loads(out)
     assert results["frames_processed"] >= 0.98 * results["frames_published"] > 600
     assert results["messages_lost"] == 0
@@ -80,7 +80,7 @@ def test_a_log_without_an_end_is_saved_as_a_valid_rrd_file(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("given", "complaint"),
+    ("options", "complaint"),
     [
         ({"web": True, "native": True}, "use one"),
         ({"foxglove": True, "web": True}, "--foxglove"),
@@ -98,16 +98,16 @@ def test_a_log_without_an_end_is_saved_as_a_valid_rrd_file(tmp_path: Path) -> No
     ],
 )
 def test_invalid_view_options_are_one_line_errors(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: dict[str, object], complaint: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, object], complaint: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for screen in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(screen, raising=False)
     monkeypatch.setattr("lowfc.adapters.process.realtime.lower_priority", lambda: None)
-    if "run" not in given and "logs" not in given:
-        given = given | {"run": open_run("mistaken").run_id}
+    if "run" not in options and "logs" not in options:
+        options = options | {"run": open_run("mistaken").run_id}
     with pytest.raises(LowfcError, match=complaint) as raised:
-        view(**given)  # type: ignore[arg-type]
+        view(**options)  # type: ignore[arg-type]
     assert len(str(raised.value).splitlines()) == 1
     assert not list(tmp_path.iterdir())
 
@@ -161,8 +161,8 @@ def test_the_web_view_shows_the_live_loop_and_fetches_from_this_host_only(live: 
         assert share_of(pixels(picture.read_bytes()), good) > 0.01, "no tile has the colour of a good state"
         assert {url.startswith(("http://127.0.0.1", "data:", "blob:")) for url in page.fetched.values()} == {True}
     finally:
-        _, rest = interrupt(process)
-        assert process.returncode == 0, rest
+        _, stderr = interrupt(process)
+        assert process.returncode == 0, stderr
 
 
 def _shades(viewer: RerunViewer, view_id: object) -> int:

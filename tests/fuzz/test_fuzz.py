@@ -50,25 +50,25 @@ def test_crashes_and_hangs_of_a_reader_are_found(monkeypatch: pytest.MonkeyPatch
             while data.startswith(b"\0"):
                 pass
 
-    found = fuzz(Target("bad", (b"\xff" * 4, b"\0" * 4, b"good"), read), range(60))
-    assert found["crashes"]
-    assert found["hangs"]
+    results = fuzz(Target("bad", (b"\xff" * 4, b"\0" * 4, b"good"), read), range(60))
+    assert results["crashes"]
+    assert results["hangs"]
 
 
-def _check(all_targets: list[Target], inputs: int) -> None:
+def _check_readers(all_targets: list[Target], inputs: int) -> None:
     counts = shares(all_targets, inputs)
     for target in all_targets:
-        found = fuzz(target, range(counts[target.name]))
-        assert found["crashes"] == [], target.name
-        assert found["hangs"] == [], target.name
-        assert found["grown_bytes"] < MAX_GROWTH_BYTES, target.name
+        results = fuzz(target, range(counts[target.name]))
+        assert results["crashes"] == [], target.name
+        assert results["hangs"] == [], target.name
+        assert results["grown_bytes"] < MAX_GROWTH_BYTES, target.name
 
 
-def test_damaged_inputs(all_targets: list[Target]) -> None:
-    _check(all_targets, FEW)
+def test_damaged_inputs_neither_crash_nor_hang_a_reader(all_targets: list[Target]) -> None:
+    _check_readers(all_targets, FEW)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_a_million_damaged_inputs(all_targets: list[Target]) -> None:
-    _check(all_targets, MANY)
+def test_a_million_damaged_inputs_neither_crash_nor_hang_a_reader(all_targets: list[Target]) -> None:
+    _check_readers(all_targets, MANY)
