@@ -81,9 +81,9 @@ class Night:
             Attachment("config.toml", "application/toml", config.to_toml().encode()),
             Attachment("calibration.fits", "application/fits", calibration_file.to_bytes(calibration)),
         ]
-        about = {"lowfc": provenance("golden", config.seed) | {"host": "bench"}}
+        metadata = {"lowfc": provenance("golden", config.seed) | {"host": "bench"}}
         recorder = Recorder(
-            self.bus("recorder"), self.clock, "golden", folder / "logs", metadata=about, attachments=attached
+            self.bus("recorder"), self.clock, "golden", folder / "logs", metadata=metadata, attachments=attached
         )
         services = [Service(role, "golden", self.clock, self.bus(role)) for role in ("controller", "mirror-dm")]
         latch = Latch([folder / "run" / "safe"])
@@ -172,9 +172,9 @@ def main(folder: Path) -> None:
     """Write all golden files."""
     folder.mkdir(parents=True)
     config = load(None, CONFIGURATION)
-    calibration, made = calibrated(config), law(config)
+    calibration, golden_law = calibrated(config), law(config)
     calibration_file.save(calibration, folder / "calibration.fits")
-    law_file.save(made, folder / "law.fits")
+    law_file.save(golden_law, folder / "law.fits")
     (folder / "lowfc.toml").write_text(config.to_toml())
     for path in (ROOT / "deploy/layouts").glob("*.*"):
         if path.suffix != ".rbl":  # binary format of one version of rerun
@@ -199,7 +199,7 @@ def main(folder: Path) -> None:
     loop.channel("dark-hole", ramp_nm)
     loop.channel("flat", ramp_nm.T / 4)
     night.expose(3)
-    loop.law(made)
+    loop.law(golden_law)
     night.expose(4)
     loop.play(np.stack([ramp_nm / 20, ramp_nm.T / 20]), [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.5], [0.0, 0.0]])
     night.expose(2)
@@ -217,9 +217,9 @@ def main(folder: Path) -> None:
     loop.channel("dark-hole")
     loop.offset()
     night.frames.put(b"", sequence=night.frames.last[1].sequence + 2 if night.frames.last else 1)  # one is missing
-    night.expose(1, lambda pixels: pixels[:3])
-    night.expose(1, lambda pixels: np.full_like(pixels, 100))
-    night.expose(1, lambda pixels: np.full_like(pixels, 65_535))
+    night.expose(1, lambda pixels: pixels[:3])  # of the wrong size
+    night.expose(1, lambda pixels: np.full_like(pixels, 100))  # dark
+    night.expose(1, lambda pixels: np.full_like(pixels, 65_535))  # saturated
     night.expose(1, late_ns=25_000_000)
     stuck = night.scene.expose(night.index, night.shape_nm)
     night.expose(6, lambda _: stuck)

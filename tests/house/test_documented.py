@@ -24,17 +24,17 @@ UNIT = re.compile(
 Definition = ast.FunctionDef | ast.ClassDef
 
 
-def public(body: list[ast.stmt], before: str, above: str = "") -> Iterator[tuple[str, Definition, str, str]]:
-    """Public definitions by dotted name, with their own docstring and that of their class."""
-    for one in body:
-        if isinstance(one, Definition) and not one.name.startswith("_"):
-            text = ast.get_docstring(one) or ""
-            yield f"{before}.{one.name}", one, text, above
-            if isinstance(one, ast.ClassDef):
-                yield from public(one.body, f"{before}.{one.name}", text)
+def public(body: list[ast.stmt], parent: str, parents_text: str = "") -> Iterator[tuple[str, Definition, str, str]]:
+    """Name, node, own docstring and docstring of the class of each public definition."""
+    for node in body:
+        if isinstance(node, Definition) and not node.name.startswith("_"):
+            text = ast.get_docstring(node) or ""
+            yield f"{parent}.{node.name}", node, text, parents_text
+            if isinstance(node, ast.ClassDef):
+                yield from public(node.body, f"{parent}.{node.name}", text)
 
 
-def names(package: str) -> list[tuple[str, Definition, str, str]]:
+def definitions(package: str) -> list[tuple[str, Definition, str, str]]:
     found = []
     for path in sorted((ROOT / "lowfc" / package).rglob("*.py")):
         module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
@@ -44,19 +44,19 @@ def names(package: str) -> list[tuple[str, Definition, str, str]]:
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_every_public_name_has_a_docstring(package: str) -> None:
-    found = names(package)
-    assert len(found) > 20
-    assert [name for name, _, text, _ in found if not text] == []
+    documented = definitions(package)
+    assert len(documented) > 20
+    assert [name for name, _, text, _ in documented if not text] == []
 
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_functions_of_arrays_document_shapes_and_units(package: str) -> None:
     lacking = []
-    for name, one, text, above in names(package):
-        if isinstance(one, ast.FunctionDef):
-            annotated = [each for each in (*one.args.args, *one.args.kwonlyargs) if each.annotation is not None]
+    for name, node, text, parents_text in definitions(package):
+        if isinstance(node, ast.FunctionDef):
+            annotated = [each for each in (*node.args.args, *node.args.kwonlyargs) if each.annotation is not None]
             arrays = [each for each in annotated if ARRAYS.search(ast.unparse(each.annotation))]
-            words = f"{text} {above} {' '.join(each.arg.rpartition('_')[2] for each in arrays)}"
+            words = f"{text} {parents_text} {' '.join(each.arg.rpartition('_')[2] for each in arrays)}"
             if arrays and not (SHAPE.search(words) and UNIT.search(words)):
                 lacking.append((name, "shape" if not SHAPE.search(words) else "unit", [each.arg for each in arrays]))
     assert lacking == []

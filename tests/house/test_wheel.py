@@ -34,6 +34,7 @@ REQUIRED = {
 
 
 def succeed(*words: str | Path, folder: Path) -> str:
+    """Run a program that must succeed, without this environment's PYTHONPATH; return its standard output."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120, check=False, env=environment)
     assert done.returncode == 0, done.stderr
@@ -49,8 +50,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, folder / "source")
     succeed(*PIP, "wheel", *OFFLINE, "--no-build-isolation", "--wheel-dir", folder, folder / "source", folder=folder)
-    (found,) = folder.glob("*.whl")
-    return found
+    (path,) = folder.glob("*.whl")
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -60,11 +61,10 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(folder, with_pip=False, symlinks=True)
     python = folder / "bin" / "python"
     succeed(*PIP, "--python", python, "install", "--no-compile", *OFFLINE, wheel, folder=folder)
-    own = Path(sysconfig.get_path("purelib", vars={"base": str(folder)}))
+    site_packages = Path(sysconfig.get_path("purelib", vars={"base": str(folder)}))
     libraries = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
-    (own / "libraries.pth").write_text(
-        "\n".join(libraries)
-    )  # .pth files in these, as of an editable install, are not read
+    # Python does not read `.pth` files in the folders listed here, such as that of an editable install.
+    (site_packages / "libraries.pth").write_text("\n".join(libraries))
     return folder / "bin"
 
 
