@@ -73,13 +73,14 @@ class Variables(dict[str, "Variables.Shared"]):
 
 @pytest.fixture
 def pvs(monkeypatch: pytest.MonkeyPatch) -> Variables:
-    found = Variables()
+    """Variables of a stand-in for p4p, which is imported in its place."""
+    variables = Variables()
     modules = {
         "p4p.client": {},
-        "p4p.client.thread": {"Context": found.context},
+        "p4p.client.thread": {"Context": variables.context},
         "p4p.nt": {"NTScalar": lambda code, display: code, "NTNDArray": lambda: "image"},
-        "p4p.server": {"Server": found.server},
-        "p4p.server.thread": {"SharedPV": found.Shared},
+        "p4p.server": {"Server": variables.server},
+        "p4p.server.thread": {"SharedPV": variables.Shared},
         "p4p.util": {"ThreadedWorkQueue": lambda maxsize, daemon: SimpleNamespace(start=object)},
     }
     for name, content in {"p4p": {}, **modules}.items():
@@ -89,7 +90,7 @@ def pvs(monkeypatch: pytest.MonkeyPatch) -> Variables:
         parent, _, child = name.rpartition(".")
         if parent:
             setattr(sys.modules[parent], child, module)
-    return found
+    return variables
 
 
 def received(value: Any, kind: str = "epics:nt/NTScalar:1.0", severity: int = 0, **fields: Any) -> Any:
@@ -201,12 +202,13 @@ def test_a_put_is_a_request_and_fails_with_its_refusal(pvs: Variables) -> None:
 )
 def test_a_monitored_variable_is_a_bench_value_while_it_is_valid(update: Any, value: Any, pvs: Variables) -> None:
     served = gateway()
-    for one, bench in ((received("before"), {"mask": "before"}), (update, {} if value is None else {"mask": value})):
+    valid = {} if value is None else {"mask": value}
+    for monitored, bench in ((received("before"), {"mask": "before"}), (update, valid)):
         served.changed.clear()
-        pvs.monitors["BENCH:MASK"](one)
+        pvs.monitors["BENCH:MASK"](monitored)
         assert (served.bench, served.changed.is_set()) == (bench, True)
-    assert [type(one) for one in served.bench.values()] == ([] if value is None else [type(value)])
-    assert all(bench_message("mask", one, 0) for one in served.bench.values())
+    assert [type(kept) for kept in served.bench.values()] == ([] if value is None else [type(value)])
+    assert all(bench_message("mask", kept, 0) for kept in served.bench.values())
 
 
 def test_a_port_in_use_is_an_error_with_the_address(pvs: Variables) -> None:
@@ -217,6 +219,7 @@ def test_a_port_in_use_is_an_error_with_the_address(pvs: Variables) -> None:
 
 @pytest.fixture
 def signals() -> Iterator[None]:
+    """Restore the handlers of signals that a command sets."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     yield
     for number, handler in before.items():
@@ -229,12 +232,12 @@ def test_the_command_serves_a_run_until_it_is_stopped(
 ) -> None:
     """The run restarts at once; `safe` does not wait for the end of a log; the first posted frame stops the command."""
     buses: list[MemoryBus] = []
-    hub, bench, plain, finished = MemoryHub(), list[Sample](), pvs.Shared.post, threading.Event()
+    hub, bench, real_post, log_ended = MemoryHub(), list[Sample](), pvs.Shared.post, threading.Event()
     controller = MemoryBus(hub, "controller", HostClock())
     controller.subscribe(BENCH, bench.append)
     reply = wire.Request(accepted=True).SerializeToString()
     controller.queryable(REQUEST_KEY.format(name="*"), lambda query: query.reply(reply))
-    controller.queryable(RECORD_KEY.format(name="*"), lambda query: finished.wait(TIMEOUT_S) and query.reply(reply))
+    controller.queryable(RECORD_KEY.format(name="*"), lambda query: log_ended.wait(TIMEOUT_S) and query.reply(reply))
     stop, safe = Operation(True), Operation(True)
     states = controller.publisher(CONTROLLER_STATE)
     health, frames = controller.publisher(HEALTH, "controller"), controller.publisher(FRAME)
@@ -244,35 +247,35 @@ def test_the_command_serves_a_run_until_it_is_stopped(
         buses.append(MemoryBus(hub, role, clock))
         return buses[-1]
 
-    def watch(*arguments: Any) -> Any:
-        made = command_watch(*arguments)
+    def watch_and_use(*arguments: Any) -> Any:
+        watch = real_watch(*arguments)
         if len(buses) == 1:
-            return made
+            return watch
         puts = [
             threading.Thread(target=pvs[f"lowfc:{name}"].handler.put, args=(None, operation))
             for name, operation in (("record_stop", stop), ("safe", safe))
         ]
-        for one in puts:
-            one.start()
+        for put in puts:
+            put.start()
         puts[1].join(TIMEOUT_S)
         assert (stop.ended, safe.ended) == ([], [""])
-        finished.set()
+        log_ended.set()
         puts[0].join(TIMEOUT_S)
         assert stop.ended == [""]
         states.put(wire.ControllerState(mode=wire.LOOP_MODE_CLOSED).SerializeToString())
         health.put(wire.Health(process="controller", pid=7, rate_hz=250).SerializeToString())
         frames.put(image(np.ones((2, 3), np.uint16), 1, "toy").SerializeToString())
         pvs.monitors["BENCH:MASK"](received(True))
-        return made
+        return watch
 
     def post(pv: Variables.Shared, value: Any, **more: Any) -> None:
-        plain(pv, value, **more)
+        real_post(pv, value, **more)
         if pv.nt == "image":
             os.kill(os.getpid(), signal.SIGTERM)
 
     (tmp_path / "config.toml").write_text('[gateway]\nbench = { mask = "BENCH:MASK" }\n')
-    command_watch = command.Watch
-    monkeypatch.setattr(command, "Watch", watch)
+    real_watch = command.Watch
+    monkeypatch.setattr(command, "Watch", watch_and_use)
     monkeypatch.setattr(pvs.Shared, "post", post)
     monkeypatch.setattr(command, "ZenohBus", make_bus)
     monkeypatch.setattr(command, "the_run", lambda run: run)

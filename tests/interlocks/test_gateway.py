@@ -94,13 +94,13 @@ class Text(str):
 
 
 def test_requests_with_numbers_or_a_text_are_variables_with_unique_names() -> None:
-    offered = {one.name: one for one in variables()}
+    offered = {variable.name: variable for variable in variables()}
     assert len(offered) == len(list(variables()))
-    for one in DECLARED:
-        fields = {field for field, _ in one.fields}
-        name = one.name if "record" not in one.key else f"record_{one.name}"
-        plain = fields <= {"modes", "values", "text", "lease_id"} and one.example
-        writable = bool(plain) and name not in ("status", "configuration")
+    for request in DECLARED:
+        fields = {field for field, _ in request.fields}
+        name = request.name if "record" not in request.key else f"record_{request.name}"
+        has_simple_fields = fields <= {"modes", "values", "text", "lease_id"} and request.example
+        writable = bool(has_simple_fields) and name not in ("status", "configuration")
         assert (name in offered and offered[name].put is not None) is writable, name
     loop = Mock()
     for name, value, arguments in (
@@ -114,7 +114,7 @@ def test_requests_with_numbers_or_a_text_are_variables_with_unique_names() -> No
         put(loop, value)
         loop.ask.assert_called_with(name, **arguments)
     assert offered["gain"].kind is Kind.NUMBERS
-    assert all(one.read is not None or one.put is not None for one in offered.values())
+    assert all(variable.read is not None or variable.put is not None for variable in offered.values())
 
 
 def test_missing_p4p_is_reported_with_install_advice(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,12 +136,12 @@ class DeafBus(MemoryBus):
 
 def test_states_that_were_not_received_are_queried_again() -> None:
     hub, clock = MemoryHub(), FakeClock()
-    controller, own = MemoryBus(hub, "controller", clock), DeafBus(hub, "operator", clock)
+    controller, deaf_bus = MemoryBus(hub, "controller", clock), DeafBus(hub, "operator", clock)
     controller.publisher(CONTROLLER_STATE).put(wire.ControllerState(calibration_id="night").SerializeToString())
-    watch = Watch(own, clock)
+    watch = Watch(deaf_bus, clock)
     controller.publisher(HEALTH, "controller").put(wire.Health(process="controller", pid=7).SerializeToString())
     watch.update()
-    own.deaf = False
+    deaf_bus.deaf = False
     assert [watch.update().state.calibration_id for _ in range(2)] == ["", ""], "at most one query in 5 s"
     clock.advance(6_000_000_000)
     assert [watch.update().state.calibration_id for _ in range(2)] == ["", "night"]
@@ -182,12 +182,13 @@ def test_an_unreadable_step_leaves_the_one_before() -> None:
 
 @pytest.fixture
 def ioc() -> Iterator[tuple[Process, int]]:
+    """A running IOC, and the UDP port of its searches."""
     pytest.importorskip("softioc", reason="needs softioc")
     tcp, udp, channel_access = free_ports(3)
     ports = {"EPICS_PVAS_SERVER_PORT": tcp, "EPICS_PVAS_BROADCAST_PORT": udp, "EPICS_CA_SERVER_PORT": channel_access}
     local = dict.fromkeys(("EPICS_PVAS_INTF_ADDR_LIST", "EPICS_CAS_INTF_ADDR_LIST"), "127.0.0.1")
-    known = os.environ | {name: str(port) for name, port in ports.items()} | local
-    process = subprocess.Popen([sys.executable, "-c", IOC], env=known, stdout=subprocess.DEVNULL, text=True)
+    environment = os.environ | {name: str(port) for name, port in ports.items()} | local
+    process = subprocess.Popen([sys.executable, "-c", IOC], env=environment, stdout=subprocess.DEVNULL, text=True)
     yield process, udp
     process.kill()
     process.wait()
@@ -232,8 +233,10 @@ def run_scan(loop: Process, gateway: Process, ioc: Process, addresses: str) -> N
         until(lambda: read("interlocks") == "none of 1 acts")
         with pytest.raises(thread.RemoteError, match=r"gain refused: .* becomes unstable"):
             pvs.put("lowfc:gain", [9.0])
-        known = os.environ | {"EPICS_PVA_ADDR_LIST": addresses, "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
-        scan = subprocess.run([sys.executable, "-c", SCAN], env=known, capture_output=True, text=True, check=False)
+        environment = os.environ | {"EPICS_PVA_ADDR_LIST": addresses, "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
+        scan = subprocess.run(
+            [sys.executable, "-c", SCAN], env=environment, capture_output=True, text=True, check=False
+        )
         assert scan.returncode == 0, scan.stderr
         rows = json.loads(scan.stdout)
         assert [gains for _, gains in rows] == [pytest.approx([value] * 14) for value in (0.05, 0.1, 0.2)]

@@ -74,7 +74,7 @@ def _publish(name: str) -> None:
         loop.bench("shutter", "open")
         for number in range(FLIPS):  # some values fall between the same two frames
             for acts in (True, False):
-                time.sleep(rng.uniform(0, 7.5 / RATE_HZ))
+                time.sleep(rng.uniform(0, 7.5 / RATE_HZ))  # up to seven and a half frames
                 if number % 5:
                     loop.bench("mask", acts)
                     continue
@@ -142,9 +142,9 @@ def _values_act_at_the_next_frame(log: Path) -> None:
     for value, after in pairwise(values):
         acts = wire.BenchValue.FromString(value.payload).truth
         begun_ns = value.publish_time_ns + S // RATE_HZ
-        made = [step for step in steps if begun_ns < frames_ns[step.frame_sequence] < after.publish_time_ns]
+        between = [step for step in steps if begun_ns < frames_ns[step.frame_sequence] < after.publish_time_ns]
         obeyed += [
-            (wire.REASON_HELD in step.reasons) is (acts and step.mode == wire.LOOP_MODE_CLOSED) for step in made[:1]
+            (wire.REASON_HELD in step.reasons) is (acts and step.mode == wire.LOOP_MODE_CLOSED) for step in between[:1]
         ]
     assert len(obeyed) > FLIPS // 2
     assert obeyed.count(False) <= len(obeyed) // 10, f"{obeyed.count(False)} of {len(obeyed)} values arrived later"
