@@ -63,7 +63,7 @@ def test_a_step_retains_no_memory_and_allocates_only_frame_and_actuators(monkeyp
     found = step.allocated(ControlStep(config, calibration, 0), Payloads(frames))
     assert abs(found["kept_bytes"]) < 1
     assert 2 * SMALL.pixels < found["peak_bytes"] < 2 * SMALL.pixels + 5 * 4 * SMALL.actuators + 4096
-    kept, original = [], stepping.integrate
+    kept, original = [], stepping.integrate  # a step that keeps memory is detected
     monkeypatch.setattr(stepping, "integrate", lambda *arguments: (kept.append(bytes(100)), original(*arguments))[1])
     assert step.allocated(ControlStep(config, calibration, 0), Payloads(frames))["kept_bytes"] > 100
 
@@ -77,8 +77,8 @@ def test_the_stages_are_those_of_a_step_and_add_up(monkeypatch: pytest.MonkeyPat
     (lines,) = step.tables(found)
     assert [line[0] for line in lines[1:]] == [*step.STAGES, step.REMAINDER, step.STEP, step.PRODUCT]
     assert all(float(cell) >= 0 for line in lines[1:] for cell in line[1:])
-    over = found["hot_us"][step.STEP]["p50"] / found["hot_us"][step.PRODUCT]["p50"]
-    assert f"{over:.1f} times" in step.about(found)
+    ratio = found["hot_us"][step.STEP]["p50"] / found["hot_us"][step.PRODUCT]["p50"]
+    assert f"{ratio:.1f} times" in step.about(found)
 
 
 # Cost curves
@@ -151,7 +151,7 @@ def test_a_point_has_the_median_of_its_repeats_and_the_memory_limit() -> None:
     assert "Failed, 48: the mirror ended." in curves.about(result)
 
 
-def test_the_curves_of_a_few_sizes_from_the_command_line() -> None:
+def test_the_curves_of_a_few_sizes_are_measured_from_the_command_line() -> None:
     words = "--pixels 32 --modes 20 --actuators --no-loop --seconds 0.02 --repeats 2 --json"
     command = [sys.executable, "-m", "benchmarks", "curves", *words.split()]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -190,23 +190,24 @@ def test_the_search_finds_the_highest_sustained_rate_despite_one_wrong_result(ed
         return (index <= edge) != mistaken
 
     assert throughput.search(sustains, 32) == edge
-    assert len(tried) <= 2 * 6 + 1
+    assert len(tried) <= 2 * 6 + 1  # six bisections of 33 intervals, two runs each, and a third for the wrong result
 
 
-def good(**changed: Any) -> dict[str, Any]:
+def sustained(**changed: Any) -> dict[str, Any]:
+    """Result of a run that sustains its rate, with changes."""
     latency_us = {"p50": 200.0, "p99": 400.0}
-    one = {"requested_hz": 1000.0, "rate_hz": 995.0, "frames": 10_000, "without_command": 10, "messages_lost": 0}
-    return one | {"frame_to_command_us": latency_us, "usage": {}} | changed
+    result = {"requested_hz": 1000.0, "rate_hz": 995.0, "frames": 10_000, "without_command": 10, "messages_lost": 0}
+    return result | {"frame_to_command_us": latency_us, "usage": {}} | changed
 
 
 @pytest.mark.parametrize(
     ("one", "complaints"),
     [
-        (good(), []),
-        (good(messages_lost=None), []),
-        (good(rate_hz=989.0), ["989 frames a second"]),
-        (good(without_command=11), ["0.11 % of the frames without a command"]),
-        (good(messages_lost=1), ["1 messages lost"]),
+        (sustained(), []),
+        (sustained(messages_lost=None), []),
+        (sustained(rate_hz=989.0), ["989 frames a second"]),
+        (sustained(without_command=11), ["0.11 % of the frames without a command"]),
+        (sustained(messages_lost=1), ["1 messages lost"]),
         ({"requested_hz": 1000.0, "failure": "it fell"}, ["it fell"]),
     ],
 )
@@ -220,7 +221,8 @@ def test_a_loop_has_its_highest_rate_and_the_reason_for_its_limit(monkeypatch: p
 
     def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> dict[str, Any]:
         lost = 0 if rate_hz <= 1300 else 7
-        return good(requested_hz=rate_hz, rate_hz=rate_hz, messages_lost=lost, usage=usage, commands_late_fraction=0.25)
+        changed = {"messages_lost": lost, "usage": usage, "commands_late_fraction": 0.25}
+        return sustained(requested_hz=rate_hz, rate_hz=rate_hz, **changed)
 
     monkeypatch.setattr(throughput, "run_once", run_once)
     rates = throughput.grid(1000, 2000, 1.1)
@@ -370,7 +372,7 @@ def test_the_step_is_an_integrator_with_a_leak(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "chosen", [pytest.param(one, id=one.name, marks=[pytest.mark.slow] * bool(one.kernel)) for one in IMPLEMENTATIONS]
 )
-def test_a_real_run_of_an_implementation(chosen: implementations.Implementation) -> None:
+def test_a_real_run_of_an_implementation_gives_its_latencies(chosen: implementations.Implementation) -> None:
     """The C chain if ISIO_DIR is a checkout of ImageStreamIO, pyrtcao if PYRTCAO_PYTHON has it."""
     seconds, rate_hz = 0.5, 200.0
     options = parsed("--seconds", str(seconds), "--rate", str(rate_hz), "--warm-up", "10")

@@ -41,7 +41,7 @@ from lowfc.programs.measure.latency.text import compared, sparkline, table
 from tests.support.loops import json_of, lowfc, refusal, until
 from tools.law_bench import calibrated
 
-START = 1_700_000_000 << 32
+START = 1_700_000_000 << 32  # sequence of the first frame
 MS = 1_000_000
 RATE_HZ, SECONDS = 200, 0.5
 HISTORY = Path(__file__).parents[2] / "benchmarks" / "history"

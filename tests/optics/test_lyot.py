@@ -45,16 +45,16 @@ def test_lyot_image_agrees_with_hcipy(hcipy, coronagraph, modes, waves_nm):
 def test_fast_image_and_quadratic_form_agree_with_the_exact_image(coronagraph, modes, waves_nm):
     modal = ModalContrast(coronagraph, NOLLS_14, NM)
     small_nm = [0.3 * np.random.default_rng(seed).choice([-1.0, 1.0], 14) for seed in range(6)]
-    own, large, *small = (
+    flat, large, *small = (
         mean_contrast(coronagraph, np.tensordot(one, modes[:14], 1), NM, coronagraph.dark_zone, 2)
         for one in (0 * waves_nm[0], waves_nm[0], *small_nm)
     )
-    assert modal.by_image(waves_nm[0]) - modal.by_image(0 * waves_nm[0]) == pytest.approx(large - own, rel=0.02)
-    assert [one @ modal.form @ one for one in small_nm] == pytest.approx(np.array(small) - own, rel=0.01)
+    assert modal.by_image(waves_nm[0]) - modal.by_image(0 * waves_nm[0]) == pytest.approx(large - flat, rel=0.02)
+    assert [one @ modal.form @ one for one in small_nm] == pytest.approx(np.array(small) - flat, rel=0.01)
 
 
 def test_lyot_coronagraphs_are_far_more_sensitive_to_tilt_than_a_shaped_pupil(coronagraph):
-    """Tilt adds 1800 times more contrast with the APLC; with the classical mask it changes that mask's own 1e-5."""
+    """Tilt adds 1800 times more contrast with the APLC; with the classical mask it changes a contrast of 1e-5."""
     shaped = coronagraph_from(SensorSection())
-    each, of_shaped = (contrast_form(one, (2,), NM).item() for one in (coronagraph, shaped))
-    assert abs(each) > 1000 * of_shaped > 0
+    of_lyot, of_shaped = (contrast_form(one, (2,), NM).item() for one in (coronagraph, shaped))
+    assert abs(of_lyot) > 1000 * of_shaped > 0

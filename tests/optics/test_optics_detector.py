@@ -52,7 +52,7 @@ def test_a_million_pixels_pass_the_chi_square_test(camera, mean_e):
     numbers = np.arange(400)
     expected = count * probabilities(camera, float(np.float32(mean_e)), numbers)
     found = np.bincount(frame.ravel(), minlength=400)
-    often = expected > least
+    often = expected > least  # all other numbers form one class
     expected = np.append(expected[often], max(count - expected[often].sum(), least))
     found = np.append(found[often], found[~often].sum())
     assert scipy.stats.chi2.sf(np.sum((found - expected)[:-1] ** 2 / expected[:-1]), often.sum() - 1) > 1e-3
@@ -137,13 +137,13 @@ def test_invalid_detectors_are_refused(bad):
         Detector(**bad)
 
 
-def test_photometry_of_section_3_3():
+def test_photometry_agrees_with_section_3_3():
     assert electrons(Photometry(), 0.05) == pytest.approx(8.12e6, rel=1e-3)
     assert electrons(Photometry(magnitude=2.33), 0.05) == pytest.approx(10 * electrons(Photometry(), 0.05))
     assert electrons(Photometry(), 0.1) == pytest.approx(2 * electrons(Photometry(), 0.05))
 
 
-def test_tilt_of_a_milliarcsecond_in_nm():
+def test_a_milliarcsecond_of_tilt_is_2_4_nm_rms_with_a_telescope_of_2_m():
     assert tilt_nm_per_mas(2.0) == pytest.approx(2.424, abs=1e-3)
     assert 4 * tilt_nm_per_mas(2.0) / 550 == pytest.approx(0.0176, abs=1e-4)  # waves peak to valley, Sect. 3.3
 

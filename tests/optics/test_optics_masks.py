@@ -15,7 +15,7 @@ from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge
 from lowfc.optics.chain.sam import Layout, check, is_even_symmetric, transmission
 from lowfc.programs.core.start_up import check_files
 
-TWO = {"purpose": "two holes", "hole_diameter": 0.1, "holes": [[0.1, 0.2], [-0.3, 0.0]]}
+TWO_HOLES = {"purpose": "two holes", "hole_diameter": 0.1, "holes": [[0.1, 0.2], [-0.3, 0.0]]}
 
 
 def written(tmp_path, content, name="mask.json"):
@@ -85,14 +85,14 @@ def test_even_symmetric_mask_gives_a_warning(tmp_path):
     assert warnings == []
 
 
-def test_layouts_from_files(tmp_path, monkeypatch):
-    alone = load_layout(str(written(tmp_path, TWO)))
+def test_layouts_are_read_from_files(tmp_path, monkeypatch):
+    alone = load_layout(str(written(tmp_path, TWO_HOLES)))
     monkeypatch.setenv("HOME", str(tmp_path))
     assert load_layout("~/mask.json") == alone
     assert alone == Layout("mask", "two holes", ((0.1, 0.2, 0.1), (-0.3, 0.0, 0.1)))
-    one = written(tmp_path, {"layouts": {"x": TWO}}, "one.json")
+    one = written(tmp_path, {"layouts": {"x": TWO_HOLES}}, "one.json")
     assert load_layout(str(one)) == load_layout(f"{one}:x")
-    several = written(tmp_path, {"layouts": {"x": TWO, "y": TWO}}, "several.json")
+    several = written(tmp_path, {"layouts": {"x": TWO_HOLES, "y": TWO_HOLES}}, "several.json")
     assert load_layout(f"{several}:y").name == "y"
     with pytest.raises(ConfigurationError, match=r"several layouts.* x, y"):
         load_layout(str(several))
@@ -107,10 +107,10 @@ def test_layouts_from_files(tmp_path, monkeypatch):
         ("[]", "holds no layouts"),
         ({"layouts": {}}, "holds no layouts"),
         ({"layouts": {"x": {"holes": [[0, 0]]}}}, "hole_diameter"),
-        ({"layouts": {"x": {**TWO, "holes": [[0, 0, 0, 0]]}}}, "pairs"),
-        ({"layouts": {"x": {**TWO, "holes": [[0, 0], [0.05, 0]]}}}, "overlap"),
-        ({"layouts": {"x": {**TWO, "holes": [[0.49, 0]]}}}, "outside"),
-        ({"layouts": {"x": {**TWO, "holes": [[10**400, 0]]}}}, "OverflowError: 'int too large"),
+        ({"layouts": {"x": {**TWO_HOLES, "holes": [[0, 0, 0, 0]]}}}, "pairs"),
+        ({"layouts": {"x": {**TWO_HOLES, "holes": [[0, 0], [0.05, 0]]}}}, "overlap"),
+        ({"layouts": {"x": {**TWO_HOLES, "holes": [[0.49, 0]]}}}, "outside"),
+        ({"layouts": {"x": {**TWO_HOLES, "holes": [[10**400, 0]]}}}, "OverflowError: 'int too large"),
         ({"layouts": {"x": 3}}, "layout x"),
     ],
 )
@@ -121,7 +121,7 @@ def test_errors_of_damaged_layout_files_have_their_path(tmp_path, content, messa
     assert str(path) in str(caught.value)
 
 
-def test_missing_files_misspelt_names_and_impossible_values():
+def test_missing_files_misspelt_names_and_impossible_values_are_refused():
     with pytest.raises(DataFileError, match=r"no layout file nowhere\.json"):
         load_layout("nowhere.json")
     with pytest.raises(ConfigurationError, match="did you mean 'sam27d07_bal14'"):

@@ -52,17 +52,17 @@ def wavefronts_and_modes(commands):
     """Wavefronts (20, samples in the pupil) of the commands (actuators, 20), and the modes."""
     u = pupil_axis(256)
     inside, factors = np.hypot(u[:, None], u) <= 0.5, influence_factors(MIRROR, u, 34)
-    made = [2.0 * surface_nm(factors, each.reshape(34, 34), factors)[inside] for each in commands.T]
-    return np.array(made), zernikes(NOLLS_20, 2 * u, 2 * u[:, None])[:, inside]
+    wavefronts = [2.0 * surface_nm(factors, each.reshape(34, 34), factors)[inside] for each in commands.T]
+    return np.array(wavefronts), zernikes(NOLLS_20, 2 * u, 2 * u[:, None])[:, inside]
 
 
 def test_modes_to_actuators_gives_the_modes_with_half_the_surface():
     commands = modes_to_actuators(MIRROR, NOLLS_20)
     assert commands.shape == (34 * 34, 20)
     assert not commands[~active_actuators(MIRROR).ravel()].any()
-    made, targets = wavefronts_and_modes(commands)
-    assert ((made - targets).std(axis=1) < 0.016).all()  # print-through: 1.3 %, 1.6 % for the worst mode
-    assert (made * targets).sum(axis=1) / (targets**2).sum(axis=1) == pytest.approx(1.0, abs=2e-3)
+    wavefronts, targets = wavefronts_and_modes(commands)
+    assert ((wavefronts - targets).std(axis=1) < 0.016).all()  # print-through: 1.3 %, 1.6 % for the worst mode
+    assert (wavefronts * targets).sum(axis=1) / (targets**2).sum(axis=1) == pytest.approx(1.0, abs=2e-3)
 
 
 def test_neighbours_compensate_for_unusable_actuators():
@@ -72,9 +72,11 @@ def test_neighbours_compensate_for_unusable_actuators():
     commands = modes_to_actuators(MIRROR, NOLLS_20, usable)
     assert not commands[~usable.ravel()].any()
     uncompensated = modes_to_actuators(MIRROR, NOLLS_20) * usable.ravel()[:, None]
-    errors, others = (np.subtract(*wavefronts_and_modes(each)).std(axis=1) for each in (commands, uncompensated))
-    assert (errors < 0.95 * others).all()
-    assert np.median(errors / others) < 0.8
+    errors, uncompensated_errors = (
+        np.subtract(*wavefronts_and_modes(each)).std(axis=1) for each in (commands, uncompensated)
+    )
+    assert (errors < 0.95 * uncompensated_errors).all()
+    assert np.median(errors / uncompensated_errors) < 0.8
     few = np.zeros((34, 34), bool)
     few[16:18, 16:18] = True
     with pytest.raises(ValueError, match="4 active actuators in the pupil cannot make 20 modes"):

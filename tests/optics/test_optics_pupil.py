@@ -117,7 +117,7 @@ def test_prolate_pupil_is_an_eigenfunction_of_the_mask(apodised):
     assert np.abs(back[inside] - encircled_fraction * apodised[inside]).max() < 1e-3
 
 
-def test_prolate_pupil_throughput_and_symmetry(apodised):
+def test_prolate_pupil_is_symmetric_and_has_the_throughput_of_its_asymptote(apodised):
     assert apodised.max() <= 1
     assert apodised[127:129, 127:129] == pytest.approx(1, abs=1e-3)
     assert not apodised[circle(256) == 0].any()

@@ -158,16 +158,19 @@ def test_six_millimetres_are_3_4_waves_of_defocus():
 
 @pytest.mark.parametrize("wavelength_nm", [550.0, pytest.param(500.0, marks=pytest.mark.slow)])
 def test_the_defocused_image_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
-    """hcipy's window is periodic, which changes the scale by up to 1e-3; lengths in lambda0/D, small wavelength."""
+    """Lengths are in lambda0/D, and the wavelength is small, so that hcipy's propagation is paraxial.
+
+    Its window is periodic, which changes the scale by up to 1e-3.
+    """
     optics = sensor_named("clowfs")
-    samples, paraxial = 512, 1e-3
+    samples, small_wavelength = 512, 1e-3
     grid = hcipy.make_uniform_grid([samples] * 2, [samples / 8] * 2)
     start = np.zeros((samples, samples), complex)
     start[224:288, 224:288] = at_the_mask(optics, opd_nm, wavelength_nm)
-    free_space = hcipy.FresnelPropagator(grid, optics.relay.distance / paraxial)
-    wave = hcipy.Wavefront(hcipy.Field(start.ravel(), grid), paraxial * wavelength_nm / 550.0)
-    there = np.asarray(free_space.forward(wave).electric_field).reshape(samples, samples)[176:336, 176:336]
-    theirs, ours = np.abs(there) ** 2, np.abs(field(optics, opd_nm, wavelength_nm)) ** 2
+    free_space = hcipy.FresnelPropagator(grid, optics.relay.distance / small_wavelength)
+    wave = hcipy.Wavefront(hcipy.Field(start.ravel(), grid), small_wavelength * wavelength_nm / 550.0)
+    at_detector = np.asarray(free_space.forward(wave).electric_field).reshape(samples, samples)[176:336, 176:336]
+    theirs, ours = np.abs(at_detector) ** 2, np.abs(field(optics, opd_nm, wavelength_nm)) ** 2
     scale = np.vdot(theirs, ours) / np.vdot(theirs, theirs)
     assert scale == pytest.approx(1, abs=1e-3)
     assert relative_l2(ours, scale * theirs) < 1e-3
@@ -180,9 +183,9 @@ def test_defocused_image_agrees_with_a_quadratic_phase_in_the_relay_pupil(opd_nm
     x, u = image_axis(64, 8), image_axis(4096, 512)  # 8 D of relay pupil
     window = np.cos(np.clip((np.abs(u) - 3.0) * np.pi / 2, 0, np.pi / 2)) ** 2  # its rim sends no light to the detector
     transfer = window * np.exp(-1j * np.pi * optics.relay.distance * u**2)
-    there = np.exp(2j * np.pi * np.outer(image_axis(160, 8), u)) * transfer @ np.exp(-2j * np.pi * np.outer(u, x))
-    there /= 8 * 512
-    theirs = there @ at_the_mask(optics, opd_nm, 550.0) @ there.T
+    propagator = np.exp(2j * np.pi * np.outer(image_axis(160, 8), u)) * transfer @ np.exp(-2j * np.pi * np.outer(u, x))
+    propagator /= 8 * 512
+    theirs = propagator @ at_the_mask(optics, opd_nm, 550.0) @ propagator.T
     assert relative_l2(field(optics, opd_nm, 550.0), theirs) < 1e-3
 
 
@@ -197,8 +200,8 @@ def test_pupil_image_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
     start = hcipy.Field((optics.pupil * np.exp(1j * phase)).ravel(), pupil_grid)
     focal = hcipy.FraunhoferPropagator(pupil_grid, focal_grid).forward(hcipy.Wavefront(start, wavelength_nm / 550.0))
     focal.electric_field *= optics.focal_mask.ravel()
-    there = np.asarray(hcipy.FraunhoferPropagator(detector, focal_grid).backward(focal).electric_field)
-    theirs = np.abs(there.reshape(80, 80)) ** 2 * optics.pitch**2 / (np.pi / 4)
+    at_detector = np.asarray(hcipy.FraunhoferPropagator(detector, focal_grid).backward(focal).electric_field)
+    theirs = np.abs(at_detector.reshape(80, 80)) ** 2 * optics.pitch**2 / (np.pi / 4)
     ours = image(optics, opd_nm, monochromatic(wavelength_nm))
     assert relative_l2(ours, theirs.reshape(40, 2, 40, 2).sum(axis=(1, 3))) < 1e-12
 
@@ -321,8 +324,8 @@ def calibrated(**changed):
     keys = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 11.0}
     config = load(None, keys | {key.replace("__", "."): value for key, value in changed.items()})
     optics = factory.twin(config, None, pytest.fail)
-    made = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, pytest.fail))
-    return made, factory.frame_noise_nm(config, made)
+    calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, pytest.fail))
+    return calibration, factory.frame_noise_nm(config, calibration)
 
 
 @pytest.mark.parametrize(("name", "noise_factor"), [("clowfs", (3, 8)), ("zwfs", (1.2, 2))])
@@ -348,10 +351,10 @@ def test_fitting_shear_and_background_removes_their_bias(name, noise_factor):
 
 
 def test_the_noise_of_a_frame_includes_rounding_to_whole_dn():
-    made, noise_nm = calibrated(camera__gain_e_per_dn=4.0, star__magnitude=5.0)
-    mean_e = np.tile(4.0 * made.flux_dn * made.reference, (100, 1))
-    light = expose(Detector(gain_e_per_dn=4.0), mean_e, np.random.Generator(np.random.SFC64(1))) - made.dark
-    modes_nm = (light / light.sum(axis=1, keepdims=True) - made.reference) @ made.reconstructor.T
+    calibration, noise_nm = calibrated(camera__gain_e_per_dn=4.0, star__magnitude=5.0)
+    mean_e = np.tile(4.0 * calibration.flux_dn * calibration.reference, (100, 1))
+    light = expose(Detector(gain_e_per_dn=4.0), mean_e, np.random.Generator(np.random.SFC64(1))) - calibration.dark
+    modes_nm = (light / light.sum(axis=1, keepdims=True) - calibration.reference) @ calibration.reconstructor.T
     assert np.median(modes_nm.std(axis=0) / noise_nm) == pytest.approx(1, abs=0.1)
 
 

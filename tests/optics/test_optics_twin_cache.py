@@ -115,13 +115,13 @@ def test_tests_use_their_own_cache():
 def test_damaged_file_is_reported_and_rebuilt(sensor, stored, tmp_path):
     twin, path = stored
     content = path.read_bytes()
-    middle = len(content) // 3
+    damaged_byte = len(content) // 3
     load_or_build(sensor, replace(SMALL, rank=41), cache_dir=tmp_path / "other")
     (other,) = (tmp_path / "other").iterdir()
     for damaged in (
         content[: len(content) // 2],
         b"",
-        content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :],
+        content[:damaged_byte] + bytes([content[damaged_byte] ^ 1]) + content[damaged_byte + 1 :],
         other.read_bytes(),
     ):
         path.write_bytes(damaged)
