@@ -39,10 +39,10 @@ def test_the_page_is_rendered_from_its_json_file(name):
 def test_a_long_table_prints_selected_rows_and_agrees_with_simulation():
     table = committed("tolerance")
     assert all(CASES["tolerance"].in_text(row) for row in table["rows"])
-    more = table | {
+    longer = table | {
         "rows": [*table["rows"], table["rows"][0] | {"quantity": "drift of Z15 tetrafoil 45, V = 8, 1e-09"}]
     }
-    assert f"{len(table['rows'])} of {len(more['rows'])} rows" in to_text(more)
+    assert f"{len(table['rows'])} of {len(longer['rows'])} rows" in to_text(longer)
     checked = [row for row in table["rows"] if "at its tolerance" in row["quantity"]]
     assert len(checked) == 12
     for row in checked:
@@ -67,13 +67,13 @@ def test_every_published_value_has_a_verdict_and_no_noise_is_below_the_quantum_l
 def agree(rows: list[Row], name: str) -> int:
     """Assert that rows in a committed table have its values, up to rounding errors; returns how many there are."""
     references = {(row["name"], row["estimator"], row["quantity"]): row for row in committed(name)["rows"]}
-    found = [row for row in map(plain, rows) if (row["name"], row["estimator"], row["quantity"]) in references]
-    for row in found:
+    common = [row for row in map(plain, rows) if (row["name"], row["estimator"], row["quantity"]) in references]
+    for row in common:
         reference = references[row["name"], row["estimator"], row["quantity"]]
         for column in ("measured", "predicted", "limit", "error"):
             expected = reference[column]
             assert row[column] == (expected if expected is None else pytest.approx(expected, rel=1e-3)), row
-    return len(found)
+    return len(common)
 
 
 def test_tolerances_of_a_sensor_have_the_committed_values(monkeypatch):
@@ -143,8 +143,8 @@ class Loops:
         config = load(cwd / options["--config"] if "--config" in options else None)
         assert name == "tune" or config.sensor == section_of(SMALLEST)
         self.commands.append((name, options.get("--disturbance", ""), bool(config.control.law)))
-        found = {"log": "a.mcap", "tilt_disturbance_mas": 14.0, "tilt_residual_mas": self.residual_mas}
-        return SimpleNamespace(returncode=0, stdout=json.dumps(found))
+        results = {"log": "a.mcap", "tilt_disturbance_mas": 14.0, "tilt_residual_mas": self.residual_mas}
+        return SimpleNamespace(returncode=0, stdout=json.dumps(results))
 
     def history(self, log):
         rng, frames = np.random.default_rng(4), round(24 * anchors.RATE_HZ)
@@ -168,7 +168,9 @@ def test_loops_are_judged_by_the_published_pointing(monkeypatch):
         assert 0 < row.limit * tilt_nm_per_mas(2.0) < 2.0, "of a line of 14 nm rms that the law has in its model"
     for where, verdict in (("sky", anchors.REACHED), ("laboratory", anchors.NOT_REACHED)):
         row = rows[f"std of means over 2 s, {where}"]
-        assert row.measured == pytest.approx(0.05 * np.sqrt(10 / 9))
+        assert row.measured == pytest.approx(
+            0.05 * np.sqrt(10 / 9)
+        )  # ten means of +-0.05 mas, in 24 s without the first four
         assert rows[f"verdict, {row.quantity}"].measured == verdict
     driven = [
         [("sim-loop", preset, False), ("tune", "", False), ("sim-loop", preset, True)]

@@ -131,17 +131,17 @@ def test_the_committed_conditioning_confirms_section_4(committed):
 def test_table3_is_better_than_the_paper_with_few_wavefronts(few):
     assert {row["estimator"] for row in few["table3"]["rows"]} == {None, *ESTIMATORS}
     for modes in (14, 20):
-        plain_one, weighted, _, iterated = (find(few["table3"], SAM, RMS, modes, estimator) for estimator in ESTIMATORS)
-        assert plain_one["measured"] < plain_one["paper"]
-        assert iterated["measured"] < weighted["measured"] < plain_one["measured"]
+        pinv, weighted, _, iterated = (find(few["table3"], SAM, RMS, modes, estimator) for estimator in ESTIMATORS)
+        assert pinv["measured"] < pinv["paper"]
+        assert iterated["measured"] < weighted["measured"] < pinv["measured"]
         assert 0.5 * iterated["limit"] < iterated["measured"] < 1.5 * iterated["limit"]
 
 
 def test_the_prediction_for_table4_is_better_than_the_paper(few):
-    plain_one, weighted = (
+    pinv, weighted = (
         find(few["table4"], SAM, "std of x tilt, 1 mas, paper's electrons", 2, kind) for kind in ("pinv", "weighted")
     )
-    assert plain_one["predicted"] < plain_one["paper"] == 0.36
+    assert pinv["predicted"] < pinv["paper"] == 0.36
     assert weighted["predicted"] < 0.25
     assert weighted["limit"] <= weighted["predicted"] < 1.02 * weighted["limit"]
 
@@ -149,10 +149,10 @@ def test_the_prediction_for_table4_is_better_than_the_paper(few):
 def test_the_papers_inconsistencies_are_computed(few):
     rows = [row for row in few["photometry"]["rows"] if row["name"].startswith("inconsistency")]
     assert {row["name"].split(":")[0] for row in rows} == {f"inconsistency {k}" for k in (1, 2, 3, 4)}
-    found = {row["quantity"]: row for row in rows}
-    tilt = found["largest P-V of 1 mas that Table 2's tilt allows"]
+    by_quantity = {row["quantity"]: row for row in rows}
+    tilt = by_quantity["largest P-V of 1 mas that Table 2's tilt allows"]
     assert tilt["measured"] < 0.6 * tilt["paper"]
-    defocus = found["defocus at which the brightest pixel has 1.10 %"]
+    defocus = by_quantity["defocus at which the brightest pixel has 1.10 %"]
     assert 1.0 < defocus["measured"] < 1.6 < defocus["paper"] == 6.0
     for row in rows:
         if row["paper"] == 0.97:
@@ -335,16 +335,16 @@ TABLE3 = {
 
 @pytest.mark.parametrize(("name", "estimator"), TABLE3)
 def test_the_committed_table3_is_better_than_the_paper(committed, name, estimator):
-    for modes, most in zip((14, 20), TABLE3[name, estimator], strict=True):
-        assert find(committed["table3"], name, RMS, modes, estimator)["measured"] < most
+    for modes, largest in zip((14, 20), TABLE3[name, estimator], strict=True):
+        assert find(committed["table3"], name, RMS, modes, estimator)["measured"] < largest
 
 
 @pytest.mark.parametrize(("name", "light"), [*product(("sam", "sam27d10_bal14"), LIGHT), (SAM, LIGHT[0])])
 def test_the_committed_table4_is_better_than_the_paper(committed, name, light):
-    for mas, (kind, most) in product((1, 10), (("pinv", 0.36), ("weighted", 0.25))):
+    for mas, (kind, largest_mas) in product((1, 10), (("pinv", 0.36), ("weighted", 0.25))):
         row = find(committed["table4"], name, f"std of x tilt, {mas} mas, {light}", 2, kind)
-        assert row["predicted"] < most, row
-        assert row["measured"] < most + 2.0 * row["error"], row
+        assert row["predicted"] < largest_mas, row
+        assert row["measured"] < largest_mas + 2.0 * row["error"], row
 
 
 @pytest.mark.parametrize(
@@ -356,9 +356,9 @@ def test_the_committed_table4_is_better_than_the_paper(committed, name, light):
         *(("bowtie", "sam", 14, estimator) for estimator in ESTIMATORS),
     ],
 )
-def test_order_of_sensors_in_the_committed_table3(committed, better, worse, modes, estimator):
-    good, bad = (find(committed["table3"], name, RMS, modes, estimator)["measured"] for name in (better, worse))
-    assert good < bad
+def test_one_sensor_is_better_than_another_in_the_committed_table3(committed, better, worse, modes, estimator):
+    smaller, larger = (find(committed["table3"], name, RMS, modes, estimator)["measured"] for name in (better, worse))
+    assert smaller < larger
 
 
 def test_zernike_sensor_beats_sparse_apertures_and_sized_holes_beat_equal_ones_in_the_committed_table4(committed):
@@ -372,12 +372,12 @@ def test_zernike_sensor_beats_sparse_apertures_and_sized_holes_beat_equal_ones_i
 
 def test_fitting_flux_and_shear_adds_noise_for_clowfs_but_not_for_sam(committed):
     """With real pupil and mask, flux and shear change the image evenly and modes oddly: fitting them costs nothing."""
-    plain_one, with_nuisances = (
+    without_nuisances, with_nuisances = (
         {name: find(committed["table3"], name, RMS, 14, kind)["measured"] for name in ("sam", "clowfs")}
         for kind in ("weighted", WITH_NUISANCES)
     )
-    assert with_nuisances["sam"] == pytest.approx(plain_one["sam"], rel=1e-6)
-    assert with_nuisances["clowfs"] > 1.5 * plain_one["clowfs"]
+    assert with_nuisances["sam"] == pytest.approx(without_nuisances["sam"], rel=1e-6)
+    assert with_nuisances["clowfs"] > 1.5 * without_nuisances["clowfs"]
 
 
 def test_an_interruption_does_not_wait_for_running_items():

@@ -28,13 +28,13 @@ def tables():
 
 
 def values(rows, quantity, estimator=None, name=""):
-    found = [
+    measured = [
         row.measured
         for row in rows
         if row.quantity == quantity and row.estimator == estimator and row.name.startswith(name)
     ]
-    assert found
-    return found
+    assert measured
+    return measured
 
 
 @pytest.mark.parametrize("figure", FIGURES)
@@ -148,8 +148,8 @@ def test_the_signal_of_a_milliarcsecond_agrees_with_the_slope_of_the_image(table
     ready = prepared("sam")
     u = 2 * pupil_axis(512)
     tilt_nm = 1e-3 / 3600 * np.pi / 180 * 2.0 / 4 * 1e9 * 2 * np.broadcast_to(u, (512, 512))  # 2 m; Z2 = 2 u
-    np.testing.assert_allclose(ready.opd_nm(np.array([2.4241, 0.0])), tilt_nm, atol=1e-3)
-    slope = ready.band_tilt_H[:, 0] * 2.4241 / ready.band_I0.max()
+    np.testing.assert_allclose(ready.opd_nm(np.array([NM_PER_MAS, 0.0])), tilt_nm, atol=1e-3)
+    slope = ready.band_tilt_H[:, 0] * NM_PER_MAS / ready.band_I0.max()
     assert values(rows, "P-V change over peak", name="sam, tilt x")[0] == pytest.approx(np.ptp(slope), rel=0.02)
 
 
