@@ -42,6 +42,7 @@ GRID = CONFIG.mirror.rows, CONFIG.mirror.columns
 
 
 def ns(index: int) -> int:
+    """Time of a frame, at 250 Hz."""
     return START_S * SECOND_NS + index * 4_000_000
 
 
@@ -71,11 +72,12 @@ def event(level: Level, text: str) -> Entry:
 
 
 def received(*lost: int) -> Gaps:
-    found = Gaps(0)
+    """Account of a topic of which all messages but those lost were received."""
+    gaps = Gaps(0)
     for number in range(FRAMES):
         if number not in lost:
-            found.add(number)
-    return found
+            gaps.add(number)
+    return gaps
 
 
 @pytest.fixture(scope="module")
@@ -88,18 +90,18 @@ def good_entries() -> dict[Topic, tuple[Entry, ...]]:
 @pytest.fixture
 def evidence(good_entries: dict[Topic, tuple[Entry, ...]]) -> Evidence:
     """Logs of a loop without a fault, four seconds long."""
-    found = Evidence(messages=5 * FRAMES, log_ends=[(ns(FRAMES), True)])
+    evidence = Evidence(messages=5 * FRAMES, log_ends=[(ns(FRAMES), True)])
     for topic, entries in good_entries.items():
-        found.entries[topic] = list(entries)
-    found.received = {(0, key, START_S): received() for key in (FRAME.key, STEP.key)}
-    return found
+        evidence.entries[topic] = list(entries)
+    evidence.received = {(0, key, START_S): received() for key in (FRAME.key, STEP.key)}
+    return evidence
 
 
 @pytest.fixture
 def outcome(tmp_path: Path) -> Outcome:
-    found = Outcome(tmp_path, CONFIG, marks={"quiet": ns(300), "end": ns(FRAMES)}, mode=wire.LOOP_MODE_CLOSED)
-    found.ended = [ProcessEnd("camera", 0, 0.1, True), ProcessEnd("controller", 0, 0.1, True)]
-    return found
+    outcome = Outcome(tmp_path, CONFIG, marks={"quiet": ns(300), "end": ns(FRAMES)}, mode=wire.LOOP_MODE_CLOSED)
+    outcome.ended = [ProcessEnd("camera", 0, 0.1, True), ProcessEnd("controller", 0, 0.1, True)]
+    return outcome
 
 
 def broken_rules(case: Case, outcome: Outcome, evidence: Evidence) -> dict[str, str]:
@@ -155,9 +157,9 @@ def test_a_fault_breaks_its_rule_and_no_other(
 ) -> None:
     assert [one.held for one in judge(CASE, outcome, evidence)] == [True] * 6
     inject(evidence, outcome)
-    found = broken_rules(CASE, outcome, evidence)
-    assert set(found) == {rule}
-    assert text in found[rule]
+    broken = broken_rules(CASE, outcome, evidence)
+    assert set(broken) == {rule}
+    assert text in broken[rule]
 
 
 def test_losses_that_are_counted_and_refused_frames_that_hold_the_command_break_no_rule(
@@ -278,12 +280,12 @@ def without_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         return [Finding("notes", not outcome.notes, "; ".join(outcome.notes))]
 
     def act_only(case: Case, folder: Path, rng: object) -> Outcome:
-        found = Outcome(folder, load(None))
+        outcome = Outcome(folder, load(None))
         try:
             case.act(None)  # type: ignore[arg-type]  # these acts need no bench
         except LowfcError as error:
-            found.notes.append(str(error))
-        return found
+            outcome.notes.append(str(error))
+        return outcome
 
     def faulty(bench: object) -> None:
         raise KeyError("odd")

@@ -138,7 +138,7 @@ def test_a_camera_with_another_clock_is_replaced_by_one_with_the_hosts() -> None
 def test_every_killed_or_stopped_process_continues_in_the_random_case() -> None:
     done: list[tuple[str, str]] = []
 
-    def noted(action: str) -> Callable[[str], None]:
+    def recorded(action: str) -> Callable[[str], None]:
         return lambda name: done.append((action, name))
 
     class Stopped:
@@ -155,8 +155,8 @@ def test_every_killed_or_stopped_process_continues_in_the_random_case() -> None:
         rng=random.Random(3),  # noqa: S311
         process=str,
         pause=lambda *_: None,
-        kill=noted("kill"),
-        restart=noted("restart"),
+        kill=recorded("kill"),
+        restart=recorded("restart"),
         stopped=Stopped,
     )
     CASES["random"].act(stub)

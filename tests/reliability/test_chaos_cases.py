@@ -27,13 +27,13 @@ def in_simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replace every bench by a `ToyBench`; cases wait and intruders send in its simulated time."""
 
     def new_bench(*arguments: Any) -> ToyBench:
-        made = ToyBench(*arguments)
+        toy_bench = ToyBench(*arguments)
         for module in (control, junk, processes, console):
-            made.replace_time(module, monkeypatch.setattr)
+            toy_bench.replace_time(module, monkeypatch.setattr)
         for module in (client, junk, console):
-            monkeypatch.setattr(module, "HostClock", lambda: made.clock)
-        monkeypatch.setattr(junk, "ZenohBus", lambda _, role, __: made.connection(role))
-        return made
+            monkeypatch.setattr(module, "HostClock", lambda: toy_bench.clock)
+        monkeypatch.setattr(junk, "ZenohBus", lambda _, role, __: toy_bench.connection(role))
+        return toy_bench
 
     monkeypatch.setattr(bench, "ChaosBench", new_bench)
     monkeypatch.setattr(case, "WHILE_FRAMES", 100)

@@ -45,6 +45,7 @@ TO_MODES = np.linalg.pinv(TOY.modes_to_actuators)
 QUIET_FRAMES = 150
 CAMERA_PID = 1
 PATIENCE_FRAMES = 3000
+"""Frames after which a condition is waited for in vain."""
 
 
 class ImmediateController(Controller):
@@ -140,13 +141,13 @@ class ToyBench(ChaosBench):
     def restart(self, name: str, command: list[str] | None = None, *, ready: bool = True) -> None:
         """Start a controller; its calibration file is the last word of the command."""
         try:
-            found = calibration_file.load(Path((command or self.children[Role.CONTROLLER].command)[-1]))
+            loaded = calibration_file.load(Path((command or self.children[Role.CONTROLLER].command)[-1]))
         except LowfcError as fault:
             self._fault = str(fault)
             return
         service = self._service(name)
         self._latch = Latch([self.run.path / NAME], lambda why: service.event("LATCH_FAILED", why=why))
-        self._controller = ImmediateController(self.config, service, found, "a test", self._latch)
+        self._controller = ImmediateController(self.config, service, loaded, "a test", self._latch)
         service.fill = self._controller.fill
         self._mirror._publish(self.clock.now_ns())  # the mirror's state, from which a controller starts
         self._controller._camera.await_first()
@@ -169,7 +170,7 @@ class ToyBench(ChaosBench):
         self.health[Role.RECORDER] = wire.Health(recording=wire.Recording(messages=self._recorder.messages))
 
     def expose(self) -> None:
-        """One frame, the command from it, and what the processes do between two frames."""
+        """Expose one frame, and let the processes do what they do until the next."""
         self.clock.advance(self.config.period_ns)
         disturbance_nm = DRIFT_NM * np.sin(2 * np.pi * DRIFT_HZ * self._index / self.config.camera.rate_hz)
         surface_nm = self._mirror._status.surface_nm.reshape(-1)
