@@ -13,6 +13,7 @@ SETTLED, AT_ONCE = np.inf, 0.0  # elapsed time, ns
 
 
 def even(height_nm: float) -> np.ndarray:
+    """Shape with all actuators at one height."""
     return np.full(GRID, height_nm, np.float32)
 
 
@@ -26,14 +27,14 @@ def test_gain_errors_differ_between_actuators_and_depend_on_the_seed() -> None:
 
 def play(width_nm: float, heights_nm: list[float]) -> list[float]:
     """Play operator: a block in a slot, which moves only when an end of the slot pushes it."""
-    found, at_nm = [], 0.0
+    positions_nm, at_nm = [], 0.0
     for height_nm in heights_nm:
         if height_nm - at_nm > width_nm:
             at_nm = height_nm - width_nm
         elif at_nm - height_nm > width_nm:
             at_nm = height_nm + width_nm
-        found.append(at_nm)
-    return found
+        positions_nm.append(at_nm)
+    return positions_nm
 
 
 def test_hysteresis_agrees_with_play_operators_and_encloses_their_area() -> None:
@@ -45,8 +46,9 @@ def test_hysteresis_agrees_with_play_operators_and_encloses_their_area() -> None
     reached = [float(actuators.reach(even(height), AT_ONCE)[0, 0]) for height in heights]
     plays = np.mean([play(width, heights) for width in PLAY_NM], axis=0)
     np.testing.assert_allclose(reached, (1 - share) * np.array(heights) + share * plays, atol=1e-3)
-    driven, settled = np.array(heights[4000:]), np.array(reached[4000:])
-    area = abs(np.sum((settled[1:] + settled[:-1]) / 2 * np.diff(driven)))
+    # The second of the two cycles; the first begins inside the loop.
+    commanded_nm, reached_nm = np.array(heights[4000:]), np.array(reached[4000:])
+    area = abs(np.sum((reached_nm[1:] + reached_nm[:-1]) / 2 * np.diff(commanded_nm)))
     expected = share * np.mean([4 * width * max(swing_nm - width, 0) for width in PLAY_NM])
     assert area == pytest.approx(expected, rel=0.01)
 

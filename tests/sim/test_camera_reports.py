@@ -30,10 +30,10 @@ def truth(residual_nm: float, noll: tuple[int, ...] = NOLL) -> Truth:
 def statistics(
     *residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1, noll: tuple[int, ...] = NOLL
 ) -> WavefrontAccumulator:
-    found = WavefrontAccumulator(noll, nm_per_mas, recent)
+    accumulator = WavefrontAccumulator(noll, nm_per_mas, recent)
     for residual_nm in residuals_nm:
-        found.add(truth(residual_nm, noll))
-    return found
+        accumulator.add(truth(residual_nm, noll))
+    return accumulator
 
 
 @pytest.mark.parametrize("blocks", [2, MAX_BLOCKS - 1, MAX_BLOCKS, MAX_BLOCKS + 2, 2 * MAX_BLOCKS + 4])
@@ -95,8 +95,8 @@ def test_occasional_late_commands_are_not_habitual() -> None:
 def test_camera_reports_each_change_of_habitual_lateness() -> None:
     hub, clock, config = MemoryHub(), FakeClock(), Configuration()
     listener = Listener(hub, clock)
-    optics = cast("Scene", SimpleNamespace(shape=(80, 80), instants=()))
-    camera = SimulatedCamera(SimulatedCamera.Options(), config, optics)
+    scene = cast("Scene", SimpleNamespace(shape=(80, 80), instants=()))
+    camera = SimulatedCamera(SimulatedCamera.Options(), config, scene)
     camera.join(listener.service("camera"))
     states = MemoryBus(hub, "mirror-dm", clock).publisher(MIRROR_STATE, config.mirror.name)
     shape = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
@@ -126,8 +126,8 @@ def test_camera_reports_each_change_of_habitual_lateness() -> None:
 
 
 def test_a_call_of_a_slow_camera_waits_half_a_second_at_most() -> None:
-    optics = cast("Scene", SimpleNamespace(shape=(80, 80), instants=(), expose=lambda index, shape: np.zeros((80, 80))))
-    camera = SimulatedCamera(SimulatedCamera.Options(), load(None, {"camera.rate_hz": 0.5}), optics)
+    scene = cast("Scene", SimpleNamespace(shape=(80, 80), instants=(), expose=lambda index, shape: np.zeros((80, 80))))
+    camera = SimulatedCamera(SimulatedCamera.Options(), load(None, {"camera.rate_hz": 0.5}), scene)
     camera.join(Listener(MemoryHub(), FakeClock()).service("camera"))
     camera.start()
     assert [camera.expose() is None for _ in range(5)] == [False, True, True, True, False]
@@ -135,9 +135,9 @@ def test_a_call_of_a_slow_camera_waits_half_a_second_at_most() -> None:
 
 def test_region_is_read_at_the_centre_of_the_sensor() -> None:
     pixels = np.arange(80 * 80, dtype=np.uint16).reshape(80, 80)
-    optics = cast("Scene", SimpleNamespace(shape=(80, 80), instants=(), expose=lambda index, shape: pixels))
+    scene = cast("Scene", SimpleNamespace(shape=(80, 80), instants=(), expose=lambda index, shape: pixels))
     options = SimulatedCamera.Options(rows=64, columns=50)
-    camera, clock = SimulatedCamera(options, Configuration(), optics), FakeClock()
+    camera, clock = SimulatedCamera(options, Configuration(), scene), FakeClock()
     settings = camera.settings()
     region = settings.region_row, settings.rows, settings.region_column, settings.columns
     assert region == (8, 64, 15, 50)
@@ -147,4 +147,4 @@ def test_region_is_read_at_the_centre_of_the_sensor() -> None:
     assert exposure is not None
     assert np.array_equal(exposure.pixels, pixels[8:72, 15:65])
     with pytest.raises(ConfigurationError, match="rows is 81, the sensor has 80"):
-        SimulatedCamera(SimulatedCamera.Options(rows=81), Configuration(), optics)
+        SimulatedCamera(SimulatedCamera.Options(rows=81), Configuration(), scene)

@@ -51,14 +51,14 @@ def rms_nm(disturbance: Disturbance) -> np.ndarray:
 
 
 def check_order_and_block(name: str, first: int, count: int, cut: int) -> None:
-    """Compare `count` frames from `first` on with those after `cut`, with one alone, and with all of a new object."""
+    """Compare `count` frames from `first` on with those after `cut`, with one alone, and with another object's."""
     disturbance = preset(name, static_nm={4: 3.0})
-    whole = modes_nm(disturbance, first, count, RATE_HZ)
+    expected = modes_nm(disturbance, first, count, RATE_HZ)
     cut = min(cut, count - 1)
-    assert whole.shape == (count, len(NOLL))
-    assert np.abs(modes_nm(disturbance, first + cut, count - cut, RATE_HZ) - whole[cut:]).max() < 1e-5
-    assert np.abs(modes_nm(disturbance, first + cut, 1, RATE_HZ)[0] - whole[cut]).max() < 1e-5
-    assert np.array_equal(modes_nm(preset(name, static_nm={4: 3.0}), first, count, RATE_HZ), whole)
+    assert expected.shape == (count, len(NOLL))
+    assert np.abs(modes_nm(disturbance, first + cut, count - cut, RATE_HZ) - expected[cut:]).max() < 1e-5
+    assert np.abs(modes_nm(disturbance, first + cut, 1, RATE_HZ)[0] - expected[cut]).max() < 1e-5
+    assert np.array_equal(modes_nm(preset(name, static_nm={4: 3.0}), first, count, RATE_HZ), expected)
 
 
 @pytest.mark.parametrize("name", [name for name in PRESETS if name != WHEEL])
@@ -213,7 +213,7 @@ def test_screen_has_a_kolmogorov_spectrum_and_depends_on_the_seed() -> None:
     assert not np.allclose(screen(3, 20, 0.05), screen(4, 20, 0.05))
 
 
-def test_unknown_presets_and_modes_are_refused() -> None:
+def test_unknown_presets_are_refused() -> None:
     with pytest.raises(ValueError, match="'earthquake'"):
         preset("earthquake")
 
@@ -289,7 +289,7 @@ def test_message_faults_change_the_payload() -> None:
 
 @pytest.mark.parametrize("kind", [Kind.DUPLICATED, Kind.REORDERED, Kind.LATE, Kind.OLD_SEQUENCE, Kind.TRUNCATED])
 def test_faulty_publisher_sends_the_configured_frames(kind: Kind) -> None:
-    hub, clock = MemoryHub(), FakeClock(EARLIER_S * 10**10)
+    hub, clock = MemoryHub(), FakeClock(EARLIER_S * 10**10)  # late enough for a start EARLIER_S before
     camera, reader = MemoryBus(hub, "camera", clock), MemoryBus(hub, "controller", clock)
     received: list[Sample] = []
     reader.subscribe(FRAME, received.append)

@@ -6,6 +6,7 @@ import pytest
 from sim_camera.path import MirrorPath
 
 FLAT, ONE, TWO = (np.full((2, 2), height, np.float32) for height in (0.0, 1.0, 2.0))
+"""Shapes of this height."""
 INSTANTS = np.array([0.1, 0.5, 0.9])
 
 

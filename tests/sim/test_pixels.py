@@ -13,7 +13,7 @@ from sim_camera.driver import scene
 from sim_camera.pixels import pixel_errors, response
 
 FLAT = np.zeros((34, 34), np.float32)
-FULL = Detector(full_well_e=40_000.0, bias_dn=100.0)
+DETECTOR = Detector(full_well_e=40_000.0, bias_dn=100.0)
 
 
 def quiet(**changed: Any) -> Configuration:
@@ -39,25 +39,25 @@ def test_dark_current_raises_the_mean_of_frames() -> None:
 
 
 def test_hot_pixels_and_gains_have_the_configured_statistics() -> None:
-    found = pixel_errors(FULL, (300, 400), 1, 0.02, 0.0, 0.01, 50.0)
+    found = pixel_errors(DETECTOR, (300, 400), 1, 0.02, 0.0, 0.01, 50.0)
     assert found is not None
     assert found.gain.std() == pytest.approx(0.02, rel=0.02)
     hot = found.hot_e[found.hot_e > 0]
     assert hot.size == pytest.approx(1200, abs=4 * np.sqrt(1200))
     assert hot.mean() == pytest.approx(50, rel=0.15)
-    again = pixel_errors(FULL, (300, 400), 1, 0.02, 0.0, 0.01, 50.0)
+    again = pixel_errors(DETECTOR, (300, 400), 1, 0.02, 0.0, 0.01, 50.0)
     np.testing.assert_array_equal(found.hot_e, again.hot_e)
     np.testing.assert_array_equal(found.gain, again.gain)
-    assert pixel_errors(FULL, (300, 400), 1, 0, 0, 0, 50.0) is None
+    assert pixel_errors(DETECTOR, (300, 400), 1, 0, 0, 0, 50.0) is None
 
 
 def test_nonlinear_response_is_exact_at_zero_and_full_well() -> None:
-    found, full = response(FULL, 0.05), saturation_dn(FULL)
+    found, full = response(DETECTOR, 0.05), saturation_dn(DETECTOR)
     assert found[[0, 50, 100, full]].tolist() == [0, 50, 100, full]
     for signal in (200, 20_000, 35_000):
         assert found[100 + signal] - 100 == pytest.approx(signal * 1.05 - 0.05 * signal**2 / 40_000, abs=0.5)
     assert (np.diff(found[: full + 1].astype(int)) >= 0).all()
-    np.testing.assert_array_equal(response(FULL, 0.0), np.arange(1 << 16))
+    np.testing.assert_array_equal(response(DETECTOR, 0.0), np.arange(1 << 16))
 
 
 def test_scene_applies_pixel_errors_reproducibly() -> None:
@@ -66,7 +66,7 @@ def test_scene_applies_pixel_errors_reproducibly() -> None:
     plain, one, same = (scene(load(None, bright | more)) for more in ({"camera.noise": False}, keys, keys))
     ideal, real = plain.expose(0, FLAT), one.expose(0, FLAT)
     np.testing.assert_array_equal(real, same.expose(0, FLAT))
-    errors = pixel_errors(FULL, real.shape, 1, 0.02, 0.05, 0.01, 40.0)
+    errors = pixel_errors(DETECTOR, real.shape, 1, 0.02, 0.05, 0.01, 40.0)
     signal = (ideal.astype(float) - 100) * errors.gain + errors.hot_e
     expected = 100 + signal * (1 + 0.05 * (1 - signal / 40_000))
     np.testing.assert_allclose(real, expected, atol=2)

@@ -31,10 +31,12 @@ def command(actuators_nm: Single | None, index: int = 1, **changes: object) -> C
 
 
 def even(height_nm: float) -> Single:
+    """Shape with all actuators at one height."""
     return np.full(GRID, height_nm, np.float32)
 
 
 def follow(device: Simulated, status: Status, *heights_nm: float) -> Status:
+    """Status after commands to these heights, which must be accepted."""
     for height_nm in heights_nm:
         index = status.frame_sequence + 1
         status, refused = device.apply_command(status, command(even(height_nm), index), START_NS + index * MS)
@@ -319,7 +321,7 @@ def test_driver_step_too_coarse_for_the_slew_limit_is_refused() -> None:
 
 def test_the_configuration_gives_the_mirrors_limits_and_faulty_actuators() -> None:
     keys = {"mirror.dead": [0, 35], "mirror.stuck_nm": {"35": 9.0, "40": -70.0}, "mirror.on_command_timeout": "hold"}
-    made = Simulated(load(None, keys))
-    assert made.protection == MirrorProtection((34, 34), LIMITS, STEP_NM, flatten=False)
-    assert np.argwhere(made.initial.surface_nm).tolist() == [[1, 1], [1, 6]]
-    assert made.initial.surface_nm[1, [1, 6]].tolist() == [9, -70]
+    simulated = Simulated(load(None, keys))
+    assert simulated.protection == MirrorProtection((34, 34), LIMITS, STEP_NM, flatten=False)
+    assert np.argwhere(simulated.initial.surface_nm).tolist() == [[1, 1], [1, 6]]
+    assert simulated.initial.surface_nm[1, [1, 6]].tolist() == [9, -70]

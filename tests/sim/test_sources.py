@@ -41,25 +41,25 @@ def wheel(course: str, change: float, start_hz: float = 30.0) -> Wheel:
 )
 def test_phase_of_wheel_harmonics_is_the_integral_of_the_speed(course: str, change: float, speed_hz: Any) -> None:
     """Compared with a numerically integrated phase; a ramp passes through zero speed, where the amplitude vanishes."""
-    made, speed = wheel(course, change), speed_hz(TIME_S)
+    spinning, speed = wheel(course, change), speed_hz(TIME_S)
     phase = 2 * np.pi * cumulative_trapezoid(speed, TIME_S, initial=0)
     expected = np.zeros((TIME_S.size, 2))
-    for order, at_rest in zip(ORDERS, made.amplitude_nm, strict=True):
+    for order, at_rest in zip(ORDERS, spinning.amplitude_nm, strict=True):
         height = (order * speed) ** 2 / ((order * speed) ** 2 + SOFT_HZ**2)
         expected += (height * np.exp(1j * order * phase))[:, None].real * at_rest.real
         expected -= (height * np.exp(1j * order * phase))[:, None].imag * at_rest.imag
-    np.testing.assert_allclose(made.speed_hz(TIME_S), speed, atol=1e-9)
-    np.testing.assert_allclose(made.modes_nm(TIME_S), expected, atol=2e-3)
-    np.testing.assert_allclose(np.abs(made.amplitude_nm[0]) / np.sqrt(2), [2.0, 3.0])
-    assert np.abs(made.amplitude_nm[:, 0] / made.amplitude_nm[0, 0]) == pytest.approx(HEIGHTS)
+    np.testing.assert_allclose(spinning.speed_hz(TIME_S), speed, atol=1e-9)
+    np.testing.assert_allclose(spinning.modes_nm(TIME_S), expected, atol=2e-3)
+    np.testing.assert_allclose(np.abs(spinning.amplitude_nm[0]) / np.sqrt(2), [2.0, 3.0])
+    assert np.abs(spinning.amplitude_nm[:, 0] / spinning.amplitude_nm[0, 0]) == pytest.approx(HEIGHTS)
 
 
 def test_phase_of_a_random_walk_speed_is_its_integral() -> None:
-    made, time_s = wheel("walk", 0.5), TIME_S[::10]
-    speed = made.speed_hz(time_s)
+    spinning, time_s = wheel("walk", 0.5), TIME_S[::10]
+    speed = spinning.speed_hz(time_s)
     assert speed[0] == pytest.approx(30)
     assert np.ptp(speed) > 0.3
-    np.testing.assert_allclose(made.turns(time_s), cumulative_trapezoid(speed, time_s, initial=0), atol=1e-3)
+    np.testing.assert_allclose(spinning.turns(time_s), cumulative_trapezoid(speed, time_s, initial=0), atol=1e-3)
 
 
 def test_random_walk_grows_with_the_square_root_of_time() -> None:
@@ -99,6 +99,7 @@ def test_two_wheels_beat() -> None:
     both = [replace(each, amplitude_nm=np.array([[2.0], *[[0]] * 4]) + 0j) for each in (one, other)]
     total = sum(each.modes_nm(time_s)[:, 0] for each in both)
     envelope = np.abs(total).reshape(-1, 100).max(axis=1)
+    # In the middle of each tenth of a second; 900 / 925 is the height at 30 Hz with the corner at 5 Hz.
     expected = 4 * np.abs(np.cos(np.pi * 0.5 * (0.05 + 0.1 * np.arange(40)))) * 900 / 925
     np.testing.assert_allclose(envelope, expected, atol=0.4)
     config = quiet(disturbance__wheel_hz=30.0, disturbance__second_wheel_hz=0.5)
@@ -113,26 +114,27 @@ def test_sensor_sees_the_mean_of_fast_jitter_over_the_exposure(exposure: float) 
     np.testing.assert_allclose(
         np.sqrt(variances_nm2(disturbance)[1].sum(axis=0))[:3] / NM_PER_MAS, [2, 2, 0], rtol=1e-3
     )
-    made, fine = scene(config), 2000
+    simulated, samples = scene(config), 2000  # per frame period
     for index in (0, 7, 8, 30):
-        within = modes_nm(disturbance, index * fine, round(exposure * fine) + 1, 1000.0 * fine)
+        within = modes_nm(disturbance, index * samples, round(exposure * samples) + 1, 1000.0 * samples)
         mean = (within[1:] + within[:-1]).mean(axis=0) / 2
-        assert np.abs(made.truth(index, FLAT).sensed_nm - mean)[:2].max() < 0.1
+        assert np.abs(simulated.truth(index, FLAT).sensed_nm - mean)[:2].max() < 0.1
 
 
 def test_shear_changes_the_image_but_not_the_wavefront() -> None:
     keys = {"camera__noise": False, "camera__gain_e_per_dn": 0.01, "camera__full_well_e": 600.0}
     config = quiet(disturbance__shear=0.002, **keys)
-    made, disturbance = scene(config), disturbance_of(config)
+    sheared, disturbance = scene(config), disturbance_of(config)
     series = np.array([shear_at(disturbance, time_s) for time_s in np.arange(0, 100, 0.01)])
     assert series.std(axis=0) == pytest.approx([0.002, 0.002], rel=0.2)
     index = 1000 * int(np.abs(series[::100]).max(axis=1).argmax())  # a frame with large shear
-    truth = made.truth(index, FLAT)
+    truth = sheared.truth(index, FLAT)
+    # Half of each period is exposed; the shear is that of the middle.
     np.testing.assert_allclose(truth.shear, shear_at(disturbance, (index + 0.25) / 1000))
     assert truth.sampled.residual_rms_nm == pytest.approx(0, abs=1e-4)
-    changed = made.expose(index, FLAT).astype(float) - scene(quiet(**keys)).expose(index, FLAT)
+    changed = sheared.expose(index, FLAT).astype(float) - scene(quiet(**keys)).expose(index, FLAT)
     slopes = shear_slopes(config) @ truth.shear
-    electrons = (made.expose(index, FLAT).sum() - 100 * 6400) / reference(twin(config, None, print)).sum()
+    electrons = (sheared.expose(index, FLAT).sum() - 100 * 6400) / reference(twin(config, None, print)).sum()
     np.testing.assert_allclose(changed.ravel(), electrons * slopes, atol=1.5)
     assert np.abs(changed).max() > 25
 
@@ -149,11 +151,11 @@ def test_frames_and_truths_depend_on_the_seed_only() -> None:
     }
     runs = []
     for seed, order in ((1, (0, 9, 70)), (1, (70, 0, 9)), (2, (0, 9, 70))):
-        made = scene(quiet(**keys, seed=seed, camera__noise=False))
-        found = {index: (made.expose(index, FLAT).tobytes(), made.truth(index, FLAT)) for index in order}
-        runs.append([(found[index][0], found[index][1].instants_nm.tobytes()) for index in (0, 9, 70)])
+        simulated = scene(quiet(**keys, seed=seed, camera__noise=False))
+        pairs = {index: (simulated.expose(index, FLAT).tobytes(), simulated.truth(index, FLAT)) for index in order}
+        runs.append([(pairs[index][0], pairs[index][1].instants_nm.tobytes()) for index in (0, 9, 70)])
     assert runs[0] == runs[1]
     assert runs[0] != runs[2]
-    speeds = made.truth(70, FLAT).wheel_speed_hz
+    speeds = simulated.truth(70, FLAT).wheel_speed_hz
     assert speeds == pytest.approx([40, 40.7], abs=0.5)
     assert speeds[0] not in (40.0, speeds[1])
