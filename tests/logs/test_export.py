@@ -47,10 +47,10 @@ from tests.support.loops import json_of, lowfc, refusal
 from tests.support.mutated_logs import flipped
 from tests.support.report_log import METADATA, SyntheticLog
 
-STEPS, REFUSED, WITHOUT_COMMAND, WITHOUT_TRUTH = 30, 4, 7, 9
+STEPS, REFUSED, WITHOUT_COMMAND, WITHOUT_TRUTH = 30, 4, 7, 9  # number of steps, and indices of three of them
 MODES, ACTUATORS = len(toy.NOLL), toy.GRID[0] * toy.GRID[1]
 QUIET = Console(quiet=True)
-GOOD = np.arange(toy.SHAPE[0] * toy.SHAPE[1]) != 10
+GOOD = np.arange(toy.SHAPE[0] * toy.SHAPE[1]) != 10  # one bad pixel
 CALIBRATED = identified(replace(toy.calibration(), good=GOOD.astype(np.float32)))
 
 
@@ -103,7 +103,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return written(tmp_path_factory.mktemp("night") / "night.mcap")
 
 
-def test_csv(log: Path, tmp_path: Path) -> None:
+def test_a_csv_row_has_the_values_of_its_step(log: Path, tmp_path: Path) -> None:
     results = export_log(log, Format.CSV, tmp_path / "out.csv", console=QUIET)
     assert results["files"] == [str(tmp_path / "out.csv")]
     assert (results["steps"], results["modes"], results["finished"]) == (STEPS, MODES, True)
@@ -125,7 +125,7 @@ def test_csv(log: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.array(table["command_z4_nm"], np.float32), sent(STEP, "command_nm")[:, 2])
 
 
-def test_npz(log: Path, tmp_path: Path) -> None:
+def test_npz_arrays_have_the_values_of_the_messages(log: Path, tmp_path: Path) -> None:
     results = export_log(log, Format.NPZ, tmp_path / "out.npz", frames=True, console=QUIET)
     assert results["files"] == [str(tmp_path / "out.npz"), str(tmp_path / "out.frames.npy")]
     assert results["frames"] == STEPS
@@ -144,7 +144,7 @@ def test_npz(log: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.load(tmp_path / "out.frames.npy", mmap_mode="r"), FRAMES)
 
 
-def test_fits(log: Path, tmp_path: Path) -> None:
+def test_fits_tables_and_images_have_the_values_of_the_messages(log: Path, tmp_path: Path) -> None:
     export_log(log, Format.FITS, tmp_path / "out.fits", frames=True, console=QUIET)
     with fits.open(tmp_path / "out.fits", checksum=True) as hdus:
         hdus.verify("exception")
@@ -165,7 +165,7 @@ def test_fits(log: Path, tmp_path: Path) -> None:
     assert table["time_utc"][1] == f"{np.datetime64(TIMES_NS[1], 'ns')}"
 
 
-def test_aot(log: Path, tmp_path: Path) -> None:
+def test_an_aot_file_describes_the_system_to_aotpy(log: Path, tmp_path: Path) -> None:
     path = tmp_path / "out.aot.fits"
     export_log(log, Format.AOT, path, frames=True, console=QUIET)
     system = aotpy.AOSystem.read_from_file(path, exception_level=AOTFITSErrorLevel.WARNING)
@@ -173,10 +173,10 @@ def test_aot(log: Path, tmp_path: Path) -> None:
     sensor, mirror = loop.input_sensor, loop.commanded_corrector
     calibration, good = CALIBRATED, GOOD
 
-    def check(found: aotpy.Image, unit: str | None, expected: npt.ArrayLike) -> None:
-        assert found.unit == unit
-        assert found.data.shape == np.shape(expected)
-        np.testing.assert_array_equal(found.data, expected)
+    def check(image: aotpy.Image, unit: str | None, expected: npt.ArrayLike) -> None:
+        assert image.unit == unit
+        assert image.data.shape == np.shape(expected)
+        np.testing.assert_array_equal(image.data, expected)
 
     commands_nm = sent(COMMAND, "actuators", ACTUATORS)
     assert np.flatnonzero(np.isnan(commands_nm[:, 0])).tolist() == [WITHOUT_COMMAND]
@@ -204,7 +204,7 @@ def test_aot(log: Path, tmp_path: Path) -> None:
     assert mirror.uid == "dm"
     assert mirror.n_valid_actuators == len(mirror.actuator_coordinates) == ACTUATORS
     across = [coordinate.x for coordinate in mirror.actuator_coordinates[: toy.GRID[1]]]
-    np.testing.assert_allclose(np.diff(across), 2.0 / 31.0)
+    np.testing.assert_allclose(np.diff(across), 2.0 / 31.0)  # diameter, m, over pitches per pupil
     assert system.main_telescope.enclosing_diameter == 2.0
     metadata = {one.key: one.value for one in system.metadata}
     assert (metadata["CALID"], metadata["RUN"], metadata["EPERADU"]) == (calibration.id, "night", 1.0)

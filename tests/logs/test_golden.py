@@ -44,8 +44,8 @@ def test_a_replay_is_identical_except_for_rules_that_changed_on_purpose(
     results = json_of("replay", path, "--tolerance", 1e-3)
     assert (results["frames"], results["different"], results["unchecked"]) == (frames, 0, 0)
     assert results["rules_changed"] == changed
-    whole = json_of("replay", log, "--tolerance", 1e-3) if lost_bytes else results  # it names its host
-    if not {"blas", "cpu_features", "numpy"} & whole["host_differs"].keys():
+    complete = json_of("replay", log, "--tolerance", 1e-3) if lost_bytes else results  # the complete log names its host
+    if not {"blas", "cpu_features", "numpy"} & complete["host_differs"].keys():
         assert (results["identical"], results["largest_difference_nm"]) == (True, 0.0)
 
 
@@ -75,7 +75,7 @@ def test_a_log_of_0_1_is_exported(form: str, tmp_path: Path) -> None:
     assert json_of("export", NIGHT, "--to", form, "--out", tmp_path / f"night.{form}")
 
 
-def test_a_what_if_of_a_log_of_0_1() -> None:
+def test_a_what_if_of_a_log_of_0_1_is_computed() -> None:
     assert json_of("what-if", NIGHT, "--set", "gain=0.3")["frames"] > 20
 
 

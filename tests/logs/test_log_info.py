@@ -46,7 +46,7 @@ def log(tmp_path: Path) -> Path:
         now_ns = START_NS + number * SECOND // 10
         restarted = number > 50
         count = number - 51 if restarted else number
-        if count in frames:
+        if count in frames:  # any message of a kilobyte will do
             writer.write(sample(FRAME.key, wire.Health(process="x" * 1000), count, now_ns, START_S + 5 * restarted))
         if number < 100:
             writer.write(sample(STEP.key, wire.ControlStep(), number, now_ns))

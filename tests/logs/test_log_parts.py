@@ -135,7 +135,7 @@ COMMANDS = [
     ["export", "--decimate", "7"],
     ["latency"],
 ]
-OF_FILES = {
+KEYS_OF_FILES = {
     *("log", "logs", "file", "files", "bytes", "bytes_before", "metadata", "attachments", "speed", "runs", "source"),
     *("remarks", "settings", "warnings"),
 }
@@ -144,7 +144,7 @@ OF_FILES = {
 def without_files(results: Any) -> Any:
     """Results without those that depend on the files or on the time taken."""
     if isinstance(results, dict):
-        return {key: without_files(value) for key, value in results.items() if key not in OF_FILES}
+        return {key: without_files(value) for key, value in results.items() if key not in KEYS_OF_FILES}
     return results
 
 
@@ -153,7 +153,7 @@ def ten_files_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sa
     """Folder with a log in ten files and in one: all of it, or the first quarter."""
 
     @cache
-    def made(all_of_it: bool) -> Path:
+    def recorded_folder(all_of_it: bool) -> Path:
         folder = tmp_path_factory.mktemp("recorded")
         chosen = samples if all_of_it else samples[: len(samples) // 4]
         calibration_file.save(SyntheticLog().calibration, folder / "other.fits")
@@ -162,7 +162,7 @@ def ten_files_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sa
         recorded(folder / "one", chosen, 1)
         return folder
 
-    return made
+    return recorded_folder
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)

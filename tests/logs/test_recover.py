@@ -22,7 +22,7 @@ MUTATIONS = 120  # of complete and of unfinished logs together
 def recovered(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Counter[str]]:
     """Recovered logs, and the number of readable messages of each topic in the damaged ones."""
     folder = tmp_path_factory.mktemp("recovered")
-    found = {}
+    logs = {}
     for finished in (True, False):
         data = small_log(folder / f"whole-{finished}.mcap", finished=finished).read_bytes()
         for number, kind, changed in mutations(data, range(MUTATIONS // 2)):
@@ -38,9 +38,9 @@ def recovered(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Counter[st
             done = recover(source, recovered_path(source))
             assert source.read_bytes() == changed
             assert (done.messages, done.damage) == (counts.total(), reader.damage)
-            found[recovered_path(source)] = counts
-    assert len(found) > 0.9 * MUTATIONS
-    return found
+            logs[recovered_path(source)] = counts
+    assert len(logs) > 0.9 * MUTATIONS
+    return logs
 
 
 def test_recovered_logs_are_complete(recovered: dict[Path, Counter[str]]) -> None:
@@ -59,9 +59,9 @@ def test_recovered_logs_are_complete(recovered: dict[Path, Counter[str]]) -> Non
 
 @pytest.mark.node
 def test_foxglove_reads_recovered_logs_completely(recovered: dict[Path, Counter[str]]) -> None:
-    found = foxglove(recovered)
-    assert [(one["counts"], one["counted"]) for one in found] == [(c, c.total()) for c in recovered.values()]
-    assert all("recovery" in one["metadata"] for one in found)
+    logs = foxglove(recovered)
+    assert [(log["counts"], log["counted"]) for log in logs] == [(one, one.total()) for one in recovered.values()]
+    assert all("recovery" in log["metadata"] for log in logs)
 
 
 def test_rerun_reads_recovered_logs_completely(recovered: dict[Path, Counter[str]]) -> None:
@@ -70,11 +70,11 @@ def test_rerun_reads_recovered_logs_completely(recovered: dict[Path, Counter[str
         lines = [line.split() for line in rerun("info", path).splitlines()]
         assert ["Messages", str(counts.total())] in lines
         assert ["Summary", "embedded"] in lines
-        seen: Counter[str] = Counter()
+        listed: Counter[str] = Counter()
         for words in lines:
             if len(words) > 2 and words[1].startswith("/"):
-                seen[words[1]] += int(words[2])
-        assert seen == counts
+                listed[words[1]] += int(words[2])
+        assert listed == counts
         assert all(topic in checked for topic in counts)
 
 

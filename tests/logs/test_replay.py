@@ -63,6 +63,7 @@ STATE_EVERY = 12
 STEPS = 1000
 EXAMPLES = 40
 SHAPE = np.full(20, 3, np.float32)
+"""Shape of a command channel, nm of surface."""
 
 
 class Night:
@@ -100,10 +101,10 @@ class Night:
             self.put(STEP, codec.encode_step(outputs.step, number))
         if isinstance(input_, Request):
             assert outputs.reply is not None
-            shown = (
+            state = (
                 controller_state(self.state, self.loop_settings, input_.time_ns) if input_.name == "status" else None
             )
-            self.put(REQUEST, codec.encode_request(logged or input_, outputs.reply, number, shown))
+            self.put(REQUEST, codec.encode_request(logged or input_, outputs.reply, number, state))
         elif not isinstance(input_, Frame) and number > self._last_number:
             self.put(CONTROL_INPUT, codec.encode_input(input_, number))
         if outputs.changed or (number > self._last_number and number % STATE_EVERY == 0):
@@ -150,11 +151,11 @@ def replay(
     return run.finish()
 
 
-def night(input_list: list[Input], **changes: object) -> Night:
-    made = Night(settings(**(TIGHT | changes)))
+def night_of(input_list: list[Input], **changes: object) -> Night:
+    night = Night(settings(**(TIGHT | changes)))
     for one in input_list:
-        made.apply(one)
-    return made
+        night.apply(one)
+    return night
 
 
 @pytest.mark.skipif(not compiled.available(), reason="needs the extra `fast`")
@@ -162,14 +163,14 @@ def test_a_log_of_the_fused_kernel_is_replayed_bit_by_bit_with_it_and_with_a_dif
     channel = Request(0, "channel", text="dark-hole", actuators_nm=SHAPE)
     law = Request(0, "law", law=integrator([0.3] * 3, [0.0] * 3, NOLL, 2.5, 1000.0))
     input_list = [*frames(60, 1), channel, *frames(100, 61), law, *frames(400, 161)]
-    made = night(input_list, kernel=compiled.kernel("fused"), delay_frames=2.5, interlocks=())
-    logged = [one.payload for one in made.messages if one.key == CONTROLLER_STATE.key][-1]
+    night = night_of(input_list, kernel=compiled.kernel("fused"), delay_frames=2.5, interlocks=())
+    logged = [one.payload for one in night.messages if one.key == CONTROLLER_STATE.key][-1]
     assert wire.ControllerState.FromString(logged).settings.kernel == "fused"
-    assert replay(made.messages).identical
-    other = replay(made.messages, kernel="numpy")
+    assert replay(night.messages).identical
+    other = replay(night.messages, kernel="numpy")
     assert (other.other_kernel, other.identical) == ("numpy", False)
     assert 0 < other.largest_difference_nm < 1e-3
-    tolerant = replay(made.messages, 1e-3, kernel="numpy")
+    tolerant = replay(night.messages, 1e-3, kernel="numpy")
     assert (tolerant.frames, tolerant.different, tolerant.identical) == (560, 0, False)
 
 
@@ -191,11 +192,13 @@ def frames(count: int, first: int = 0) -> list[Input]:
 def test_any_sequence_of_inputs_is_replayed_bit_by_bit(
     before: list[Input], after: list[Input], on_frame_timeout: str, delay_frames: float, kernel: str
 ) -> None:
-    made = night(before, on_frame_timeout=on_frame_timeout, delay_frames=delay_frames, kernel=compiled.kernel(kernel))
-    made.restart()
+    night = night_of(
+        before, on_frame_timeout=on_frame_timeout, delay_frames=delay_frames, kernel=compiled.kernel(kernel)
+    )
+    night.restart()
     for one in after_camera_restart(after):
-        made.apply(one)
-    account, sent = replay(made.messages), Counter(message.key for message in made.messages)
+        night.apply(one)
+    account, sent = replay(night.messages), Counter(message.key for message in night.messages)
     assert (account.different, account.largest_difference_nm, account.unchecked_because) == (0, 0.0, {})
     assert account.frames == sent[STEP.key]
     assert account.commands == sent[COMMAND.at("dm")]
@@ -204,19 +207,22 @@ def test_any_sequence_of_inputs_is_replayed_bit_by_bit(
 
 
 def test_an_overruled_law_is_replayed_bit_by_bit_even_from_the_middle() -> None:
-    made = night([], guard=True, rate_hz=1000.0, limit_nm=(150.0, 150.0))
-    made.apply(Request(made.now_ns, "law", law=integrator((0.05,) * len(NOLL), (0.0,) * len(NOLL), NOLL, 1.0, 1000.0)))
+    night = night_of([], guard=True, rate_hz=1000.0, limit_nm=(150.0, 150.0))
+    night.apply(
+        Request(night.now_ns, "law", law=integrator((0.05,) * len(NOLL), (0.0,) * len(NOLL), NOLL, 1.0, 1000.0))
+    )
     for count in range(860):
         wave_nm = 20 * np.sin(0.04 * count + np.arange(len(NOLL)))
-        made.apply(frame(count, wave_nm + made.state.loop.history_nm[0]))
-    steps = [message for message in made.messages if message.key == STEP.key]
+        night.apply(frame(count, wave_nm + night.state.loop.history_nm[0]))
+    steps = [message for message in night.messages if message.key == STEP.key]
+    # About 100 frames of observation, 100 of cross-fade, and four blocks of 100 in which the law is worse.
     overruled = [Limit.LAW_OVERRULED in wire.ControlStep.FromString(message.payload).reasons for message in steps]
     assert overruled == [False] * 598 + [True] * 262
-    account = replay(made.messages)
+    account = replay(night.messages)
     assert account.identical
     for first in (300, 640, 800):
-        truncated = [message for message in made.messages if message.key in (CALIBRATION.key, LAW.key)]
-        truncated += [message for message in made.messages if message.receive_time_ns >= steps[first].receive_time_ns]
+        truncated = [message for message in night.messages if message.key in (CALIBRATION.key, LAW.key)]
+        truncated += [message for message in night.messages if message.receive_time_ns >= steps[first].receive_time_ns]
         account = replay(truncated)
         assert account.identical
         assert account.frames >= 860 - first - 2 * STATE_EVERY
@@ -227,8 +233,8 @@ def test_an_overruled_law_is_replayed_bit_by_bit_even_from_the_middle() -> None:
 def test_lost_messages_are_never_a_difference_and_every_step_is_accounted_for(
     input_list: list[Input], random: st.DataObject, losses: int
 ) -> None:
-    made = night([*frames(30, 9000), *after_camera_restart([*input_list, *frames(30, 5000)])])
-    remaining = list(made.messages)
+    night = night_of([*frames(30, 9000), *after_camera_restart([*input_list, *frames(30, 5000)])])
+    remaining = list(night.messages)
     for _ in range(losses):
         remaining.pop(random.randrange(len(remaining)))  # type: ignore[attr-defined]
     account = replay(remaining)
@@ -239,16 +245,16 @@ def test_lost_messages_are_never_a_difference_and_every_step_is_accounted_for(
 @effort(deadline=None, max_examples=EXAMPLES)
 @given(inputs(), st.randoms(use_true_random=False))
 def test_the_order_between_publishers_does_not_matter(input_list: list[Input], random: st.DataObject) -> None:
-    made = night([*input_list, *frames(20, 5000)])
+    night = night_of([*input_list, *frames(20, 5000)])
     frames_late_ns, others_late_ns = (random.randrange(PATIENCE_NS // 2) for _ in range(2))  # type: ignore[attr-defined]
     late = []
-    for message in made.messages:
+    for message in night.messages:
         late_ns = frames_late_ns if message.key == FRAME.key else others_late_ns
         late.append(message._replace(receive_time_ns=message.receive_time_ns + late_ns))
     shuffled = sorted(late, key=lambda message: message.receive_time_ns)
     account = replay(shuffled)
     assert account.identical
-    assert account.frames == made.steps()
+    assert account.frames == night.steps()
 
 
 @effort(deadline=None, max_examples=EXAMPLES)
@@ -269,14 +275,14 @@ def test_segments_together_give_the_account_of_the_whole_log(
     slowdown: int,
 ) -> None:
     """With single messages or seconds of messages or states missing, at different message rates."""
-    made = night([*before, *frames(60, 9000)])
-    made.restart()
+    night = night_of([*before, *frames(60, 9000)])
+    night.restart()
     for one in after_camera_restart([*after, *frames(60, 9000)]):
-        made.apply(one)
-    begun_ns = made.messages[0].receive_time_ns
+        night.apply(one)
+    begun_ns = night.messages[0].receive_time_ns
     messages = [
         message._replace(receive_time_ns=begun_ns + slowdown * (message.receive_time_ns - begun_ns))
-        for message in made.messages
+        for message in night.messages
     ]
     for place, count in gaps:
         first = int(place * (len(messages) - 1))
@@ -299,26 +305,26 @@ def test_segments_together_give_the_account_of_the_whole_log(
 
 
 def test_after_a_gap_the_replay_continues_at_the_next_state_and_reports_unchecked_steps() -> None:
-    made = night(frames(100))
-    steps = [index for index, message in enumerate(made.messages) if message.key == STEP.key]
-    account = replay([*made.messages[: steps[30]], *made.messages[steps[40] :]])
+    night = night_of(frames(100))
+    steps = [index for index, message in enumerate(night.messages) if message.key == STEP.key]
+    account = replay([*night.messages[: steps[30]], *night.messages[steps[40] :]])
     assert account.identical
     assert list(account.unchecked_because) == ["after an input that the log does not have"]
     assert account.frames + account.unchecked == 90
-    without = [message for message in made.messages if message.key != FRAME.key or message.sequence % 100 != 50]
+    without = [message for message in night.messages if message.key != FRAME.key or message.sequence % 100 != 50]
     assert replay(without).unchecked_because["after a frame that the log does not have"] >= 1
-    head = [message for message in made.messages if message.key == CALIBRATION.key]
-    account = replay([*head, *made.messages[len(made.messages) // 2 :]])
+    head = [message for message in night.messages if message.key == CALIBRATION.key]
+    account = replay([*head, *night.messages[len(night.messages) // 2 :]])
     assert account.identical
     assert 0 < account.unchecked_because["recorded before the first complete state of the controller"] <= STATE_EVERY
 
 
 def test_a_recording_that_begins_in_the_middle_of_a_run_lacks_no_input() -> None:
     """A recorder that starts receives the newest state; the inputs since then are from before the recording."""
-    made = night(frames(100)).messages
-    head = [message for message in made if message.key == CALIBRATION.key]
-    later = made[len(made) // 2 :]
-    state = [message for message in made[: len(made) // 2] if message.key == CONTROLLER_STATE.key][-2]
+    messages = night_of(frames(100)).messages
+    head = [message for message in messages if message.key == CALIBRATION.key]
+    later = messages[len(messages) // 2 :]
+    state = [message for message in messages[: len(messages) // 2] if message.key == CONTROLLER_STATE.key][-2]
     account = replay([*head, state._replace(receive_time_ns=later[0].receive_time_ns), *later])
     assert account.identical
     assert list(account.unchecked_because) == ["recorded before the first complete state of the controller"]
@@ -340,19 +346,19 @@ OTHER = identified(calibration(NOLL, 2.0))
 def test_an_input_of_a_former_version_whose_rule_has_changed_is_named_and_replay_continues(
     rule: str, logged: Request, applied: Request
 ) -> None:
-    made = night([Request(0, "open"), *frames(30)], interlocks=())
-    made.put(CALIBRATION, encode_calibration(OTHER, made.now_ns))
-    made.apply(applied, logged)
+    night = night_of([Request(0, "open"), *frames(30)], interlocks=())
+    night.put(CALIBRATION, encode_calibration(OTHER, night.now_ns))
+    night.apply(applied, logged)
     for one in frames(30, 31):
-        made.apply(one)
-    account = replay(made.messages, former=FormerVersion({}))
+        night.apply(one)
+    account = replay(night.messages, former=FormerVersion({}))
     assert (account.frames, account.different, account.rules_changed) == (60, 0, {rule: 1})
-    assert replay(made.messages).different  # of this version
+    assert replay(night.messages).different  # of this version
 
 
-def tampered(made: Night, topic: Topic, number: int, change: str) -> Account:
+def tampered(night: Night, topic: Topic, number: int, change: str) -> Account:
     """Change one message slightly, and replay."""
-    messages = list(made.messages)
+    messages = list(night.messages)
     places = [index for index, message in enumerate(messages) if topic.matches(message.key)]
     index = places[number]
     body = topic.message.FromString(messages[index].payload)
@@ -382,7 +388,7 @@ def tampered(made: Night, topic: Topic, number: int, change: str) -> Account:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_the_smallest_difference_is_found_and_reported(topic: Topic, change: str, expected: str) -> None:
-    account = tampered(night(frames(60)), topic, 2, change)
+    account = tampered(night_of(frames(60)), topic, 2, change)
     assert not account.identical
     assert account.first_difference.message == topic.message.DESCRIPTOR.name
     assert any(line.startswith(expected) for line in account.first_difference.fields), account.first_difference.fields
@@ -396,30 +402,30 @@ def test_the_smallest_difference_is_found_and_reported(topic: Topic, change: str
 
 
 def test_a_second_message_for_one_input_differs() -> None:
-    made = night(frames(60))
-    place = [index for index, message in enumerate(made.messages) if message.key == STEP.key][20]
-    account = replay([*made.messages, made.messages[place]])
+    night = night_of(frames(60))
+    place = [index for index, message in enumerate(night.messages) if message.key == STEP.key][20]
+    account = replay([*night.messages, night.messages[place]])
     assert account.different == 1
     assert account.first_difference.fields == ["a second message of input 22"]
 
 
 def test_commands_that_are_not_in_the_log_are_counted() -> None:
-    made = night(frames(60))
-    commands = [index for index, message in enumerate(made.messages) if COMMAND.matches(message.key)]
-    without = [message for index, message in enumerate(made.messages) if index not in commands[10:13]]
+    night = night_of(frames(60))
+    commands = [index for index, message in enumerate(night.messages) if COMMAND.matches(message.key)]
+    without = [message for index, message in enumerate(night.messages) if index not in commands[10:13]]
     account = replay(without)
     assert (account.identical, account.commands, account.commands_missing) == (True, 57, 3)
-    none = replay([message for message in made.messages if not COMMAND.matches(message.key)])
-    assert (none.different, none.commands, none.commands_missing) == (0, 0, 60)
-    assert not none.identical
+    without_any = replay([message for message in night.messages if not COMMAND.matches(message.key)])
+    assert (without_any.different, without_any.commands, without_any.commands_missing) == (0, 0, 60)
+    assert not without_any.identical
 
 
 def test_a_log_without_input_numbers_is_refused() -> None:
-    made = night(frames(3))
+    night = night_of(frames(3))
     with pytest.raises(DataFileError, match="the steps in this log are not numbered"):
-        tampered(made, STEP, 0, "body.input_number = 0")
-    made.messages.append(Sample(REQUEST.key, wire.Request(name="gain").SerializeToString(), 0, 0, 0))
-    assert replay(made.messages).identical
+        tampered(night, STEP, 0, "body.input_number = 0")
+    night.messages.append(Sample(REQUEST.key, wire.Request(name="gain").SerializeToString(), 0, 0, 0))
+    assert replay(night.messages).identical
 
 
 def test_one_frame_is_singular() -> None:
@@ -428,8 +434,8 @@ def test_one_frame_is_singular() -> None:
 
 def test_a_log_with_nothing_to_check_is_not_identical() -> None:
     assert not replay([]).identical
-    made = night(frames(5))
-    assert not replay([message for message in made.messages if message.key != CALIBRATION.key]).identical
+    night = night_of(frames(5))
+    assert not replay([message for message in night.messages if message.key != CALIBRATION.key]).identical
 
 
 def test_frames_are_kept_within_a_limit_of_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -455,9 +461,9 @@ def test_several_processes_give_the_account_of_one(log: Path, monkeypatch: pytes
     chunk_ends_ns = workers._chunk_ends_ns  # out of order: a large calibration is a chunk, and has its former time
     monkeypatch.setattr(workers, "_chunk_ends_ns", lambda path: chunk_ends_ns(path)[::-1])
     monkeypatch.setattr(workers, "_WORTH_BYTES", 1)
-    one, two = (workers.replay_files([log], 0.0, jobs, lambda done: None) for jobs in (1, 2))
-    assert (one.identical, one.log_s) == (True, pytest.approx((STEPS - 1) / 1000))
-    assert one == two
+    by_one, by_two = (workers.replay_files([log], 0.0, jobs, lambda done: None) for jobs in (1, 2))
+    assert (by_one.identical, by_one.log_s) == (True, pytest.approx((STEPS - 1) / 1000))
+    assert by_one == by_two
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -482,15 +488,15 @@ def test_two_lockstep_runs_with_the_same_sequences_are_replayed_apart(
     """Also two runs of one name, `sim-loop --lockstep --run a`."""
     paths: list[Path] = []
     for run, gain in (("a", 0.1), (other, 0.2)):
-        made = report_log.SyntheticLog().request("gain", (gain,)).frames(200)
+        night = report_log.SyntheticLog().request("gain", (gain,)).frames(200)
         hour_ns = len(paths) * 3600 * 10**9
-        made.samples = [
+        night.samples = [
             one._replace(publish_time_ns=one.publish_time_ns + hour_ns, receive_time_ns=one.receive_time_ns + hour_ns)
-            for one in made.samples
+            for one in night.samples
         ]
         part = {"of": f"night-{len(paths)}", "number": "1"}
         monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"run": run}, "part": part})
-        paths.append(made.write(tmp_path / f"{len(paths)}.mcap"))
+        paths.append(night.write(tmp_path / f"{len(paths)}.mcap"))
     found = workers.replay_files(paths, 0.0, 1, lambda done: None)
     assert (found.frames, found.unchecked, found.first_difference, found.runs) == (400, 0, None, sorted({"a", other}))
 
@@ -519,16 +525,16 @@ def test_a_finished_log_with_a_damaged_summary_is_not_called_cut_off(log: Path, 
 
 
 def test_a_forged_command_and_another_host_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = report_log.SyntheticLog().frames(STEPS)
-    place = [index for index, sample in enumerate(made.samples) if COMMAND.matches(sample.key)][700]
-    command = wire.MirrorCommand.FromString(made.samples[place].payload)
+    night = report_log.SyntheticLog().frames(STEPS)
+    place = [index for index, sample in enumerate(night.samples) if COMMAND.matches(sample.key)][700]
+    command = wire.MirrorCommand.FromString(night.samples[place].payload)
     surface = np.frombuffer(command.actuators, np.float32).copy()
     surface[13] = np.nextafter(surface[13], np.float32(np.inf))
     command.actuators = surface.tobytes()
-    made.samples[place] = made.samples[place]._replace(payload=command.SerializeToString())
+    night.samples[place] = night.samples[place]._replace(payload=command.SerializeToString())
     features = provenance()["cpu_features"] + " abacus"
     monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"numpy": "1.0", "cpu_features": features}})
-    forged = made.write(tmp_path / "forged.mcap")
+    forged = night.write(tmp_path / "forged.mcap")
     done = lowfc("replay", forged)
     assert done.exit_code == 1
     for words in (
