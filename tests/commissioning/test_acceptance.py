@@ -28,7 +28,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
 )
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
 from tests.support.loops import refusal
-from tests.support.report_log import TOYS, SyntheticLog
+from tests.support.report_log import TOY_CALIBRATION, SyntheticLog
 
 MULTISINE = {"duration_s": 3.0, "rms_nm": 3.0, "lines_per_mode": 8, "modes": (), "seed": 1}
 
@@ -250,9 +250,11 @@ def test_a_disturbed_test_that_was_repeated_does_not_count(tmp_path: Path) -> No
 def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_of_its_time(tmp_path: Path) -> None:
     night = SyntheticLog().frames(20)
     night.request("note", text='acceptance {"test": "noise-floor", "loop": "open", "frames": 50}').frames(60)
-    night.request("gain", (0.1,)).request("safe").request("clear").load(identified(replace(TOYS, flux_dn=1.0)))
+    night.request("gain", (0.1,)).request("safe").request("clear").load(
+        identified(replace(TOY_CALIBRATION, flux_dn=1.0))
+    )
     (response,) = logged_responses(read_history(LogReader(night.frames(5).write(tmp_path / "night.mcap"))), noise.KIND)
-    assert (response.loop.law.gain[0], response.loop.calibration.id) == (np.float32(0.4), TOYS.id)
+    assert (response.loop.law.gain[0], response.loop.calibration.id) == (np.float32(0.4), TOY_CALIBRATION.id)
 
 
 def test_modes_default_to_all_and_must_be_controlled() -> None:

@@ -7,7 +7,7 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from tests.support.in_process_loop import SMALL_MIRROR, fold
+from tests.support.in_process_loop import SMALL_MIRROR, run_loop
 from tools.law_bench import calibrated
 
 QUIET = SMALL_MIRROR | {
@@ -44,7 +44,7 @@ def test_the_limiting_gain_is_accurate_to_one_percent(
     config = configured(
         camera__delay_frames=delay, control__tilt_gain=gain, control__gain=0.0, disturbance__static_nm={"2": start_nm}
     )
-    run = fold(config, 240, calibration)
+    run = run_loop(config, 240, calibration)
     tilt = np.abs(run.residual_nm[:, 0])
     early, late = tilt[40:80].max(), tilt[-40:].max()
     assert tilt[:80].max() < tilt_nm_per_mas(2.0)
@@ -53,7 +53,7 @@ def test_the_limiting_gain_is_accurate_to_one_percent(
 
 def test_a_kolmogorov_screen_is_corrected_up_to_the_controlled_modes() -> None:
     """Case (3) of the paper: 0.05 waves rms before correction; the high orders that remain exceed a third of that."""
-    run = fold(configured(disturbance__preset="kolmogorov", control__gain=0.2, control__tilt_gain=0.3), 150)
+    run = run_loop(configured(disturbance__preset="kolmogorov", control__gain=0.2, control__tilt_gain=0.3), 150)
     assert run.disturbance_rms_nm[-1] == pytest.approx(0.05 * 550, rel=1e-5)
     assert 0.35 < run.residual_rms_nm[-1] / run.disturbance_rms_nm[-1] < 0.6
     np.testing.assert_allclose(run.error_nm[-1], 0, atol=0.01)

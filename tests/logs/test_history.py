@@ -26,7 +26,7 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
-from tests.support.report_log import TOYS, SyntheticLog
+from tests.support.report_log import TOY_CALIBRATION, SyntheticLog
 from tests.support.toy import NOLL, PERIOD_NS, START, calibration
 
 STEPS = 20
@@ -76,7 +76,7 @@ def test_late_commands_after_a_restart_of_the_camera_are_counted(tmp_path: Path)
     assert history_of(night, tmp_path / "x.mcap").commands_late == 3 + 6  # 40 precede the log
 
 
-def test_the_camera_is_that_of_most_steps_and_the_others_are_told_apart(tmp_path: Path) -> None:
+def test_the_camera_is_that_of_most_steps_and_steps_under_another_are_marked(tmp_path: Path) -> None:
     night = SyntheticLog().frames(STEPS)
     settings = next(wire.CameraState.FromString(one.payload) for one in night.samples if CAMERA_STATE.matches(one.key))
     for factor, frames in ((2, 5), (1, 5)):
@@ -91,13 +91,13 @@ def test_the_camera_is_that_of_most_steps_and_the_others_are_told_apart(tmp_path
 
 def test_the_attached_calibration_replaces_a_lost_message(tmp_path: Path) -> None:
     night = SyntheticLog().frames(STEPS)
-    whole = history_of(night, tmp_path / "whole.mcap")
+    complete = history_of(night, tmp_path / "complete.mcap")
     night.samples = [one for one in night.samples if not CALIBRATION.matches(one.key)]
-    history = read_history(LogReader(night.write(tmp_path / "x.mcap", attached=TOYS)))
-    assert whole.calibration is not None
+    history = read_history(LogReader(night.write(tmp_path / "x.mcap", attached=TOY_CALIBRATION)))
+    assert complete.calibration is not None
     assert history.calibration is not None
-    assert history.calibration.id == whole.calibration.id
-    np.testing.assert_equal(history.steps.error_nm, whole.steps.error_nm)
+    assert history.calibration.id == complete.calibration.id
+    np.testing.assert_equal(history.steps.error_nm, complete.steps.error_nm)
     assert history.remarks == [f"{history.log.path}: the message of its calibration is lost; the attached one is used"]
     other = identified(calibration(NOLL, 2.0))  # no controller reported using it
     for name, attached in (("none", None), ("other", other)):

@@ -28,22 +28,25 @@ from lowfc.programs.logs.report.verdict import verdict
 from tests.support import report_log
 from tests.support.loops import json_of, lowfc
 from tests.support.mutated_logs import flipped
-from tests.support.report_log import READ_NOISE_E, TOYS, SyntheticLog
+from tests.support.report_log import READ_NOISE_E, TOY_CALIBRATION, SyntheticLog
 from tests.support.theory import noise_gain, rejection
 from tests.support.toy import NOLL, calibration
 
 RATE_HZ = 1000.0
 
 
-def results(log: Path) -> dict[str, Any]:
-    found = report_of(read_run(log)).results
-    json.dumps(found, allow_nan=False)
-    return found
+def results_of(log: Path) -> dict[str, Any]:
+    results = report_of(read_run(log)).results
+    json.dumps(results, allow_nan=False)
+    return results
 
 
 @pytest.fixture(scope="module")
 def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """A log with the loop open and closed, frames lost and dark, gains changed, controller and camera restarted."""
+    """A log with the loop open and closed, frames lost and dark, gains changed, controller and camera restarted.
+
+    Of its 2250 frames 6 are lost, so that there are 2244 steps.
+    """
     night = SyntheticLog().health("camera", commands_late=40, state="ready").request("open").frames(300)
     night.request("close")
     night.frames(1500, lost={200, 201, 202, 203, 204, 700}, dark={800})
@@ -60,7 +63,7 @@ def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     counts = [wire.TopicCount(topic=FRAME.key, received=2244, skipped=4, missing=2)]
     night.health("controller", topics=counts, state="stopped")
     night.health("camera", commands_late=43, state="stopped")
-    return results(night.write(tmp_path_factory.mktemp("eventful") / "night.mcap"))
+    return results_of(night.write(tmp_path_factory.mktemp("eventful") / "night.mcap"))
 
 
 def test_modes_laws_and_requests_are_listed(eventful: dict[str, Any]) -> None:
@@ -96,9 +99,9 @@ def test_frames_are_accounted_for(eventful: dict[str, Any]) -> None:
 
 
 def test_commands_of_a_camera_that_does_not_count_late_ones_are_not_called_in_time(tmp_path: Path) -> None:
-    found = results(uneventful(SyntheticLog(truth=False)).write(tmp_path / "log.mcap"))
-    assert found["timing"]["frames"]["commands_late"] is None
-    delay = next(check for check in found["verdict"]["checks"] if check["name"] == "delay")
+    results = results_of(uneventful(SyntheticLog(truth=False)).write(tmp_path / "log.mcap"))
+    assert results["timing"]["frames"]["commands_late"] is None
+    delay = next(check for check in results["verdict"]["checks"] if check["name"] == "delay")
     assert delay["level"] == "unknown"
 
 
@@ -124,16 +127,14 @@ def test_the_longest_stretch_under_one_law_is_analysed(eventful: dict[str, Any])
 
 
 def test_the_error_budget_agrees_with_the_toy(eventful: dict[str, Any]) -> None:
-    made = SyntheticLog().calibration
-    noise = sensor_noise(
-        made.reconstructor.astype(float), made.reference.astype(float), made.flux_dn, np.hypot(READ_NOISE_E, 12**-0.5)
-    )
+    used, dn_noise = SyntheticLog().calibration, np.hypot(READ_NOISE_E, 12**-0.5)  # with rounding to whole DN
+    noise = sensor_noise(used.reconstructor.astype(float), used.reference.astype(float), used.flux_dn, dn_noise)
     terms = {term["name"]: term for term in eventful["error_budget"]["terms"]}
-    through = np.sqrt([noise_gain(gain, 0.0, 1.0) for gain in (0.4, 0.4, 0.2)])
+    noise_to_residual = np.sqrt([noise_gain(gain, 0.0, 1.0) for gain in (0.4, 0.4, 0.2)])
     groups = ("tilt x", "tilt y", "other modes")
     for name, expected in (("photon noise", noise.photon_nm), ("read noise", noise.read_nm)):
-        found = [terms[name]["rms_nm"][group] for group in groups]
-        assert found == pytest.approx((expected * through).tolist(), rel=0.01)
+        rms_nm = [terms[name]["rms_nm"][group] for group in groups]
+        assert rms_nm == pytest.approx((expected * noise_to_residual).tolist(), rel=0.01)
     expected_nm = 12 / np.sqrt(2) * rejection(np.array([7.0]), RATE_HZ, 0.4, 0.0, 1.0)[0]
     assert terms["lag"]["rms_nm"]["tilt x"] == pytest.approx(expected_nm, rel=0.1)
     assert terms["lag"]["rms_nm"]["tilt y"] < 0.01
@@ -228,20 +229,20 @@ def test_the_state_of_the_log_is_in_the_verdict(
     good: Path, tmp_path: Path, make: Callable[[Path, Path], Path], level: str, text: str, complete: bool
 ) -> None:
     log = make(good, tmp_path)
-    made = report_of(read_run(log))
-    check = made.results["verdict"]["checks"][0]
+    report = report_of(read_run(log))
+    check = report.results["verdict"]["checks"][0]
     assert (check["name"], check["level"], check["text"].partition(", unreadable")[0]) == ("log", level, text)
-    assert (made.results["log"]["complete"], made.results["log"]["finished"]) == (complete, make is not cut_off)
-    assert 0 < made.results["run"]["steps"] <= 1500
-    assert made.results["verdict"]["level"] == level
-    assert made.results["verdict"]["because"] == ("" if level == "good" else check["text"])
+    assert (report.results["log"]["complete"], report.results["log"]["finished"]) == (complete, make is not cut_off)
+    assert 0 < report.results["run"]["steps"] <= 1500
+    assert report.results["verdict"]["level"] == level
+    assert report.results["verdict"]["because"] == ("" if level == "good" else check["text"])
 
 
 def test_the_noise_is_that_of_the_reconstructor_in_use(tmp_path: Path) -> None:
     run = read_run(uneventful(SyntheticLog(), 600).write(tmp_path / "x.mcap"))
     before, state = closed_loop.noise_of(run.history, slice(None)), run.history.controllers[-1]
     state.prior_nm2.extend([0.0, 0.0, 0.01])  # automatic gains leave the last mode uncorrected
-    state.weighting_flux_dn = TOYS.flux_dn
+    state.weighting_flux_dn = TOY_CALIBRATION.flux_dn
     state.camera_expected.gain_e_per_dn = 1.0
     after = closed_loop.noise_of(run.history, slice(None))
     assert before is not None
@@ -253,15 +254,18 @@ def test_the_noise_is_that_of_the_reconstructor_in_use(tmp_path: Path) -> None:
 
 
 def test_a_limit_of_mirror_and_controller_has_the_larger_count(good: Path) -> None:
-    found = results(good)
-    found["mirror"] |= {"limits_at_mirror": {"stroke": 50, "slew": 2}, "limits_at_controller": {"stroke": 1, "slew": 3}}
-    check = next(check for check in verdict(found)["checks"] if check["name"] == "mirror")
+    results = results_of(good)
+    results["mirror"] |= {
+        "limits_at_mirror": {"stroke": 50, "slew": 2},
+        "limits_at_controller": {"stroke": 1, "slew": 3},
+    }
+    check = next(check for check in verdict(results)["checks"] if check["name"] == "mirror")
     assert check["text"] == "limits acted: stroke 50, slew 3"
 
 
 def test_only_the_end_of_a_very_long_stretch_is_analysed(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closed_loop, "MAX_STEPS", 400)
-    stretch = results(good)["closed_stretch"]
+    stretch = results_of(good)["closed_stretch"]
     assert stretch["frames"] == 400
     assert stretch["steps_settling"] + stretch["steps_earlier"] == 1100
     assert stretch["to_s"] == pytest.approx(1.499)
@@ -272,39 +276,39 @@ def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> N
     night = SyntheticLog()
     if empty:
         night.samples.clear()
-    made = report_of(read_run(night.write(tmp_path / "x.mcap", config=not empty)))
-    assert made.results["verdict"]["level"] == "bad"
-    assert made.results["verdict"]["because"] == "this log has no control steps"
-    assert "Without control steps that can be read" in page(made)
+    report = report_of(read_run(night.write(tmp_path / "x.mcap", config=not empty)))
+    assert report.results["verdict"]["level"] == "bad"
+    assert report.results["verdict"]["because"] == "this log has no control steps"
+    assert "Without control steps that can be read" in page(report)
 
 
 @pytest.mark.usefixtures("without_drawings")
 def test_a_report_says_that_the_calibration_of_its_steps_is_missing(tmp_path: Path) -> None:
     night = SyntheticLog().frames(20)
     night.samples = [one for one in night.samples if one.key != CALIBRATION.key]
-    made = report_of(read_run(night.write(tmp_path / "x.mcap")))
-    texts = {check["name"]: check["text"] for check in made.results["verdict"]["checks"]}
+    report = report_of(read_run(night.write(tmp_path / "x.mcap")))
+    texts = {check["name"]: check["text"] for check in report.results["verdict"]["checks"]}
     assert texts["loop"] == "this log has no calibration, without which its 20 control steps cannot be read"
     assert texts["commands"] == "this log has no calibration, without which its steps cannot be read"
-    assert "has no control steps" not in page(made)
+    assert "has no control steps" not in page(report)
 
 
 @pytest.mark.usefixtures("without_drawings")
 def test_imperfections_of_the_simulated_world_are_named(tmp_path: Path) -> None:
     night, imperfect = uneventful(SyntheticLog()), {"disturbance.wheel_hz": 40.0, "camera.hot_pixels": 0.01}
-    made = report_of(read_run(night.write(tmp_path / "x.mcap", toml=load(None, imperfect).to_toml())))
-    assert made.results["run"]["imperfections"] == imperfect
-    assert "simulated with disturbance.wheel_hz = 40.0, camera.hot_pixels = 0.01;" in page(made)
+    report = report_of(read_run(night.write(tmp_path / "x.mcap", toml=load(None, imperfect).to_toml())))
+    assert report.results["run"]["imperfections"] == imperfect
+    assert "simulated with disturbance.wheel_hz = 40.0, camera.hot_pixels = 0.01;" in page(report)
 
 
 def test_a_loop_in_safe_mode_is_not_a_good_run(tmp_path: Path) -> None:
     night = uneventful(SyntheticLog())
     night.request("safe").frames(50).request("clear")
-    found = results(night.request("note", text="camera off").write(tmp_path / "x.mcap"))
-    assert [one["time_s"] for one in found["requests"]] == pytest.approx([0.3, 0.349, 0.349])
-    assert found["verdict"]["level"] == "bad"
-    assert {check["name"] for check in found["verdict"]["checks"] if check["level"] == "bad"} == {"loop", "events"}
-    assert [event["name"] for event in found["events"] if event["level"] == "error"] == ["SAFED"]
+    results = results_of(night.request("note", text="camera off").write(tmp_path / "x.mcap"))
+    assert [one["time_s"] for one in results["requests"]] == pytest.approx([0.3, 0.349, 0.349])
+    assert results["verdict"]["level"] == "bad"
+    assert {check["name"] for check in results["verdict"]["checks"] if check["level"] == "bad"} == {"loop", "events"}
+    assert [event["name"] for event in results["events"] if event["level"] == "error"] == ["SAFED"]
 
 
 def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(
@@ -312,8 +316,8 @@ def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(
 ) -> None:
     night = SyntheticLog()
     night.samples = [sample for sample in good_night.samples if sample.key != TRUTH.key]
-    found = results(night.write(tmp_path / "x.mcap"))
-    terms = {term["name"]: term for term in found["error_budget"]["terms"]}
+    results = results_of(night.write(tmp_path / "x.mcap"))
+    terms = {term["name"]: term for term in results["error_budget"]["terms"]}
     for name in ("cross-talk and aliasing", "nonlinearity"):
         assert terms[name]["missing"]
         assert set(terms[name]["rms_nm"].values()) == {None}
@@ -321,22 +325,22 @@ def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(
     expected_nm = 12 / np.sqrt(2) * rejection(np.array([7.0]), RATE_HZ, 0.4, 0.0, 1.0)[0]
     assert terms["lag"]["rms_nm"]["tilt x"] == pytest.approx(expected_nm, rel=0.25)
     assert "noise floor" in terms["lag"]["how"]
-    assert found["error_budget"]["sum_lacks"] == ["cross-talk and aliasing", "nonlinearity"]
-    assert set(found["error_budget"]["true_residual"]["rms_nm"].values()) == {None}
-    assert found["residual"]["total_rms_nm"]["residual"] is None
-    assert "true_over_theory" not in found["spectra"]["groups"][0]
-    assert found["run"]["simulated"] is False
-    assert "nm after in all modes over the circle;" in found["verdict"]["checks"][2]["text"]
+    assert results["error_budget"]["sum_lacks"] == ["cross-talk and aliasing", "nonlinearity"]
+    assert set(results["error_budget"]["true_residual"]["rms_nm"].values()) == {None}
+    assert results["residual"]["total_rms_nm"]["residual"] is None
+    assert "true_over_theory" not in results["spectra"]["groups"][0]
+    assert results["run"]["simulated"] is False
+    assert "nm after in all modes over the circle;" in results["verdict"]["checks"][2]["text"]
 
 
 def test_a_log_of_an_open_loop_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
     night = SyntheticLog().request("open")
-    found = results(uneventful(night, 300).write(tmp_path / "x.mcap"))
-    assert found["closed_stretch"] is None
-    assert found["spectra"] == found["error_budget"] == {"why_not": "the loop was not closed in this log"}
-    assert found["residual"]["total_rms_nm"]["open_error"] > 5
-    assert found["residual"]["total_rms_nm"]["error"] is None
-    assert found["verdict"]["level"] == "unknown"
+    results = results_of(uneventful(night, 300).write(tmp_path / "x.mcap"))
+    assert results["closed_stretch"] is None
+    assert results["spectra"] == results["error_budget"] == {"why_not": "the loop was not closed in this log"}
+    assert results["residual"]["total_rms_nm"]["open_error"] > 5
+    assert results["residual"]["total_rms_nm"]["error"] is None
+    assert results["verdict"]["level"] == "unknown"
 
 
 def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
@@ -344,11 +348,11 @@ def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
     night.samples = [sample for sample in night.samples if sample.key != CALIBRATION.key]
     night._state = State()
     night.frames(300)
-    found = results(night.write(tmp_path / "x.mcap"))
-    assert (found["mode_steps"], found["run"]["simulated"]) == ({"idle": 300}, True)
-    check = found["verdict"]["checks"][2]
+    results = results_of(night.write(tmp_path / "x.mcap"))
+    assert (results["mode_steps"], results["run"]["simulated"]) == ({"idle": 300}, True)
+    check = results["verdict"]["checks"][2]
     assert (check["level"], check["text"]) == ("unknown", "the loop was not closed in this log")
-    check = found["verdict"]["checks"][3]
+    check = results["verdict"]["checks"][3]
     assert (check["name"], check["level"]) == ("commands", "unknown")
 
 
@@ -359,27 +363,27 @@ def test_frames_before_other_modes_led_to_commands_and_a_refused_calibration_los
     night.put(CALIBRATION, encode_calibration(night.calibration, night.now_ns))
     night.frames(100)
     for steps in (200, 0):
-        found = results(night.write(tmp_path / f"{steps}.mcap"))
-        assert (found["run"]["steps"], found["log"]["steps_left_out"]) == (steps, 200 - steps)
-        assert found["timing"]["frames"]["without_command"] == 0
+        results = results_of(night.write(tmp_path / f"{steps}.mcap"))
+        assert (results["run"]["steps"], results["log"]["steps_left_out"]) == (steps, 200 - steps)
+        assert results["timing"]["frames"]["without_command"] == 0
         night.put(CALIBRATION, two)
 
 
 def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
-    night, other = SyntheticLog(), replace(TOYS, reconstructor=0.9 * TOYS.reconstructor)
+    night, other = SyntheticLog(), replace(TOY_CALIBRATION, reconstructor=0.9 * TOY_CALIBRATION.reconstructor)
     night.frames(500).request("open").frames(50).request("close")
     night.load(identified(other))
-    why = results(night.write(tmp_path / "before.mcap"))["spectra"]["why_not"]
+    why = results_of(night.write(tmp_path / "before.mcap"))["spectra"]["why_not"]
     assert why == "the loop was closed only under an earlier calibration than the last one of this log"
     night.frames(300)
-    stretch = results(night.write(tmp_path / "x.mcap"))["closed_stretch"]
+    stretch = results_of(night.write(tmp_path / "x.mcap"))["closed_stretch"]
     assert stretch["from_s"] > 0.549
     assert stretch["frames"] + stretch["steps_settling"] == 300
-    assert results(tmp_path / "x.mcap")["residual"]["steps_open"] == 0, "those of the earlier calibration"
+    assert results_of(tmp_path / "x.mcap")["residual"]["steps_open"] == 0, "those of the earlier calibration"
     night.start_controller()  # with the first calibration; its first state with a frame follows after 50 frames
-    found = results(night.request("gain", (0.2,)).frames(300).write(tmp_path / "restarted.mcap"))
-    assert found["requests"][-1]["time_s"] == pytest.approx(0.85)
-    assert found["closed_stretch"]["frames"] + found["closed_stretch"]["steps_settling"] == 250
+    results = results_of(night.request("gain", (0.2,)).frames(300).write(tmp_path / "restarted.mcap"))
+    assert results["requests"][-1]["time_s"] == pytest.approx(0.85)
+    assert results["closed_stretch"]["frames"] + results["closed_stretch"]["steps_settling"] == 250
 
 
 def test_a_camera_ahead_and_a_clear_for_a_lower_start_move_no_law_and_no_request(tmp_path: Path) -> None:
@@ -389,10 +393,10 @@ def test_a_camera_ahead_and_a_clear_for_a_lower_start_move_no_law_and_no_request
     night.put(STEP, step)
     night.frames(50).request("gain", (0.2,)).frames(50).request("safe").request("clear")
     night._camera_start -= 60
-    found = results(night.frames(10).request("gain", (0.1,)).frames(10).write(tmp_path / "x.mcap"))
-    assert [one["from_s"] for one in found["laws"]] == pytest.approx([0, 0.05, 0.11])
-    assert [one["time_s"] for one in found["requests"]] == pytest.approx([0.05, 0.099, 0.1, 0.11], abs=0.0011)
-    assert (found["run"]["steps_s"], found["light"]["refused"]) == (pytest.approx(0.119), {"ahead": 1})
+    results = results_of(night.frames(10).request("gain", (0.1,)).frames(10).write(tmp_path / "x.mcap"))
+    assert [one["from_s"] for one in results["laws"]] == pytest.approx([0, 0.05, 0.11])
+    assert [one["time_s"] for one in results["requests"]] == pytest.approx([0.05, 0.099, 0.1, 0.11], abs=0.0011)
+    assert (results["run"]["steps_s"], results["light"]["refused"]) == (pytest.approx(0.119), {"ahead": 1})
 
 
 def test_a_law_whose_step_is_lost_is_found_also_with_another_clock_of_the_camera(tmp_path: Path) -> None:
@@ -403,30 +407,30 @@ def test_a_law_whose_step_is_lost_is_found_also_with_another_clock_of_the_camera
             step = wire.ControlStep.FromString(one.payload)
             step.timestamp.seconds -= 3600
             night.samples[row] = one._replace(payload=step.SerializeToString())
-    found = results(night.write(tmp_path / "x.mcap"))
-    assert (found["laws"][-1]["from_s"], found["requests"][-1]["time_s"]) == pytest.approx((0.05, 0.05))
+    results = results_of(night.write(tmp_path / "x.mcap"))
+    assert (results["laws"][-1]["from_s"], results["requests"][-1]["time_s"]) == pytest.approx((0.05, 0.05))
 
 
 def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -> None:
     night = SyntheticLog().frames(300)
     night.samples = [sample for sample in night.samples if sample.key != CONTROLLER_STATE.key]
-    found = results(night.write(tmp_path / "x.mcap"))
-    assert found["mode_steps"] == {"closed": 300}
+    results = results_of(night.write(tmp_path / "x.mcap"))
+    assert results["mode_steps"] == {"closed": 300}
     why = "the law with which the loop was closed is not in this log, or the integrator took over some of its modes"
-    assert found["spectra"] == found["error_budget"] == {"why_not": why}
-    assert found["verdict"]["checks"][2]["text"] == why
+    assert results["spectra"] == results["error_budget"] == {"why_not": why}
+    assert results["verdict"]["checks"][2]["text"] == why
 
 
 def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
     night = SyntheticLog().frames(200, dark=range(200))
-    found = results(night.write(tmp_path / "x.mcap"))
-    assert found["closed_stretch"]["frames"] == 0
-    assert "has 0 frames" in found["spectra"]["why_not"]
-    assert {term["missing"] for term in found["error_budget"]["terms"]} == {True}
-    assert found["light"]["refused"] == {"dark": 200}
-    assert found["verdict"]["checks"][2]["level"] == "look"  # the true wavefront is uncorrected
-    found = results(night.request("offset", (20.0, 0.0, 0.0)).write(tmp_path / "offset.mcap"))
-    assert found["verdict"]["checks"][2]["text"].endswith("(true, with the shapes of offset and channels)")
+    results = results_of(night.write(tmp_path / "x.mcap"))
+    assert results["closed_stretch"]["frames"] == 0
+    assert "has 0 frames" in results["spectra"]["why_not"]
+    assert {term["missing"] for term in results["error_budget"]["terms"]} == {True}
+    assert results["light"]["refused"] == {"dark": 200}
+    assert results["verdict"]["checks"][2]["level"] == "look"  # the true wavefront is uncorrected
+    results = results_of(night.request("offset", (20.0, 0.0, 0.0)).write(tmp_path / "offset.mcap"))
+    assert results["verdict"]["checks"][2]["text"].endswith("(true, with the shapes of offset and channels)")
 
 
 @pytest.mark.parametrize("logged", [True, False])
@@ -434,19 +438,19 @@ def test_theory_is_that_of_the_linear_law_in_use(tmp_path: Path, logged: bool) -
     night = SyntheticLog().frames(300)
     night.law(0.05, logged=logged)
     night.frames(2000)
-    made = report_of(read_run(night.write(tmp_path / "x.mcap")))
-    assert [(one["law"], one["from_s"]) for one in made.results["laws"]] == [
+    report = report_of(read_run(night.write(tmp_path / "x.mcap")))
+    assert [(one["law"], one["from_s"]) for one in report.results["laws"]] == [
         ("integrator", 0.0),
         ("pi", pytest.approx(0.3)),
     ]
-    stretch = made.results["closed_stretch"]
+    stretch = report.results["closed_stretch"]
     assert stretch["law"] == ("pi" if logged else "integrator")
     assert stretch["to_s"] == pytest.approx(2.299 if logged else 0.299)
     if logged:
         assert (stretch["steps_settling"], stretch["frames"]) == (200, 1800)
-        tip = made.results["spectra"]["groups"][0]
+        tip = report.results["spectra"]["groups"][0]
         assert tip["measured_over_theory"]["median"] == pytest.approx(1, abs=0.03)
-        assert "linear law pi" in page(made)
+        assert "linear law pi" in page(report)
 
 
 def test_the_lag_of_a_live_log_is_for_the_times_of_its_mirror(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -461,11 +465,11 @@ def test_the_lag_of_a_live_log_is_for_the_times_of_its_mirror(tmp_path: Path, mo
 def test_the_stretch_of_a_law_ends_where_the_law_is_overruled(tmp_path: Path) -> None:
     night = SyntheticLog(guard=True, rate_hz=1000.0).frames(20)
     night.law(0.01)
-    found = results(night.frames(700).write(tmp_path / "x.mcap"))
-    stretch = found["closed_stretch"]
+    results = results_of(night.frames(700).write(tmp_path / "x.mcap"))
+    stretch = results["closed_stretch"]
     assert (stretch["law"], stretch["to_s"], stretch["steps_limited"]) == ("pi", pytest.approx(0.617), 0)
     assert ("LAW_OVERRULED", pytest.approx(0.618, abs=1e-4)) in [
-        (one["name"], one["time_s"]) for one in found["events"]
+        (one["name"], one["time_s"]) for one in results["events"]
     ]
 
 
@@ -474,19 +478,19 @@ def test_the_last_frames_may_have_their_command_after_the_log(
     tmp_path: Path, lost: int, without: int, at_the_end: int
 ) -> None:
     night = SyntheticLog().frames(200, lost=range(200 - lost, 200))
-    found = results(night.write(tmp_path / "x.mcap"))["timing"]["frames"]
-    assert (found["without_command"], found["at_the_end"]) == (without, at_the_end)
+    frames = results_of(night.write(tmp_path / "x.mcap"))["timing"]["frames"]
+    assert (frames["without_command"], frames["at_the_end"]) == (without, at_the_end)
 
 
 def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> None:
     night = uneventful(SyntheticLog(), 3)
     night.put(REQUEST, wire.Request(name="gain", values=[np.nan, np.inf, 0.5]))
     log = night.write(tmp_path / "night.mcap")
-    found = json_of("report", str(log))
-    assert found["run"]["steps"] == 3
-    assert found["requests"][-1]["values"] == [None, None, 0.5], "JSON has no number for some"
-    assert "has 3 frames" in found["spectra"]["why_not"]
-    assert [term["missing"] for term in found["error_budget"]["terms"]] == [False, False, True, True, True]
+    results = json_of("report", str(log))
+    assert results["run"]["steps"] == 3
+    assert results["requests"][-1]["values"] == [None, None, 0.5], "JSON has no number for some"
+    assert "has 3 frames" in results["spectra"]["why_not"]
+    assert [term["missing"] for term in results["error_budget"]["terms"]] == [False, False, True, True, True]
     assert not log.with_name("night.html").exists()
 
     out = tmp_path / "page.html"

@@ -32,7 +32,7 @@ from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, render, what_if
 from lowfc.programs.logs.what_if.options import WhatIf, requested, user_controller
 from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support import toy
-from tests.support.in_process_loop import SMALL_MIRROR, fold
+from tests.support.in_process_loop import SMALL_MIRROR, run_loop
 from tests.support.report_log import SyntheticLog
 from tools.law_bench import calibrated
 
@@ -100,7 +100,7 @@ def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_those_gains(
     """In both directions between two laws, each mode is within 10 % of the simulated run; its own law to rounding."""
     configs = [configured(gains, delay, **overrides) for gains in pair]
     calibration = calibrated(configs[0])  # independent of the gains
-    runs = [fold(config, frames, calibration) for config in configs]
+    runs = [run_loop(config, frames, calibration) for config in configs]
     for run, config in zip(runs, configs, strict=True):
         tilt_mas = settled_rms(run.disturbance_nm)[:2] / tilt_nm_per_mas(config.star.diameter_m)
         assert tilt_mas.max() < 5
@@ -113,20 +113,20 @@ def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_those_gains(
 
 
 FRAMES = 1200
-SETTLING = 599  # half of the log: the settling time is longer
+SETTLING = 599  # frames left out: half of the log, because settling takes longer
 OTHER = "gain=0.3,tilt_gain=0.2,leak=0.01"
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoggedRun]:
     """A closed loop, and one with other gains whose controller has a wrong delay."""
-    folder, made = tmp_path_factory.mktemp("logs"), {}
+    folder, runs = tmp_path_factory.mktemp("logs"), {}
     other = {"gain": (0.2, 0.3), "leak": (0.01, 0.01), "delay_frames": 2.0}
     toml = load(None, {"sensor.modes": 10}).to_toml()  # with 10 modes the contrast, which is slow, is not computed
     for name, changes in (("default", {}), ("other", other)):
         night = SyntheticLog(**changes).frames(FRAMES)
-        made[name] = LoggedRun(read_history(LogReader(night.write(folder / f"{name}.mcap", toml=toml))))
-    return made
+        runs[name] = LoggedRun(read_history(LogReader(night.write(folder / f"{name}.mcap", toml=toml))))
+    return runs
 
 
 def results_of(run: LoggedRun, what: WhatIf | None = None) -> dict[str, Any]:
@@ -375,14 +375,14 @@ def rows_compared(run: LoggedRun) -> list[int]:
 
 def test_an_offset_is_not_reported_as_a_missing_command() -> None:
     """With an offset the error is smaller by the target, which is in the logged state; its frames are compared."""
-    known = history(error_nm=np.r_[np.full((20, 3), 4, np.float32), np.full((20, 3), 1, np.float32)])
-    [last] = known.controllers
+    logged = history(error_nm=np.r_[np.full((20, 3), 4, np.float32), np.full((20, 3), 1, np.float32)])
+    [last] = logged.controllers
     states = [wire.ControllerState(), wire.ControllerState(), wire.ControllerState(offset_nm=[3] * 3), last]
     states[0].frame_sequence, states[1].frame_sequence = toy.frame_sequence(0), toy.frame_sequence(19)
     states[1].offset_nm[:] = last.offset_nm[:] = [3] * 3
     last.frame_sequence = toy.frame_sequence(39)
-    known.controllers = states
-    run = LoggedRun(known)
+    logged.controllers = states
+    run = LoggedRun(logged)
     assert not run.torn.any()
     np.testing.assert_array_equal(run.seen_nm, 0)
 
@@ -396,7 +396,7 @@ def test_a_frame_ahead_and_a_clear_for_a_lower_start_do_not_cut_the_run() -> Non
     assert run.missing.tolist() == [0] * 10 + [1] + [0] * 28
 
 
-def test_which_rows_are_compared() -> None:
+def test_rows_of_settling_open_loop_and_refused_or_saturated_frames_are_not_compared() -> None:
     """Five time constants of a gain of 0.5 are 10 frames to settle."""
     error, saturated = np.full((40, 3), 4, np.float32), np.zeros(40, np.int64)
     error[[10, 11]], saturated[[20, 21]] = np.nan, 3
@@ -418,12 +418,12 @@ def test_which_rows_are_compared() -> None:
 
 
 def test_steps_under_another_calibration_give_a_warning() -> None:
-    known = history()
-    [last] = known.controllers
+    logged = history()
+    [last] = logged.controllers
     first, loaded = wire.ControllerState(calibration_id="another"), wire.ControllerState()
     loaded.frame_sequence = toy.frame_sequence(14)
-    known.controllers = [first, loaded, last]
-    warnings = "\n".join(what_if(LoggedRun(known), WhatIf())["warnings"])
+    logged.controllers = [first, loaded, last]
+    warnings = "\n".join(what_if(LoggedRun(logged), WhatIf())["warnings"])
     assert "another calibration or camera setting was in use for 15 steps" in warnings
 
 
@@ -443,12 +443,12 @@ def test_warnings_name_what_makes_the_results_doubtful() -> None:
     reasons[3:7] = 1 << Limit.STROKE | 1 << Limit.SLEW
     pol = np.full((40, 3), 4, np.float32)
     pol[20] -= 1
-    known = replace(history(reasons=reasons, pol_nm=pol), requests=[wire.Request(name="gain", accepted=True)])
-    known.mirror.limits = np.array([0, 1, 1])
-    known.controllers[0].law.name = "lqg"
-    known.log.finished = False
-    known.log.damage.append(Damage(77, 5, "the checksum of a chunk is wrong"))
-    warnings = "\n".join(what_if(LoggedRun(known), WhatIf())["warnings"])
+    logged = replace(history(reasons=reasons, pol_nm=pol), requests=[wire.Request(name="gain", accepted=True)])
+    logged.mirror.limits = np.array([0, 1, 1])
+    logged.controllers[0].law.name = "lqg"
+    logged.log.finished = False
+    logged.log.damage.append(Damage(77, 5, "the checksum of a chunk is wrong"))
+    warnings = "\n".join(what_if(LoggedRun(logged), WhatIf())["warnings"])
     for words in (
         "stroke at 4 frames, slew at 4 frames",
         "the mirror's own limits acted on 2 commands",
@@ -475,7 +475,7 @@ def test_an_open_loop_beyond_the_linear_range_gives_warnings() -> None:
     assert results["compared"] == "the loop was never closed"
     assert column(results, "was").tolist() == column(results, "open").tolist() == [20, 30, 12]
     _, linear, unstable, limits = results["warnings"]
-    assert pytest.approx(5 * 2.424, abs=0.01) == LINEAR_WAVES * 550
+    assert pytest.approx(5 * 2.424, abs=0.01) == LINEAR_WAVES * 550  # nm: 5 mas of 2.424 nm each
     assert "12.1 nm rms" in linear
     assert "tilt x with " in linear
     assert "focus" not in linear

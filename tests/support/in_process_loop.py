@@ -1,4 +1,4 @@
-"""A loop in one process with the interface of `lowfc.client`, and a fold over a run of the configured bench."""
+"""A loop in one process: with the interface of `lowfc.client`, or run for a number of frames."""
 
 import contextlib
 import tomllib
@@ -29,7 +29,7 @@ from lowfc.device import driver
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from tools.law_bench import Bench, calibrated
 
-FIRST = 1 << 32
+FIRST = 1 << 32  # sequence of the first frame of a camera
 SMALL_MIRROR = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 10}
 """For tests that do not depend on the number of actuators: a calibration is computed several times as fast."""
 
@@ -229,7 +229,7 @@ class InProcessLoop(Client):
         return each()
 
 
-def fold(config: Configuration, frames: int, calibration: Calibration | None = None) -> SimpleNamespace:
+def run_loop(config: Configuration, frames: int, calibration: Calibration | None = None) -> SimpleNamespace:
     """Run the loop of a configuration; every frame must be used.
 
     Returns error_nm, pol_nm and command_nm (frames, modes) of the steps, and disturbance_nm and residual_nm
@@ -238,7 +238,7 @@ def fold(config: Configuration, frames: int, calibration: Calibration | None = N
     bench = Bench(config, calibration or calibrated(config))
     bench.run(frames)
     assert not bench.frames_refused
-    found = {name: [getattr(step, name) for step in bench.steps] for name in ("error_nm", "pol_nm", "command_nm")}
+    columns = {name: [getattr(step, name) for step in bench.steps] for name in ("error_nm", "pol_nm", "command_nm")}
     for name in ("disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm"):
-        found[name] = [getattr(truth.sampled, name) for truth in bench.truths]
-    return SimpleNamespace(**{name: np.array(rows, np.float64) for name, rows in found.items()})
+        columns[name] = [getattr(truth.sampled, name) for truth in bench.truths]
+    return SimpleNamespace(**{name: np.array(rows, np.float64) for name, rows in columns.items()})

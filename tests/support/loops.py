@@ -101,24 +101,24 @@ def loop(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120
 
 def payloads(log: Path) -> dict[str, list[bytes]]:
     """Payloads of every topic of a log, in order; CRCs are checked."""
-    found: dict[str, list[bytes]] = defaultdict(list)
+    bodies: dict[str, list[bytes]] = defaultdict(list)
     with log.open("rb") as stream:
         for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
-            found[channel.topic].append(message.data)
-    return dict(found)
+            bodies[channel.topic].append(message.data)
+    return dict(bodies)
 
 
 def children(launcher: int) -> dict[str, int]:
     """Process ids of a launcher's processes, by subcommand of `lowfc` or by module."""
-    found = {}
+    pids = {}
     listed = Path(f"/proc/{launcher}/task/{launcher}/children").read_text().split()
     for pid in map(int, listed):
         words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
         if "-m" not in words:  # between fork and exec
             continue
         module = words[words.index("-m") + 1]
-        found[module if module != "lowfc" else words[words.index("-m") + 2]] = pid
-    return found
+        pids[module if module != "lowfc" else words[words.index("-m") + 2]] = pid
+    return pids
 
 
 def start(folder: Path, *arguments: object) -> "subprocess.Popen[str]":
@@ -133,14 +133,14 @@ def start(folder: Path, *arguments: object) -> "subprocess.Popen[str]":
     )
 
 
-def command(folder: Path, line: str, timeout_s: float = 120, good: tuple[int, ...] = (0,)) -> str:
-    """Output of a documented command; redirected output is also written to its file."""
+def command(folder: Path, line: str, timeout_s: float = 120, statuses: tuple[int, ...] = (0,)) -> str:
+    """Output of a documented command, which must end with one of the statuses; a redirection is also carried out."""
     words, _, output = line.partition(" > ")
     program, *rest = shlex.split(words, comments=True)
     done = subprocess.run(
         [PROGRAMS / program, *rest], cwd=folder, capture_output=True, text=True, timeout=timeout_s, check=False
     )
-    assert done.returncode in good, f"{line}: {done.stdout} {done.stderr}"
+    assert done.returncode in statuses, f"{line}: {done.stdout} {done.stderr}"
     assert "Traceback" not in done.stderr, done.stderr
     if output:
         (folder / output).write_text(done.stdout)

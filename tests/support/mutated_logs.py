@@ -32,19 +32,19 @@ MISPLACED = ("shuffled", "repeated", "removed", "swapped", "doubled")
 def small_samples(frames: int = 40) -> list[Sample]:
     """Messages of some topics from two starts of their publishers; surfaces, Health and events are rare."""
     rng = np.random.default_rng(1)
-    made = []
+    samples = []
     for number in range(frames):
-        now = START_NS + number * 1_000_000
+        now_ns = START_NS + number * 1_000_000
         start_s, count = START_S + number // (frames // 2), number % (frames // 2)
         sequence = sequence_of(start_s, count)
-        picture = image(rng.integers(0, 4000, (40, 40), dtype=np.uint16), now, "sensor")
-        step = wire.ControlStep(timestamp=timestamp(now), frame_sequence=sequence, error_nm=[1.5, -2.0])
+        picture = image(rng.integers(0, 4000, (40, 40), dtype=np.uint16), now_ns, "sensor")
+        step = wire.ControlStep(timestamp=timestamp(now_ns), frame_sequence=sequence, error_nm=[1.5, -2.0])
         bodies = [(FRAME.key, picture), (STEP.key, step)]
         if number % 7 == 3:
-            surface = image(rng.random((16, 16)).astype(np.float32), now, "dm")
+            surface = image(rng.random((16, 16)).astype(np.float32), now_ns, "dm")
             bodies += [(SURFACE.at("dm"), surface), (HEALTH.at("camera"), wire.Health(process="camera"))]
-        made += [Sample(key, m.SerializeToString(), sequence, now, now + 200) for key, m in bodies]
-    return [*made, Sample(EVENT.key, b"", sequence_of(START_S, 0), START_NS + 1, START_NS + 2)]
+        samples += [Sample(key, body.SerializeToString(), sequence, now_ns, now_ns + 200) for key, body in bodies]
+    return [*samples, Sample(EVENT.key, b"", sequence_of(START_S, 0), START_NS + 1, START_NS + 2)]
 
 
 def small_log(path: Path, *, finished: bool = True) -> Path:
@@ -68,10 +68,10 @@ def contents(messages: list[Sample]) -> list[tuple[str, bytes, int, int, int]]:
 
 def boundaries(data: bytes) -> list[int]:
     """First byte of each record of a log, and the end of the last one."""
-    found = [len(MAGIC)]
-    while found[-1] + 9 <= len(data) - len(MAGIC) * data.endswith(MAGIC):
-        found.append(found[-1] + 9 + struct.unpack_from("<Q", data, found[-1] + 1)[0])
-    return found
+    starts = [len(MAGIC)]
+    while starts[-1] + 9 <= len(data) - len(MAGIC) * data.endswith(MAGIC):  # an opcode and a length of eight bytes
+        starts.append(starts[-1] + 9 + struct.unpack_from("<Q", data, starts[-1] + 1)[0])
+    return starts
 
 
 def chunks_of(path: Path) -> list[tuple[int, int]]:

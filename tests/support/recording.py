@@ -18,6 +18,8 @@ PATIENCE_S = 20.0
 
 
 class Bench:
+    """A recorder in its own thread, two services that publish, and the events on their bus."""
+
     def __init__(self, folder: Path) -> None:
         self.hub = MemoryHub()
         self.clock = HostClock()
@@ -70,6 +72,7 @@ class Bench:
 
 
 def put(publisher: Publisher, count: int) -> list[bytes]:
+    """Publish numbered messages; return their payloads."""
     bodies = [b"%s %d" % (publisher.key.encode(), publisher.published + number) for number in range(count)]
     for body in bodies:
         publisher.put(body)

@@ -45,7 +45,7 @@ from lowfc.control.loop.inputs import Frame, Load, Outputs, Request
 from lowfc.control.loop.state import State
 from tests.support.toy import FLUX_DN, NOLL, PERIOD_NS, SHAPE, START, TOY, calibration, settings
 
-TOYS = identified(calibration())
+TOY_CALIBRATION = identified(calibration())
 DELAY_NS = 300_000  # from a frame to its command
 READ_NOISE_E = 2.0
 METADATA = {"lowfc": {"lowfc": "0.1.0", "numpy": "2.0", "host": "bench", "run": "night", "seed": "5"}}
@@ -54,7 +54,7 @@ METADATA = {"lowfc": {"lowfc": "0.1.0", "numpy": "2.0", "host": "bench", "run": 
 class SyntheticLog:
     """Messages of a run, appended frame by frame; the tip disturbance is a sine of 12 nm at 7 Hz."""
 
-    def __init__(self, *, truth: bool = True, calibration: Calibration = TOYS, **changes: object) -> None:
+    def __init__(self, *, truth: bool = True, calibration: Calibration = TOY_CALIBRATION, **changes: object) -> None:
         """Start a loop with `changes` to its settings."""
         self.samples: list[Sample] = []
         self.truth = truth

@@ -33,7 +33,7 @@ from lowfc.programs.view.snapshot import Accumulator, Snapshot
 from lowfc.programs.view.verdicts.tile import Tile, Verdict
 from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
-from tests.support.toy import FLUX_DN, NOLL, START, TOY, calibration
+from tests.support.toy import FLUX_DN, NOLL, SATURATION_DN, START, TOY, calibration
 
 MAS = tilt_nm_per_mas(2.0)
 
@@ -62,6 +62,11 @@ class Stage:
         states: state in each process's Health.
         health: further fields of a process's Health.
         reasons: reasons of every step; with a rejection the frame counts as refused.
+        saturated_pixels: number of pixels at full well in every frame.
+        flux: light in every frame, relative to the calibration.
+        residual_nm, open_nm: residual, and disturbance, rms of the first mode.
+        behind_s: time by which the view is behind the run.
+        each: called with every snapshot.
     """
 
     def __init__(self, *, data_ns: int = START * 10**9) -> None:
@@ -73,7 +78,7 @@ class Stage:
         self.health: dict[str, dict[str, object]] = {"recorder": {"recording": wire.Recording(file="logs/a.mcap")}}
         self.mode, self.reasons = LoopMode.CLOSED, ()
         self.truth, self.residual_nm, self.open_nm = True, 5.0, 40.0
-        self.flux, self.full = 1.0, 0
+        self.flux, self.saturated_pixels = 1.0, 0
         self.stroke_nm, self.latency_us = 100.0, 500
         self.status, self.limits_hit = wire.MIRROR_STATUS_FOLLOWING, ()
         self.refused = 0
@@ -118,7 +123,7 @@ class Stage:
         residual_nm, open_nm = ([size, 0.0, 0.0] for size in (self.residual_nm, self.open_nm))
         if self._runs("camera"):
             pixels = TOY.pixels([0.0] * len(NOLL), self.flux * FLUX_DN)
-            pixels.flat[: self.full] = 60_000
+            pixels.flat[: self.saturated_pixels] = SATURATION_DN
             self.send(FRAME, image(pixels, self.data_ns, "toy"))
             if self.truth:
                 truth = wire.Truth(**frame, disturbance_nm=open_nm, residual_nm=residual_nm)

@@ -191,8 +191,8 @@ def _messages() -> list[Target]:
         Target("camera to controller", (frame_bytes,), processes.frame, message=codec.RawImage, cost=10),
         Target("controller to mirror", (command_bytes,), processes.command, message=wire.MirrorCommand, cost=10),
         Target("camera's settings", (camera_bytes,), processes.settings, message=wire.CameraState, cost=10),
-        Target("mirror state", (mirror_bytes,), partial(_mirror, loop), (LowfcError,), wire.MirrorState),
-        Target("camera state", (camera_bytes,), partial(_camera, loop), (LowfcError,), wire.CameraState),
+        Target("mirror state", (mirror_bytes,), partial(_process_mirror_state, loop), (LowfcError,), wire.MirrorState),
+        Target("camera state", (camera_bytes,), partial(_process_camera_state, loop), (LowfcError,), wire.CameraState),
         Target(
             "bench value",
             tuple(encode_bench_value(value, 5) for value in (True, 2.5, "parked")),
@@ -216,36 +216,42 @@ def _messages() -> list[Target]:
         ),
         Target(
             "controller state",
-            (_busy(state).SerializeToString(),),
-            lambda data: _advance_from(*decode_state(wire.ControllerState.FromString(data), calibration(), *_arrays())),
+            (_state_with_all_parts(state).SerializeToString(),),
+            lambda data: _advance_from(
+                *decode_state(wire.ControllerState.FromString(data), calibration(), *_laws_and_probe_sequences())
+            ),
             (ValueError, codec.DecodeError),
             wire.ControllerState,
             10,
         ),
-        Target("mirror command", (command_bytes,), _apply, (codec.DecodeError, LowfcError), wire.MirrorCommand, 2),
-        Target("a view's messages", (command_bytes,), _shown, cost=10),
+        Target(
+            "mirror command", (command_bytes,), _apply_to_mirror, (codec.DecodeError, LowfcError), wire.MirrorCommand, 2
+        ),
+        Target("a view's messages", (command_bytes,), _show, cost=10),
     ]
 
 
-def _mirror(loop: Loop, data: bytes) -> None:
+def _process_mirror_state(loop: Loop, data: bytes) -> None:
     shape = codec.decode_mirror(data)
     if shape is not None:
         loop.process_input(shape)
         advance(NORMAL, loaded(NORMAL), shape)  # a controller that has sent no command adopts the shape
 
 
-def _camera(loop: Loop, data: bytes) -> None:
+def _process_camera_state(loop: Loop, data: bytes) -> None:
     loop.process_input(codec.decode_camera(data, 3))
 
 
 @cache
-def _arrays() -> tuple[dict[str, LinearLaw], dict[str, PlayTable]]:
+def _laws_and_probe_sequences() -> tuple[dict[str, LinearLaw], dict[str, PlayTable]]:
+    """Laws and probe sequences of the valid requests, by identity."""
     requests = [prepared(NORMAL, codec.request(one, one.name, 0)) for one in _valid_requests()]
     laws = {one.law.id: one.law for one in requests if one.law is not None}
     return laws, {one.played.id: one.played for one in requests if one.played is not None}
 
 
-def _busy(state: State) -> wire.ControllerState:
+def _state_with_all_parts(state: State) -> wire.ControllerState:
+    """State of a controller with a channel, an offset, a law and a probe sequence."""
     state, _ = advance(NORMAL, state, BenchReport(0, "mask", None))
     for request in _valid_requests():
         if request.name in ("channel", "offset", "law", "play"):
@@ -259,14 +265,14 @@ def _advance_from(_settings: object, state: State) -> None:
         state, _ = advance(NORMAL, state, frame(number + 1000))
 
 
-def _apply(data: bytes) -> None:
+def _apply_to_mirror(data: bytes) -> None:
     mirror = Simulated(CONFIG)
     after, _ = mirror.apply_command(mirror.initial, command_of(data), 10)
     assert violations(mirror.protection.limits, mirror.initial.driven_nm, after.driven_nm) == []
     mirror.tick(after, 10**9)
 
 
-def _shown(data: bytes) -> None:
+def _show(data: bytes) -> None:
     """Pass a message to the viewer as each displayed topic."""
     accumulator = Accumulator()
     for topic in SHOWN:
@@ -292,15 +298,17 @@ def _valid_requests() -> list[wire.Request]:
 
 
 def _requests() -> list[Target]:
-    found = []
+    request_targets = []
     for request in _valid_requests():
         read = partial(Loop().request, request.name)
         name, corpus = f"request {request.name}", (request.SerializeToString(),)
-        found.append(Target(name, corpus, read, (ValueError,), wire.Request, 10))
-    return found
+        request_targets.append(Target(name, corpus, read, (ValueError,), wire.Request, 10))
+    return request_targets
 
 
-def _by(read: Callable[[Path], object], path: Path) -> Callable[[bytes], object]:
+def _through_file(read: Callable[[Path], object], path: Path) -> Callable[[bytes], object]:
+    """Function that writes bytes to a file and reads the file."""
+
     def run(data: bytes) -> object:
         path.write_bytes(data)
         return read(path)
@@ -329,17 +337,17 @@ def _files(folder: Path) -> list[Target]:
         "pupil file": (pupils, lambda path: load_pupil(256, path), "input.npz", 30),
     }
     return [
-        Target(name, corpus, _by(read, folder / file), (LowfcError,), cost=cost)
+        Target(name, corpus, _through_file(read, folder / file), (LowfcError,), cost=cost)
         for name, (corpus, read, file, cost) in readers.items()
     ]
 
 
 def _logs(folder: Path) -> list[Target]:
-    whole = tuple(
+    small_logs = tuple(
         small_log(folder / f"log{finished}.mcap", finished=finished).read_bytes() for finished in (True, False)
     )
     log = SyntheticLog().frames(30).request("gain", (0.3,)).frames(20)
-    run = (log.write(folder / "run.mcap").read_bytes(),)
+    loop_log = (log.write(folder / "run.mcap").read_bytes(),)
 
     def recovered(path: Path) -> None:
         with tempfile.TemporaryDirectory(dir=folder) as out:
@@ -347,7 +355,19 @@ def _logs(folder: Path) -> list[Target]:
 
     path, errors = folder / "input.mcap", (LowfcError,)
     return [
-        Target("log, read", whole, _by(lambda path: list(LogReader(path, skip_damaged=True)), path), errors, cost=300),
-        Target("log, its history", run, _by(lambda path: read_history(LogReader(path)), path), errors, cost=300),
-        Target("log, recovered", whole, _by(recovered, path), errors, cost=600),
+        Target(
+            "log, read",
+            small_logs,
+            _through_file(lambda path: list(LogReader(path, skip_damaged=True)), path),
+            errors,
+            cost=300,
+        ),
+        Target(
+            "log, its history",
+            loop_log,
+            _through_file(lambda path: read_history(LogReader(path)), path),
+            errors,
+            cost=300,
+        ),
+        Target("log, recovered", small_logs, _through_file(recovered, path), errors, cost=600),
     ]

@@ -32,6 +32,7 @@ def law_of(
 def linear(
     law: Integrator, noll: tuple[int, ...] = (2, 3, 4), delay_frames: float = 1.0, rate_hz: float = 1e3
 ) -> LinearLaw:
+    """An integrator as a linear law."""
     return integrator(law.gain, law.leak, noll, delay_frames, rate_hz)
 
 
@@ -80,17 +81,17 @@ def realised(model: Model, frames: int, seed: int = 0) -> Array:
     F, Q, C = model.states()
     root = np.linalg.svd(Q)
     steps = rng.standard_normal((frames, len(F))) @ (root.U * np.sqrt(root.S)).T
-    x, found = np.zeros(len(F)), np.zeros((frames, 1))
+    x, disturbance_nm = np.zeros(len(F)), np.zeros((frames, 1))
     for row, step in enumerate(steps):
         x = F @ x + step
-        found[row] = C @ x
-    return found + np.sqrt(model.noise_nm2) * rng.standard_normal((frames, 1))
+        disturbance_nm[row] = C @ x
+    return disturbance_nm + np.sqrt(model.noise_nm2) * rng.standard_normal((frames, 1))
 
 
-_GAIN, _NONE = np.array([0.5, 0.3, 0.1]), np.zeros(3)
+_GAIN, _ZERO = np.array([0.5, 0.3, 0.1]), np.zeros(3)
 _NOTCHES = [(Notch(18, 8, 10), Notch(71, 8, 5))] * 3
 LAWS = {
-    "pi": pi_notch((2, 3, 4), _GAIN, _GAIN / 2, _NONE, [()] * 3, 1.0, 1000.0),
-    "notch": pi_notch((2, 3, 4), _GAIN, _NONE, _NONE, _NOTCHES, 1.0, 1000.0),
+    "pi": pi_notch((2, 3, 4), _GAIN, _GAIN / 2, _ZERO, [()] * 3, 1.0, 1000.0),
+    "notch": pi_notch((2, 3, 4), _GAIN, _ZERO, _ZERO, _NOTCHES, 1.0, 1000.0),
 }
 """Laws for three modes and a delay of one frame, at 1 kHz."""

@@ -17,9 +17,9 @@ from lowfc.control.loop.state import Settings, State
 
 SHAPE, GRID, NOLL = (6, 7), (4, 5), (2, 3, 4)
 FLUX_DN, DARK_DN, SATURATION_DN = 200_000.0, 100.0, 60_000.0
-START = 1_700_000_000
+START = 1_700_000_000  # of every process, s since 1970
 PERIOD_NS = 1_000_000
-SOME = (10.0, -5.0, 3.0)
+SOME = (10.0, -5.0, 3.0)  # modes of a wavefront, nm
 # Clock-induced charge and dark current lift the dark above the bias.
 CAMERA = CameraSettings(0, SHAPE, DARK_DN - 40, SATURATION_DN, 1.0, 1.0, 3.0, start_s=START)
 
@@ -99,6 +99,7 @@ def settings(**changes: object) -> Settings:
 
 
 def loaded(settings: Settings) -> State:
+    """State of a controller that has loaded the toy's calibration."""
     return advance(settings, State(), Load(0, calibration(), "test"))[0]
 
 
@@ -122,6 +123,7 @@ def feed(settings: Settings, state: State, *inputs: Input) -> tuple[State, list[
 
 
 def names(all_outputs: list[Outputs]) -> list[str]:
+    """Names of all events of these outputs."""
     return [event.name for outputs in all_outputs for event in outputs.events]
 
 

@@ -35,6 +35,7 @@ def levels(verdict: Verdict) -> dict[str, Level]:
 
 
 def begun(seconds: float = 0.0, **values: object) -> Stage:
+    """A stage with these attributes, after so many seconds."""
     stage = Stage()
     setting(**values)(stage)
     stage.begin()
@@ -73,7 +74,7 @@ def counting(**counts: int) -> Callable[[Stage], None]:
     return health("controller", topics=[wire.TopicCount(topic=FRAME.key, **counts)])
 
 
-def changed(mode: LoopMode, why: str) -> Callable[[Stage], None]:
+def to_mode(mode: LoopMode, why: str) -> Callable[[Stage], None]:
     def change(stage: Stage) -> None:
         stage.mode = mode
         details = {"before": "closed", "after": mode.in_words, "why": why}
@@ -100,10 +101,10 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "healthy": (setting(), "LOOP CLOSED GOOD", "nothing is wrong"),
     "open": (setting(mode=LoopMode.OPEN), "LOOP OPEN NEUTRAL", "lowfc ctl close"),
     "open, worse than flat": (setting(mode=LoopMode.OPEN, residual_nm=60.0), "LOOP OPEN NEUTRAL", HARMFUL),
-    "camera changed": (changed(LoopMode.OPEN, MISFIT), "LOOP OPEN WARNING", "opened by itself"),
+    "camera changed": (to_mode(LoopMode.OPEN, MISFIT), "LOOP OPEN WARNING", "opened by itself"),
     "safe": (setting(mode=LoopMode.SAFE), "LOOP SAFE BAD", "lowfc ctl clear"),
     "idle": (setting(mode=LoopMode.IDLE, reasons=(Rejection.NO_CALIBRATION,)), "FRAMES REFUSED BAD", "no calibration"),
-    "idle, other size": (changed(LoopMode.IDLE, OTHER_SIZE), "LOOP IDLE WARNING", "no calibration for these frames"),
+    "idle, other size": (to_mode(LoopMode.IDLE, OTHER_SIZE), "LOOP IDLE WARNING", "no calibration for these frames"),
     "controller dead": (silence("controller"), "LOOP DEAD BAD", "Controller silent for 4 s"),
     "camera dead": (silence("camera"), "FRAMES NO FRAMES BAD", "No frame for 4 s, camera silent"),
     "mirror dead": (silence("mirror-dm"), "MIRROR DEAD BAD", "Mirror silent for 4 s"),
@@ -122,11 +123,11 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "reserved": (holding(Rejection.HELD, lease=LEASE), "LOOP HOLDING WARNING", "reserved for calibrate"),
     "held, no state": (setting(reasons=(Rejection.HELD,)), "LOOP HOLDING WARNING", "Every frame is refused"),
     "saturated": (
-        setting(reasons=(Rejection.SATURATED,), full=20),
+        setting(reasons=(Rejection.SATURATED,), saturated_pixels=20),
         "STAR SATURATED BAD",
         "Every frame is refused, detector saturated",
     ),
-    "nearly saturated": (setting(full=3), "STAR 183 % WARNING", "3 pixels at full well"),
+    "nearly saturated": (setting(saturated_pixels=3), "STAR 183 % WARNING", "3 pixels at full well"),
     "star gone": (setting(reasons=(Rejection.DARK,), flux=0.01), "STAR GONE BAD", "the star is gone"),
     "dim": (setting(flux=0.4), "STAR 40 % WARNING", "The star is dim"),
     "stroke": (setting(reasons=(Limit.STROKE,)), "MIRROR AT LIMIT BAD", "actuator stroke"),
@@ -361,14 +362,14 @@ def test_an_idle_loop_names_the_cause(verdicts: dict[str, Verdict]) -> None:
     "why", ["the camera's frames fit the calibration", "an interlock acts: camera_temp is 41", "camera exchange"]
 )
 def test_a_loop_that_opened_for_another_reason_is_not_blamed_on_the_camera(why: str) -> None:
-    verdict = staged(changed(LoopMode.OPEN, why), 2)
+    verdict = staged(to_mode(LoopMode.OPEN, why), 2)
     assert tile(verdict, "LOOP").detail.startswith(why)
     assert (tile(verdict, "LOOP").level, verdict.level) == (Level.NEUTRAL, Level.NEUTRAL)
 
 
 def test_the_cause_of_the_mode_is_that_of_the_controllers_state() -> None:
     stage = begun(1)
-    changed(LoopMode.OPEN, "operator asked to pause")(stage)
+    to_mode(LoopMode.OPEN, "operator asked to pause")(stage)
     stage.send(CONTROLLER_STATE, wire.ControllerState(mode=wire.LOOP_MODE_OPEN, mode_cause="operator asked to open"))
     assert tile(stage.run(2), "LOOP").detail.startswith("operator asked to open")
 
@@ -425,15 +426,15 @@ def picture_of(verdict: Verdict, time_ns: int = NOON_NS) -> npt.NDArray[np.uint8
 def test_text_stays_inside_its_tile_and_off_its_border(level: Level, tiles: int) -> None:
     verdict = Verdict(LONG, level, tuple(Tile("RECORDER", "NO MESSAGES FROM IT", LONG, level) for _ in range(tiles)))
     shown = picture_of(verdict)
-    rest = np.ones((HEIGHT, WIDTH), bool)
+    outside = np.ones((HEIGHT, WIDTH), bool)
     for x0, y0, x1, y1 in tile_boxes(tiles):
         inside = shown[y0:y1, x0:x1]
         border = np.ones(inside.shape[:2], bool)
         border[2:-2, 2:-2] = False
         assert (inside[border] == FILL[level]).all()
         assert (inside != FILL[level]).any(axis=2).mean() > 0.03  # there are words
-        rest[y0:y1, x0:x1] = False
-    assert (shown[rest] == GROUND).all()
+        outside[y0:y1, x0:x1] = False
+    assert (shown[outside] == GROUND).all()
 
 
 def test_the_picture_shows_the_whole_text_and_the_time_of_day_at_its_right_edge() -> None:
@@ -445,12 +446,12 @@ def test_the_picture_shows_the_whole_text_and_the_time_of_day_at_its_right_edge(
     differs = np.argwhere((noon != second).any(axis=2))
     (top, left), (bottom, right) = differs.min(axis=0), differs.max(axis=0)
     assert 0 < top < bottom < tile_boxes(7)[0][3]
-    assert WIDTH - 190 < left < right < WIDTH
+    assert WIDTH - 190 < left < right < WIDTH  # the time of day takes less than 190 pixels
 
 
 def test_levels_differ_in_lightness() -> None:
-    light = sorted(float(np.dot(FILL[level], (0.2126, 0.7152, 0.0722))) for level in Level)
-    assert min(np.diff(light)) > 8
+    lightness = sorted(float(np.dot(FILL[level], (0.2126, 0.7152, 0.0722))) for level in Level)
+    assert min(np.diff(lightness)) > 8  # of 255
 
 
 def test_a_picture_is_drawn_each_second_and_when_the_verdict_changes() -> None:

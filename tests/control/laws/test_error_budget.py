@@ -12,7 +12,7 @@ from lowfc.control.laws.continuous import Timing, residual_power
 from lowfc.control.laws.error_budget import Term, lag, lag_under_noise, measurement_error, sensor_noise, white_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import TimeSeries, spectrum
-from tests.support.in_process_loop import SMALL_MIRROR, fold
+from tests.support.in_process_loop import SMALL_MIRROR, run_loop
 from tests.support.theory import rejection
 from tools.law_bench import calibrated
 
@@ -165,7 +165,7 @@ def test_the_terms_add_up_to_the_residual_of_a_simulated_loop() -> None:
     keys = {"control.start_mode": "closed", "camera.rate_hz": RATE_HZ, "disturbance.scale": 2.0}
     config = load(None, keys | FIXED_GAINS | SMALL_MIRROR)
     calibration = calibrated(config)
-    ran = fold(config, 1600, calibration)
+    ran = run_loop(config, 1600, calibration)
     signals = {name: getattr(ran, name)[100:] for name in ("error_nm", "pol_nm", "disturbance_nm", "residual_nm")}
     settings = factory.settings(config)
     law = settings.integrator(calibration.noll)

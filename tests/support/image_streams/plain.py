@@ -31,7 +31,7 @@ class PlainStream:
         self.keywords = self.data + (length + 7) // 8 * 8
         self.semaphores = self.keywords + KEYWORD * keywords
         self.readers = self.semaphores + 11 * SEMAPHORE  # ten, and one for the log
-        self.writers = self.readers + 40
+        self.writers = self.readers + 40  # ten process ids of four bytes each
         self.address = ctypes.addressof(ctypes.c_char.from_buffer(self.map))
 
     @classmethod
@@ -55,7 +55,7 @@ class PlainStream:
         itemsize = np.dtype(NUMPY_TYPES.get(number, "f8")).itemsize
         elements = columns * rows * planes
         length = (elements * itemsize + 7) // 8 * 8
-        # Of a circular buffer: times and counter of each plane.
+        # A circular buffer also has times and a counter of each plane.
         ring_times = planes * 40 if kind & 0xF000F == 0x20001 else 0
         path.unlink(missing_ok=True)
         with path.open("wb") as file:
@@ -64,12 +64,12 @@ class PlainStream:
             file.truncate(header_bytes + length + tail)
         stream = cls(path, columns, rows, number if number in NUMPY_TYPES else 10, planes, len(words))
         stream.pack("80s", 32, path.name.removesuffix(".im.shm").encode())
-        stream.pack("<B3xIII", 112, axes, columns, rows, planes if axes == 3 else 0)
+        stream.pack("<B3xIII", 112, axes, columns, rows, planes if axes == 3 else 0)  # number of axes, sizes
         stream.pack("<QB7xQ", 128, elements, number, kind)
-        stream.pack("<iiB", 216, os.getpid(), 0, 1)
+        stream.pack("<iiB", 216, os.getpid(), 0, 1)  # creator, owner, shared
         stream.pack("<Qb", 232, os.fstat(stream.file).st_ino, location)
-        stream.pack("<HH", 258, 10, 10)
-        stream.pack("<BxH", 288, 0, len(words))
+        stream.pack("<HH", 258, 10, 10)  # numbers of semaphores and of traces
+        stream.pack("<BxH", 288, 0, len(words))  # write flag, number of keywords
         stream.pack("<Q", 312, elements * itemsize)
         for index, (name, value) in enumerate(words.items()):
             at = stream.keywords + KEYWORD * index
@@ -93,12 +93,14 @@ class PlainStream:
         return ctypes.c_void_p(self.address + self.semaphores + SEMAPHORE * index)
 
     def value(self, index: int) -> int:
+        """Value of a semaphore."""
         value = ctypes.c_int()
         LIBC.sem_getvalue(self.semaphore(index), ctypes.byref(value))
         return value.value
 
     @property
     def count(self) -> int:
+        """Number of images written: cnt0."""
         return self.get("<Q", 264)
 
     @property
@@ -109,11 +111,11 @@ class PlainStream:
 
     def begin(self, image: npt.NDArray[np.generic], plane: int = 0) -> None:
         """Begin to write an image: set the flag, write the pixels."""
-        self.pack("B", 288, 1)
+        self.pack("B", 288, 1)  # write flag
         raw = np.ascontiguousarray(image, self.type).tobytes()
         at = self.data + plane * len(raw)
         self.map[at : at + len(raw)] = raw
-        self.pack("<Q", 272, plane)
+        self.pack("<Q", 272, plane)  # cnt1
 
     def end(self, acquired_ns: int | None = None) -> None:
         """Finish the image: times, counter, flag, and post the semaphores whose value is below ten."""
@@ -132,8 +134,10 @@ class PlainStream:
         self.end(acquired_ns)
 
     def take(self, index: int, pid: int | None = None) -> None:
+        """Register a process, by default this one, as the reader of a semaphore."""
         self.pack("<i", self.readers + 4 * index, os.getpid() if pid is None else pid)
 
     def wait(self, index: int, timeout_s: float) -> bool:
+        """Wait for a semaphore; return whether it was posted."""
         end = struct.pack("@ll", *divmod(time.time_ns() + int(timeout_s * 1e9), 10**9))
         return LIBC.sem_timedwait(self.semaphore(index), ctypes.c_char_p(end)) == 0
