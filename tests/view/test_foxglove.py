@@ -129,8 +129,8 @@ def bus() -> MemoryBus:
 
 @pytest.fixture
 def bridge(bus: MemoryBus) -> Iterator[FoxgloveBridge]:
-    with running(bus) as one:
-        yield one
+    with running(bus) as bridge:
+        yield bridge
 
 
 def test_channels_are_those_of_the_topic_table_and_have_their_schemas(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
@@ -186,11 +186,11 @@ def test_a_client_that_does_not_read_loses_messages_and_blocks_nobody(bridge: Fo
             truth.put(payload, publish_time_ns=number)
         bus.publisher(STEP).put(STEP_BYTES)
         reading.next()
-        got = [0]
-        while got[-1] < count:
-            got.append(frozen.next()[1])
-    assert got == sorted(got)
-    assert 1000 < len(got) < count, "a bounded number of messages waits for it"
+        times_ns = [0]
+        while times_ns[-1] < count:
+            times_ns.append(frozen.next()[1])
+    assert times_ns == sorted(times_ns)
+    assert 1000 < len(times_ns) < count, "a bounded number of messages waits for it"
 
 
 def test_the_port_is_on_loopback_only_and_errors_have_one_line(
@@ -222,10 +222,10 @@ def test_the_process_serves_a_real_run(tmp_path: Path, run: Run) -> None:
                 frames.put(FRAME_BYTES)
                 steps.put(STEP_BYTES)
                 time.sleep(0.001)
-            got = {"/" + FRAME.key: 0, "/" + STEP.key: 0}
-            while got["/" + STEP.key] < COUNT:
-                got[client.next()[0]] += 1
-            assert 0 < got["/" + FRAME.key] < COUNT / 2, "only images are thinned"
+            counts = {"/" + FRAME.key: 0, "/" + STEP.key: 0}
+            while counts["/" + STEP.key] < COUNT:
+                counts[client.next()[0]] += 1
+            assert 0 < counts["/" + FRAME.key] < COUNT / 2, "only images are thinned"
             assert set(received) == {Role.VIEWER}
             client.connection.socket.close()  # like a killed client
             until(lambda: steps.put(STEP_BYTES * 1000) and steps.published > COUNT + 20)

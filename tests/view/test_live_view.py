@@ -58,7 +58,7 @@ class FakeViewer:
         self.stopped.set()
 
 
-class Scene:
+class ViewBench:
     """A live view on an in-memory bus, in a thread, of a run that started before it; the first `stuck` viewers hang."""
 
     memory_mb = 100.0
@@ -113,85 +113,85 @@ class Scene:
 
 
 @pytest.fixture(autouse=True)
-def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+def _short_periods(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_view, "_CHECK_S", 0.05)
     monkeypatch.setattr(live_view, "_POLL_S", 0.02)
     monkeypatch.setattr(render_threads, "PICTURES_HZ", 100.0)
     monkeypatch.setattr(live_view, "resident_bytes", lambda: 0)  # the memory of the test process is not that of a view
 
 
-Scenes = Callable[..., Scene]
+ViewBenches = Callable[..., ViewBench]
 
 
 @pytest.fixture
-def scenes() -> Iterator[Scenes]:
-    with contextlib.ExitStack() as made:
+def benches() -> Iterator[ViewBenches]:
+    with contextlib.ExitStack() as stack:
 
-        def make(*given: Any, **more: Any) -> Scene:
-            scene = Scene(*given, **more)
-            made.callback(scene.end)
-            return scene
+        def make(*arguments: Any, **options: Any) -> ViewBench:
+            bench = ViewBench(*arguments, **options)
+            stack.callback(bench.end)
+            return bench
 
         yield make
 
 
-def failed(scene: Scene) -> str:
+def failure_of(bench: ViewBench) -> str:
     """Wait until the view fails; return its error."""
-    scene.thread.join(PATIENCE_S)
-    assert isinstance(scene.failure, ViewError)
-    return str(scene.failure)
+    bench.thread.join(PATIENCE_S)
+    assert isinstance(bench.failure, ViewError)
+    return str(bench.failure)
 
 
-def test_a_late_view_requests_the_calibration(scenes: Scenes) -> None:
+def test_a_late_view_requests_the_calibration(benches: ViewBenches) -> None:
     assert topic_of(CALIBRATION.key).queryable
-    scene = scenes()
-    step = next(one.payload for one in scene.night.samples if one.key == STEP.key)
+    bench = benches()
+    step = next(one.payload for one in bench.night.samples if one.key == STEP.key)
     # repeatedly: steps before the calibration are not drawn
-    until(lambda: scene.drawn(1), each=lambda: scene.publishers[STEP.key].put(step))
+    until(lambda: bench.drawn(1), each=lambda: bench.publishers[STEP.key].put(step))
 
 
-def test_a_late_view_shows_earlier_events_once(scenes: Scenes, tmp_path: Path) -> None:
-    before = SyntheticLog()
-    before.event("NOTE", text="before the view")
-    assert before.write(tmp_path / "night.mcap", finish=False).name.endswith(".part")
-    scene = scenes()
+def test_a_late_view_shows_earlier_events_once(benches: ViewBenches, tmp_path: Path) -> None:
+    earlier = SyntheticLog()
+    earlier.event("NOTE", text="before the view")
+    assert earlier.write(tmp_path / "night.mcap", finish=False).name.endswith(".part")
+    bench = benches()
     recording = wire.Recording(files=[str(tmp_path / "night.mcap")], folder="/")
     health = wire.Health(process="recorder", state="running", pid=5, recording=recording)
-    MemoryBus(scene.hub, "recorder", scene.clock).publisher(HEALTH, "recorder").put(health.SerializeToString())
+    MemoryBus(bench.hub, "recorder", bench.clock).publisher(HEALTH, "recorder").put(health.SerializeToString())
 
     def notes() -> list[str]:
-        return [text for viewer in scene.viewers for text in viewer.tape.texts("log/controller") if "NOTE" in text]
+        return [text for viewer in bench.viewers for text in viewer.tape.texts("log/controller") if "NOTE" in text]
 
     until(notes)
     assert len(notes()) == 1
 
 
 def test_without_a_recorder_a_line_reports_that_earlier_events_are_missing(
-    scenes: Scenes, monkeypatch: pytest.MonkeyPatch
+    benches: ViewBenches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live_view, "_RECORDER_S", 0.0)
-    scene = scenes()
-    until(lambda: any("there is no recorder" in text for text in scene.viewers[0].tape.texts("log/view")))
+    bench = benches()
+    until(lambda: any("there is no recorder" in text for text in bench.viewers[0].tape.texts("log/view")))
 
 
-def viewer_dies(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene.viewers[0].alive = False
+def viewer_dies(bench: ViewBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.viewers[0].alive = False
 
 
-def reads_nothing(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def reads_nothing(bench: ViewBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_view, "STUCK_S", 0.1)
 
 
-def viewer_grows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene.viewers[0].memory_bytes = 100_000_000 + live_view.VIEWER_SPARE_BYTES - 1
+def viewer_grows(bench: ViewBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.viewers[0].memory_bytes = 100_000_000 + live_view.VIEWER_SPARE_BYTES - 1
     time.sleep(0.1)
-    assert len(scene.viewers) == 1
-    scene.viewers[0].memory_bytes += 2
+    assert len(bench.viewers) == 1
+    bench.viewers[0].memory_bytes += 2
 
 
-def view_grows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    held = [live_view.OWN_BYTES + 1]
-    monkeypatch.setattr(live_view, "resident_bytes", lambda: held.pop() if held else 0)
+def view_grows(bench: ViewBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = [live_view.OWN_BYTES + 1]  # once too large
+    monkeypatch.setattr(live_view, "resident_bytes", lambda: sizes.pop() if sizes else 0)
 
 
 @pytest.mark.parametrize(
@@ -204,64 +204,66 @@ def view_grows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_a_failed_viewer_is_restarted_and_shows_everything(
-    scenes: Scenes, monkeypatch: pytest.MonkeyPatch, fail: Callable[..., None], stuck: int, why: str
+    benches: ViewBenches, monkeypatch: pytest.MonkeyPatch, fail: Callable[..., None], stuck: int, why: str
 ) -> None:
-    scene = scenes(stuck=stuck)
-    scene.publish()
-    until(lambda: stuck or scene.drawn(1))
-    fail(scene, monkeypatch)
-    until(lambda: len(scene.viewers) == 2)
-    assert scene.viewers[0].stopped.is_set()
-    scene.publish()
-    until(lambda: scene.drawn(2))
-    assert any("VIEW_RENEWED" in event and why in event for event in scene.events)
-    assert scene.failure is None
+    bench = benches(stuck=stuck)
+    bench.publish()
+    until(lambda: stuck or bench.drawn(1))
+    fail(bench, monkeypatch)
+    until(lambda: len(bench.viewers) == 2)
+    assert bench.viewers[0].stopped.is_set()
+    bench.publish()
+    until(lambda: bench.drawn(2))
+    assert any("VIEW_RENEWED" in event and why in event for event in bench.events)
+    assert bench.failure is None
 
 
-def test_closing_the_window_ends_the_view(scenes: Scenes) -> None:
-    scene = scenes(Show.NATIVE)
-    scene.viewers[0].alive = False
-    scene.thread.join(PATIENCE_S)
-    assert (scene.failure, scene.view.renewals) == (None, 0)
+def test_closing_the_window_ends_the_view(benches: ViewBenches) -> None:
+    bench = benches(Show.NATIVE)
+    bench.viewers[0].alive = False
+    bench.thread.join(PATIENCE_S)
+    assert (bench.failure, bench.view.renewals) == (None, 0)
 
 
 def test_a_hung_window_is_not_restarted_and_memory_stays_bounded(
-    scenes: Scenes, monkeypatch: pytest.MonkeyPatch
+    benches: ViewBenches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live_view, "STUCK_S", 0.1)
-    scene = scenes(Show.NATIVE, stuck=1)
-    until(lambda: scene.viewers[0].blocked.is_set())
+    bench = benches(Show.NATIVE, stuck=1)
+    until(lambda: bench.viewers[0].blocked.is_set())
     for _ in range(100):
-        scene.publish()
-    waiting = {topic: len(ring.waiting) for topic, ring in scene.view._rings.items()}
+        bench.publish()
+    waiting = {topic: len(ring.waiting) for topic, ring in bench.view._rings.items()}
     assert (waiting[STEP], waiting[FRAME]) == (live_view.RING_LENGTHS[STEP], 1)
     assert all(count <= live_view.RING_LENGTHS[topic] for topic, count in waiting.items())
-    until(lambda: any("VIEW_STUCK" in event for event in scene.events))
+    until(lambda: any("VIEW_STUCK" in event for event in bench.events))
     time.sleep(0.2)
-    assert sum("VIEW_STUCK" in event for event in scene.events) == 1
-    assert len(scene.viewers) == 1
-    scene.viewers[0].stopped.set()
-    until(lambda: scene.drawn(1))
+    assert sum("VIEW_STUCK" in event for event in bench.events) == 1
+    assert len(bench.viewers) == 1
+    bench.viewers[0].stopped.set()
+    until(lambda: bench.drawn(1))
 
 
-def test_memory_above_the_limit_after_a_restart_ends_the_view(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = scenes()
+def test_memory_above_the_limit_after_a_restart_ends_the_view(
+    benches: ViewBenches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = benches()
     monkeypatch.setattr(live_view, "resident_bytes", lambda: live_view.OWN_BYTES + 1)
-    assert "even after a restart" in failed(scene)
+    assert "even after a restart" in failure_of(bench)
 
 
-def test_repeated_failures_end_the_view(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_failures_end_the_view(benches: ViewBenches, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FakeViewer, "alive", property(lambda self: False, lambda self, value: None), raising=False)
-    assert "5 times" in failed(scenes())
+    assert "5 times" in failure_of(benches())
 
 
 @pytest.mark.parametrize("method", ["set_time", "flush"])
-def test_a_view_to_a_file_is_not_restarted(scenes: Scenes, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
-    scene = scenes(None)
+def test_a_view_to_a_file_is_not_restarted(benches: ViewBenches, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
+    bench = benches(None)
     monkeypatch.setattr(Tape, method, None)
     if method == "flush":  # as on a full disk, at the end
-        scene.view.service.stop("the test is over")
-    assert "writing the view to a file failed: drawing failed" in failed(scene)
+        bench.view.service.stop("the test is over")
+    assert "writing the view to a file failed: drawing failed" in failure_of(bench)
 
 
 @pytest.mark.parametrize(("pause_s", "all_complete"), [(0.1, True), (0.0, False)])

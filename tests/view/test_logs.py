@@ -68,11 +68,11 @@ def drawn(*logs: Path, config: Configuration | None = None) -> tuple[Drawn, Tape
 def test_the_final_verdict_is_on_the_log_and_not_on_a_recording(
     tmp_path: Path, shown: Shown, finish: bool, value: str, level: Level
 ) -> None:
-    made = SyntheticLog()
+    night = SyntheticLog()
     for _ in range(10):
-        made.frames(50)
-        made.health("recorder", state="running", recording=wire.Recording(file="logs/a.mcap"))
-    drawn(made.write(tmp_path / "night.mcap", finish=finish))
+        night.frames(50)
+        night.health("recorder", state="running", recording=wire.Recording(file="logs/a.mcap"))
+    drawn(night.write(tmp_path / "night.mcap", finish=finish))
     assert tile(shown[-2], "RECORDER").value == "RECORDING"  # while it was recorded
     end = shown[-1]
     assert (tile(end, "LOG").value, tile(end, "LOG").level) == (value, level)
@@ -86,11 +86,11 @@ def test_the_final_verdict_is_on_the_log_and_not_on_a_recording(
 def test_the_verdict_has_the_losses_of_the_log_and_not_of_earlier_ones(
     tmp_path: Path, shown: Shown, in_health: tuple[int, int], at_the_end: int, detail: str
 ) -> None:
-    made = SyntheticLog()
+    night = SyntheticLog()
     for lost in in_health:
-        made.frames(300)
-        made.health("recorder", state="running", pid=7, recording=wire.Recording(lost=lost))
-    drawn(made.write(tmp_path / "night.mcap", messages_lost=str(at_the_end)))
+        night.frames(300)
+        night.health("recorder", state="running", pid=7, recording=wire.Recording(lost=lost))
+    drawn(night.write(tmp_path / "night.mcap", messages_lost=str(at_the_end)))
     log = tile(shown[-1], "LOG")
     assert (log.detail, log.level) == (detail, Level.GOOD if "nothing" in detail else Level.WARNING)
 
@@ -101,11 +101,11 @@ def test_the_verdict_on_a_log_of_a_fraction_of_a_second_has_its_losses(shown: Sh
 
 
 def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) -> None:
-    made = SyntheticLog().frames(750)
-    made.frames(50, dark=range(50))
-    made.request("safe")
-    made.frames(200)
-    drawn(made.write(tmp_path / "night.mcap"))
+    night = SyntheticLog().frames(750)
+    night.frames(50, dark=range(50))
+    night.request("safe")
+    night.frames(200)
+    drawn(night.write(tmp_path / "night.mcap"))
     instant, end = shown[-2], shown[-1]
     assert tile(instant, "LOOP").value == "SAFE"
     assert "safe 0.2 s" in tile(end, "LOOP").detail
@@ -113,7 +113,7 @@ def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) ->
     assert tile(end, "FRAMES").value == "50 UNUSED"
     assert "of 1000 frames: 0 lost, 50 refused (50 too dark)" in tile(end, "FRAMES").detail
     assert (end.level, "in safe mode for 0.2 s" in end.headline) == (Level.WARNING, True)
-    truths = [wire.Truth.FromString(one.payload) for one in made.samples if one.key == TRUTH.key][:800]
+    truths = [wire.Truth.FromString(one.payload) for one in night.samples if one.key == TRUTH.key][:800]
     rms_nm = float(np.sqrt(np.mean([one.residual_rms_nm**2 for one in truths])))
     assert float(tile(end, "WAVEFRONT").value.split()[0]) == pytest.approx(rms_nm, rel=0.05)
     assert f"worst 1 s: {tile(end, 'WAVEFRONT').value.split()[0]} nm" in tile(end, "WAVEFRONT").detail
@@ -129,21 +129,21 @@ def test_the_time_of_a_slow_loop_and_of_a_frame_with_a_wrong_clock_is_counted(
     tmp_path: Path, shown: Shown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(report_log, "PERIOD_NS", 2_000_000_000)
-    made = SyntheticLog().frames(10)
-    step = next(wire.ControlStep.FromString(one.payload) for one in made.samples if one.key == STEP.key)
+    night = SyntheticLog().frames(10)
+    step = next(wire.ControlStep.FromString(one.payload) for one in night.samples if one.key == STEP.key)
     step.timestamp.CopyFrom(timestamp(0))
     step.reasons.append(Rejection.OUT_OF_ORDER.value)
-    made.put(STEP, step)
-    made.frames(10)
-    drawn(made.write(tmp_path / "night.mcap"))
+    night.put(STEP, step)
+    night.frames(10)
+    drawn(night.write(tmp_path / "night.mcap"))
     assert (tile(shown[-1], "LOOP").value, tile(shown[-1], "LOOP").detail) == ("CLOSED", "closed 38 s")
     assert tile(shown[-1], "FRAMES").detail == "of 21 frames: 0 lost, 1 refused (1 out of order)"
-    made = SyntheticLog().frames(1)
-    drawn(made.write(tmp_path / "frame.mcap"))
+    night = SyntheticLog().frames(1)
+    drawn(night.write(tmp_path / "frame.mcap"))
     assert tile(shown[-1], "FRAMES").value == "0.5 Hz"
-    made = SyntheticLog()
-    made.put(STEP, step)
-    drawn(made.write(tmp_path / "step.mcap"))
+    night = SyntheticLog()
+    night.put(STEP, step)
+    drawn(night.write(tmp_path / "step.mcap"))
     assert shown[-1].headline.startswith("Log without a step of the controller at a valid time")
 
 
@@ -159,23 +159,23 @@ def test_a_log_with_late_or_slow_commands_needs_attention(
     tmp_path: Path, shown: Shown, monkeypatch: pytest.MonkeyPatch, delay_ns: int, late: int, value: str, advice: str
 ) -> None:
     monkeypatch.setattr(report_log, "DELAY_NS", delay_ns)
-    made = SyntheticLog()
+    night = SyntheticLog()
     for count in (0, late):
-        made.health("camera", state="running", pid=7, commands_late=count)
-        made.frames(300)
-    drawn(made.write(tmp_path / "night.mcap"))
+        night.health("camera", state="running", pid=7, commands_late=count)
+        night.frames(300)
+    drawn(night.write(tmp_path / "night.mcap"))
     latency = tile(shown[-1], "LATENCY")
     assert (latency.value, latency.level) == (value, Level.WARNING if advice else Level.GOOD)
     assert advice in latency.advice
 
 
 def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: Shown) -> None:
-    made = SyntheticLog().health("recorder", state="running")
-    drawn(made.write(tmp_path / "night.mcap", messages_lost="3"))
+    night = SyntheticLog().health("recorder", state="running")
+    drawn(night.write(tmp_path / "night.mcap", messages_lost="3"))
     assert shown[-1].headline.startswith("Log without a step of the controller. The recorder lost 3 messages")
-    made.samples = [one for one in made.samples if one.key != EVENT.key]
-    done, tape = drawn(made.write(tmp_path / "states.mcap"))
-    assert (done.log_s, tape.logged[tiles.TILES][-1][0]) == (0, made.samples[-1].receive_time_ns)
+    night.samples = [one for one in night.samples if one.key != EVENT.key]
+    done, tape = drawn(night.write(tmp_path / "states.mcap"))
+    assert (done.log_s, tape.logged[tiles.TILES][-1][0]) == (0, night.samples[-1].receive_time_ns)
     assert [one.value for one in shown[-1].tiles] == ["NOT CLOSED", "?", "1000 Hz", "?", "?", "?", "FINISHED"]
 
 
@@ -186,14 +186,14 @@ def test_the_trend_of_a_night_has_a_limited_number_of_spans() -> None:
     squares = np.stack([snapshot.truths.residual_rms_nm, snapshot.truths.disturbance_rms_nm], axis=1).astype(float) ** 2
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
     averages.add(np.array([snapshot.truths.time_ns[0] + 10 * 3600 * 10**9]), slice(0, 3), np.ones((1, 2)))
-    after_ns, rms_nm = averages.wavefront()
-    assert span_means.MAX_SPANS / 2 <= len(after_ns) <= span_means.MAX_SPANS
+    begin_ns, rms_nm = averages.wavefront()
+    assert span_means.MAX_SPANS / 2 <= len(begin_ns) <= span_means.MAX_SPANS
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
     assert np.isnan(rms_nm[1:-1]).all()  # nothing in between: a gap
     for days in (6, 12, 100):  # a view may run for weeks; the last is an error of the clock
         averages.add(np.array([averages.begin_ns + days * 86_400 * 10**9]), slice(0, 3), np.ones((1, 2)))
-    after_ns, _ = averages.wavefront()
-    assert after_ns[-1] == pytest.approx(12 * 86_400e9, rel=0.02)
+    begin_ns, _ = averages.wavefront()
+    assert begin_ns[-1] == pytest.approx(12 * 86_400e9, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -216,11 +216,11 @@ def test_a_log_larger_than_the_memory_of_the_viewer_gives_a_remark() -> None:
 
 
 def test_every_view_of_the_layout_has_data_and_the_plots_span_the_whole_log(tmp_path: Path) -> None:
-    made = SyntheticLog().frames(120)
-    made.health("controller")
-    made.put(SURFACE, image(np.eye(8, dtype=np.float32), made.now_ns, "dm"))
-    made.frames(1380)
-    done, tape = drawn(made.write(tmp_path / "night.mcap"))
+    night = SyntheticLog().frames(120)
+    night.health("controller")
+    night.put(SURFACE, image(np.eye(8, dtype=np.float32), night.now_ns, "dm"))
+    night.frames(1380)
+    done, tape = drawn(night.write(tmp_path / "night.mcap"))
     assert done.remarks == []
     assert done.snapshots > 5
     times_ns, _ = tape.column(wavefront.ERROR.path)
@@ -257,25 +257,25 @@ def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_th
 
 
 def test_a_log_begins_with_its_first_frame_and_not_with_an_older_calibration(tmp_path: Path) -> None:
-    made = SyntheticLog().frames(100)
-    calibration = next(one for one in made.samples if one.key == CALIBRATION.key)
+    night = SyntheticLog().frames(100)
+    calibration = next(one for one in night.samples if one.key == CALIBRATION.key)
     earlier_ns = calibration.receive_time_ns - 3600 * 10**9
-    made.samples = [calibration._replace(receive_time_ns=ns) for ns in (earlier_ns, made.now_ns)] + made.samples
-    done, tape = drawn(made.write(tmp_path / "night.mcap"))
+    night.samples = [calibration._replace(receive_time_ns=ns) for ns in (earlier_ns, night.now_ns)] + night.samples
+    done, tape = drawn(night.write(tmp_path / "night.mcap"))
     assert done.log_s == pytest.approx(0.1, abs=0.01)
     assert min(tape.logged[tiles.TILES])[0] > earlier_ns + 3599 * 10**9
 
 
 def test_a_frame_of_a_camera_whose_clock_is_ahead_does_not_move_the_time_line(tmp_path: Path) -> None:
-    made = SyntheticLog().frames(300)
-    ahead_ns = made.now_ns + 3600 * 10**9
-    step = next(wire.ControlStep.FromString(one.payload) for one in made.samples if one.key == STEP.key)
+    night = SyntheticLog().frames(300)
+    ahead_ns = night.now_ns + 3600 * 10**9
+    step = next(wire.ControlStep.FromString(one.payload) for one in night.samples if one.key == STEP.key)
     step.timestamp.CopyFrom(timestamp(ahead_ns))
     step.reasons.append(Rejection.AHEAD.value)
-    made.put(FRAME, image(np.zeros((8, 8), np.uint16), ahead_ns, "sensor"))
-    made.put(STEP, step)
-    made.frames(300)
-    done, tape = drawn(made.write(tmp_path / "night.mcap"))
+    night.put(FRAME, image(np.zeros((8, 8), np.uint16), ahead_ns, "sensor"))
+    night.put(STEP, step)
+    night.frames(300)
+    done, tape = drawn(night.write(tmp_path / "night.mcap"))
     begin_ns, end_ns = done.span_ns
     assert (end_ns - begin_ns) * 1e-9 == pytest.approx(done.log_s, abs=0.1)
     drawn_ns = [time_ns or 0 for logged in tape.logged.values() for time_ns, _ in logged]
@@ -284,19 +284,19 @@ def test_a_frame_of_a_camera_whose_clock_is_ahead_does_not_move_the_time_line(tm
 
 
 def test_the_largest_stroke_of_a_log_is_taken_over_all_mirror_states(tmp_path: Path, shown: Shown) -> None:
-    made = SyntheticLog().frames(300)
-    number = [place for place, one in enumerate(made.samples) if MIRROR_STATE.matches(one.key)][101]
-    state = wire.MirrorState.FromString(made.samples[number].payload)
+    night = SyntheticLog().frames(300)
+    number = [place for place, one in enumerate(night.samples) if MIRROR_STATE.matches(one.key)][101]
+    state = wire.MirrorState.FromString(night.samples[number].payload)
     state.actuators = np.full(state.rows * state.columns, -350, "<f4").tobytes()
-    made.samples[number] = made.samples[number]._replace(payload=state.SerializeToString())
-    drawn(made.write(tmp_path / "night.mcap"))
+    night.samples[number] = night.samples[number]._replace(payload=state.SerializeToString())
+    drawn(night.write(tmp_path / "night.mcap"))
     assert tile(shown[-1], "MIRROR").value == "50 %"
 
 
 def test_a_message_of_an_impossible_time_is_left_out(tmp_path: Path) -> None:
-    made = SyntheticLog().frames(10)
-    made.samples.append(made.samples[-1]._replace(receive_time_ns=1 << 63))
-    done, _ = drawn(made.write(tmp_path / "night.mcap"))
+    night = SyntheticLog().frames(10)
+    night.samples.append(night.samples[-1]._replace(receive_time_ns=1 << 63))
+    done, _ = drawn(night.write(tmp_path / "night.mcap"))
     assert (done.remarks, done.log_s < 1) == (["1 message could not be read"], True)
 
 
@@ -333,12 +333,12 @@ def recorder_of(log: Path, host: str = "") -> wire.Health:
 
 @pytest.mark.parametrize("finish", [True, False])
 def test_earlier_events_are_read_from_the_log_finished_or_not(tmp_path: Path, finish: bool) -> None:
-    made = SyntheticLog().frames(100)
-    made.request("note", text="new star")
-    made.frames(100)
-    made.event("RECORDING_STOPPED", why="operator asked")
-    made.write(tmp_path / "night.mcap", finish=finish)
-    expected = [one for one in made.samples if one.key == EVENT.key]
+    night = SyntheticLog().frames(100)
+    night.request("note", text="new star")
+    night.frames(100)
+    night.event("RECORDING_STOPPED", why="operator asked")
+    night.write(tmp_path / "night.mcap", finish=finish)
+    expected = [one for one in night.samples if one.key == EVENT.key]
     found = earlier_events(recorder_of(tmp_path / "night.mcap", platform.node()), 0)
     assert [(one.sequence, one.payload) for one in found] == [(one.sequence, one.payload) for one in expected]
     accumulator = accumulated([*expected[-1:], *found])  # the last one also arrived on the bus

@@ -47,7 +47,7 @@ from tests.support.toy import FLUX_DN, NOLL, calibration
 FRAMES = 120
 
 
-def night(*, truth: bool = True) -> SyntheticLog:
+def synthetic_log(*, truth: bool = True) -> SyntheticLog:
     return SyntheticLog(truth=truth).frames(FRAMES)
 
 
@@ -61,10 +61,10 @@ def rendered(snapshot: Snapshot) -> Tape:
 
 
 def test_every_step_and_truth_is_drawn_under_its_name() -> None:
-    made = night()
-    tape = rendered(snapshot_of(made.samples))
-    steps = [wire.ControlStep.FromString(one.payload) for one in made.samples if one.key == STEP.key]
-    truths = [wire.Truth.FromString(one.payload) for one in made.samples if one.key == TRUTH.key]
+    night = synthetic_log()
+    tape = rendered(snapshot_of(night.samples))
+    steps = [wire.ControlStep.FromString(one.payload) for one in night.samples if one.key == STEP.key]
+    truths = [wire.Truth.FromString(one.payload) for one in night.samples if one.key == TRUTH.key]
     assert len(steps) == len(truths) == FRAMES
     measured = ((wavefront.ERROR, "error_nm"), (wavefront.POL, "pol_nm"), (wavefront.COMMAND, "command_nm"))
     for plot, field in measured:
@@ -85,9 +85,9 @@ def test_every_step_and_truth_is_drawn_under_its_name() -> None:
 
 
 def test_without_truth_the_wavefront_is_labelled_measured() -> None:
-    made = night(truth=False)
-    tape = rendered(snapshot_of(made.samples))
-    steps = [wire.ControlStep.FromString(one.payload) for one in made.samples if one.key == STEP.key]
+    night = synthetic_log(truth=False)
+    tape = rendered(snapshot_of(night.samples))
+    steps = [wire.ControlStep.FromString(one.payload) for one in night.samples if one.key == STEP.key]
     rms_nm = [[np.hypot.reduce(step.pol_nm), np.hypot.reduce(step.error_nm)] for step in steps]
     np.testing.assert_allclose(tape.column(wavefront.RMS.path)[1], rms_nm, rtol=1e-5)
     assert tape.names(wavefront.RMS.path) == ["with a flat mirror, pseudo-open-loop", "residual, measured"]
@@ -95,7 +95,7 @@ def test_without_truth_the_wavefront_is_labelled_measured() -> None:
 
 
 def test_pictures_show_the_newest_frame() -> None:
-    snapshot = snapshot_of(night().samples)
+    snapshot = snapshot_of(synthetic_log().samples)
     tape = rendered(snapshot)
     frame, calibration = snapshot.frame, snapshot.calibration
     brightness = pixels(tape, sensor.FRAME).sum(axis=2).astype(float)
@@ -110,7 +110,7 @@ def test_pictures_show_the_newest_frame() -> None:
 
 
 def test_a_hot_pixel_of_the_dark_does_not_darken_the_picture() -> None:
-    snapshot = snapshot_of(night().samples)
+    snapshot = snapshot_of(synthetic_log().samples)
     dark = snapshot.calibration.dark.copy()
     dark[0] += 10_000
     hot = dataclasses.replace(snapshot, calibration=dataclasses.replace(snapshot.calibration, dark=dark))
@@ -120,7 +120,7 @@ def test_a_hot_pixel_of_the_dark_does_not_darken_the_picture() -> None:
 
 
 def test_actuators_at_their_limit_are_marked() -> None:
-    snapshot = snapshot_of(night().samples)
+    snapshot = snapshot_of(synthetic_log().samples)
     marks = f"{mirror.COMMAND}/at_limit"
     assert marks not in rendered(snapshot).logged
     surface_nm = actuators(snapshot.mirror).copy()
@@ -132,11 +132,11 @@ def test_actuators_at_their_limit_are_marked() -> None:
 
 
 def test_the_mode_is_a_band_and_events_have_their_level() -> None:
-    made = night()
-    made.request("open")
-    made.frames(10)
-    made.event("RECORDING_FAILED", why="disk full")
-    tape = rendered(snapshot_of(made.samples))
+    night = synthetic_log()
+    night.request("open")
+    night.frames(10)
+    night.event("RECORDING_FAILED", why="disk full")
+    tape = rendered(snapshot_of(night.samples))
     assert [values_of(change.state) for _, (change,) in tape.logged[loop.MODE][1:]] == [["CLOSED"], ["OPEN"]]
     lines = [found for path, lines in tape.logged.items() if path.startswith("log/") for _, (found,) in lines]
     levels = {values_of(line.text)[0].split()[2]: values_of(line.level) for line in lines}
@@ -153,9 +153,9 @@ def test_the_mode_band_begins_at_the_last_change_before_the_view() -> None:
 
 
 def test_the_flux_of_refused_frames_is_a_gap() -> None:
-    made = SyntheticLog().frames(100, dark=range(40, 60))
+    night = SyntheticLog().frames(100, dark=range(40, 60))
     tape = Tape()
-    loop.Loop().draw(tape, snapshot_of(made.samples))
+    loop.Loop().draw(tape, snapshot_of(night.samples))
     for plot in (loop.FLUX, loop.SATURATED):
         _, values = tape.column(plot.path)
         assert np.isnan(values).sum() == 1  # one row breaks the line
@@ -165,7 +165,7 @@ def test_the_flux_of_refused_frames_is_a_gap() -> None:
 
 def test_unreadable_messages_and_unknown_values_do_not_affect_other_panels() -> None:
     samples = []
-    for number, sample in enumerate(night().samples):
+    for number, sample in enumerate(synthetic_log().samples):
         payload = sample.payload
         if sample.key == EVENT.key:
             log = Log.FromString(payload)
@@ -187,7 +187,7 @@ def test_unreadable_messages_and_unknown_values_do_not_affect_other_panels() -> 
 @pytest.mark.parametrize("seconds", [10**12, -(10**12), 6 * 10**9])
 @pytest.mark.parametrize("topic", [EVENT, CONTROLLER_STATE, STEP, TRUTH])
 def test_a_message_of_a_time_out_of_range_is_left_out(topic: Topic, seconds: int) -> None:
-    samples = night().samples
+    samples = synthetic_log().samples
     last = next(one for one in reversed(samples) if topic.matches(one.key))
     message = topic.message.FromString(last.payload)
     time = message.mode_timestamp if topic is CONTROLLER_STATE else message.timestamp
@@ -199,7 +199,7 @@ def test_a_message_of_a_time_out_of_range_is_left_out(topic: Topic, seconds: int
 
 
 def test_a_panel_that_fails_is_left_out_for_a_while() -> None:
-    snapshot = snapshot_of(night().samples)
+    snapshot = snapshot_of(synthetic_log().samples)
     tape = Tape()
     renderer = Renderer(Configuration(), tape)
     panels = len(renderer.panels)
@@ -223,13 +223,13 @@ def test_without_a_model_of_the_science_camera_the_other_panels_are_drawn() -> N
 
 
 def test_an_older_state_does_not_replace_a_newer_one() -> None:
-    old = next(one for one in night().samples if one.key == CONTROLLER_STATE.key)
+    old = next(one for one in synthetic_log().samples if one.key == CONTROLLER_STATE.key)
     new = old._replace(sequence=old.sequence + 1, payload=b"")
     assert accumulated([new, old]).snapshot(0).controller == wire.ControllerState()
 
 
 def test_a_complete_snapshot_has_every_picture_since_the_previous_complete_one() -> None:
-    accumulator = accumulated(night().samples)
+    accumulator = accumulated(synthetic_log().samples)
     incomplete = accumulator.snapshot(0, complete=False)
     assert incomplete.frame is not None
     assert accumulator.snapshot(0, complete=False).frame is None
@@ -240,14 +240,14 @@ def test_a_complete_snapshot_has_every_picture_since_the_previous_complete_one()
 
 
 def test_a_frame_of_a_camera_whose_clock_is_ahead_is_drawn_at_the_time_of_the_view() -> None:
-    made = night()
-    made.put(FRAME, image(np.zeros((6, 7), np.uint16), made.now_ns + 3600 * 10**9, "sensor"))
-    snapshot = snapshot_of(made.samples)
-    assert snapshot.frame_ns == snapshot.time_ns < made.now_ns + 10**9
+    night = synthetic_log()
+    night.put(FRAME, image(np.zeros((6, 7), np.uint16), night.now_ns + 3600 * 10**9, "sensor"))
+    snapshot = snapshot_of(night.samples)
+    assert snapshot.frame_ns == snapshot.time_ns < night.now_ns + 10**9
 
 
 def test_a_malformed_step_is_left_out_and_counted() -> None:
-    steps = [one for one in night().samples if one.key == STEP.key]
+    steps = [one for one in synthetic_log().samples if one.key == STEP.key]
     malformed = wire.ControlStep.FromString(steps[0].payload)
     del malformed.error_nm[1:]
     accumulator = accumulated([*steps, steps[0]._replace(payload=malformed.SerializeToString())])
@@ -281,7 +281,7 @@ NM = 550.0
 RATE_HZ = 500.0
 CALIBRATION = calibration()
 MODES = len(NOLL)
-TICK_NS = 33_333_333
+TICK_NS = 33_333_333  # between two snapshots at 30 Hz
 
 
 def steps(first: int, error_nm: Any, pol_nm: Any, mode: int = LoopMode.CLOSED) -> Steps:
@@ -447,9 +447,9 @@ def test_spectra_of_a_loop_of_tip_and_tilt_alone_state_that_it_has_no_other_mode
 
 
 def test_memory_of_the_spectra_is_bounded() -> None:
-    tape, panel, some = Tape(), spectra.Spectra(), np.ones((500, MODES))
+    tape, panel, constant = Tape(), spectra.Spectra(), np.ones((500, MODES))
     for first in range(0, 2 * steady.FRAMES, 500):
-        drawn(panel, tape, first, steps=steps(first, some, some))
+        drawn(panel, tape, first, steps=steps(first, constant, constant))
     kept = len(panel._steady.rows()[0])
     assert steady.FRAMES <= kept < steady.FRAMES + 500
 
