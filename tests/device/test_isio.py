@@ -455,7 +455,7 @@ def test_a_shape_of_other_channels_is_removed_only_if_the_controller_has_one(fol
     others = bridge.ExternalChannels(client, MemoryBus(hub, "operator", FakeClock()), ["dm00disp01"], 1000.0)
     others.pass_on()
     assert requests == []
-    known = wire.Channel(name="external", actuators=np.ones(GRID, np.float32).tobytes())
-    states.put(wire.ControllerState(channels=[known]).SerializeToString())
+    reported = wire.Channel(name="external", actuators=np.ones(GRID, np.float32).tobytes())
+    states.put(wire.ControllerState(channels=[reported]).SerializeToString())
     others.pass_on()
     assert requests == [("external", None)]

@@ -143,13 +143,13 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    made = Bench(tmp_path_factory.mktemp("hosts"))
+    bench = Bench(tmp_path_factory.mktemp("hosts"))
     try:
-        made.start()
-        made.wait_until_settled(60)
-        yield made
+        bench.start()
+        bench.wait_until_settled(60)
+        yield bench
     finally:
-        made.lab.close()
+        bench.lab.close()
 
 
 def test_a_host_has_its_own_network_from_the_start(tmp_path: Path) -> None:

@@ -89,9 +89,9 @@ class Night:
 
 @pytest.fixture
 def night(tmp_path: Path) -> Iterator[Night]:
-    made = Night(tmp_path)
-    yield made
-    made.close()
+    night = Night(tmp_path)
+    yield night
+    night.close()
 
 
 def steps_of(*logs: Path) -> int:
