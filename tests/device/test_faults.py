@@ -274,7 +274,7 @@ def test_commands_are_limited_and_the_mirror_goes_flat_after_the_command_timeout
 
 def test_the_mirror_refuses_a_command_whose_sender_started_in_the_future_and_follows_the_next_valid_one() -> None:
     mirror = Mirror()
-    bench = Bench(mirror)
+    bench = MirrorBench(mirror)
     start_s = bench.clock.start_s
     assert bench.command(50.0, start_s=start_s).refused == 0
     assert bench.command(90.0, start_s=start_s + 25 * 3600).refused == Rejection.AHEAD
