@@ -53,7 +53,7 @@ _TUNING = (
 )
 _GUARD = (
     ("duration of a block, s, unless the minimum number of frames takes longer", guard.BLOCK_S),
-    ("minimum number of frames of a block", guard.FEWEST),
+    ("minimum number of frames of a block", guard.MIN_BLOCK_FRAMES),
     ("consecutive worse blocks before the integrator takes over", guard.WORSE_BLOCKS),
     ("law is worse: mean squared error / that of the integrator, above", guard.WORSE),
     ("loop amplifies: mean squared error / long-term mean square, above", guard.AMPLIFIED),

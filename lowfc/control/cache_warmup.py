@@ -3,18 +3,18 @@
 LEAD_NS = 300_000
 """Time from the warm-up to the next frame: short enough to keep the caches warm, with a margin for late wake-ups."""
 LATEST_NS = 80_000
-"""Time before the next frame after which a warm-up would delay it."""
+"""Least time from a warm-up to the next frame: a later warm-up would delay that frame."""
 MIN_PERIOD_NS = 500_000
 """Frame period below which there is no time for a warm-up, and no need: the caches stay warm."""
 LATENESS_DIVISOR = 50
-"""A late frame moves the schedule by its lateness divided by this."""
+"""A frame late by at most `LEAD_NS` moves the schedule by its lateness divided by this."""
 
 
 class CacheWarmup:
     """Predicts the next frame and schedules one warm-up before it.
 
-    A frame that is early, or far from the schedule, resets the schedule. A late frame moves it only a little, because
-    the host is sometimes late and the camera is not.
+    A frame that is early, or late by more than `LEAD_NS`, resets the schedule. A less late one moves it only a little,
+    because the host is sometimes late and the camera is not.
     """
 
     def __init__(self, period_ns: int) -> None:

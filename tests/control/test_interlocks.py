@@ -57,10 +57,10 @@ def applied(setup: Settings, state: State, name: str, **fields: object) -> tuple
 def test_conditions_of_an_interlock(test: str, value: Value, input_: Value | None, why: str) -> None:
     interlock = Interlock("mask", test, value, Action.HOLD, 2 * S)
     indifferent = interlock._replace(acts_when_old=False)
-    assert interlock.acts(input_, 2 * S) == why
-    assert indifferent.acts(input_, 2 * S) == (why if type(input_) is type(value) else "")
-    assert interlock.acts(input_, 2 * S + 1)
-    assert not indifferent.acts(input_, 2 * S + 1)
+    assert interlock.cause(input_, 2 * S) == why
+    assert indifferent.cause(input_, 2 * S) == (why if type(input_) is type(value) else "")
+    assert interlock.cause(input_, 2 * S + 1)
+    assert not indifferent.cause(input_, 2 * S + 1)
 
 
 def test_an_interlock_holds_and_releases_the_command_at_the_next_frame() -> None:

@@ -83,8 +83,8 @@ def measure_blocks(
     block = scratch.size
     for number in range(first, last):
         begin, end, sums = number * block, (number + 1) * block, sums_nm[number]
-        counts, used, offset = pixels[begin:end], good[begin:end], dark[begin:end]
-        total, highest = scan(counts, used, offset, tiles, number * sums.size, scratch, sums)
+        counts, used, dark_dn = pixels[begin:end], good[begin:end], dark[begin:end]
+        total, highest = scan(counts, used, dark_dn, tiles, number * sums.size, scratch, sums)
         totals[number, 0], totals[number, 1] = total, highest
 
 
@@ -162,14 +162,14 @@ def respond(
     results: Single,
     actuators_nm: Single,
 ) -> bool:
-    """From modal errors to the command of a closed loop, provided that no limit acts.
+    """From modal errors to the command of a closed loop, provided that no limit acts; modes in nm of wavefront rms.
 
     Args:
         measured_nm: (modes,) result of `measure`.
         seen_nm: (modes,) command seen in the exposure.
         shift_nm: (modes,) shift by the channels seen in the exposure.
         target_nm: (modes,) target of the loop.
-        previous_command_nm: (modes,) last command.
+        previous_command_nm: (modes,) last modal command.
         integrator: (3, modes) gain, fraction of the command that is kept, and limit, as in `Integrator.rows`.
         x: (states,) state of a linear law; empty for the integrator, like the next two.
         transition: (states, states + 2 modes) F, G and U of a linear law, side by side.
@@ -177,13 +177,13 @@ def respond(
         from_error: whether the law's signal is the error, not the pseudo-open-loop modes.
         shapes: (modes, actuators) nm of surface per nm of wavefront.
         added_nm: (rows, columns) channels, nm of surface.
-        previous_nm: (rows, columns) last command, nm of surface.
+        previous_nm: (rows, columns) actuators of the last command, nm of surface.
         stroke_nm: largest deviation of an actuator from flat.
         slew_nm: largest move of an actuator.
         neighbour_nm: largest difference between neighbours.
         results: (3 modes + states,) output: error less shift and target, pseudo-open-loop modes less shift, command
             and x.
-        actuators_nm: (rows, columns) output, nm of surface.
+        actuators_nm: (rows, columns) output: actuators of the command, nm of surface.
 
     Returns:
         Whether the results are valid: all numbers are finite, and no limit would change the command.

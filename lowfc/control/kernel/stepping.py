@@ -50,7 +50,7 @@ def _fused(
     """Error, pseudo-open-loop modes, command (modes,), x (states,) and actuators (rows, columns) of a normal frame.
 
     None if the frame is not normal: the loop is not closed, its command returns to zero, a channel moves or a probe
-    sequence is played, a law does not drive it alone, or a limit acts.
+    sequence is played, a law is in use but does not drive it alone, or a limit acts.
     """
     channels, law_runner = loop.command_channels, loop.law_runner
     if state.mode is not LoopMode.CLOSED or state.returning_to_zero or (channels is not None and channels.moving):
@@ -118,8 +118,8 @@ def _update_guard(
         else:  # virtual commands have the modal limit, too
             limited = any(reason is not Limit.MODAL_LIMIT for reason in state.limits_hit)
             commands = advanced.law, advanced.x, loop.integrator, loop.delay_weights, loop.history_nm
-            guard, more = guard.judged(*commands, error_nm, pol_from_target_nm, limited=limited)
-            events += more
+            guard, guard_events = guard.judged(*commands, error_nm, pol_from_target_nm, limited=limited)
+            events += guard_events
         advanced = advanced._replace(guard=guard)
     return loop._replace(law_runner=advanced)
 
@@ -132,7 +132,7 @@ def next_command(
         return step_to_flat(settings, loop), (), False
     channels, returning_to_zero = loop.command_channels, state.returning_to_zero
     closed = state.mode is LoopMode.CLOSED
-    # If a limit acted on the last command, the channels have not been reached yet; without commands, none is.
+    # After a command that a limit changed, the mirror has not reached its channels, even if they count as reached.
     channels_move = channels is not None and bool(channels.moving or state.limits_hit)
     if not (state.may_command and (closed or returning_to_zero or channels_move)):
         return loop.holding_command(1), (), returning_to_zero
@@ -163,7 +163,7 @@ def next_command(
 
 
 def _law_output(loop: ActiveLoop, error_nm: Single) -> tuple[Single, bool]:
-    """The law's modal command (modes,) within its limits, and whether a limit acted."""
+    """Modal command (modes,) of law and integrator, clipped to the modal limits, and whether it was clipped."""
     law_runner, held_nm = loop.law_runner, loop.history_nm[0]
     alone = law_runner is not None and law_runner.alone()
     if law_runner is None or not alone:
@@ -179,7 +179,7 @@ def _law_output(loop: ActiveLoop, error_nm: Single) -> tuple[Single, bool]:
 
 
 def step_to_flat(settings: Settings, loop: ActiveLoop) -> ActiveLoop:
-    """Move the mirror towards flat by one frame, within the slew limit."""
+    """The loop after one step of the mirror towards flat, within the slew limit."""
     flat = limit(settings.limits, loop.actuators_nm, np.zeros_like(loop.actuators_nm)).actuators_nm
     if loop.command_channels is not None:
         loop = loop._replace(command_channels=loop.command_channels.restarted_from_flat(loop.to_modes))

@@ -15,7 +15,8 @@ FUSED: Final = "fused"
 BLOCK = 6400
 """Most pixels per block: 25.6 kB as float32, which fits into an L1 data cache of 32 to 48 kB."""
 DARK_MARGIN = 1e-3
-"""Margin over the lowest flux, as a fraction of the expected flux, against rounding: below it numpy decides."""
+"""Margin above the lowest allowed flux, as a fraction of the expected flux: within it, where rounding matters, the
+reference step decides whether a frame is dark."""
 
 
 class Kernel(NamedTuple):
@@ -37,7 +38,7 @@ class Tables(NamedTuple):
 
     Attributes:
         full_well: lowest count of a saturated pixel; above all counts if no pixel can be saturated.
-        margin_dn: flux by which a frame must exceed the lowest flux.
+        margin_dn: `DARK_MARGIN` in DN.
         shapes: (modes, actuators) nm of surface per nm of wavefront.
         no_modes: (modes,) zeros, like `no_states` (0,), `no_law` (0, 0) and `no_channels` (rows, columns).
     """
@@ -68,16 +69,16 @@ class Tables(NamedTuple):
             return None
         blocks = -(-pixels // BLOCK)
         block = -(-pixels // blocks)
-        filled = np.zeros((-(-modes // 5) * 5, blocks * block), np.float32)
-        filled[:modes, :pixels] = calibration.reconstructor
+        padded = np.zeros((-(-modes // 5) * 5, blocks * block), np.float32)
+        padded[:modes, :pixels] = calibration.reconstructor
         return cls(
             kernel.measure,
             kernel.respond,
             np.where(calibration.good > 0, 0xFFFF, 0).astype(np.uint16),
             single(calibration.dark),
-            single(filled.reshape(-1, blocks, block).swapaxes(0, 1)).reshape(-1, block),
+            single(padded.reshape(-1, blocks, block).swapaxes(0, 1)).reshape(-1, block),
             np.empty(block, np.float32),
-            np.empty((blocks, len(filled)), np.float32),
+            np.empty((blocks, len(padded)), np.float32),
             np.empty((blocks, 2), np.uint64),
             reference_nm,
             int(np.ceil(min(calibration.saturation_dn, 0x1_0000))),
@@ -91,7 +92,10 @@ class Tables(NamedTuple):
         )
 
     def estimate(self, pixels: Pixels, min_flux_dn: float) -> tuple[Single, float] | None:
-        """Modal errors (modes,) and flux of a frame (pixels,), DN; None if a pixel is saturated or the flux is low."""
+        """Modal errors (modes,), nm, and flux, DN, of a frame (pixels,), DN.
+
+        None if a good pixel is saturated, or the flux is not above `min_flux_dn` plus the margin.
+        """
         error_nm = np.empty_like(self.reference_nm)
         least_dn = min_flux_dn + self.margin_dn
         scanned = pixels, self.good, self.dark, self.tiles, self.scratch, self.sums_nm, self.totals

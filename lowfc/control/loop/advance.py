@@ -34,8 +34,8 @@ from lowfc.control.loop.loading import (
     in_mode,
     interlock_or_permit_cause,
     loaded,
-    mirror_judged,
-    mirror_reported,
+    mirror_fault_reported,
+    mirror_shape_reported,
     mode_event,
 )
 from lowfc.control.loop.requests import answer
@@ -71,17 +71,17 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     state, loop = _arrive(state, frame, events)
     lease_ended = False
     if state.conditions.lease is not None:
-        state, ended = lease_checked(state._replace(loop=loop), 0, frame.sequence)
-        events, loop, lease_ended = [*events, *ended], state.loop, bool(ended)
+        state, lease_events = lease_checked(state._replace(loop=loop), 0, frame.sequence)
+        events, loop, lease_ended = [*events, *lease_events], state.loop, bool(lease_events)
     if loop is None:
-        return _refuse(settings, _newest(state, loop, frame), frame, Rejection.NO_CALIBRATION, events)
+        return _refuse(settings, _with_newest_frame(state, loop, frame), frame, Rejection.NO_CALIBRATION, events)
     measured = _measure(settings, state, loop, frame)
     if isinstance(measured, Rejection):
-        return _refuse(settings, _newest(state, loop, frame), frame, measured, events)
+        return _refuse(settings, _with_newest_frame(state, loop, frame), frame, measured, events)
     estimate, saturated, fused = measured
     identical = state.identical_frames + 1 if estimate.same(state.estimate) else 0
     if 0 < settings.max_identical_frames < identical:
-        stuck = _newest(state, loop, frame)._replace(identical_frames=identical)
+        stuck = _with_newest_frame(state, loop, frame)._replace(identical_frames=identical)
         return _refuse(settings, stuck, frame, Rejection.STUCK, events)
     error_nm, pol_nm, loop, reasons, returning_to_zero = respond(
         settings, state, loop, estimate.error_nm, frame.sequence, events, fused=fused
@@ -93,7 +93,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         events.append(PendingEvent("FRAMES_ACCEPTED", details))
     if reasons != state.limits_hit:
         _limit_events(state.limits_hit, reasons, events)
-    shown = (*reasons, Limit.LAW_OVERRULED) if _overruled(state, loop) else reasons
+    reported = (*reasons, Limit.LAW_OVERRULED) if _overruled(state, loop) else reasons
     mode, command_nm, commanded = state.mode, loop.history_nm[0], state.may_command
     steps_left, stepped = max(state.steps_left - 1, 0), state.steps_left == 1
     if stepped:
@@ -106,7 +106,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         state.frames_used + 1,
         limits_hit=reasons,
         commanded=commanded,
-        counts=_counted(state.counts, shown),
+        counts=_counted(state.counts, reported),
         steps_left=steps_left,
         returning_to_zero=returning_to_zero,
         input_number=state.input_number + 1,
@@ -116,7 +116,9 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     )
     if stepped:
         state = in_mode(state, LoopMode.OPEN, frame.time_ns, STEPPED)
-    step = Step(frame.sequence, frame.time_ns, mode, command_nm, shown, error_nm, pol_nm, estimate.flux_dn, saturated)
+    step = Step(
+        frame.sequence, frame.time_ns, mode, command_nm, reported, error_nm, pol_nm, estimate.flux_dn, saturated
+    )
     command = _command_message(state, loop, command_nm) if commanded else None
     return state, Outputs(step, command, None, events, changed=stepped or lease_ended)
 
@@ -164,14 +166,15 @@ def _camera_started(state: State, frame: Frame) -> State:
     return state._replace(conditions=conditions)
 
 
-def _newest(state: State, loop: ActiveLoop | None, frame: Frame) -> State:
+def _with_newest_frame(state: State, loop: ActiveLoop | None, frame: Frame) -> State:
+    """The state with this loop, and with a refused frame as the newest one."""
     return state._replace(loop=loop, frame_timeout=False, frame_sequence=frame.sequence, frame_time_ns=frame.time_ns)
 
 
 def _measure(
     settings: Settings, state: State, loop: ActiveLoop, frame: Frame
 ) -> tuple[Estimate, int, bool] | Rejection:
-    """Estimate of a frame, its saturated pixels, and whether the fused step was used; or why the frame is refused."""
+    """Estimate of a frame, number of saturated pixels, whether the fused step was used; or why the frame is refused."""
     calibration = loop.calibration
     if not calibration.noll:
         return Rejection.NO_CALIBRATION
@@ -199,7 +202,7 @@ def _measure(
 
 
 def _overruled(state: State, loop: ActiveLoop) -> bool:
-    """Whether the integrator has taken over part of the command from a law that did worse."""
+    """Whether the integrator has part of a closed loop's command because the law did worse."""
     guard = loop.law_runner.guard if loop.law_runner is not None else None
     return guard is not None and state.mode is LoopMode.CLOSED and guard.overruled
 
@@ -212,23 +215,23 @@ def _limit_cause(limits: tuple[Reason, ...]) -> str:
 def _refuse(
     settings: Settings, state: State, frame: Frame, reason: Rejection, events: list[PendingEvent]
 ) -> tuple[State, Outputs]:
-    """Step and command of a refused frame: the command is held, except in safe mode and after `UNMEASURED`."""
+    """State and outputs after a refused frame: the command is held, except in safe mode and after `UNMEASURED`."""
     if reason is not state.refused:
         events.append(PendingEvent("FRAMES_REFUSED", {"reason": reason.name}))
-    loop, returning_to_zero, hit = state.loop, state.returning_to_zero, state.limits_hit
+    loop, returning_to_zero, limits_hit = state.loop, state.returning_to_zero, state.limits_hit
     held_nm = np.zeros(0, np.float32)
     reasons: tuple[Reason, ...] = (reason,)
     if loop is not None:
         if state.mode is LoopMode.SAFE:
             loop = step_to_flat(settings, loop)
         elif reason in UNMEASURED and state.mode is not LoopMode.CLOSED:
-            loop, hit, returning_to_zero = next_command(
+            loop, limits_hit, returning_to_zero = next_command(
                 settings, state, loop.predicted(1), loop.history_nm[0], frame.sequence
             )
-            if hit:
-                loop = end_probe(loop, frame.sequence, _limit_cause(hit), events)
-            _limit_events(state.limits_hit, hit, events)
-            reasons = (reason, *hit)
+            if limits_hit:
+                loop = end_probe(loop, frame.sequence, _limit_cause(limits_hit), events)
+            _limit_events(state.limits_hit, limits_hit, events)
+            reasons = (reason, *limits_hit)
         elif reason not in NOT_NEW:
             loop = loop.missed(1)
         held_nm = loop.history_nm[0]
@@ -236,7 +239,7 @@ def _refuse(
         loop=loop,
         refused=reason,
         refused_count=state.refused_count + 1,
-        limits_hit=hit,
+        limits_hit=limits_hit,
         returning_to_zero=returning_to_zero,
         commanded=loop is not None and state.may_command,
         counts=_counted(state.counts, reasons),
@@ -245,7 +248,7 @@ def _refuse(
     step = Step(frame.sequence, frame.time_ns, state.mode, held_nm, reasons)
     if loop is None or not state.commanded:
         return state, Outputs(step=step, events=events)
-    # With the newest frame's sequence even if this frame is older: the mirror refuses older commands.
+    # The command has the newest frame's sequence even if this frame is older: the mirror refuses older commands.
     return state, Outputs(step=step, command=_command_message(state, loop, held_nm), events=events)
 
 
@@ -291,8 +294,8 @@ def _counted(counts: Mapping[Reason, int], reasons: tuple[Reason, ...]) -> Mappi
 
 _HANDLERS: dict[type, Callable[..., tuple[State, Outputs]]] = {
     Request: answer,
-    MirrorShape: mirror_reported,
-    MirrorReport: mirror_judged,
+    MirrorShape: mirror_shape_reported,
+    MirrorReport: mirror_fault_reported,
     CameraSettings: camera_reported,
     BenchReport: bench_reported,
     Load: _load,

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-MIN_DN = 1.0
+MIN_TOLERANCE_DN = 1.0
 """Change of bias or saturation that is always tolerated, DN."""
 GAIN_TOLERANCE = 0.01
 """Relative change of a gain that is tolerated: gains are settings, not measurements."""
@@ -41,8 +41,8 @@ class CameraSettings:
 
 
 def changes(now: CameraSettings, then: CameraSettings) -> list[str]:
-    """List differences larger than noise explains, one phrase each; `then` are the settings of the calibration."""
-    tolerance_dn = max(MIN_DN, then.noise_dn)
+    """Phrases for the changes that make a calibration invalid, from its settings `then` to the settings `now`."""
+    tolerance_dn = max(MIN_TOLERANCE_DN, then.noise_dn)
     exact = (
         ("rows", now.shape[0], then.shape[0]),
         ("columns", now.shape[1], then.shape[1]),
@@ -51,7 +51,8 @@ def changes(now: CameraSettings, then: CameraSettings) -> list[str]:
     )
     levels = (("bias_dn", now.bias_dn, then.bias_dn), ("saturation_dn", now.saturation_dn, then.saturation_dn))
     gains = (("gain_e_per_dn", now.gain_e_per_dn, then.gain_e_per_dn), ("em_gain", now.em_gain, then.em_gain))
-    different: list[tuple[str, float, float]] = [one for one in exact if one[1] != one[2]]
-    different += [one for one in levels if not abs(one[1] - one[2]) <= tolerance_dn]
-    different += [one for one in gains if min(one[1:]) > 0 and abs(one[1] / one[2] - 1) > GAIN_TOLERANCE]
+    different: list[tuple[str, float, float]] = [(name, got, want) for name, got, want in exact if got != want]
+    different += [(name, got, want) for name, got, want in levels if not abs(got - want) <= tolerance_dn]
+    known = ((name, got, want) for name, got, want in gains if min(got, want) > 0)
+    different += [(name, got, want) for name, got, want in known if abs(got / want - 1) > GAIN_TOLERANCE]
     return [f"{name} is {got:g}, calibrated {want:g}" for name, got, want in different]

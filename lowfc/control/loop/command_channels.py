@@ -1,8 +1,8 @@
 """Additions to the loop's command: static channels, an offset of its target, a table played frame by frame.
 
-A channel is a mirror shape set by another user, such as a dark hole. The sensor sees it, so its zero point shifts
-with it (Subedi et al. 2015, Sect. 1 and 4), after the delay of a command, and the loop does not remove it; only `FLAT`
-shifts nothing. A probe sequence ("play") is for calibration and tests and shifts nothing.
+A channel is a mirror shape set by another user, such as a dark hole. The sensor sees it, so the sensor's zero point
+shifts with it (Subedi et al. 2015, Sect. 1 and 4), after the delay of a command, and the loop does not remove it; of
+the channels, only `FLAT` shifts nothing. A probe sequence ("play") is for calibration and tests and shifts nothing.
 """
 
 from typing import NamedTuple
@@ -16,13 +16,14 @@ from lowfc.control.loop.wording import counted
 FLAT = "flat"
 """Channel of the mirror's flat map: the reference image includes it, so it shifts nothing."""
 ADOPTED = "adopted"
-"""Channel of the mirror's shape at the controller's start, beyond the modes."""
+"""Channel of the part of the mirror's shape outside the modes, at the controller's start or at a change of modes."""
 EXTERNAL = "external"
 """Channel of shapes that other programs apply to the mirror: the loop does not command it."""
 MAX_CHANNELS = 16
 MAX_PROBE_NUMBERS = 1 << 24
 """Most numbers in the table of a probe sequence, and in its basis."""
 MIRROR, OFFSET = "mirror", "offset"
+"""Targets of a probe sequence."""
 MAX_NAME_LENGTH = 32
 
 
@@ -64,7 +65,7 @@ class PlayTable(NamedTuple):
         target: `MIRROR`: a row holds the factors of the shapes in `basis` (columns, actuators), nm of surface; or
             `OFFSET`: a row is added to the loop's target, nm of wavefront of each mode.
         largest: (columns,) largest absolute number of each column.
-        reach_nm: on the mirror, an upper bound for every actuator.
+        reach_nm: on the mirror, an upper bound of every actuator's deviation from zero, nm of surface.
         id: identity of target, rows and basis.
     """
 
@@ -90,8 +91,8 @@ class Play(NamedTuple):
 
     def row(self, sequence: int) -> Single | None:
         """Row for a frame; None before the first and after the last."""
-        place = sequence - self.first_sequence
-        return self.table.rows[place] if 0 <= place < self.frames else None
+        index = sequence - self.first_sequence
+        return self.table.rows[index] if 0 <= index < self.frames else None
 
     def remaining(self, sequence: int) -> int:
         """Number of rows for this and later frames."""
@@ -124,8 +125,8 @@ class CommandChannels(NamedTuple):
     @classmethod
     def none(cls, grid: tuple[int, int], modes: int, frames: int) -> "CommandChannels":
         """No additions; `frames` is the number of weights of the delay."""
-        rest = np.zeros(modes, np.float32)
-        return cls((), np.zeros(grid, np.float32), rest, (rest,) * frames, rest)
+        zero = np.zeros(modes, np.float32)
+        return cls((), np.zeros(grid, np.float32), zero, (zero,) * frames, zero)
 
     @property
     def moving(self) -> bool:
@@ -155,18 +156,19 @@ class CommandChannels(NamedTuple):
         if not moving:
             return self._replace(play=play)
         step = np.float32(step_nm / moving)
-        return self._replace(play=play).with_all(tuple(_nearer(one, step) for one in self.channels), to_modes)
+        return self._replace(play=play).with_all(tuple(_nearer(channel, step) for channel in self.channels), to_modes)
 
     def with_all(self, channels: tuple[Channel, ...], to_modes: Single) -> "CommandChannels":
         """A copy with these channels instead of its own, without those that have reached flat."""
-        kept = tuple(one for one in channels if one.shape_nm.any() or one.reached_nm.any())
+        kept = tuple(channel for channel in channels if channel.shape_nm.any() or channel.reached_nm.any())
+        commanded = [channel for channel in kept if channel.commanded]
         zero = np.zeros_like(self.sum_nm)
-        shifting_nm = sum((one.reached_nm for one in kept if one.commanded and one.shifts), zero)
-        sum_nm = shifting_nm + sum((one.reached_nm for one in kept if one.commanded and not one.shifts), zero)
-        seen_nm = sum((one.reached_nm for one in kept if not one.commanded), shifting_nm)
-        return self._replace(channels=kept, sum_nm=sum_nm, shift_nm=to_modes @ seen_nm.reshape(-1))
+        own_shifting_nm = sum((channel.reached_nm for channel in commanded if channel.shifts), zero)
+        sum_nm = own_shifting_nm + sum((channel.reached_nm for channel in commanded if not channel.shifts), zero)
+        shifting_nm = sum((channel.reached_nm for channel in kept if not channel.commanded), own_shifting_nm)
+        return self._replace(channels=kept, sum_nm=sum_nm, shift_nm=to_modes @ shifting_nm.reshape(-1))
 
-    def with_channel(self, name: str, shape_nm: Single, to_modes: Single) -> "CommandChannels":
+    def with_shape(self, name: str, shape_nm: Single, to_modes: Single) -> "CommandChannels":
         """A copy with a new shape for a channel, approached from its current one; `EXTERNAL` is reached at once.
 
         Raises:
@@ -179,26 +181,26 @@ class CommandChannels(NamedTuple):
         if before is None and shape_nm.any() and len(self.channels) >= MAX_CHANNELS:
             raise ValueError(f"there are {MAX_CHANNELS} channels already, which is the most: remove one")
         if name == EXTERNAL:
-            return self.with_one(Channel(name, shape_nm, shape_nm), to_modes).at_once(self)
+            return self.with_channel(Channel(name, shape_nm, shape_nm), to_modes).at_once(self)
         reached_nm = np.zeros_like(shape_nm) if before is None else before.reached_nm
-        return self.with_one(Channel.of(name, shape_nm, reached_nm), to_modes)
+        return self.with_channel(Channel.of(name, shape_nm, reached_nm), to_modes)
 
     def at_once(self, before: "CommandChannels") -> "CommandChannels":
-        """A copy that differs from `before` in the shifts of the last frames as in the present one."""
-        more_nm = self.shift_nm - before.shift_nm
-        return self._replace(shifts_nm=tuple(one + more_nm for one in self.shifts_nm))
+        """A copy in which the change of `shift_nm` since `before` also applies to the last frames."""
+        change_nm = self.shift_nm - before.shift_nm
+        return self._replace(shifts_nm=tuple(shift_nm + change_nm for shift_nm in self.shifts_nm))
 
     def channel(self, name: str) -> Channel | None:
-        """The channel of that name."""
-        return next((one for one in self.channels if one.name == name), None)
+        """The channel of that name; None if there is none."""
+        return next((channel for channel in self.channels if channel.name == name), None)
 
-    def with_one(self, channel: Channel, to_modes: Single) -> "CommandChannels":
-        """A copy with this channel added, or in the place of the one of its name."""
-        channels = {one.name: one for one in (*self.channels, channel)}
+    def with_channel(self, channel: Channel, to_modes: Single) -> "CommandChannels":
+        """A copy with this channel, which replaces a channel of the same name."""
+        channels = {each.name: each for each in (*self.channels, channel)}
         return self.with_all(tuple(channels[name] for name in sorted(channels)), to_modes)
 
     def stopped(self, sequence: int) -> "CommandChannels":
-        """A copy whose play ends after this frame; its shape is removed with the next command."""
+        """A copy whose probe sequence ends after this frame; the next command removes its last shape."""
         if self.play is None:
             return self
         remaining = min(max(sequence + 1 - self.play.first_sequence, 0), self.play.frames)
@@ -220,9 +222,9 @@ class CommandChannels(NamedTuple):
         """
         flat = np.zeros_like(self.sum_nm)
         kept = (
-            Channel.of(one.name, one.shape_nm, flat if one.commanded else one.shape_nm)
-            for one in self.channels
-            if one.name in (FLAT, EXTERNAL) or not only_flat
+            Channel.of(channel.name, channel.shape_nm, flat if channel.commanded else channel.shape_nm)
+            for channel in self.channels
+            if channel.name in (FLAT, EXTERNAL) or not only_flat
         )
         return self._replace(play=None).with_all(tuple(kept), to_modes)
 
@@ -259,12 +261,13 @@ def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
     basis = basis.reshape(columns, -1) if target == MIRROR else np.zeros((0, 0), np.float32)
     largest = np.abs(rows).max(axis=0).astype(np.float64)
     reach_nm = float(largest @ np.abs(basis).max(axis=1)) if basis.size else 0.0
-    made = identity((("target", target), ("table", rows), ("columns", columns), ("basis", basis)))
-    return PlayTable(target, rows, basis, largest, reach_nm, made)
+    table_id = identity((("target", target), ("table", rows), ("columns", columns), ("basis", basis)))
+    return PlayTable(target, rows, basis, largest, reach_nm, table_id)
 
 
 def _nearer(channel: Channel, step_nm: np.float32) -> Channel:
-    rest = channel.shape_nm - channel.reached_nm
-    if np.abs(rest).max() <= step_nm:
+    """The channel moved towards its shape by at most `step_nm` in each actuator."""
+    remaining_nm = channel.shape_nm - channel.reached_nm
+    if np.abs(remaining_nm).max() <= step_nm:
         return channel._replace(reached_nm=channel.shape_nm)
-    return channel._replace(reached_nm=channel.reached_nm + np.clip(rest, -step_nm, step_nm))
+    return channel._replace(reached_nm=channel.reached_nm + np.clip(remaining_nm, -step_nm, step_nm))

@@ -52,12 +52,12 @@ class Estimator(NamedTuple):
         return cls(rows, reference_nm, calibration.dark, scratch, kernel, tables)
 
     def estimate_fused(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
-        """Modal error of a frame (pixels,) by the fused step; None if the frame needs the reference step."""
+        """Estimate of a frame (pixels,) by the fused step; None if the frame needs the reference step."""
         measured = None if self.tables is None else self.tables.estimate(pixels, min_flux_dn)
         return None if measured is None else Estimate(*measured)
 
     def estimate(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
-        """Modal error of a frame (pixels,); None if its flux is at most `min_flux_dn`."""
+        """Estimate of a frame (pixels,) by the reference step; None if its flux is at most `min_flux_dn`."""
         np.copyto(self.scratch, pixels)  # separately: faster than a subtraction of two types
         np.subtract(self.scratch, self.dark, out=self.scratch)
         sums = self.rows.dot(self.scratch)  # half a microsecond less than `@`

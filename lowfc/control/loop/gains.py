@@ -16,12 +16,12 @@ from lowfc.control.loop.state import ActiveLoop, Settings, Weighting
 from lowfc.control.loop.wording import AUTO, counted
 
 _MAX_PREPARED = 64
-"""Most leaks of a request whose limiting gains are cached; no calibration has more modes."""
+"""Most different leaks of a request for which `prepare_gains` caches the highest gains."""
 
 Changed = tuple[ActiveLoop, str, *tuple[PendingEvent, ...]]  # the loop after a request, its reply, events
 
 
-def changed_integrator(settings: Settings, loop: ActiveLoop, request: Request) -> Changed:
+def change_integrator(settings: Settings, loop: ActiveLoop, request: Request) -> Changed:
     """The loop after a request for gain, leak or limit, and the reply; ValueError with the reason if refused."""
     if request.name == "gain" and request.text == AUTO:
         return _automatic_gain(settings, loop, request)
@@ -30,7 +30,7 @@ def changed_integrator(settings: Settings, loop: ActiveLoop, request: Request) -
             f"the law {loop.law_runner.law.name!r} drives the mirror, and has no {request.name}: "
             "`lowfc ctl law integrator` returns to the integrator"
         )
-    integrator = _changed(loop.integrator, loop.calibration.noll, settings.delay_frames, request)
+    integrator = _new_integrator(loop.integrator, loop.calibration.noll, settings.delay_frames, request)
     if request.name == "gain":  # a gain set by a person is not automatic, and R treats its mode as corrected
         chosen = _chosen(loop, request)
         weighting = loop.weighting
@@ -44,13 +44,13 @@ def changed_integrator(settings: Settings, loop: ActiveLoop, request: Request) -
 
 
 def _automatic_gain(settings: Settings, loop: ActiveLoop, request: Request) -> Changed:
-    """Automatic gains: switched on by a request without values, changed by one with measured values."""
+    """The loop after a request for automatic gains: without values it switches them on, with values it changes them."""
     chosen, noll = _chosen(loop, request), loop.calibration.noll
     if not request.values:
         loop = loop._replace(automatic=loop.automatic | chosen).with_gains(loop.integrator)
-        names = ", ".join(f"Z{index}" for index, one in zip(noll, chosen, strict=True) if one)
+        names = ", ".join(f"Z{index}" for index, is_chosen in zip(noll, chosen, strict=True) if is_chosen)
         return loop, f"the gain of {names} is automatic"
-    changed = _changed(loop.integrator, noll, settings.delay_frames, request)
+    changed = _new_integrator(loop.integrator, noll, settings.delay_frames, request)
     prior_nm2 = np.array(request.prior_nm2, np.float32)
     valid = prior_nm2.shape == chosen.shape and (np.isfinite(prior_nm2) & (prior_nm2 >= 0)).all()
     if prior_nm2.size and not valid:
@@ -96,7 +96,7 @@ def per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
     return array
 
 
-def _changed(integrator: Integrator, noll: tuple[int, ...], delay_frames: float, request: Request) -> Integrator:
+def _new_integrator(integrator: Integrator, noll: tuple[int, ...], delay_frames: float, request: Request) -> Integrator:
     """The integrator with new gains, leaks or limits; ValueError if the request is wrong."""
     attribute = _ATTRIBUTES[request.name]
     values = per_mode(noll, request, getattr(integrator, attribute))
@@ -170,7 +170,7 @@ def remark(settings: Settings, loop: ActiveLoop, request: Request) -> str:
 def offset_remark(loop: ActiveLoop, offset_nm: Single) -> str:
     """Remark on offsets (modes,) of modes that cannot follow at a gain of 0; empty if there are none."""
     fixed = (offset_nm != 0) & (loop.integrator.gain == 0) & ~loop.automatic & (loop.law_runner is None)
-    names = ", ".join(f"Z{mode}" for mode, one in zip(loop.calibration.noll, fixed, strict=True) if one)
+    names = ", ".join(f"Z{mode}" for mode, is_fixed in zip(loop.calibration.noll, fixed, strict=True) if is_fixed)
     return f": {names} would not follow at a gain of 0" if names else ""
 
 
@@ -190,5 +190,5 @@ def check_offset(loop: ActiveLoop, largest_nm: npt.NDArray[np.floating[Any]]) ->
         raise ValueError(f"offset of mode {mode}: R measures it only in part (--truncate): the loop would overshoot")
 
 
-_MAX_DEPARTURE = 0.1  # of what R measures of a mode from that mode, for an offset of it
+_MAX_DEPARTURE = 0.1  # norm of what R measures of a mode less that mode, above which its offset is refused
 _ATTRIBUTES = {"gain": "gain", "leak": "leak", "limit": "limit_nm"}

@@ -18,7 +18,7 @@ from lowfc.control.laws.integrator import TIP_TILT, Integrator, integrate
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.inputs import PendingEvent
 
-BLOCK_S, FEWEST = 0.1, 100
+BLOCK_S, MIN_BLOCK_FRAMES = 0.1, 100
 """Duration of a block, and its least number of frames."""
 WORSE_BLOCKS = 4
 """Blocks in a row after which the integrator takes over."""
@@ -34,7 +34,7 @@ LONG_TERM_S = 10.0
 """Time constant of the long-term mean square of the pseudo-open-loop modes."""
 AMPLIFIED = 2.5
 """Ratio of mean squared error to the long-term mean square of the pseudo-open-loop modes above which the loop
-amplifies, unless the error is below `BETTER` of their current mean square: then the disturbance has grown."""
+amplifies, unless the former is below `BETTER` times their current mean square: then the disturbance has grown."""
 
 NAMES = ("tip and tilt", "the other modes")  # of the groups
 LAW_RETURNS = "law returns"
@@ -51,7 +51,7 @@ class Spans(NamedTuple):
     @classmethod
     def at(cls, rate_hz: float) -> "Spans":
         """The durations at a frame rate."""
-        block = max(FEWEST, round(BLOCK_S * rate_hz))
+        block = max(MIN_BLOCK_FRAMES, round(BLOCK_S * rate_hz))
         better, long_term = (max(1, round(seconds * rate_hz / block)) for seconds in (BETTER_S, LONG_TERM_S))
         return cls(block, max(1, round(FADED_S * rate_hz)), better, long_term)
 
@@ -163,7 +163,10 @@ class LawGuard(NamedTuple):
         return self.with_groups([group._replace(blocks=0) for group in self.groups])
 
     def observed(self, pol_nm: Single, frames: int) -> "LawGuard":
-        """A copy at rest, advanced by one frame, the last of `frames` in which the law did not drive."""
+        """A copy at rest, its long-term mean squares updated with a frame in which the law did not drive.
+
+        `frames` is the number of frames that the law has processed.
+        """
         part = 1 / min(frames, self.spans.long_term * self.spans.block)
         squares = np.square(pol_nm).dot(self.members).tolist()
         return self.with_groups(
@@ -218,20 +221,21 @@ class LawGuard(NamedTuple):
         virtual_x: Single | None = None
         if not limited:
             virtual_nm = self.virtual_nm or history_nm
-            other_nm = pol_nm
+            virtual_error_nm = pol_nm
             for lag, weight in weights:
-                other_nm = other_nm + (virtual_nm[lag] if weight == 1 else weight * virtual_nm[lag])
-            command_nm, _ = integrate(integrator, virtual_nm[0], other_nm)
+                seen_nm = virtual_nm[lag] if weight == 1 else weight * virtual_nm[lag]
+                virtual_error_nm = virtual_error_nm + seen_nm
+            command_nm, _ = integrate(integrator, virtual_nm[0], virtual_error_nm)
             if overruled:
                 integrated: Mask = self.weight < 1  # modes that the integrator drives
                 virtual_x = x
                 if self.x is not None:
-                    y = pol_nm if law.signal == "pol" else np.where(integrated, other_nm, error_nm)
+                    y = pol_nm if law.signal == "pol" else np.where(integrated, virtual_error_nm, error_nm)
                     last_nm = np.where(integrated, virtual_nm[0], history_nm[0])
                     virtual_x = linear_law.predict_and_update(law, self.x, y, last_nm)
                 law_nm = np.clip(linear_law.respond(law, virtual_x), -integrator.limit_nm, integrator.limit_nm)
                 command_nm = np.where(integrated, law_nm, command_nm)
-            virtual_nm, squares[1] = (command_nm, *virtual_nm[:-1]), other_nm
+            virtual_nm, squares[1] = (command_nm, *virtual_nm[:-1]), virtual_error_nm
         np.square(squares, out=squares)
         frames, sums_nm2, void = self.frames + 1, self.sums_nm2 + squares.dot(self.members), self.void or limited
         if frames < spans.block:

@@ -51,13 +51,13 @@ class Interlock(NamedTuple):
     max_age_ns: int
     acts_when_old: bool = True
 
-    def acts(self, value: Value | None, age_ns: int) -> str:
+    def cause(self, value: Value | None, age_ns: int) -> str:
         """Why it acts on a value of this age (None if never received); empty if it does not act."""
-        age_s = self.max_age_ns * 1e-9
+        max_age_s = self.max_age_ns * 1e-9
         if value is None:
             return f"no value of {self.name} has been received" if self.acts_when_old else ""
         if age_ns > self.max_age_ns:
-            return f"no value of {self.name} for more than {age_s:g} s" if self.acts_when_old else ""
+            return f"no value of {self.name} for more than {max_age_s:g} s" if self.acts_when_old else ""
         if type(value) is not type(self.value):
             return f"{self.name} is {shown(value)}, not {_KINDS[type(self.value)]}" if self.acts_when_old else ""
         return f"{self.name} is {shown(value)}{self._compared()}" if self._holds(value) else ""
@@ -98,13 +98,13 @@ class BenchReport:
 def judged(interlocks: tuple[Interlock, ...], acting: tuple[Acting, ...], report: BenchReport) -> tuple[Acting, ...]:
     """The interlocks that act after a report; the same object if nothing changed.
 
-    One that acts already keeps its cause, unless a value replaces a missing one or vice versa.
+    An interlock that acts already keeps its cause, unless a value replaces a missing one or vice versa.
     """
     before = {one.number: one for one in acting}
     after = dict(before)
     for number, interlock in enumerate(interlocks):
         if interlock.name == report.name:
-            why = interlock.acts(report.value, report.age_ns)
+            why = interlock.cause(report.value, report.age_ns)
             if not why:
                 after.pop(number, None)
             elif number not in after or _by_value(after[number].why, report) is not _by_value(why, report):

@@ -14,7 +14,7 @@ from lowfc.control.loop.wording import AUTO
 
 MAX_S = 60.0
 """Longest duration of a lease or permit without renewal, s."""
-MAX_HOLDER = 200
+MAX_HOLDER_LENGTH = 200
 """Most characters of the holder's description."""
 
 ENDED_BY = frozenset({"safe", "open", "pause", "stop"})
@@ -53,15 +53,15 @@ class Lease(NamedTuple):
         return self.holder.rpartition(REMAINING_TIME_SEPARATOR)[0] or self.holder
 
     def over(self, time_ns: int, frame_sequence: int) -> bool:
-        """Whether it was not renewed in time, by the clock or by frames."""
+        """Whether its time is over, by the clock or by frames."""
         return time_ns > self.until_ns or (self.same_start(frame_sequence) and self.last_sequence < frame_sequence)
 
     def same_start(self, frame_sequence: int) -> bool:
         """Whether `last_sequence` counts from the same start of the camera as this frame's sequence."""
         return self.last_sequence > 0 and frame_sequence >> COUNT_BITS == self.last_sequence >> COUNT_BITS
 
-    def reserved(self, time_ns: int) -> str:
-        """Message that the loop is reserved."""
+    def reserved_message(self, time_ns: int) -> str:
+        """Message that the loop is reserved, for whom and for how long."""
         remaining_s = ceil(max(0, self.until_ns - time_ns) * 1e-9)
         if self.holds:  # a permit ends even if its holder goes on
             return f"the loop is reserved for {self.holder} (for at most {remaining_s} s more)"
@@ -71,8 +71,8 @@ class Lease(NamedTuple):
 def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
     """Why a request is refused; empty if it is granted.
 
-    Other clients' requests are refused while a lease is in force, and a former holder's after it, so that it does not
-    act against the client that ended the lease. `lease` is the last one, in force or ended; `lease_id` is the
+    Other clients' requests are refused while a lease is in force, and the former holder's after it, so that the holder
+    does not act against the client that ended the lease. `lease` is the last one, in force or ended; `lease_id` is the
     request's, 0 for none; the time is the controller's.
     """
     if name in ENDED_BY or name in UNRELATED:
@@ -80,7 +80,7 @@ def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
     if lease is not None and not lease.ended:
         if lease_id == lease.id:
             return ""
-        return f"{lease.reserved(time_ns)}; `lowfc ctl open` or `lowfc ctl safe` ends that"
+        return f"{lease.reserved_message(time_ns)}; `lowfc ctl open` or `lowfc ctl safe` ends that"
     if not lease_id:
         return ""
     if lease is None or lease.id != lease_id:

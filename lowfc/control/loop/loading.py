@@ -61,8 +61,8 @@ def loaded(
             history_nm=(command_nm,) * len(loop.history_nm),
         )
         if state.mode is not LoopMode.SAFE:  # in safe mode it relaxes to flat and stays there
-            loop, rest = adopted(loop, shape_nm)
-            events += rest
+            loop, adoption_events = adopted(loop, shape_nm)
+            events += adoption_events
     before_mode, cause = state.mode, "a calibration was loaded"
     mode = settings.start_mode if before_mode is LoopMode.IDLE else before_mode
     if mode is LoopMode.SAFE:
@@ -136,7 +136,8 @@ def interlock_or_permit_cause(state: State) -> str:
 def bench_reported(settings: Settings, state: State, report: BenchReport) -> tuple[State, Outputs]:
     """Evaluate the interlocks on a bench value; one that begins to act makes the loop safer, and none closes it.
 
-    Before the first used frame, and while the gains are measured, `refuse_close` also opens a loop that started closed.
+    Before the first used frame, `refuse_close` also opens a loop that started closed. While the gains are measured,
+    `open` and `refuse_close` keep the loop from closing by itself afterwards.
     """
     before = state.conditions.acting
     after = judged(settings.interlocks, before, report)
@@ -144,8 +145,8 @@ def bench_reported(settings: Settings, state: State, report: BenchReport) -> tup
         return state, Outputs()
     begun = [one for one in after if one not in before]
     events = [PendingEvent("INTERLOCK_ACTS", {"why": one.why, "action": IN_WORDS[one.action]}) for one in begun]
-    still = {one.number for one in after}
-    events += [PendingEvent("INTERLOCK_CLEARED", {"why": one.why}) for one in before if one.number not in still]
+    acting_now = {one.number for one in after}
+    events += [PendingEvent("INTERLOCK_CLEARED", {"why": one.why}) for one in before if one.number not in acting_now]
     state = state._replace(conditions=state.conditions._replace(acting=after))
     opening = (Action.OPEN,) if state.frames_used and not state.waits else (Action.OPEN, Action.REFUSE_CLOSE)
     for one in begun:
@@ -154,24 +155,24 @@ def bench_reported(settings: Settings, state: State, report: BenchReport) -> tup
             mode = LoopMode.SAFE
         elif one.action in opening and mode is LoopMode.CLOSED:
             mode = LoopMode.OPEN
-        elif one.action in opening and state.waits:  # it does not close by itself
+        elif one.action in opening and state.waits:  # it no longer closes by itself
             state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
         state = _changed(state, mode, report.time_ns, cause, events)
     return state, Outputs(events=events, changed=True)
 
 
-def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:
+def mirror_shape_reported(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:
     """Start from the mirror's shape, so that it does not jump; after the first command, shapes change nothing."""
     if state.commanded:
         return state, Outputs()
     events: list[PendingEvent] = []
-    loop, safe = state.loop, MIRROR_WAS_SAFE if shape.safe else ""
+    loop, safe_cause = state.loop, MIRROR_WAS_SAFE if shape.safe else ""
     if loop is None:  # probe sequences and channels need no calibration
         loop = ActiveLoop.at_rest(settings, Calibration.none(shape.actuators_nm.shape))
         events.append(PendingEvent("NOT_CALIBRATED", {"why": uncalibrated(state)}))
-        safe = safe or (LATCHED if safe_pending(settings, state) else "")
-    if safe:
-        state = _changed(state, LoopMode.SAFE, shape.time_ns, safe, events)
+        safe_cause = safe_cause or (LATCHED if safe_pending(settings, state) else "")
+    if safe_cause:
+        state = _changed(state, LoopMode.SAFE, shape.time_ns, safe_cause, events)
         loop = state.loop or loop  # without the channels that safe mode removes
     grid, finite = loop.calibration.grid, np.isfinite(shape.actuators_nm)
     wrong = "" if finite.all() else f"{np.sum(~finite)} of its {finite.size} actuators have no finite position"
@@ -179,7 +180,7 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
         wrong = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {grid}"
     if wrong:
         events.append(PendingEvent("MIRROR_REFUSED", {"why": wrong}))
-        return state, Outputs(events=events, changed=bool(safe))
+        return state, Outputs(events=events, changed=bool(safe_cause))
     limit_nm = loop.integrator.limit_nm
     plausible = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
     command_nm = shape.command_nm if plausible else loop.inverse @ shape.actuators_nm.reshape(-1)
@@ -187,13 +188,15 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
     if command_nm.any():
         events.append(PendingEvent("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
     if state.mode is not LoopMode.SAFE:  # in safe mode it relaxes to flat and stays there
-        channels = loop.command_channels  # set before, if the mirror reports late
-        loop, rest = adopted(loop, shape.actuators_nm if channels is None else shape.actuators_nm - channels.sum_nm)
-        events += rest
+        channels = loop.command_channels  # clients may have set some before a late report
+        loop, adoption_events = adopted(
+            loop, shape.actuators_nm if channels is None else shape.actuators_nm - channels.sum_nm
+        )
+        events += adoption_events
     return state._replace(loop=loop), Outputs(events=events, changed=True)
 
 
-def mirror_judged(settings: Settings, state: State, report: MirrorReport) -> tuple[State, Outputs]:
+def mirror_fault_reported(settings: Settings, state: State, report: MirrorReport) -> tuple[State, Outputs]:
     """Hold while the mirror does not follow; a closed loop steps back to the mirror's last shape, against wind-up.
 
     A large step back takes several reports, within the slew limit.
@@ -277,15 +280,15 @@ def _expected(loop: ActiveLoop, camera: CameraSettings) -> CameraSettings:
 
 def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[PendingEvent]]:
     """Make a shape's deviation (rows, columns) from the modal command a channel, unless it is the driver's rounding."""
-    rest_nm = shape_nm.copy()
-    rest_nm -= (loop.to_actuators @ loop.history_nm[0]).reshape(rest_nm.shape)
-    if not np.abs(rest_nm).max() > ADOPTED_NM:
+    deviation_nm = shape_nm.copy()
+    deviation_nm -= (loop.to_actuators @ loop.history_nm[0]).reshape(deviation_nm.shape)
+    if not np.abs(deviation_nm).max() > ADOPTED_NM:
         return loop, []
     channels = loop.channels_or_empty()
     before = channels.channel(ADOPTED)
-    channel_nm = rest_nm if before is None else before.shape_nm + rest_nm
-    channels = channels.with_one(Channel(ADOPTED, channel_nm, channel_nm), loop.to_modes).settled()
-    rms_nm = float(np.sqrt(np.mean(np.square(rest_nm))))
+    channel_nm = deviation_nm if before is None else before.shape_nm + deviation_nm
+    channels = channels.with_channel(Channel(ADOPTED, channel_nm, channel_nm), loop.to_modes).settled()
+    rms_nm = float(np.sqrt(np.mean(np.square(deviation_nm))))
     loop = loop._replace(command_channels=channels)
     return loop, [PendingEvent("SHAPE_ADOPTED", {"rms_nm": rms_nm})]
 
@@ -299,8 +302,8 @@ def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
     if loop is not None and mode is not state.mode:
         loop = loop.stopped(state.frame_sequence)
         if loop.command_channels is not None and mode is LoopMode.SAFE:
-            restarted_from_flat = loop.command_channels.restarted_from_flat(loop.to_modes, only_flat=True)
-            loop = loop._replace(command_channels=restarted_from_flat)
+            channels = loop.command_channels.restarted_from_flat(loop.to_modes, only_flat=True)
+            loop = loop._replace(command_channels=channels)
         if loop.law_runner is not None and mode is LoopMode.CLOSED:
             loop = loop._replace(law_runner=loop.law_runner.taking_over())
     same, conditions = mode is state.mode, state.conditions

@@ -12,7 +12,7 @@ from lowfc.arrays import Single
 from lowfc.control.laws.margins import check_law
 from lowfc.control.loop import interlocks
 from lowfc.control.loop.command_channels import EXTERNAL, FLAT, MIRROR, CommandChannels, Play, play_table
-from lowfc.control.loop.gains import changed_integrator, check_offset, offset_remark, per_mode, prepare_gains
+from lowfc.control.loop.gains import change_integrator, check_offset, offset_remark, per_mode, prepare_gains
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
 from lowfc.control.loop.loading import holding_cause, in_mode, loaded, misfit, mode_event, safe_pending, uncalibrated
@@ -29,7 +29,7 @@ MAX_REPLY_LENGTH = 1000
 def answer(settings: Settings, state: State, request: Request) -> tuple[State, Outputs]:
     """The state after a request, and its reply; a refused request changes nothing but is counted."""
     request = prepared(settings, request)
-    now, ended = lease_checked(state, request.time_ns, 0)
+    now, expiry_events = lease_checked(state, request.time_ns, 0)
     lease_before = now.conditions.lease
     try:
         after, text, *events = _handler(request, lease_before)(settings, now, request)
@@ -37,9 +37,9 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
         return state._replace(), Outputs(reply=Reply(False, _short(str(error)), state.frame_sequence + 1))
     by_another = lease_before is not None and lease_before.id != request.lease_id
     if request.name == "safe" or (request.name in ENDED_BY and by_another):
-        after, others = lease_ended(after, asked_by(lease_before, request))
-        events += others
-        text += "".join(f"; this ended the reservation for {event.details['holder']}" for event in others)
+        after, lease_events = lease_ended(after, asked_by(lease_before, request))
+        events += lease_events
+        text += "".join(f"; this ended the reservation for {event.details['holder']}" for event in lease_events)
     if after.mode is not state.mode:
         why = asked_by(lease_before, request)
         events.append(mode_event(state.mode, after.mode, why))
@@ -47,7 +47,9 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
             events.append(PendingEvent("SAFED", {"why": why}))
     changed = after is not state
     reply = Reply(True, text, state.frame_sequence + 1)
-    return after if changed else state._replace(), Outputs(reply=reply, events=(*ended, *events), changed=changed)
+    return after if changed else state._replace(), Outputs(
+        reply=reply, events=(*expiry_events, *events), changed=changed
+    )
 
 
 def _handler(request: Request, lease_before: Lease | None) -> "Handler":
@@ -178,7 +180,7 @@ def _reset(settings: Settings, state: State, request: Request) -> Handled:
 
 def _integrator(settings: Settings, state: State, request: Request) -> Handled:
     """gain, leak and limit of the integrator."""
-    loop, text, *events = changed_integrator(settings, _calibrated_loop(state), request)
+    loop, text, *events = change_integrator(settings, _calibrated_loop(state), request)
     return state._replace(loop=loop), text, *events
 
 
@@ -204,7 +206,7 @@ def _channel(settings: Settings, state: State, request: Request) -> Handled:
         shape_nm = request.actuators_nm.reshape(grid)
     _check_shape(None if request.text == EXTERNAL else settings.limits, shape_nm)
     before = loop.channels_or_empty()
-    channels = before.with_channel(request.text, shape_nm, loop.to_modes)
+    channels = before.with_shape(request.text, shape_nm, loop.to_modes)
     if not request.actuators_nm.size and before.channel(request.text) is None:
         names = ", ".join(one.name for one in before.channels)
         raise ValueError(f"there is no channel {request.text!r} to remove; there are {names or 'none'}")
@@ -281,7 +283,7 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
     if not safe_pending(settings, state):  # an idle loop opens, whatever the configured mode
         settings = replace(settings, start_mode=LoopMode.OPEN)
     after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
-    loop = _active_loop(after)  # a limit may be below its offset
+    loop = _active_loop(after)  # an offset beyond its limit, which may have been lowered, is no reason to refuse
     check_offset(loop, np.minimum(np.abs(loop.channels_or_empty().offset_nm), loop.integrator.limit_nm))
     others = (event for event in events if event.name != "MODE_CHANGED")  # `answer` adds it
     return after, f"calibration {request.calibration.id[:12]}", *others

@@ -3,7 +3,7 @@
 from math import ceil
 
 from lowfc.control.loop.inputs import PendingEvent, Request
-from lowfc.control.loop.lease import LEASE_OVER, MAX_HOLDER, MAX_S, Lease
+from lowfc.control.loop.lease import LEASE_OVER, MAX_HOLDER_LENGTH, MAX_S, Lease
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import Settings, State
 
@@ -18,9 +18,10 @@ def lease(settings: Settings, state: State, request: Request) -> tuple[State, st
     if state.mode is LoopMode.SAFE:
         raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
     if before is not None and not before.ended and before.id != request.lease_id:
-        raise ValueError(before.reserved(request.time_ns))
-    made = _extended(settings, state, request)
-    return _with(state, made), made.reserved(request.time_ns), PendingEvent("LEASE_TAKEN", {"holder": made.holder})
+        raise ValueError(before.reserved_message(request.time_ns))
+    granted = _extended(settings, state, request)
+    event = PendingEvent("LEASE_TAKEN", {"holder": granted.holder})
+    return _with(state, granted), granted.reserved_message(request.time_ns), event
 
 
 def renew(settings: Settings, state: State, request: Request) -> tuple[State, str]:
@@ -30,8 +31,8 @@ def renew(settings: Settings, state: State, request: Request) -> tuple[State, st
         raise ValueError("this lease is not in force: the controller restarted, or another lease was granted")
     if before.ended:
         raise ValueError(f"{LEASE_OVER}{before.ended}")
-    made = _extended(settings, state, request)._replace(holds=before.holds)
-    return _with(state, made), made.reserved(request.time_ns)
+    renewed = _extended(settings, state, request)._replace(holds=before.holds)
+    return _with(state, renewed), renewed.reserved_message(request.time_ns)
 
 
 def release(settings: Settings, state: State, request: Request) -> tuple[State, str] | tuple[State, str, PendingEvent]:
@@ -69,7 +70,7 @@ def permit(settings: Settings, state: State, request: Request) -> tuple[State, s
     """
     before, loop, closed = state.conditions.lease, state.loop, state.mode is LoopMode.CLOSED
     if before is not None and not before.ended and before.id != request.lease_id:
-        raise ValueError(before.reserved(request.time_ns))
+        raise ValueError(before.reserved_message(request.time_ns))
     play = None if loop is None else loop.play
     if play is not None and not play.over(state.frame_sequence + 1):
         raise ValueError("a probe sequence is being played, and the move would disturb its measurement")
@@ -78,10 +79,10 @@ def permit(settings: Settings, state: State, request: Request) -> tuple[State, s
             what = "is closed" if closed else "closes once its gains are measured"
             raise ValueError(f"the loop {what}, and would follow the move: request a hold of some seconds")
         return state, f"granted: the loop is {state.mode.in_words}"
-    made = _extended(settings, state, request)._replace(holds=True)
+    granted = _extended(settings, state, request)._replace(holds=True)
     what = "holds its command" if closed else f"is {state.mode.in_words} and stays so"
     text = f"granted for {request.values[0]:g} s: the loop {what}"
-    return _with(state, made), text, PendingEvent("LEASE_TAKEN", {"holder": made.holder})
+    return _with(state, granted), text, PendingEvent("LEASE_TAKEN", {"holder": granted.holder})
 
 
 def _extended(settings: Settings, state: State, request: Request) -> Lease:
@@ -93,8 +94,10 @@ def _extended(settings: Settings, state: State, request: Request) -> Lease:
         raise ValueError(f"{request.name} takes one duration above 0 and of at most {MAX_S:g} s; got {given}")
     if not request.lease_id:
         raise ValueError("a lease needs an identity above 0, got 0")
-    if not (0 < len(holder) <= MAX_HOLDER and holder.isprintable()):
-        raise ValueError(f"a lease names its holder in 1 to {MAX_HOLDER} printable characters, got {holder[:40]!r}")
+    if not (0 < len(holder) <= MAX_HOLDER_LENGTH and holder.isprintable()):
+        raise ValueError(
+            f"a lease names its holder in 1 to {MAX_HOLDER_LENGTH} printable characters, got {holder[:40]!r}"
+        )
     last_sequence = state.frame_sequence + ceil(duration_s * settings.rate_hz) if settings.rate_hz else 0
     return Lease(request.lease_id, holder, request.time_ns + round(duration_s * 1e9), last_sequence)
 

@@ -1,4 +1,4 @@
-"""Limits of the mirror, the loop-mode machine and the command timeout, independent of control law and estimate.
+"""Limits of the mirror, changes of the loop mode and the command timeout, independent of control law and estimate.
 
 The controller applies them to the commands that it sends, and the mirror again to those that it receives;
 `docs/explanation/safety.md` lists the hazards.
@@ -16,7 +16,7 @@ from lowfc.arrays import Single
 from lowfc.control.loop.wording import mode_word
 
 MAX_LIMIT_NM = 1e9
-"""Largest modal limit and actuator of a channel; the square of a much larger number overflows in float32."""
+"""Largest modal limit and largest actuator of a channel, nm; a much larger number squared overflows in float32."""
 MARGIN_NM = 1e-3
 """Least distance kept from stroke and slew limit, and half of it from the neighbour limit, so that float32 rounding
 (6e-5 nm at 750 nm) cannot cross them."""
@@ -132,11 +132,11 @@ class Limited(NamedTuple):
 def limit(limits: Limits, previous_nm: Single, requested_nm: Single) -> Limited:
     """Limit the command `requested_nm` so that it may follow `previous_nm`.
 
-    Both are (rows, columns) float32, nm of surface; the previous one is finite, as a result of this function. Stroke,
-    then slew, clip each actuator separately; the neighbour limit shortens the whole move. For any `requested_nm`, the
-    result is finite, no actuator moves further than the slew limit, and if `previous_nm` is within the stroke and
-    neighbour limits, so is the result; otherwise it returns to them at the slew limit. A requested shape of another
-    grid, or with a value that is not finite, leaves the previous command.
+    Both are (rows, columns) float32, nm of surface; `previous_nm` must be finite. Stroke, then slew, clip each actuator
+    separately; the neighbour limit shortens the whole move. For any `requested_nm`, the result is finite, no actuator
+    moves further than the slew limit, and if `previous_nm` is within the stroke and neighbour limits, so is the result;
+    otherwise it returns to them at the slew limit. A requested shape of another grid, or with a value that is not
+    finite, leaves the previous command.
     """
     if requested_nm.shape != previous_nm.shape:
         return Limited(previous_nm, (Limit.WRONG_GRID,))

@@ -128,9 +128,9 @@ class LawRunner(NamedTuple):
         weight = np.float32(min(max(self.frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1))
         return weight if self.guard is None or not self.guard.overruled else weight * self.guard.weight
 
-    def alone(self, more: int = 0) -> bool:
-        """Whether the law determines the whole command, now or `more` frames later."""
-        frames = self.frames + more
+    def alone(self, later: int = 0) -> bool:
+        """Whether the law determines the whole command, now or this number of frames later."""
+        frames = self.frames + later
         return frames >= SETTLING_FRAMES + FADING_FRAMES and (self.guard is None or not self.guard.overruled)
 
     def taking_over(self) -> "LawRunner":
@@ -219,7 +219,7 @@ class ActiveLoop(NamedTuple):
         return self._replace(integrator=replace(integrator, uncorrected=self.automatic & (integrator.gain == 0)))
 
     def with_weighting(self, weighting: Weighting | None) -> "ActiveLoop":
-        """A copy with R, and the modes that it measures of a channel, for other uncorrected modes or another flux."""
+        """A copy with R and `to_modes` for these uncorrected modes and this flux; None for those of the calibration."""
         calibration, channels = self.calibration, self.command_channels
         to_modes = _own_to_modes(calibration, self.inverse)
         if weighting is not None:
@@ -304,9 +304,9 @@ class State(NamedTuple):
 
     Attributes:
         frame_sequence: sequence of the newest frame, 0 before the first and after `clear`; its time is `frame_time_ns`.
-        refused: why the last frame was refused, if it was, and how many in a row.
+        refused: why the last frame was refused, None if it was used; `refused_count` frames in a row were refused.
         limits_hit: limits that acted on the last command.
-        frame_timeout: whether the frame timeout has been reported.
+        frame_timeout: whether no frame has come for longer than the frame timeout.
         commanded: whether a command has been sent, so that the mirror's shape is no longer adopted.
         counts: number of frames, or of frame timeouts, for each reason.
         steps_left: used frames until the loop opens automatically; 0 for never.
@@ -335,7 +335,7 @@ class State(NamedTuple):
 
     @property
     def may_command(self) -> bool:
-        """Whether commands may be sent: except in safe mode, not the first to a mirror with a fault: it might jump."""
+        """Whether commands may be sent: outside safe mode not the first to a mirror with a fault, as it might jump."""
         return self.commanded or not self.conditions.mirror_fault or self.mode is LoopMode.SAFE
 
     @property

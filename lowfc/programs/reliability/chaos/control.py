@@ -19,7 +19,7 @@ from lowfc.contract.messages import Role
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.stability import limiting_gain
-from lowfc.control.loop.guard import FEWEST, WORSE_BLOCKS
+from lowfc.control.loop.guard import MIN_BLOCK_FRAMES, WORSE_BLOCKS
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, WHILE_FRAMES, case, no_mounts, no_other_clock, read_only
@@ -53,7 +53,7 @@ def _law_that_fails(bench: ChaosBench) -> None:
     noll, known = bench.config.noll, settings(bench.config)
     weak = integrator((0.002,) * len(noll), (0.0,) * len(noll), noll, known.delay_frames, known.rate_hz)
     bench.client().law(weak)
-    bench.frames(SETTLING_FRAMES + FADING_FRAMES + (WORSE_BLOCKS + 2) * FEWEST)
+    bench.frames(SETTLING_FRAMES + FADING_FRAMES + (WORSE_BLOCKS + 2) * MIN_BLOCK_FRAMES)
 
 
 def _calibration(bench: ChaosBench) -> Calibration:
