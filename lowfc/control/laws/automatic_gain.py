@@ -1,4 +1,4 @@
-"""Automatic gains: a bank of virtual integrators shows what each gain would leave, and whether closing does harm."""
+"""Automatic gains: a bank of virtual integrators shows the residual of each gain, and whether closing does harm."""
 
 from typing import NamedTuple
 
@@ -9,24 +9,24 @@ from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.virtual import VirtualIntegrators, Weights
 
 MIN_GAIN = 1e-3
-"""Lower limit of the gains of a bank's rows: the highest gain within the margins, halved repeatedly. Row 0 has 0."""
+"""Lower limit of a bank's gains: the highest gain within the margins, halved repeatedly. Row 0 has a gain of 0."""
 BLOCKS = 10
 """Blocks of a window, for the standard errors of its means."""
 CONFIDENCE = 2.0
-"""Standard errors by which one gain must beat another. To be better in `WINNING_BLOCKS` of the blocks is enough
-as well, since one block may outweigh all others when the open loop wanders."""
+"""Standard errors by which one gain must beat another. A gain that is better in `WINNING_BLOCKS` blocks wins as well,
+since one block may outweigh all others when the open loop wanders."""
 WINNING_BLOCKS = 9
 GRANTED = 3.0
-"""Standard errors of white noise by which a gain must beat the open loop in a first window, and for a mode at 0: on a
-faint star, a single gain granted because of noise may add as much contrast as the dark zone has."""
+"""Standard errors of white noise by which a gain must beat the open loop in a first window, and for a mode with a gain
+of 0: on a faint star, a single gain granted because of noise may add as much contrast as the dark zone has."""
 EARLY = 5
 """Blocks of a window after which a mode that is hardly corrected may get another gain before the window ends: a mode
-at 0 by `GRANTED`, one at the least gain after this many blocks in a row in favour of another gain."""
+with a gain of 0 by `GRANTED`, a mode with the least gain after this many blocks in a row in favour of another gain."""
 LONGEST = 16
-"""Factor of its first length to which a window grows while it decides nothing."""
+"""Largest factor by which a window grows while it decides nothing."""
 FEW = 3
 """Number of modes below which each is judged by itself only; with more, the majority is evidence for each."""
-MIN_CORRECTED = 0.1
+MAX_INJECTED = 0.1
 """Ratio of injected noise to correctable power below which a first window chooses the least gain instead of 0."""
 
 SURE = 4.0
@@ -48,11 +48,11 @@ class Verdict(NamedTuple):
     Attributes:
         gain: the gain of each mode from now on.
         power_nm2: mean square of the open loop, with the noise of a frame and without the cross-talk of tip and tilt.
-        noise_nm2: noise in it: as computed, or half the mean square of the change between frames if that is
+        noise_nm2: noise in `power_nm2`: as computed, or half the mean square of the change between frames if that is
             larger; None if it was not computed.
         change_nm2: mean square with the current gain less that of the open loop; above 0, closing does harm.
         change_error_nm2: its standard error.
-        loop_nm2: the same for the real loop, with any law; None if it was not closed throughout.
+        loop_nm2: as `change_nm2`, of the real loop with any law; None if it was not closed throughout.
         loop_error_nm2: its standard error.
         frames: frames of the window.
     """
@@ -107,13 +107,13 @@ class GainBank:
         self._before_nm: Single | None = None
         self.begin_first_window()
 
-    def use_reconstructor(self, of_own: Array | Single) -> None:
-        """Use modes of another R from now on: (modes, modes), its response to the modes of the calibration's own R.
+    def use_reconstructor(self, from_own: Array | Single) -> None:
+        """Expect modes of another R from now on: `from_own` (modes, modes) times those of the calibration's own R.
 
-        The cross-talk of tilt is fitted in the latter, which do not change: an R for fewer modes mixes it into them.
+        The cross-talk of tilt is fitted in the latter, which do not change: an R for fewer modes mixes it into others.
         """
         self._add_up()
-        self._of_own, self._to_own = of_own, np.linalg.inv(of_own)
+        self._from_own, self._to_own = from_own, np.linalg.inv(from_own)
 
     def begin_first_window(self) -> None:
         """Make the next window a first one."""
@@ -159,7 +159,8 @@ class GainBank:
     def early(self, gain: Single) -> Single:
         """Gains (modes,) before the window is complete.
 
-        A better one for modes at 0 or the least gain (see `EARLY`), and 0 for modes that prove to be cross-talk.
+        A better one for modes with a gain of 0 or the least gain (see `EARLY`), and 0 for modes that prove to be
+        cross-talk.
         """
         if self.first or len(self._blocks) < EARLY:
             return gain
@@ -169,12 +170,12 @@ class GainBank:
         own = blocks[:, now, np.arange(now.size)]
         beyond = blocks - own[:, None]
         mean = np.where(now == 0, beyond.mean(axis=0), beyond[-EARLY:].mean(axis=0))
-        shown = np.where(now == 0, self._beyond_noise(mean), (beyond[-EARLY:] < 0).all(axis=0))
-        sure = np.where(shown, mean, np.inf)
-        changed = (now <= 1) & shown.any(axis=0)
-        absent = (cross_talk_nm != 0) & (own[-EARLY:] > 0).all(axis=0)
-        gain = np.where(changed, self.rows[np.argmin(sure, axis=0)], gain)
-        return np.where(absent, 0, gain).astype(np.float32)
+        proven = np.where(now == 0, self._beyond_noise(mean), (beyond[-EARLY:] < 0).all(axis=0))
+        proven_mean = np.where(proven, mean, np.inf)
+        changed = (now <= 1) & proven.any(axis=0)
+        only_cross_talk = (cross_talk_nm != 0) & (own[-EARLY:] > 0).all(axis=0)
+        gain = np.where(changed, self.rows[np.argmin(proven_mean, axis=0)], gain)
+        return np.where(only_cross_talk, 0, gain).astype(np.float32)
 
     def held(self, frames: int) -> None:
         """Advance by frames without measurements: changes across them are not used."""
@@ -196,10 +197,10 @@ class GainBank:
             noise_nm2 = np.maximum(noise_nm2, np.mean(self._changed, axis=0))
         if self.first and noise_nm2 is not None:
             scatter = _mean(np.subtract(self._powers, self._changed))[1]  # noise of a faint star has long tails
-            there = power - noise_nm2 - GRANTED * np.maximum(noise_nm2 * np.sqrt(2 / frames), scatter)
-            little = injected(self.rows[1]) * noise_nm2 < MIN_CORRECTED * there
+            certain_power = power - noise_nm2 - GRANTED * np.maximum(noise_nm2 * np.sqrt(2 / frames), scatter)
+            little = injected(self.rows[1]) * noise_nm2 < MAX_INJECTED * certain_power
             chosen = np.where((chosen == 0) & little & (suspected_nm == 0), 1, chosen)
-        found = Verdict(
+        verdict = Verdict(
             self.rows[chosen],
             power,
             noise_nm2,
@@ -214,13 +215,15 @@ class GainBank:
             self._clear(self._windows[1])
         else:
             self._lengthen()
-        return found
+        return verdict
 
     def _cross_talk_nm(self, tilts: list[Array]) -> list[Array]:
-        """Cross-talk of tip and tilt over these blocks, twice (modes,): where certain, where suspected; else 0."""
-        found, error = self._cross_talk.mean_nm(np.mean(tilts, axis=0))
-        accepted: list[Array] = [np.where(np.abs(found) > errors * error, found, 0) for errors in (SURE, SUSPECTED)]
-        return [self._of_own @ one for one in accepted]
+        """Certain and suspected cross-talk (modes,) of tip and tilt over these blocks, nm; 0 where there is none."""
+        mean_nm, error_nm = self._cross_talk.mean_nm(np.mean(tilts, axis=0))
+        accepted: list[Array] = [
+            np.where(np.abs(mean_nm) > errors * error_nm, mean_nm, 0) for errors in (SURE, SUSPECTED)
+        ]
+        return [self._from_own @ cross_talk_nm for cross_talk_nm in accepted]
 
     def _without(self, cross_talk_nm: Array) -> Array:
         """Mean squares of the true modes less those in open loop (blocks, rows and the real loop, modes), nm^2.
@@ -240,7 +243,7 @@ class GainBank:
     def _chosen(self, blocks: Array, now: Integers) -> Integers:
         """Best row (modes,) of each mode whose current row is `now`."""
         own, modes = blocks[:, :-1], np.arange(now.size)
-        rows, helps = own + self._alike(own), own.mean(axis=0) < 0
+        rows, helps = own + self._median_of_modes(own), own.mean(axis=0) < 0
         if self.first:
             beyond_open = rows.mean(axis=0)
             better = helps & self._beyond_noise(beyond_open)
@@ -262,8 +265,8 @@ class GainBank:
             mean < -GRANTED * np.sqrt(np.mean(self._spreads, axis=0) / (len(self._spreads) * self._block))
         )
 
-    def _alike(self, blocks: Array) -> Array:
-        """The modes' median of the blocks, relative to the noise of each mode; 0 for fewer modes than `FEW`."""
+    def _median_of_modes(self, blocks: Array) -> Array:
+        """Median over the modes, in units of each mode's noise, scaled to each mode; 0 for fewer modes than `FEW`."""
         if blocks.shape[-1] < FEW:
             return np.zeros_like(blocks)
         noise_nm2 = np.maximum(np.mean(self._changed, axis=0), 1e-12)
@@ -340,7 +343,7 @@ class TiltCrossTalk:
         """Add consecutive frames: tip and tilt (frames, 2) as the sensor saw them, the others (frames, modes), nm.
 
         Returns:
-            (regressors,) summed over the frames, whose mean is the argument of `mean_nm`.
+            (regressors,) sums over the frames; `mean_nm` takes their means.
         """
         x, y = tilt_nm.T.astype(float)
         rows = np.column_stack([x, y, x * x, x * y, y * y, open_nm])
@@ -355,8 +358,8 @@ class TiltCrossTalk:
         """Skip frames without measurements: changes across them are not used."""
         self._before = None
 
-    def mean_nm(self, tilt: Array) -> tuple[Array, Array]:
-        """Mean cross-talk and its standard error (modes,), nm, over frames with these mean regressors; 0 if unknown."""
+    def mean_nm(self, regressors: Array) -> tuple[Array, Array]:
+        """Mean cross-talk and its standard error (modes,), nm, at these means of the regressors; 0 if unknown."""
         normal, right = self._products[:, :_REGRESSORS], self._products[:, _REGRESSORS:]
         if self._changes < 4 * _REGRESSORS or not np.all(np.diag(normal) > 0):
             return np.zeros(right.shape[1]), np.zeros(right.shape[1])
@@ -364,7 +367,7 @@ class TiltCrossTalk:
         inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
         slopes = inverse @ right
         unexplained = np.maximum(self._powers - np.sum(slopes * right, axis=0), 0) / (self._changes - _REGRESSORS)
-        squares = np.where(np.arange(_REGRESSORS) < 2, 0, tilt)
+        squares = np.where(np.arange(_REGRESSORS) < 2, 0, regressors)
         return squares @ slopes, np.sqrt((squares @ inverse @ squares) * unexplained)
 
 

@@ -1,7 +1,8 @@
 """Residual wavefront of a loop in continuous time, not only at one instant of each frame.
 
-The star moves while the mirror holds. A wave e^(i w t) is measured as m e^(i w t_k), its mean over the exposure; the
-command computed from it is in force from a to a + 1 periods after t_k, where the wave has the mean h e^(i w (t_k + a)).
+The star moves while the mirror holds. A wave e^(i w t) is measured as m e^(i w t_k), its mean over the exposure that
+starts at t_k; the command computed from it is in force from a to a + 1 periods after t_k, where the wave has the mean
+h e^(i w (t_k + a)).
 The command follows from the sampled loop; the residual has a floor, `1 - |h|^2`, that no command can remove.
 
 Frequencies are in rad per frame and may exceed pi, where the sampled loop sees the alias.
@@ -19,7 +20,7 @@ from lowfc.control.laws.stability import delay_weights
 _FILTER_POINTS = 4096  # of the transform from a response to its taps
 _FILTER_OMEGA = np.linspace(0, np.pi, _FILTER_POINTS // 2 + 1)
 _FILTER_REACH = 48
-"""Frames before and after from which a mean between measurements is interpolated."""
+"""Frames on either side from which a mean between measurements is interpolated."""
 
 _MOMENTS = 8  # instants of a period over which a mean square is taken
 
@@ -135,12 +136,12 @@ def means_while_applied(measured_nm: Array, timing: Timing) -> tuple[Array, Arra
     lags = np.arange(-_FILTER_REACH, _FILTER_REACH + 1) + centre  # in frames ahead
     taps = full[-lags % _FILTER_POINTS] * np.hanning(lags.size + 2)[1:-1]
     taps /= taps.sum()
-    found = np.full(measured_nm.shape, np.nan)
+    means_nm = np.full(measured_nm.shape, np.nan)
     rows = np.arange(max(0, -lags[0]), len(measured_nm) - max(0, lags[-1]))
     if rows.size:
-        for found_mode, mode_nm in zip(found.T, measured_nm.T, strict=True):
-            found_mode[rows] = np.correlate(mode_nm, taps, "valid")
-    return found, np.asarray(np.exp(1j * np.outer(_FILTER_OMEGA, lags)) @ taps)
+        for mean_nm, mode_nm in zip(means_nm.T, measured_nm.T, strict=True):
+            mean_nm[rows] = np.correlate(mode_nm, taps, "valid")
+    return means_nm, np.asarray(np.exp(1j * np.outer(_FILTER_OMEGA, lags)) @ taps)
 
 
 def held_residual_nm2(
@@ -165,8 +166,8 @@ def continuous_residual_nm2(disturbance_nm: Array, mirror_nm: Array, moves_at: f
     The disturbance (frames, modes) is interpolated between those instants, and the mirror (frames, modes) holds until
     it moves to its next state, `moves_at` periods later; NaN where there are too few neighbours.
     """
-    found, next_nm = np.zeros_like(disturbance_nm), np.roll(mirror_nm, -1, axis=0)
+    mean_square, next_nm = np.zeros_like(disturbance_nm), np.roll(mirror_nm, -1, axis=0)
     for moment in ((np.arange(_MOMENTS) + 0.5) / _MOMENTS).tolist():
         between_nm, _ = means_while_applied(disturbance_nm, Timing(1.0, moment, 0.0, 0.0))
-        found += (between_nm + (mirror_nm if moment < moves_at else next_nm)) ** 2 / _MOMENTS
-    return found
+        mean_square += (between_nm + (mirror_nm if moment < moves_at else next_nm)) ** 2 / _MOMENTS
+    return mean_square

@@ -95,13 +95,13 @@ def lag_under_noise(law: LinearLaw, measured: Spectrum, mean_nm: Array, timing: 
     return Term(above + _steady_nm2(law, mean_nm), measured.error_nm2(passed))
 
 
-def _omega(law: LinearLaw, found: Spectrum) -> Array:
-    return np.asarray(2 * np.pi * found.frequency_hz / law.rate_hz)
+def _omega(law: LinearLaw, power: Spectrum) -> Array:
+    return np.asarray(2 * np.pi * power.frequency_hz / law.rate_hz)
 
 
-def _passed(law: LinearLaw, found: Spectrum, timing: Timing) -> Array:
+def _passed(law: LinearLaw, power: Spectrum, timing: Timing) -> Array:
     """Residual power (frequencies, modes) of a disturbance of power 1 at each frequency of a spectrum."""
-    return residual_power(law, _omega(law, found), timing)
+    return residual_power(law, _omega(law, power), timing)
 
 
 def _steady_nm2(law: LinearLaw, mean_nm: Array) -> Array:
@@ -110,7 +110,7 @@ def _steady_nm2(law: LinearLaw, mean_nm: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class MeasurementError:
-    """Errors of the sensor other than noise."""
+    """Residual from errors of the sensor other than noise."""
 
     crosstalk: Term
     nonlinearity: Term
@@ -144,26 +144,26 @@ def measurement_error(
     basis = basis[:, sizes > _DEGENERATE * sizes[0]]
     added = error.joined() - residual.joined()
     linear = basis @ (basis.T @ added)
-    rest = added - linear
+    nonlinear = added - linear
 
     def spectrum_of(column: Array) -> Spectrum | None:
         ends = np.cumsum([len(piece) for piece in error.values])[:-1]
         return spectrum(TimeSeries(tuple(np.split(column, ends)), error.interpolated), law.rate_hz)
 
-    smooth, rough, each = spectrum_of(linear), spectrum_of(rest), spectrum_of(basis)
-    if smooth is None or rough is None or each is None:
+    of_linear, of_nonlinear, of_basis = spectrum_of(linear), spectrum_of(nonlinear), spectrum_of(basis)
+    if of_linear is None or of_nonlinear is None or of_basis is None:
         return None
-    passed, at_rest = noise_transfer(law, rough.frequency_hz) ** 2, noise_transfer(law, np.zeros(1))[0] ** 2
+    passed, at_rest = noise_transfer(law, of_nonlinear.frequency_hz) ** 2, noise_transfer(law, np.zeros(1))[0] ** 2
     steady = linear.mean(axis=0) ** 2 * at_rest
     freedom = rows - basis.shape[1]
     # Residual from one unit of noise in each direction of the basis, (modes, directions).
-    by_chance = passed.T @ each.power_nm2_hz * each.spacing_hz + np.outer(at_rest, basis.mean(axis=0) ** 2)
-    noise_nm2 = np.sum(rest**2, axis=0) / freedom
-    nonlinear_nm2 = rough.variance_nm2(passed) * rows / freedom - noise_nm**2 * noise_gain(law)
+    by_chance = passed.T @ of_basis.power_nm2_hz * of_basis.spacing_hz + np.outer(at_rest, basis.mean(axis=0) ** 2)
+    noise_nm2 = np.sum(nonlinear**2, axis=0) / freedom
+    nonlinear_nm2 = of_nonlinear.variance_nm2(passed) * rows / freedom - noise_nm**2 * noise_gain(law)
     return MeasurementError(
         Term(
-            smooth.variance_nm2(passed) + steady - noise_nm2 * by_chance.sum(axis=1),
+            of_linear.variance_nm2(passed) + steady - noise_nm2 * by_chance.sum(axis=1),
             noise_nm2 * np.sqrt(2 * np.sum(by_chance**2, axis=1)),
         ),
-        Term(nonlinear_nm2, rough.error_nm2(passed)),
+        Term(nonlinear_nm2, of_nonlinear.error_nm2(passed)),
     )

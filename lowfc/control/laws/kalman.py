@@ -62,10 +62,10 @@ def _riccati(A: Array, Q: Array, C: Array) -> Array:
     identity = np.eye(len(A))
     for _ in range(_DOUBLINGS):
         inside = np.linalg.solve(identity + seen @ found, np.hstack([passed, seen]))
-        ahead, more = inside[:, : len(A)], inside[:, len(A) :]
-        grown = passed.T @ found @ ahead
-        seen = seen + passed @ more @ passed.T
-        passed = passed @ ahead
+        solved_passed, solved_seen = inside[:, : len(A)], inside[:, len(A) :]
+        grown = passed.T @ found @ solved_passed
+        seen = seen + passed @ solved_seen @ passed.T
+        passed = passed @ solved_passed
         found = found + (grown + grown.T) / 2
         seen = (seen + seen.T) / 2
         if np.abs(grown).max() <= 1e-12 * np.abs(found).max():

@@ -36,7 +36,7 @@ class Margins:
         radius: largest modulus of the closed-loop poles of the mode (and of the modes coupled with it).
         gain_margin: factor by which the loop's gain may grow; infinite if there is no bound.
         gain_reduction: factor above which the gain must stay; 0 if there is no bound.
-        phase_margin_deg: lag at which it oscillates; 180 if the loop never has a gain of 1.
+        phase_margin_deg: additional phase lag at which the loop oscillates; 180 if the loop never has a gain of 1.
         peak: largest `|S|`: 1 over the modulus margin, the least distance of L from -1.
     """
 
@@ -257,7 +257,7 @@ def _poles(matrix: Array) -> Complex:
 
 
 def _frequencies(poles: Complex) -> Array:
-    """Rad per frame from 0 to pi, ascending: everywhere, towards 0, and densely around each pole."""
+    """Rad per frame from nearly 0 to pi, ascending: evenly, logarithmically towards 0, densely around each pole."""
     near = poles[np.abs(poles) > 0.5]
     gap = np.maximum(np.abs(1 - np.abs(near)), 1e-9)
     around = np.abs(np.angle(near))[:, None] + gap[:, None] * _AROUND_POLE

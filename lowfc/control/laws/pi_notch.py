@@ -11,13 +11,14 @@ from lowfc.control.laws.linear_law import Block, LinearLaw, law_from_blocks
 from lowfc.control.laws.stability import delay_weights
 
 _EXACT = 1e-6  # variance of limited commands relative to the states'; the Riccati equation needs one above 0
-_UNKNOWN = 1e-3  # more delays the return from a limit, less keeps wrong states of the notches longer
+_UNKNOWN = 1e-3  # variance of the unknown part: more delays the return from a limit, less keeps wrong states longer
 
 
 class Notch(NamedTuple):
     """A notch of the rejection: at `frequency_hz` it is divided by `depth`.
 
-    `width_hz` is that between its -3 dB points if it is deep (at a depth of 4, 6 % less); neighbours deepen each other.
+    `width_hz` is the width between its -3 dB points if it is deep (at a depth of 4, 6 % less). Neighbours deepen each
+    other.
     """
 
     frequency_hz: float
@@ -55,7 +56,7 @@ def pi_notch(
     for name, values in (("gain", gain), ("proportional", proportional), ("leak", leak), ("notches", notches)):
         if len(values) != len(noll):
             raise ValueError(f"{name} must be given for each of {len(noll)} modes, got {len(values)}")
-    for notch in (one for many in notches for one in many):
+    for notch in (notch for of_mode in notches for notch in of_mode):
         if not (0 < notch.frequency_hz < rate_hz / 2 and 0 < notch.width_hz < rate_hz / 2 and notch.depth > 1):
             raise ValueError(
                 f"a notch lies between 0 and {rate_hz / 2:g} Hz, has a width in the same range and a depth above 1, "

@@ -88,8 +88,8 @@ def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSe
             camera's start counts as an increase: the start may be lower after a clear.
         values: (rows, columns); a row with a NaN is a missing frame.
     """
-    there = np.isfinite(values).all(axis=1)
-    sequence, values = sequence[there], values[there].astype(np.float64)
+    measured = np.isfinite(values).all(axis=1)
+    sequence, values = sequence[measured], values[measured].astype(np.float64)
     if not sequence.size:
         return TimeSeries((), 0)
     start, count = np.divmod(sequence, np.uint64(1 << COUNT_BITS))
@@ -100,11 +100,11 @@ def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSe
     sequence, values = sequence[newer], values[newer]
     missing = np.diff(sequence) - np.uint64(1)
     cuts = np.flatnonzero(missing > MAX_INTERPOLATED_FRAMES) + 1
-    found = [
+    pieces = [
         _even((numbers - numbers[0]).astype(np.int64), rows)
         for numbers, rows in zip(np.split(sequence, cuts), np.split(values, cuts), strict=True)
     ]
-    return TimeSeries(tuple(found), int(missing[missing <= MAX_INTERPOLATED_FRAMES].sum()))
+    return TimeSeries(tuple(pieces), int(missing[missing <= MAX_INTERPOLATED_FRAMES].sum()))
 
 
 def spectrum(run: TimeSeries, rate_hz: float) -> Spectrum | None:

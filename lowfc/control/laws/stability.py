@@ -1,4 +1,4 @@
-"""The integrator's limits: the gains at which its loop oscillates, or has exactly the least allowed margins.
+"""Highest gains of the integrator: those at which its loop oscillates, or has exactly the least allowed margins.
 
 The loop of `lowfc.control.laws.integrator`: command[k] = (1 - leak) command[k-1] - gain error[k], and
 error[k] = disturbance[k] + sum_j w_j command[k-1-j] + noise[k], with w from the delay in frames.
@@ -13,7 +13,7 @@ from lowfc.arrays import Array, Complex, Single
 MIN_GAIN_MARGIN = 1.8
 MIN_PHASE_MARGIN_DEG = 45.0
 LOWEST_GAIN = 0.01
-"""Gain of a mode whose drift does not show in the noise of a log, so that it is corrected nevertheless."""
+"""Least gain that `lowfc tune` chooses: it corrects even a mode whose drift is hidden by the noise of a log."""
 SETTLING = 5.0
 """Time constants of the slowest mode after which a loop counts as settled."""
 

@@ -24,7 +24,7 @@ from lowfc.control.laws.what_if import counterfactual, driven_by
 _NARROWER = (0.1, 0.01, 1e-3)  # factors tried on the fitted width of a line that a log cannot resolve
 _WIDER = (10.0,)  # likewise, for lines that move
 _SETTLING_FRAMES = 5000
-_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # overestimates of the noise, tried until the margins suffice
+_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # overestimates of the noise variance, until the margins suffice
 _NEAR_ENOUGH = 0.25
 """Octaves between a filter with sufficient margins and one without: their residuals agree within half a percent."""
 
@@ -178,24 +178,24 @@ def tune_pi_notch(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], 
 def _notched(model: Model, gain: float, leak: float, timing: Timing) -> tuple[float, tuple[Notch, ...]]:
     """Gain and notches of one mode."""
 
-    def made(notches: Sequence[Notch], g: float) -> LinearLaw:
+    def law_of(notches: Sequence[Notch], g: float) -> LinearLaw:
         return pi_notch((2,), np.array([g]), np.zeros(1), np.array([leak]), [notches], timing.delay, model.rate_hz)
 
     tried: list[tuple[float, float, tuple[Notch, ...]]] = []
     for share in (1.0, 0.7, 0.5, 0.35):  # less gain leaves room for notches
         g, notches = share * gain, tuple[Notch, ...]()
-        least = float(predicted_nm(made(notches, g), [model], timing)[0])
+        least = float(predicted_nm(law_of(notches, g), [model], timing)[0])
         for line in sorted(model.lines, key=lambda line: -line.variance_nm2):
             width_hz = min(max(4 * line.width_hz, 0.2 * line.frequency_hz), 0.02 * model.rate_hz)
             for depth in (30.0, 10.0, 4.0):
-                more = (*notches, Notch(line.frequency_hz, width_hz, depth))
-                law = made(more, g)
+                with_another = (*notches, Notch(line.frequency_hz, width_hz, depth))
+                law = law_of(with_another, g)
                 residual = float(predicted_nm(law, [model], timing)[0])
                 if residual < least and _sufficient(margins.margins(law, timing.delay)):
-                    notches, least = more, residual
+                    notches, least = with_another, residual
                     break
         tried.append((least, g, notches))
-    _, g, notches = min(tried, key=lambda one: one[0])
+    _, g, notches = min(tried, key=lambda attempt: attempt[0])
     return g, notches
 
 
@@ -249,8 +249,8 @@ def simulated_residual_nm2(law: LinearLaw, run: TimeSeries, noise_nm2: Array, ti
         missing = np.zeros(len(piece), np.int64)
         command_nm = counterfactual(driven_by(law), weights, piece.astype(np.float32), missing)[1]
         measured_nm, commanded_nm = piece[skipped:].astype(np.float64), command_nm[skipped:].astype(np.float64)
-        more, counted = held_residual_nm2(law, measured_nm, commanded_nm, noise_nm2, timing)
-        squares, frames = squares + more, frames + counted
+        piece_squares, piece_frames = held_residual_nm2(law, measured_nm, commanded_nm, noise_nm2, timing)
+        squares, frames = squares + piece_squares, frames + piece_frames
     return np.asarray(squares / max(frames, 1))
 
 

@@ -20,7 +20,7 @@ FEWEST = 2048
 _LONGEST = 1 << 16  # frames of a segment
 _MAX_LINES = 12
 _SCALES = (3, 9, 27, 81)  # numbers of frequencies over which lines are searched
-_PENALTY = 2.5  # of a line: log-likelihood per log(frequencies); 1.5 is Schwarz's for 3 values, 1 for choosing a place
+_PENALTY = 2.5  # of a line: log-likelihood per log(frequencies); 1.5 for 3 parameters (BIC), 1 for the choice of place
 _SHARE = 0.3  # of the largest gain in likelihood, which a narrower line must reach to be preferred
 _HANN = 1.5  # neighbours are correlated: three count as two
 _LOBE = 12  # frequencies on either side of a line into which the window spreads it
@@ -207,8 +207,8 @@ class _Whittle:
                 )
 
             def cost(parameters: Array) -> float:
-                one = model_of(parameters)
-                floor = _drift(omega, one.drift_nm2, one.cutoff_hz / self.rate_hz) + one.noise_nm2
+                trial = model_of(parameters)
+                floor = _drift(omega, trial.drift_nm2, trial.cutoff_hz / self.rate_hz) + trial.noise_nm2
                 return self.misfit(power, floor + known, counts)
 
             start = np.log([step, white] + ([cutoff] if np.isfinite(cutoff) else []))
@@ -292,8 +292,8 @@ class _Whittle:
             )
 
         def cost(parameters: Array) -> float:
-            one = model_of(parameters)
-            return self.misfit(power, one.spectrum_nm2(omega) + one.noise_nm2, counts)
+            trial = model_of(parameters)
+            return self.misfit(power, trial.spectrum_nm2(omega) + trial.noise_nm2, counts)
 
         floor = [np.log(model.drift_nm2), np.log(model.noise_nm2)] + ([np.log(model.cutoff_hz)] if corner else [])
         lines = [[0.0, np.log(line.width_hz), np.log(line.variance_nm2)] for line in model.lines]

@@ -28,7 +28,7 @@ _NOT_NEW = sum(1 << reason for reason in NOT_NEW)
 
 
 def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
-    """A linear law from rest and a flat mirror; `limit_nm` (modes,) cuts its commands, as in the live loop."""
+    """A linear law from rest and a flat mirror; `limit_nm` (modes,) clips its commands, as in the live loop."""
 
     def step(before: tuple[Single, Single] | None, error_nm: Single, pol_nm: Single) -> tuple[Any, Single]:
         x, held_nm = before or (at_rest(law), np.zeros_like(error_nm))
@@ -140,8 +140,8 @@ def delay_from_times(
     Args:
         sequence: (steps,) of the frames, ascending.
         exposure_start_ns: (steps,) on the clock of `applied_ns`.
-        applied_sequence: (states,) of the frame of the mirror's command.
-        applied_ns: (states,) time of the mirror's report.
+        applied_sequence: (reports,) sequence of the frame of the command that the mirror reports as applied.
+        applied_ns: (reports,) time of the report.
 
     Returns:
         The delay; None if fewer than 20 commands have one from 1 to 10 frames.

@@ -188,16 +188,16 @@ def test_tilt_cross_talk_does_not_favour_a_gain() -> None:
 def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
     """R for fewer modes subtracts twice the mode with the squares of tilt from another mode, which had none of them."""
     tilt_nm, modes_nm = _vibrating(5200, 22)
-    of_own = np.eye(MODES)
-    of_own[7, 4] = -2
-    mixed = (modes_nm @ of_own.T).astype(np.float32)
+    from_own = np.eye(MODES)
+    from_own[7, 4] = -2
+    mixed = (modes_nm @ from_own.T).astype(np.float32)
     gains = []
     for updated in (True, False):
         bank_ = bank(windows=(200, 1000))
         verdicts(bank_, modes_nm[:5000], 0 * ONES, 1.0, tilt_nm[:5000], closed=True)
         bank_.begin_first_window()
         if updated:
-            bank_.use_reconstructor(of_own)
+            bank_.use_reconstructor(from_own)
         gains.append(verdicts(bank_, mixed[5000:], 0 * ONES, 1.0, tilt_nm[5000:], closed=True)[0].gain[7])
     assert gains[0] == 0
     assert gains[1] > 0
