@@ -87,10 +87,11 @@ class Settings:
 
 
 class LawRunner(NamedTuple):
-    """A running linear law: its state x (states,), and the number of frames that it has processed.
+    """A running linear law: its state x (states,), and the frames that it has processed since it began to observe.
 
     It observes for `SETTLING_FRAMES`; over the next `FADING_FRAMES` it takes over from the integrator in a cross-fade,
-    so that the mirror does not jump. Once it drives alone, a `guard` compares it with the integrator.
+    so that the mirror does not jump. When the loop closes, `frames` is set back to at most `SETTLING_FRAMES`. Once
+    the law drives alone, a `guard` compares it with the integrator.
     """
 
     law: LinearLaw
