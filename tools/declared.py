@@ -69,7 +69,7 @@ _ACCEPTANCE = (
     ("linearity: amplitudes, times `linear_nm`", *acceptance_linearity.AMPLITUDES),
     ("linearity: standard errors above the limit at which a value fails", linearity.SURE),
     ("capture-range: amplitudes, times the required one", *acceptance_capture.SIZES),
-    ("capture-range: maximum fraction of a shape that remains", linearity.MISSED),
+    ("capture-range: maximum fraction of a shape that remains", linearity.MAX_RESIDUAL),
 )
 _OPERATING = (
     *_TAKEOVER,

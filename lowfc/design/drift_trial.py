@@ -12,7 +12,7 @@ from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, reference, respo
 
 _INSTANTS = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)])  # Gauss-Legendre, in exposure times
 _SAMPLE_TIMES = (np.arange(8) + 0.5) / 8  # times at which the residual is sampled, in periods
-_SETTLING_TIME_CONSTANTS = 8.0  # time constants of the slowest mode that are discarded
+_SETTLING_TIME_CONSTANTS = 8.0  # time constants of the slowest mode that do not count
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class DriftTrial:
     Attributes:
         twin: twin of the sensor.
         noll: Noll indices of the fitted modes.
-        light_e: electrons per exposure that enter the unobscured circular pupil.
+        light_e: electrons per exposure of the light through the open circle.
         read_noise_e: read noise of a pixel, electrons.
         exposure: exposure time, in periods.
     """
@@ -53,17 +53,17 @@ class DriftTrial:
         times = np.concatenate([self.exposure * _INSTANTS, _SAMPLE_TIMES, [1.0]])
         order = np.argsort(times, kind="stable")
         lengths = np.diff(times[order], prepend=0.0)
-        first = int(np.ceil(_SETTLING_TIME_CONSTANTS / gain[gain > 0].min()))
+        settling = int(np.ceil(_SETTLING_TIME_CONSTANTS / gain[gain > 0].min()))
         start, command, squares = np.zeros(len(gain)), np.zeros(len(gain)), np.zeros(len(gain))
         moves = np.sqrt(lengths[:, None] * step_nm2)
-        for frame in range(first + frames):
+        for frame in range(settling + frames):
             path = np.empty((len(times), len(gain)))
             path[order] = start + np.cumsum(moves * rng.standard_normal(path.shape), axis=0)
             residual = path + command
             opds = residual[: len(_INSTANTS)].astype(np.float32) @ on_nodes
             mean = np.mean([evaluator.image(opd).copy() for opd in opds], axis=0).ravel()  # the buffer is reused
             image = noisy_e(rng, mean * self.light_e, self.read_noise_e)
-            if frame >= first:
+            if frame >= settling:
                 squares += np.square(residual[len(_INSTANTS) : -1]).mean(axis=0)
             command = command - gain * (R @ (image / image.sum() - normalised_I0))
             start = path[-1]

@@ -61,7 +61,7 @@ class FocalLight:
             nolls, (low, high) = NOLLS_20[:count], LITERAL_WAVES
             scale = TABLE3_INPUT_WAVES[count] / input_rms(forms.gram[:count, :count], bounds_waves(nolls, low, high))
             waves = random_wavefronts(np.random.default_rng(_SEED), _WAVEFRONTS, nolls, low * scale, high * scale)
-            phases = (np.tensordot(one, modes[:count], 1) for one in waves)
+            phases = (np.tensordot(wavefront, modes[:count], 1) for wavefront in waves)
             drawn[count] = waves * WAVELENGTH_NM
             aberrated[count] = np.array([focal(sensor.pupil * np.exp(2j * np.pi * phase)) for phase in phases])
         return cls(band, forms, fields, drawn, aberrated)
@@ -117,7 +117,7 @@ class FullLight:
         I0, H = np.zeros(pixels), np.zeros((pixels, len(NOLLS_20)))
         for nm, weight in zip(band.wavelengths_nm, band.weights, strict=True):
             flat, *modes = (self._on_sensor(field, nm) for field in self.focal_light.fields[nm])
-            slopes = [(4.0 * np.pi / nm) * (flat * np.conj(1j * one)).real for one in modes]
+            slopes = [(4.0 * np.pi / nm) * (flat * np.conj(1j * mode)).real for mode in modes]
             I0 += weight * self._intensity(flat)
             H += weight * np.array([pixel_sums(self.sensor, slope).ravel() for slope in slopes]).T
         return Signal(I0, H, 1.0, float(I0.max()))

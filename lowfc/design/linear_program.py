@@ -42,9 +42,9 @@ def maximise(rows: Array, weights: Array, multipliers: Array) -> tuple[Array, Ar
     )
     if result.status or result.x is None:
         raise NotSolvedError(f"the linear program was not solved: {result.message}")
-    found = multipliers.copy()
-    found[tight] -= result.eqlin.marginals
-    found[~tight] -= result.ineqlin.marginals
-    found = np.where(found > 1e-12, found, 0.0)
-    bound = float(np.maximum(weights - found @ rows, 0.0).sum())
-    return np.clip(result.x[: rows.shape[1]], 0.0, 1.0), found, bound
+    updated = multipliers.copy()
+    updated[tight] -= result.eqlin.marginals
+    updated[~tight] -= result.ineqlin.marginals
+    updated = np.where(updated > 1e-12, updated, 0.0)
+    bound = float(np.maximum(weights - updated @ rows, 0.0).sum())
+    return np.clip(result.x[: rows.shape[1]], 0.0, 1.0), updated, bound

@@ -188,13 +188,13 @@ class SamCandidate:
     def in_band(self) -> Signal:
         """I0 and H in the band with the first focal-plane mask."""
         optics, fields = self.optics, self.fields
-        count, first = 1 + optics.band_modes, (1 + len(NOLLS_20)) * len(optics.focal_masks)
+        count, next_start = 1 + optics.band_modes, (1 + len(NOLLS_20)) * len(optics.focal_masks)
         I0: Array = np.zeros(fields[0].size)
         H: Array = np.zeros((fields[0].size, optics.band_modes))
         for wavelength_nm, weight in zip(optics.band.wavelengths_nm, optics.band.weights, strict=True):
             start = 0
             if wavelength_nm != WAVELENGTH_NM:
-                start, first = first, first + count
+                start, next_start = next_start, next_start + count
             image, response = _image_and_response(fields[start : start + count], wavelength_nm)
             I0, H = I0 + weight * image, H + weight * response
         return Signal(I0, H, _pixels_per_sample(optics), float(I0.max()))

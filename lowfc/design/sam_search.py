@@ -110,9 +110,9 @@ def advance(optics: Optics, goal: Goal, bounds: Bounds, chain: Chain) -> Chain:
         best, best_merit = tuple(orbits), current
     end = min(chain.step + BLOCK, chain.steps)
     for step in range(chain.step, end):
-        done = step / chain.steps
-        temperature = _WARM * (_COLD / _WARM) ** done
-        move = _move(rng, bounds, orbits, done)
+        progress = step / chain.steps
+        temperature = _WARM * (_COLD / _WARM) ** progress
+        move = _move(rng, bounds, orbits, progress)
         if move is None:
             continue
         at, orbit = move
@@ -168,9 +168,12 @@ def _packed(rng: np.random.Generator, bounds: Bounds) -> tuple[Orbit, ...] | Non
 
 
 def _move(
-    rng: np.random.Generator, bounds: Bounds, orbits: list[Orbit], done: float
+    rng: np.random.Generator, bounds: Bounds, orbits: list[Orbit], progress: float
 ) -> tuple[int | None, Orbit | None] | None:
-    """A random change: index of the removed orbit, and the added orbit, either or both; None if none was found."""
+    """A random change: index of the removed orbit, and the added orbit, either or both; None if none was found.
+
+    `progress` is the fraction of the chain's steps made so far.
+    """
     at = int(rng.integers(len(orbits)))
     if bounds.count[0] < bounds.count[1] and rng.random() < 0.1:
         count = sum(len(images(orbit, bounds.symmetry)) for orbit in orbits)
@@ -183,9 +186,9 @@ def _move(
         return (None, added) if added is not None else None
     others = orbits[:at] + orbits[at + 1 :]
     paired = len(images(orbits[at], bounds.symmetry)) == 2
-    jumps = rng.random() < 0.25 * (1.0 - done)
+    jumps = rng.random() < 0.25 * (1.0 - progress)
     resizes = bounds.diameter[0] < bounds.diameter[1] and rng.random() < 0.4
-    reach = _FAR * (_NEAR / _FAR) ** done
+    reach = _FAR * (_NEAR / _FAR) ** progress
     for _ in range(_ATTEMPTS):
         x, y, diameter = orbits[at]
         if resizes:

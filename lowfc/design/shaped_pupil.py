@@ -164,9 +164,9 @@ def exchange(request: Request) -> Iterator[Round]:
             yield Round(number, len(points), quarter, _open_area(quarter), bound_area, contrast)
             if not is_open or contrast <= request.contrast:
                 break
-            found, found_signs = _maxima(quarter, request, level * (1 + 1e-6))
-            points, signs = np.concatenate([points, found]), np.concatenate([signs, found_signs])
-            multipliers = np.concatenate([multipliers, np.zeros(len(found))])
+            maxima, maxima_signs = _maxima(quarter, request, level * (1 + 1e-6))
+            points, signs = np.concatenate([points, maxima]), np.concatenate([signs, maxima_signs])
+            multipliers = np.concatenate([multipliers, np.zeros(len(maxima))])
         if is_open:  # with more cells, the limit on the other sign of the field is hardly ever active at a point
             relevant = (signs * _field_at(quarter, points) > 0) | (multipliers > 0)
             points, signs, multipliers = points[relevant], signs[relevant], multipliers[relevant]
@@ -225,8 +225,8 @@ def nearest_feasible(request: Request) -> tuple[float | None, float | None]:
     They are found with the fewest cells that resolve the zone.
 
     Returns:
-        Inner angle (at most twice as large) and contrast (at most 1e5 times as large), each with everything else
-        unchanged; None if even the largest is infeasible.
+        Inner angle, lambda/D (at most twice as large), and contrast (at most 1e5 times as large), each with everything
+        else unchanged; None if even the largest is infeasible.
     """
     coarse = replace(request, cells=_levels(request)[0])
     inners = [round(v, 6) for v in request.inner + 0.1 * np.arange(1, round(10 * request.inner) + 1)]
@@ -239,7 +239,7 @@ def nearest_feasible(request: Request) -> tuple[float | None, float | None]:
 
 def is_feasible(request: Request) -> bool:
     """Whether a mask that meets the contrast and is not closed is found within the rounds."""
-    return [found.contrast <= request.contrast for found in exchange(request)][-1]
+    return [solved.contrast <= request.contrast for solved in exchange(request)][-1]
 
 
 def _last_inner(outer: float) -> float:

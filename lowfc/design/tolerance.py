@@ -1,8 +1,8 @@
 """Tolerances of drift and vibration lines, from theory: the size that a loop can correct to an allowed contrast.
 
 A mode drifts as a random walk of variance D per frame. Its mean over an exposure of e frames is measured with noise of
-variance n; a command takes effect at the next frame. For the residual r at the start of a frame, its change d over the
-frame, and the mean m of its change over the exposure,
+variance n; a command takes effect at the next frame. For the residual r at the start of a frame, the drift d during the
+frame, and the mean m over the exposure of the drift since the start of the frame,
 
     r' = r + d - g (r + m + noise),    var d = D, var m = D e / 3, cov(d, m) = D e / 2
 
@@ -105,15 +105,15 @@ def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> 
 
     if kind == "integrator":  # v = A line + B noise at each gain
         laws = [integrator([gain], [0.0], (2,), DELAY, rate_hz) for gain in np.append(_GAINS, highest_gain(DELAY))]
-        of_noise = np.array([0.0, *(float(noise_gain(law)[0]) for law in laws)])  # the first: without a loop
+        of_noise = np.array([0.0, *(float(noise_gain(law)[0]) for law in laws)])  # the first value: without a loop
         of_line = np.array([1.0, *(residual(law, 1.0) for law in laws)]) - of_noise
         return lambda allowed: np.asarray(np.max((allowed[..., None] - of_noise) / of_line, axis=-1))
 
     def filtered(variance: float) -> float:
         return min(residual(lqg([model(variance)], (2,), timing), variance), variance)
 
-    found = np.log([filtered(variance) for variance in _LINE_RATIOS.tolist()])
-    return lambda allowed: np.asarray(np.exp(np.interp(np.log(allowed), found, np.log(_LINE_RATIOS))))
+    residuals = np.log([filtered(variance) for variance in _LINE_RATIOS.tolist()])
+    return lambda allowed: np.asarray(np.exp(np.interp(np.log(allowed), residuals, np.log(_LINE_RATIOS))))
 
 
 def tolerated_variance(form: float, quartic: float, contrast: float) -> float:

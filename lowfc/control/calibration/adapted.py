@@ -86,7 +86,7 @@ def _rank(matrix: Array) -> int:
 
 def _reconstructed(calibration: Calibration, read_noise_e: float, gain_e: float) -> Calibration:
     """Recompute R from I0 and H, with the weights of its estimator."""
-    made = reconstruct(
+    reconstruction = reconstruct(
         calibration.reference.astype(np.float64),
         calibration.response.astype(np.float64),
         None,
@@ -95,4 +95,4 @@ def _reconstructed(calibration: Calibration, read_noise_e: float, gain_e: float)
         read_noise_e,
         calibration.estimator.partition("+")[0],
     )
-    return replace(calibration, reconstructor=single(made.matrix), operator_hash="", id="")
+    return replace(calibration, reconstructor=single(reconstruction.matrix), operator_hash="", id="")

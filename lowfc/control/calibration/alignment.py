@@ -152,22 +152,24 @@ def _residual(model: Array, real: Array) -> tuple[float, float, float]:
     shape, light = model - model.mean(), real - real.mean()
     square = float(np.vdot(shape, shape))
     flux = float(np.vdot(shape, light)) / square if square else 0.0
-    rest = light - flux * shape
-    return float(np.sqrt(np.mean(rest**2)) / real.std()), flux, float(real.mean() - flux * model.mean())
+    residual = light - flux * shape
+    return float(np.sqrt(np.mean(residual**2)) / real.std()), flux, float(real.mean() - flux * model.mean())
 
 
 def _refine(spline: Array, guess: Geometry, real: Array) -> tuple[float, Geometry]:
+    """Relative residual and geometry of the least-squares fit that starts at a guess."""
+
     def geometry(values: Array) -> Geometry:
         scale, row, column, rotation_deg = values.tolist()
         return Geometry(scale * guess.scale, row, column, rotation_deg, guess.parity)
 
-    def rest(values: Array) -> Array:
+    def residuals(values: Array) -> Array:
         model = _sample(spline, geometry(values), real.shape)
         _, flux, background = _residual(model, real)
         return np.asarray(((real - flux * model - background) / real.std()).ravel())
 
     start = np.array([1.0, guess.row, guess.column, guess.rotation_deg])
-    fit = least_squares(rest, start, x_scale=np.array([0.01, 0.3, 0.3, 1.0]), diff_step=[1e-5])
+    fit = least_squares(residuals, start, x_scale=np.array([0.01, 0.3, 0.3, 1.0]), diff_step=[1e-5])
     best = geometry(fit.x)
     return float(np.sqrt(np.mean(fit.fun**2))), best
 

@@ -80,8 +80,8 @@ class Calibration:
         """Placeholder for no calibration: a mirror of (rows, columns) actuators, without modes or pixels."""
         shapes = array_shapes(0, (0, 0), grid)
         arrays: dict[str, Any] = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
-        rest: dict[str, Any] = {"estimator": "none", "wavelength_nm": 0.0, "operator_hash": "", "id": ""}
-        return cls((), shape=(0, 0), grid=grid, flux_dn=1.0, saturation_dn=np.inf, **arrays, **rest)
+        values: dict[str, Any] = {"estimator": "none", "wavelength_nm": 0.0, "operator_hash": "", "id": ""}
+        return cls((), shape=(0, 0), grid=grid, flux_dn=1.0, saturation_dn=np.inf, **arrays, **values)
 
     def identity(self) -> str:
         """The correct `id`: a hash of all other content."""

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from lowfc.arrays import Array, Mask
 
 _SIGMAS = 8.0
-"""Robust standard deviations from the median beyond which a pixel is bad; none of 6400 good pixels is that far."""
+"""Robust standard deviations above the median beyond which a pixel is bad; none of 6400 good pixels is that far."""
 _MAX_LIGHT = 0.02
 """Largest fraction of the star's light in dark frames."""
 _TO_SIGMA = 1.4826

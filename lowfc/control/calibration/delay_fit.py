@@ -65,15 +65,16 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
     factors, variances = np.zeros(LAGS), np.zeros(LAGS)
     response = np.zeros(len(reference))
     power = 0.0
-    for one, other in (halves, halves[::-1]):
-        responses, _ = _regressed(rows[one], moved[one], instruments[one])
+    for estimating, detecting in (halves, halves[::-1]):
+        responses, _ = _regressed(rows[estimating], moved[estimating], instruments[estimating])
         left, values, right = np.linalg.svd(responses, full_matrices=False)
         direction = right[0] * np.sign(left[:, 0].sum())
-        found, noise = _regressed((rows[other] @ direction)[:, None], moved[other], instruments[other])
-        factors += found[:, 0] / 2
-        variances += noise[:, 0] ** 2 / 4
+        detected = (rows[detecting] @ direction)[:, None]
+        half_factors, errors = _regressed(detected, moved[detecting], instruments[detecting])
+        factors += half_factors[:, 0] / 2
+        variances += errors[:, 0] ** 2 / 4
         response += direction * light * abs(left[:, 0].sum()) * values[0] / 2
-        power += float(((found[:, 0] / noise[:, 0]) ** 2).sum())
+        power += float(((half_factors[:, 0] / errors[:, 0]) ** 2).sum())
     snr = float(np.sqrt(power))
     total = factors.sum()
     if snr < MIN_SNR:

@@ -9,7 +9,7 @@ from lowfc.arrays import Array, Integers
 
 SURE = 3.0
 """Standard errors by which a value must exceed a limit to count as beyond it."""
-MISSED = 0.3
+MAX_RESIDUAL = 0.3
 """Largest residual of a captured shape, in any mode, as a fraction of its amplitude."""
 
 _SIGNS = np.array([1.0, -1.0, -1.0, 1.0])  # so that a linear drift cancels
@@ -80,5 +80,5 @@ def captured(error_nm: Array, command_nm: Array, mode: int, level_nm: float, bef
     """
     moved_nm = command_nm[after, mode].mean() - command_nm[before, mode].mean()
     residual_nm = error_nm[after].mean(axis=0)
-    allowed = MISSED * abs(level_nm)
+    allowed = MAX_RESIDUAL * abs(level_nm)
     return bool(abs(moved_nm + level_nm) <= allowed and (np.abs(residual_nm) <= allowed).all())

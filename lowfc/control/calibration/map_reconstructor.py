@@ -23,7 +23,11 @@ def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: Camer
 
 
 def map_rows(
-    calibration: Calibration, prior_nm2: Array | Single, flux_dn: float, camera: CameraSettings | None, *of: Single
+    calibration: Calibration,
+    prior_nm2: Array | Single,
+    flux_dn: float,
+    camera: CameraSettings | None,
+    *matrices: Single,
 ) -> list[Single]:
     """Matrices M (modes, any), such as R, with the rows M_c - C_cu (C_uu + P_u)^-1 M_u for corrected modes c.
 
@@ -35,17 +39,17 @@ def map_rows(
         prior_nm2: (modes,) mean square of an uncorrected mode; 0 for a corrected mode.
         flux_dn: Sum of the good pixels, for the weights.
         camera: Camera settings; if they or their gain are unknown, or no mode or every mode is corrected, the matrices
-            are returned.
-        of: The matrices M.
+            are returned unchanged.
+        matrices: The matrices M.
     """
     prior_nm2 = np.asarray(prior_nm2, np.float64)
     uncorrected = prior_nm2 > 0
     covariance = noise_covariance_nm2(calibration, flux_dn, camera)
     if covariance is None or not uncorrected.any() or uncorrected.all():
-        return list(of)
+        return list(matrices)
     among = covariance[np.ix_(uncorrected, uncorrected)] + np.diag(prior_nm2[uncorrected])
     mixed = np.linalg.solve(among, covariance[np.ix_(uncorrected, ~uncorrected)]).T
-    found = [matrix.astype(np.float64) for matrix in of]
-    for rows in found:
+    mapped = [matrix.astype(np.float64) for matrix in matrices]
+    for rows in mapped:
         rows[~uncorrected] -= mixed @ rows[uncorrected]
-    return list(map(single, found))
+    return list(map(single, mapped))

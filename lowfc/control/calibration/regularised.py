@@ -101,17 +101,17 @@ def pixel_variance(reference: Array, flux_e: float, read_noise_e: float) -> Arra
     return np.asarray(np.maximum(variance, 1e-12 * variance.max()))
 
 
-def advice(made: Reconstruction, noll: tuple[int, ...], limit_nm: Single) -> str:
+def advice(reconstruction: Reconstruction, noll: tuple[int, ...], limit_nm: Single) -> str:
     """Advice on poorly measured combinations of modes, in one sentence.
 
     Args:
-        made: A reconstruction with the weighted estimator.
+        reconstruction: R and its singular values, by the weighted estimator.
         noll: Noll index of each mode.
         limit_nm: (modes,) largest command; the loop cannot follow a combination with more noise in a frame than the
             limit of its largest mode.
     """
-    noise_nm = 1 / np.maximum(made.singular_values, 1e-300)
-    suppressed, least = int(np.count_nonzero(made.kept < 0.5)), float(made.kept.min())
+    noise_nm, kept = 1 / np.maximum(reconstruction.singular_values, 1e-300), reconstruction.kept
+    suppressed, least = int(np.count_nonzero(kept < 0.5)), float(kept.min())
     if suppressed:
         return (
             f"{suppressed} of {len(noll)} combinations of modes are suppressed: they are not controlled, and their "
@@ -119,16 +119,18 @@ def advice(made: Reconstruction, noll: tuple[int, ...], limit_nm: Single) -> str
         )
     if least <= 0.999:
         return f"the worst-measured combination of modes is damped to {least:.1%}: its modes are measured too small"
-    limits_nm = limit_nm[np.abs(made.combinations).argmax(axis=0)]
+    limits_nm = limit_nm[np.abs(reconstruction.combinations).argmax(axis=0)]
     bad = np.flatnonzero(noise_nm > limits_nm)
     if bad.size == 0:
         return (
             "no regularisation needed: the worst-measured combination of modes has "
             f"{noise_nm[-1]:.2g} nm of noise in a frame"
         )
-    worst = np.argsort(-np.abs(made.combinations[:, bad[-1]]))[:2]
+    worst = np.argsort(-np.abs(reconstruction.combinations[:, bad[-1]]))[:2]
     names = " and ".join(f"Z{noll[mode]}" for mode in worst)
-    cut = made.singular_values[bad[0]] / made.singular_values[0]  # 1 if all are bad: nothing would be left
+    cut = (
+        reconstruction.singular_values[bad[0]] / reconstruction.singular_values[0]
+    )  # 1 if all are bad: nothing would be left
     drop = f", or drop them with --truncate {1.01 * cut:.3g}" if bad[0] else ""
     return (
         f"{bad.size} combinations of modes (mostly {names}) are measured with more noise than the "

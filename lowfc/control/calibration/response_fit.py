@@ -163,12 +163,12 @@ def cycle_response(
     y, x, z = fractions[kept][poked], x[poked], z[poked]
     slow = _slow(np.flatnonzero(kept)[poked], len(used), slowest)
     z = z - slow @ (slow.T @ z)
-    together = (x - x.mean(axis=0)).T @ z
-    if not np.linalg.cond(together) < _WORST_INSTRUMENT:
+    covariance = (x - x.mean(axis=0)).T @ z
+    if not np.linalg.cond(covariance) < _WORST_INSTRUMENT:
         raise ValueError(
             f"the {len(z)} usable frames do not tell the {x.shape[1]} modes apart: too many frames were lost or refused"
         )
-    response = np.linalg.solve(together.T, z.T @ y).T
+    response = np.linalg.solve(covariance.T, z.T @ y).T
     at_rest = fractions[kept][~poked]
     reference = at_rest.mean(axis=0) if len(at_rest) else None
     return Cycle(response, reference, float(flux_dn[kept].mean()))
