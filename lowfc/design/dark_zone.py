@@ -19,8 +19,8 @@ def first_points(zone: Wedge, step: float) -> Array:
     """Points (n, 2), x and y, of a square grid in the zone, and along its edges, where the field is largest."""
     axis = _axis(step, zone.outer)
     y, x = np.nonzero(_inside(zone, axis))
-    found = np.concatenate([np.column_stack([axis[x], axis[y]]), edge_points(zone, step)])
-    return np.unique(np.round(found, 9), axis=0)
+    points = np.concatenate([np.column_stack([axis[x], axis[y]]), edge_points(zone, step)])
+    return np.unique(np.round(points, 9), axis=0)
 
 
 def edge_points(zone: Wedge, step: float) -> Array:

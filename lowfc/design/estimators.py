@@ -78,7 +78,7 @@ def iterated(fit: Fit, image_e: Array, model: Model, iterations: int) -> list[Ar
         model: The sensor's image for modes in nm.
         iterations: Number of iterations.
     """
-    found = [estimate(fit, image_e)]
+    estimates = [estimate(fit, image_e)]
     for _ in range(iterations):
-        found.append(found[-1] + fit.R @ (image_e - fit.scale_e * model(found[-1])))
-    return found
+        estimates.append(estimates[-1] + fit.R @ (image_e - fit.scale_e * model(estimates[-1])))
+    return estimates

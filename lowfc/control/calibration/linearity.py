@@ -66,9 +66,9 @@ def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Integers, frames
     height = np.abs(levels_nm[:: len(_SIGNS)])
     amplitudes = np.unique(height)
     cycles = [per_cycle[height == amplitude] / amplitude for amplitude in amplitudes]
-    found = np.stack([each.mean(axis=0) for each in cycles])
-    uncertain = np.stack([each.std(axis=0, ddof=1) / np.sqrt(len(each)) for each in cycles])
-    return Gains(amplitudes, found, uncertain, mode)
+    mean_gain = np.stack([each.mean(axis=0) for each in cycles])
+    error = np.stack([each.std(axis=0, ddof=1) / np.sqrt(len(each)) for each in cycles])
+    return Gains(amplitudes, mean_gain, error, mode)
 
 
 def captured(error_nm: Array, command_nm: Array, mode: int, level_nm: float, before: slice, after: slice) -> bool:

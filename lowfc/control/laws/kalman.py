@@ -58,18 +58,18 @@ def _riccati(A: Array, Q: Array, C: Array) -> Array:
     Raises:
         ValueError: it does not converge.
     """
-    seen, passed, found = np.outer(C, C), A.T, Q
+    seen, passed, X = np.outer(C, C), A.T, Q
     identity = np.eye(len(A))
     for _ in range(_DOUBLINGS):
-        inside = np.linalg.solve(identity + seen @ found, np.hstack([passed, seen]))
+        inside = np.linalg.solve(identity + seen @ X, np.hstack([passed, seen]))
         solved_passed, solved_seen = inside[:, : len(A)], inside[:, len(A) :]
-        grown = passed.T @ found @ solved_passed
+        grown = passed.T @ X @ solved_passed
         seen = seen + passed @ solved_seen @ passed.T
         passed = passed @ solved_passed
-        found = found + (grown + grown.T) / 2
+        X = X + (grown + grown.T) / 2
         seen = (seen + seen.T) / 2
-        if np.abs(grown).max() <= 1e-12 * np.abs(found).max():
-            return np.asarray(found)
+        if np.abs(grown).max() <= 1e-12 * np.abs(X).max():
+            return np.asarray(X)
     raise ValueError(
         f"no Kalman filter settles within {2**_DOUBLINGS} frames: drift or line far below the noise, or no noise"
     )

@@ -146,15 +146,15 @@ def noise_transfer(law: LinearLaw, frequency_hz: Array, delay_frames: float | No
 
 def noise_gain(law: LinearLaw, delay_frames: float | None = None) -> Array:
     """Variance (modes,) of the residual per variance of white noise of one frame of the same mode."""
-    found, weights = np.zeros(len(law.noll)), _weights(law, delay_frames)
+    gain, weights = np.zeros(len(law.noll)), _weights(law, delay_frames)
     for part in _parts(law):
         if not part.driven:
             continue
         omega = _frequencies(_poles(part.closed(weights)))
         S = part.sensitivity(omega, weights)
         for place, mode in enumerate(part.modes.tolist()):
-            found[mode] = np.trapezoid(np.abs(S[:, place, place] - 1) ** 2, omega) / np.pi
-    return found
+            gain[mode] = np.trapezoid(np.abs(S[:, place, place] - 1) ** 2, omega) / np.pi
+    return gain
 
 
 def _weights(law: LinearLaw, delay_frames: float | None) -> Array:
@@ -164,11 +164,11 @@ def _weights(law: LinearLaw, delay_frames: float | None) -> Array:
 def sensitivity(law: LinearLaw, omega: Array, delay_frames: float | None = None) -> Complex:
     """Complex S (frequencies, modes) of each mode, at frequencies in rad per frame."""
     weights, omega = _weights(law, delay_frames), np.maximum(omega, _LOWEST)
-    found = np.ones((omega.size, len(law.noll)), complex)
+    of_modes = np.ones((omega.size, len(law.noll)), complex)
     for part in _parts(law):
         S = part.sensitivity(omega, weights)
-        found[:, part.modes] = np.einsum("fmm->fm", S)
-    return found
+        of_modes[:, part.modes] = np.einsum("fmm->fm", S)
+    return of_modes
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,13 +229,13 @@ def _parts(law: LinearLaw) -> list[_Part]:
     linked = np.block([[np.abs(F) + np.abs(A), np.abs(G) + np.abs(U)], [np.abs(K), np.zeros((modes, modes))]])
     label = _first_linked(linked + linked.T + np.eye(len(linked)) > 0)
     own = delay_weights(law.delay_frames) if law.signal == "pol" else np.zeros(0)
-    found = []
+    parts = []
     for number in np.unique(label).tolist():
         x, m = np.flatnonzero(label[:states] == number), np.flatnonzero(label[states:] == number)
         if m.size and x.size:
             own_states, driving = np.ix_(x, x), np.ix_(x, m)
-            found.append(_Part(m, F[own_states], G[driving], U[driving], A[own_states], K[np.ix_(m, x)], own))
-    return found
+            parts.append(_Part(m, F[own_states], G[driving], U[driving], A[own_states], K[np.ix_(m, x)], own))
+    return parts
 
 
 def _first_linked(linked: Mask) -> Integers:

@@ -76,10 +76,10 @@ def _block(
     residues: list[tuple[complex, complex]] = []  # pole, residue
 
     def law(z: complex) -> complex:
-        found = gain / (1 - (1 - leak) / z) + proportional
+        response = gain / (1 - (1 - leak) / z) + proportional
         for pole, residue in residues:
-            found += residue / (1 - pole / z) + residue.conjugate() / (1 - pole.conjugate() / z)
-        return found
+            response += residue / (1 - pole / z) + residue.conjugate() / (1 - pole.conjugate() / z)
+        return response
 
     for notch in notches:
         omega = 2 * np.pi * notch.frequency_hz / rate_hz

@@ -77,7 +77,7 @@ def measure_lines(error_nm: Array, added_nm: Array) -> Lines:
         raise ValueError(f"errors {error_nm.shape} and added signal {added_nm.shape} must have the same frames")
     frames = len(error_nm)
     response, added = _hann(error_nm), _hann(added_nm)
-    found: list[tuple[Integers, Integers, Complex, Array]] = []
+    by_mode: list[tuple[Integers, Integers, Complex, Array]] = []
     for mode in range(error_nm.shape[1]):
         amplitude = np.abs(np.fft.rfft(added_nm[:, mode])) / frames
         bins = np.flatnonzero(amplitude[1:-1] > _FAINTEST * amplitude[1:-1].max(initial=0.0)) + 1
@@ -94,10 +94,10 @@ def measure_lines(error_nm: Array, added_nm: Array) -> Lines:
         flank_power = _OF_FLANKS * np.mean(np.abs(flanks) ** 2, axis=1)
         noise = np.sqrt(np.maximum(np.nanmean(adjacent_power, axis=1), flank_power) / 2)
         S = response[bins, mode] / added[bins, mode]
-        found.append((np.full(bins.size, mode), bins, S, noise / np.abs(added[bins, mode])))
-    if not found:
+        by_mode.append((np.full(bins.size, mode), bins, S, noise / np.abs(added[bins, mode])))
+    if not by_mode:
         raise ValueError("nothing was added to the loop's input: there is nothing to measure")
-    modes, bins, S, error = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    modes, bins, S, error = (np.concatenate(parts) for parts in zip(*by_mode, strict=True))
     return Lines(modes, bins / frames, S, error)
 
 

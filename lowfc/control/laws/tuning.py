@@ -115,13 +115,13 @@ def identify_modes(run: TimeSeries, rate_hz: float) -> list[Model]:
     Raises:
         ValueError: there are too few frames in a row.
     """
-    found = []
+    models = []
     for mode in range(run.values[0].shape[1] if run.values else 0):
         model = identify(run.columns(slice(mode, mode + 1)), rate_hz)
         if model is None:
             raise ValueError(f"a model is fitted to at least {FEWEST} frames in a row, there are fewer")
-        found.append(model)
-    return found
+        models.append(model)
+    return models
 
 
 def tune_integrator(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing) -> Tuned:
@@ -169,8 +169,8 @@ def tune_pi_notch(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], 
     Leaks (modes,) without unit.
     """
     rate_hz = models[0].rate_hz
-    found = [_notched(*mode, timing) for mode in zip(models, gains.gain.tolist(), leak.tolist(), strict=True)]
-    gain, notches = np.array([g for g, _ in found]), [of_mode for _, of_mode in found]
+    tuned = [_notched(*mode, timing) for mode in zip(models, gains.gain.tolist(), leak.tolist(), strict=True)]
+    gain, notches = np.array([g for g, _ in tuned]), [of_mode for _, of_mode in tuned]
     law = pi_notch(noll, gain, np.zeros(len(noll)), leak, notches, timing.delay, rate_hz)
     return _tuned(law, timing, ["pi-notch" if of_mode else "integrator" for of_mode in notches], models)
 
@@ -201,20 +201,20 @@ def _notched(model: Model, gain: float, leak: float, timing: Timing) -> tuple[fl
 
 def _tuned(law: LinearLaw, timing: Timing, kinds: Sequence[str], models: Sequence[Model]) -> Tuned:
     margins.check_stable(law, timing.delay)
-    found = margins.margins(law, timing.delay)
-    return Tuned(law, found, predicted_nm(law, models, timing), tuple(kinds), tuple(models))
+    law_margins = margins.margins(law, timing.delay)
+    return Tuned(law, law_margins, predicted_nm(law, models, timing), tuple(kinds), tuple(models))
 
 
 def predicted_nm(law: LinearLaw, models: Sequence[Model], timing: Timing) -> Array:
     """Rms (modes,) over all time of the true residual of modes with these models."""
-    found = np.zeros(len(models))
+    variance_nm2 = np.zeros(len(models))
     for mode, model in enumerate(models):
         omega = _fine_frequencies(model)
         measured = model.spectrum_nm2(omega)[:, None] + model.noise_nm2
         noise_nm2 = np.full(len(models), model.noise_nm2)
         power = residual_spectrum(law, omega, measured, noise_nm2, timing)[:, mode]
-        found[mode] = np.trapezoid(power, omega) / np.pi
-    return np.sqrt(found)
+        variance_nm2[mode] = np.trapezoid(power, omega) / np.pi
+    return np.sqrt(variance_nm2)
 
 
 def predicted_nm2(law: LinearLaw, models: Sequence[Model], noise_nm2: Array, timing: Timing) -> Array:
@@ -224,9 +224,9 @@ def predicted_nm2(law: LinearLaw, models: Sequence[Model], noise_nm2: Array, tim
     """
     omega = np.linspace(0, np.pi, 2049)[1:]
     passed = commanded(law, omega, timing.delay)
-    found = np.asarray((passed.T @ passed.conj()).real / len(omega) * frame_noise_nm2(models, noise_nm2))
-    np.fill_diagonal(found, predicted_nm(law, models, timing) ** 2)
-    return found
+    covariance_nm2 = np.asarray((passed.T @ passed.conj()).real / len(omega) * frame_noise_nm2(models, noise_nm2))
+    np.fill_diagonal(covariance_nm2, predicted_nm(law, models, timing) ** 2)
+    return covariance_nm2
 
 
 def frame_noise_nm2(models: Sequence[Model], noise_nm2: Array) -> Array:

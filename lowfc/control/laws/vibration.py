@@ -65,10 +65,10 @@ class Model:
         Its mean over all frequencies from -pi to pi is the variance.
         """
         shown = np.maximum(omega, 2 * np.pi * self.lowest_hz / self.rate_hz)
-        found = _drift(shown, self.drift_nm2, self.cutoff_hz / self.rate_hz)
+        power = _drift(shown, self.drift_nm2, self.cutoff_hz / self.rate_hz)
         for line in self.lines:
-            found = found + _line(omega, *_per_frame(line, self.rate_hz))
-        return found
+            power = power + _line(omega, *_per_frame(line, self.rate_hz))
+        return power
 
     def states(self) -> tuple[Array, Array, Array]:
         """A, Q (states, states), C (states,) of x[k] = A x[k-1] + q, disturbance[k] = C x[k]; Q the covariance of q."""
@@ -144,15 +144,15 @@ class _Whittle:
             return None
         window = np.hanning(frames + 2)[1:-1]
         window /= np.sqrt(np.sum(window**2))
-        found, segments = np.zeros(frames // 2 + 1), 0
+        power, segments = np.zeros(frames // 2 + 1), 0
         for piece in run.values:
             for start in range(0, len(piece) - frames + 1, frames):
                 values = piece[start : start + frames, 0]
-                found += np.abs(rfft(window * (values - values.mean()))) ** 2
+                power += np.abs(rfft(window * (values - values.mean()))) ** 2
                 segments += 1
         keep = slice(3, -1)  # the window removes the lowest with the mean; half the frame rate has another distribution
-        omega = 2 * np.pi * np.arange(found.size) / frames
-        return cls(omega[keep], np.maximum(found[keep] / segments, 1e-300), segments, rate_hz)
+        omega = 2 * np.pi * np.arange(power.size) / frames
+        return cls(omega[keep], np.maximum(power[keep] / segments, 1e-300), segments, rate_hz)
 
     @property
     def frequency_hz(self) -> Array:
@@ -227,17 +227,17 @@ class _Whittle:
         free[:_LOBE] = False  # drift dominates there
         for line in model.lines:
             free &= np.abs(self.frequency_hz - line.frequency_hz) > max(_LOBE * self.spacing_hz, 1.5 * line.width_hz)
-        found = []
+        candidates = []
         for scale in _SCALES:
             mean = np.convolve(ratio, np.ones(scale) / scale, "same")
             gain = scale * self.segments / _HANN * (mean - 1 - np.log(mean)) * (mean > 1) * free
             place = int(np.argmax(gain))
-            found.append((float(gain[place]), place, scale))
-        largest = max(gain for gain, _, _ in found)
+            candidates.append((float(gain[place]), place, scale))
+        largest = max(gain for gain, _, _ in candidates)
         if largest < _PENALTY * np.log(ratio.size):
             return None
         # The narrowest with a fair share of the gain: a wide one could be two separate lines.
-        place, scale = next((place, scale) for gain, place, scale in found if gain >= _SHARE * largest)
+        place, scale = next((place, scale) for gain, place, scale in candidates if gain >= _SHARE * largest)
         if scale == _SCALES[0]:  # of its three frequencies, the one of the highest power
             place += int(np.argmax(self.power[place - 1 : place + 2])) - 1
         near = slice(max(place - max(_FULL, 3 * scale), 0), place + max(_FULL, 3 * scale) + 1)

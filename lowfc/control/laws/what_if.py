@@ -144,7 +144,7 @@ def delay_from_times(
         applied_ns: (reports,) time of the report.
 
     Returns:
-        The delay; None if fewer than 20 commands have one from 1 to 10 frames.
+        The delay; None if fewer than 20 commands have a delay from 1 to 10 frames.
     """
     commanding, first = np.unique(applied_sequence, return_index=True)  # a command may be applied repeatedly
     after = np.searchsorted(exposure_start_ns, applied_ns[first], side="right")

@@ -100,7 +100,7 @@ def judged(interlocks: tuple[Interlock, ...], acting: tuple[Acting, ...], report
 
     An interlock that acts already keeps its cause, unless a value replaces a missing one or vice versa.
     """
-    before = {one.number: one for one in acting}
+    before = {each.number: each for each in acting}
     after = dict(before)
     for number, interlock in enumerate(interlocks):
         if interlock.name == report.name:
@@ -114,7 +114,9 @@ def judged(interlocks: tuple[Interlock, ...], acting: tuple[Acting, ...], report
 
 def refusal(acting: tuple[Acting, ...], name: str) -> str:
     """Why acting interlocks refuse to `close` the loop or `clear` safe mode; empty if they do not."""
-    return "; ".join(f"an interlock acts: {one.why}" for one in acting if one.action in _REFUSING.get(name, ()))
+    return "; ".join(
+        f"an interlock acts: {interlock.why}" for interlock in acting if interlock.action in _REFUSING.get(name, ())
+    )
 
 
 def shown(value: Value) -> str:

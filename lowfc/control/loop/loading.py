@@ -68,7 +68,8 @@ def loaded(
     if mode is LoopMode.SAFE:
         cause = LATCHED
     state = state._replace(loop=loop)
-    acting = tuple(one for one in state.conditions.acting if one.action is not Action.HOLD)  # a held loop stays closed
+    # A held loop stays closed.
+    acting = tuple(interlock for interlock in state.conditions.acting if interlock.action is not Action.HOLD)
     if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
         mode, cause = LoopMode.IDLE, wrong
     elif mode is LoopMode.CLOSED and (wrong := misfit(state)):
@@ -127,9 +128,9 @@ def interlock_or_permit_cause(state: State) -> str:
     acting, lease = state.conditions.acting, state.conditions.lease
     if lease is not None and lease.holds and not lease.ended:
         return f"it is held for {lease.holder}"
-    for one in acting:
-        if one.action is Action.HOLD:
-            return f"an interlock acts: {one.why}"
+    for interlock in acting:
+        if interlock.action is Action.HOLD:
+            return f"an interlock acts: {interlock.why}"
     return ""
 
 
@@ -143,19 +144,26 @@ def bench_reported(settings: Settings, state: State, report: BenchReport) -> tup
     after = judged(settings.interlocks, before, report)
     if after is before:
         return state, Outputs()
-    begun = [one for one in after if one not in before]
-    events = [PendingEvent("INTERLOCK_ACTS", {"why": one.why, "action": IN_WORDS[one.action]}) for one in begun]
-    acting_now = {one.number for one in after}
-    events += [PendingEvent("INTERLOCK_CLEARED", {"why": one.why}) for one in before if one.number not in acting_now]
+    begun = [interlock for interlock in after if interlock not in before]
+    events = [
+        PendingEvent("INTERLOCK_ACTS", {"why": interlock.why, "action": IN_WORDS[interlock.action]})
+        for interlock in begun
+    ]
+    acting_now = {interlock.number for interlock in after}
+    events += [
+        PendingEvent("INTERLOCK_CLEARED", {"why": interlock.why})
+        for interlock in before
+        if interlock.number not in acting_now
+    ]
     state = state._replace(conditions=state.conditions._replace(acting=after))
     opening = (Action.OPEN,) if state.frames_used and not state.waits else (Action.OPEN, Action.REFUSE_CLOSE)
-    for one in begun:
-        mode, cause = state.mode, f"an interlock acts: {one.why}"
-        if one.action is Action.SAFE:
+    for interlock in begun:
+        mode, cause = state.mode, f"an interlock acts: {interlock.why}"
+        if interlock.action is Action.SAFE:
             mode = LoopMode.SAFE
-        elif one.action in opening and mode is LoopMode.CLOSED:
+        elif interlock.action in opening and mode is LoopMode.CLOSED:
             mode = LoopMode.OPEN
-        elif one.action in opening and state.waits:  # it no longer closes by itself
+        elif interlock.action in opening and state.waits:  # it no longer closes by itself
             state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
         state = _changed(state, mode, report.time_ns, cause, events)
     return state, Outputs(events=events, changed=True)

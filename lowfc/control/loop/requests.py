@@ -208,9 +208,9 @@ def _channel(settings: Settings, state: State, request: Request) -> Handled:
     before = loop.channels_or_empty()
     channels = before.with_shape(request.text, shape_nm, loop.to_modes)
     if not request.actuators_nm.size and before.channel(request.text) is None:
-        names = ", ".join(one.name for one in before.channels)
+        names = ", ".join(channel.name for channel in before.channels)
         raise ValueError(f"there is no channel {request.text!r} to remove; there are {names or 'none'}")
-    commanded = (one.shape_nm for one in channels.channels if one.commanded)
+    commanded = (channel.shape_nm for channel in channels.channels if channel.commanded)
     _check_shape(settings.limits, sum(commanded, np.zeros(grid, np.float32)), "with the other channels, ")
     rms_nm = float(np.sqrt(np.mean(np.square(shape_nm, dtype=np.float64))))
     return _with(state, loop, channels), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
