@@ -16,7 +16,7 @@ from lowfc.control.loop.wording import counted
 FLAT = "flat"
 """Channel of the mirror's flat map: the reference image includes it, so it shifts nothing."""
 ADOPTED = "adopted"
-"""Channel of the part of the mirror's shape outside the modes, at the controller's start or at a change of modes."""
+"""Channel of the mirror's shape outside the modes when the controller started or a calibration was loaded."""
 EXTERNAL = "external"
 """Channel of shapes that other programs apply to the mirror: the loop does not command it."""
 MAX_CHANNELS = 16
@@ -30,7 +30,7 @@ MAX_NAME_LENGTH = 32
 class Channel(NamedTuple):
     """A shape added to the command, (rows, columns), nm of surface, and the part of it reached so far.
 
-    With `of`, both are the same array once the mirror has reached the shape.
+    Once the command has reached the shape, `reached_nm` is the same array as `shape_nm`; `of` makes it so.
     """
 
     name: str

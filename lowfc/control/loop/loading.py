@@ -156,14 +156,14 @@ def bench_reported(settings: Settings, state: State, report: BenchReport) -> tup
         if interlock.number not in acting_now
     ]
     state = state._replace(conditions=state.conditions._replace(acting=after))
-    opening = (Action.OPEN,) if state.frames_used and not state.waits else (Action.OPEN, Action.REFUSE_CLOSE)
+    opening = (Action.OPEN,) if state.frames_used and not state.waits_for_gains else (Action.OPEN, Action.REFUSE_CLOSE)
     for interlock in begun:
         mode, cause = state.mode, f"an interlock acts: {interlock.why}"
         if interlock.action is Action.SAFE:
             mode = LoopMode.SAFE
         elif interlock.action in opening and mode is LoopMode.CLOSED:
             mode = LoopMode.OPEN
-        elif interlock.action in opening and state.waits:  # it no longer closes by itself
+        elif interlock.action in opening and state.waits_for_gains:  # it no longer closes by itself
             state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
         state = _changed(state, mode, report.time_ns, cause, events)
     return state, Outputs(events=events, changed=True)
@@ -258,7 +258,7 @@ def camera_reported(settings: Settings, state: State, camera: CameraSettings) ->
     if wrong and wrong != misfit(state):
         events.append(PendingEvent("CAMERA_CHANGED", {"what": wrong}))
         cause = f"{CAMERA_MISFIT}: {wrong}"
-        if after.waits:
+        if after.waits_for_gains:
             after = after._replace(conditions=after.conditions._replace(mode_cause=cause))
     if mode is not LoopMode.SAFE and uncalibrated(after) and not after.frames_used:
         mode = LoopMode.IDLE

@@ -106,9 +106,9 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
         reply = "the loop is open already, and holds the command"
     if request.name == "close" and state.mode is LoopMode.CLOSED and not state.steps_left:
         reply = "the loop stays closed"
-    if request.name == "close" and request.text.startswith(f"{AUTO}: ") and not state.waits:
+    if request.name == "close" and request.text.startswith(f"{AUTO}: ") and not state.waits_for_gains:
         raise ValueError("the loop no longer waits for its gains")
-    if (request.name == "open" and paused) or (after is LoopMode.OPEN and state.waits):  # it stays open
+    if (request.name == "open" and paused) or (after is LoopMode.OPEN and state.waits_for_gains):  # it stays open
         state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
     if after is LoopMode.CLOSED and state.loop is not None and state.loop.calibration.provisional:
         reply += (

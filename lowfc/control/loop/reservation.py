@@ -75,7 +75,7 @@ def permit(settings: Settings, state: State, request: Request) -> tuple[State, s
     if play is not None and not play.over(state.frame_sequence + 1):
         raise ValueError("a probe sequence is being played, and the move would disturb its measurement")
     if not request.values:
-        if closed or state.waits:
+        if closed or state.waits_for_gains:
             what = "is closed" if closed else "closes once its gains are measured"
             raise ValueError(f"the loop {what}, and would follow the move: request a hold of some seconds")
         return state, f"granted: the loop is {state.mode.in_words}"

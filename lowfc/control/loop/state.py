@@ -340,6 +340,6 @@ class State(NamedTuple):
         return self.commanded or not self.conditions.mirror_fault or self.mode is LoopMode.SAFE
 
     @property
-    def waits(self) -> bool:
+    def waits_for_gains(self) -> bool:
         """Whether the loop is open only until its gains are measured."""
         return self.mode is LoopMode.OPEN and self.conditions.mode_cause == MEASURED_FIRST

@@ -224,7 +224,7 @@ class GainWatch:
         if loop.automatic.any() and (initial or not np.array_equal(gain, loop.integrator.gain)):
             requests.append(self._gain_request(step, loop, gain))
         self.closing_harm = "" if state.mode is LoopMode.CLOSED else self._closing_harm(gain, loop)
-        if state.waits and all(group.verdict is not None for group in self._groups):
+        if state.waits_for_gains and all(group.verdict is not None for group in self._groups):
             requests.append(
                 Request(step.time_ns, "close", text=f"{AUTO}: the gains were measured", requester=REQUESTER)
             )
