@@ -50,12 +50,12 @@ def test_publish_and_receive_rights_follow_the_table_of_topics(topic: Topic) -> 
     assert receivers == subscribers | ({"operator"} if "viewer" in subscribers else set())
 
 
-def _covers(keys: tuple[str, ...], key: str) -> bool:
+def _covers(patterns: tuple[str, ...], key: str) -> bool:
     parts = key.split("/")
     return any(
-        len(words := one.split("/")) == len(parts)
+        len(words := pattern.split("/")) == len(parts)
         and all(word in ("*", part) for word, part in zip(words, parts, strict=True))
-        for one in keys
+        for pattern in patterns
     )
 
 
@@ -78,11 +78,11 @@ def test_access_control_denies_by_default_and_refers_to_defined_names_only() -> 
     control = access_control(["mirror-dm", "mirror-tip"])
     assert control["enabled"]
     assert control["default_permission"] == "deny"
-    rules, subjects = ({one["id"]: one for one in control[name]} for name in ("rules", "subjects"))
+    rules, subjects = ({entry["id"]: entry for entry in control[name]} for name in ("rules", "subjects"))
     assert len(rules) == len(control["rules"])
     assert all(rule["permission"] == "allow" for rule in rules.values())
     assert {"mirror-dm", "mirror-tip"} <= set(subjects)
-    assert all(one["cert_common_names"] == [name] for name, one in subjects.items())
+    assert all(subject["cert_common_names"] == [name] for name, subject in subjects.items())
     for policy in control["policies"]:
         assert set(policy["rules"]) <= set(rules)
         assert set(policy["subjects"]) <= set(subjects)
@@ -129,9 +129,9 @@ class Hosts:
 
 @pytest.fixture
 def hosts(tmp_path: Path) -> Iterator[Hosts]:
-    made = Hosts(tmp_path)
-    yield made
-    for bus in reversed(made.buses):
+    joined = Hosts(tmp_path)
+    yield joined
+    for bus in reversed(joined.buses):
         bus.close()
 
 
@@ -150,26 +150,27 @@ def test_the_router_forwards_exactly_what_the_table_of_topics_allows(hosts: Host
     publishers = [bus[role].publisher(topic, "dm") for role in ROLES for topic in topics]
     roles_of = [role for role in ROLES for _ in topics]
 
-    def allowed(role: str, topic: Topic, by: str) -> bool:
+    def allowed(role: str, topic: Topic, publisher_role: str) -> bool:
         key = topic.at("dm")
-        return _covers(grant(role).receives, key) and _covers(grant(by).publishes, key)
+        return _covers(grant(role).receives, key) and _covers(grant(publisher_role).publishes, key)
 
     expected = {
-        (role, topic.at("dm"), by)
+        (role, topic.at("dm"), publisher_role)
         for role in ROLES
         for topic in topics
-        for by in ROLES
-        if role != by and allowed(role, topic, by)
+        for publisher_role in ROLES
+        if role != publisher_role and allowed(role, topic, publisher_role)
     }
     assert len(expected) > 30
 
     def put() -> None:
-        for publisher, by in zip(publishers, roles_of, strict=True):
-            publisher.put(by.encode())
+        for publisher, publisher_role in zip(publishers, roles_of, strict=True):
+            publisher.put(publisher_role.encode())
 
     until(lambda: expected <= received, each=put)
     time.sleep(0.2)
-    assert {one for one in received if one[0] != one[2]} == expected  # own messages are delivered locally
+    forwarded = {message for message in received if message[0] != message[2]}  # own messages are delivered locally
+    assert forwarded == expected
     bus["controller"].queryable("lowfc/request/*", lambda query: query.reply(b"done"))
     bus["camera"].queryable("lowfc/request/*", lambda query: query.reply(b"forged"))
     until(lambda: bus["operator"].get("lowfc/request/status"))
@@ -247,7 +248,7 @@ def test_a_lost_router_is_reported_with_the_reason(hosts: Hosts, capfd: pytest.C
     await_report("camera: the router is back\n")
 
 
-def test_there_is_no_wait_for_an_unreachable_router_or_after_a_repeated_refusal(
+def test_an_unknown_name_of_the_router_and_a_session_that_does_not_open_are_errors_without_a_wait(
     hosts: Hosts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hosts.join(ROUTER)
@@ -277,8 +278,8 @@ def test_a_roles_certificate_is_not_accepted_as_the_routers(hosts: Hosts, monkey
 
 def test_a_run_keeps_its_network(tmp_path: Path) -> None:
     network = Network(router="tls/bench:7447", certificates=str(tmp_path))
-    made = open_run("hosts", base=tmp_path, network=network)
-    assert made.links.network == network
+    first = open_run("hosts", base=tmp_path, network=network)
+    assert first.links.network == network
     for later in (None, Network(), network):
         assert open_run("hosts", base=tmp_path, network=later).links.network == network
     other = Network(router="tls/elsewhere:7447", certificates=str(tmp_path))
@@ -287,7 +288,7 @@ def test_a_run_keeps_its_network(tmp_path: Path) -> None:
     assert open_run("alone", base=tmp_path).links.network == Network()
     with pytest.raises(BusError, match="run 'alone' is on this host alone, and"):
         open_run("alone", base=tmp_path, network=network)
-    open_run("launched", base=tmp_path, listeners=(Role.LAUNCHER,))  # stays on its host
+    open_run("launched", base=tmp_path, listeners=(Role.LAUNCHER,))  # a launcher's run stays on its host
     assert open_run("launched", base=tmp_path, network=network).links.network == Network()
 
 

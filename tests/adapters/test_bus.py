@@ -48,11 +48,11 @@ def _runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def join() -> Iterator[Join]:
     buses: list[ZenohBus] = []
 
-    def begin(run: Run, role: str, **how: bool) -> ZenohBus:
-        buses.append(ZenohBus(run.links, role, HostClock(), **how))
+    def new_bus(run: Run, role: str, **options: bool) -> ZenohBus:
+        buses.append(ZenohBus(run.links, role, HostClock(), **options))
         return buses[-1]
 
-    yield begin
+    yield new_bus
     for bus in buses:
         bus.close()
 
@@ -81,7 +81,7 @@ def test_a_put_reaches_every_subscriber_of_its_key(pair: tuple[Bus, Bus]) -> Non
     assert not frames
 
 
-def test_no_link_blocks_its_process_while_it_is_closed(run: Run, join: Join) -> None:
+def test_closing_a_link_does_not_block_its_process(run: Run, join: Join) -> None:
     buses = [join(run, role) for role in ("controller", "camera")]
     until(lambda: all(bus.peers() for bus in buses))
     until(lambda: not any(socket_options(socket.SOL_SOCKET, socket.SO_LINGER)))
@@ -103,7 +103,7 @@ def test_a_query_returns_the_last_message_with_its_envelope(pair: tuple[Bus, Bus
     assert late.get(FRAME.key, timeout_s=0.1) == []
     late.publisher(HEALTH, "operator").put(b"operator")
     controller.publisher(HEALTH, "controller").put(b"controller")
-    until(lambda: {one.payload for one in late.get(HEALTH.at("*"))} == {b"controller", b"operator"})
+    until(lambda: {health.payload for health in late.get(HEALTH.at("*"))} == {b"controller", b"operator"})
 
 
 def test_a_query_may_be_answered_later_from_another_thread(pair: tuple[Bus, Bus]) -> None:
@@ -212,7 +212,7 @@ def test_messages_without_a_valid_envelope_are_counted_without_traceback(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_a_ring_that_is_closed_has_no_subscriber(run: Run, join: Join) -> None:
+def test_a_closed_ring_has_no_subscriber(run: Run, join: Join) -> None:
     operator, camera = join(run, "operator"), join(run, "camera")
     frames = camera.publisher(FRAME)
     ring = operator.ring(FRAME, 4)
@@ -282,7 +282,8 @@ def test_a_monitor_receives_every_row_and_images_at_display_rate(run: Run, join:
     assert 5 < len(drained[FRAME]) - first[FRAME] < 125
 
 
-# A recorder that drains on request: prints how many messages and complete ones it has, and the last one's number.
+# A recorder that drains its ring on request, and prints how many messages it received so far, how many of these are
+# complete, and the number in the last complete one.
 READER = """
 import sys
 from lowfc.adapters.bus.run import open_run
@@ -296,8 +297,8 @@ ring = bus.ring(FRAME, 4096)
 bus.publisher(HEALTH, "recorder").put(b"")
 while sys.stdin.readline():
     received += [sample.payload for sample in ring.drain()]
-    whole = [payload for payload in received if payload == payload[:8] * 1600]
-    print(len(received), len(whole), int(whole[-1][:8]) if whole else -1, flush=True)
+    complete = [payload for payload in received if payload == payload[:8] * 1600]
+    print(len(received), len(complete), int(complete[-1][:8]) if complete else -1, flush=True)
 """
 
 
@@ -317,7 +318,8 @@ class Reader:
         self.frames.put(b"%08d" % number * 1600)
         return number
 
-    def drained(self) -> list[int]:
+    def drain(self) -> list[int]:
+        """Let the recorder drain its ring; return the three numbers that it prints."""
         self.process.stdin.write("\n")
         self.process.stdin.flush()
         return [int(word) for word in self.process.stdout.readline().split()]
@@ -325,11 +327,11 @@ class Reader:
 
 @pytest.fixture
 def reader(run: Run, join: Join) -> Iterator[Reader]:
-    made = Reader(run, join(run, "camera"))
-    until(lambda: made.drained()[0] > 0, each=made.put)
-    yield made
-    made.process.kill()
-    made.process.communicate()
+    recorder = Reader(run, join(run, "camera"))
+    until(lambda: recorder.drain()[0] > 0, each=recorder.put)
+    yield recorder
+    recorder.process.kill()
+    recorder.process.communicate()
 
 
 def test_a_stopped_subscriber_does_not_delay_the_others(reader: Reader, run: Run, join: Join) -> None:
@@ -342,9 +344,9 @@ def test_a_stopped_subscriber_does_not_delay_the_others(reader: Reader, run: Run
         assert box.take(PATIENCE_S)
     reader.process.send_signal(signal.SIGCONT)
     last = reader.put()
-    until(lambda: reader.drained()[2] > last, each=reader.put)
-    received_number, whole, _ = reader.drained()
-    assert received_number == whole < reader.frames.published
+    until(lambda: reader.drain()[2] > last, each=reader.put)
+    received, complete, _ = reader.drain()
+    assert received == complete < reader.frames.published
 
 
 def test_closing_a_session_leaves_a_slow_reader_only_complete_messages(reader: Reader) -> None:
@@ -353,9 +355,9 @@ def test_closing_a_session_leaves_a_slow_reader_only_complete_messages(reader: R
         reader.put()
     threading.Timer(0.2, reader.process.send_signal, [signal.SIGCONT]).start()
     reader.camera.close()
-    received, whole, _ = reader.drained()
-    assert received == whole
-    assert whole > 15  # content of queue and socket
+    received, complete, _ = reader.drain()
+    assert received == complete
+    assert complete > 15  # content of queue and socket
 
 
 def test_a_session_ends_although_a_handler_never_returns(run: Run, join: Join, monkeypatch: pytest.MonkeyPatch) -> None:

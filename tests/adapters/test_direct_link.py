@@ -23,7 +23,7 @@ PATIENCE_S = 30.0
 
 
 class Ends:
-    """A run with a camera and a controller that records its messages and their threads."""
+    """A run, and what `receive` received: counts and sizes of messages, and the thread of each."""
 
     def __init__(self, base: Path) -> None:
         self.run: Run = open_run("direct-link", base=base)
@@ -63,9 +63,9 @@ class Ends:
 
 @pytest.fixture
 def ends(tmp_path: Path) -> Iterator[Ends]:
-    made = Ends(tmp_path)
-    yield made
-    made.close()
+    both = Ends(tmp_path)
+    yield both
+    both.close()
 
 
 def test_the_direct_subscriber_receives_over_the_direct_link_and_others_over_the_bus(ends: Ends) -> None:
@@ -114,47 +114,57 @@ def test_switching_to_the_direct_link_loses_and_repeats_nothing(ends: Ends) -> N
 
 
 class ReaderOnTwoPaths:
-    """A reader to which the test passes messages by socket and bus, and the sequences that it delivered."""
+    """A reader to which the test passes messages by socket and by bus.
+
+    Attributes:
+        delivered: sequences of the messages that the reader delivered.
+        unsubscribed: number of times that it left the bus.
+    """
 
     def __init__(self, path: Path) -> None:
-        self.got: list[int] = []
-        self.left = 0
+        self.delivered: list[int] = []
+        self.unsubscribed = 0
         self.reader = direct_link.DirectReader(
-            path, FRAME.key, lambda sample: self.got.append(sample.sequence), self._subscribe, time.time_ns, pytest.fail
+            path,
+            FRAME.key,
+            lambda sample: self.delivered.append(sample.sequence),
+            self._subscribe,
+            time.time_ns,
+            pytest.fail,
         )
 
     def _subscribe(self, _: Callable[[Sample], None]) -> Callable[[], None]:
         def leave() -> None:
-            self.left += 1
+            self.unsubscribed += 1
 
         return leave
 
-    def socket(self, sequence: int, time_ns: int) -> None:
+    def by_socket(self, sequence: int, time_ns: int) -> None:
         self.reader.take(Envelope(sequence, time_ns).encode(), b"", 1)
 
-    def bus(self, sequence: int, time_ns: int) -> None:
+    def by_bus(self, sequence: int, time_ns: int) -> None:
         self.reader._by_bus(Sample(FRAME.key, b"", sequence, time_ns, 1))
 
 
 @pytest.fixture
 def reader(tmp_path: Path) -> Iterator[ReaderOnTwoPaths]:
-    found = ReaderOnTwoPaths(tmp_path / "socket")
-    yield found
-    found.reader.close()
+    on_two_paths = ReaderOnTwoPaths(tmp_path / "socket")
+    yield on_two_paths
+    on_two_paths.reader.close()
 
 
 def test_a_message_in_transit_during_the_switch_is_delivered_once(reader: ReaderOnTwoPaths) -> None:
-    reader.socket(1, 1)
-    reader.bus(1, 1)
+    reader.by_socket(1, 1)
+    reader.by_bus(1, 1)
     reader.reader._leave()
-    assert reader.left == 1
-    reader.bus(2, 2)
-    reader.socket(2, 2)
-    assert reader.got == [1, 2]
+    assert reader.unsubscribed == 1
+    reader.by_bus(2, 2)
+    reader.by_socket(2, 2)
+    assert reader.delivered == [1, 2]
 
 
 def test_a_reader_is_closed_although_a_handler_never_returns(reader: ReaderOnTwoPaths) -> None:
-    reader.reader._turn.acquire()
+    reader.reader._turn.acquire()  # as held while a handler runs
     closing = threading.Thread(target=reader.reader.close, daemon=True)
     closing.start()
     closing.join(PATIENCE_S)
@@ -166,17 +176,18 @@ def test_messages_that_a_publisher_repeats_or_reorders_are_delivered_as_they_wer
     reader: ReaderOnTwoPaths, direct_only: bool
 ) -> None:
     """The controller must see the fault of such a camera."""
-    reader.socket(10, 1)
+    reader.by_socket(10, 1)
     if direct_only:
-        reader.bus(10, 1)
+        reader.by_bus(10, 1)
         reader.reader._leave()
     for time_ns, sequence in enumerate((12, 11, 11, 3), start=2):
-        reader.socket(sequence, time_ns)
+        reader.by_socket(sequence, time_ns)
         if not direct_only:
-            reader.bus(sequence, time_ns)
-    for _ in range(1 + direct_only):  # with the same time, only the socket alone shows a repetition
-        reader.socket(13, 9)
-    assert reader.got == [10, 12, 11, 11, 3, *[13] * (1 + direct_only)]
+            reader.by_bus(sequence, time_ns)
+    # Without a bus a message with the same time is a repetition; beside the bus it could be the copy from there.
+    for _ in range(1 + direct_only):
+        reader.by_socket(13, 9)
+    assert reader.delivered == [10, 12, 11, 11, 3, *[13] * (1 + direct_only)]
 
 
 def test_reader_and_writer_reconnect_after_restarts_and_the_bus_serves_without_a_writer(
@@ -235,8 +246,8 @@ def test_an_invalid_message_is_counted_and_the_next_is_delivered(ends: Ends, cap
     writer.send(b"\xff" * 16, b"from the end of time")
     writer.send(Envelope(7, 0).encode(), b"fine")
     until(lambda: ends.received == [7])
-    (found,) = controller.faults.take_unreadable().items()
-    assert (found[0], found[1][0]) == (FRAME.key, 2)
+    ((key, (count, _)),) = controller.faults.take_unreadable().items()
+    assert (key, count) == (FRAME.key, 2)
     assert "Traceback" not in capfd.readouterr().err
     writer.close()
 
@@ -250,7 +261,7 @@ def test_only_direct_subscribers_have_a_direct_link(ends: Ends) -> None:
     assert sorted(path.name for path in ends.run.path.glob("*.in")) == ["controller.in", "mirror-dm.in"]
 
 
-class Commanded:
+class CommandedMirror:
     """A mirror that records its commands, with a controller and an operator that both publish commands."""
 
     def __init__(self, ends: Ends) -> None:
@@ -268,7 +279,7 @@ class Commanded:
 
     def until_both_paths(self) -> None:
         def both() -> bool:
-            return "direct-link" in self.threads and any(one.payload == b"operator" for one in self.received)
+            return "direct-link" in self.threads and any(sample.payload == b"operator" for sample in self.received)
 
         until(both, each=self.put)
 
@@ -278,7 +289,7 @@ class Commanded:
 
 
 def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct_link(ends: Ends) -> None:
-    mirror = Commanded(ends)
+    mirror = CommandedMirror(ends)
     mirror.until_both_paths()
     begun = len(mirror.received)
     for _ in range(100):
@@ -286,25 +297,25 @@ def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct
         time.sleep(0.001)
     last = mirror.controller.published - 1, mirror.operator.published - 1
     newest = set(zip((b"controller", b"operator"), last, strict=True))
-    until(lambda: newest <= {(one.payload, count_of(one.sequence)) for one in mirror.received[begun:]})
+    until(lambda: newest <= {(sample.payload, count_of(sample.sequence)) for sample in mirror.received[begun:]})
     time.sleep(0.1)  # time for a copy over the bus
     by_publisher = list(zip(mirror.received, mirror.threads, strict=True))[begun:]
     for payload, last_count in zip((b"controller", b"operator"), last, strict=True):
-        counts = [count_of(one.sequence) for one, _ in by_publisher if one.payload == payload]
+        counts = [count_of(sample.sequence) for sample, _ in by_publisher if sample.payload == payload]
         assert counts[-100:] == list(range(last_count - 99, last_count + 1))
         assert len(counts) == len(set(counts))
-    direct = [name == "direct-link" for one, name in by_publisher if one.payload == b"controller"]
+    direct = [name == "direct-link" for sample, name in by_publisher if sample.payload == b"controller"]
     assert any(direct)  # the bus may be faster
-    assert all(name != "direct-link" for one, name in by_publisher if one.payload == b"operator")
-    copied = next(one for one in reversed(mirror.received) if one.payload == b"controller")
+    assert all(name != "direct-link" for sample, name in by_publisher if sample.payload == b"operator")
+    copied = next(sample for sample in reversed(mirror.received) if sample.payload == b"controller")
     mirror.operator.put(b"a copy", publish_time_ns=copied.publish_time_ns, sequence=copied.sequence)
     mirror.operator.put(b"another", sequence=copied.sequence)
     until(lambda: mirror.received[-1].payload == b"another")
-    assert all(one.payload != b"a copy" for one in mirror.received)
+    assert all(sample.payload != b"a copy" for sample in mirror.received)
 
 
 def test_handed_ns_precedes_the_bus_put_with_a_direct_reader_and_follows_it_without(ends: Ends) -> None:
-    mirror = Commanded(ends)
+    mirror = CommandedMirror(ends)
     mirror.until_both_paths()
     put_ns: list[int] = []
 
@@ -312,32 +323,38 @@ def test_handed_ns_precedes_the_bus_put_with_a_direct_reader_and_follows_it_with
         def put(self, payload: bytes, attachment: bytes) -> None:
             put_ns.append(ends.clock.host_ns())
 
-    for publisher, is_read in ((mirror.controller, True), (mirror.operator, False)):
+    for publisher, has_reader in ((mirror.controller, True), (mirror.operator, False)):
         publisher._publisher = Timed()  # type: ignore[assignment]
         envelope = publisher.put(b"")
         assert envelope.publish_time_ns <= publisher.handed_ns
-        assert (publisher.handed_ns <= put_ns[-1]) is is_read
+        assert (publisher.handed_ns <= put_ns[-1]) is has_reader
 
 
 def test_after_a_stall_with_the_bus_ahead_nothing_is_delivered_twice(tmp_path: Path) -> None:
     """A socket buffers at most a few thousand commands."""
-    got: list[int] = []
+    delivered_ns: list[int] = []
     by_bus: list[direct_link.Handler] = []
 
     def subscribe(handler: direct_link.Handler) -> Callable[[], None]:
         by_bus.append(handler)
         return by_bus.clear
 
-    path, number = tmp_path / "mirror-dm.in", 5000
+    path, commands = tmp_path / "mirror-dm.in", 5000
     reader = direct_link.DirectReader(
-        path, "k", lambda sample: got.append(sample.publish_time_ns), subscribe, lambda: 0, pytest.fail, shared=True
+        path,
+        "k",
+        lambda sample: delivered_ns.append(sample.publish_time_ns),
+        subscribe,
+        lambda: 0,
+        pytest.fail,
+        shared=True,
     )
-    for count in range(number):
+    for count in range(commands):
         by_bus[0](Sample("k", b"", sequence_of(5, count), count, 0))
-    for count in range(number + 1):
+    for count in range(commands + 1):
         reader.take(Envelope(sequence_of(5, count), count).encode(), b"", 0)
     reader.close()
-    assert got == list(range(number + 1))
+    assert delivered_ns == list(range(commands + 1))
 
 
 def test_with_a_router_there_is_no_direct_link(ends: Ends) -> None:

@@ -17,6 +17,7 @@ from tests.support.image_streams.plain import NUMPY_TYPES, PlainStream
 
 ROWS, COLUMNS = 6, 9
 UINT16, FLOAT32 = 3, 9
+"""Numbers of pixel types; other numbers in `get` and `pack` are byte offsets in the published layout."""
 
 
 @pytest.fixture
@@ -24,19 +25,21 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "camnsv.im.shm"
 
 
-def made(path: Path, number: int = UINT16, **options: object) -> PlainStream:
+def new_stream(path: Path, number: int = UINT16, **options: object) -> PlainStream:
+    """Create a stream with pixels of the type `number`."""
     return PlainStream.make(path, COLUMNS, ROWS, number, **options)  # type: ignore[arg-type]
 
 
 def image(seed: int, number: int = UINT16) -> np.ndarray:
+    """A random image with pixels of the type `number`."""
     values = np.random.default_rng(seed).integers(0, 100, (ROWS, COLUMNS))
     return values.astype(NUMPY_TYPES[number])
 
 
 def newest(reader: StreamReader) -> StreamImage:
-    got = reader.next(5)
-    assert got is not None
-    return got
+    image_ = reader.next(5)
+    assert image_ is not None
+    return image_
 
 
 def dead_pid() -> int:
@@ -47,14 +50,14 @@ def dead_pid() -> int:
 
 @pytest.mark.parametrize("number", NUMPY_TYPES)
 def test_images_of_every_type_are_read_and_written(path: Path, number: int) -> None:
-    writer = made(path, number)
+    writer = new_stream(path, number)
     reader = StreamReader(path)
     writer.write(image(1, number), 1_700_000_000_123_456_789)
-    got = newest(reader)
-    assert got.number == 1
-    assert got.acquired_ns == 1_700_000_000_123_456_789
-    assert got.pixels.dtype == NUMPY_TYPES[number]
-    assert np.array_equal(got.pixels, image(1, number))
+    received = newest(reader)
+    assert received.number == 1
+    assert received.acquired_ns == 1_700_000_000_123_456_789
+    assert received.pixels.dtype == NUMPY_TYPES[number]
+    assert np.array_equal(received.pixels, image(1, number))
     stream, other = Stream(path), PlainStream(path, COLUMNS, ROWS, number)
     other.take(7)
     before_ns = time.clock_gettime_ns(time.CLOCK_TAI)
@@ -81,16 +84,16 @@ def test_a_created_stream_is_readable_by_others(path: Path) -> None:
     assert other.get("<q", 184) - 1_700_000_000 == round(time.clock_gettime(time.CLOCK_TAI) - time.time())
     with pytest.raises(StreamError, match="exists already"):
         Stream.create(path, (ROWS, COLUMNS), np.float32)
-    assert [one.name for one in path.parent.iterdir()] == [path.name]
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
 def test_keywords_of_every_kind_are_read(path: Path) -> None:
-    made(path, keywords={"fps": 500, "tint": 1e-3, "camera": "nsv"})
+    new_stream(path, keywords={"fps": 500, "tint": 1e-3, "camera": "nsv"})
     assert Stream(path).keywords() == {"fps": 500, "tint": 1e-3, "camera": "nsv"}
 
 
 @pytest.mark.parametrize(
-    ("options", "found"),
+    ("options", "difference"),
     [
         ({"version": b"1.00"}, "layout version '1.00', expected '2.00'"),
         ({"version": b"1.00\0\xff\n"}, "layout version '1.00'"),
@@ -104,9 +107,9 @@ def test_keywords_of_every_kind_are_read(path: Path) -> None:
         ({"axes": 4}, "4 axes"),
     ],
 )
-def test_other_layouts_are_refused_with_the_difference(path: Path, options: dict[str, object], found: str) -> None:
-    made(path, **options)
-    with pytest.raises(StreamError, match=found) as fault:
+def test_other_layouts_are_refused_with_the_difference(path: Path, options: dict[str, object], difference: str) -> None:
+    new_stream(path, **options)
+    with pytest.raises(StreamError, match=difference) as fault:
         Stream(path)
     assert "camnsv" in str(fault.value)
     assert not isinstance(fault.value, StreamAbsentError)
@@ -118,7 +121,7 @@ def test_a_stream_being_created_counts_as_absent(path: Path) -> None:
     path.write_bytes(b"")
     with pytest.raises(StreamAbsentError):
         Stream(path)
-    made(path, version=b"")
+    new_stream(path, version=b"")
     with pytest.raises(StreamAbsentError):
         Stream(path)
     path.unlink()
@@ -128,28 +131,28 @@ def test_a_stream_being_created_counts_as_absent(path: Path) -> None:
 
 
 def test_the_newest_plane_of_a_stream_is_returned(path: Path) -> None:
-    writer = made(path, planes=4, axes=3, kind=0x20001)
+    writer = new_stream(path, planes=4, axes=3, kind=0x20001)
     reader = StreamReader(path)
     for number in range(1, 7):
         writer.write(image(number), plane=number % 4)
-        got = newest(reader)
-        assert np.array_equal(got.pixels, image(number))
+        received = newest(reader)
+        assert np.array_equal(received.pixels, image(number))
     writer.pack("<Q", 272, 2**64 - 1)  # an invalid plane
     writer.pack("<Q", 264, 7)
     newest(reader)
 
 
 def test_an_image_being_written_is_awaited(path: Path) -> None:
-    writer = made(path)
+    writer = new_stream(path)
     reader = StreamReader(path)
     writer.write(image(1))
     writer.begin(image(2))
     assert reader.next(0.02) is None
     assert reader.silence_cause() == "its writer is silent, in the middle of an image"
     writer.end()
-    got = newest(reader)
-    assert got.number == 2
-    assert np.array_equal(got.pixels, image(2))
+    received = newest(reader)
+    assert received.number == 2
+    assert np.array_equal(received.pixels, image(2))
     assert reader.next(0.02) is None
     assert reader.silence_cause() == "its writer is silent"
 
@@ -173,51 +176,51 @@ def test_no_torn_image_is_returned_and_a_dead_writer_is_reported(path: Path) -> 
         assert writer.stdout.readline()
         numbers = []
         for _ in range(500):
-            got = newest(reader)
-            assert (got.pixels == got.number % 65536).all()
-            numbers.append(got.number)
+            received = newest(reader)
+            assert (received.pixels == received.number % 65536).all()
+            numbers.append(received.number)
         writer.send_signal(signal.SIGKILL)
     assert numbers == sorted(set(numbers))
     while reader.next(0.1) is not None:
         pass
     assert reader.silence_cause().startswith(f"its writer (process {writer.pid}) has ended")
     stream.write(np.full((64, 64), stream.count + 1))  # another writer takes over
-    got = newest(reader)
-    assert (got.pixels == got.number % 65536).all()
+    received = newest(reader)
+    assert (received.pixels == received.number % 65536).all()
 
 
 def test_a_recreated_stream_is_reopened(path: Path) -> None:
-    writer = made(path)
+    writer = new_stream(path)
     reader = StreamReader(path)
     writer.write(image(1))
     newest(reader)
-    made(path).write(image(2))
-    got = newest(reader)
-    assert (got.number, got.generation) == (1, 2)
-    assert np.array_equal(got.pixels, image(2))
+    new_stream(path).write(image(2))
+    received = newest(reader)
+    assert (received.number, received.generation) == (1, 2)
+    assert np.array_equal(received.pixels, image(2))
     PlainStream.make(path, 3, 2, FLOAT32).write(np.ones((2, 3)))
-    got = newest(reader)
-    assert got.generation == 3
-    assert got.pixels.shape == (2, 3)
+    received = newest(reader)
+    assert received.generation == 3
+    assert received.pixels.shape == (2, 3)
     path.unlink()
     assert reader.next(0.02) is None
     assert reader.silence_cause() == "there is no stream 'camnsv'"
-    made(path).write(image(3))
-    got = newest(reader)
-    assert got.generation == 4
-    made(path, version=b"1.00")
+    new_stream(path).write(image(3))
+    received = newest(reader)
+    assert received.generation == 4
+    new_stream(path, version=b"1.00")
     with pytest.raises(StreamError, match="layout version"):
         reader.next(0.02)
-    writer = made(path, version=b"")
+    writer = new_stream(path, version=b"")
     writer.map[writer.semaphores + 8] ^= 1
     writer.map[:4] = b"2.00"
     assert reader.next(0) is None, "it may be in creation"
-    made(path).write(image(4))
+    new_stream(path).write(image(4))
     newest(reader)
 
 
 def test_a_truncated_file_is_no_longer_accessed(path: Path) -> None:
-    writer = made(path)
+    writer = new_stream(path)
     reader = StreamReader(path)
     writer.write(image(1))
     os.truncate(path, 100)
@@ -227,7 +230,7 @@ def test_a_truncated_file_is_no_longer_accessed(path: Path) -> None:
 
 
 def test_each_reader_has_its_own_semaphore(path: Path) -> None:
-    writer = made(path)
+    writer = new_stream(path)
     writer.take(0, os.getppid())
     writer.take(1, dead_pid())
     reader = StreamReader(path)
@@ -244,23 +247,23 @@ def test_each_reader_has_its_own_semaphore(path: Path) -> None:
 
 
 def test_semaphores_are_posted_up_to_ten_and_a_full_one_blocks_nothing(path: Path) -> None:
-    writer = made(path)
+    writer = new_stream(path)
     reader = StreamReader(path)
     stream = Stream(path)
     for number in range(25):
         stream.put(image(number))
     assert [writer.value(index) for index in range(10)] == [10] * 10
-    got = newest(reader)
-    assert got.number == 25
-    assert np.array_equal(got.pixels, image(24))
+    received = newest(reader)
+    assert received.number == 25
+    assert np.array_equal(received.pixels, image(24))
     assert reader.next(0.02) is None
     stream.put(image(26))
-    got = newest(reader)
-    assert got.number == 26
+    received = newest(reader)
+    assert received.number == 26
 
 
 def test_another_living_writer_is_detected(path: Path) -> None:
-    writer = made(path)
+    writer = new_stream(path)
     stream = Stream(path)
     assert not stream.other_writer()
     writer.write(image(1))
@@ -273,7 +276,9 @@ def test_another_living_writer_is_detected(path: Path) -> None:
     assert not stream.other_writer()
 
 
-def test_the_first_existing_folder_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_existing_folder_is_used_and_a_name_that_is_no_file_name_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
     assert stream_path("dm00disp03") == tmp_path / "dm00disp03.im.shm"
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path / "none"))
@@ -285,10 +290,10 @@ def test_the_first_existing_folder_is_used(tmp_path: Path, monkeypatch: pytest.M
 
 def test_damaged_headers_cause_no_access_outside_the_stream(path: Path) -> None:
     rng = np.random.default_rng(7)
-    writer = made(path, planes=2, axes=3, kind=0x20001, keywords={"tint": 1e-3})
+    writer = new_stream(path, planes=2, axes=3, kind=0x20001, keywords={"tint": 1e-3})
     good = bytes(writer.map)
-    # After eleven semaphores and four blocks of counters: all bytes that a reader or writer may change.
-    rest = slice(writer.semaphores + 11 * 32 + 4 * 40, None)
+    # Readers and writers may change eleven semaphores and four blocks of counters, but nothing after them.
+    after_counters = slice(writer.semaphores + 11 * 32 + 4 * 40, None)
     opened = 0
     for _ in range(1500):
         writer.map[:] = good
@@ -311,5 +316,5 @@ def test_damaged_headers_cause_no_access_outside_the_stream(path: Path) -> None:
         stream.put(np.zeros(stream.layout.shape[1:], stream.layout.dtype))
         assert isinstance(stream.newest.acquired_ns, int)
         assert bytes(writer.map[:184]) == header
-        assert bytes(writer.map[rest]) == good[rest]
+        assert bytes(writer.map[after_counters]) == good[after_counters]
     assert 75 < opened < 1425

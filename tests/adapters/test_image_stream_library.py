@@ -43,7 +43,7 @@ class Image:
         return np.frombuffer(memory, dtype).reshape(ROWS, COLUMNS)
 
     def write(self, image: np.ndarray) -> None:
-        ctypes.c_uint8.from_address(self.pointer(120) + 288).value = 1
+        ctypes.c_uint8.from_address(self.pointer(120) + 288).value = 1  # `write` in the metadata: being written
         self.pixels(image.dtype.str)[:] = image
         assert not LIBRARY.ImageStreamIO_UpdateIm(self.memory)
 
@@ -98,7 +98,7 @@ def _receive(name: str, images: int, started: object, queue: object) -> None:
         queue.put(library.pixels("f4").copy())  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("made_by", ["library", "here"])
+@pytest.mark.parametrize("made_by", ["library", "lowfc"])
 def test_our_images_wake_readers_of_the_c_library(path: Path, made_by: str) -> None:
     name = path.name.removesuffix(".im.shm")
     if made_by == "library":
@@ -120,7 +120,7 @@ def test_our_images_wake_readers_of_the_c_library(path: Path, made_by: str) -> N
 
 def test_the_ring_buffer_is_written_as_by_the_c_library(path: Path) -> None:
     name = path.name.removesuffix(".im.shm")
-    kept = []
+    written = []
     for by_library in (True, False):
         library = Image(name).create(9, ring=3)
         stream = Stream(path)
@@ -128,5 +128,5 @@ def test_the_ring_buffer_is_written_as_by_the_c_library(path: Path) -> None:
         for number in range(1, 6):
             put(image(number, "f4"))
         start = stream.layout.starts["ring"]
-        kept.append((path.read_bytes()[start : start + 3 * ROWS * COLUMNS * 4], path.read_bytes()[296:312]))
-    assert kept[0] == kept[1]
+        written.append((path.read_bytes()[start : start + 3 * ROWS * COLUMNS * 4], path.read_bytes()[296:312]))
+    assert written[0] == written[1]

@@ -62,68 +62,68 @@ def test_a_damaged_log_yields_no_false_message_and_no_silent_loss(tmp_path: Path
     for number, kind, content in mutations(data, range(finished, MUTATIONS, 2)):
         path.write_bytes(content)
         case = f"mutation {number}: {kind}"
-        strictly, refusal = read_of(LogReader(path))
+        read_strictly, strict_error = read_of(LogReader(path))
         reader = LogReader(path, skip_damaged=True)
-        read, nothing = read_of(reader)
-        assert not refusal or str(path) in refusal, case
-        assert not nothing or (refusal and not read and "is not an MCAP file" in nothing), case
-        assert strictly == read[: len(strictly)], case
+        read, error = read_of(reader)
+        assert not strict_error or str(path) in strict_error, case
+        assert not error or (strict_error and not read and "is not an MCAP file" in error), case
+        assert read_strictly == read[: len(read_strictly)], case
         assert set(SENT).issuperset(read), case
         assert len(set(read)) == len(read), case
         delivered += len(read)
-        assert bool(refusal) == bool(nothing or reader.damage or reader.unreadable), case
-        assert refusal or not (finished and reader.complete), f"{case}: it counts as intact"
+        assert bool(strict_error) == bool(error or reader.damage or reader.unreadable), case
+        assert strict_error or not (finished and reader.complete), f"{case}: it counts as intact"
         if read != SENT and (finished or kind not in MISPLACED):
             broken_off = not reader.complete and read == SENT[: len(read)]
-            assert refusal or broken_off, f"{case}: an unreported loss"
+            assert strict_error or broken_off, f"{case}: an unreported loss"
     assert delivered > 0.5 * len(SENT) * MUTATIONS / 2, "too little was read for a meaningful test"
 
 
-def heads(size: int, magic: bytes) -> bytes:
-    """Chunk headers every 64 bytes, each declaring a chunk of almost the rest of the file."""
-    made = b""
+def chunk_headers(size: int, content: bytes) -> bytes:
+    """Chunk headers every 64 bytes, each of a chunk that begins with `content` and takes almost the whole rest."""
+    file = b""
     for at in range(0, size, 64):
         length = max(size - at - 9, 43)
         fields = struct.pack("<QQQII3sQ", 0, 0, length, 0, 3, b"lz4", length - 43)
-        made += (struct.pack("<BQ", 6, length) + fields + magic).ljust(64, b"\0")
-    return made
+        file += (struct.pack("<BQ", 6, length) + fields + content).ljust(64, b"\0")
+    return file
 
 
-def between(size: int, sound: bytes) -> bytes:
-    """Intact chunks, each followed by a record that declares almost the rest of the file."""
-    made = b""
-    while len(made) < size:
-        made += sound
-        made += struct.pack("<BQ", 12, max(size - len(made) - 100, 0))
-    return made
+def chunks_and_long_records(size: int, chunk: bytes) -> bytes:
+    """Copies of an intact chunk, each followed by a record that declares almost the rest of the file."""
+    file = b""
+    while len(file) < size:
+        file += chunk
+        file += struct.pack("<BQ", 12, max(size - len(file) - 100, 0))
+    return file
 
 
-@pytest.mark.parametrize("kind", ["heads", "heads of frames", "sound chunks between", "sound chunks and zeros"])
+@pytest.mark.parametrize("kind", ["headers", "headers and LZ4 frames", "chunks and long records", "chunks and zeros"])
 def test_a_malicious_file_is_read_only_a_few_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     data = small_log(tmp_path / "whole.mcap", finished=False).read_bytes()
-    sound = min((data[a:b] for a, b in pairwise(boundaries(data)) if data[a] == 6), key=len)
+    chunk = min((data[a:b] for a, b in pairwise(boundaries(data)) if data[a] == 6), key=len)
     size = 1 << 19
     hostile = {
-        "heads": heads(size, b""),
-        "heads of frames": heads(size, b"\x04\x22\x4d\x18"),
-        "sound chunks between": between(size, sound),
-        "sound chunks and zeros": (sound + bytes(100)) * (size // (len(sound) + 100)),
+        "headers": chunk_headers(size, b""),
+        "headers and LZ4 frames": chunk_headers(size, b"\x04\x22\x4d\x18"),
+        "chunks and long records": chunks_and_long_records(size, chunk),
+        "chunks and zeros": (chunk + bytes(100)) * (size // (len(chunk) + 100)),
     }[kind]
     path = tmp_path / "hostile.mcap"
     path.write_bytes(MAGIC + b"\x7f" + hostile)
-    total, read = 0, LogFile._read
+    bytes_read, read = 0, LogFile._read
 
     def counted(file: LogFile, at: int, length: int) -> bytes:
-        nonlocal total
-        found = read(file, at, length)
-        total += len(found)
-        return found
+        nonlocal bytes_read
+        data = read(file, at, length)
+        bytes_read += len(data)
+        return data
 
     monkeypatch.setattr(LogFile, "_read", counted)
     reader = LogReader(path, skip_damaged=True)
     read_of(reader)
     assert not reader.complete
-    assert total < 12 * path.stat().st_size
+    assert bytes_read < 12 * path.stat().st_size
 
 
 def rewritten(source: Path, out: Path, options: dict[str, Any]) -> Path:
@@ -149,8 +149,8 @@ NO_CHUNKS = {"use_chunking": False}
 @pytest.mark.parametrize(
     "options",
     [
-        *({"compression": one} for one in CompressionType),
-        *({"compression": one} | NO_CRCS for one in CompressionType),
+        *({"compression": compression} for compression in CompressionType),
+        *({"compression": compression} | NO_CRCS for compression in CompressionType),
         {"compression": CompressionType.ZSTD, "use_statistics": False, "use_summary_offsets": False},
         NO_CHUNKS,
         NO_CHUNKS | NO_CRCS,
@@ -166,7 +166,7 @@ def test_a_rewritten_log_is_read_as_the_original(tmp_path: Path, source: Path, o
     assert sorted(contents(list(reader))) == sorted(SENT)
     assert (reader.damage, reader.unreadable, reader.finished, reader.complete) == ([], 0, True, True)
     assert reader.metadata == METADATA | {"recording": {"messages": str(len(SENT))}}
-    assert reader.attachments == {one.name: one.data for one in ATTACHMENTS}
+    assert reader.attachments == {attachment.name: attachment.data for attachment in ATTACHMENTS}
     assert survey(path)["state"] == "complete"
     assert recover(path, tmp_path / "recovered.mcap").recovered is None
 
@@ -198,7 +198,7 @@ def test_a_log_is_recovered_without_permissions(tmp_path: Path, source: Path, mo
 
 
 @pytest.mark.parametrize("compression", CompressionType)
-@pytest.mark.parametrize("at", [8, 60])  # of a chunk: its length, and its content
+@pytest.mark.parametrize("at", [8, 60])  # in the chunk: a byte of its length, and one of its content
 @pytest.mark.parametrize("finished", [True, False])
 def test_only_the_damaged_chunk_of_a_rewritten_log_is_lost(
     tmp_path: Path, source: Path, compression: CompressionType, at: int, finished: bool
@@ -214,7 +214,7 @@ def test_only_the_damaged_chunk_of_a_rewritten_log_is_lost(
     assert set(SENT).issuperset(read)
     assert len(SENT) / 2 < len(read) < len(SENT)
     assert reader.damage[0].position == chunks[5][0]
-    assert sum(one.length for one in reader.damage) < chunks[6][0] - chunks[5][0] + 1
+    assert sum(damage.length for damage in reader.damage) < chunks[6][0] - chunks[5][0] + 1
     done = recover(path, tmp_path / "recovered.mcap")
     assert done.recovered is not None
     assert contents(list(LogReader(done.recovered))) == read
@@ -234,7 +234,7 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
 ) -> None:
     path = rewritten(source, tmp_path / "rewritten.mcap", NO_CRCS)
     data = path.read_bytes()
-    changed(path, next(one for one in boundaries(data) if data[one] == opcode) + at, new)
+    changed(path, next(start for start in boundaries(data) if data[start] == opcode) + at, new)
     assert sorted(contents(list(LogReader(path)))) == sorted(SENT)
     with LogFile(path) as file:
         assert list(file.index()) == []
@@ -244,7 +244,7 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
 def test_of_two_logs_in_one_file_the_first_is_read_and_the_second_reported(
     tmp_path: Path, source: Path, cuts: tuple[int, int]
 ) -> None:
-    """The second is not read with the channels of the first, even if this was cut off by the death of its recorder."""
+    """The second is not read with the channels of the first, even if the first was cut off when its recorder died."""
     first = (whole := source.read_bytes())[: len(whole) - cuts[0]]
     second = rewritten(source, tmp_path / "second.mcap", {}).read_bytes()
     second = second[: len(second) - cuts[1]]
@@ -270,11 +270,11 @@ def test_another_file_after_a_log_is_damage(source: Path) -> None:
 
 def test_a_message_index_of_an_impossible_length_is_damage_for_a_sparse_reader_too(source: Path) -> None:
     data = source.read_bytes()
-    begin = next(one for one in boundaries(data) if data[one] == Opcode.MESSAGE_INDEX)
+    begin = next(start for start in boundaries(data) if data[start] == Opcode.MESSAGE_INDEX)
     changed(source, begin + 1, (1 << 63).to_bytes(8, "little"))
     reader = LogReader(source, topics=(STEP,), sparse=True, skip_damaged=True)
     assert sum(1 for _ in reader)
-    assert [one.why for one in reader.damage] == ["a record has an impossible length"]
+    assert [damage.why for damage in reader.damage] == ["a record has an impossible length"]
 
 
 def test_unchunked_messages_are_covered_by_the_data_checksum_and_read_up_to_a_truncation(
@@ -284,7 +284,7 @@ def test_unchunked_messages_are_covered_by_the_data_checksum_and_read_up_to_a_tr
     flipped(path, middle := path.stat().st_size // 2)
     reader = LogReader(path, skip_damaged=True)
     assert len(list(reader)) == len(SENT)
-    assert [one.why.partition(",")[0] for one in reader.damage] == ["its parts are intact"]
+    assert [damage.why.partition(",")[0] for damage in reader.damage] == ["its parts are intact"]
     os.truncate(path, middle)
     reader = LogReader(path)
     read = contents(list(reader))
@@ -298,8 +298,9 @@ def test_an_unsupported_compression_is_reported_as_such(tmp_path: Path, source: 
     path, builder = tmp_path / "rewritten.mcap", RecordBuilder()
     with rewritten(source, path, {}).open("rb") as stream:
         for record in StreamReader(stream, emit_chunks=True).records:
-            changed = dataclasses.replace(record, compression="brotli") if isinstance(record, Chunk) else record
-            changed.write(builder)
+            if isinstance(record, Chunk):
+                record = dataclasses.replace(record, compression="brotli")
+            record.write(builder)
     path.write_bytes(MAGIC + builder.end() + MAGIC)
     with pytest.raises(DataFileError) as caught:
         list(LogReader(path, skip_damaged=skip_damaged))

@@ -57,7 +57,7 @@ def test_a_written_log_is_read_back(tmp_path: Path) -> None:
     assert {reader.schema_of(m) for m in read} >= {"foxglove.RawImage", "lowfc.v1.ControlStep"}
     assert reader.complete
     assert reader.metadata == {**METADATA, "recording": {"messages": str(len(SENT))}}
-    assert reader.attachments == {one.name: one.data for one in ATTACHMENTS}
+    assert reader.attachments == {attachment.name: attachment.data for attachment in ATTACHMENTS}
     assert [path.name for path in (tmp_path / "logs").iterdir()] == ["a.mcap"]
 
 
@@ -97,15 +97,15 @@ def test_metadata_and_attachments_precede_the_messages_and_chunks_are_small(tmp_
 
 def test_a_truncated_log_yields_its_complete_chunks(tmp_path: Path) -> None:
     data = small_log(tmp_path / "whole.mcap").read_bytes()
-    cut, found = tmp_path / "cut.mcap", []
+    cut, counts = tmp_path / "cut.mcap", []
     for size in [*range(1, 40), *range(40, len(data), 1001), *range(len(data) - 40, len(data) + 1)]:
         cut.write_bytes(data[:size])
         reader = LogReader(cut)
-        found.append(len(list(reader)))
+        counts.append(len(list(reader)))
         assert reader.complete == (size == len(data))
-    assert found == sorted(found)
-    assert (found[0], found[-1]) == (0, len(SENT))
-    assert len(set(found)) > 3
+    assert counts == sorted(counts)
+    assert (counts[0], counts[-1]) == (0, len(SENT))
+    assert len(set(counts)) > 3
 
 
 def crafted(path: Path, *records: McapRecord) -> Path:
@@ -125,8 +125,8 @@ def chunk(*records: McapRecord, **changes: Any) -> Chunk:
 
 
 def packed(content: bytes, **changes: Any) -> Chunk:
-    sound = Chunk("lz4", lz4.frame.compress(content), 0, 0, zlib.crc32(content), len(content))
-    return dataclasses.replace(sound, **changes)
+    intact = Chunk("lz4", lz4.frame.compress(content), 0, 0, zlib.crc32(content), len(content))
+    return dataclasses.replace(intact, **changes)
 
 
 STEPS = Schema(id=1, data=b"", encoding="protobuf", name="lowfc.v1.ControlStep")
@@ -178,7 +178,7 @@ def test_the_summary_replaces_the_declarations_of_a_damaged_chunk(tmp_path: Path
         (0, b"\x07"),  # opcode of a message index
         (0, b"\x86"),  # opcode of a private record
         (0, b"\x03"),  # opcode of a declaration without checksum
-        (1, b"\x00"),
+        (1, b"\x00"),  # its length, as the next three
         (4, b"\x01"),  # 16 MB longer
         (6, b"\xff"),
         (8, b"\xff"),
@@ -313,7 +313,7 @@ def test_a_decompression_bomb_does_not_fill_the_memory(tmp_path: Path) -> None:
 
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     peaks = []
-    for number, count in enumerate((200, 200, 2000)):
+    for number, count in enumerate((200, 200, 2000)):  # the first fills caches
         path = written(tmp_path / f"{number}.mcap", messages := small_samples(count))
         tracemalloc.start()
         assert sum(1 for _ in LogReader(path)) == len(messages)
@@ -383,10 +383,10 @@ def test_a_log_finished_meanwhile_keeps_its_name(tmp_path: Path, monkeypatch: py
     exists = Path.exists
 
     def then_finished(path: Path) -> bool:
-        found = exists(path)
+        exists_now = exists(path)
         if not exists(log.path):
             log.finish({})
-        return found
+        return exists_now
 
     monkeypatch.setattr(Path, "exists", then_finished)
     assert log_path(tmp_path, START_NS).name == "20260101T000000Z-2.mcap"

@@ -56,19 +56,19 @@ def test_wake_ends_the_wait_at_once_and_only_once() -> None:
 
 
 def test_a_message_ends_the_wait_of_another_thread() -> None:
-    box, there = Mailbox(), Mailbox()
+    box, handled = Mailbox(), Mailbox()
     got: list[Sample | None] = []
 
     def loop() -> None:
         for _ in range(500):
             got.append(box.take(PATIENCE_S))
-            there.wake()
+            handled.wake()
 
     thread = threading.Thread(target=loop)
     thread.start()
     for count in range(500):
         box.put(sample(count))
-        there.take(PATIENCE_S)
+        handled.take(PATIENCE_S)
     thread.join()
     assert got == [sample(count) for count in range(500)]
     assert (box.received, box.skipped, box.missing) == (500, 0, 0)
@@ -88,6 +88,7 @@ def test_every_message_is_taken_skipped_missing_or_waiting(actions: list[str]) -
             sent += 1
         count += 1
     published = [action for action in actions if action != "take"]
+    # Messages lost after the last that arrived are not missing yet: no later one reveals them.
     lost_last = min(sent, sum(1 for _ in takewhile(lambda action: action == "lose", reversed(published))))
     waiting = box.take(0.0) is not None
     assert sent - lost_last == taken + waiting + box.skipped + box.missing
@@ -162,14 +163,14 @@ def test_without_a_period_nothing_is_superseded() -> None:
 def test_a_slow_handler_never_falls_far_behind() -> None:
     bench = Bench(handle_superseded=True)
     bench.work_ns = 3 * PERIOD_NS
-    begun_ns, behind = bench.now_ns + 10**8, []
+    begun_ns, lags = bench.now_ns + 10**8, []  # lags in periods
     for count in range(500):
         put_ns = begun_ns + count * PERIOD_NS
         before = len(bench.handled)
         bench.arrive(count, put_ns)
         if len(bench.handled) > before:
-            behind.append((bench.now_ns - bench.work_ns - put_ns) / PERIOD_NS)
-    assert max(behind) < 5
+            lags.append((bench.now_ns - bench.work_ns - put_ns) / PERIOD_NS)
+    assert max(lags) < 5
     assert len(bench.handled) > 5
     assert len(bench.handled) + len(bench.superseded) + bench.dispatch.skipped == bench.dispatch.received == 500
 
@@ -200,7 +201,7 @@ def test_two_receive_threads_take_turns() -> None:
     assert (dispatch.received, most_inside) == (2000, 1)
 
 
-def test_only_messages_that_never_arrived_are_missing_in_any_order() -> None:
+def test_only_messages_that_never_arrive_are_missing_whatever_the_order_of_the_others() -> None:
     rng = np.random.default_rng(5)
     arrived = [0, *rng.permutation(rng.choice(np.arange(1, 1000), 800, replace=False)).tolist()]
     gaps, seen = Gaps(0), set()

@@ -188,7 +188,7 @@ def test_refused_measures_are_reported_with_their_cost() -> None:
     assert found["granted"] == ["one BLAS thread", "garbage collector off"]
 
 
-def test_a_class_below_the_normal_one_stays() -> None:
+def test_a_scheduling_class_below_the_normal_one_is_kept() -> None:
     found = report(
         "set_up_below_loop(None, None)", f"os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0)); {UNPRIVILEGED}"
     )
@@ -226,7 +226,7 @@ def test_cpu_idle_stays_disabled_while_the_process_lives() -> None:
     assert (found["granted"][-1], found["open"].count(LATENCY_DEVICE)) == ("processors awake", 1)
 
 
-def test_the_recorder_leaves_its_parents_scheduling_class() -> None:
+def test_the_recorder_does_not_keep_the_real_time_class_of_its_parent() -> None:
     real_time, cpu = fifo_permitted(), min(os.sched_getaffinity(0))
     limits = "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))" if real_time else ""
     found = report(f"set_up_below_loop(None, {{{cpu}}})", limits)
@@ -236,6 +236,7 @@ def test_the_recorder_leaves_its_parents_scheduling_class() -> None:
 
 def test_processes_are_spread_over_the_available_processors() -> None:
     def cpus_of(*cpus: int, simulated: bool = True) -> list[list[int]]:
+        """Processors of camera, controller, mirror and recorder."""
         return list(spread(cpus, simulated=simulated).values())
 
     assert cpus_of(3) == []

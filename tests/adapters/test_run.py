@@ -48,7 +48,7 @@ def test_a_run_has_ports_a_secret_and_private_files(monkeypatch: pytest.MonkeyPa
 def test_simultaneous_opens_get_the_same_run(own_runtime: Path) -> None:
     with ThreadPoolExecutor(8) as pool:
         links = [run.links for run in pool.map(open_run, ["one"] * 8)]
-    assert all((one, one.secret) == (links[0], links[0].secret) for one in links)
+    assert all((other, other.secret) == (links[0], links[0].secret) for other in links)
     assert [path.name for path in (own_runtime / "lowfc").iterdir()] == ["one"]
 
 
@@ -227,7 +227,7 @@ def test_a_latch_under_its_former_name_counts(files: tuple[Path, Path]) -> None:
     assert not files[0].with_name("safed").exists(), "cleared under either name"
 
 
-def test_a_missing_directory_does_no_harm_and_is_used_again_later(
+def test_a_latch_is_kept_in_one_place_while_the_other_is_missing_and_written_there_again_later(
     files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(latch_module, "RETRY_S", 0.01)
@@ -289,15 +289,15 @@ def test_a_failed_write_leaves_the_old_file_only(tmp_path: Path, monkeypatch) ->
     wrong = [(special, "not a regular file") for special in (tmp_path / "pipe", Path(), Path("/"), tmp_path)]
     unwritable = Path("/proc/calibration.fits"), "No such file"  # for root too
     for file, why in (*wrong, (tmp_path / ("x" * 300), "File name too long"), unwritable):
-        for refusing in (require_folder, partial(write_whole, content=b"")):
+        for write in (require_folder, partial(write_whole, content=b"")):
             with pytest.raises(DataFileError, match=f"^{file} cannot be written: {why}"):
-                refusing(file)
+                write(file)
     (tmp_path / "pipe").unlink()
     (tmp_path / "loop").symlink_to("loop")
-    for usual in (tmp_path / "loop", tmp_path / ("x" * 255)):
-        require_folder(path, usual)
-        write_whole(usual, b"")
-        usual.unlink()
+    for allowed in (tmp_path / "loop", tmp_path / ("x" * 255)):
+        require_folder(path, allowed)
+        write_whole(allowed, b"")
+        allowed.unlink()
     with pytest.raises(DataFileError, match="nowhere/file cannot be written: No such file"):
         write_whole(tmp_path / "nowhere" / "file", b"")
     monkeypatch.setattr(Path, "replace", FULL_DISK)

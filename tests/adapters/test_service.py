@@ -30,8 +30,8 @@ def clock() -> FakeClock:
     return FakeClock()
 
 
-def service(hub: MemoryHub, clock: FakeClock, name: str, **more: object) -> Service:
-    return Service(name, "night", clock, MemoryBus(hub, name, clock), **more)
+def service(hub: MemoryHub, clock: FakeClock, name: str, **options: object) -> Service:
+    return Service(name, "night", clock, MemoryBus(hub, name, clock), **options)
 
 
 def test_health_is_published_when_due_with_all_fields(hub: MemoryHub, clock: FakeClock) -> None:
@@ -102,11 +102,11 @@ def test_events_are_published_and_warnings_printed(
     assert from_timestamp(listener.messages(EVENT)[-1].timestamp) == clock.now_ns()
     printed = capsys.readouterr().err
     assert printed == "controller: REALTIME_REFUSED the host refused SCHED_FIFO: a longer tail\n"
-    (_, terminal), kept = os.openpty(), os.dup(2)
+    (_, terminal), stderr = os.openpty(), os.dup(2)
     termios.tcflow(terminal, termios.TCOOFF)  # as by Ctrl-S
     os.dup2(terminal, 2)
     controller.event("CLOCK_OFF", ahead_ms=200)
-    os.dup2(kept, 2)
+    os.dup2(stderr, 2)
     assert not capsys.readouterr().err, "a write would halt the process"
 
 
@@ -162,7 +162,7 @@ def test_a_newcomer_gets_a_health_before_the_next_is_due(hub: MemoryHub, clock: 
     for number in (1, 2, 1):  # two views, in turns
         MemoryBus(hub, "viewer", clock).publisher(HEALTH, "viewer").put(wire.Health(pid=number).SerializeToString())
         camera.beat()
-    assert [health.process for health in listener.messages(HEALTH)[before:]] == ["", "camera", "", ""]
+    assert [health.process for health in listener.messages(HEALTH)[before:]] == ["", "camera", "", ""]  # "": a view
 
 
 def test_a_flood_of_bad_messages_gives_one_event_and_the_last_health_has_all_counts(
@@ -197,7 +197,7 @@ def test_an_unreadable_message_gives_an_event_without_traceback_or_stop(
     mirror = service(hub, clock, "mirror-dm")
     read: list[int] = []
     decode = wire.MirrorCommand.FromString
-    mirror.dispatch(COMMAND, lambda one: read.append(len(decode(one.payload).actuators)), "dm", period_ns=10**6)
+    mirror.dispatch(COMMAND, lambda sample: read.append(len(decode(sample.payload).actuators)), "dm", period_ns=10**6)
     MemoryBus(hub, "operator", clock).publisher(HEALTH, "stranger").put(b"\xff")
     commands = MemoryBus(hub, "controller", clock).publisher(COMMAND, "dm")
     commands.put(b"\xff")
