@@ -48,8 +48,8 @@ def handshake(server: Path, client: Path, role: str, name: str = "localhost") ->
 
 
 def test_router_and_roles_of_one_authority_accept_each_other(tmp_path: Path) -> None:
-    made = make(tmp_path, (ROUTER, "camera", "mirror-dm"), ["localhost", "10.0.0.1"])
-    assert [file.name for file in made] == ["router.pem", "camera.pem", "mirror-dm.pem"]
+    certificate_files = make(tmp_path, (ROUTER, "camera", "mirror-dm"), ["localhost", "10.0.0.1"])
+    assert [file.name for file in certificate_files] == ["router.pem", "camera.pem", "mirror-dm.pem"]
     for role in ("camera", "mirror-dm"):
         handshake(tmp_path, tmp_path, role)
     handshake(tmp_path, tmp_path, "camera", "10.0.0.1")
@@ -126,24 +126,24 @@ def test_a_connection_that_ends_in_the_handshake_is_not_reported_as_a_rejected_c
 
 
 def test_a_certificate_is_checked_as_its_peers_check_it(tmp_path: Path) -> None:
-    made = datetime.datetime.now(datetime.UTC)
+    made_at = datetime.datetime.now(datetime.UTC)
     make(tmp_path, (ROUTER, "camera"), ["localhost"], 100)
     for role in (ROUTER, "camera"):
         files = (tmp_path / "ca.pem", tmp_path / f"{role}.pem", tmp_path / f"{role}.key")
-        found = read_certificate(*files, server=role == ROUTER)
-        assert found.name == role
-        assert abs(found.ends - made - datetime.timedelta(days=100)) < datetime.timedelta(minutes=10)
+        certificate = read_certificate(*files, server=role == ROUTER)
+        assert certificate.name == role
+        assert abs(certificate.ends - made_at - datetime.timedelta(days=100)) < datetime.timedelta(minutes=10)
         with pytest.raises(DataFileError, match="is not a valid certificate"):
             read_certificate(*files, server=role != ROUTER)
     camera = tmp_path / "camera.pem", tmp_path / "camera.key"
-    for wrong in (
+    for unrelated_files in (
         (tmp_path / "ca.pem", camera[0], tmp_path / "router.key"),
         (camera[0], *camera),
         (tmp_path / "none.pem", *camera),
         (camera[1], *camera),
     ):
         with pytest.raises(DataFileError, match=r"camera\.pem is not a valid certificate of .* signed by"):
-            read_certificate(*wrong)
+            read_certificate(*unrelated_files)
     (tmp_path / "own.key").write_text("-----BEGIN ENCRYPTED PRIVATE KEY-----")
     with pytest.raises(DataFileError, match="the key is encrypted"):
         read_certificate(tmp_path / "ca.pem", camera[0], tmp_path / "own.key")

@@ -45,10 +45,10 @@ def test_a_missing_run_is_created_only_with_make() -> None:
     for command in (["hosts", "--run", "tpyo"], show_zenoh):
         assert "there is no run 'tpyo'" in refusal(*command, kind=BusError)
         assert runs() == []
-    made = lowfc(*show_zenoh, "--make")
-    assert made.exit_code == 0
+    created = lowfc(*show_zenoh, "--make")
+    assert created.exit_code == 0
     assert runs() == ["tpyo"]
-    assert lowfc(*show_zenoh).stdout == made.stdout
+    assert lowfc(*show_zenoh).stdout == created.stdout
 
 
 @pytest.mark.usefixtures("toml")
@@ -78,7 +78,9 @@ def test_the_roles_of_a_run_with_a_router_are_those_of_its_certificates() -> Non
     assert set(re.findall(r"`(.*?)`", documented[1])) == {ROUTER, *certified}
 
 
-def test_a_list_stores_the_connection_of_a_run_that_answers(toml: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lowfc_hosts_stores_its_connection_under_the_name_of_the_run_that_answers(
+    toml: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("lowfc.adapters.bus.zenoh_bus.ZenohBus", Mock())
     answers = {"camera": wire.Health(process="camera", run_id="bench")}
     monkeypatch.setattr("lowfc.client.Client", lambda *_, **__: Mock(processes=lambda: answers))
@@ -95,7 +97,7 @@ def test_a_run_that_cannot_be_joined_hides_no_other() -> None:
         open_run("across", network=NETWORK.model_copy(update={"router": address}))
         listed = json_of("runs")
         text = lowfc("runs").stdout
-    assert [one["run"] for one in listed["runs"]] == ["bench"]
+    assert [run["run"] for run in listed["runs"]] == ["bench"]
     (why,) = listed["not_joined"].values()
     assert "ca.pem cannot be read" in why
     assert text.splitlines()[1] == f"across  cannot be joined: {why}"

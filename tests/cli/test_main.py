@@ -27,19 +27,19 @@ def test_every_command_is_listed_under_its_heading_with_its_whole_description() 
 
 def test_every_help_page_has_an_example_whole_descriptions_and_no_colloquial_verbs() -> None:
     pages, context = [], click.Context(typer.main.get_command(app))
-    waiting = [(context.command, context)]
-    for command, above in waiting:
-        here = click.Context(command, parent=above, info_name=command.name)
-        page = command.get_help(here)
+    pending = [(context.command, context)]
+    for command, parent_context in pending:
+        own_context = click.Context(command, parent=parent_context, info_name=command.name)
+        page = command.get_help(own_context)
         pages.append(" ".join(page.split()))
         assert "Example: lowfc " in pages[-1]
         assert "..." not in page.partition("\nCommands:\n")[2]
         if hasattr(command, "list_commands"):
-            commands = (command.get_command(here, name) for name in command.list_commands(here))
-            waiting.extend((each, here) for each in commands if each is not None)
+            commands = (command.get_command(own_context, name) for name in command.list_commands(own_context))
+            pending.extend((each, own_context) for each in commands if each is not None)
     assert len(pages) > 70
-    found = [re.search(r"\b(told|tells?|hears?|listen to|lies to|nobody can|last words)\b.*", page) for page in pages]
-    assert [one[0] for one in found if one] == []
+    matches = [re.search(r"\b(told|tells?|hears?|listen to|lies to|nobody can|last words)\b.*", page) for page in pages]
+    assert [match[0] for match in matches if match] == []
 
 
 def test_the_command_line_imports_no_large_package_before_a_command_is_used() -> None:
@@ -59,14 +59,14 @@ def test_a_run_named_before_the_request_is_the_run_of_every_command_of_ctl() -> 
     group: Any = typer.main.get_command(ctl_app)
     with group.make_context("ctl", ["--run", "other", "status"]) as context:
         context.invoke(group.callback, **context.params)
-    waiting = [(context, group)]
+    pending = [(context, group)]
     runs: dict[str, str | None] = {}
-    for above, parent in waiting:
+    for parent_context, parent in pending:
         for name, command in parent.commands.items():
-            here = click.Context(command, parent=above, info_name=name)
-            runs[here.command_path] = here.lookup_default("run")
+            own_context = click.Context(command, parent=parent_context, info_name=name)
+            runs[own_context.command_path] = own_context.lookup_default("run")
             if hasattr(command, "commands"):
-                waiting.append((here, command))
+                pending.append((own_context, command))
     assert {"ctl bench", "ctl dark", "ctl safe", "ctl record stop"} <= runs.keys()
     assert [path for path, run in runs.items() if run != "other"] == []
 
@@ -80,7 +80,7 @@ class Mode(Result):
         return ["low"] if self.gain is not None and self.gain < 1 else []
 
 
-class Found(Result):
+class LoopResult(Result):
     rate_hz: float = result_field("rate", "Hz", "g")
     good: bool = result_field("good")
     noll: list[int] = result_field("mode", form="Z{}", column=True)
@@ -90,14 +90,14 @@ class Found(Result):
 
 
 @pytest.mark.parametrize(("word", "value"), [("True", True), ("FALSE", False), ("2.5e1", 25.0), ("truer", "truer")])
-def test_a_bench_value_is_a_truth_value_a_number_or_a_text(word: str, value: object) -> None:
+def test_a_bench_value_is_read_as_true_or_false_a_number_or_a_text(word: str, value: object) -> None:
     assert (type(bench_value(word)), bench_value(word)) == (type(value), value)
 
 
 def test_text_and_json_of_a_result_have_the_same_fields() -> None:
     modes = [Mode(noll=2, gain=0.5), Mode(noll=11, gain=None)]
-    found = Found(rate_hz=250, good=True, noll=[2, 11], noise_nm=[1, 12.25], modes=modes)
-    assert found.text().splitlines() == [
+    result = LoopResult(rate_hz=250, good=True, noll=[2, 11], noise_nm=[1, 12.25], modes=modes)
+    assert result.text().splitlines() == [
         "rate               250 Hz",
         "good               yes",
         "mode  noise, nm",
@@ -107,7 +107,7 @@ def test_text_and_json_of_a_result_have_the_same_fields() -> None:
         "Z2    0.50   low",
         "Z11      -",
     ]
-    assert found.json_object() == {
+    assert result.json_object() == {
         "rate_hz": 250,
         "good": True,
         "noll": [2, 11],

@@ -131,14 +131,14 @@ CALLS: tuple[tuple[Callable[[Client], object], Request], ...] = (
 )
 
 
-@pytest.mark.parametrize(("ask", "expected"), CALLS, ids=lambda one: getattr(one, "name", ""))
+@pytest.mark.parametrize(("ask", "expected"), CALLS, ids=lambda value: getattr(value, "name", ""))
 def test_the_controller_decodes_each_request(
     controller: FakeController, loop: Client, ask: Callable[[Client], object], expected: Request
 ) -> None:
     answer = ask(loop)
     assert controller.requests == [expected]
-    accepted = (True, "done", 77, expected.text, None, "default")
-    assert answer == ("done" if expected.name == "configuration" else accepted)
+    expected_answer = (True, "done", 77, expected.text, None, "default")
+    assert answer == ("done" if expected.name == "configuration" else expected_answer)
 
 
 def test_every_request_is_tested() -> None:
@@ -171,7 +171,7 @@ def test_a_reservation_is_renewed_and_its_id_is_in_the_holders_requests(controll
     assert f"(process {os.getpid()}), about 30 s to go" in first.text
     assert (gain.name, gain.lease_id) == ("gain", lease.id)
     assert renewals
-    assert {(one.name, one.lease_id) for one in renewals} == {("renew", lease.id)}
+    assert {(renewal.name, renewal.lease_id) for renewal in renewals} == {("renew", lease.id)}
     assert (release.name, release.lease_id) == ("release", lease.id)
     assert after.lease_id == 0
 
@@ -263,7 +263,7 @@ def test_a_controller_without_a_calibration_accepts_a_channel_of_the_mirrors_gri
     loop = controller.join()
     assert loop.mirror_grid() == (4, 5)
     loop.channel("flat", SHAPE)
-    assert [one.text for one in controller.requests] == ["flat"]
+    assert [request.text for request in controller.requests] == ["flat"]
     with pytest.raises(RequestRefusedError, match=r"the mirror has actuators of shape \(4, 5\)"):
         loop.channel("flat", SHAPE.T)
     with pytest.raises(BusError, match=r"^no calibration is loaded in run 'default': `lowfc ctl load FILE` loads one"):
@@ -287,12 +287,12 @@ def test_the_configuration_of_a_loop_is_read_and_another_versions_is_refused(
 @pytest.fixture
 def listen(own_runtime: Path) -> Iterator[Callable[..., None]]:
     """Open the ports of a run's processes, as if they were running."""
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as open_sockets:
 
         def begin(name: str, *roles: str) -> None:
             ports = open_run(name).links.ports
             for role in roles:
-                held.enter_context(socket.create_server(("127.0.0.1", ports[role])))
+                open_sockets.enter_context(socket.create_server(("127.0.0.1", ports[role])))
 
         yield begin
 
@@ -363,38 +363,41 @@ def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., 
 
 
 def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With owner, process and, if readable, runtime directory; the user's own loop in this directory is starting."""
+    """With its owner, its process and, if readable, its runtime directory.
+
+    A loop of the same user in the same directory is starting. A shell with a loop's command as arguments is no loop.
+    """
     name = f"night-{os.getpid()}"
     words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", name]
     wrapped = ["/bin/sh", "-c", 'echo; read end; "$@"', *words[3:]]
     parent = [*words[:1], "-c", "import subprocess, sys; subprocess.run(sys.argv[3:])", "lowfc", "sim-loop", *words]
-    for there, words_there in (
+    for runtime_dir, command in (
         ("/run/elsewhere", words),
         ("", words),
         (str(own_runtime), [*words[:-2], f"--run={name}"]),
         (str(own_runtime), wrapped),
         ("/run/elsewhere", parent),
     ):
-        environment = os.environ | {"XDG_RUNTIME_DIR": there}
-        with subprocess.Popen(words_there, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
+        environment = os.environ | {"XDG_RUNTIME_DIR": runtime_dir}
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
             process.stdout.readline()
-            ours = [one for one in other_loops() if f"(process {process.pid})" in one[0] or name in one[0]]
+            ours = [other for other in other_loops() if f"(process {process.pid})" in other[0] or name in other[0]]
             message = none_here()
             with monkeypatch.context() as patch:
                 patch.setattr("lowfc.adapters.bus.other_loops._START_S", 0.0)
                 late = none_here()
                 patch.setattr(os, "geteuid", lambda: 4_000_000_000)
-                patch.setenv("XDG_RUNTIME_DIR", there)
+                patch.setenv("XDG_RUNTIME_DIR", runtime_dir)
                 theirs = list(other_loops())
             process.communicate(b"\n")
-        program = "sim-loop" if words_there is parent else "controller"
+        program = "sim-loop" if command is parent else "controller"
         loop = f"`lowfc {program} --run {name}` (process {process.pid})"
-        where = f", with XDG_RUNTIME_DIR={there}" if there else ", without XDG_RUNTIME_DIR"
-        found, starting = words_there is not wrapped, there == str(own_runtime)
-        assert ours == [(f"you run {loop}{'' if starting else where}", starting)] * found
-        assert ((f"user {own_runtime.owner()} runs {loop}{where}", False) in theirs) == found
-        assert message.endswith("starting or ending: try again in a few seconds") == (found and starting)
-        assert (f"{loop}, but its directory is gone" in late) == (found and starting)
+        where = f", with XDG_RUNTIME_DIR={runtime_dir}" if runtime_dir else ", without XDG_RUNTIME_DIR"
+        is_loop, starting = command is not wrapped, runtime_dir == str(own_runtime)
+        assert ours == [(f"you run {loop}{'' if starting else where}", starting)] * is_loop
+        assert ((f"user {own_runtime.owner()} runs {loop}{where}", False) in theirs) == is_loop
+        assert message.endswith("starting or ending: try again in a few seconds") == (is_loop and starting)
+        assert (f"{loop}, but its directory is gone" in late) == (is_loop and starting)
 
 
 # The mirror.
@@ -403,11 +406,12 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
 def test_mirror_watch_reports_restarts_and_expired_commands_and_ignores_damaged_messages() -> None:
     hub = MemoryHub()
 
-    def process(role: str) -> Callable[[int], object]:
+    def start(role: str) -> Callable[[int], object]:
+        """Start a mirror; return a function that reports the mirror's newest frame."""
         states = MemoryBus(hub, role, HostClock()).publisher(MIRROR_STATE, role.removeprefix("mirror-"))
         return lambda frame: states.put(wire.MirrorState(frame_sequence=frame).SerializeToString())
 
-    slow, quick = process("mirror-slow"), process("mirror-quick")
+    slow, quick = start("mirror-slow"), start("mirror-quick")
     bus = ReportingBus(hub, lambda: slow(1))
     watch = Client(bus=bus).mirror_watch()
     assert (watch.frame_sequence, watch.interruption) == (1, "")
@@ -418,7 +422,7 @@ def test_mirror_watch_reports_restarts_and_expired_commands_and_ignores_damaged_
     bus.publisher(EVENT).put(EVENTS["COMMAND_BACK"].log("mirror-slow", 0).SerializeToString())
     watch.read()
     assert (watch.frame_sequence, watch.interruption) == (7, "")
-    process("mirror-quick")(10)
+    start("mirror-quick")(10)
     watch.read()
     assert (watch.frame_sequence, watch.interruption) == (7, "the mirror 'quick' restarted")
     expired = EVENTS["COMMAND_EXPIRED"].log("mirror-slow", 0, command_timeout_ms=200.0, action="holding the shape")
@@ -474,23 +478,23 @@ def stream(*samples: Sample, count: int | None = None) -> Stream[client.Frame]:
 
 
 def test_frames_arrive_in_order_as_arrays() -> None:
-    found = list(stream(*map(frame_sample, range(5, 15)), count=4))
-    assert [frame.pixels[0, 0] for frame in found] == [5, 6, 7, 8]
-    assert [(frame.number, frame.time_ns) for frame in found] == [(5, 5000), (6, 6000), (7, 7000), (8, 8000)]
-    assert (found[0].pixels.shape, found[0].pixels.dtype) == ((3, 4), np.uint16)
+    frames = list(stream(*map(frame_sample, range(5, 15)), count=4))
+    assert [frame.pixels[0, 0] for frame in frames] == [5, 6, 7, 8]
+    assert [(frame.number, frame.time_ns) for frame in frames] == [(5, 5000), (6, 6000), (7, 7000), (8, 8000)]
+    assert (frames[0].pixels.shape, frames[0].pixels.dtype) == ((3, 4), np.uint16)
     assert list(stream(frame_sample(5), count=-1)) == []
 
 
 def test_lost_frames_are_counted_but_not_restarts_or_duplicates() -> None:
-    early = image(np.zeros((3, 4), np.uint16), -1, "camera").SerializeToString()
-    again = [frame_sample(count, 1_700_000_060) for count in (0, 2)]
-    for payload in (b"\xff", early):
+    before_1970 = image(np.zeros((3, 4), np.uint16), -1, "camera").SerializeToString()
+    restarted = [frame_sample(count, 1_700_000_060) for count in (0, 2)]
+    for payload in (b"\xff", before_1970):
         broken = frame_sample(9)._replace(payload=payload)
-        frames = stream(frame_sample(5), frame_sample(8), broken, frame_sample(10), *again, count=5)
+        frames = stream(frame_sample(5), frame_sample(8), broken, frame_sample(10), *restarted, count=5)
         assert len(list(frames)) == 5
-        assert frames.lost == 2 + 1 + 1
-    before = frame_sample(2, 1_699_999_000)
-    frames = stream(*map(frame_sample, (5, 7, 7, 6)), before, *map(frame_sample, (8, 8, 11, 10)), count=9)
+        assert frames.lost == 2 + 1 + 1, "6 and 7, the unreadable 9, and 1 after the restart"
+    of_earlier_start = frame_sample(2, 1_699_999_000)
+    frames = stream(*map(frame_sample, (5, 7, 7, 6)), of_earlier_start, *map(frame_sample, (8, 8, 11, 10)), count=9)
     assert [frame.number for frame in frames] == [5, 7, 7, 6, 2, 8, 8, 11, 10]
     assert frames.lost == 1, "only 9 is missing"
 
@@ -552,10 +556,10 @@ def test_an_invalid_answer_is_an_error_message(payload: bytes) -> None:
 def test_a_step_is_decoded_unchanged() -> None:
     three = np.array([1.5, -2.0, 0.25], np.float32)
     sent = Step(9, 5_000, LoopMode.CLOSED, three, (Limit.SLEW,), three + 1, three + 2, 1234.5, 3)
-    got = step_of(Sample(STEP.key, codec.encode_step(sent, 1), 0, 0, 0))
-    assert got is not None
+    received = step_of(Sample(STEP.key, codec.encode_step(sent, 1), 0, 0, 0))
+    assert received is not None
     for name in Step._fields:
-        assert np.array_equal(getattr(got, name), getattr(sent, name)), name
+        assert np.array_equal(getattr(received, name), getattr(sent, name)), name
     held = step_of(Sample(STEP.key, codec.encode_step(sent._replace(error_nm=None, pol_nm=None), 1), 0, 0, 0))
     assert (held.error_nm, held.pol_nm) == (None, None)
     assert step_of(Sample(STEP.key, b"\xff", 0, 0, 0)) is None
@@ -566,7 +570,7 @@ def test_held_holds_the_loop_and_releases_it(controller: FakeController, loop: C
     with pytest.raises(KeyError), loop.held("moving the mask", 5.0):
         raise KeyError
     permission, hold, release = controller.requests
-    assert [one.name for one in controller.requests] == ["permit", "permit", "release"]
+    assert [request.name for request in controller.requests] == ["permit", "permit", "release"]
     assert (permission.values, hold.values) == ((), (5.0,))
     assert hold.text.startswith("moving the mask by ")
     assert hold.lease_id == release.lease_id != permission.lease_id
@@ -579,7 +583,7 @@ def test_a_bench_value_arrives_unchanged(controller: FakeController, loop: Clien
     for _ in range(2):
         loop.bench("mask", value)
     loop.bench("another", value)
-    decoded = [decode_bench_value(one.payload) for one in received]
+    decoded = [decode_bench_value(sample.payload) for sample in received]
     assert decoded == [value, value]
     assert isinstance(decoded[0], bool) is isinstance(value, bool | np.bool_)
     invalid: list[tuple[str, Value]] = [("a b", True), ("1st", True)]
@@ -688,6 +692,7 @@ def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
     put(bench.controller.publisher(CALIBRATION), 1)
     states = bench.camera.publisher(CAMERA_STATE)
     frames = bench.camera.publisher(FRAME)
+    # One frame of each recording: the first has frames 0 to 49, the second begins with frame 90.
     bench.hub.lose = lambda role, key, envelope: (
         role == "recorder" and key == FRAME.key and envelope.sequence & 0xFFFF in (5, 95)
     )
@@ -757,11 +762,11 @@ def test_a_log_that_cannot_be_created_is_refused_and_can_be_requested_again(
 
 
 def test_contrast_is_estimated_for_a_real_camera_and_true_for_a_simulated_one() -> None:
-    guess = {"added_contrast_flat": 2e-9, "added_contrast": 3e-11}
-    measured = wire.Health(last_second={"frames": 9}, recent_wavefront=guess)
+    estimate = {"added_contrast_flat": 2e-9, "added_contrast": 3e-11}
+    measured = wire.Health(last_second={"frames": 9}, recent_wavefront=estimate)
     true = wire.Health(recent_wavefront={"added_contrast_flat": 4e-9, "added_contrast": 5e-11})
     processes = {Role.CAMERA: wire.Health(), Role.CONTROLLER: measured}
-    real, simulated = (json_object(wire.ControllerState(), processes | more) for more in ({}, {Role.CAMERA: true}))
+    real, simulated = (json_object(wire.ControllerState(), processes | camera) for camera in ({}, {Role.CAMERA: true}))
     assert real["added_contrast"] == {"open": 2e-9, "closed": 3e-11}
     assert "+3.0e-11, estimated from the sensor" in text(real)
     assert simulated["added_contrast"] == {"open": 4e-9, "closed": 5e-11}

@@ -60,15 +60,15 @@ class LiveRun:
             Service(name, RUN, self.clock, self.bus(name)) for name in ("controller", "mirror-dm", "camera")
         ]
         controller, mirror, self.camera = self.services
-        self.frames, settings = self.camera.publisher(FRAME), self.camera.publisher(CAMERA_STATE)
+        self.frames, camera_states = self.camera.publisher(FRAME), self.camera.publisher(CAMERA_STATE)
         processes = [MirrorLoop(SimulatedMirror(DriverOptions(), CONFIG), mirror, CONFIG)]
         processes.append(Controller(CONFIG, controller, identified(calibration()), "a test", Latch([folder / "safe"])))
-        self._threads = [threading.Thread(target=one.run, daemon=True) for one in processes]
+        self._threads = [threading.Thread(target=process.run, daemon=True) for process in processes]
         self._threads.append(threading.Thread(target=self._expose, daemon=True))
-        camera = camera_state(
+        state = camera_state(
             replace(CameraSettings.configured(CONFIG, *SHAPE), saturation_dn=SATURATION_DN), self.clock.now_ns()
         )
-        settings.put(camera.SerializeToString())
+        camera_states.put(state.SerializeToString())
         for thread in self._threads:
             thread.start()
         until(lambda: mirror_states)

@@ -49,9 +49,9 @@ TIMEOUT_S = 15.0
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRun]:
-    one = LiveRun(tmp_path_factory.mktemp("run"))
-    yield one
-    one.stop()
+    live_run = LiveRun(tmp_path_factory.mktemp("run"))
+    yield live_run
+    live_run.stop()
 
 
 @pytest.fixture(autouse=True)
@@ -81,6 +81,8 @@ async def console(run: LiveRun) -> AsyncIterator["Screen"]:
 
 
 class Screen:
+    """A console without a terminal, and the pilot that presses its keys."""
+
     def __init__(self, app, pilot) -> None:
         self.app, self.pilot = app, pilot
 
@@ -172,7 +174,7 @@ def test_the_key_of_every_button_sends_its_request(
                 assert request.requester.endswith(f"(process {os.getpid()})")
             assert len(screen.app.screen_stack) == 1, "a form closes when its request is accepted"
         laws = [request for request in run.requests if request.name == "law"]
-        assert [one.HasField("law") for one in laws] == [True, False]
+        assert [law.HasField("law") for law in laws] == [True, False]
         assert run.recorded == ["stop", "start", "stop"]
         await screen.until(lambda: "pause (" in screen.text("log"))
         line = next(line for line in screen.text("log").splitlines() if "pause (" in line)
@@ -250,16 +252,16 @@ def test_safe_is_requested_by_s_by_its_button_by_f12_in_a_form_and_by_s_in_the_h
         for press in (lambda: screen.pilot.press("S"), lambda: screen.pilot.click("#safe")):
             before = len(run.requests)
             await press()
-            await screen.until(lambda before=before: [one.name for one in run.requests[before:]] == ["safe"])
+            await screen.until(lambda before=before: [request.name for request in run.requests[before:]] == ["safe"])
         before = len(run.requests)
         await screen.pilot.press("question_mark", "s")
-        await screen.until(lambda: [one.name for one in run.requests[before:]] == ["safe"])
+        await screen.until(lambda: [request.name for request in run.requests[before:]] == ["safe"])
         await screen.until(lambda: len(screen.app.screen_stack) == 1)
         await screen.pilot.press("n")
         await screen.until(lambda: len(screen.app.screen_stack) == 2)
         before = len(run.requests)
         await screen.pilot.press("s", "f12")
-        await screen.until(lambda: [one.name for one in run.requests[before:]] == ["safe"])
+        await screen.until(lambda: [request.name for request in run.requests[before:]] == ["safe"])
         await screen.until(lambda: screen.app.screen.query_one("Input").value == "s")
         await screen.pilot.press("escape", "k", "enter")
         await screen.until(lambda: run.requests[-1].name == "clear" and len(screen.app.screen_stack) == 1)
@@ -280,8 +282,8 @@ def test_a_gain_knob_scales_the_gains_of_all_modes_or_of_one_radial_order(run: L
         before = len(run.requests)
         await screen.pilot.press(*["right"] * 4)
         await screen.until(lambda: gain() == pytest.approx([0.7, 0.7, 0.07]))
-        turned = [one.values[0] for one in run.requests[before:]]
-        assert turned == sorted(turned), "requested in the order of the keys"
+        tip_gains = [request.values[0] for request in run.requests[before:]]
+        assert tip_gains == sorted(tip_gains), "requested in the order of the keys"
         await screen.until(lambda: "0.07-0.7" in screen.text("gains"))
         await screen.pilot.press("down", "left")
         await screen.until(lambda: gain() == pytest.approx([0.65, 0.65]))
@@ -289,10 +291,10 @@ def test_a_gain_knob_scales_the_gains_of_all_modes_or_of_one_radial_order(run: L
         await screen.pilot.press("down", "left")
         await screen.until(lambda: gain() == pytest.approx([0.06]))
         await screen.until(lambda: "0.06-0.65" in screen.text("gains"))
-        await screen.pilot.click("#gains", offset=(11 + 8, 0))
+        await screen.pilot.click("#gains", offset=(11 + 8, 0))  # the right end of the knob's bar
         await screen.until(lambda: gain() == pytest.approx([1.5, 1.5, 0.1385]))
         await screen.pilot.press("u")
-        await screen.until(lambda: any(one.text == "auto" and one.accepted for one in run.requests))
+        await screen.until(lambda: any(request.text == "auto" and request.accepted for request in run.requests))
         await screen.until(lambda: "auto" in screen.text("gains"))
         await screen.pilot.press("g")  # automatic gains would send requests during the next tests
         await screen.fill("0.5 0.5 0.05", "2-4")
@@ -315,12 +317,12 @@ def test_a_knob_is_chosen_and_shown_whatever_the_number_of_modes(monkeypatch: py
     update(2, 3)
     knobs.turn(1)
     knobs.automatic()
-    assert [one.modes for one in turned] == [(2, 3), (2, 3)]
+    assert [turn.modes for turn in turned] == [(2, 3), (2, 3)]
     monkeypatch.setattr(Gains, "size", Size(60, 5))
     update(*range(2, 37))
     for _ in range(8):
         knobs.choose(1)
-        assert any(line.plain.startswith("▸") for line in knobs._lines[:5]), "scrolled to the chosen one"
+        assert any(line.plain.startswith("▸") for line in knobs._lines[:5]), "scrolled to the chosen knob"
 
 
 def test_keys_typed_while_a_form_opens_are_entered_in_it(run: LiveRun) -> None:
@@ -405,27 +407,29 @@ def test_a_task_runs_in_its_own_session_and_reports_its_end() -> None:
 
 
 def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    found: list[object] = []
-    ask = Mock(side_effect=lambda _: found[0] if found else Mock(side_effect=BusError)())
+    configurations: list[object] = []
+    ask = Mock(side_effect=lambda _: configurations[0] if configurations else Mock(side_effect=BusError)())
     monkeypatch.setattr(feed, "configuration_of", ask)
     monkeypatch.setattr(monitor, "_QUERY_AGAIN_NS", 100_000_000)
-    screen = feed.Feed(run.bus("operator"), RUN, run.clock)
-    until(lambda: len(screen.read().state.snapshot.health) == 3 and screen.read().state.snapshot.calibration)
-    found.append(CONFIG)
-    until(lambda: screen.read() and screen._configured)
-    assert not screen._complete(Mock(controller=None)), "its state is queried again, too"
+    console_feed = feed.Feed(run.bus("operator"), RUN, run.clock)
+    until(
+        lambda: len(console_feed.read().state.snapshot.health) == 3 and console_feed.read().state.snapshot.calibration
+    )
+    configurations.append(CONFIG)
+    until(lambda: console_feed.read() and console_feed._configured)
+    assert not console_feed._complete(Mock(controller=None)), "its state is queried again, too"
     asked = ask.call_count
-    screen._query()  # as again and again without a calibration
+    console_feed._query()  # as is repeated while there is no calibration
     until(lambda: not any(thread.name == "query" for thread in threading.enumerate()))
-    assert (ask.call_count, screen._config) == (asked, CONFIG), "each query is a request in the log"
+    assert (ask.call_count, console_feed._config) == (asked, CONFIG), "each query is a request in the log"
 
 
 def test_a_request_is_in_the_log_of_every_console(run: LiveRun) -> None:
     async def both() -> None:
-        async with console(run) as one, console(run) as other:
-            await one.pilot.press("n")
-            await one.fill("from the first")
-            for screen in (one, other):
+        async with console(run) as first, console(run) as second:
+            await first.pilot.press("n")
+            await first.fill("from the first")
+            for screen in (first, second):
                 await screen.until(lambda screen=screen: "note from the first (" in screen.text("log"))
 
     asyncio.run(both())
