@@ -51,10 +51,10 @@ def responses_of(loop: InProcessLoop, test: Any, **options: Any) -> list[ProbeRe
     """Run a test on a loop, check that the loop mode is restored, and return the responses to its probe sequences."""
     loop.run(5)
     live = Live(loop, lambda *_: None)
-    found = loop.status().state.mode
+    mode_before = loop.status().state.mode
     with loop.reserved("a test"), live.restored():
         responses = test.play(live, **options)
-    assert loop.status().state.mode == found
+    assert loop.status().state.mode == mode_before
     return responses
 
 
@@ -67,25 +67,25 @@ def drawn(module: Any, result: AcceptanceResult) -> bytes:
 @pytest.fixture(scope="module", params=[1.0, 1.5])
 def multisine(request: pytest.FixtureRequest) -> tuple[InProcessLoop, ProbeResponse]:
     loop = InProcessLoop(configured(camera__delay_frames=request.param))
-    (one,) = responses_of(loop, rejection, **MULTISINE)
-    return loop, one
+    (response,) = responses_of(loop, rejection, **MULTISINE)
+    return loop, response
 
 
 def test_the_rejection_of_the_simulated_bench_matches_theory(multisine: tuple[InProcessLoop, ProbeResponse]) -> None:
-    loop, one = multisine
-    found = rejection.judge([one], loop.config)
-    assert found.passed, found.text()
-    assert found.injected == "offset"
-    assert found.largest_departure_db < 1.0
-    assert found.lines == 3 * MULTISINE["lines_per_mode"]
-    assert found.lines_judged > 0.7 * found.lines
-    assert found.lowest_hz >= 2.0
-    assert found.highest_hz == pytest.approx(75, rel=0.05)  # 0.3 of 250 Hz
-    wrong_delay = replace(one, loop=replace(one.loop, delay_frames=one.loop.delay_frames + 1))
+    loop, response = multisine
+    result = rejection.judge([response], loop.config)
+    assert result.passed, result.text()
+    assert result.injected == "offset"
+    assert result.largest_departure_db < 1.0
+    assert result.lines == 3 * MULTISINE["lines_per_mode"]
+    assert result.lines_judged > 0.7 * result.lines
+    assert result.lowest_hz >= 2.0
+    assert result.highest_hz == pytest.approx(75, rel=0.05)  # 0.3 of 250 Hz
+    wrong_delay = replace(response, loop=replace(response.loop, delay_frames=response.loop.delay_frames + 1))
     failed = rejection.judge([wrong_delay], loop.config)
     assert not failed.passed
     assert "FAILED" in failed.text()
-    strict = rejection.judge([one], configured(acceptance__rejection_db=1e-4))
+    strict = rejection.judge([response], configured(acceptance__rejection_db=1e-4))
     assert not strict.passed
     assert "too noisy" in strict.text()
 
@@ -93,39 +93,39 @@ def test_the_rejection_of_the_simulated_bench_matches_theory(multisine: tuple[In
 def test_with_a_pseudo_open_loop_law_the_multisine_is_added_to_the_mirror() -> None:
     loop = InProcessLoop(configured())
     loop.law(law_from_blocks([integrator_block(0.3, 0.001, "pol", 1.0)] * 3, "pol", "leaky", (2, 3, 4), 1.0, 250.0))
-    found = rejection.judge(responses_of(loop, rejection, **MULTISINE), loop.config)
-    assert (found.injected, found.law) == ("mirror", "leaky")
-    assert found.passed, found.text()
-    assert drawn(rejection, found).startswith(b"\x89PNG")
+    result = rejection.judge(responses_of(loop, rejection, **MULTISINE), loop.config)
+    assert (result.injected, result.law) == ("mirror", "leaky")
+    assert result.passed, result.text()
+    assert drawn(rejection, result).startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("multisine", [1.0], indirect=True)
 def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, ProbeResponse]) -> None:
-    loop, one = multisine
+    loop, response = multisine
     with pytest.raises(AcceptanceError, match=r"2 modes|3 modes"):
         responses_of(loop, rejection, **MULTISINE | {"duration_s": 0.1})
     with pytest.raises(AcceptanceError, match="of 3 columns takes at most 5333 s: shorten it"):
         responses_of(loop, rejection, **MULTISINE | {"duration_s": 6000.0})
-    other = one.mode.copy()
-    other[50] = LoopMode.OPEN
-    limited = one.reasons.copy()
+    opened = response.mode.copy()
+    opened[50] = LoopMode.OPEN
+    limited = response.reasons.copy()
     limited[70] = 1 << Limit.SLEW
-    missing = one.error_nm.copy()
+    missing = response.error_nm.copy()
     missing[100:110] = np.nan
     for disturbed, why in (
-        (replace(one, mode=other), "became open"),
-        (replace(one, reasons=limited), r"SLEW\) and ended the probe: use a smaller amplitude"),
-        (replace(one, reasons=limited, target=""), r"SLEW\): measure when"),
-        (replace(one, reasons=one.reasons | 1 << Limit.LAW_OVERRULED), "in place of the law"),
-        (replace(one, error_nm=missing), f"10 of {len(one.table)}"),
+        (replace(response, mode=opened), "became open"),
+        (replace(response, reasons=limited), r"SLEW\) and ended the probe: use a smaller amplitude"),
+        (replace(response, reasons=limited, target=""), r"SLEW\): measure when"),
+        (replace(response, reasons=response.reasons | 1 << Limit.LAW_OVERRULED), "in place of the law"),
+        (replace(response, error_nm=missing), f"10 of {len(response.table)}"),
     ):
         with pytest.raises(AcceptanceError, match=why):
             rejection.judge([disturbed], loop.config)
-    few = one.error_nm.copy()
-    few[400] = np.nan
-    found = rejection.judge([replace(one, error_nm=few)], loop.config)
-    assert found.frames_missing == 1
-    assert "interpolated" in found.text()
+    one_missing = response.error_nm.copy()
+    one_missing[400] = np.nan
+    result = rejection.judge([replace(response, error_nm=one_missing)], loop.config)
+    assert result.frames_missing == 1
+    assert "interpolated" in result.text()
     loop.ask("safe")
     with pytest.raises(AcceptanceError, match="it must be open or closed to be measured"):
         Live(loop, lambda *_: None)
@@ -138,19 +138,21 @@ def test_linearity_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain(
     loop = InProcessLoop(configured())
     with pytest.raises(AcceptanceError, match="2 frames at each level are too few: the first 3"):
         responses_of(loop, linearity, hold_frames=2, cycles=3, modes=(2,))
-    (one,) = responses_of(loop, linearity, hold_frames=7, cycles=3, modes=(2,))
-    found = linearity.judge([one], loop.config)
-    assert found.passed, found.text()
-    assert len(str(one.what)) < 100, "the note of any number of cycles is short"
-    (mode,) = found.modes
+    (response,) = responses_of(loop, linearity, hold_frames=7, cycles=3, modes=(2,))
+    result = linearity.judge([response], loop.config)
+    assert result.passed, result.text()
+    assert len(str(response.what)) < 100, "the note of any number of cycles is short"
+    (mode,) = result.modes
     assert mode.levels[1].gain == pytest.approx(1.0, abs=0.03)
     assert [row.amplitude_nm for row in mode.levels] == pytest.approx([6, 12, 24])
-    noise_nm = np.random.default_rng(8).normal(0.0, 50.0, one.error_nm.shape)
-    assert linearity.judge([replace(one, error_nm=one.error_nm + noise_nm)], loop.config).modes[0].too_noisy
-    halved = linearity.judge([one, replace(one, error_nm=0.5 * one.error_nm)], loop.config)  # the test was repeated
+    noise_nm = np.random.default_rng(8).normal(0.0, 50.0, response.error_nm.shape)
+    assert linearity.judge([replace(response, error_nm=response.error_nm + noise_nm)], loop.config).modes[0].too_noisy
+    halved = linearity.judge(
+        [response, replace(response, error_nm=0.5 * response.error_nm)], loop.config
+    )  # the test was repeated
     assert [mode.passed for mode in halved.modes] == [False]
     assert "FAILED" in halved.text()
-    assert drawn(linearity, found).startswith(b"\x89PNG")
+    assert drawn(linearity, result).startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(
@@ -167,13 +169,13 @@ def test_the_capture_range_ends_at_the_modal_limit_or_the_sensor_range(
 ) -> None:
     config = configured(**changes, acceptance__capture_tilt_nm=tilt_nm)
     trials = responses_of(InProcessLoop(config), capture, modes=(2,))  # Z2, tip
-    found = capture.judge(trials, config)
-    (mode,) = found.modes
+    result = capture.judge(trials, config)
+    (mode,) = result.modes
     assert (mode.captured_nm, mode.lost_nm, mode.limits) == (captured_nm, lost_nm, limits)
-    assert found.passed == (captured_nm >= tilt_nm)
-    assert all(name in found.text() for name in limits)
+    assert result.passed == (captured_nm >= tilt_nm)
+    assert all(name in result.text() for name in limits)
     if lost_nm is None:
-        assert drawn(capture, found).startswith(b"\x89PNG")
+        assert drawn(capture, result).startswith(b"\x89PNG")
     assert not capture.judge(trials[:1], config).passed
 
 
@@ -187,19 +189,21 @@ def test_the_noise_floor_matches_photon_and_read_noise() -> None:
     config = configured(disturbance__preset="bench", camera__instants=8)
     loop = InProcessLoop(config)
     responses, calibration = responses_of(loop, noise, duration_s=3.0), loop.calibration()
-    found = noise.judge(responses, config)
-    assert found.passed, found.text()
-    for mode in found.modes:
+    result = noise.judge(responses, config)
+    assert result.passed, result.text()
+    for mode in result.modes:
         assert mode.open_nm == pytest.approx(mode.expected_nm, rel=0.2)
         assert mode.closed_nm == pytest.approx(mode.expected_nm, rel=0.2)
         assert 0 < mode.residual_floor_nm < mode.closed_nm
     brighter = configured(star__magnitude=-2.0)
     four_times = replace(calibration, flux_dn=4 * calibration.flux_dn)
-    lit = [replace(one, loop=replace(one.loop, calibration=four_times)) for one in responses]
-    failed = noise.judge(lit, brighter)
+    of_brighter_star = [
+        replace(response, loop=replace(response.loop, calibration=four_times)) for response in responses
+    ]
+    failed = noise.judge(of_brighter_star, brighter)
     assert not failed.passed
     assert "FAILED" in failed.text()
-    assert drawn(noise, found).startswith(b"\x89PNG")
+    assert drawn(noise, result).startswith(b"\x89PNG")
     with pytest.raises(AcceptanceError, match="closed-loop recording"):
         noise.judge(responses[:1], config)
 

@@ -52,9 +52,9 @@ Action = Callable[[Any], object]
 
 
 def calibrator_of(
-    loop: InProcessLoop, method: str, cycles: int = 4, *, report: Callable[[str], None] = ignore, **more: Any
+    loop: InProcessLoop, method: str, cycles: int = 4, *, report: Callable[[str], None] = ignore, **options: Any
 ) -> Calibrator:
-    request = CalibrationRequest(method, **{"out": OUT, "snr": 50.0, "cycles": cycles, **more})
+    request = CalibrationRequest(method, **{"out": OUT, "snr": 50.0, "cycles": cycles, **options})
     return Calibrator(loop, request, report, ignore)
 
 
@@ -71,8 +71,8 @@ def mode_of(loop: InProcessLoop) -> int:
 
 def calibrated(loop: InProcessLoop, method: str, cycles: int) -> tuple[Calibration, CalibrationData]:
     calibrator, data = measure(loop, method, cycles)
-    made, _ = measured_calibration(loop.config, calibrator.before, data.measured, CalibrationRequest(method, OUT, 50.0))
-    return made, data
+    request = CalibrationRequest(method, OUT, 50.0)
+    return measured_calibration(loop.config, calibrator.before, data.measured, request)[0], data
 
 
 @pytest.mark.parametrize(
@@ -92,25 +92,30 @@ def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, 
         loop.close_loop()
         loop.run(30)
     before = loop.calibration()
-    made, data = calibrated(loop, method, 4)
+    calibration, data = calibrated(loop, method, 4)
     assert abs(data.delay.delay_frames - delay) < 0.05
     assert data.measured.error.max() < 0.02
-    talk = np.abs(cross_talk(made.reconstructor, before.response))
-    assert (talk - 4 * data.measured.error[:, None]).max() < 0.02
-    assert np.allclose(made.actuators_to_modes @ made.modes_to_actuators, np.eye(len(made.noll)), atol=1e-4)
-    difference = made.actuators_to_modes - before.actuators_to_modes
+    error = np.abs(cross_talk(calibration.reconstructor, before.response))
+    assert (error - 4 * data.measured.error[:, None]).max() < 0.02
+    assert np.allclose(
+        calibration.actuators_to_modes @ calibration.modes_to_actuators, np.eye(len(calibration.noll)), atol=1e-4
+    )
+    difference = calibration.actuators_to_modes - before.actuators_to_modes
     assert np.linalg.norm(difference) < 0.1 * np.linalg.norm(before.actuators_to_modes)
     for factor in (0.5, -2.0):  # the mirror moves half as far as its model, or twice as far and the other way
-        other = data.measured._replace(response=factor * data.measured.response)
-        scaled, _ = measured_calibration(loop.config, before, other, CalibrationRequest(method, OUT, 50.0))
-        assert np.allclose(scaled.actuators_to_modes, made.actuators_to_modes, atol=1e-3)
-    assert made.id != before.id
-    assert made.estimator == f"weighted+{method}"
-    first = data.measured._replace(initial=data.measured.initial._replace(estimator=f"weighted+{method}+first"))
-    assert not measured_calibration(config, before, first, CalibrationRequest(method, OUT, 50.0))[0].provisional
+        scaled_response = data.measured._replace(response=factor * data.measured.response)
+        scaled, _ = measured_calibration(loop.config, before, scaled_response, CalibrationRequest(method, OUT, 50.0))
+        assert np.allclose(scaled.actuators_to_modes, calibration.actuators_to_modes, atol=1e-3)
+    assert calibration.id != before.id
+    assert calibration.estimator == f"weighted+{method}"
+    # A calibration measured with the provisional one of commissioning as the initial one is not provisional itself.
+    from_first = data.measured._replace(initial=data.measured.initial._replace(estimator=f"weighted+{method}+first"))
+    assert not measured_calibration(config, before, from_first, CalibrationRequest(method, OUT, 50.0))[0].provisional
 
 
-def closed(config: Configuration, calibration: Calibration, frames: int, world: Configuration) -> np.ndarray:
+def closed_residual_nm(
+    config: Configuration, calibration: Calibration, frames: int, world: Configuration
+) -> np.ndarray:
     """True residual (frames, modes) of the second half of a closed loop."""
     loop = InProcessLoop(config, calibration, world)
     loop.close_loop()
@@ -120,9 +125,9 @@ def closed(config: Configuration, calibration: Calibration, frames: int, world: 
 
 def test_measured_and_computed_calibrations_give_residuals_within_5_percent() -> None:
     loop = InProcessLoop(configured(**FEW))
-    made, _ = calibrated(loop, "hadamard", 4)
+    calibration, _ = calibrated(loop, "hadamard", 4)
     disturbed = configured(**FEW, disturbance__preset="bench")
-    residuals = (closed(disturbed, each, 300, disturbed) for each in (loop.calibration(), made))
+    residuals = (closed_residual_nm(disturbed, each, 300, disturbed) for each in (loop.calibration(), calibration))
     computed_rms, measured_rms = (np.sqrt((each**2).sum(axis=1).mean()) for each in residuals)
     assert abs(measured_rms / computed_rms - 1) < 0.05
 
@@ -135,14 +140,14 @@ def test_a_mirror_with_dead_actuators_and_misregistration_is_calibrated_and_clos
     config = configured(**NOISELESS, mirror__active="active.npy")
     true = {"mirror__dead": dead, "mirror__magnification": 1.01, "mirror__shift_pitches": 0.1}
     loop = InProcessLoop(config, world=configured(**NOISELESS, **true))
-    made, data = calibrated(loop, "hadamard", 4)
+    calibration, data = calibrated(loop, "hadamard", 4)
     assert calibrator_of(loop, "hadamard", 4).pokes.amplitude_nm <= 3
-    assert not made.modes_to_actuators[dead].any()
-    assert not made.actuators_to_modes[:, dead].any()
+    assert not calibration.modes_to_actuators[dead].any()
+    assert not calibration.actuators_to_modes[:, dead].any()
     computed_talk = cross_talk(loop.calibration().reconstructor, data.measured.response)
     assert np.abs(computed_talk).max() > 0.02  # the computed calibration does not include the mirror's errors
     disturbed = configured(**NOISELESS, **true, disturbance__static_nm={"2": 10.0, "4": -6.0})
-    settled = closed(config, made, 200, disturbed).mean(axis=0)
+    settled = closed_residual_nm(config, calibration, 200, disturbed).mean(axis=0)
     assert np.abs(settled).max() < 0.5
 
 
@@ -150,10 +155,10 @@ def test_the_loop_holds_a_zero_point_that_is_not_flat() -> None:
     state = {"3": -10.0, "4": 15.0}
     config = configured(**NOISELESS)
     loop = InProcessLoop(config, world=configured(**NOISELESS, disturbance__static_nm=state))
-    made, _ = calibrated(loop, "hadamard", 4)
+    calibration, _ = calibrated(loop, "hadamard", 4)
     zero = loop.residual_nm(0, 1)[0]
-    moved = configured(**NOISELESS, disturbance__static_nm={"2": 20.0, "3": -10.0, "4": 35.0})  # by 20 nm from `state`
-    difference = closed(config, made, 200, moved).mean(axis=0) - zero
+    moved_by_20_nm = configured(**NOISELESS, disturbance__static_nm={"2": 20.0, "3": -10.0, "4": 35.0})  # from `state`
+    difference = closed_residual_nm(config, calibration, 200, moved_by_20_nm).mean(axis=0) - zero
     assert np.abs(difference).max() < 0.02 * 20.0
 
 

@@ -51,9 +51,9 @@ STATIC = CONFIG | {"disturbance.static_nm": {"4": 6.0}}
 @pytest.fixture
 def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
     monkeypatch.chdir(tmp_path)
-    made = InProcessLoop(load(None, CONFIG), world=load(None, STATIC))
-    connect(made, monkeypatch)
-    return made
+    new_loop = InProcessLoop(load(None, CONFIG), world=load(None, STATIC))
+    connect(new_loop, monkeypatch)
+    return new_loop
 
 
 @pytest.fixture
@@ -61,9 +61,9 @@ def noiseless_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcess
     """The same without noise, so that a frame takes half the time, and with a slew limit that shrinks the pokes."""
     monkeypatch.chdir(tmp_path)
     config = load(None, CONFIG | {"control.max_identical_frames": 0, "safety.slew_nm": 5.0})
-    made = InProcessLoop(config, world=load(None, STATIC | {"camera.noise": False}))
-    connect(made, monkeypatch)
-    return made
+    new_loop = InProcessLoop(config, world=load(None, STATIC | {"camera.noise": False}))
+    connect(new_loop, monkeypatch)
+    return new_loop
 
 
 def connect(loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,8 +75,8 @@ def json_of(*words: str) -> dict[str, Any]:
     """The JSON of a command that must succeed."""
     done = CliRunner().invoke(calibrate_app, [*words, "--json"], catch_exceptions=False)
     assert done.exit_code == 0, done.output
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
 
 
 def toml(config: Configuration) -> str:
@@ -95,7 +95,9 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
 ) -> None:
     loop = noiseless_loop
     check = Calibrator.check
-    begun = DELAY_FRAMES + 2 * 8  # frames for measuring the delay, before the first report of the time to go
+    delay_measurement_frames = (
+        DELAY_FRAMES + 2 * 8
+    )  # for measuring the delay, before the first report of the time to go
     monkeypatch.setattr(Calibrator, "check", Mock(side_effect=KeyboardInterrupt))
     before = loop.calibration()
     words = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]
@@ -106,24 +108,24 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
     assert not Path("night.fits").exists()
     assert loop.calibration().id == before.id
     monkeypatch.setattr(Calibrator, "check", check)
-    cycles = len(loop.surfaces_nm) - begun
-    again = CliRunner().invoke(calibrate_app, [*words, "--resume", "--json"])
-    checks = len(loop.surfaces_nm) - cycles - 2 * begun
-    assert frames_to_go(again.stderr) == pytest.approx(checks, abs=0.6 * RATE_HZ)
-    assert frames_to_go(done.stderr) == pytest.approx(cycles + checks, abs=0.6 * RATE_HZ)
-    found = json.loads(again.stdout)
-    made = calibration_file.load(Path("night.fits"))
-    assert (found["method"], found["cycles"]) == ("hadamard", 4)
-    assert found["modes"] == 3
-    assert found["file"] == "night.fits"
-    assert found["condition_number"] > 1
-    assert abs(found["delay_frames"] - 1) < 0.05
-    assert found["frame_to_effect_ms"] == pytest.approx(4.0, rel=0.05)
-    assert len(found["noise_gain_nm"]) == len(found["singular_values"]) == 3
+    cycle_frames = len(loop.surfaces_nm) - delay_measurement_frames
+    resumed = CliRunner().invoke(calibrate_app, [*words, "--resume", "--json"])
+    check_frames = len(loop.surfaces_nm) - cycle_frames - 2 * delay_measurement_frames
+    assert frames_to_go(resumed.stderr) == pytest.approx(check_frames, abs=0.6 * RATE_HZ)
+    assert frames_to_go(done.stderr) == pytest.approx(cycle_frames + check_frames, abs=0.6 * RATE_HZ)
+    result = json.loads(resumed.stdout)
+    calibration = calibration_file.load(Path("night.fits"))
+    assert (result["method"], result["cycles"]) == ("hadamard", 4)
+    assert result["modes"] == 3
+    assert result["file"] == "night.fits"
+    assert result["condition_number"] > 1
+    assert abs(result["delay_frames"] - 1) < 0.05
+    assert result["frame_to_effect_ms"] == pytest.approx(4.0, rel=0.05)
+    assert len(result["noise_gain_nm"]) == len(result["singular_values"]) == 3
     # H was measured 6 nm from flat, where it differs a little from the computed H
-    assert found["cross_talk"] < 0.1 + 4 * found["cross_talk_error"]
-    assert (found["recommended"], found["snr"]) == (True, 20)
-    assert loop.calibration().id == made.id != before.id
+    assert result["cross_talk"] < 0.1 + 4 * result["cross_talk_error"]
+    assert (result["recommended"], result["snr"]) == (True, 20)
+    assert loop.calibration().id == calibration.id != before.id
     assert list(Path().glob("*.part.npz")) == []
     same = json_of("--compare", "night.fits", "night.fits")
     assert same["cross_talk"] < 1e-4
@@ -137,7 +139,7 @@ def test_a_calibration_in_closed_loop_is_loaded_and_the_loop_closed_again(
     noiseless_loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loop, before = noiseless_loop, noiseless_loop.calibration()
-    made = identified(replace(before, reference=before.reference * np.float32(1.001)))
+    new_calibration = identified(replace(before, reference=before.reference * np.float32(1.001)))
     part = Path("night.fits.part.npz")
     refuse = False
 
@@ -152,14 +154,14 @@ def test_a_calibration_in_closed_loop_is_loaded_and_the_loop_closed_again(
 
     result = SimpleNamespace(recommended=True, not_loaded=False)
     monkeypatch.setattr(Calibrator, "run", run)
-    monkeypatch.setattr(calibrate_commands, "finish_calibration", lambda *_: (made, result))
+    monkeypatch.setattr(calibrate_commands, "finish_calibration", lambda *_: (new_calibration, result))
     monkeypatch.setattr(loop, "load", load_calibration)
     monkeypatch.setattr(command, "print_result", lambda *_, **__: None)
     loop.close_loop()
     words = ["--method", "in-loop", "--out", "night.fits", "--load"]
     done = CliRunner().invoke(calibrate_app, words, catch_exceptions=False)
     assert "the loop is opened to load the calibration and closed again afterwards" in done.stderr
-    assert (loop.calibration().id, loop.status().state.mode) == (made.id, wire.LOOP_MODE_CLOSED)
+    assert (loop.calibration().id, loop.status().state.mode) == (new_calibration.id, wire.LOOP_MODE_CLOSED)
     assert not part.exists()
     refuse = True
     done = CliRunner().invoke(calibrate_app, words)
@@ -193,11 +195,11 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
     words = ["--cycles", "4", "--snr", "200", "--out", "night.fits", "--load"]
     done = CliRunner().invoke(calibrate_app, [*words, "--json"])
     assert done.exit_code == 1
-    found = json.loads(done.stdout)
-    assert not found["recommended"]
-    assert found["snr_reached"] < 200
-    assert "200 required: find what disturbs this mode, or measure about" in found["faults"][0]
-    assert found["file"] == "night.rejected.fits"
+    result = json.loads(done.stdout)
+    assert not result["recommended"]
+    assert result["snr_reached"] < 200
+    assert "200 required: find what disturbs this mode, or measure about" in result["faults"][0]
+    assert result["file"] == "night.rejected.fits"
     assert calibration_file.load(Path("night.rejected.fits")).id != before.id
     assert not Path("night.fits").exists(), "an existing calibration would be overwritten"
     assert loop.calibration().id == before.id
@@ -210,7 +212,7 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
         monkeypatch.setattr(loop.scene, "expose", shifted)
         return check(self, *arguments)
 
-    assert "cross-talk on separate frames" not in str(found["faults"])
+    assert "cross-talk on separate frames" not in str(result["faults"])
     monkeypatch.setattr(Calibrator, "check", check_shifted)
     done = CliRunner().invoke(calibrate_app, [*words, "--resume"])
     assert done.exit_code == 1
@@ -226,6 +228,9 @@ def test_work_before_the_first_cycle_does_not_affect_the_time_to_go() -> None:
     for done in (400, 500, 600):
         count("hadamard cycle", done, 1000)
     assert lines == ["hadamard cycle: 50%, about 15 s to go"]
+
+
+def test_a_progress_bar_shows_brackets_in_a_file_name() -> None:
     with counting_bar(Console(file=(shown := StringIO()), force_terminal=True, width=80)) as count:
         count("reading [/b].mcap", 1, 2)
     assert "reading [/b].mcap" in shown.getvalue()
@@ -244,13 +249,13 @@ def test_progress_without_a_terminal_is_a_line_every_10_s_with_the_time_to_go_of
 
 
 def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:
-    found = json_of("reference", "--frames", "200", "--out", "there.fits")
-    shift = dict(zip(found["noll"], found["reference_shift_nm"], strict=True))
+    result = json_of("reference", "--frames", "200", "--out", "there.fits")
+    shift = dict(zip(result["noll"], result["reference_shift_nm"], strict=True))
     assert shift[4] == pytest.approx(6.0, abs=0.6)
-    made = calibration_file.load(Path("there.fits"))
-    assert np.abs(cross_talk(made.reconstructor, made.response)).max() < 1e-3
-    assert np.array_equal(made.response, loop.calibration().response)
-    loop.offset(5.0, [4])  # a loop with this zero point would go on by as much
+    calibration = calibration_file.load(Path("there.fits"))
+    assert np.abs(cross_talk(calibration.reconstructor, calibration.response)).max() < 1e-3
+    assert np.array_equal(calibration.response, loop.calibration().response)
+    loop.offset(5.0, [4])  # the new reference includes the offset, which would move the loop once more
     done = CliRunner().invoke(calibrate_app, ["reference", "--frames", "16"], catch_exceptions=False)
     assert "the new reference image contains the offset" in " ".join(done.stderr.split())
     loop.ask("lease", values=60.0, text="somebody", lease_id=2)
@@ -267,11 +272,11 @@ def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
     cube = np.rint(100 + 1.5 * rng.standard_normal((64, 80, 80)))
     cube[:, 40, 41] += 500
     fits.PrimaryHDU(cube.astype(np.int16)).writeto("dark.fits")
-    found = json_of("dark", "--file", "dark.fits", "--out", "masked.fits")
-    assert (found["hot"], found["noisy"], found["dead"]) == (1, 0, 0)
-    made = calibration_file.load(Path("masked.fits"))
-    assert made.good.reshape(80, 80)[40, 41] == 0
-    assert not made.reconstructor[:, 40 * 80 + 41].any()
+    result = json_of("dark", "--file", "dark.fits", "--out", "masked.fits")
+    assert (result["hot"], result["noisy"], result["dead"]) == (1, 0, 0)
+    calibration = calibration_file.load(Path("masked.fits"))
+    assert calibration.good.reshape(80, 80)[40, 41] == 0
+    assert not calibration.reconstructor[:, 40 * 80 + 41].any()
     fits.PrimaryHDU(cube[:, :20].astype(np.int16)).writeto("small.fits")
     with pytest.raises(DataFileError, match=r"frames have \(20, 80\) pixels, the calibration \(80, 80\)"):
         json_of("dark", "--file", "small.fits")
@@ -282,9 +287,9 @@ def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
         json_of("dark", "--file", "cube.npy")
     dark = InProcessLoop(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
     connect(dark, monkeypatch)
-    found = json_of("dark", "--star-blocked", "--frames", "50", "--out", "night.fits")
-    assert found["dark_dn"] == pytest.approx(100, abs=0.5)
-    assert found["hot"] < 5
+    result = json_of("dark", "--star-blocked", "--frames", "50", "--out", "night.fits")
+    assert result["dark_dn"] == pytest.approx(100, abs=0.5)
+    assert result["hot"] < 5
 
 
 @pytest.mark.parametrize("words", ["", "reference", "align", "dark --star-blocked"])
@@ -305,20 +310,20 @@ def test_the_computed_calibration_is_resampled_to_a_scaled_and_rotated_sensor(lo
     geometry = Geometry(1.08, 44.0, 47.5, 12.0, -1)
     model = before.reference.astype(float).reshape(80, 80)
     light = np.random.default_rng(2).poisson(np.maximum(3e5 * onto(model, geometry, shape) + 3, 0))
-    found = align(light.astype(float), model)
+    aligned = align(light.astype(float), model)
     zeros = np.zeros((90 * 96, len(before.noll)), np.float32)
     blank = {"dark": zeros[:, 0], "reference": zeros[:, 0], "response": zeros, "reconstructor": zeros.T}
     real = replace(before, shape=shape, good=zeros[:, 0] + 1, **blank)
-    made = on_sensor(loop.config, before, found.geometry, float(light.sum()), real)
+    calibration = on_sensor(loop.config, before, aligned.geometry, float(light.sum()), real)
     H = onto(before.response.astype(float).reshape(80, 80, -1), geometry, shape).reshape(90 * 96, -1)
-    assert np.abs(cross_talk(made.reconstructor, H)).max() < 0.03
+    assert np.abs(cross_talk(calibration.reconstructor, H)).max() < 0.03
 
 
 def test_a_poke_resolves_the_rotation_by_180_degrees(noiseless_loop: InProcessLoop) -> None:
-    found = json_of("align", "--out", "aligned.fits", "--frames", "200")
-    assert (found["pixels_per_lambda_d"], found["parity"]) == (pytest.approx(4, rel=0.003), 1)
-    made = calibration_file.load(Path("aligned.fits"))
-    assert np.abs(cross_talk(made.reconstructor, noiseless_loop.calibration().response)).max() < 0.05
+    result = json_of("align", "--out", "aligned.fits", "--frames", "200")
+    assert (result["pixels_per_lambda_d"], result["parity"]) == (pytest.approx(4, rel=0.003), 1)
+    calibration = calibration_file.load(Path("aligned.fits"))
+    assert np.abs(cross_talk(calibration.reconstructor, noiseless_loop.calibration().response)).max() < 0.05
 
 
 def test_an_aligned_calibration_expects_the_light_of_the_good_pixels(
@@ -328,24 +333,28 @@ def test_an_aligned_calibration_expects_the_light_of_the_good_pixels(
     good = before.good.reshape(80, 80).copy()
     good[:36] = 0
     monkeypatch.setattr(loop, "calibration", lambda: replace(before, good=good.reshape(-1)))
-    found = json_of("align", "--out", "aligned.fits", "--frames", "16")
+    result = json_of("align", "--out", "aligned.fits", "--frames", "16")
     light_dn = (next(loop.frames(1)).pixels.reshape(-1) - before.dark) @ good.reshape(-1)
     assert light_dn < 0.9 * before.flux_dn
     assert calibration_file.load(Path("aligned.fits")).flux_dn == pytest.approx(light_dn, rel=0.01)
-    assert found["flux_dn"] == pytest.approx(light_dn, rel=0.01)
+    assert result["flux_dn"] == pytest.approx(light_dn, rel=0.01)
 
 
 def test_a_computed_calibration_may_truncate_singular_values(loop: InProcessLoop) -> None:
     config = toml(loop.config)
-    found = json_of("--method", "analytic", "--config", config, "--out", "all.fits")
-    assert found["kept"] == [1.0] * 3
-    smallest = found["singular_values"][-1] / found["singular_values"][0]
-    few = json_of("--method", "analytic", "--config", config, "--out", "few.fits", "--truncate", str(1.01 * smallest))
-    assert np.count_nonzero(few["kept"]) == 2
-    one, other = (calibration_file.load(Path(name)) for name in ("all.fits", "few.fits"))
-    assert np.linalg.matrix_rank(one.reconstructor) == 3
-    assert np.linalg.matrix_rank(other.reconstructor) == 2
-    assert np.allclose(other.actuators_to_modes @ one.modes_to_actuators, other.reconstructor @ one.response, atol=1e-4)
+    result = json_of("--method", "analytic", "--config", config, "--out", "all.fits")
+    assert result["kept"] == [1.0] * 3
+    smallest = result["singular_values"][-1] / result["singular_values"][0]
+    truncated_result = json_of(
+        "--method", "analytic", "--config", config, "--out", "few.fits", "--truncate", str(1.01 * smallest)
+    )
+    assert np.count_nonzero(truncated_result["kept"]) == 2
+    whole, truncated = (calibration_file.load(Path(name)) for name in ("all.fits", "few.fits"))
+    assert np.linalg.matrix_rank(whole.reconstructor) == 3
+    assert np.linalg.matrix_rank(truncated.reconstructor) == 2
+    assert np.allclose(
+        truncated.actuators_to_modes @ whole.modes_to_actuators, truncated.reconstructor @ whole.response, atol=1e-4
+    )
     done = CliRunner().invoke(calibrate_app, ["--method", "analytic", "--config", config, "--out", "all.fits"])
     assert "no regularisation needed" in done.stdout
 
@@ -354,22 +363,22 @@ def test_a_truncation_keeps_the_fit_of_a_background(tmp_path: Path, monkeypatch:
     monkeypatch.chdir(tmp_path)
     fitted = load(None, {"sensor.kind": "zwfs", "control.nuisance": ["background"]} | SMALL_MIRROR)
     json_of("--method", "analytic", "--config", toml(fitted), "--out", "few.fits", "--truncate", "0.3")
-    made = calibration_file.load(Path("few.fits"))
-    assert made.estimator == "weighted+background+regularised"
-    assert np.linalg.matrix_rank(made.reconstructor) < len(made.noll)
-    I0, good = made.reference.astype(float), made.good.astype(float)
+    calibration = calibration_file.load(Path("few.fits"))
+    assert calibration.estimator == "weighted+background+regularised"
+    assert np.linalg.matrix_rank(calibration.reconstructor) < len(calibration.noll)
+    I0, good = calibration.reference.astype(float), calibration.good.astype(float)
     background = normalise_flux(I0, np.full((I0.size, 1), 1 / I0.size), good)[1]
-    assert np.abs(made.reconstructor @ background).max() < 1e-3
+    assert np.abs(calibration.reconstructor @ background).max() < 1e-3
 
 
 def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop) -> None:
     config = toml(loop.config)
     json_of("--method", "analytic", "--config", config, "--out", "flat.fits")
     json_of("--method", "analytic", "--config", config, "--out", "there.fits", "--at", "3=-10,4=15")
-    found = json_of("--compare", "flat.fits", "there.fits")
-    assert found["estimators"] == ["weighted", "weighted+at 3=-10,4=15"]
-    assert found["cross_talk"] > 0.02
-    shift = dict(zip(found["noll"], found["reference_shift_nm"], strict=True))
+    result = json_of("--compare", "flat.fits", "there.fits")
+    assert result["estimators"] == ["weighted", "weighted+at 3=-10,4=15"]
+    assert result["cross_talk"] > 0.02
+    shift = dict(zip(result["noll"], result["reference_shift_nm"], strict=True))
     assert (shift[4], shift[3]) == pytest.approx((15, -10), abs=1.5)
 
 
@@ -398,17 +407,17 @@ def test_fewer_cycles_than_their_scatter_needs_are_refused() -> None:
 
 
 def test_a_comparison_of_different_sensors_and_a_missing_directory_are_refused(loop: InProcessLoop) -> None:
-    one = loop.calibration()
-    calibration_file.save(one, Path("one.fits"))
-    other = replace(
-        one,
-        noll=one.noll[:2],
-        response=one.response[:, :2],
-        reconstructor=one.reconstructor[:2],
-        modes_to_actuators=one.modes_to_actuators[:, :2],
-        actuators_to_modes=one.actuators_to_modes[:2],
+    three_modes = loop.calibration()
+    calibration_file.save(three_modes, Path("one.fits"))
+    two_modes = replace(
+        three_modes,
+        noll=three_modes.noll[:2],
+        response=three_modes.response[:, :2],
+        reconstructor=three_modes.reconstructor[:2],
+        modes_to_actuators=three_modes.modes_to_actuators[:, :2],
+        actuators_to_modes=three_modes.actuators_to_modes[:2],
     )
-    calibration_file.save(identified(other), Path("other.fits"))
+    calibration_file.save(identified(two_modes), Path("other.fits"))
     with pytest.raises(CalibrationError, match="cannot be compared"):
         json_of("--compare", "one.fits", "other.fits")
     with pytest.raises(DataFileError, match="there is no directory"):
@@ -445,7 +454,7 @@ def test_the_response_is_the_derivative_of_the_image(optics: Twin) -> None:
     assert np.abs(response(optics, modes, 0 * state_nm) - flat).max() < 1e-12 * np.abs(flat).max()
 
 
-def test_a_mirror_shape_for_at_equals_the_wavefront_it_makes(
+def test_the_option_at_takes_a_mirror_shape_for_the_wavefront_that_it_makes(
     config: Configuration, at_zero_point: Calibration, tmp_path: Path
 ) -> None:
     flat = analytic(config, SILENT)
@@ -473,7 +482,7 @@ def test_the_noise_of_a_mode_is_compared_with_its_own_limit(config: Configuratio
 @pytest.mark.parametrize(
     ("keys", "why"), [({"bias_dn": 0.0}, "raise camera.bias_dn"), ({"gain_e_per_dn": 10.0}, "rounded down"), ({}, "")]
 )
-def test_frames_that_cannot_have_the_flux_of_the_light_are_named(keys: dict[str, float], why: str) -> None:
+def test_camera_settings_that_change_the_flux_of_frames_cause_a_warning(keys: dict[str, float], why: str) -> None:
     printed = StringIO()
     analytic(
         load(None, {"star.magnitude": 6.0} | {f"camera.{key}": value for key, value in keys.items()}),
@@ -486,8 +495,8 @@ def test_frames_that_cannot_have_the_flux_of_the_light_are_named(keys: dict[str,
 def test_a_loop_with_a_calibration_at_a_wavefront_converges_to_it() -> None:
     few = load(None, BRIGHT | {"sensor.modes": 6})
     world = load(None, BRIGHT | {"sensor.modes": 6, "disturbance.static_nm": {"4": 35.0, "6": 20.0}})
-    made = analytic(few, SILENT, zero_point(few, "4=15,7=-10")[1])
-    loop = InProcessLoop(few, made, world)
+    calibration = analytic(few, SILENT, zero_point(few, "4=15,7=-10")[1])
+    loop = InProcessLoop(few, calibration, world)
     loop.close_loop()
     loop.run(200)
     held = np.mean(loop.residual_nm(100), axis=0)[:6]

@@ -25,12 +25,13 @@ from lowfc.programs.commissioning.calibrate.run import Calibrator
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
 from tests.support.loops import interrupt, run, start, until
 
-SLOW = ("quiet", "thermal", "bench", "step", "kolmogorov")
+REACHABLE = ("quiet", "thermal", "bench", "step", "kolmogorov")
 """Disturbance presets at which a signal-to-noise ratio of 30 is reached."""
 WHEEL = "reaction-wheel"
 """Preset with 34 nm of tilt, at which pokes of some nm cannot reach a signal-to-noise ratio of 30."""
 SEEDS = 20
 BLOCK = 5
+"""Seeds in one test."""
 
 
 class Outcome(NamedTuple):
@@ -52,11 +53,11 @@ def true_response(loop: InProcessLoop, first: int, *, closed: bool) -> np.ndarra
     shapes = np.array(
         [wavefront_nm(mirror, each.reshape(before.grid)) for each in before.modes_to_actuators.T], dtype=np.float64
     )
-    good, found = before.good.astype(np.float64), []
+    good, responses = before.good.astype(np.float64), []
     for opd_nm in (np.asarray(static_nm + each, dtype=np.float64) for each in moving_nm):
         light = reference(optics, opd_nm).reshape(-1)
-        found.append(normalise_flux(light, response(optics, shapes, opd_nm), good)[1])
-    return np.mean(found, axis=0)
+        responses.append(normalise_flux(light, response(optics, shapes, opd_nm), good)[1])
+    return np.mean(responses, axis=0)
 
 
 def outcome(method: str, preset: str, seed: int, snr: float, folder: Path, modes: int = 14) -> Outcome:
@@ -72,23 +73,23 @@ def outcome(method: str, preset: str, seed: int, snr: float, folder: Path, modes
     calibrator = Calibrator(loop, request, lambda _: None, lambda *_: None, before)
     with calibrator.required_mode():
         data = calibrator.run()
-        made, _ = measured_calibration(config, before, data.measured, request)
-        check = calibrator.check(made, data)
-    computed = computed_noise_nm(config, made, before)
+        calibration, _ = measured_calibration(config, before, data.measured, request)
+        check = calibrator.check(calibration, data)
+    computed = computed_noise_nm(config, calibration, before)
     assert computed is not None
-    ratio = factory.frame_noise_nm(config, made) / computed
-    verdict = judge(snr, data.measured.cycles, data.measured.error, check, ratio, made.noll)
+    ratio = factory.frame_noise_nm(config, calibration) / computed
+    verdict = judge(snr, data.measured.cycles, data.measured.error, check, ratio, calibration.noll)
     H = true_response(loop, first, closed=method == "in-loop")
-    return Outcome(cross_talk(made.reconstructor, H), ratio, verdict)
+    return Outcome(cross_talk(calibration.reconstructor, H), ratio, verdict)
 
 
-def assert_accurate(found: Outcome, snr: float) -> None:
+def assert_accurate(result: Outcome, snr: float) -> None:
     """A good verdict, cross-talk of at most 1.2 / snr rms and 4 / snr at the largest, at most 1.5 times the noise."""
-    assert not found.verdict.faults
-    rms, largest = np.sqrt((found.talk**2).mean()), np.abs(found.talk).max()
+    assert not result.verdict.faults
+    rms, largest = np.sqrt((result.talk**2).mean()), np.abs(result.talk).max()
     assert rms * snr < 1.2
     assert largest * snr < 4
-    assert found.noise_ratio.max() < 1.5
+    assert result.noise_ratio.max() < 1.5
 
 
 @pytest.mark.parametrize(("method", "modes"), [pytest.param("hadamard", 14, marks=pytest.mark.slow), ("in-loop", 4)])
@@ -102,7 +103,7 @@ def test_a_calibration_with_few_cycles_has_the_requested_accuracy(
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("first", range(1, SEEDS + 1, BLOCK))
-@pytest.mark.parametrize("preset", SLOW)
+@pytest.mark.parametrize("preset", REACHABLE)
 @pytest.mark.parametrize("method", ["hadamard", "poke", "in-loop"])
 def test_calibrations_have_the_requested_accuracy(method: str, preset: str, first: int, tmp_path: Path) -> None:
     for seed in range(first, first + BLOCK):
@@ -119,9 +120,9 @@ def test_the_accuracy_is_reached_at_the_default_snr_and_with_halved_amplitudes(s
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_verdict_names_the_mode_if_the_snr_is_out_of_reach(seed: int, tmp_path: Path) -> None:
-    found = outcome("hadamard", WHEEL, seed, 30.0, tmp_path)
-    assert found.verdict.snr_reached < 30
-    assert re.search(r" in Z\d+, 30 required: find what disturbs this mode, or measure about", found.verdict.faults[0])
+    result = outcome("hadamard", WHEEL, seed, 30.0, tmp_path)
+    assert result.verdict.snr_reached < 30
+    assert re.search(r" in Z\d+, 30 required: find what disturbs this mode, or measure about", result.verdict.faults[0])
 
 
 @pytest.mark.slow
@@ -170,7 +171,7 @@ def test_calibrations_over_the_bus_have_the_requested_accuracy(method: str, pres
     scene.surfaces_nm = [shape for state in states if (shape := actuators(state)) is not None]
     first = next(row for row, state in enumerate(states) if state.frame_sequence > begun)
     H = true_response(scene, first, closed=method == "in-loop")
-    made = calibration_file.load(tmp_path / "calibration.fits")
-    talk = 30 * cross_talk(made.reconstructor, H)
-    assert np.sqrt((talk**2).mean()) < 1.2
-    assert np.abs(talk).max() < 4
+    calibration = calibration_file.load(tmp_path / "calibration.fits")
+    scaled_talk = 30 * cross_talk(calibration.reconstructor, H)
+    assert np.sqrt((scaled_talk**2).mean()) < 1.2
+    assert np.abs(scaled_talk).max() < 4

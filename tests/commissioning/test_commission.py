@@ -114,11 +114,11 @@ def test_commissioning_closes_a_loop_with_another_frame_size(commissioned: tuple
     assert state.mode == wire.LOOP_MODE_CLOSED
     assert list(state.gain) == pytest.approx([0.1, 0.1, 0.2])
     assert list(state.automatic) == [True, True, False]
-    made = calibration_file.load(bench.out)
-    assert made.shape == (64, 64)
+    calibration = calibration_file.load(bench.out)
+    assert calibration.shape == (64, 64)
     modelled = computed(DISTURBED.to_toml()).actuators_to_modes  # also of shapes outside the modes
-    assert np.linalg.norm(made.actuators_to_modes - modelled) < 0.2 * np.linalg.norm(modelled)
-    assert made.saturation_dn == 2**14 - 1
+    assert np.linalg.norm(calibration.actuators_to_modes - modelled) < 0.2 * np.linalg.norm(modelled)
+    assert calibration.saturation_dn == 2**14 - 1
     assert not provisional_path(bench.out).exists()
     assert not partial_of(bench.out).exists()
 
@@ -160,8 +160,8 @@ def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench,
     with pytest.raises(CalibrationError, match="the loop went from closed to open"):
         bench.steps()._measured_nm(10, 1, 1.0)
     bench.actions.clear()
-    late = np.where(np.arange(2000) == 1500, np.nan, 1.0)[:, None]
-    assert commissioning._rms_nm(late, 1000) == 1.0, "a refused frame does not end it, also at 1 kHz"
+    errors_nm = np.where(np.arange(2000) == 1500, np.nan, 1.0)[:, None]
+    assert commissioning._rms_nm(errors_nm, 1000) == 1.0, "a refused frame does not end the measurement, also at 1 kHz"
 
 
 @pytest.mark.parametrize("reversed_modes", [[0], [0, 1, 2]])
@@ -336,6 +336,7 @@ def changed(**fields: float) -> wire.CameraState:
 
 
 def faults(config: Configuration, state: wire.CameraState) -> dict[str, Status]:
+    """Statuses of the checks that are not ok, by field or key."""
     checks = agreement_checks(config, state)
     return {check.name.split(" ")[0]: check.status for check in checks if check.status is not Status.OK}
 
@@ -347,20 +348,20 @@ def test_the_simulated_camera_agrees_with_its_configuration(em_gain: float, bits
     assert faults(config, configured(config)) == {}
 
 
-@pytest.mark.parametrize("one", AGREEMENTS, ids=lambda one: one.field)
-def test_a_difference_of_camera_and_configuration_is_found(one: Agreement) -> None:
-    field, needed = one.field, one.needed
-    found = faults(Configuration(), changed(**{field: getattr(changed(), field) * 2}))
-    assert found[field] is (Status.WRONG if needed else Status.WARNING)
+@pytest.mark.parametrize("agreement", AGREEMENTS, ids=lambda agreement: agreement.field)
+def test_a_difference_of_camera_and_configuration_is_found(agreement: Agreement) -> None:
+    field, needed = agreement.field, agreement.needed
+    statuses = faults(Configuration(), changed(**{field: getattr(changed(), field) * 2}))
+    assert statuses[field] is (Status.WRONG if needed else Status.WARNING)
 
 
 def test_an_existing_calibration_is_replaced_only_with_force(own_runtime: Path) -> None:
     out = own_runtime / "calibration.fits"
     out.write_text("mine")
     assert "already exists" in refusal("commission", "--no-dark", "--out", out, kind=DataFileError)
-    for way in ("--force", "--resume"):
-        done = lowfc("commission", "--no-dark", "--out", out, way)
-        assert isinstance(done.exception, BusError), "it continues to the connection, which fails without a loop"
+    for option in ("--force", "--resume"):
+        done = lowfc("commission", "--no-dark", "--out", out, option)
+        assert isinstance(done.exception, BusError), "it gets as far as the connection, which fails without a loop"
     assert out.read_text() == "mine"
 
 

@@ -86,8 +86,8 @@ class Device:
             self.iterate(self.now_ns())
 
     def received(self) -> list[Received]:
-        found, self._waiting = self._waiting, []
-        return found
+        received, self._waiting = self._waiting, []
+        return received
 
     def put(self, topic: Topic, name: str, payload: bytes) -> None:
         self.receive(payload, self.now_ns())
@@ -189,7 +189,7 @@ class Mirror(Device):
         self._published_ns = now_ns
 
 
-def found(checks: Iterator[Check]) -> dict[str, str]:
+def not_ok(checks: Iterator[Check]) -> dict[str, str]:
     """Statuses of the checks that are not ok, by name."""
     listed = list(checks)
     assert len({check.name for check in listed}) == len(listed)
@@ -197,12 +197,12 @@ def found(checks: Iterator[Check]) -> dict[str, str]:
     return {check.name: str(check.status) for check in listed if check.status != "ok"}
 
 
-def of_camera(**changes: Any) -> dict[str, str]:
-    return found(camera_checks(watch(Camera(**changes), 3.0, lambda _: None)))
+def camera_faults(**changes: Any) -> dict[str, str]:
+    return not_ok(camera_checks(watch(Camera(**changes), 3.0, lambda _: None)))
 
 
-def of_mirror(mirror: Mirror, config: Configuration = CONFIG, **options: Any) -> dict[str, str]:
-    return found(mirror_checks(Dialogue(mirror, Expected(config)), 0.2, **{"show": lambda _: None, **options}))
+def mirror_faults(mirror: Mirror, config: Configuration = CONFIG, **options: Any) -> dict[str, str]:
+    return not_ok(mirror_checks(Dialogue(mirror, Expected(config)), 0.2, **{"show": lambda _: None, **options}))
 
 
 def failing(health: Any) -> Any:
@@ -282,15 +282,15 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     ),
     "frames that stop": ({"frame": lambda frame, i: frame if i < 100 else None}, {"steadiness": WRONG}),
     "a frame in ten late": ({"frame": lambda frame, i: frame if i % 10 else None}, {"steadiness": WARNING}),
-    "a stuck image": ({"pixels": lambda one, i: np.full(SHAPE, 500, np.uint16)}, {"live image": WRONG}),
-    "zeros": ({"pixels": lambda one, i: 0 * one}, {"live image": WRONG, "light": WRONG}),
-    "darkness": ({"pixels": lambda one, i: one // 3000 + 100 + i % 2}, {"light": WARNING}),
+    "a stuck image": ({"pixels": lambda dn, i: np.full(SHAPE, 500, np.uint16)}, {"live image": WRONG}),
+    "zeros": ({"pixels": lambda dn, i: 0 * dn}, {"live image": WRONG, "light": WRONG}),
+    "darkness": ({"pixels": lambda dn, i: dn // 3000 + 100 + i % 2}, {"light": WARNING}),
     "full well": (
-        {"pixels": lambda one, i: np.minimum(one * 100 + i, 40_100 - (np.arange(16) == 3) * i).astype(np.uint16)},
+        {"pixels": lambda dn, i: np.minimum(dn * 100 + i, 40_100 - (np.arange(16) == 3) * i).astype(np.uint16)},
         {"light": WARNING},
     ),
-    "big-endian pixels": ({"pixels": lambda one, i: one.byteswap()}, {"byte order": WRONG, "settings' range": WRONG}),
-    "left-aligned pixels": ({"pixels": lambda one, i: one * 16}, {"byte order": WRONG, "settings' range": WRONG}),
+    "big-endian pixels": ({"pixels": lambda dn, i: dn.byteswap()}, {"byte order": WRONG, "settings' range": WRONG}),
+    "left-aligned pixels": ({"pixels": lambda dn, i: dn * 16}, {"byte order": WRONG, "settings' range": WRONG}),
     "no settings": ({"state": lambda *_: None}, {"settings": WRONG}),
     "undecodable settings": ({"state": lambda *_: b"\xff\xff\xff"}, {"settings": WRONG, "settings on request": WRONG}),
     "settings once": ({"state": lambda state, i: state if i == 0 else None}, {"settings": WARNING}),
@@ -311,13 +311,13 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
 
 
 def test_a_correct_camera_passes() -> None:
-    assert of_camera() == {}
+    assert camera_faults() == {}
 
 
 @pytest.mark.parametrize("fault", CAMERAS)
 def test_a_fault_of_a_camera_is_found(fault: str) -> None:
     changes, expected = CAMERAS[fault]
-    assert of_camera(**changes) == expected
+    assert camera_faults(**changes) == expected
 
 
 def shaped(function: Callable[[Single], Single]) -> Callable[[wire.MirrorState], wire.MirrorState]:
@@ -365,7 +365,7 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "another clock": ({"attach": put_at(lambda t: t - 35 * MS)}, {"publish time": WRONG}),
     "undecodable state": ({"state": lambda _: b"\xff\xff\xff"}, {"state": WRONG} | UNTRIED),
     "another grid": ({"state": setting(rows=7, columns=6)}, {"grid": WRONG} | UNTRIED),
-    "doubles": ({"state": lambda one: setting(actuators=2 * one.actuators)(one)}, {"grid": WRONG} | UNTRIED),
+    "doubles": ({"state": lambda state: setting(actuators=2 * state.actuators)(state)}, {"grid": WRONG} | UNTRIED),
     "NaN for a missing actuator": ({"state": shaped(lambda shape: one_dead(shape, np.nan))}, {"grid": WRONG} | UNTRIED),
     "wavefront instead of surface": ({"state": shaped(lambda shape: 2 * shape)}, {"applied": WRONG} | UNTRIED),
     "um instead of nm": ({"state": shaped(lambda shape: shape / 1000)}, {"applied": WRONG} | UNTRIED),
@@ -381,8 +381,8 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
         {"state": shaped(lambda shape: np.where(np.abs(shape) > 1, np.float32(3e38), shape))},
         {"applied": WRONG} | UNTRIED,
     ),
-    "its own time": ({"state": lambda one: stamped(3 * MS)(one, 0)}, {"time": WARNING}),
-    "no modal command": ({"state": lambda one: one.ClearField("command_nm") or one}, {"modal command": WARNING}),
+    "its own time": ({"state": lambda state: stamped(3 * MS)(state, 0)}, {"time": WARNING}),
+    "no modal command": ({"state": lambda state: state.ClearField("command_nm") or state}, {"modal command": WARNING}),
     "NaN replaced by zero": (
         {"command": careless("finite")},
         {"NaN refused": WRONG, "infinity refused": WRONG, "dead-man": WRONG} | UNTRIED,
@@ -390,16 +390,16 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "any grid": ({"command": careless("grid")}, {"wrong grid refused": WRONG} | UNTRIED),
     "any length": ({"command": careless("bytes")}, {"short command refused": WRONG} | UNTRIED),
     "any order": ({"command": careless("order")}, {"old command refused": WRONG, "clear": WARNING} | UNTRIED),
-    "no dead-man": ({"tick": lambda one: lambda status, now_ns: status}, NEVER_EXPIRED),
+    "no dead-man": ({"tick": lambda tick: lambda status, now_ns: status}, NEVER_EXPIRED),
     "a refused command extends the timeout": ({"renews": True}, {"dead-man": WRONG} | UNTRIED),
     "expired at once": (
-        {"tick": lambda one: lambda status, now_ns: one(status._replace(valid_for_ns=MS), now_ns)},
+        {"tick": lambda tick: lambda status, now_ns: tick(status._replace(valid_for_ns=MS), now_ns)},
         {"dead-man": WRONG} | UNTRIED,
     ),
     "command_nm set while it relaxes": (
         {
-            "state": lambda one: (
-                one if one.status != wire.MIRROR_STATUS_EXPIRED else one.command_nm.extend([1.0, 2.0]) or one
+            "state": lambda state: (
+                state if state.status != wire.MIRROR_STATUS_EXPIRED else state.command_nm.extend([1.0, 2.0]) or state
             )
         },
         {"relaxing": WRONG} | UNTRIED,
@@ -409,7 +409,7 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "no neighbour limit": ({"protection": {"limits": Limits(750.0, 150.0, 10_000.0)}}, {"neighbours": WRONG}),
     "a shorter stroke": ({"protection": {"limits": Limits(400.0, 150.0, 500.0)}}, {"stroke": WARNING}),
     "limits_hit empty": (
-        {"state": lambda one: one.ClearField("limits_hit") or one},
+        {"state": lambda state: state.ClearField("limits_hit") or state},
         {"stroke": WARNING, "slew": WARNING, "neighbours": WARNING},
     ),
     "no health": ({"health": lambda _: None}, {"health": WARNING}),
@@ -421,7 +421,7 @@ def test_a_correct_mirror_passes_and_returns_to_its_shape() -> None:
     start = np.full((6, 7), 40, np.float32)
     command = Command("lowfc", 5, 1, 10**10, start, np.zeros(2, np.float32))
     mirror.status, _ = mirror.mirror.apply_command(mirror.status, command, mirror.now_ns())
-    assert of_mirror(mirror) == {}
+    assert mirror_faults(mirror) == {}
     np.testing.assert_allclose(mirror.status.surface_nm, start, atol=0.03)
     assert 5 < mirror.status.frame_sequence < 5000  # below the sequences of a camera, which are not refused later
 
@@ -429,22 +429,23 @@ def test_a_correct_mirror_passes_and_returns_to_its_shape() -> None:
 @pytest.mark.parametrize("fault", MIRRORS)
 def test_a_fault_of_a_mirror_is_found(fault: str) -> None:
     changes, expected = MIRRORS[fault]
-    assert of_mirror(Mirror(**changes)) == expected
+    assert mirror_faults(Mirror(**changes)) == expected
 
 
 def test_an_answer_that_is_read_late_because_this_host_stalls_is_no_fault() -> None:
     class Stalled(Mirror):
         def wait(self, seconds: float) -> None:
+            # Longer than an answer may take, after two of the commands.
             super().wait(0.6037 if self._received in (31, 33) else seconds)
 
-    assert of_mirror(Stalled()) == {}
+    assert mirror_faults(Stalled()) == {}
 
 
 def test_gentle_does_not_test_the_limits() -> None:
     mirror = Mirror()
     highest_nm: list[float] = []
     mirror.changes["state"] = shaped(lambda shape: highest_nm.append(float(np.abs(shape).max())) or shape)
-    assert of_mirror(mirror, gentle=True) == UNTRIED
+    assert mirror_faults(mirror, gentle=True) == UNTRIED
     assert 0 < max(highest_nm) < 0.051 * CONFIG.mirror.slew_nm
 
 
@@ -462,7 +463,7 @@ def test_an_interrupted_check_returns_the_mirror_to_its_shape() -> None:
         return state
 
     with pytest.raises(KeyboardInterrupt):
-        of_mirror(mirror, show=interrupted)
+        mirror_faults(mirror, show=interrupted)
     assert mirror.status.following
     np.testing.assert_allclose(mirror.status.surface_nm, 0, atol=0.03)
 
@@ -472,10 +473,10 @@ def test_actuators_configured_as_fixed_are_no_fault(dead: list[int], untested: d
     active, file = np.arange(42).reshape(6, 7) % 7 < 5, str(tmp_path / "active.npy")
     np.save(file, active.astype(float))
     config = load(None, SMALL | {"mirror.dead": dead, "mirror.stuck_nm": {"24": 30.0}, "mirror.active": file})
-    free = Mirror(state=shaped(lambda shape: shape * active))
-    free.mirror = Simulated(config)
-    free.status = free.mirror.initial
-    assert of_mirror(free, config) == untested
+    mirror = Mirror(state=shaped(lambda shape: shape * active))
+    mirror.mirror = Simulated(config)
+    mirror.status = mirror.mirror.initial
+    assert mirror_faults(mirror, config) == untested
 
 
 def test_the_report_has_advice_for_failed_checks(capsys: pytest.CaptureFixture[str]) -> None:
@@ -511,8 +512,8 @@ def test_conformance_refuses_runs_that_it_cannot_check(tmp_path: Path) -> None:
 def test_an_absent_camera_fails_the_check_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     open_run("bench")
     monkeypatch.setattr(conformance, "CONNECT_S", 0.0)
-    found = json_of("conformance", "camera", "--run", "bench", "--duration", 0.2, status=1)
-    checks = {check["name"]: check for check in found["checks"]}
+    report = json_of("conformance", "camera", "--run", "bench", "--duration", 0.2, status=1)
+    checks = {check["name"]: check for check in report["checks"]}
     assert checks["frames"]["status"] == "wrong"
     assert "received: nothing" in checks["frames"]["got"]
 
@@ -524,10 +525,13 @@ def test_a_connection_queries_and_receives_messages_without_an_envelope() -> Non
         session.declare_queryable(CAMERA_STATE.key, lambda query: query.reply(CAMERA_STATE.key, b"settings"))
         with closing(Connection(links, Role.OPERATOR)) as connection:
             until(connection.peers)
-            until(lambda: [one.payload for one in connection.ask(CAMERA_STATE.key)] == [b"settings"])
-            got: list[Received] = []
-            until(lambda: got.extend(connection.received()) or got, each=lambda: session.put(FRAME.key, b"frame"))
-            assert got[0][:3] == (FRAME.key, b"frame", None)
+            until(lambda: [answer.payload for answer in connection.ask(CAMERA_STATE.key)] == [b"settings"])
+            received: list[Received] = []
+            until(
+                lambda: received.extend(connection.received()) or received,
+                each=lambda: session.put(FRAME.key, b"frame"),
+            )
+            assert received[0][:3] == (FRAME.key, b"frame", None)
 
 
 @pytest.mark.usefixtures("own_runtime")

@@ -90,7 +90,7 @@ NAMED: dict[str, object] = {
     "realtime.mirror_cpus": [6],
     "realtime.recorder_cpus": [0],  # not one of the isolated: the recorder can wait
 }
-UNASKED = load(None, {"realtime.priority": 0, "realtime.recorder_priority": 0, "realtime.lock_memory": False})
+NOTHING_REQUESTED = load(None, {"realtime.priority": 0, "realtime.recorder_priority": 0, "realtime.lock_memory": False})
 REFUSED = {
     "priority": ("SCHED_FIFO priority 50 (no)", "frames come late"),
     "lock_memory": ("locked", "stalls"),
@@ -132,13 +132,13 @@ def briefly(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
-    found = examine(facts(tmp_path))
-    assert {name: found[name] for name in OF_THE_HOST if found[name].status != "ok"} == {}
-    assert found["isolation"].got == "4-7; of these without a timer tick: 4-6"
-    assert "turbo off" in found["frequency"].got
-    assert "C1 with 2 us" in found["idle states"].got
-    assert "213 kB, at most 4194 kB" in found["socket buffers"].got
-    assert "p99 20 us, max 60 us" in found["wake-up"].got
+    checks = examine(facts(tmp_path))
+    assert {name: checks[name] for name in OF_THE_HOST if checks[name].status != "ok"} == {}
+    assert checks["isolation"].got == "4-7; of these without a timer tick: 4-6"
+    assert "turbo off" in checks["frequency"].got
+    assert "C1 with 2 us" in checks["idle states"].got
+    assert "213 kB, at most 4194 kB" in checks["socket buffers"].got
+    assert "p99 20 us, max 60 us" in checks["wake-up"].got
 
 
 @pytest.mark.parametrize(
@@ -192,14 +192,14 @@ def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
         ("synchronisation", "warning", "not synchronised", {"synchronisation": Synchronisation(False, 12e-6, 0.001)}),
         ("wake-up", "warning", "max 4100 us", {"trial": trial(fifo_ns=[1000] * 999 + [4_100_000])}),
         ("wake-up", "warning", "a frame period is 4000 us", {"trial": trial(REFUSED, normal_ns=[500_000], fifo_ns=[])}),
-        ("scheduling class", "note", "realtime.priority = 0", {"config": UNASKED}),
+        ("scheduling class", "note", "realtime.priority = 0", {"config": NOTHING_REQUESTED}),
         ("scheduling class", "warning", "LimitRTPRIO=50 frames come late", {"trial": trial(REFUSED)}),
         ("locked memory", "warning", "stalls", {"trial": trial(REFUSED)}),
         ("swap", "warning", "memory is not locked", {"trial": trial(REFUSED), "swap": (1 << 31, 0)}),
         ("idle states", "ok", "133 us to wake; kept awake", DEEP | {"config": load(None, NAMED)}),
         ("idle states", "warning", "it wakes late", DEEP | {"config": load(None, NAMED), "trial": trial(REFUSED)}),
         ("load", "warning", "busy now: chromium 60 %", {"busy": (("chromium", 0.6), ("sshd", 0.05))}),
-        ("locked memory", "note", "lock_memory = false", {"config": UNASKED}),
+        ("locked memory", "note", "lock_memory = false", {"config": NOTHING_REQUESTED}),
     ],
 )
 def test_each_property_of_a_host_has_its_status_and_text(
@@ -214,11 +214,11 @@ def test_each_property_of_a_host_has_its_status_and_text(
 def test_unreadable_data_gives_a_note(tmp_path: Path) -> None:
     unreadable = dict.fromkeys(METAL)
     failed = OSError("the trial's process ended with exit status 1: no")
-    found = examine(facts(tmp_path, unreadable, trial=failed))
-    unknown = {name for name, check in found.items() if check.got.startswith("not known: ")}
+    checks = examine(facts(tmp_path, unreadable, trial=failed))
+    unknown = {name for name, check in checks.items() if check.got.startswith("not known: ")}
     assert unknown >= set(OF_THE_HOST)
-    assert {found[name].status for name in unknown} == {"note"}
-    assert found["scheduling class"].got == f"not known: {failed}"
+    assert {checks[name].status for name in unknown} == {"note"}
+    assert checks["scheduling class"].got == f"not known: {failed}"
     assert command.measured(facts(tmp_path, unreadable, trial=failed))["wake_up_us"] == {}
     files = {path: "\x00 ?" for path in METAL if "/" in path}
     nonsense = examine(facts(tmp_path, files))
@@ -235,10 +235,10 @@ def test_the_check_of_the_disk_uses_the_recorders_volume(tmp_path: Path, monkeyp
     an_hour = 500_000_000 + round(growth * 3600) + 1
     for free, status in ((an_hour, "ok"), (an_hour - 10**6, "warning"), (10**6, "warning")):
         usage.free = free
-        found = examine(of_disk)["disk"]
-        assert found.status == status
-        assert found.got.startswith(f"{Path.home()}/not/yet: ")
-        assert (f"enough for 1.0 h at 1000 Hz, {growth * 3600 / 1e9:.1f} GB an hour" in found.got) == (free > 10**9)
+        check = examine(of_disk)["disk"]
+        assert check.status == status
+        assert check.got.startswith(f"{Path.home()}/not/yet: ")
+        assert (f"enough for 1.0 h at 1000 Hz, {growth * 3600 / 1e9:.1f} GB an hour" in check.got) == (free > 10**9)
     monkeypatch.setattr(host_module.os, "access", lambda path, mode: False)
     usage.free = an_hour
     assert "not writable" in examine(of_disk)["disk"].got
@@ -309,19 +309,19 @@ trial = try_out(Realtime(), set(), 0.01)
 print(*trial.refused["priority"], *trial.refused["lock_memory"], len(trial.normal_ns), len(trial.fifo_ns), sep="\\n")
 """
     done = subprocess.run([*NO_RIGHTS, program], capture_output=True, text=True, timeout=60, check=True)
-    refused, cost, unlocked, stall, normal, first = done.stdout.splitlines()
+    refused, cost, unlocked, stall, normal, fifo = done.stdout.splitlines()
     assert refused.startswith("SCHED_FIFO priority 50 (")
     assert "LimitRTPRIO" in cost
     assert "the limit is 64 kB" in unlocked
     assert "swapped out" in stall
-    assert (normal, first) == ("10", "0")
+    assert (normal, fifo) == ("10", "0"), "numbers of wake-ups measured"
 
 
 def test_a_trial_ends_after_an_interrupt() -> None:
     with subprocess.Popen([*LOWFC, "doctor"], stderr=subprocess.PIPE, text=True, start_new_session=True) as doctor:
         assert doctor.stderr is not None
         assert "measuring" in doctor.stderr.readline()
-        until(lambda: any(one.cpu_times().user > 0.1 for one in psutil.Process(doctor.pid).children()))
+        until(lambda: any(child.cpu_times().user > 0.1 for child in psutil.Process(doctor.pid).children()))
         os.killpg(doctor.pid, signal.SIGINT)  # as a terminal does
         try:
             assert doctor.communicate(timeout=60)[1] == "interrupted\n"
@@ -334,9 +334,9 @@ def test_a_failed_trial_has_its_cause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(multiprocessing.spawn, "get_executable", lambda: b"/bin/false")
     with pytest.raises(OSError, match="the trial's process ended"):
         try_out(Realtime(), set(), 0.01)
-    found = examine(gather(Host(), Configuration(), 0.01))
-    assert "the trial's process ended" in found["wake-up"].got
-    assert found["wake-up"].status == "note"
+    checks = examine(gather(Host(), Configuration(), 0.01))
+    assert "the trial's process ended" in checks["wake-up"].got
+    assert checks["wake-up"].status == "note"
 
 
 def test_busy_finds_a_process_that_uses_the_cpu() -> None:
@@ -357,12 +357,12 @@ def test_doctor_checks_this_host(briefly: None) -> None:
     done = lowfc("doctor", "--json")
     assert done.exit_code == 0, done.output
     (line,) = done.stdout.splitlines()
-    found = json.loads(line)
-    assert [check["name"] for check in found["checks"]] == list(CHECKS)
-    assert all(set(check) == {"name", "status", "detail", "advice", "cost"} for check in found["checks"])
-    assert not [check for check in found["checks"] if check["status"] == "warning" and not check["advice"]]
-    assert sum(found["counts"].values()) == len(found["checks"])
-    normal = found["wake_up_us"]["normal"]
+    report = json.loads(line)
+    assert [check["name"] for check in report["checks"]] == list(CHECKS)
+    assert all(set(check) == {"name", "status", "detail", "advice", "cost"} for check in report["checks"])
+    assert not [check for check in report["checks"] if check["status"] == "warning" and not check["advice"]]
+    assert sum(report["counts"].values()) == len(report["checks"])
+    normal = report["wake_up_us"]["normal"]
     assert 0 < normal["p50"] <= normal["p99"] <= normal["max"]
     assert "1000 sleeps per second" in done.stderr
 
@@ -402,9 +402,9 @@ def test_the_check_of_the_control_step_names_the_kernel(
     kernel: str, available: bool, status: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(resources.compiled, "available", lambda: available)
-    found = examine(facts(tmp_path, config=load(None, {"realtime.kernel": kernel})))["control step"]
-    assert found.status == status
-    assert text in f"{found.got} {found.advice}"
+    check = examine(facts(tmp_path, config=load(None, {"realtime.kernel": kernel})))["control step"]
+    assert check.status == status
+    assert text in f"{check.got} {check.advice}"
 
 
 def test_real_time_rights_are_shown_applied_and_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

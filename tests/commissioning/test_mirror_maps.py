@@ -72,9 +72,9 @@ def test_gains_with_which_the_loop_is_unstable_are_refused(key: str) -> None:
 @pytest.mark.parametrize("kind", [np.float64, np.float32, np.int16, ">f4"])
 def test_a_map_is_read_from_fits_and_numpy_files(tmp_path: Path, name: str, kind: npt.DTypeLike) -> None:
     shape = np.round(wavy()).astype(kind)
-    found = read_shape(Path(saved(tmp_path, name, shape)))
-    assert found.dtype == np.float32
-    np.testing.assert_array_equal(found, shape)
+    read = read_shape(Path(saved(tmp_path, name, shape)))
+    assert read.dtype == np.float32
+    np.testing.assert_array_equal(read, shape)
 
 
 def test_an_invalid_map_gives_an_error_of_one_line(tmp_path: Path) -> None:
@@ -144,15 +144,15 @@ def test_inactive_actuators_get_no_command_and_modes_and_actuators_stay_inverse(
     active = np.ones(GRID)
     active.flat[dead] = 0
     config = load(None, QUIET | {"mirror.active": saved(tmp_path, "a.fits", active), "mirror.dead": dead})
-    made = calibrated(config)
-    assert not made.modes_to_actuators[dead].any()
-    assert not made.actuators_to_modes[:, dead].any()
+    computed = calibrated(config)
+    assert not computed.modes_to_actuators[dead].any()
+    assert not computed.actuators_to_modes[:, dead].any()
     assert np.abs(calibration.modes_to_actuators[dead]).max() > 0.01
-    response = made.actuators_to_modes @ made.modes_to_actuators
+    response = computed.actuators_to_modes @ computed.modes_to_actuators
     assert np.abs(response - np.eye(14)).max() < 1e-4
     without_map = calibration.modes_to_actuators.copy()
     without_map[dead] = 0
-    error = np.abs(made.actuators_to_modes @ without_map - np.eye(14)).max()
+    error = np.abs(computed.actuators_to_modes @ without_map - np.eye(14)).max()
     assert error > 0.01, "without the map of active actuators the modes are wrong"
 
 
@@ -172,7 +172,7 @@ def test_a_registration_error_affects_the_mirror_but_not_the_computed_calibratio
     assert moved[1] == pytest.approx(moved[0], rel=0.05)
 
 
-def begun(config: Configuration, calibration: Calibration, shape: MirrorShape | None) -> tuple[State, list[Request]]:
+def started(config: Configuration, calibration: Calibration, shape: MirrorShape | None) -> tuple[State, list[Request]]:
     """Start a controller: load the calibration, report the mirror, carry out the configured requests; all accepted."""
     settings = factory.settings(config)
     state, _ = advance(settings, State(), Load(0, calibration, "test"))
@@ -194,13 +194,13 @@ def commands(config: Configuration, state: State, frames: int) -> tuple[list[Sin
     for index in range(frames):
         state, outputs = advance(settings, state, Frame(1 + index, index, 0, pixels))
         sent.append(outputs.command.actuators_nm)
-    return sent, [one.name for one in state.loop.channels_or_empty().channels]
+    return sent, [channel.name for channel in state.loop.channels_or_empty().channels]
 
 
 def test_the_flat_map_is_applied_at_the_start(tmp_path: Path, calibration: Calibration) -> None:
     config = load(None, {"mirror.flat": saved(tmp_path, "flat.fits", wavy(120.0))})
-    state, requests = begun(config, calibration, None)
-    assert [(one.name, one.text) for one in requests] == [("channel", FLAT)]
+    state, requests = started(config, calibration, None)
+    assert [(request.name, request.text) for request in requests] == [("channel", FLAT)]
     sent, names = commands(config, state, 10)
     assert names == [FLAT]
     np.testing.assert_allclose(sent[-1], wavy(120.0), atol=1e-3)
@@ -218,8 +218,8 @@ def test_a_restarted_controller_does_not_apply_the_flat_map_twice(
     modal_nm = np.linspace(-10, 10, 14, dtype=np.float32)
     mirror_nm = wavy(120.0) + (calibration.modes_to_actuators @ modal_nm).reshape(GRID)
     reported_nm = modal_nm if command_reported else np.zeros(0, np.float32)
-    state, requests = begun(config, calibration, MirrorShape(0, mirror_nm, reported_nm))
-    assert [one.text for one in requests] == [ADOPTED, FLAT]
+    state, requests = started(config, calibration, MirrorShape(0, mirror_nm, reported_nm))
+    assert [request.text for request in requests] == [ADOPTED, FLAT]
     sent, names = commands(config, state, 10)
     for shape in sent:
         np.testing.assert_allclose(shape, mirror_nm, atol=2e-3)
@@ -231,8 +231,8 @@ def test_the_configured_law_is_requested_at_the_start(tmp_path: Path, calibratio
     path = tmp_path / "law.fits"
     config = load(None, {"control.law": str(path)})
     law_file.save(law_of(config), path)
-    state, requests = begun(config, calibration, None)
-    assert [one.name for one in requests] == ["law"]
+    state, requests = started(config, calibration, None)
+    assert [request.name for request in requests] == ["law"]
     assert state.mode is LoopMode.OPEN
     assert state.loop.law_runner.law.name == "leaky"
     with pytest.raises(ConfigurationError, match="the law is of the modes"):
@@ -240,7 +240,7 @@ def test_the_configured_law_is_requested_at_the_start(tmp_path: Path, calibratio
 
 
 def test_a_controller_does_not_start_without_a_configured_file(tmp_path: Path) -> None:
-    """It ends with one line of error."""
+    """It ends with an error of one line."""
     done = run(tmp_path, "controller", "--run", "lawless", config='[control]\nlaw = "none.fits"\n', timeout_s=30)
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1].startswith("error: control.law: none.fits: there is no such law file")

@@ -46,8 +46,8 @@ def tune(*words: object) -> dict[str, Any]:
     done = lowfc("tune", *words, "--json")
     if done.exception is not None:
         raise done.exception
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
 
 
 @pytest.fixture(scope="module")
@@ -72,15 +72,15 @@ def test_each_law_is_tuned_from_a_closed_loop(
 ) -> None:
     """Tip is a sine of 12 nm at 7 Hz with noise: the line is found, and each law predicts a smaller residual."""
     best, gains = tuned_as(controller)
-    found = result_of(telemetry, best, gains, controller)
-    tip = found.modes[0]
+    result = result_of(telemetry, best, gains, controller)
+    tip = result.modes[0]
     assert [line["frequency_hz"] for line in tip.lines] == pytest.approx([7.0], abs=0.05)
     assert tip.lines[0]["rms_nm"] == pytest.approx(12 / np.sqrt(2), rel=0.1)
     assert tip.gain_now == pytest.approx(0.4)
     assert tip.achieved_nm == pytest.approx(tip.predicted_now_nm, rel=0.15)
     assert tip.predicted_nm < tip.achieved_nm
-    assert (found.closed, found.achieved_from, best.law.name) == (True, "truth", controller)
-    check_stable(best.law, found.delay_frames)
+    assert (result.closed, result.achieved_from, best.law.name) == (True, "truth", controller)
+    check_stable(best.law, result.delay_frames)
     continuous = replace(telemetry, continuous_rms_nm=np.array(telemetry.noll, float))
     assert all(mode.achieved_nm == mode.noll for mode in result_of(continuous, best, gains, controller).modes)
 
@@ -99,8 +99,8 @@ def test_the_command_writes_the_law_and_draws_it(
     log: Path, tuned_as: Callable[[str], tuple[Tuned, Gains]], tmp_path: Path
 ) -> None:
     out, plot = tmp_path / "law.fits", tmp_path / "law.png"
-    found = tune(log, "--controller", "lqg", "--out", out, "--plot", plot)
-    assert found["files"] == [str(out), str(plot)]
+    result = tune(log, "--controller", "lqg", "--out", out, "--plot", plot)
+    assert result["files"] == [str(out), str(plot)]
     assert plot.read_bytes()[:4] == b"\x89PNG"
     assert law_file.load(out).id == tuned_as("lqg")[0].law.id
 
@@ -112,19 +112,19 @@ def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path)
     table = 20 * np.sin(2 * np.pi * 31 * np.arange(500) * PERIOD_NS * 1e-9).astype(np.float32)[:, None]
     night.request("play", text="mirror", actuators_nm=shape, table=table)
     night.frames(2900)
-    found = tune(night.write(tmp_path / "played.mcap"))
-    assert found["delay_frames"] == 1.0
-    assert found["warnings"] == []
-    assert found["frames"] < 2900
-    assert [line["frequency_hz"] for line in found["modes"][0]["lines"]] == pytest.approx([7.0], abs=0.05)
+    result = tune(night.write(tmp_path / "played.mcap"))
+    assert result["delay_frames"] == 1.0
+    assert result["warnings"] == []
+    assert result["frames"] < 2900
+    assert [line["frequency_hz"] for line in result["modes"][0]["lines"]] == pytest.approx([7.0], abs=0.05)
 
 
 def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
     path = SyntheticLog().request("open").frames(2150).write(tmp_path / "open.mcap")
-    found = tune(path)
-    assert not found["closed"]
-    assert found["modes"][0]["achieved_nm"] is None
-    assert found["warnings"] == []
+    result = tune(path)
+    assert not result["closed"]
+    assert result["modes"][0]["achieved_nm"] is None
+    assert result["warnings"] == []
     run = telemetry_from_log(LogReader(path))
     larger = replace(run, nm_per_mas=run.nm_per_mas / 10)  # type: ignore[operator]
     warned = result_of(larger, *tuned(larger, "integrator"), "integrator").text()
@@ -176,12 +176,12 @@ def test_tuning_uses_the_steps_of_a_running_loop() -> None:
     assert run.pol.frames == pytest.approx(5500, abs=5)
 
     result = result_of(run, *tuned(run, "lqg"), "lqg")
-    found, text = result.json_object(), result.text()
-    assert f"{found['modes'][0]['lines'][0]['frequency_hz']:.2f} Hz (" in text
+    values, text = result.json_object(), result.text()
+    assert f"{values['modes'][0]['lines'][0]['frequency_hz']:.2f} Hz (" in text
     assert "tilt per axis, mas rms: open" in text
-    assert found["modes"][0]["lines"][0]["frequency_hz"] == pytest.approx(20, abs=0.05)
-    assert found["achieved_from"] == "error less noise"
-    added = found["added_contrast"]
+    assert values["modes"][0]["lines"][0]["frequency_hz"] == pytest.approx(20, abs=0.05)
+    assert values["achieved_from"] == "error less noise"
+    added = values["added_contrast"]
     assert 0 < added["predicted"] < added["open"]
     assert set(added["by_group"]["predicted"]) == {"tilt", "focus"}
     assert f"closed {added['closed']:+.1e}, predicted {added['predicted']:+.1e}; focus contributes most (" in text
@@ -224,7 +224,7 @@ class SteppedLoop(StreamedLoop):
     def status(self) -> Answer:
         answer = super().status()
         self.requested += 1
-        if self.later_gain and self.requested == 1 + 31:
+        if self.later_gain and self.requested == 1 + 31:  # once at the start, and then every 100 steps
             answer.state.play.CopyFrom(PROBE)
         if self.later_gain and self.requested > 31:
             answer.state.gain[:] = [self.later_gain] * 3
@@ -366,9 +366,9 @@ def test_tune_needs_either_a_log_or_a_running_loop() -> None:
 @pytest.mark.parametrize("law", [*LAWS.values(), integrator([0.1] * 20, [0.0] * 20, tuple(range(2, 22)), 1.0, 1e3)])
 def test_a_law_is_unchanged_after_saving_and_loading(law: LinearLaw, tmp_path: Path) -> None:
     law_file.save(law, tmp_path / "law.fits")
-    again = law_file.load(tmp_path / "law.fits")
-    assert again.id == law.id
-    assert (again.name, again.noll, again.delay_frames) == (law.name, law.noll, 1.0)
+    loaded = law_file.load(tmp_path / "law.fits")
+    assert loaded.id == law.id
+    assert (loaded.name, loaded.noll, loaded.delay_frames) == (law.name, law.noll, 1.0)
 
 
 def test_a_damaged_law_file_is_an_error(tmp_path: Path) -> None:
