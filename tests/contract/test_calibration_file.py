@@ -19,28 +19,31 @@ from tests.support import toy
 
 def calibration(flux_dn: float = 1234.5678901234) -> Calibration:
     """The toy's calibration with bad pixels and noise in some arrays."""
-    made, rng = toy.calibration(), np.random.default_rng(3)
+    toy_calibration, rng = toy.calibration(), np.random.default_rng(3)
     arrays = {
-        name: single(rng.standard_normal(getattr(made, name).shape)) for name in ("reference", "response", "dark")
+        name: single(rng.standard_normal(getattr(toy_calibration, name).shape))
+        for name in ("reference", "response", "dark")
     }
-    good = single(rng.random(made.good.size) > 0.2)
-    return calibration_codec.identified(replace(made, good=good, flux_dn=flux_dn, operator_hash="0a" * 32, **arrays))
+    good = single(rng.random(toy_calibration.good.size) > 0.2)
+    return calibration_codec.identified(
+        replace(toy_calibration, good=good, flux_dn=flux_dn, operator_hash="0a" * 32, **arrays)
+    )
 
 
 @pytest.mark.parametrize("flux_dn", [1234.5678901234, 0.0026589626685784786, 2.6589626685784786e-123])
 def test_a_saved_calibration_is_loaded_bit_for_bit(tmp_path: Path, flux_dn: float) -> None:
     saved, path = calibration(flux_dn), tmp_path / "night.fits"
     save(saved, path)
-    found = load(path)
-    for part in fields(Calibration):
-        one, other = getattr(saved, part.name), getattr(found, part.name)
-        if isinstance(one, np.ndarray):
-            assert one.dtype == other.dtype
-            assert one.tobytes() == other.tobytes()
-            assert other.dtype.isnative
+    loaded = load(path)
+    for field in fields(Calibration):
+        before, after = getattr(saved, field.name), getattr(loaded, field.name)
+        if isinstance(before, np.ndarray):
+            assert before.dtype == after.dtype
+            assert before.tobytes() == after.tobytes()
+            assert after.dtype.isnative
         else:
-            assert one == other
-            assert type(one) is type(other)
+            assert before == after
+            assert type(before) is type(after)
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -90,26 +93,26 @@ def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_identity_depends_on_every_field() -> None:
-    one = calibration()
-    assert calibration_codec.identified(one).id == one.id
-    assert len(one.id) == 64
+    original = calibration()
+    assert calibration_codec.identified(original).id == original.id
+    assert len(original.id) == 64
     added: dict[str, Any] = {"camera": toy.CAMERA, "actuators_to_modes": np.zeros((3, 20), np.float32)}
-    for name in {part.name for part in fields(Calibration)} - {"id"}:
-        value = added.get(name, getattr(one, name))
-        other = value if name in added else value[::-1] if isinstance(value, str | tuple) else value + 1
-        assert calibration_codec.identified(replace(one, **{name: other})).id != one.id, name
+    for name in {field.name for field in fields(Calibration)} - {"id"}:
+        value = added.get(name, getattr(original, name))
+        changed = value if name in added else value[::-1] if isinstance(value, str | tuple) else value + 1
+        assert calibration_codec.identified(replace(original, **{name: changed})).id != original.id, name
 
 
 def test_actuators_to_modes_are_stored_and_optional(tmp_path: Path) -> None:
-    one, path = calibration(), tmp_path / "night.fits"
-    seen = np.arange(60, dtype=np.float32).reshape(3, 20)
-    whole = calibration_codec.identified(replace(one, actuators_to_modes=seen))
-    save(whole, path)
-    assert np.array_equal(load(path).actuators_to_modes, seen)
-    assert whole.id != one.id
+    without, path = calibration(), tmp_path / "night.fits"
+    matrix = np.arange(60, dtype=np.float32).reshape(3, 20)
+    with_matrix = calibration_codec.identified(replace(without, actuators_to_modes=matrix))
+    save(with_matrix, path)
+    assert np.array_equal(load(path).actuators_to_modes, matrix)
+    assert with_matrix.id != without.id
     with fits.open(path) as units:
         assert "ACT2MODES" in units
-    save(one, path)
+    save(without, path)
     assert load(path).actuators_to_modes.size == 0
     with fits.open(path) as units:
         assert "ACT2MODES" not in units

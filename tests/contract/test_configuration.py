@@ -49,10 +49,10 @@ def test_the_defaults_are_valid_for_detector_mirror_and_controller() -> None:
 def test_every_key_has_a_description() -> None:
     sections = {type(value) for _, value in Configuration() if isinstance(value, Section)}
     for section in (Configuration, InterlockSection, *sections):
-        found = section.descriptions()
-        assert found.keys() == section.model_fields.keys()
+        descriptions = section.descriptions()
+        assert descriptions.keys() == section.model_fields.keys()
         subsections = {key for key, info in section.model_fields.items() if isinstance(info.default, Section)}
-        assert [key for key, text in found.items() if not text.endswith(".") and key not in subsections] == []
+        assert [key for key, text in descriptions.items() if not text.endswith(".") and key not in subsections] == []
 
 
 class Outer:
@@ -174,10 +174,10 @@ def test_an_impossible_address_of_the_router_is_refused(key: str, address: str, 
 
 def test_config_show_sets_only_keys_that_were_set(tmp_path: Path) -> None:
     """Read from a file, the output of `config show` leaves the defaults of a command in force."""
-    silent = write(tmp_path, commented(load(None)))
-    assert tomllib.loads(silent.read_text()) == {name: {} for name in tomllib.loads(silent.read_text())}
-    assert load(silent, None, {"control.start_mode": "closed"}).control.start_mode == "closed"
-    assert {line.removeprefix("#").split(" = ")[0] for line in silent.read_text().splitlines()} >= {
+    defaults_file = write(tmp_path, commented(load(None)))
+    assert tomllib.loads(defaults_file.read_text()) == {name: {} for name in tomllib.loads(defaults_file.read_text())}
+    assert load(defaults_file, None, {"control.start_mode": "closed"}).control.start_mode == "closed"
+    assert {line.removeprefix("#").split(" = ")[0] for line in defaults_file.read_text().splitlines()} >= {
         key.rpartition(".")[2] for key in KEYS
     }
     chosen = {

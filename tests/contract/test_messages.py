@@ -68,16 +68,16 @@ def test_the_generated_code_matches_the_proto_file(tmp_path: Path) -> None:
     pytest.importorskip("grpc_tools", reason="needs grpcio-tools, which contains protoc, for development only")
     command = [sys.executable, "-m", "lowfc.contract.compile_proto", "--into", str(tmp_path)]
     subprocess.run(command, check=True, cwd=ROOT)
-    made = sorted(path.name for path in tmp_path.iterdir())
-    assert made == ["lowfc.desc", "lowfc_pb2.py", "lowfc_pb2.pyi"]
-    for name in made:
+    generated = sorted(path.name for path in tmp_path.iterdir())
+    assert generated == ["lowfc.desc", "lowfc_pb2.py", "lowfc_pb2.pyi"]
+    for name in generated:
         assert (tmp_path / name).read_bytes() == (WIRE / name).read_bytes(), f"{name} is stale: run `make proto`"
 
 
 @pytest.mark.parametrize(("enum", "prefix"), [(LoopMode, "LOOP_MODE_"), (REASONS, "REASON_")])
 def test_enums_have_the_numbers_of_the_wire(enum: Iterable[IntEnum], prefix: str) -> None:
     theirs = dict((wire.LoopMode if enum is LoopMode else wire.Reason).items())
-    assert theirs == {f"{prefix}UNSPECIFIED": 0} | {f"{prefix}{one.name}": one.value for one in enum}
+    assert theirs == {f"{prefix}UNSPECIFIED": 0} | {f"{prefix}{member.name}": member.value for member in enum}
 
 
 def test_levels_have_the_numbers_of_foxgloves_schema() -> None:
@@ -94,7 +94,9 @@ def test_every_message_and_every_field_has_a_comment() -> None:
             if field.name != "timestamp" and not sentences.get((4, index, 2, position)):
                 bare.append(f"{message.name}.{field.name}")
     for index, enum in enumerate(file.enum_type):
-        bare += [one.name for at, one in enumerate(enum.value) if one.number and not sentences.get((5, index, 2, at))]
+        bare += [
+            value.name for at, value in enumerate(enum.value) if value.number and not sentences.get((5, index, 2, at))
+        ]
     assert bare == []
 
 
@@ -154,15 +156,15 @@ def details_of(description: str) -> set[str]:
 
 
 def test_every_raised_event_is_in_the_table_with_the_same_details() -> None:
-    found = list(raised_events())
+    raised = list(raised_events())
     wrong = [
         f"{where}: {name} with {sorted(details)}"
-        for where, name, details in found
+        for where, name, details in raised
         if name not in EVENTS or details != details_of(EVENTS[name].description)
     ]
     assert wrong == []
-    assert len(found) > 25
-    assert {"MODE_CHANGED", "CALIBRATION_LOADED", "COMMAND_EXPIRED"} <= {name for _, name, _ in found}
+    assert len(raised) > 25
+    assert {"MODE_CHANGED", "CALIBRATION_LOADED", "COMMAND_EXPIRED"} <= {name for _, name, _ in raised}
 
 
 def test_every_event_formats_as_a_line() -> None:
@@ -229,10 +231,10 @@ def test_steps_commands_and_requests_round_trip() -> None:
 def test_a_mirror_state_is_decoded() -> None:
     shape = np.arange(6, dtype=np.float32).reshape(2, 3)
     state = wire.MirrorState(timestamp=timestamp(77), rows=2, columns=3, actuators=shape.tobytes(), command_nm=[1, 2])
-    found = codec.decode_mirror(state.SerializeToString())
-    assert found.time_ns == 77
-    assert np.array_equal(found.actuators_nm, shape)
-    assert found.command_nm.tolist() == [1, 2]
+    decoded = codec.decode_mirror(state.SerializeToString())
+    assert decoded.time_ns == 77
+    assert np.array_equal(decoded.actuators_nm, shape)
+    assert decoded.command_nm.tolist() == [1, 2]
     state.rows = 3
     assert codec.decode_mirror(state.SerializeToString()) is None
     assert codec.decode_mirror(b"\xff") is None

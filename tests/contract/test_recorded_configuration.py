@@ -29,15 +29,15 @@ REMARKS = [
 ]
 
 
-def test_known_keys_are_used_and_the_rest_are_remarks() -> None:
+def test_known_keys_are_used_and_unknown_or_invalid_ones_are_remarks() -> None:
     config, remarks = recorded(OTHER.encode())
     assert config == load(None, {"camera.rate_hz": 300.0})
     assert remarks == REMARKS
     assert recorded(Configuration().to_toml().encode()) == (Configuration(), [])
-    later = b"[[interlocks]]\nname = 'flow'\nvalue = 'on'\ntest = 'above'\naction = 'explode'\nfoo = 1\n"
-    one = b"[[interlocks]]\nname = 'dome'\nvalue = 1.0\naction = 'open'\nfoo = 1\nbar = 2\n"
-    config, _ = recorded(later + one + b"[[more]]\n")
-    assert [one.name for one in config.interlocks] == ["dome"]
+    of_later_version = b"[[interlocks]]\nname = 'flow'\nvalue = 'on'\ntest = 'above'\naction = 'explode'\nfoo = 1\n"
+    with_unknown_keys = b"[[interlocks]]\nname = 'dome'\nvalue = 1.0\naction = 'open'\nfoo = 1\nbar = 2\n"
+    config, _ = recorded(of_later_version + with_unknown_keys + b"[[more]]\n")
+    assert [interlock.name for interlock in config.interlocks] == ["dome"]
 
 
 @pytest.mark.parametrize(
@@ -53,9 +53,9 @@ def test_known_keys_are_used_and_the_rest_are_remarks() -> None:
 def test_an_invalid_value_is_replaced_by_the_default(toml: str, changed: dict[str, object], remark: str) -> None:
     config, remarks = recorded(toml.encode())
     assert config == load(None, changed)
-    (found,) = remarks
-    assert found.startswith(remark)
-    assert found.endswith("; the default is used")
+    (only_remark,) = remarks
+    assert only_remark.startswith(remark)
+    assert only_remark.endswith("; the default is used")
 
 
 def test_contradicting_values_stay_as_recorded() -> None:
@@ -94,13 +94,13 @@ def test_an_unreadable_configuration_is_a_remark(tmp_path: Path, toml: str) -> N
 @pytest.fixture(scope="module")
 def night() -> SyntheticLog:
     """A loop that was open, then closed, with an acceptance test of its noise."""
-    night_ = SyntheticLog()
+    recording = SyntheticLog()
     for loop, frames in (("open", 500), ("closed", 1200)):
-        night_.request({"open": "open", "closed": "close"}[loop])
-        night_.frames(200)
-        night_.request("note", text=ANNOUNCEMENT + json.dumps({"test": "noise-floor", "loop": loop, "frames": 400}))
-        night_.frames(frames)
-    return night_
+        recording.request({"open": "open", "closed": "close"}[loop])
+        recording.frames(200)
+        recording.request("note", text=ANNOUNCEMENT + json.dumps({"test": "noise-floor", "loop": loop, "frames": 400}))
+        recording.frames(frames)
+    return recording
 
 
 @pytest.fixture(scope="module")
@@ -111,11 +111,11 @@ def written(night: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Ca
 
 @pytest.fixture
 def log_with(tmp_path: Path, written: Callable[[str], bytes]) -> Callable[[str], Path]:
-    def made(toml: str) -> Path:
+    def write_log(toml: str) -> Path:
         (path := tmp_path / "night.mcap").write_bytes(written(toml))
         return path
 
-    return made
+    return write_log
 
 
 @pytest.fixture

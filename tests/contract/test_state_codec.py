@@ -55,15 +55,15 @@ def test_a_state_with_too_few_modes_is_refused(field: str) -> None:
         Load(5, CALIBRATION, "a file"),
         *(BenchReport(5, "mask", value, 3) for value in (True, False, 2.5, "parked", None)),
     ],
-    ids=lambda one: type(one).__name__,
+    ids=lambda input_: type(input_).__name__,
 )
 def test_inputs_round_trip(input_: Report) -> None:
     message = wire.ControlInput.FromString(codec.encode_input(input_, 9))
     assert message.input_number == 9
-    found = codec.decode_input(message, {CALIBRATION.id: CALIBRATION})
-    assert type(found) is type(input_)
+    decoded = codec.decode_input(message, {CALIBRATION.id: CALIBRATION})
+    assert type(decoded) is type(input_)
     for field in fields(input_):
-        assert np.array_equal(getattr(found, field.name), getattr(input_, field.name)), field.name
+        assert np.array_equal(getattr(decoded, field.name), getattr(input_, field.name)), field.name
     with pytest.raises(ValueError, match="input 0 of the controller cannot be read"):
         codec.decode_input(wire.ControlInput(), {})
 
@@ -72,9 +72,9 @@ def test_a_calibration_round_trips() -> None:
     message = wire.Calibration.FromString(encode_calibration(CALIBRATION, 5_000_000_001))
     assert message.timestamp.ToNanoseconds() == 5_000_000_001
     assert list(message.mode_names) == ["tilt x", "tilt y", "focus"]
-    found = decode_calibration(message)
+    decoded = decode_calibration(message)
     for field in fields(CALIBRATION):
-        assert np.array_equal(getattr(found, field.name), getattr(CALIBRATION, field.name)), field.name
+        assert np.array_equal(getattr(decoded, field.name), getattr(CALIBRATION, field.name)), field.name
     message.flux_dn += 1
     with pytest.raises(ValueError, match="is damaged: its content has another identity"):
         decode_calibration(message)

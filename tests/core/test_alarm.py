@@ -13,6 +13,7 @@ from lowfc.programs.core.recording.alarm import Alarm
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.loops import until
 
+# Shell command that appends a line about the event to the file `notes`.
 NOTE = 'printf "%s\\n" "$LOWFC_RUN|$LOWFC_LEVEL|$LOWFC_PROCESS|$LOWFC_EVENT|$LOWFC_TEXT|$LOWFC_OTHERS" >> notes; '
 
 

@@ -100,7 +100,7 @@ class Rig:
         self.settings.put(state.SerializeToString())
         self.latch = Path(tempfile.mkdtemp()) / "safe"
         self.controller = Controller(config, self.services[0], calibration, "a test", Latch([self.latch]))
-        self.threads = [threading.Thread(target=one.run) for one in (self.mirror, self.controller)]
+        self.threads = [threading.Thread(target=process.run) for process in (self.mirror, self.controller)]
         for thread in self.threads:
             thread.start()
 
@@ -210,8 +210,8 @@ def running(config: Configuration, calibration: Calibration, scene: Scene) -> It
 
 @pytest.fixture
 def rig(calibration: Calibration, scene: Scene) -> Iterator[Rig]:
-    with running(CONFIG, calibration, scene) as one:
-        yield one
+    with running(CONFIG, calibration, scene) as started:
+        yield started
 
 
 def test_closing_the_loop_corrects_every_mode(rig: Rig) -> None:
@@ -259,7 +259,7 @@ def test_a_reply_names_the_first_frame_that_the_request_affects(rig: Rig) -> Non
     (bad,) = rig.operator.get("lowfc/request/gain", b"\xff\xff", PATIENCE_S)
     assert "could not be read" in wire.Request.FromString(bad.payload).reply
     rig.until("five published requests", lambda: len(rig.received.get(REQUEST.key, [])) == 5)
-    published = [(one.name, one.accepted) for one in rig.received[REQUEST.key]]
+    published = [(request.name, request.accepted) for request in rig.received[REQUEST.key]]
     assert published == [("close", True), ("gain", False), ("status", True), ("dance", False), ("gain", False)]
 
 
@@ -306,7 +306,7 @@ def test_frames_with_wrong_times_do_not_stop_the_controller(calibration: Calibra
     assert max(rig.received[TIMING.key][0].transport_ns) == 2**32 - 1
 
 
-def test_a_latch_that_cannot_be_written_starts_open(calibration: Calibration, tmp_path: Path) -> None:
+def test_a_loop_whose_latch_cannot_be_written_starts_open(calibration: Calibration, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     warnings: list[str] = []
     _, service, controller = alone(calibration, Latch([tmp_path / "file" / "safe"], warnings.append), CLOSED)
@@ -415,7 +415,7 @@ def test_start_requests_wait_for_the_mirror_and_the_cameras_settings(calibration
             controller._state = controller._state._replace(conditions=conditions)
             controller._between_frames(None)
             assert controller._start_pending is awaited
-        assert [one.name for one in controller._state.loop.command_channels.channels] == ["flat"]
+        assert [channel.name for channel in controller._state.loop.command_channels.channels] == ["flat"]
 
 
 def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: Calibration, tmp_path: Path) -> None:
@@ -477,12 +477,13 @@ def test_an_exception_in_frame_processing_ends_the_controller(
 
 def test_of_frames_that_waited_only_the_newest_is_integrated(calibration: Calibration, scene: Scene) -> None:
     """All were exposed with the same mirror shape: together they may change the command by one gain, not by ten."""
-    config = configured(lockstep=False, camera__rate_hz=5.0, control__start_mode="closed")  # a stall is no period
+    # 5 Hz, so that a stall of this host is shorter than a period.
+    config = configured(lockstep=False, camera__rate_hz=5.0, control__start_mode="closed")
     with running(config, calibration, scene) as rig:
         rig.inject(2.0 * np.eye(14)[3])
         pixels = scene.expose(0, rig.offset_nm)
         payload = image(pixels, 1, "camera").SerializeToString()
-        dispatch = next(one for one in rig.services[0].arrivals if one.key == FRAME.key)
+        dispatch = next(arrival for arrival in rig.services[0].arrivals if arrival.key == FRAME.key)
         until(lambda: rig.controller._mirror_adopted)
         now_ns = HostClock().now_ns()
         newest = rig.settings.last[1].sequence + 100
@@ -508,8 +509,8 @@ def test_refused_commands_do_not_reset_the_command_timeout(
         rig.put(scene.expose(0, rig.offset_nm))
         rig.services[0].stop("the controller has died")
         rig.threads[1].join(PATIENCE_S)
-        other = rig.bus("other").publisher(COMMAND, "dm")
+        another_publisher = rig.bus("other").publisher(COMMAND, "dm")
         nonsense = wire.MirrorCommand(
             rows=GRID[0], columns=GRID[1], actuators=actuators, frame_sequence=2**63, valid_for_ns=10**9
         ).SerializeToString()
-        until(lambda: "COMMAND_EXPIRED" in rig.events(), each=lambda: other.put(nonsense))
+        until(lambda: "COMMAND_EXPIRED" in rig.events(), each=lambda: another_publisher.put(nonsense))

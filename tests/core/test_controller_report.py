@@ -21,7 +21,7 @@ from lowfc.programs.launch.status import screen, status_line, summary_text
 from lowfc.programs.launch.watch import Watch, summary
 from tests.support.toy import DARK_DN, GRID, SATURATION_DN, SHAPE, START, calibration, feed, frame, loaded, settings
 
-USUAL = settings()
+SETTINGS = settings()
 CAMERA = CameraSettings(START * 10**9, SHAPE, DARK_DN, SATURATION_DN)
 SECOND = 10**9
 PROCESSES = {
@@ -45,20 +45,20 @@ PROCESSES = {
 
 def test_the_time_not_closed_is_summed_and_has_its_cause() -> None:
     account = NotClosed()
-    assert account.note(loaded(USUAL), 0) == (0, "")
-    state, _ = feed(USUAL, loaded(USUAL), CAMERA, frame(1))
+    assert account.note(loaded(SETTINGS), 0) == (0, "")
+    state, _ = feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1))
     assert account.note(state, 1 * SECOND) == (0, ""), "closed since its first frame"
-    state, _ = feed(USUAL, state, replace(CAMERA, bias_dn=DARK_DN + 300))
+    state, _ = feed(SETTINGS, state, replace(CAMERA, bias_dn=DARK_DN + 300))
     assert account.note(state, 2 * SECOND)[0] == 0
     total_ns, cause = account.note(state, 5 * SECOND)
     assert (total_ns, "bias_dn is 400" in cause) == (3 * SECOND, True)
 
 
 def test_every_cause_of_a_loop_that_was_not_closed_is_named() -> None:
-    account, (state, _) = NotClosed(), feed(USUAL, loaded(USUAL), CAMERA, frame(1))
+    account, (state, _) = NotClosed(), feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1))
     account.note(state, 0)
     for number, name in enumerate(("open", "close", "pause", "close", "open", "close"), 1):
-        state, _ = feed(USUAL, state, Request(number * SECOND, name))
+        state, _ = feed(SETTINGS, state, Request(number * SECOND, name))
         account.note(state, number * SECOND)
         cause = account.note(state, number * SECOND + 1)[1]
     assert cause == "operator asked to open (2 times); operator asked to pause (1 time)"
@@ -83,7 +83,7 @@ def test_the_closed_fraction_is_that_of_the_time_between_first_and_last_frame(
 
 
 def test_summary_and_status_show_the_time_not_closed() -> None:
-    def first(**health: Any) -> str:
+    def first_line(**health: Any) -> str:
         watch = Watch({"controller": wire.Health(**health)}, [])
         return summary_text(summary(watch, record=False)).splitlines()[0].split(maxsplit=1)[1]
 
@@ -93,15 +93,15 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
     results = summary(Watch({"camera": camera}, []), record=False)
     assert "over the open pupil, second half of the run" in summary_text(results)
     not_closed = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
-    assert first(mode=wire.LOOP_MODE_CLOSED) == "closed"
+    assert first_line(mode=wire.LOOP_MODE_CLOSED) == "closed"
     expected = "closed; not closed for 3.0 s in total: the camera does not fit"
-    assert first(mode=wire.LOOP_MODE_CLOSED, **not_closed) == expected
-    assert first(mode=wire.LOOP_MODE_OPEN, **not_closed) == expected.replace("closed;", "open;")
-    assert first(mode=wire.LOOP_MODE_SAFE, **not_closed) == expected.replace("closed;", "in safe mode;")
+    assert first_line(mode=wire.LOOP_MODE_CLOSED, **not_closed) == expected
+    assert first_line(mode=wire.LOOP_MODE_OPEN, **not_closed) == expected.replace("closed;", "open;")
+    assert first_line(mode=wire.LOOP_MODE_SAFE, **not_closed) == expected.replace("closed;", "in safe mode;")
     assert screen(Watch({}, [Log(message="without a level")]), Configuration(), None, 1.0)
-    assert first() == "no controller reported", "no time counts before the loop has started"
-    state, _ = feed(USUAL, loaded(USUAL), CAMERA, frame(1), replace(CAMERA, bias_dn=DARK_DN + 300))
-    message = controller_state(state, USUAL, (START + 12) * SECOND)
+    assert first_line() == "no controller reported", "no time counts before the loop has started"
+    state, _ = feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1), replace(CAMERA, bias_dn=DARK_DN + 300))
+    message = controller_state(state, SETTINGS, (START + 12) * SECOND)
     mirror = wire.Health(command_refused=wire.REASON_OUT_OF_ORDER)
     _, *lines = status.text(status.json_object(message, {"mirror-dm": mirror})).splitlines()
     assert lines[0].split(maxsplit=1)[1].startswith("open for 12 s (the camera does not fit the calibration: bias_dn")
@@ -115,37 +115,39 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
 
 
 def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> None:
-    state, _ = feed(USUAL, loaded(USUAL), CAMERA, frame(1))
+    state, _ = feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1))
 
-    def first(**changes: Any) -> str:
-        message = controller_state(state, USUAL, (START + 12) * SECOND)
+    def first_line(**changes: Any) -> str:
+        message = controller_state(state, SETTINGS, (START + 12) * SECOND)
         return status.text(status.json_object(message, PROCESSES | changes, "night")).splitlines()[0]
 
     normal = (
         "closed · residual 2.50 nm rms, noise included (true 2.00) · light 97 % · 3 frames lost · recording logs/a.mcap"
     )
     warned = "10 s ago camera: COMMANDS_LATE 9 % late"
-    assert first() == f"{normal} · run night · law integrator · {warned}"
+    assert first_line() == f"{normal} · run night · law integrator · {warned}"
     stopped = wire.Health(state="ready", recording=wire.Recording(file="logs/a.mcap", stopped=True))
-    assert "· recording stopped ·" in first(recorder=stopped)
+    assert "· recording stopped ·" in first_line(recorder=stopped)
     failed = wire.Health(state="ready", recording=wire.Recording(failure="full"))
-    assert "· recording failed ·" in first(recorder=failed)
-    assert "· not recording ·" in first(recorder=wire.Health(state="stopped"))
-    assert first(controller=wire.Health()).startswith("closed · no frame used in the last second · 0 frames lost ·")
-    assert first(camera=wire.Health(), recorder=wire.Health()).endswith(" · no warning")
+    assert "· recording failed ·" in first_line(recorder=failed)
+    assert "· not recording ·" in first_line(recorder=wire.Health(state="stopped"))
+    assert first_line(controller=wire.Health()).startswith(
+        "closed · no frame used in the last second · 0 frames lost ·"
+    )
+    assert first_line(camera=wire.Health(), recorder=wire.Health()).endswith(" · no warning")
     words = ("paused", "open", "open", "closed", "in safe mode")  # a second `pause` finds the loop open already
     for name, word in zip(("pause", "open", "pause", "close", "safe"), words, strict=True):
-        state, (outputs,) = feed(USUAL, state, Request((START + 2) * SECOND, name))
+        state, (outputs,) = feed(SETTINGS, state, Request((START + 2) * SECOND, name))
         assert outputs.reply.accepted
-        assert first().startswith(f"{word} ·")
-        assert status.json_object(controller_state(state, USUAL, 0))["paused"] == (word == "paused")
+        assert first_line().startswith(f"{word} ·")
+        assert status.json_object(controller_state(state, SETTINGS, 0))["paused"] == (word == "paused")
 
 
 def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None:
     recent = wire.WavefrontFigures(added_contrast_flat=7e-10, added_contrast=-4e-11)
     published = wire.TopicCount(topic=FRAME.key, published=1)
     camera = wire.Health(recent_wavefront=recent, wavefront=recent, topics=[published])
-    message = controller_state(loaded(USUAL), USUAL, (START + 12) * SECOND)
+    message = controller_state(loaded(SETTINGS), SETTINGS, (START + 12) * SECOND)
     watch = Watch({"camera": camera}, [])
     expected = "added to the dark zone's contrast: flat mirror +7.0e-10, residual -4.0e-11"
     assert expected in status.text(status.json_object(message, {"camera": camera}))
@@ -157,7 +159,7 @@ def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None
 
 
 def test_statistics_of_the_last_second_exclude_older_and_refused_frames() -> None:
-    state, last = loaded(USUAL), LastSecond(SECOND // 4)
+    state, last = loaded(SETTINGS), LastSecond(SECOND // 4)
     assert last.statistics(state, SECOND) == wire.LoopFigures()
     flux_dn = state.loop.calibration.flux_dn
 
@@ -167,8 +169,12 @@ def test_statistics_of_the_last_second_exclude_older_and_refused_frames() -> Non
 
     for quarter, error_nm in enumerate((9.0, 9.0, 9.0, 9.0, 9.0, 1.0, 1.0, None, 1.0, 1.0)):
         last.add(step(error_nm), quarter * SECOND // 4)
-    found = last.statistics(state, 9 * SECOND // 4)
-    assert (found.frames, found.residual_rms_nm, found.flux_fraction) == (3, pytest.approx(2.0), pytest.approx(0.5))
+    figures = last.statistics(state, 9 * SECOND // 4)
+    assert (figures.frames, figures.residual_rms_nm, figures.flux_fraction) == (
+        3,
+        pytest.approx(2.0),
+        pytest.approx(0.5),
+    )
     assert last.statistics(state, 20 * SECOND).frames == 0
 
 
@@ -212,10 +218,10 @@ def test_frames_published_after_the_last_received_one_count_as_lost(received: in
     assert (results["messages_lost"], results["lost"].get(FRAME.key, 0)) == (lost, lost)
 
 
-def test_after_a_refused_calibration_without_one_in_use_no_empty_one_is_published() -> None:
+def test_a_refused_load_while_no_calibration_is_in_use_publishes_no_calibration() -> None:
     published: list[bytes] = []
     shape, arrays = np.zeros(GRID, np.float32), Arrays(*[SimpleNamespace(put=published.append)] * 3)
-    state, _ = feed(USUAL, loaded(USUAL)._replace(loop=None), MirrorShape(1, shape, np.zeros(0, np.float32)))
+    state, _ = feed(SETTINGS, loaded(SETTINGS)._replace(loop=None), MirrorShape(1, shape, np.zeros(0, np.float32)))
     arrays.publish_in_use(Request(1, "load", calibration=calibration()), state)
     assert published == []
 

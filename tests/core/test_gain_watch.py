@@ -63,7 +63,7 @@ def rms_nm(loop: Bench, frames: int) -> tuple[float, float]:
     """True residual and disturbance over the last frames, nm rms."""
     truths = [truth.continuous for truth in loop.truths[-frames:]]
     return tuple(
-        float(np.sqrt(np.mean([np.sum(np.square(one)) for one in values])))
+        float(np.sqrt(np.mean([np.sum(np.square(modes_nm)) for modes_nm in values])))
         for values in ([truth.residual_nm for truth in truths], [truth.disturbance_nm for truth in truths])
     )
 
@@ -131,8 +131,8 @@ def test_the_noise_of_tip_falls_to_a_quarter_if_only_tip_and_tilt_are_corrected(
     prior_nm2 = 1.0 - np.isin(config.noll, TIP_TILT)
     (rows,) = map_rows(known, prior_nm2, known.flux_dn, known.camera, known.reconstructor)
     noise_nm = [
-        float(np.sqrt(noise_covariance_nm2(one, known.flux_dn, known.camera)[0, 0]))
-        for one in (known, replace(known, reconstructor=rows))
+        float(np.sqrt(noise_covariance_nm2(calibration_, known.flux_dn, known.camera)[0, 0]))
+        for calibration_ in (known, replace(known, reconstructor=rows))
     ]
     assert len(config.noll) == 14
     assert noise_nm == pytest.approx([42, 10], rel=0.02)
@@ -187,8 +187,8 @@ def test_the_command_of_a_mode_with_automatic_gain_zero_relaxes_to_zero() -> Non
     assert after_nm[2] == before_nm[2] != 0
 
 
-def _contrast_of_open(magnitude: float, seed: int, frames: int) -> float:
-    """Ratio of residual to open-loop contrast for a Zernike sensor with reaction-wheel jitter, second half of a run."""
+def _contrast_over_open_loop(magnitude: float, seed: int, frames: int) -> float:
+    """Contrast of the residual over that in open loop: Zernike sensor, reaction-wheel jitter, second half of a run."""
     loop = bench(magnitude, "reaction-wheel", "zwfs", seed=seed)
     form = np.diag(factory.contrast_of(loop.config).form)
     loop.run(frames - frames // 2, record=False)
@@ -196,20 +196,20 @@ def _contrast_of_open(magnitude: float, seed: int, frames: int) -> float:
     truths = [truth.continuous for truth in loop.truths]
     residual, disturbance = (
         form @ np.mean(np.square(values), axis=0)
-        for values in ([one.residual_nm for one in truths], [one.disturbance_nm for one in truths])
+        for values in ([truth.residual_nm for truth in truths], [truth.disturbance_nm for truth in truths])
     )
     return float(residual / disturbance)
 
 
 def test_closing_reduces_contrast_on_a_zernike_sensor_beyond_its_linear_range() -> None:
     """The square of the residual tilt looks like focus, astigmatism and spherical aberration to a Zernike sensor."""
-    assert _contrast_of_open(2.0, 1, 1250) < 1
+    assert _contrast_over_open_loop(2.0, 1, 1250) < 1
 
 
 @pytest.mark.slow
 def test_closing_seldom_adds_contrast_on_a_faint_star_with_a_zernike_sensor() -> None:
     """The cross-talk is close to the noise: whether it is detected depends on the host's rounding."""
-    assert sum(_contrast_of_open(8.0, seed, 2500) > 1 for seed in range(1, 7)) <= 1
+    assert sum(_contrast_over_open_loop(8.0, seed, 2500) > 1 for seed in range(1, 7)) <= 1
 
 
 def test_a_decoded_state_has_the_same_reconstructor(faint: Bench) -> None:
@@ -301,7 +301,7 @@ def harmful() -> ModalBench:
 def test_a_harmful_loop_without_a_law_opens_if_the_integrator_should_take_over() -> None:
     loop = harmful()
     loop.run(1150)
-    assert [one["action"] for one in named(loop, "LOOP_HARMS")] == ["the loop opens"]
+    assert [event["action"] for event in named(loop, "LOOP_HARMS")] == ["the loop opens"]
     assert loop.state.mode is LoopMode.OPEN
 
 
@@ -312,7 +312,7 @@ def test_the_integrator_takes_over_from_a_harmful_law_once_the_loop_is_not_reser
     loop.run(100)
     loop.process_input(Request(loop.steps[-1].time_ns, "lease", (), (60.0,), "another client", lease_id=1))
     loop.run(1000)
-    assert [one["action"] for one in named(loop, "LOOP_HARMS")] == ["the integrator takes over"]
+    assert [event["action"] for event in named(loop, "LOOP_HARMS")] == ["the integrator takes over"]
     assert loop.state.loop.law_runner is not None  # refused
     loop.ask("release", lease_id=1)
     loop.run(700)
@@ -354,12 +354,12 @@ def test_a_truncated_reconstructor_is_weighted_without_an_inverse_of_its_respons
 def watched(*inputs: Input) -> list[str]:
     """Names of the requests of the gain watch for these inputs to a toy loop with automatic gains."""
     setup = settings(auto_gain=(True, True), start_mode=LoopMode.OPEN)
-    watch, state, found = GainWatch(setup, "warn"), loaded(setup), []
+    watch, state, requested = GainWatch(setup, "warn"), loaded(setup), []
     for input_ in inputs:
         state, outputs = advance(setup, state, input_)
         if outputs.step is not None:
-            found += [request.name for request in watch.observe(outputs.step, state).requests]
-    return found
+            requested += [request.name for request in watch.observe(outputs.step, state).requests]
+    return requested
 
 
 @pytest.mark.parametrize(
@@ -371,20 +371,20 @@ def watched(*inputs: Input) -> list[str]:
     ],
     ids=["ahead", "out of order", "a clear for a camera that starts lower"],
 )
-def test_gains_are_measured_after_another_sequence(between: list[Input]) -> None:
+def test_frames_out_of_sequence_do_not_prevent_the_measurement_of_gains(between: list[Input]) -> None:
     first = [frame(count) for count in range(1, 11)]
     later = [frame(count) for count in range(11, 11 + MIN_FRAMES)]
     assert "gain" in watched(*first, *between, *later)
 
 
-def test_another_star_lowers_the_gains_and_restarts_their_measurement() -> None:
+def test_a_fainter_star_lowers_the_gains_and_restarts_their_measurement() -> None:
     loop = bench(2.0)
     loop.run(560, record=False)
-    bright = gains(loop)
+    gains_before = gains(loop)
     loop.change_star(3.5)
     loop.run(150, record=False)
     assert named(loop, "STAR_CHANGED")[0]["ratio"] == pytest.approx(0.25, rel=0.1)
-    assert (gains(loop) <= 0.5 * bright).all()
-    changed = len(named(loop, "GAINS_CHANGED"))
+    assert (gains(loop) <= 0.5 * gains_before).all()
+    changes = len(named(loop, "GAINS_CHANGED"))
     loop.run(550, record=False)
-    assert len(named(loop, "GAINS_CHANGED")) > changed
+    assert len(named(loop, "GAINS_CHANGED")) > changes

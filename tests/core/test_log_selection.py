@@ -91,35 +91,37 @@ def test_every_tenth_frame_is_recorded_and_the_others_do_not_count_as_lost(tmp_p
     mirror.finish()
     summary = bench.stop()
     messages = logged(summary)
-    assert [count_of(one.sequence) for one in on(messages, FRAME)] == [0, 10, 20, 30, 40, 50, 70, 80, 90]
-    recorded = [count_of(wire.MirrorState.FromString(one.payload).frame_sequence) for one in on(messages, MIRROR_STATE)]
-    assert recorded == [number for ten in range(0, 100, 10) for number in (ten, ten)]
+    assert [count_of(sample.sequence) for sample in on(messages, FRAME)] == [0, 10, 20, 30, 40, 50, 70, 80, 90]
+    state_numbers = [
+        count_of(wire.MirrorState.FromString(sample.payload).frame_sequence) for sample in on(messages, MIRROR_STATE)
+    ]
+    assert state_numbers == [number for number in range(0, 100, 10) for _ in range(2)]
     assert len(on(messages, COMMAND)) == 95
     assert not on(messages, SURFACE)
     assert summary.lost == {FRAME.key: 2}
     (path,) = summary.files
-    found = survey(path)
-    assert found["selection"] == "1 in 10 frames and mirror states, without lowfc/mirror/{name}/surface"
-    assert (found["messages_missing"], found["missing_topics"]) == (0, {})
-    assert found["topics"][FRAME.key]["missing"] is None
-    assert found["metadata"]["recording"]["messages_lost"] == "2"
-    assert found["metadata"]["selection"] == {"every": "10", "left_out": "lowfc/mirror/{name}/surface"}
+    info = survey(path)
+    assert info["selection"] == "1 in 10 frames and mirror states, without lowfc/mirror/{name}/surface"
+    assert (info["messages_missing"], info["missing_topics"]) == (0, {})
+    assert info["topics"][FRAME.key]["missing"] is None
+    assert info["metadata"]["recording"]["messages_lost"] == "2"
+    assert info["metadata"]["selection"] == {"every": "10", "left_out": "lowfc/mirror/{name}/surface"}
 
 
 def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
     before, after = list(LogReader(whole)), list(LogReader(small))
     assert bodies_of(after, STEP) == bodies_of(before, STEP)
     assert len(on(after, COMMAND)) == len(on(before, COMMAND))
-    assert [one.sequence for one in on(after, FRAME)] == [one.sequence for one in on(before, FRAME)][::EVERY]
-    frames = {one.sequence for one in on(after, FRAME)}
+    all_frames, frames = ([sample.sequence for sample in on(log, FRAME)] for log in (before, after))
+    assert frames == all_frames[::EVERY]
     states = on(after, MIRROR_STATE)
-    assert {wire.MirrorState.FromString(one.payload).frame_sequence for one in states} == frames
-    found = survey(small)
-    assert (found["messages_missing"], found["state"], "recovery" in found["metadata"]) == (0, "complete", False)
+    assert {wire.MirrorState.FromString(sample.payload).frame_sequence for sample in states} == set(frames)
+    info = survey(small)
+    assert (info["messages_missing"], info["state"], "recovery" in info["metadata"]) == (0, "complete", False)
     again = thin((small,), small.with_name("again.mcap"), selection(4, ["lowfc/camera/*"]))
-    made = Selection(20, frozenset({MIRROR_STATE, SURFACE, TIMING, TRUTH}))
-    assert again["selection"] == made.description
-    assert Selection.of(survey(path := Path(again["file"]))["metadata"]) == made
+    expected = Selection(20, frozenset({MIRROR_STATE, SURFACE, TIMING, TRUTH}))
+    assert again["selection"] == expected.description
+    assert Selection.of(survey(path := Path(again["file"]))["metadata"]) == expected
     assert len(on(list(LogReader(path)), FRAME)) == FRAMES // 20
     with pytest.raises(DataFileError, match="already exists"):
         thin((whole,), small, Selection(2))
@@ -135,11 +137,11 @@ def test_a_smaller_copy_has_all_messages_of_an_unknown_topic(tmp_path: Path, mon
         log = night.write(tmp_path / "night.mcap")
     done = thin((log,), tmp_path / "small.mcap", Selection(EVERY))
     messages = list(LogReader(Path(done["file"])))
-    assert [one.payload for one in messages if one.key == newer] == [b"newer"] * 3
+    assert [message.payload for message in messages if message.key == newer] == [b"newer"] * 3
     assert len(on(messages, FRAME)) == 3
 
 
-def test_replay_refuses_a_log_without_all_frames_in_one_sentence(small: Path) -> None:
+def test_replay_refuses_a_log_without_all_frames_in_one_line(small: Path) -> None:
     for words in (["--jobs", "1"], ["--jobs", "2"]):
         done = lowfc("replay", small, *words)
         assert isinstance(done.exception, LowfcError)
@@ -155,10 +157,10 @@ def test_replay_needs_frames_but_no_other_optional_topic(whole: Path) -> None:
 
 def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: Path) -> None:
     changes = requested("gain=0.3", None, None, None)
-    found = [what_if(LoggedRun(read_history(LogReader(log))), changes) for log in (whole, small)]
-    for results in found:
+    both_results = [what_if(LoggedRun(read_history(LogReader(log))), changes) for log in (whole, small)]
+    for results in both_results:
         del results["log"]
-    assert found[0] == found[1]
+    assert both_results[0] == both_results[1]
     other = {"pinv": "weighted", "weighted": "pinv"}[read_history(WholeLog(small)).calibration.estimator]
     with pytest.raises(DataFileError, match=r"reconstructor cannot be tried.*other gains, leaks and limits can"):
         what_if(LoggedRun(read_history(LogReader(small))), WhatIf(estimator=other))
@@ -166,13 +168,13 @@ def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: P
 
 @pytest.mark.usefixtures("without_drawings")
 def test_a_report_of_a_smaller_copy_has_the_same_results(whole: Path, small: Path) -> None:
-    found = [json_of("report", whole), json_of("report", small, "--out", small.with_suffix(".html"))]
+    reports = [json_of("report", whole), json_of("report", small, "--out", small.with_suffix(".html"))]
     for part in ("residual", "spectra", "error_budget", "closed_stretch", "light", "laws", "requests"):
-        assert found[0][part] == found[1][part], part
-    levels = [{check["name"]: check["level"] for check in one["verdict"]["checks"]} for one in found]
+        assert reports[0][part] == reports[1][part], part
+    levels = [{check["name"]: check["level"] for check in report["verdict"]["checks"]} for report in reports]
     assert levels[0] == levels[1]
-    assert found[1]["timing"]["interval_us"]["frames"]["count"] == 0
-    assert found[1]["timing"]["latency_us"]["frame_to_mirror"]["count"] == FRAMES // EVERY
+    assert reports[1]["timing"]["interval_us"]["frames"]["count"] == 0
+    assert reports[1]["timing"]["latency_us"]["frame_to_mirror"]["count"] == FRAMES // EVERY
     assert "1 in 10 frames and mirror states" in small.with_suffix(".html").read_text()
 
 
@@ -180,8 +182,8 @@ def test_an_export_contains_the_frames_of_a_smaller_copy(small: Path, tmp_path: 
     out = tmp_path / "small.npz"
     results = json_of("export", small, "--to", "npz", "--frames", "--out", out)
     assert results["selection"] == "1 in 10 frames and mirror states"
-    with np.load(out) as found:
-        arrays = dict(found)
+    with np.load(out) as file:
+        arrays = dict(file)
     assert (len(arrays["sequence"]), len(arrays["frame_sequence"])) == (FRAMES, FRAMES // EVERY)
     assert np.count_nonzero(np.isfinite(arrays["mirror_stroke_nm"])) == FRAMES // EVERY
     assert len(np.load(out.with_suffix(".frames.npy"))) == FRAMES // EVERY
@@ -201,14 +203,14 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     assert estimate(config).endswith(" h, at 250 Hz and 80 x 80 pixels, the simulated camera's")
     camera = wire.CameraState(rows=160, columns=120)
     assert estimate(config, camera).endswith(" h, at 250 Hz and 160 x 120 pixels")
-    more = bytes_per_s(config, configured_selection(config), camera) - growth
-    assert more == pytest.approx((160 * 120 - 80 * 80) * 2 * 0.6 * 250)
+    added_per_s = bytes_per_s(config, configured_selection(config), camera) - growth
+    assert added_per_s == pytest.approx((160 * 120 - 80 * 80) * 2 * 0.6 * 250)
     assert estimate(config, wire.CameraState()) == estimate(config)
     assert estimate(load(None, keys | {"sensor.kind": "zwfs"})).endswith(" 40 x 40 pixels, the simulated camera's")
     fields = *wire.ControlStep.DESCRIPTOR.fields, *wire.Truth.DESCRIPTOR.fields
     modal = sum(field.is_repeated and field.name.endswith("_nm") for field in fields)
-    more = bytes_per_s(load(None, keys | {"sensor.modes": 35}), EVERYTHING) - growth
-    assert more == pytest.approx(modal * (35 - 14) * 4 * 250)
+    added_per_s = bytes_per_s(load(None, keys | {"sensor.modes": 35}), EVERYTHING) - growth
+    assert added_per_s == pytest.approx(modal * (35 - 14) * 4 * 250)
     assert bytes_per_s(load(None, keys | {"camera.rate_hz": 500.0}), EVERYTHING) > 1.8 * growth
     fewer = load(None, keys | {"recorder.every": 10, "recorder.topics": [FRAME.key, "lowfc/mirror/{name}/state"]})
     assert bytes_per_s(fewer, configured_selection(fewer)) < 0.5 * growth

@@ -19,9 +19,9 @@ def test_closing_does_not_raise_the_contrast_of_the_dark_zone(sensor: str, magni
     words = [*COMMAND.split(), "--star-magnitude", str(magnitude), "--sensor", sensor]
     done = subprocess.run([sys.executable, "-m", *words], cwd=tmp_path, capture_output=True, text=True, timeout=230)
     assert not done.returncode, done.stderr
-    found = json.loads(done.stdout)
-    added = found["added_contrast"]
-    assert found["closed_fraction"] > 0.85
-    assert added["closed"] < added["open"] + TOLERATED * found["dark_zone_contrast"]
+    results = json.loads(done.stdout)
+    added = results["added_contrast"]
+    assert results["closed_fraction"] > 0.85
+    assert added["closed"] < added["open"] + TOLERATED * results["dark_zone_contrast"]
     if not magnitude:
         assert added["closed"] < 0.1 * added["open"]

@@ -61,18 +61,18 @@ def test_everything_is_recorded_verbatim(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("camera_present", [False, True])
-def test_a_log_of_a_run_without_other_processes_is_removed(tmp_path: Path, camera_present: bool) -> None:
+def test_a_log_is_kept_only_if_the_run_had_another_process(tmp_path: Path, camera_present: bool) -> None:
     hub, clock = MemoryHub(), HostClock()
     folder = tmp_path / "caf\udce9"  # in Latin-1
     recorder = Recorder(MemoryBus(hub, "recorder", clock), clock, "bnch", folder, metadata={})
     thread = threading.Thread(target=recorder.run, daemon=True)
     thread.start()
-    until(lambda: list((folder).glob("*.part")))
+    until(lambda: list(folder.glob("*.part")))
     if camera_present:  # a camera without Health that starts after the recorder
         MemoryBus(hub, "camera", clock).publisher(FRAME).put(b"a frame")
     recorder.service.stop("end of the test")
     thread.join(PATIENCE_S)
-    assert len(list((folder).iterdir())) == camera_present
+    assert len(list(folder.iterdir())) == camera_present
     assert len(recorder.service.health().recording.files) == camera_present
 
 
@@ -142,7 +142,7 @@ def test_every_lost_message_is_counted(bench: Bench, tmp_path: Path, monkeypatch
     (path,) = summary.files
     reader = LogReader(path)
     recorded, published = [Log.FromString(m.payload).message for m in reader if m.key == EVENT.key], bench.events
-    losses = [[one for one in events if one.startswith("MESSAGES_LOST")] for events in (recorded, published)]
+    losses = [[event for event in events if event.startswith("MESSAGES_LOST")] for events in (recorded, published)]
     assert losses[0] == losses[1]
     assert reader.metadata["recording"] == {
         "messages": str(summary.messages),

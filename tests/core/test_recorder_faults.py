@@ -257,7 +257,7 @@ def test_a_stop_requested_while_the_recorder_ends_is_answered_with_the_complete_
     _, release = slow_disk(monkeypatch, refuses=False)
     threading.Timer(0.2, release.set).start()
     (log,) = bench.stop().files
-    assert [wire.Request.FromString(one).text for one in answers] == [str(log)]
+    assert [wire.Request.FromString(answer).text for answer in answers] == [str(log)]
     assert not log.name.endswith(UNFINISHED)
 
 

@@ -84,11 +84,11 @@ class Bench:
 @pytest.fixture
 def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
     hang_up = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests under nohup would leave it ignored
-    found = Bench(tmp_path, *getattr(request, "param", ()))
+    started = Bench(tmp_path, *getattr(request, "param", ()))
     signal.signal(signal.SIGHUP, hang_up)
-    with closing(found):
-        until(lambda: found.recorder_is("ready"))
-        yield found
+    with closing(started):
+        until(lambda: started.recorder_is("ready"))
+        yield started
 
 
 @pytest.mark.parametrize("signals", [(signal.SIGHUP,), (signal.SIGINT, signal.SIGTERM), (signal.SIGKILL,)])
@@ -132,7 +132,7 @@ def test_record_rotates_logs_and_reports_messages_and_losses(bench: Bench) -> No
     assert done["longest_unflushed_ms"] >= done["longest_wait_ms"] > 0
 
 
-def test_a_recording_can_be_stopped_without_a_controller_but_not_replaced(
+def test_a_recording_is_stopped_without_a_controller_and_a_second_recorder_is_refused(
     own_runtime: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lowfc.programs.core.recording.process.set_up_below_loop", lambda *_: NOTHING)
@@ -192,18 +192,18 @@ def test_a_recording_has_the_configuration_of_its_run(tmp_path: Path, monkeypatc
 
 
 def test_the_provenance_identifies_processor_and_blas() -> None:
-    found = provenance("night", seed=3)
-    assert (found["run"], found["seed"], found["processors"]) == ("night", "3", str(os.cpu_count()))
+    recorded = provenance("night", seed=3)
+    assert (recorded["run"], recorded["seed"], recorded["processors"]) == ("night", "3", str(os.cpu_count()))
     flags = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Feat")))
-    features = found["cpu_features"].split()
+    features = recorded["cpu_features"].split()
     assert features == sorted(set(features))
     assert set(features) <= set(flags.partition(":")[2].split())
     assert {"sse2", "asimd"} & set(features)
-    assert all(found[key] for key in ("host", "kernel", "processor", "python", "numpy", "eclipse-zenoh"))
-    assert any(digit.isdigit() for digit in found["blas"])
+    assert all(recorded[key] for key in ("host", "kernel", "processor", "python", "numpy", "eclipse-zenoh"))
+    assert any(digit.isdigit() for digit in recorded["blas"])
     import scipy.linalg  # noqa: F401  # loads a BLAS of its own, which the loop does not use
 
-    assert provenance() == {key: value for key, value in found.items() if key not in ("run", "seed")}
+    assert provenance() == {key: value for key, value in recorded.items() if key not in ("run", "seed")}
 
 
 def test_the_provenance_has_no_commit_if_git_is_slow(monkeypatch: pytest.MonkeyPatch) -> None:
