@@ -237,6 +237,7 @@ def test_a_log_may_be_moved_as_soon_as_it_has_its_name(bench: Bench, monkeypatch
     monkeypatch.setattr(writer, "_sync_folder", lambda folder: next(folder.glob("*.mcap")).unlink())
     bench.start()
     assert bench.stop().failure == ""
+    assert list(bench.folder.iterdir()) == [], "the log was moved before the recorder was done with it"
 
 
 def test_a_stop_requested_while_the_recorder_ends_is_answered_with_the_complete_log(
