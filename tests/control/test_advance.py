@@ -74,8 +74,8 @@ def test_a_bad_frame_is_refused_with_an_event_and_the_command_holds(reason: Reas
         assert np.array_equal(outputs.command.actuators_nm, held.actuators_nm)
     assert state.counts == {reason: 3}
     assert state.frames_used == before.frames_used
-    follows = 6 if reason in (Rejection.OUT_OF_ORDER, Rejection.REPEATED) else 9
-    state, back = feed(DEFAULTS, state, frame(follows, SOME), frame(follows + 1, SOME))
+    next_count = 6 if reason in (Rejection.OUT_OF_ORDER, Rejection.REPEATED) else 9
+    state, back = feed(DEFAULTS, state, frame(next_count, SOME), frame(next_count + 1, SOME))
     assert names(all_outputs + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert all_outputs[0].events[0].details == {"reason": reason.name}
     assert back[0].events[0].details == {"refused": 3, "reason": reason.name}
@@ -126,7 +126,7 @@ def test_a_frame_is_used_up_to_each_limit(changes: dict[str, object], reasons: t
     assert (outputs.step.error_nm is None) is bool(reasons)
 
 
-def test_each_reason_in_a_row_raises_one_event() -> None:
+def test_consecutive_frames_refused_for_one_reason_raise_one_event() -> None:
     reasons = Rejection.LATE, Rejection.LATE, Rejection.DARK
     inputs = [BAD[reason](count) for count, reason in enumerate(reasons, start=6)]
     state, all_outputs = feed(DEFAULTS, running(), *inputs, frame(9, SOME))
@@ -306,9 +306,9 @@ def test_gain_and_leak_are_refused_if_unstable_together() -> None:
     setup = settings(gain=(0.5, 0.1))
     above, below, leaky = ask("gain", 1.9, modes=(2,)), ask("gain", 1.7, modes=(2,)), ask("leak", 0.2)
     for requests in ([above, leaky], [leaky, above]):
-        _, (one, other) = feed(setup, loaded(setup), *requests)
-        assert one.reply.accepted
-        check_reply(other, False, "below 1.8", "a delay of 1 frame and a leak of 0.2 becomes unstable; got 1.9")
+        _, (first, second) = feed(setup, loaded(setup), *requests)
+        assert first.reply.accepted
+        check_reply(second, False, "below 1.8", "a delay of 1 frame and a leak of 0.2 becomes unstable; got 1.9")
     for requests in ([below, leaky], [leaky, below], [above, ask("leak", 0.2, modes=(3, 4))]):
         _, all_outputs = feed(setup, loaded(setup), *requests)
         assert all(outputs.reply.accepted for outputs in all_outputs)
@@ -324,9 +324,9 @@ def test_a_request_with_more_leaks_than_modes_is_refused_without_computing_their
 def test_a_mode_that_a_request_names_twice_has_one_value() -> None:
     for name in ("gain", "limit", "offset"):
         requests = ask(name, 0.1, modes=(2, 2)), ask(name, 0.1, 0.2, modes=(2, 2))
-        _, (one, two) = feed(DEFAULTS, loaded(DEFAULTS), *requests)
-        assert one.reply.accepted
-        check_reply(two, False, "got 2")
+        _, (one_value, two_values) = feed(DEFAULTS, loaded(DEFAULTS), *requests)
+        assert one_value.reply.accepted
+        check_reply(two_values, False, "got 2")
 
 
 def test_the_first_step_after_closing_is_gain_times_error() -> None:

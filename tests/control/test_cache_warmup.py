@@ -54,8 +54,8 @@ def test_a_frame_that_is_early_or_far_off_resets_the_schedule(shift_ns: int) -> 
 @pytest.mark.parametrize("scale", [0.9995, 1.0005])
 def test_the_schedule_follows_a_camera_with_a_different_clock_rate(scale: float) -> None:
     arrivals_ns = [round(frame * PERIOD_NS * scale) for frame in range(3000)]
-    found_ns = due_ns(after(*arrivals_ns), arrivals_ns[-1])
-    assert found_ns == pytest.approx(arrivals_ns[-1] + PERIOD_NS * scale - LEAD_NS, abs=30_000)
+    next_ns = due_ns(after(*arrivals_ns), arrivals_ns[-1])
+    assert next_ns == pytest.approx(arrivals_ns[-1] + PERIOD_NS * scale - LEAD_NS, abs=30_000)
 
 
 def test_no_warm_up_at_short_frame_periods() -> None:

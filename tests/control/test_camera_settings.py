@@ -46,6 +46,7 @@ def ask(state: State, name: str, **fields: object) -> tuple[State, Reply]:
 
 
 def opened(*inputs: Input) -> State:
+    """An open loop after these inputs."""
     state, _ = ask(loaded(DEFAULTS), "open")
     return feed(DEFAULTS, state, *inputs)[0]
 
@@ -59,8 +60,8 @@ def test_changed_camera_settings_open_the_loop() -> None:
     assert (state.mode, names(all_outputs)) == (LoopMode.OPEN, ["CAMERA_CHANGED", "MODE_CHANGED"])
     assert "bias_dn" in str(all_outputs[0].events[0].details["what"])
     measuring = replace(DEFAULTS, auto_gain=(True, True))
-    for opened_by_it in (state, feed(measuring, loaded(measuring), CAMERA, WRONG)[0]):
-        assert opened_by_it.conditions.mode_cause.startswith(f"{CAMERA_MISFIT}: ")
+    for not_closed in (state, feed(measuring, loaded(measuring), CAMERA, WRONG)[0]):
+        assert not_closed.conditions.mode_cause.startswith(f"{CAMERA_MISFIT}: ")
 
 
 @pytest.mark.parametrize("name", ["close", "step", "law"])
@@ -108,7 +109,7 @@ def test_camera_settings_are_part_of_a_calibrations_identity() -> None:
         (replace(CAMERA, bias_dn=float("nan")), ["bias_dn"]),
     ],
 )
-def test_only_differences_beyond_the_noise_count(now: CameraSettings, different: list[str]) -> None:
+def test_only_differences_beyond_the_noise_are_changes(now: CameraSettings, different: list[str]) -> None:
     assert [line.split()[0] for line in changes(now, CAMERA)] == different
 
 
@@ -125,7 +126,7 @@ def test_after_a_camera_restart_frames_are_refused_until_its_settings_arrive() -
     assert all_outputs[-1].step.reasons == ()
 
 
-def test_settings_received_before_the_first_frame_of_a_restarted_camera_count() -> None:
+def test_settings_received_before_the_first_frame_of_a_restarted_camera_are_accepted() -> None:
     state, _ = feed(DEFAULTS, loaded(DEFAULTS), CAMERA, frame(1), replace(CAMERA, start_s=START + 9))
     state, (outputs,) = feed(DEFAULTS, state, frame(1, sequence=frame_sequence(0, START + 9)))
     assert outputs.step.reasons == ()
@@ -187,7 +188,7 @@ BASIS = np.arange(GRID[0] * GRID[1], dtype=np.float32)
 
 
 def odd(count: int) -> Frame:
-    """A frame of another size."""
+    """A frame of a size that is not the calibration's."""
     return frame(count, pixels=ODD)
 
 
@@ -206,7 +207,9 @@ def play(state: State, table: Single, basis: Single = BASIS) -> State:
 
 def surfaces(all_outputs: list[Outputs]) -> Single:
     """Actuators (frames, actuators) of the commands."""
-    return np.array([one.command.actuators_nm.reshape(-1) for one in all_outputs if one.command is not None])
+    return np.array(
+        [outputs.command.actuators_nm.reshape(-1) for outputs in all_outputs if outputs.command is not None]
+    )
 
 
 def other_size() -> State:
@@ -331,10 +334,12 @@ def test_a_decoded_state_continues_identically() -> None:
     table = state.loop.command_channels.play.table
     message = controller_state(state, DEFAULTS, 0)
     _, decoded = decode_state(message, None, {}, {table.id: table})
-    rest = [odd(count) for count in range(4, 12)]
-    assert np.array_equal(surfaces(feed(DEFAULTS, state, *rest)[1]), surfaces(feed(DEFAULTS, decoded, *rest)[1]))
+    later_frames = [odd(count) for count in range(4, 12)]
+    assert np.array_equal(
+        surfaces(feed(DEFAULTS, state, *later_frames)[1]), surfaces(feed(DEFAULTS, decoded, *later_frames)[1])
+    )
 
 
-def test_no_probe_sequence_without_a_mirror() -> None:
+def test_a_probe_sequence_is_refused_without_a_mirror() -> None:
     _, outputs = advance(DEFAULTS, State(), Request(0, "play", text=MIRROR, actuators_nm=BASIS, table=BASIS[:1, None]))
     assert "no mirror" in outputs.reply.text

@@ -192,7 +192,7 @@ def test_channels_whose_sum_exceeds_the_stroke_are_refused() -> None:
 
 
 @pytest.mark.parametrize("end", ["stop", "safe", "close", "limit", "restart", "load"])
-def test_events_that_end_a_probe_sequence(end: str) -> None:
+def test_a_probe_sequence_ends_with_a_request_a_limit_a_restart_or_another_calibration(end: str) -> None:
     setup = replace(DEFAULTS, limits=Limits(700.0, 100.0, 400.0))
     loop = ToyLoop(setup, LoopMode.OPEN)
     loop.run(2)
@@ -330,9 +330,9 @@ def test_a_foreign_shape_of_the_mirror_is_adopted_as_a_channel() -> None:
     seen = loop.to_modes @ shape_nm.reshape(-1)
     loop.run(40, -seen + DISTURBED)  # the wavefront is well corrected, except for this disturbance
     assert np.abs(np.diff(loop.surfaces, axis=0)).max() < 20
-    assert [one.name for one in loop.state.loop.command_channels.channels] == [ADOPTED]
-    rest = loop.surfaces[-1] - shape_nm
-    outside = rest.reshape(-1) - TOY.modes_to_actuators @ (loop.to_modes @ rest.reshape(-1))
+    assert [channel.name for channel in loop.state.loop.command_channels.channels] == [ADOPTED]
+    moved_nm = loop.surfaces[-1] - shape_nm
+    outside = moved_nm.reshape(-1) - TOY.modes_to_actuators @ (loop.to_modes @ moved_nm.reshape(-1))
     assert np.abs(outside).max() < 0.01
 
 
@@ -431,9 +431,9 @@ def test_loading_another_calibration_moves_nothing() -> None:
     assert not refused.accepted  # while the loop is closed
     loop.ask("open")
     before = loop.surfaces[-1]
-    loaded_now = loop.process_input(LOAD_OTHER)
-    assert loaded_now.reply.accepted
-    assert "CALIBRATION_LOADED" in [event.name for event in loaded_now.events]
+    loading = loop.process_input(LOAD_OTHER)
+    assert loading.reply.accepted
+    assert "CALIBRATION_LOADED" in [event.name for event in loading.events]
     loop.run(5)
     assert np.allclose(loop.surfaces[-1], before, atol=0.01)
     loop.ask("close")
@@ -447,7 +447,7 @@ def test_loading_another_calibration_moves_nothing() -> None:
     assert np.allclose(loop.surfaces[-1], before + dark_hole(1.0), atol=1.1)
 
 
-def test_another_weighting_of_r_changes_the_shift_of_a_channel_at_rest_at_once() -> None:
+def test_another_weighting_of_r_changes_the_shift_of_a_settled_channel_at_once() -> None:
     loop = ToyLoop()
     loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(20.0).reshape(-1))
     loop.run(60)

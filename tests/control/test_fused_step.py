@@ -86,7 +86,7 @@ class Bench:
             kernel=compiled.kernel(FUSED),
         )
         self.state, _ = advance(self.settings, State(), Load(0, self.calibration, "random"))
-        self.last, self.count, self.last_image = self.state, 0, np.zeros(self.shape, np.uint16)
+        self.reference_state, self.count, self.last_image = self.state, 0, np.zeros(self.shape, np.uint16)
 
     def law(self) -> LinearLaw:
         """A law that is stable in the loop."""
@@ -133,6 +133,7 @@ class Bench:
         """Process frames, each by both implementations from the same state."""
         for _ in range(frames):
             if self.rng.random() < 0.01:
+                # With `clear` in half of the cases.
                 for request in (self.request(), Request(0, "clear"), Request(0, "close"))[:: self.rng.choice([1, 2])]:
                     self.state, _ = advance(self.settings, self.state, prepared(self.settings, request))
             self.count += 1 + int(self.rng.random() < 0.01)
@@ -144,12 +145,14 @@ class Bench:
         loop = self.state.loop
         assert loop is not None
         reference_loop = loop._replace(estimator=loop.estimator._replace(tables=None))
-        known = {"estimate": self.last.estimate, "identical_frames": self.last.identical_frames}
-        self.last, expected = advance(self.settings, self.state._replace(loop=reference_loop, **known), frame)
+        own = {name: getattr(self.reference_state, name) for name in ("estimate", "identical_frames")}
+        same_state = self.state._replace(loop=reference_loop, **own)
+        self.reference_state, expected = advance(self.settings, same_state, frame)
         self.state, outputs = advance(self.settings, self.state, frame)
         self.compare(outputs, expected)
-        assert self.state.identical_frames == self.last.identical_frames
-        assert (self.state.mode, self.state.returning_to_zero) == (self.last.mode, self.last.returning_to_zero)
+        assert self.state.identical_frames == self.reference_state.identical_frames
+        for name in ("mode", "returning_to_zero"):
+            assert getattr(self.state, name) == getattr(self.reference_state, name)
 
     def amplified(self) -> float:
         """Factor by which the projection onto modes amplifies rounding of the actuators, if a limit acted."""
@@ -158,26 +161,28 @@ class Bench:
 
     def compare(self, outputs: Outputs, expected: Outputs) -> None:
         """Compare decisions and events exactly, and numbers up to rounding."""
-        step, other = outputs.step, expected.step
+        step, reference_step = outputs.step, expected.step
         assert step is not None
-        assert other is not None
-        assert (step.mode, step.saturated_pixels) == (other.mode, other.saturated_pixels)
-        assert step.flux_dn == pytest.approx(other.flux_dn, rel=1e-6)
-        if step.reasons == other.reasons:
+        assert reference_step is not None
+        assert (step.mode, step.saturated_pixels) == (reference_step.mode, reference_step.saturated_pixels)
+        assert step.flux_dn == pytest.approx(reference_step.flux_dn, rel=1e-6)
+        if step.reasons == reference_step.reasons:
             assert outputs.events == expected.events
         else:
-            assert {*step.reasons} ^ {*other.reasons} <= {*Limit}
-            self.counts["limits that only one saw"] += 1
+            assert {*step.reasons} ^ {*reference_step.reasons} <= {*Limit}
+            self.counts["limits seen by one of the two"] += 1
         self.counts.update(reason.name for reason in step.reasons)
         self.counts["frames"] += 1
         assert (outputs.command is None) is (expected.command is None)
         numbers = list(zip(_numbers(outputs), _numbers(expected), strict=True))
-        allowed_nm = max(SAME_NM, ROUNDINGS * np.spacing(max(np.abs(two).max(initial=0) for _, two in numbers)))
-        for place, (one, two) in enumerate(numbers):
-            assert np.isfinite(one).all()
-            difference_nm = float(np.abs(one - two).max(initial=0))
-            assert difference_nm < allowed_nm * (self.amplified() if place == 0 and step.reasons else 1)
-            if place < COMMAND_ARRAYS:
+        allowed_nm = max(
+            SAME_NM, ROUNDINGS * np.spacing(max(np.abs(reference).max(initial=0) for _, reference in numbers))
+        )
+        for index, (fused, reference) in enumerate(numbers):
+            assert np.isfinite(fused).all()
+            difference_nm = float(np.abs(fused - reference).max(initial=0))
+            assert difference_nm < allowed_nm * (self.amplified() if index == 0 and step.reasons else 1)
+            if index < COMMAND_ARRAYS:
                 self.largest_nm = max(self.largest_nm, difference_nm)
 
 
@@ -186,7 +191,7 @@ def _numbers(outputs: Outputs) -> list[Single]:
     step, command, zeros = outputs.step, outputs.command, np.zeros(0, np.float32)
     assert step is not None
     arrays = (step.command_nm, None if command is None else command.actuators_nm, step.error_nm, step.pol_nm)
-    return [zeros if one is None else one for one in arrays]
+    return [zeros if array is None else array for array in arrays]
 
 
 def compared(frames: int, frames_per_bench: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Counter[str], float]:
@@ -208,7 +213,9 @@ def compared(frames: int, frames_per_bench: int, monkeypatch: pytest.MonkeyPatch
     return counts, largest_nm
 
 
-def test_the_kernel_in_use_is_an_event_and_numpy_without_numba(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_kernel_in_use_is_reported_by_an_event_and_is_numpy_without_numba(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     config, latch, events = load(None, {"realtime.kernel": "fused"}), Latch([tmp_path / "latch"]), []
     latch.set(False)
     for available, name, event in ((True, FUSED, "KERNEL"), (False, "numpy", "KERNEL_MISSING")):
@@ -258,7 +265,7 @@ def test_several_threads_give_the_same_bytes(monkeypatch: pytest.MonkeyPatch) ->
 def test_the_fused_step_agrees_on_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:
     counts, _ = compared(4_000, 500, monkeypatch)
     assert counts["fused"] > 1000
-    assert counts["limits that only one saw"] <= 2
+    assert counts["limits seen by one of the two"] <= 2
     for reason in (Rejection.SATURATED, Rejection.DARK, Rejection.STUCK, Limit.SLEW, Limit.MODAL_LIMIT, Limit.STROKE):
         assert counts[reason.name], reason.name
 
@@ -269,4 +276,4 @@ def test_the_fused_step_agrees_on_a_million_random_frames(monkeypatch: pytest.Mo
     counts, largest_nm = compared(1_000_000, 1000, monkeypatch)
     print(dict(counts), f"largest difference {largest_nm:.3g} nm")
     assert counts["fused"] > 200_000
-    assert counts["limits that only one saw"] < 200
+    assert counts["limits seen by one of the two"] < 200

@@ -51,12 +51,12 @@ def known_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -
     return lqg(models, config.noll, timing_of(config)), np.array(gains)
 
 
-def gains(*gain: float, leak: tuple[float, ...] = (0.0, 0.0, 0.0)) -> LinearLaw:
-    """A law that is an integrator with these gains, of tip, tilt and focus."""
+def law_with_gains(*gain: float, leak: tuple[float, ...] = (0.0, 0.0, 0.0)) -> LinearLaw:
+    """An integrator as a linear law, with these gains of tip, tilt and focus."""
     return integrator(gain, leak, NOLL, 1.0, RATE_HZ)
 
 
-GOOD, BAD_TILT, BAD_FOCUS = gains(0.6, 0.6, 0.4), gains(0.05, 0.05, 0.3), gains(0.5, 0.5, 0.05)
+GOOD, BAD_TILT, BAD_FOCUS = (law_with_gains(*gain) for gain in ((0.6, 0.6, 0.4), (0.05, 0.05, 0.3), (0.5, 0.5, 0.05)))
 
 
 def with_law(law: LinearLaw, setup: Settings = SETUP) -> State:
@@ -110,9 +110,9 @@ def test_the_takeover_has_an_event_and_no_jump(rate_hz: float, wait_s: int) -> N
     assert event["until"] == f"until the law would be far better for {wait_s} s"
     assert np.abs(state.loop.history_nm[0] - before).max() < 200 / faded
     _, state = run(state, faded, first + 1)
-    known = status.json_object(controller_state(state, SETUP, 1))
-    assert known["law"]["overruled"] == ["tip and tilt"]
-    assert "overruled: the integrator drives tip and tilt" in status.text(known)
+    shown = status.json_object(controller_state(state, SETUP, 1))
+    assert shown["law"]["overruled"] == ["tip and tilt"]
+    assert "overruled: the integrator drives tip and tilt" in status.text(shown)
     weight = state.loop.law_runner.weight
     np.testing.assert_array_equal(weight, [0, 0, 1])
 
@@ -179,7 +179,7 @@ def test_closing_and_loading_reset_the_guard() -> None:
 def test_missing_and_refused_frames_hold_the_virtual_command() -> None:
     frames, lost = BEFORE + 90, {"missing": {250, 251, 260}, "dark": {270}}
     setup = replace(SETUP, delay_frames=1.5)
-    law = replace(gains(0.2, 0.2, 0.2), delay_frames=1.5)
+    law = replace(law_with_gains(0.2, 0.2, 0.2), delay_frames=1.5)
     _, guarded = run(with_law(law, setup), frames, setup=setup, **lost)
     _, unguarded = run(loaded(setup), frames, setup=setup, **lost)
     virtual_nm = guarded.loop.law_runner.guard.virtual_nm
@@ -228,8 +228,10 @@ def test_a_decoded_guard_continues_identically() -> None:
         message.guard.groups[0].overruled, message.guard.groups[0].takeovers = True, 0
         with pytest.raises(ValueError, match="the guard of the controller's state does not fit"):
             decode_state(message, calibration(), {BAD_TILT.id: BAD_TILT})
-        ends = [controller_state(run(one, 130, frames_done + 1)[1], SETUP, 1) for one in (state, resumed)]
-        assert ends[0] == ends[1]
+        later, later_resumed = (
+            controller_state(run(start, 130, frames_done + 1)[1], SETUP, 1) for start in (state, resumed)
+        )
+        assert later == later_resumed
 
 
 @lru_cache
@@ -247,27 +249,27 @@ def short_settling(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_modal_noise_agrees_with_images() -> None:
     """Modes of an open loop without a disturbance, and the residual tilt of the integrator on the reaction wheel."""
     config = configured(**{"disturbance.preset": "quiet"}, **SMALL_MIRROR)
-    found = calibrated(config)
-    bench = Bench(config, found)
+    calibration_ = calibrated(config)
+    bench = Bench(config, calibration_)
     bench.run(600)
-    expected = frame_noise_nm2(config, found)
+    expected = frame_noise_nm2(config, calibration_)
     measured = np.cov(np.array([step.error_nm for step in bench.steps]).T)
     assert np.linalg.norm(measured - expected) < 0.2 * np.linalg.norm(expected)
     wheel = configured(**SMALL_MIRROR)
     tilt_mas: list[float] = []
-    for one in (Bench(wheel, found), ModalBench(wheel, expected)):
-        one.ask("close")
-        one.run(150, record=False)
-        one.run(350)
-        tilt_mas.append(one.tilt_mas(350))
+    for loop in (Bench(wheel, calibration_), ModalBench(wheel, expected)):
+        loop.ask("close")
+        loop.run(150, record=False)
+        loop.run(350)
+        tilt_mas.append(loop.tilt_mas(350))
     assert tilt_mas[1] == pytest.approx(tilt_mas[0], rel=0.03)
 
 
 def test_with_shifted_lines_the_residual_is_at_most_a_tenth_above_the_integrators(short_settling: None) -> None:
     preset, factor = MOVED[0]
-    got_mas, overruled_s = tilt_after_move(case(preset, known=True), factor, 1)
+    residual_mas, overruled_s = tilt_after_move(case(preset, known=True), factor, 1)
     assert len(overruled_s) == 1
-    assert got_mas < 1.1 * tilt_after_move(case(preset, known=True), factor, 1, with_law=False)[0]
+    assert residual_mas < 1.1 * tilt_after_move(case(preset, known=True), factor, 1, with_law=False)[0]
 
 
 def test_steps_of_the_disturbance_do_not_overrule_the_law(short_settling: None) -> None:
@@ -276,13 +278,13 @@ def test_steps_of_the_disturbance_do_not_overrule_the_law(short_settling: None) 
 
 def test_a_wrong_delay_is_detected_as_amplification() -> None:
     """The law and the pseudo-open-loop modes assume one frame of delay; the true delay is two."""
-    one = case("reaction-wheel", known=True)
-    config = one.configured(1, **{"control.delay_frames": 1.0, "camera.delay_frames": 2.0})
-    bench = ModalBench(config, one.covariance_nm2, watch=False)
+    wheel = case("reaction-wheel", known=True)
+    config = wheel.configured(1, **{"control.delay_frames": 1.0, "camera.delay_frames": 2.0})
+    bench = ModalBench(config, wheel.covariance_nm2, watch=False)
     bench.settle(1000)
-    bench.load(one.law)
+    bench.load(wheel.law)
     bench.run(2500)
-    (_, event), *_ = [one for one in bench.events if one[1].name == "LAW_OVERRULED"]
+    event = next(event for _, event in bench.events if event.name == "LAW_OVERRULED")
     assert "without correction there would be" in event.details["why"]
     assert event.details["until"] == "until the law is loaded again or the loop is closed again"
     assert bench.tilt_mas(1500) < 10

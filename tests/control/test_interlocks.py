@@ -15,13 +15,14 @@ from lowfc.control.loop.state import Settings, State
 from lowfc.control.loop.wording import MEASURED_FIRST
 from tests.support.toy import GRID, SOME, calibration, check_reply, feed, frame, loaded, names, settings
 
-S = 1_000_000_000
+SECOND_NS = 1_000_000_000
 MOVER = 7
+"""Lease of the client that moves the mask."""
 
 
 def under(action: Action, test: str = "equal", value: Value = True, *, acts_when_old: bool = True) -> Settings:
     """Settings with one interlock, on the value `mask`."""
-    return settings(rate_hz=1000.0, interlocks=(Interlock("mask", test, value, action, 2 * S, acts_when_old),))
+    return settings(rate_hz=1000.0, interlocks=(Interlock("mask", test, value, action, 2 * SECOND_NS, acts_when_old),))
 
 
 def mask(value: Value | None, age_ns: int = 0) -> BenchReport:
@@ -30,7 +31,7 @@ def mask(value: Value | None, age_ns: int = 0) -> BenchReport:
 
 def running(setup: Settings, frames: int = 5) -> State:
     """A closed loop without an acting interlock."""
-    quiet = next(one for one in (False, 0.0, "still") if type(one) is type(setup.interlocks[0].value))
+    quiet = next(value for value in (False, 0.0, "still") if type(value) is type(setup.interlocks[0].value))
     return feed(setup, loaded(setup), mask(quiet), *(frame(count, SOME) for count in range(1, frames + 1)))[0]
 
 
@@ -54,13 +55,15 @@ def applied(setup: Settings, state: State, name: str, **fields: object) -> tuple
         ("equal", 1.0, None, "no value of mask has been received"),
     ],
 )
-def test_conditions_of_an_interlock(test: str, value: Value, input_: Value | None, why: str) -> None:
-    interlock = Interlock("mask", test, value, Action.HOLD, 2 * S)
-    indifferent = interlock._replace(acts_when_old=False)
-    assert interlock.cause(input_, 2 * S) == why
-    assert indifferent.cause(input_, 2 * S) == (why if type(input_) is type(value) else "")
-    assert interlock.cause(input_, 2 * S + 1)
-    assert not indifferent.cause(input_, 2 * S + 1)
+def test_an_interlock_acts_on_its_condition_and_if_configured_on_a_missing_or_old_value(
+    test: str, value: Value, input_: Value | None, why: str
+) -> None:
+    interlock = Interlock("mask", test, value, Action.HOLD, 2 * SECOND_NS)
+    not_when_old = interlock._replace(acts_when_old=False)
+    assert interlock.cause(input_, 2 * SECOND_NS) == why
+    assert not_when_old.cause(input_, 2 * SECOND_NS) == (why if type(input_) is type(value) else "")
+    assert interlock.cause(input_, 2 * SECOND_NS + 1)
+    assert not not_when_old.cause(input_, 2 * SECOND_NS + 1)
 
 
 def test_an_interlock_holds_and_releases_the_command_at_the_next_frame() -> None:
@@ -106,7 +109,7 @@ def test_an_interlock_holds_and_releases_the_command_at_the_next_frame() -> None
         (Action.SAFE, LoopMode.SAFE),
     ],
 )
-def test_each_action_and_that_clearing_the_interlock_undoes_nothing(action: Action, mode: LoopMode) -> None:
+def test_each_action_takes_effect_and_is_not_undone_when_the_interlock_clears(action: Action, mode: LoopMode) -> None:
     setup = under(action)
     state, all_outputs = feed(setup, running(setup), mask(True), mask(True))
     assert state.mode is mode
@@ -140,7 +143,7 @@ def test_an_interlock_that_refuses_to_close_opens_a_loop_that_starts_closed(acti
         assert after.mode is mode
 
 
-def test_a_loop_that_starts_closed_is_held_by_a_hold_that_acts_before_or_after_it_loads() -> None:
+def test_a_loop_that_starts_closed_is_held_if_an_interlock_acts_before_or_after_its_calibration_is_loaded() -> None:
     setup = under(Action.HOLD)
     before, _ = feed(setup, State(), mask(True), Load(0, calibration(), "test"))
     after, _ = feed(setup, loaded(setup), mask(True))
@@ -166,11 +169,11 @@ def test_only_a_change_of_the_condition_is_a_logged_input() -> None:
 def test_a_value_that_is_too_old_acts_as_configured() -> None:
     for acting in (True, False):
         setup = under(Action.HOLD, acts_when_old=acting)
-        state, all_outputs = feed(setup, running(setup), mask(False, 2 * S + 1), frame(6, SOME))
+        state, all_outputs = feed(setup, running(setup), mask(False, 2 * SECOND_NS + 1), frame(6, SOME))
         assert bool(state.conditions.acting) is acting
         assert all_outputs[-1].step.reasons == ((Rejection.HELD,) if acting else ())
-        state, all_outputs = feed(setup, running(setup), mask(True), mask(True, 2 * S + 1))
-        assert [one.why for one in state.conditions.acting] == ["no value of mask for more than 2 s"] * acting
+        state, all_outputs = feed(setup, running(setup), mask(True), mask(True, 2 * SECOND_NS + 1))
+        assert [each.why for each in state.conditions.acting] == ["no value of mask for more than 2 s"] * acting
         assert names(all_outputs) == ["INTERLOCK_ACTS", "INTERLOCK_ACTS" if acting else "INTERLOCK_CLEARED"]
 
 
@@ -192,7 +195,7 @@ def test_a_permit_holds_a_closed_loop_for_its_duration() -> None:
     state, outputs = permit(setup, state, 0.01)
     check_reply(outputs, True, "granted for 0.01 s: the loop holds its command")
     state, all_outputs = feed(setup, state, *(frame(count, SOME) for count in range(6, 18)))
-    assert [one.step.reasons for one in all_outputs] == [(Rejection.HELD,)] * 10 + [()] * 2
+    assert [outputs.step.reasons for outputs in all_outputs] == [(Rejection.HELD,)] * 10 + [()] * 2
     assert names(all_outputs) == ["FRAMES_REFUSED", "LEASE_ENDED", "FRAMES_ACCEPTED"]
     assert state.conditions.lease.ended == "its time is over"
     assert state.mode is LoopMode.CLOSED

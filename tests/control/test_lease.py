@@ -18,7 +18,9 @@ from tests.support.toy import GRID, NOLL, SOME, check_reply, feed, frame, frame_
 
 DEFAULTS = settings(rate_hz=1000.0)
 HOLDER = "lowfc calibrate (anna, pid 7)"
-MINE, S = 11, 1_000_000_000
+MINE = 11
+"""Lease of the holder."""
+SECOND_NS = 1_000_000_000
 
 
 def held(seconds: float = 10.0, frames: int = 3) -> State:
@@ -55,34 +57,34 @@ GRANTED = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", 
 @pytest.mark.parametrize("name", sorted({*REQUESTS} - GRANTED))
 def test_requests_of_other_clients_are_refused_with_the_holders_name(name: str) -> None:
     state = held()
-    after, outputs = applied(state, Request(4 * S, name))
+    after, outputs = applied(state, Request(4 * SECOND_NS, name))
     check_reply(outputs, False, HOLDER, "6 s", "lowfc ctl open")
     assert all(now is was for now, was in zip(after[:-1], state[:-1], strict=True))
 
 
 def test_the_holders_requests_are_granted() -> None:
-    state, outputs = applied(held(), Request(S, "gain", values=(0.3,), lease_id=MINE))
+    state, outputs = applied(held(), Request(SECOND_NS, "gain", values=(0.3,), lease_id=MINE))
     check_reply(outputs, True)
-    state, outputs = applied(state, Request(S, "open", lease_id=MINE))
+    state, outputs = applied(state, Request(SECOND_NS, "open", lease_id=MINE))
     assert state.mode is LoopMode.OPEN
-    state, outputs = applied(state, Request(2 * S, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
+    state, outputs = applied(state, Request(2 * SECOND_NS, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
     check_reply(outputs, True)
 
 
 @pytest.mark.parametrize("name", ["safe", "open", "pause", "stop"])
 def test_safe_open_pause_and_stop_of_another_client_end_a_lease_and_its_probe_sequence(name: str) -> None:
-    state, outputs = applied(played(held()), Request(S, name))
+    state, outputs = applied(played(held()), Request(SECOND_NS, name))
     check_reply(outputs, True)
     assert "LEASE_ENDED" in names([outputs])
     assert not remaining_rows(state)
-    state, outputs = applied(state, Request(2 * S, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
+    state, outputs = applied(state, Request(2 * SECOND_NS, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
     assert outputs.reply.text == f"the lease ended: operator asked to {name}"
 
 
 def test_the_end_of_a_lease_names_its_holder_without_the_remaining_time() -> None:
     request = Request(0, "lease", values=(10.0,), text=f"{HOLDER}, about 33 s to go", lease_id=MINE)
     state, _ = applied(loaded(DEFAULTS), request)
-    _, outputs = applied(state, Request(S, "stop"))
+    _, outputs = applied(state, Request(SECOND_NS, "stop"))
     assert [event.details["holder"] for event in outputs.events if event.name == "LEASE_ENDED"] == [HOLDER]
     assert outputs.reply.text.endswith(f"; this ended the reservation for {HOLDER}")
 
@@ -97,36 +99,36 @@ def test_close_reports_whether_the_loop_was_closed_already() -> None:
 @pytest.mark.parametrize("name", ["close", "gain", "play", "load"])
 @pytest.mark.parametrize("ended", [True, False])
 def test_a_former_holder_is_refused_with_the_reason(name: str, ended: bool) -> None:
-    state = applied(held(), Request(S, "pause"))[0] if ended else loaded(DEFAULTS)
-    _, outputs = applied(state, Request(2 * S, name, values=(0.1,), lease_id=MINE))
+    state = applied(held(), Request(SECOND_NS, "pause"))[0] if ended else loaded(DEFAULTS)
+    _, outputs = applied(state, Request(2 * SECOND_NS, name, values=(0.1,), lease_id=MINE))
     check_reply(outputs, False, ("operator asked to pause" if ended else "did the controller restart"))
 
 
 def test_safe_mode_ends_and_refuses_a_lease() -> None:
-    state, outputs = applied(held(), Request(S, "safe", lease_id=MINE))
+    state, outputs = applied(held(), Request(SECOND_NS, "safe", lease_id=MINE))
     assert outputs.reply.text == f"loop in safe mode; this ended the reservation for {HOLDER}"
-    _, outputs = applied(state, Request(S, "lease", values=(5.0,), text=HOLDER, lease_id=12))
+    _, outputs = applied(state, Request(SECOND_NS, "lease", values=(5.0,), text=HOLDER, lease_id=12))
     assert "safe mode" in outputs.reply.text
-    _, outputs = applied(state, Request(S, "clear"))
+    _, outputs = applied(state, Request(SECOND_NS, "clear"))
     check_reply(outputs, True)
 
 
 @pytest.mark.parametrize("name", ["status", "note"])
 def test_status_and_note_do_not_end_a_lease(name: str) -> None:
-    state, outputs = applied(held(), Request(S, name, text="cloud"))
+    state, outputs = applied(held(), Request(SECOND_NS, name, text="cloud"))
     check_reply(outputs, True)
     assert not state.conditions.lease.ended
 
 
 def test_a_lease_has_one_holder_who_alone_can_release_it() -> None:
     state = held()
-    after, outputs = applied(state, Request(S, "lease", values=(5.0,), text="somebody", lease_id=12))
+    after, outputs = applied(state, Request(SECOND_NS, "lease", values=(5.0,), text="somebody", lease_id=12))
     check_reply(outputs, False)
-    after, outputs = applied(after, Request(S, "release", lease_id=12))
+    after, outputs = applied(after, Request(SECOND_NS, "release", lease_id=12))
     assert after.conditions == state.conditions
-    after, outputs = applied(after, Request(S, "release", lease_id=MINE))
+    after, outputs = applied(after, Request(SECOND_NS, "release", lease_id=MINE))
     assert names([outputs]) == ["LEASE_RELEASED"]
-    after, outputs = applied(after, Request(S, "gain", values=(0.2,)))
+    after, outputs = applied(after, Request(SECOND_NS, "gain", values=(0.2,)))
     check_reply(outputs, True)
 
 
@@ -161,10 +163,10 @@ def test_a_lease_ends_after_its_number_of_frames() -> None:
 
 
 def test_without_frames_a_lease_ends_by_the_clock_and_before_the_next_request() -> None:
-    state, all_outputs = feed(DEFAULTS, played(held(1.0)), Tick(S, 0), Tick(S + 1, 0))
+    state, all_outputs = feed(DEFAULTS, played(held(1.0)), Tick(SECOND_NS, 0), Tick(SECOND_NS + 1, 0))
     assert names(all_outputs) == ["LEASE_ENDED"]
     assert not remaining_rows(state)
-    _, outputs = applied(held(1.0), Request(S + 1, "gain", values=(0.3,)))
+    _, outputs = applied(held(1.0), Request(SECOND_NS + 1, "gain", values=(0.3,)))
     check_reply(outputs, True)
     assert names([outputs]) == ["LEASE_ENDED"]
 
@@ -231,7 +233,7 @@ def test_the_remark_on_gains_begins_above_the_highest_gain() -> None:
     assert ["lowfc tune" in text for text in texts] == [False, True]
 
 
-def test_removing_a_channel_and_a_missing_one() -> None:
+def test_the_reply_to_a_removal_names_the_channel_or_those_that_exist() -> None:
     state = loaded(DEFAULTS)
     after, reply = answer(state, "channel", text="dark-hole")
     assert (reply.accepted, reply.text) == (False, "there is no channel 'dark-hole' to remove; there are none")

@@ -51,8 +51,8 @@ COMMANDS = 40
 TIGHT: dict[str, object] = {"limit_nm": (40.0, 15.0), "max_saturated_pixels": 0}
 CALIBRATION = identified(calibration())
 OTHERS = tuple(identified(calibration(noll, scale)) for noll, scale in ((NOLL, 1.1), ((2, 3), 1.0), ((2,), 0.9)))
-ELSEWHERE = identified(replace(CALIBRATION, grid=(5, 4)))
-KNOWN = {each.id: each for each in (CALIBRATION, *OTHERS, ELSEWHERE)}
+OTHER_MIRROR = identified(replace(CALIBRATION, grid=(5, 4)))
+KNOWN = {each.id: each for each in (CALIBRATION, *OTHERS, OTHER_MIRROR)}
 HUGE = 3e38
 STATIC_NM = (12.0, -8.0, 5.0)
 """Static part of the disturbance of each mode."""
@@ -61,11 +61,11 @@ STATIC_NM = (12.0, -8.0, 5.0)
 def laws(delay_frames: float, noll: tuple[int, ...]) -> tuple[LinearLaw, ...]:
     """A stable law, a law of pseudo-open-loop modes, an unstable law, and a law of other modes."""
 
-    def one(gain: float, modes: tuple[int, ...] = noll) -> LinearLaw:
+    def integrator_of(gain: float, modes: tuple[int, ...] = noll) -> LinearLaw:
         return linear(law_of(gain, modes=len(modes)), modes, delay_frames)
 
     of_pol = replace(integrators([(0.2, 0.01)] * len(noll), "pol", delay_frames), noll=noll)
-    return one(0.3), of_pol, one(3.0), one(0.3, (7, 8))
+    return integrator_of(0.3), of_pol, integrator_of(3.0), integrator_of(0.3, (7, 8))
 
 
 class Script:
@@ -131,12 +131,12 @@ class Script:
                 message.columns = table.shape[1]
             case "law":
                 candidates = laws(self.setup.delay_frames, NOLL)
-                if (place := int(self.rng.integers(len(candidates) + 1))) < len(candidates):
-                    message.law.CopyFrom(wire_law(candidates[place]))
+                if (index := int(self.rng.integers(len(candidates) + 1))) < len(candidates):
+                    message.law.CopyFrom(wire_law(candidates[index]))
             case "load":
-                one = (CALIBRATION, *OTHERS, ELSEWHERE, None)[self.rng.integers(6)]
-                if one is not None:
-                    message.calibration.MergeFromString(encode_calibration(one, 0))
+                loaded = (CALIBRATION, *OTHERS, OTHER_MIRROR, None)[self.rng.integers(6)]
+                if loaded is not None:
+                    message.calibration.MergeFromString(encode_calibration(loaded, 0))
             case "lease" | "renew" | "release":
                 message.text = str(self.rng.choice(["lowfc calibrate"] * 8 + ["", "x" * 400]))
                 message.values.append(float(self.rng.choice([10] * 10 + [1e-6, 0, -1, np.nan, 1e9])))
@@ -203,7 +203,7 @@ def serialised(input_: Input, outputs: Outputs, state: State) -> bytes:
     if isinstance(input_, Request):
         assert outputs.reply is not None
         reply = codec.encode_request(input_, outputs.reply, state.input_number, None)
-    events = [EVENTS[one.name].log("controller", 0, **one.details).SerializeToString() for one in outputs.events]
+    events = [EVENTS[event.name].log("controller", 0, **event.details).SerializeToString() for event in outputs.events]
     return b"|".join((step, command, reply, *events))
 
 
@@ -251,7 +251,7 @@ def random_run(setup: Settings, names: list[str], pauses: list[int], seed: int) 
     state, _ = advance(setup, State(), Load(0, CALIBRATION, "a test"))
     run = Run(state, [], [], Counter())
     for name, pause in zip(names, pauses, strict=True):
-        for input_ in between(script, name, pause, run):
+        for input_ in inputs_up_to(script, name, pause, run):
             run.state, outputs = checked_advance(setup, run.state, input_)
             run.inputs.append(input_)
             run.outputs.append(serialised(input_, outputs, run.state))
@@ -260,7 +260,8 @@ def random_run(setup: Settings, names: list[str], pauses: list[int], seed: int) 
     return run
 
 
-def between(script: Script, name: str, pause: int, run: Run) -> Iterator[Input]:
+def inputs_up_to(script: Script, name: str, pause: int, run: Run) -> Iterator[Input]:
+    """Frames of a pause, sometimes a disruption, and the request."""
     for _ in range(pause):
         yield script.frame(run.state)
     if script.rng.random() < 0.2:
@@ -301,12 +302,12 @@ def check(
     last = controller_state(run.state, setup, 9).SerializeToString()
     assert controller_state(end, setup, 9).SerializeToString() == last
     message = controller_state(state, setup, 8).SerializeToString()
-    requests = [prepared(setup, one) for one in run.inputs[:middle] if isinstance(one, Request)]
+    requests = [prepared(setup, input_) for input_ in run.inputs[:middle] if isinstance(input_, Request)]
     decoded, resumed = decode_state(
         wire.ControllerState.FromString(message),
         KNOWN[state.loop.calibration.id],
-        {one.law.id: one.law for one in requests if one.law is not None},
-        {one.played.id: one.played for one in requests if one.played is not None},
+        {request.law.id: request.law for request in requests if request.law is not None},
+        {request.played.id: request.played for request in requests if request.played is not None},
     )
     end, sent = replayed(decoded, resumed, run, middle)
     assert sent == run.outputs[middle:]
@@ -330,10 +331,10 @@ def test_random_inputs_are_handled_purely_and_within_the_limits(seeds: int) -> N
     rng = np.random.default_rng(6)
     counts: Counter[tuple[str, bool]] = Counter()
     for seed in range(seeds):
-        some: list[str] = rng.choice([*NAMES, *NAMES, "safe"], COMMANDS).tolist()
+        requests: list[str] = rng.choice([*NAMES, *NAMES, "safe"], COMMANDS).tolist()
         pauses: list[int] = rng.choice([0, 1, 2, 5, 12], COMMANDS).tolist()
         delay_frames, on_frame_timeout = float(rng.choice([1.0, 1.5, 3.0])), str(rng.choice(["hold", "flat"]))
-        counts += check(some, pauses, seed, delay_frames, bool(seed % 2), on_frame_timeout).counts
+        counts += check(requests, pauses, seed, delay_frames, bool(seed % 2), on_frame_timeout).counts
     accepted = {name for name, good in counts if good}
     refused = {name for name, good in counts if not good}
     assert accepted == set(REQUESTS) - {"configuration"}

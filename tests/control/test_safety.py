@@ -24,13 +24,13 @@ GRID = (4, 5)
 
 def boundary_values(bounds: tuple[float, ...]) -> list[float]:
     """Values at and next to each limit, the limit less 1e-3 nm, and half the limit; with both signs."""
-    found = [0.0, 1e-40, -1e-45, 1e-3]
+    values = [0.0, 1e-40, -1e-45, 1e-3]
     for bound in bounds:
         for value in (np.float32(bound), np.float32(bound - 1e-3), np.float32(bound / 2)):
             below = np.nextafter(value, np.float32(0))
             above = np.nextafter(value, np.float32(np.inf))
-            found += [float(v) for v in (value, below, above, np.nextafter(above, np.float32(np.inf)))]
-    return found + [-value for value in found]
+            values += [float(v) for v in (value, below, above, np.nextafter(above, np.float32(np.inf)))]
+    return values + [-value for value in values]
 
 
 EDGES = boundary_values((LIMITS.stroke_nm, LIMITS.slew_nm, LIMITS.neighbour_nm))
@@ -111,7 +111,7 @@ def test_another_grid_is_refused(shape: tuple[int, ...]) -> None:
     assert np.array_equal(limited.actuators_nm, previous)
 
 
-def test_wide_numbers_are_limited_too() -> None:
+def test_a_request_beyond_the_range_of_float32_is_limited_too() -> None:
     limited = limit(LIMITS, np.zeros(GRID, np.float32), np.full(GRID, 1e300))
     assert violations(LIMITS, np.zeros(GRID, np.float32), limited.actuators_nm) == []
     assert limited.actuators_nm.dtype == np.float32
