@@ -80,8 +80,8 @@ def cramer_rao(flux_e: float, read_noise_e: float) -> np.ndarray:
 def covariance(estimator: str, flux_e: float, read_noise_e: float) -> np.ndarray:
     """Covariance (modes, modes) of R for frames divided by their own noisy flux."""
     R = reconstructor(I0, H, GOOD, flux_e, read_noise_e, estimator)
-    each = R - np.outer(R @ I0, GOOD)
-    result: np.ndarray = each @ np.diag((I0 * flux_e + read_noise_e**2) / flux_e**2) @ each.T
+    row_weights = R - np.outer(R @ I0, GOOD)  # a frame is divided by its own flux, to which all good pixels contribute
+    result: np.ndarray = row_weights @ np.diag((I0 * flux_e + read_noise_e**2) / flux_e**2) @ row_weights.T
     return result
 
 
@@ -162,12 +162,12 @@ def test_an_estimate_is_r_times_the_normalised_difference() -> None:
     for flux_dn in (30_000.0, 300_000.0):
         pixels = rng.poisson(TOY.pixels((3, -4, 5), flux_dn).reshape(-1)).astype(np.uint16)
         before = pixels.copy()
-        found = Estimator.of(calibration_).estimate(pixels, 0.0)
-        assert (found.error_nm.dtype, pixels.tolist()) == (np.float32, before.tolist())
-        assert found.flux_dn == pytest.approx(difference(calibration_, pixels, 0.0, out), rel=1e-6)
+        estimate = Estimator.of(calibration_).estimate(pixels, 0.0)
+        assert (estimate.error_nm.dtype, pixels.tolist()) == (np.float32, before.tolist())
+        assert estimate.flux_dn == pytest.approx(difference(calibration_, pixels, 0.0, out), rel=1e-6)
         expected_nm = calibration_.reconstructor.astype(np.float64) @ out
         assert np.abs(expected_nm).max() > 1
-        assert found.error_nm == pytest.approx(expected_nm, rel=1e-4, abs=1e-4)
+        assert estimate.error_nm == pytest.approx(expected_nm, rel=1e-4, abs=1e-4)
 
 
 def test_a_frame_at_or_below_the_least_flux_has_no_estimate() -> None:
@@ -205,7 +205,7 @@ def test_an_inconsistent_calibration_is_refused(change: dict[str, object], messa
         replace(calibration(), **change)
 
 
-def computed() -> np.ndarray:
+def computed_image() -> np.ndarray:
     """An image unchanged by a rotation of 180 degrees, like that of a flat wavefront, but not by a reflection."""
     rng = np.random.default_rng(4)
     y, x = np.indices((64, 64)) - 31.5
@@ -223,22 +223,22 @@ def computed() -> np.ndarray:
 )
 def test_the_geometry_is_recovered(geometry: Geometry) -> None:
     rng = np.random.default_rng(1)
-    real = rng.poisson(2e6 * onto(computed(), geometry, (70, 80)) + 5).astype(float)
-    found = align(real, computed())
-    assert found.geometry.parity == geometry.parity
-    assert found.geometry.scale == pytest.approx(geometry.scale, abs=0.003)
-    assert (found.geometry.row, found.geometry.column) == pytest.approx((geometry.row, geometry.column), abs=0.05)
-    difference_deg = (found.geometry.rotation_deg - geometry.rotation_deg + 90) % 180 - 90  # modulo 180 degrees
+    real = rng.poisson(2e6 * onto(computed_image(), geometry, (70, 80)) + 5).astype(float)
+    aligned = align(real, computed_image())
+    assert aligned.geometry.parity == geometry.parity
+    assert aligned.geometry.scale == pytest.approx(geometry.scale, abs=0.003)
+    assert (aligned.geometry.row, aligned.geometry.column) == pytest.approx((geometry.row, geometry.column), abs=0.05)
+    difference_deg = (aligned.geometry.rotation_deg - geometry.rotation_deg + 90) % 180 - 90  # modulo 180 degrees
     assert abs(difference_deg) < 0.2
-    assert found.flux == pytest.approx(2e6, rel=0.02)
-    assert found.background == pytest.approx(5, abs=0.5)
-    assert found.residual < 0.1
-    assert found.other_parity > 2 * found.residual
+    assert aligned.flux == pytest.approx(2e6, rel=0.02)
+    assert aligned.background == pytest.approx(5, abs=0.5)
+    assert aligned.residual < 0.1
+    assert aligned.other_parity > 2 * aligned.residual
 
 
 def test_a_rotation_by_180_degrees_keeps_the_image_and_inverts_the_response() -> None:
     geometry = Geometry(1.1, 30.0, 40.0, 20.0, -1)
-    image = computed()
+    image = computed_image()
     other = geometry.rotated_180()
     assert other.rotated_180() == geometry
     assert np.allclose(onto(image, geometry, (70, 80)), onto(image, other, (70, 80)), atol=1e-9)
@@ -248,7 +248,7 @@ def test_a_rotation_by_180_degrees_keeps_the_image_and_inverts_the_response() ->
 
 
 def test_resampling_conserves_flux_for_one_or_many_images() -> None:
-    image = computed()
+    image = computed_image()
     geometry = Geometry(1.3, 50.0, 50.0, 33.0, 1)
     assert onto(image, geometry, (100, 100)).sum() == pytest.approx(1.0, abs=0.01)
     both = onto(np.stack([image, 2 * image], axis=2), geometry, (100, 100))
@@ -259,6 +259,6 @@ def test_resampling_conserves_flux_for_one_or_many_images() -> None:
 def test_an_unrelated_image_is_refused() -> None:
     rng = np.random.default_rng(3)
     with pytest.raises(ValueError, match="the image does not resemble"):
-        align(np.pad(rng.exponential(100.0, (30, 35)), 5), computed())
+        align(np.pad(rng.exponential(100.0, (30, 35)), 5), computed_image())
     with pytest.raises(ValueError, match="no light"):
-        align(np.zeros((70, 80)), computed())
+        align(np.zeros((70, 80)), computed_image())

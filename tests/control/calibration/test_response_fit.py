@@ -73,11 +73,11 @@ def test_hadamard_patterns_poke_every_mode() -> None:
 
 
 def test_a_dither_depends_on_its_seed() -> None:
-    one, other = dither(3, 2.0, 100, 4, 1), dither(3, 2.0, 100, 4, 2)
-    assert np.array_equal(one.table, dither(3, 2.0, 100, 4, 1).table)
-    assert not np.array_equal(one.table, other.table)
-    assert np.all(np.abs(one.table) == 2.0)
-    assert one.per_column == 100
+    first, second = dither(3, 2.0, 100, 4, 1), dither(3, 2.0, 100, 4, 2)
+    assert np.array_equal(first.table, dither(3, 2.0, 100, 4, 1).table)
+    assert not np.array_equal(first.table, second.table)
+    assert np.all(np.abs(first.table) == 2.0)
+    assert first.per_column == 100
 
 
 def test_frames_grow_with_the_square_of_the_signal_to_noise() -> None:
@@ -143,7 +143,8 @@ def initial_of_sensor(seed: int = 1) -> Initial:
     return Initial(reconstructor(*truth(seed), GOOD, FLUX_E, 0.0), "weighted")
 
 
-def calibrated(patterns: np.ndarray, cycles: int, drift: float = 0.0) -> Measured:
+def measured(patterns: np.ndarray, cycles: int, drift: float = 0.0) -> Measured:
+    """H and its error from cycles of simulated frames."""
     sums = Sums.none(initial_of_sensor())
     for number in range(cycles):
         plan = cycle(patterns, hold=4, settle=1, rest=16, backwards=number % 2 == 1)
@@ -157,58 +158,58 @@ def calibrated(patterns: np.ndarray, cycles: int, drift: float = 0.0) -> Measure
 
 @pytest.mark.parametrize("patterns", [poke_patterns(MODES, 8.0), hadamard_patterns(MODES, 3.0)])
 def test_r_is_correct_within_its_standard_error(patterns: np.ndarray) -> None:
-    found = calibrated(patterns, 20)
-    assert found.reference is not None
-    assert found.flux_dn == pytest.approx(FLUX_E, rel=1e-3)
-    made = reconstruct(I0, found.response, found.initial.matrix, GOOD, FLUX_E, 0.0)
-    deviation = cross_talk(made.matrix, H) / found.error[:, None]
+    fit = measured(patterns, 20)
+    assert fit.reference is not None
+    assert fit.flux_dn == pytest.approx(FLUX_E, rel=1e-3)
+    inverse = reconstruct(I0, fit.response, fit.initial.matrix, GOOD, FLUX_E, 0.0)
+    deviation = cross_talk(inverse.matrix, H) / fit.error[:, None]
     assert 0.75 < np.sqrt((deviation**2).mean()) < 1.25
     assert np.abs(deviation).max() < 4
-    assert np.abs(made.matrix @ (found.reference - I0)).max() < 0.5
+    assert np.abs(inverse.matrix @ (fit.reference - I0)).max() < 0.5
 
 
 def test_the_noise_of_h_neither_biases_r_nor_adds_noise() -> None:
     """H is measured so briefly that the noise of its pixels is as strong as the modes."""
-    found = calibrated(poke_patterns(MODES, 0.3), 10)
+    fit = measured(poke_patterns(MODES, 0.3), 10)
     variance = I0 / FLUX_E
-    of_noisy_h = reconstruct(I0, found.response, None, GOOD, FLUX_E, 0.0)
-    made = reconstruct(I0, found.response, found.initial.matrix, GOOD, FLUX_E, 0.0)
-    least = np.sqrt(found.initial.matrix**2 @ variance)
+    of_noisy_h = reconstruct(I0, fit.response, None, GOOD, FLUX_E, 0.0)
+    inverse = reconstruct(I0, fit.response, fit.initial.matrix, GOOD, FLUX_E, 0.0)
+    least = np.sqrt(fit.initial.matrix**2 @ variance)
     assert np.diag(cross_talk(of_noisy_h.matrix, H)).mean() < -0.3
-    assert abs(np.diag(cross_talk(made.matrix, H)).mean()) < 3 * found.error.max() / np.sqrt(MODES)
-    assert (np.sqrt(made.matrix**2 @ variance) / least).max() < 1 + 3 * found.error.max()
+    assert abs(np.diag(cross_talk(inverse.matrix, H)).mean()) < 3 * fit.error.max() / np.sqrt(MODES)
+    assert (np.sqrt(inverse.matrix**2 @ variance) / least).max() < 1 + 3 * fit.error.max()
     # an initial reconstructor with wrong weights and mixed modes is unbiased too, with its own noise
     mixed = np.random.default_rng(0).standard_normal((MODES, MODES)) @ reconstructor(I0, H, GOOD, FLUX_E, 0.0, "pinv")
-    other = reconstruct(I0, found.response, mixed, GOOD, FLUX_E, 0.0)
-    assert np.abs(cross_talk(other.matrix, H)).max() < 6 * found.error.max()
+    other = reconstruct(I0, fit.response, mixed, GOOD, FLUX_E, 0.0)
+    assert np.abs(cross_talk(other.matrix, H)).max() < 6 * fit.error.max()
 
 
 def test_r_inverts_the_measured_h_and_one_cycle_has_no_standard_error() -> None:
-    assert calibrated(hadamard_patterns(MODES, 3.0), 1).error.tolist() == [np.inf] * MODES
-    found = calibrated(hadamard_patterns(MODES, 3.0), 4)
-    made = reconstruct(I0, found.response, found.initial.matrix, GOOD, FLUX_E, 0.0)
-    assert np.allclose(made.matrix @ found.response, np.eye(MODES), atol=1e-9)
+    assert measured(hadamard_patterns(MODES, 3.0), 1).error.tolist() == [np.inf] * MODES
+    fit = measured(hadamard_patterns(MODES, 3.0), 4)
+    inverse = reconstruct(I0, fit.response, fit.initial.matrix, GOOD, FLUX_E, 0.0)
+    assert np.allclose(inverse.matrix @ fit.response, np.eye(MODES), atol=1e-9)
     with pytest.raises(ValueError, match="does not tell the modes apart"):
-        reconstruct(I0, found.response, np.zeros((MODES, PIXELS)), GOOD, FLUX_E, 0.0)
+        reconstruct(I0, fit.response, np.zeros((MODES, PIXELS)), GOOD, FLUX_E, 0.0)
 
 
 def test_r_ignores_what_the_initial_reconstructor_ignores() -> None:
     background = normalise_flux(I0, np.ones((PIXELS, 1)), GOOD)[1]
     blind = reconstructor(I0, H, GOOD, FLUX_E, 2.0, "weighted", background)
-    found = calibrated(hadamard_patterns(MODES, 3.0), 4)
-    assert np.abs(reconstruct(I0, found.response, blind, GOOD, FLUX_E, 2.0).matrix @ background).max() < 1e-9
+    fit = measured(hadamard_patterns(MODES, 3.0), 4)
+    assert np.abs(reconstruct(I0, fit.response, blind, GOOD, FLUX_E, 2.0).matrix @ background).max() < 1e-9
 
 
 def test_the_initial_reconstructor_with_the_least_noise_is_chosen() -> None:
-    one = initial_of_sensor()
-    blind = Initial(np.zeros_like(one.matrix), "blind")
-    other = Initial(initial_of_sensor(2).matrix, "of another sensor")
-    scaled = Initial(one.matrix * 3.0, "again")
+    of_sensor = initial_of_sensor()
+    blind = Initial(np.zeros_like(of_sensor.matrix), "blind")
+    of_another = Initial(initial_of_sensor(2).matrix, "of another sensor")
+    scaled = Initial(of_sensor.matrix * 3.0, "again")
     for candidates, best in (
-        ([one, blind], one),
-        ([other, one], one),
-        ([blind, one, scaled], one),
-        ([scaled, one], scaled),
+        ([of_sensor, blind], of_sensor),
+        ([of_another, of_sensor], of_sensor),
+        ([blind, of_sensor, scaled], of_sensor),
+        ([scaled, of_sensor], scaled),
     ):
         assert best_initial(candidates, -0.8 * H[:, 1], 1, I0 / FLUX_E) is best
 
@@ -222,24 +223,24 @@ def test_an_outlying_cycle_hardly_affects_the_mean() -> None:
     answers[:, 3, 1, 5] += 2.0
     with_outlier = [without_outliers(each).mean(axis=0) - np.eye(8) for each in answers]
     assert np.sqrt(np.mean([each[1, 5] ** 2 for each in with_outlier])) < 2.5 * error[1] / np.sqrt(8)
-    found = np.mean([row_error(without_outliers(each)) for each in answers], axis=0)
-    assert found == pytest.approx(error / np.sqrt(8), rel=0.25)
+    errors = np.mean([row_error(without_outliers(each)) for each in answers], axis=0)
+    assert errors == pytest.approx(error / np.sqrt(8), rel=0.25)
 
 
 def test_independent_frames_reveal_a_wrong_reconstructor() -> None:
     rng = np.random.default_rng(4)
     error = np.linspace(0.01, 0.04, 8)
     answers = np.eye(8) + rng.standard_normal((400, 4, 8, 8)) * error[:, None]
-    right = [check(each, np.eye(8), error) for each in answers]
-    assert np.mean([each.within(0.012, 0.04) for each in right]) > 0.99
-    assert np.sqrt(np.mean([each.rms**2 for each in right])) < 0.01
-    largest = max(right, key=lambda each: each.largest)
+    of_right = [check(each, np.eye(8), error) for each in answers]
+    assert np.mean([each.within(0.012, 0.04) for each in of_right]) > 0.99
+    assert np.sqrt(np.mean([each.rms**2 for each in of_right])) < 0.01
+    largest = max(of_right, key=lambda each: each.largest)
     assert largest.bound(0.04) > largest.largest > 0.04, "the noise of these frames is allowed for"
     wrong = np.eye(8)
     wrong[2, 5] = 0.3
     assert not any(check(each, wrong, error).within(0.012, 0.04) for each in answers)
-    small = np.eye(8) * 1.1
-    assert not any(check(each, small, error).within(0.012, 0.04) for each in answers)
+    ten_percent_more = np.eye(8) * 1.1
+    assert not any(check(each, ten_percent_more, error).within(0.012, 0.04) for each in answers)
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.3, 1.5, 2.0, 2.75])
@@ -249,12 +250,12 @@ def test_the_delay_is_measured(delay: float) -> None:
     seen = np.convolve(poke, weights)[: len(poke)]
     frames = exposed(np.outer(seen, [0, 1, 0, 0]), 5)
     fractions, _ = fractions_of(frames)
-    found = measure_delay(fractions, I0, poke)
-    assert abs(found.delay_frames - delay) < min(0.05, 5 * found.error_frames + 1e-3)
-    assert found.response @ H[:, 1] > 0.9 * np.linalg.norm(found.response) * np.linalg.norm(H[:, 1])
-    assert np.linalg.norm(found.response) == pytest.approx(np.linalg.norm(H[:, 1]), rel=0.2)
+    measured_delay = measure_delay(fractions, I0, poke)
+    assert abs(measured_delay.delay_frames - delay) < min(0.05, 5 * measured_delay.error_frames + 1e-3)
+    assert measured_delay.response @ H[:, 1] > 0.9 * np.linalg.norm(measured_delay.response) * np.linalg.norm(H[:, 1])
+    assert np.linalg.norm(measured_delay.response) == pytest.approx(np.linalg.norm(H[:, 1]), rel=0.2)
     backwards = measure_delay(fractions, I0, -poke)
-    assert backwards.delay_frames == pytest.approx(found.delay_frames)
+    assert backwards.delay_frames == pytest.approx(measured_delay.delay_frames)
     assert backwards.response @ H[:, 1] < 0
 
 
@@ -281,17 +282,17 @@ def test_bad_pixels_are_found() -> None:
     frames[:, 10] += 40
     frames[:, 20] += np.rint(20 * rng.standard_normal(200))
     frames[:, 30] = 97
-    found = measure_dark(frames)
-    assert np.flatnonzero(found.hot).tolist() == [10]
-    assert np.flatnonzero(found.noisy).tolist() == [20]
-    assert np.flatnonzero(found.dead).tolist() == [30]
-    assert np.flatnonzero(found.good == 0).tolist() == [10, 20, 30]
-    assert np.median(found.dark_dn) == pytest.approx(100, abs=0.1)
+    dark = measure_dark(frames)
+    assert np.flatnonzero(dark.hot).tolist() == [10]
+    assert np.flatnonzero(dark.noisy).tolist() == [20]
+    assert np.flatnonzero(dark.dead).tolist() == [30]
+    assert np.flatnonzero(dark.good == 0).tolist() == [10, 20, 30]
+    assert np.median(dark.dark_dn) == pytest.approx(100, abs=0.1)
     light = np.zeros(6400)
     light[:200] = 1 / 200
-    assert light_in(found.dark_dn, light) == pytest.approx(0, abs=30)
-    lit = measure_dark(frames + 5e3 * light)
-    assert light_in(lit.dark_dn, light) == pytest.approx(5e3, abs=100)
+    assert light_in(dark.dark_dn, light) == pytest.approx(0, abs=30)
+    with_light = measure_dark(frames + 5e3 * light)
+    assert light_in(with_light.dark_dn, light) == pytest.approx(5e3, abs=100)
     with pytest.raises(ValueError, match="at least 16 frames"):
         measure_dark(frames[:5])
     frames[:, 2000:3000] += 50
@@ -301,8 +302,8 @@ def test_bad_pixels_are_found() -> None:
 
 def test_r_of_a_computed_h_is_the_reconstructor() -> None:
     for estimator in ("weighted", "pinv"):
-        made = reconstruct(I0, H, None, GOOD, FLUX_E, 2.0, estimator)
-        assert np.allclose(made.matrix, reconstructor(I0, H, GOOD, FLUX_E, 2.0, estimator), rtol=1e-6, atol=1e-9)
+        inverse = reconstruct(I0, H, None, GOOD, FLUX_E, 2.0, estimator)
+        assert np.allclose(inverse.matrix, reconstructor(I0, H, GOOD, FLUX_E, 2.0, estimator), rtol=1e-6, atol=1e-9)
 
 
 def test_poorly_measured_combinations_can_be_truncated_or_damped() -> None:
@@ -315,8 +316,8 @@ def test_poorly_measured_combinations_can_be_truncated_or_damped() -> None:
     assert "no regularisation" in advice(whole, noll, np.array([1, 1, 1e6, 1e6]))  # that of its largest mode counts
     assert "--truncate" not in advice(whole, noll, 1e-9 * one_nm)  # which would leave no combination
     for cut in np.linspace(0.01, 0.02, 20):
-        made = whole._replace(singular_values=np.array([1, 0.5, 0.3, cut]))
-        assert float(advice(made, noll, 0.9 / cut * one_nm).split()[-1]) > cut
+        with_smallest = whole._replace(singular_values=np.array([1, 0.5, 0.3, cut]))
+        assert float(advice(with_smallest, noll, 0.9 / cut * one_nm).split()[-1]) > cut
     truncated = reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, truncate=0.05)
     assert np.count_nonzero(truncated.kept) == 3
     assert np.linalg.matrix_rank(truncated.matrix) == 3
@@ -396,9 +397,12 @@ def test_r_of_a_measured_calibration_is_not_recomputed_from_noisy_h() -> None:
     best = with_dark(before, np.zeros(good.size), good, 1.0, 1.0)
     assert not masked.reconstructor[:, 3].any()
     _, H_masked = normalise_flux(reference, true_response, good)
-    there, here = (cross_talk(made, of) for made, of in ((matrix, true_response), (masked.reconstructor, H_masked)))
-    assert np.abs(there - here).max() < np.abs(there).max()  # one pixel holds 2 % of this sensor's flux
-    power = [(each.reconstructor.astype(float) ** 2 @ (reference + 1e-6)) for each in (masked, best)]
-    assert (power[0] / power[1]).max() < 1.5
+    before_mask, after_mask = (
+        cross_talk(R, true_H) for R, true_H in ((matrix, true_response), (masked.reconstructor, H_masked))
+    )
+    # One pixel holds 2 % of this sensor's flux.
+    assert np.abs(after_mask - before_mask).max() < np.abs(before_mask).max()
+    noise_power = [(each.reconstructor.astype(float) ** 2 @ (reference + 1e-6)) for each in (masked, best)]
+    assert (noise_power[0] / noise_power[1]).max() < 1.5
     with pytest.raises(ValueError, match="do not tell the modes apart"):
         with_dark(noisy, np.zeros(good.size), np.arange(good.size) < 1, 1.0, 1.0)

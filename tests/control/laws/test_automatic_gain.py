@@ -32,13 +32,13 @@ def verdicts(
     closed: bool = False,
 ) -> list[Verdict]:
     """Verdicts of a loop whose gains follow them."""
-    found = []
-    for index, one in enumerate(open_nm.astype(np.float32)):
-        seen = None if tilt_nm is None else single(tilt_nm[index])
-        if bank_.add_frame(one, one, seen, closed=closed) and bank_.complete:
-            found.append(bank_.verdict(gain, noise_nm2 * np.ones(one.size)))
-            gain = found[-1].gain
-    return found
+    all_verdicts = []
+    for index, modes_nm in enumerate(open_nm.astype(np.float32)):
+        tilt_of_frame = None if tilt_nm is None else single(tilt_nm[index])
+        if bank_.add_frame(modes_nm, modes_nm, tilt_of_frame, closed=closed) and bank_.complete:
+            all_verdicts.append(bank_.verdict(gain, noise_nm2 * np.ones(modes_nm.size)))
+            gain = all_verdicts[-1].gain
+    return all_verdicts
 
 
 def drift(frames: int, step_nm: float, noise_nm: float, seed: int) -> Array:
@@ -60,16 +60,16 @@ def test_white_noise_gets_no_gain() -> None:
 def test_a_drift_gets_nearly_the_best_gain(step_nm: float, delay_frames: float) -> None:
     """For d = 1, the rms of drift, s^2 / (g (2 - g)), plus noise, n^2 g / (2 - g), is within 12 % of the least."""
     bank_ = bank(delay_frames, (1000, 2500))
-    found = verdicts(bank_, drift(8500, step_nm, 10.0, 2), np.zeros(MODES, np.float32), 100.0)
-    assert len(found) >= 3
+    all_verdicts = verdicts(bank_, drift(8500, step_nm, 10.0, 2), np.zeros(MODES, np.float32), 100.0)
+    assert len(all_verdicts) >= 3
     gains = np.linspace(0.001, highest_gain(delay_frames), 2000)
     if delay_frames == 1.0:
         residual_nm2 = (step_nm**2 / gains + 100.0 * gains) / (2 - gains)
-        chosen = np.interp(found[-1].gain, gains, residual_nm2)
+        chosen = np.interp(all_verdicts[-1].gain, gains, residual_nm2)
         assert np.sqrt(chosen.mean() / residual_nm2.min()) < 1.12
     else:
-        assert (found[-1].gain > 0).all()
-        assert (found[-1].gain <= highest_gain(2.0) * 1.001).all()
+        assert (all_verdicts[-1].gain > 0).all()
+        assert (all_verdicts[-1].gain <= highest_gain(2.0) * 1.001).all()
 
 
 def test_modes_with_the_same_disturbance_get_similar_gains() -> None:
@@ -78,8 +78,8 @@ def test_modes_with_the_same_disturbance_get_similar_gains() -> None:
     together = verdicts(bank(), wander, np.zeros(MODES, np.float32), 100.0)[0].gain
     alone = np.concatenate(
         [
-            verdicts(bank(modes=2), wander[:, [one, one + 1]], np.zeros(2, np.float32), 100.0)[0].gain
-            for one in range(0, MODES, 2)
+            verdicts(bank(modes=2), wander[:, [mode, mode + 1]], np.zeros(2, np.float32), 100.0)[0].gain
+            for mode in range(0, MODES, 2)
         ]
     )
     assert not alone.all()
@@ -112,8 +112,8 @@ def test_a_window_without_a_decision_grows() -> None:
     gain = np.zeros(MODES, np.float32)
     lengths = []
     for _ in range(2000):
-        one = rng.normal(0, 1, MODES).astype(np.float32)
-        if bank_.add_frame(one, one, closed=True) and bank_.complete:
+        modes_nm = rng.normal(0, 1, MODES).astype(np.float32)
+        if bank_.add_frame(modes_nm, modes_nm, closed=True) and bank_.complete:
             lengths.append(bank_.verdict(gain, None).frames)  # the chosen gains are not applied
     assert lengths[0] == 100
     assert max(lengths) >= 200
@@ -123,11 +123,11 @@ def test_a_new_drift_gets_a_gain_before_the_window_ends() -> None:
     bank_, zero_gain = bank(windows=(500, 5000)), np.zeros(MODES, np.float32)
     verdicts(bank_, drift(500, 0.0, 1.0, 8), zero_gain, 1.0)
     early = zero_gain
-    for count, one in enumerate(drift(3000, 0.5, 1.0, 9).astype(np.float32)):
-        if bank_.add_frame(one, one, closed=False):
+    for count, modes_nm in enumerate(drift(3000, 0.5, 1.0, 9).astype(np.float32)):
+        if bank_.add_frame(modes_nm, modes_nm, closed=False):
             assert not bank_.complete
             early = bank_.early(early)
-            assert count >= 2499 or not early.any()
+            assert count >= 2499 or not early.any()  # before five blocks of 500 frames are complete
     assert (early > 0.01).mean() > 0.9
 
 
@@ -172,8 +172,8 @@ def test_a_gain_due_to_tilt_cross_talk_is_removed_before_the_window_ends() -> No
     bank_ = bank(windows=(100, 5000))
     gain = verdicts(bank_, drift(100, 1.0, 1.0, 18), np.zeros(MODES, np.float32), 1.0)[0].gain
     assert gain.all()
-    for seen, one in zip(tilt_nm, modes_nm, strict=True):
-        if bank_.add_frame(one, one, seen, closed=True):
+    for tilt_of_frame, modes_of_frame in zip(tilt_nm, modes_nm, strict=True):
+        if bank_.add_frame(modes_of_frame, modes_of_frame, tilt_of_frame, closed=True):
             gain = bank_.early(gain)
     assert gain[4] == 0
 
@@ -215,9 +215,9 @@ def test_drifts_and_common_noise_are_not_tilt_cross_talk() -> None:
     noise[:, 2:] += 0.8 * noise[:, :1]
     modes = drift(2000, 0.3, 0.0, 16)
     tilt_nm = 40 + modes[:, :2] + noise[:, :2]
-    bank_ = TiltCrossTalk(MODES)
-    found, error = bank_.mean_nm(bank_.add_frames(single(tilt_nm), single(modes + noise[:, 2:])) / 2000)
-    assert np.count_nonzero(np.abs(found) > SURE * error) <= 1
+    cross_talk = TiltCrossTalk(MODES)
+    mean_nm, error_nm = cross_talk.mean_nm(cross_talk.add_frames(single(tilt_nm), single(modes + noise[:, 2:])) / 2000)
+    assert np.count_nonzero(np.abs(mean_nm) > SURE * error_nm) <= 1
 
 
 def _calibration(measured: bool) -> tuple[Calibration, CameraSettings]:
@@ -231,11 +231,11 @@ def _calibration(measured: bool) -> tuple[Calibration, CameraSettings]:
     good = np.ones(pixels)
     R = reconstruct(reference, response, None, good, 1e5, 2.0).matrix
     camera = CameraSettings(0, (20, 20), 0.0, 65535.0, 2.0, 1.0, 2.0)
-    arrays = [one.astype(np.float32) for one in (reference, response, R, good, np.zeros(pixels))]
+    arrays = [array.astype(np.float32) for array in (reference, response, R, good, np.zeros(pixels))]
     shapes = np.zeros((4, modes), np.float32)
     name = "poke" if measured else "weighted"
-    rest = (shapes, (20, 20), (2, 2), 5e4, 65535.0, name, 550.0, "", "id")
-    return Calibration((2, 3, 4, 5, 6), *arrays, *rest), camera
+    other_fields = (shapes, (20, 20), (2, 2), 5e4, 65535.0, name, 550.0, "", "id")
+    return Calibration((2, 3, 4, 5, 6), *arrays, *other_fields), camera
 
 
 def test_rows_of_corrected_modes_are_the_map_estimate() -> None:
@@ -263,9 +263,9 @@ def test_r_is_unchanged_if_all_or_no_modes_are_corrected_or_the_camera_is_unknow
 
 def test_the_prior_of_uncorrected_modes_is_their_power_minus_noise_plus_two_standard_errors() -> None:
     power, zero_gain = np.array([2.0, 1.0, 5.0]), np.zeros(3)
-    found = uncorrected_prior_nm2(
+    prior_nm2 = uncorrected_prior_nm2(
         Verdict(zero_gain, power, np.ones(3), zero_gain, zero_gain, None, zero_gain, 5000),
         np.array([True, True, False]),
         np.ones(3),
     )
-    np.testing.assert_allclose(found, [1.04, 0.04, 0], rtol=1e-5)
+    np.testing.assert_allclose(prior_nm2, [1.04, 0.04, 0], rtol=1e-5)

@@ -44,10 +44,10 @@ def simulated_residual(law: LinearLaw, omega: float, timing: Timing, frames: int
     weights = delay_weights(timing.delay)
     x, c = at_rest(law).astype(float), np.zeros(frames + 8)
     squares = []
-    at = np.sqrt(2) * np.cos(omega * (np.arange(frames + 8)[:, None] + fine) + 1)
+    wave = np.sqrt(2) * np.cos(omega * (np.arange(frames + 8)[:, None] + fine) + 1)
     exposure = np.arange(FINE) < round(timing.exposure * FINE)
     for k in range(frames):
-        measured = at[k, exposure].mean() if exposure.any() else np.sqrt(2) * np.cos(omega * k + 1)
+        measured = wave[k, exposure].mean() if exposure.any() else np.sqrt(2) * np.cos(omega * k + 1)
         seen = sum(weight * c[k - 1 - lag] for lag, weight in enumerate(weights))
         y = measured if law.signal == "pol" else measured + seen
         x = predict_and_update(law, x, np.array([y]), c[k - 1 : k] if k else np.zeros(1))  # type: ignore[arg-type]
@@ -55,8 +55,8 @@ def simulated_residual(law: LinearLaw, omega: float, timing: Timing, frames: int
         if k > frames // 2:
             whole = int(timing.applied)
             part = timing.applied - whole
-            ahead = np.sqrt(2) * np.cos(omega * (k + whole + part + fine) + 1)
-            squares.append(np.mean((ahead + c[k]) ** 2))
+            while_applied = np.sqrt(2) * np.cos(omega * (k + whole + part + fine) + 1)
+            squares.append(np.mean((while_applied + c[k]) ** 2))
     return float(np.mean(squares))
 
 
@@ -64,8 +64,8 @@ def simulated_residual(law: LinearLaw, omega: float, timing: Timing, frames: int
 @pytest.mark.parametrize("omega", [0.05, 0.7, 2.0, 2 * np.pi - 0.7])
 def test_the_residual_power_of_a_wave_agrees_with_a_fine_simulation(timing: Timing, omega: float) -> None:
     law = steady(0.4, timing.delay)
-    found = residual_power(law, np.array([omega]), timing)[0, 0]
-    assert found == pytest.approx(simulated_residual(law, omega, timing), rel=0.01)
+    residual_nm2 = residual_power(law, np.array([omega]), timing)[0, 0]
+    assert residual_nm2 == pytest.approx(simulated_residual(law, omega, timing), rel=0.01)
 
 
 def test_the_floor_is_the_residual_of_the_best_held_value() -> None:
@@ -121,11 +121,11 @@ def test_means_are_interpolated_from_measurements(timing: Timing) -> None:
     for omega in (0.0, 0.04, 0.5, 1.5):
         wave = np.exp(1j * (omega * k + 0.3))
         measured = wave * mean_over(np.array([omega]), timing.exposure)
-        ahead = wave * mean_over(np.array([omega]), 1.0) * np.exp(1j * omega * timing.applied)
-        found, response = means_while_applied(measured.real[:, None], timing)
-        valid = np.isfinite(found[:, 0])
+        true_means = wave * mean_over(np.array([omega]), 1.0) * np.exp(1j * omega * timing.applied)
+        means, response = means_while_applied(measured.real[:, None], timing)
+        valid = np.isfinite(means[:, 0])
         assert valid.sum() > 290
-        np.testing.assert_allclose(found[valid, 0], ahead.real[valid], atol=2e-3)
+        np.testing.assert_allclose(means[valid, 0], true_means.real[valid], atol=2e-3)
         assert response[0] == pytest.approx(1)
 
 
@@ -137,10 +137,10 @@ def test_the_continuous_residual_is_recovered_from_instants() -> None:
     for frame in range(len(k)):
         mirror[frame] = c
         c -= 0.5 * (wave[frame] + c)
-    found = continuous_residual_nm2(wave[:, None], mirror[:, None])[500:-100]
-    assert np.isfinite(found).all()
-    assert found.mean() == pytest.approx(residual_power(law, np.array([omega]), timing)[0, 0], rel=0.01)
-    assert np.mean((wave + mirror)[500:-100] ** 2) < 0.8 * found.mean()
+    residual_nm2 = continuous_residual_nm2(wave[:, None], mirror[:, None])[500:-100]
+    assert np.isfinite(residual_nm2).all()
+    assert residual_nm2.mean() == pytest.approx(residual_power(law, np.array([omega]), timing)[0, 0], rel=0.01)
+    assert np.mean((wave + mirror)[500:-100] ** 2) < 0.8 * residual_nm2.mean()
     earlier = continuous_residual_nm2(wave[:, None], mirror[:, None], 0.5)[500:-100].mean()
     assert earlier == pytest.approx(residual_power(law, np.array([omega]), Timing(1, 0.5, 0.0))[0, 0], rel=0.01)
     assert Timing.measured(1.0, 0.5, 0.6) == Timing.of(1.0, 0.5)  # too late for a delay of one frame

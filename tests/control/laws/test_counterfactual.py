@@ -105,7 +105,7 @@ def test_any_function_of_state_and_error_is_a_controller() -> None:
     assert command[:, 0].tolist() == [0, -8, -8, 0, -8]
 
 
-def test_commands_seen_by_exposures() -> None:
+def test_an_exposure_sees_the_commands_of_its_delay_also_after_missing_frames() -> None:
     command, first, missing = single(1, 2, 4, 8), np.array([-1], np.float32), np.array([0, 0, 3, 0])
     assert seen_nm(weights(1.0), command, missing, first)[:, 0].tolist() == [-1, 1, 2, 4]
     assert seen_nm(weights(2.0), command, missing, first)[:, 0].tolist() == [-1, -1, 2, 2]
@@ -142,7 +142,7 @@ def test_a_motionless_mirror_gives_no_delay() -> None:
 
 
 def test_the_delay_is_recovered_from_message_times() -> None:
-    """40 exposures from 1000 ns on, every 1000 ns; every fourth command is late, 100 ns after a start."""
+    """40 exposures from 1000 ns on, every 1000 ns; every fourth command comes 100 ns after the next exposure began."""
     sequence = np.array([frame_sequence(count) for count in range(40)], np.uint64)
     start_ns = 1000 + 1000 * np.arange(40)
     applied_ns = start_ns + 900

@@ -21,7 +21,7 @@ BOTH = np.ones(2, bool)
 SAMPLED = Timing.sampled(1.0)
 
 
-def loop(gain: tuple[float, ...] = (0.5, 0.1), leak: tuple[float, ...] = (0.0, 0.0)) -> LinearLaw:
+def law_of_two_modes(gain: tuple[float, ...] = (0.5, 0.1), leak: tuple[float, ...] = (0.0, 0.0)) -> LinearLaw:
     return integrator(gain, leak, (2, 3), 1.0, RATE_HZ)
 
 
@@ -29,13 +29,13 @@ def one_piece(values: np.ndarray) -> TimeSeries:
     return TimeSeries((values,), 0)
 
 
-def test_noise_gain_of_a_one_frame_loop_has_a_closed_form() -> None:
-    found = white_noise(loop((0.5, 0.1)), np.array([4.0, 2.0]))
-    assert found.variance_nm2 == pytest.approx([16 * 0.5 / 1.5, 4 * 0.1 / 1.9], rel=1e-3)
+def test_the_noise_of_a_loop_with_one_frame_of_delay_has_a_closed_form() -> None:
+    noise = white_noise(law_of_two_modes((0.5, 0.1)), np.array([4.0, 2.0]))
+    assert noise.variance_nm2 == pytest.approx([16 * 0.5 / 1.5, 4 * 0.1 / 1.9], rel=1e-3)
 
 
 def test_a_mode_without_gain_keeps_its_disturbance_and_adds_no_noise() -> None:
-    law = loop((0.5, 0.0))
+    law = law_of_two_modes((0.5, 0.0))
     assert white_noise(law, np.ones(2)).variance_nm2[1] == 0
     drift = spectrum(one_piece(np.random.default_rng(1).standard_normal((4000, 2))), RATE_HZ)
     assert lag(law, drift, np.array([0.0, 3.0]), SAMPLED).variance_nm2[1] == pytest.approx(9 + drift.variance_nm2()[1])
@@ -45,26 +45,29 @@ def test_photon_and_read_noise_add_in_quadrature() -> None:
     rng = np.random.default_rng(2)
     matrix, reference = rng.standard_normal((2, 30)), rng.uniform(0.5, 1.5, 30)
     reference /= reference.sum()
-    found = sensor_noise(matrix, reference, 5000.0, 3.0)
-    assert found.total_nm == pytest.approx(noise_nm(matrix, reference, 5000.0, 3.0))
-    assert found.photon_nm == pytest.approx(noise_nm(matrix, reference, 5000.0, 0.0))
+    noise = sensor_noise(matrix, reference, 5000.0, 3.0)
+    assert noise.total_nm == pytest.approx(noise_nm(matrix, reference, 5000.0, 3.0))
+    assert noise.photon_nm == pytest.approx(noise_nm(matrix, reference, 5000.0, 0.0))
     multiplied = sensor_noise(matrix, reference, 5000.0, 3.0, excess=2.0)
-    assert multiplied.photon_nm**2 == pytest.approx(2 * found.photon_nm**2)
-    assert multiplied.read_nm == pytest.approx(found.read_nm)
+    assert multiplied.photon_nm**2 == pytest.approx(2 * noise.photon_nm**2)
+    assert multiplied.read_nm == pytest.approx(noise.read_nm)
 
 
 def test_the_lag_term_of_a_sine_is_its_rejected_power() -> None:
     time_s = np.arange(16_384) / RATE_HZ
     waves = np.stack([6 * np.sin(2 * np.pi * 31 * time_s), 2 * np.sin(2 * np.pi * 7 * time_s)], axis=1)
-    law = loop((0.5, 0.1), (0.0, 0.02))
-    found = spectrum(one_piece(waves), RATE_HZ)
-    passed = [rejection(np.array([f]), RATE_HZ, *law, 1.0)[0] for f, law in ((31.0, (0.5, 0.0)), (7.0, (0.1, 0.02)))]
+    law = law_of_two_modes((0.5, 0.1), (0.0, 0.02))
+    power = spectrum(one_piece(waves), RATE_HZ)
+    passed = [
+        rejection(np.array([hz]), RATE_HZ, gain, leak, 1.0)[0]
+        for hz, gain, leak in ((31.0, 0.5, 0.0), (7.0, 0.1, 0.02))
+    ]
     expected = np.array([18, 2]) * np.square(passed)
-    assert lag(law, found, np.zeros(2), SAMPLED).variance_nm2 == pytest.approx(expected, rel=0.02)
+    assert lag(law, power, np.zeros(2), SAMPLED).variance_nm2 == pytest.approx(expected, rel=0.02)
     omega, whole_time = 2 * np.pi * np.array([31.0, 7.0]) / RATE_HZ, Timing.of(1.0, 0.0)
     expected = np.array([18, 2]) * residual_power(law, omega, whole_time).diagonal()
-    assert lag(law, found, np.zeros(2), whole_time).variance_nm2 == pytest.approx(expected, rel=0.02)
-    with_mean, without = (lag(law, found, np.full(2, mean), SAMPLED).variance_nm2 for mean in (30.0, 0.0))
+    assert lag(law, power, np.zeros(2), whole_time).variance_nm2 == pytest.approx(expected, rel=0.02)
+    with_mean, without = (lag(law, power, np.full(2, mean), SAMPLED).variance_nm2 for mean in (30.0, 0.0))
     # An integrator without leak removes a mean.
     assert with_mean - without == pytest.approx([0, (30 * 0.02 / 0.12) ** 2], abs=1e-3)
 
@@ -75,10 +78,10 @@ def test_the_lag_term_is_recovered_under_noise(timing: Timing) -> None:
     waves = 6 * np.sin(2 * np.pi * 31 * time_s)[:, None].repeat(2, axis=1)
     noisy = waves + 4 * np.random.default_rng(3).standard_normal(waves.shape)
     clear, measured = spectrum(one_piece(waves), RATE_HZ), spectrum(one_piece(noisy), RATE_HZ)
-    expected = lag(loop(), clear, np.zeros(2), timing)
-    found = lag_under_noise(loop(), measured, np.zeros(2), timing)
-    assert np.abs(found.variance_nm2 - expected.variance_nm2).max() < 3 * np.max(found.error_nm2)
-    assert found.variance_nm2[0] == pytest.approx(expected.variance_nm2[0], rel=0.25)
+    expected = lag(law_of_two_modes(), clear, np.zeros(2), timing)
+    term = lag_under_noise(law_of_two_modes(), measured, np.zeros(2), timing)
+    assert np.abs(term.variance_nm2 - expected.variance_nm2).max() < 3 * np.max(term.error_nm2)
+    assert term.variance_nm2[0] == pytest.approx(expected.variance_nm2[0], rel=0.25)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +104,7 @@ def test_an_undetected_difference_is_an_upper_limit(
 def run(
     measure: Callable[[np.ndarray, int], np.ndarray], frames: int = 8000
 ) -> tuple[TimeSeries, TimeSeries, TimeSeries]:
-    """Error, residual and seen command of `loop()` with a sensor `measure(residual, frame)`."""
+    """Error, residual and seen command of a loop with `law_of_two_modes()` and a sensor `measure(residual, frame)`."""
     time_s = np.arange(frames) / RATE_HZ
     waves = np.stack([9 * np.sin(2 * np.pi * 11 * time_s), 4 * np.sin(2 * np.pi * 3 * time_s)], axis=1)
     command = np.zeros(2)
@@ -120,8 +123,8 @@ NOISE = np.random.default_rng(4).standard_normal((8000, 2))
 
 
 def test_a_linear_sensor_with_noise_has_no_other_term() -> None:
-    found = measurement_error(loop(), *run(lambda residual, index: residual + NOISE[index]), np.ones(2))
-    for term in (found.crosstalk, found.nonlinearity):
+    split = measurement_error(law_of_two_modes(), *run(lambda residual, index: residual + NOISE[index]), np.ones(2))
+    for term in (split.crosstalk, split.nonlinearity):
         rms_nm, detected = term.total(BOTH)
         assert not detected
         assert rms_nm < 0.25  # the noise itself leaves 0.6 nm
@@ -134,11 +137,11 @@ def test_an_offset_and_linear_mixing_are_cross_talk() -> None:
         return residual + offset + mixture @ residual + 0.2 * NOISE[index]
 
     error, residual, seen = run(mixed)
-    found = measurement_error(loop(), error, residual, seen, np.full(2, 0.2))
+    split = measurement_error(law_of_two_modes(), error, residual, seen, np.full(2, 0.2))
     steady = np.linalg.solve(np.eye(2) + mixture, -offset)  # the loop settles at a measured error of 0
-    assert found.crosstalk.total(BOTH)[0] == pytest.approx(np.linalg.norm(steady), rel=0.03)
-    assert found.crosstalk.total(BOTH)[1]
-    assert not found.nonlinearity.total(BOTH)[1]
+    assert split.crosstalk.total(BOTH)[0] == pytest.approx(np.linalg.norm(steady), rel=0.03)
+    assert split.crosstalk.total(BOTH)[1]
+    assert not split.nonlinearity.total(BOTH)[1]
 
 
 def test_a_quadratic_response_is_nonlinearity() -> None:
@@ -146,18 +149,18 @@ def test_a_quadratic_response_is_nonlinearity() -> None:
         return residual + 0.3 * residual[::-1] ** 2 + 0.2 * NOISE[index]
 
     error, residual, seen = run(quadratic)
-    found = measurement_error(loop(), error, residual, seen, np.full(2, 0.2))
+    split = measurement_error(law_of_two_modes(), error, residual, seen, np.full(2, 0.2))
     straight = run(lambda residual, index: residual + 0.2 * NOISE[index])[1].joined()
     added = residual.joined() - straight
     expected = np.sqrt(np.sum(added.var(axis=0)))
-    assert found.nonlinearity.total(BOTH) == (pytest.approx(expected, rel=0.3), True)
+    assert split.nonlinearity.total(BOTH) == (pytest.approx(expected, rel=0.3), True)
 
 
 def test_too_few_frames_give_no_measurement_error() -> None:
     few = [one_piece(part.joined()[:45]) for part in run(lambda residual, index: residual + NOISE[index], 600)]
-    assert measurement_error(loop(), *few, np.ones(2)) is None
+    assert measurement_error(law_of_two_modes(), *few, np.ones(2)) is None
     nothing = TimeSeries((), 0)
-    assert measurement_error(loop(), nothing, nothing, nothing, np.ones(2)) is None
+    assert measurement_error(law_of_two_modes(), nothing, nothing, nothing, np.ones(2)) is None
 
 
 def test_the_terms_add_up_to_the_residual_of_a_simulated_loop() -> None:
@@ -165,8 +168,8 @@ def test_the_terms_add_up_to_the_residual_of_a_simulated_loop() -> None:
     keys = {"control.start_mode": "closed", "camera.rate_hz": RATE_HZ, "disturbance.scale": 2.0}
     config = load(None, keys | FIXED_GAINS | SMALL_MIRROR)
     calibration = calibrated(config)
-    ran = run_loop(config, 1600, calibration)
-    signals = {name: getattr(ran, name)[100:] for name in ("error_nm", "pol_nm", "disturbance_nm", "residual_nm")}
+    simulated = run_loop(config, 1600, calibration)
+    signals = {name: getattr(simulated, name)[100:] for name in ("error_nm", "pol_nm", "disturbance_nm", "residual_nm")}
     settings = factory.settings(config)
     law = settings.integrator(calibration.noll)
     law = integrator(law.gain, law.leak, calibration.noll, settings.delay_frames, RATE_HZ)

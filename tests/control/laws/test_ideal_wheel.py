@@ -31,15 +31,15 @@ def wheel(**keys: Any) -> tuple[Configuration, Bench]:
 
 def residual_mas(bench: Bench, run: TimeSeries, timing: Timing, *, continuous: bool = True) -> float:
     """Continuous residual, or at the starts of exposures, with the law tuned from a run for a timing, mas."""
-    rate_hz, none = bench.config.camera.rate_hz, np.zeros(2)
-    gains = best_gains(run, rate_hz, timing, none)
-    bench.load(tune_lqg(run, identify_modes(run, rate_hz), gains, (2, 3), none, timing).law)
+    rate_hz, no_leak = bench.config.camera.rate_hz, np.zeros(2)
+    gains = best_gains(run, rate_hz, timing, no_leak)
+    bench.load(tune_lqg(run, identify_modes(run, rate_hz), gains, (2, 3), no_leak, timing).law)
     bench.new_record()
     bench.run(SETTLE + MEASURE)
     return bench.tilt_mas(MEASURE, continuous=continuous)
 
 
-def between_mas(bench: Bench) -> float:
+def residual_between_instants_mas(bench: Bench) -> float:
     """Continuous residual of the last frames from the commands, for a camera with one instant per frame, mas."""
     sampler = Sampler(disturbance_of(bench.config), (np.arange(8) + 0.5) / 8, bench.config.camera.rate_hz)
     counts = [count_of(step.frame_sequence) for step in bench.steps[-MEASURE:]]
@@ -53,10 +53,10 @@ def test_an_image_of_one_instant_hides_the_residual_between_instants() -> None:
     _, bench = wheel(**{"camera.instants": 1})
     bench.run(IDENTIFY)
     assert bench.tilt_mas(MEASURE, continuous=False) == pytest.approx(2.3, rel=0.03)
-    assert between_mas(bench) == pytest.approx(3.55, rel=0.03)
+    assert residual_between_instants_mas(bench) == pytest.approx(3.55, rel=0.03)
     at_instants_mas = residual_mas(bench, bench.pol(), Timing.sampled(1.0), continuous=False)
     assert at_instants_mas < 0.1
-    assert between_mas(bench) == pytest.approx(1.44, rel=0.03)
+    assert residual_between_instants_mas(bench) == pytest.approx(1.44, rel=0.03)
 
 
 def test_the_best_law_nulls_the_mean_over_the_period_of_its_command() -> None:

@@ -7,7 +7,7 @@ import scipy
 from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.kalman import lqg_block
-from lowfc.control.laws.linear_law import law_from_blocks
+from lowfc.control.laws.linear_law import LinearLaw, law_from_blocks
 from lowfc.control.laws.margins import margins
 from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG
@@ -32,9 +32,9 @@ def test_an_identified_law_is_nearly_optimal() -> None:
 @pytest.mark.parametrize("magnitude", lines.MAGNITUDES)
 @pytest.mark.parametrize("width", lines.WIDTHS)
 def test_laws_are_nearly_optimal_within_the_margins(width: float, magnitude: float, delay: float) -> None:
-    found = lines.case(width, magnitude, delay)
-    assert max(found["identified_mas"]) < 1.05 * found["best_within_margins_mas"]
-    assert found["optimum_mas"] <= 1.001 * found["best_within_margins_mas"]
+    residuals = lines.case(width, magnitude, delay)
+    assert max(residuals["identified_mas"]) < 1.05 * residuals["best_within_margins_mas"]
+    assert residuals["optimum_mas"] <= 1.001 * residuals["best_within_margins_mas"]
 
 
 @pytest.mark.parametrize("noise_nm", [0.05, 2.0])
@@ -48,16 +48,16 @@ def test_a_filter_keeps_the_margins_at_any_noise(noise_nm: float, width: float, 
     block = within_margins(model, timing)
     assert block is not None
     blocks = block, lqg_block(model, timing)
-    law, free = (law_from_blocks([one], "pol", "lqg", (2,), delay, RATE_HZ) for one in blocks)
+    law, unconstrained = (law_from_blocks([block], "pol", "lqg", (2,), delay, RATE_HZ) for block in blocks)
 
-    def ratio(one: object) -> float:
+    def ratio(filter_: LinearLaw) -> float:
         """Smallest ratio of a margin to its limit; for a filter the phase margin may be 0.7 times as large."""
-        found = margins(one, delay)
-        gain = min(found.gain_margin[0], 1 / max(found.gain_reduction[0], 1e-9)) / MIN_GAIN_MARGIN
-        return float(min(gain, found.phase_margin_deg[0] / (0.7 * MIN_PHASE_MARGIN_DEG)))
+        kept = margins(filter_, delay)
+        gain = min(kept.gain_margin[0], 1 / max(kept.gain_reduction[0], 1e-9)) / MIN_GAIN_MARGIN
+        return float(min(gain, kept.phase_margin_deg[0] / (0.7 * MIN_PHASE_MARGIN_DEG)))
 
     assert ratio(law) >= 1
-    assert ratio(law) < 1.1 or ratio(law) == ratio(free)
+    assert ratio(law) < 1.1 or ratio(law) == ratio(unconstrained)
 
 
 @pytest.mark.slow
@@ -73,14 +73,14 @@ def test_modal_simulation_agrees_with_images() -> None:
     bench.settle(1000)
     bench.run(lines.FRAMES)
     noise_nm = frame_noise_nm(config, calibration)[:2]
-    found = []
+    tuned_laws = []
     for pol in (TimeSeries((bench.pol().values[0][:, :2],), 0), lines.tilts_of(config, noise_nm, lines.FRAMES)):
         frequency_hz, density = scipy.signal.welch(pol.values[0], RATE_HZ, nperseg=2000, axis=0)
         level_nm = np.sqrt(density[(frequency_hz > 400) & (frequency_hz < 490)].mean(axis=0) * RATE_HZ / 2)
         np.testing.assert_allclose(level_nm, noise_nm, rtol=0.1)
-        found.append(tuned(pol, config)["lqg"])
-    identified_nm = [np.sqrt([model.noise_nm2 for model in one.models]) for one in found]
+        tuned_laws.append(tuned(pol, config)["lqg"])
+    identified_nm = [np.sqrt([model.noise_nm2 for model in tuned_law.models]) for tuned_law in tuned_laws]
     np.testing.assert_allclose(*identified_nm, rtol=0.1)
     assert (np.array(identified_nm) < noise_nm).all()
-    residual_mas = [float(np.hypot(*laws.theory_mas(config, calibration, one.law))) for one in found]
+    residual_mas = [float(np.hypot(*laws.theory_mas(config, calibration, tuned_law.law))) for tuned_law in tuned_laws]
     assert residual_mas[0] == pytest.approx(residual_mas[1], rel=0.03)

@@ -38,7 +38,7 @@ def one_piece(values: np.ndarray) -> TimeSeries:
     return TimeSeries((values,), 0)
 
 
-def numbers(count: int, start: int = 1_700_000_000) -> np.ndarray:
+def sequences(count: int, start: int = 1_700_000_000) -> np.ndarray:
     return (np.uint64(start) << np.uint64(32)) + np.arange(count, dtype=np.uint64)
 
 
@@ -66,8 +66,8 @@ def test_the_standard_error_equals_the_scatter() -> None:
     rng = np.random.default_rng(2)
     trials = [spectrum(one_piece(rng.standard_normal((2000, 1))), RATE_HZ) for _ in range(300)]
     band = (trials[0].frequency_hz < 50)[:, None]
-    variances = [float(one.variance_nm2(band)[0]) for one in trials if one is not None]
-    errors = [float(one.error_nm2(band)[0]) for one in trials if one is not None]
+    variances = [float(trial.variance_nm2(band)[0]) for trial in trials if trial is not None]
+    errors = [float(trial.error_nm2(band)[0]) for trial in trials if trial is not None]
     assert np.mean(errors) == pytest.approx(np.std(variances), rel=0.2)
 
 
@@ -76,7 +76,7 @@ def test_short_gaps_are_interpolated_and_long_gaps_split_the_run() -> None:
     present = np.ones(20, bool)
     present[5 : 5 + MAX_INTERPOLATED_FRAMES] = False
     present[12 : 13 + MAX_INTERPOLATED_FRAMES] = False
-    found = time_series(numbers(20)[present], values[present])
+    found = time_series(sequences(20)[present], values[present])
     assert [len(piece) for piece in found.values] == [12, 20 - 13 - MAX_INTERPOLATED_FRAMES]
     assert found.interpolated == MAX_INTERPOLATED_FRAMES
     assert np.array_equal(found.values[0], values[:12])  # interpolation of a straight line is exact
@@ -86,23 +86,23 @@ def test_short_gaps_are_interpolated_and_long_gaps_split_the_run() -> None:
 
 def test_repeated_and_older_frames_are_ignored() -> None:
     order = [0, 1, 2, 2, 1, 3, 4]
-    found = time_series(numbers(5)[order], np.array(order, float)[:, None])
+    found = time_series(sequences(5)[order], np.array(order, float)[:, None])
     assert found.joined().ravel().tolist() == [0, 1, 2, 3, 4]
 
 
 def test_a_camera_restart_starts_a_new_piece() -> None:
-    sequence = np.concatenate([numbers(10), numbers(10, 1_700_000_001)])
+    sequence = np.concatenate([sequences(10), sequences(10, 1_700_000_001)])
     assert [len(piece) for piece in time_series(sequence, np.ones((20, 1))).values] == [10, 10]
     lower_after_a_clear = np.roll(sequence, 10)
     assert [len(piece) for piece in time_series(lower_after_a_clear, np.ones((20, 1))).values] == [10, 10]
 
 
 def test_empty_and_short_runs_have_no_spectrum() -> None:
-    assert time_series(numbers(0), np.zeros((0, 2))) == TimeSeries((), 0)
-    assert time_series(numbers(3), np.full((3, 2), np.nan)) == TimeSeries((), 0)
+    assert time_series(sequences(0), np.zeros((0, 2))) == TimeSeries((), 0)
+    assert time_series(sequences(3), np.full((3, 2), np.nan)) == TimeSeries((), 0)
     noise = np.random.default_rng(1).standard_normal((SHORTEST, 1))
-    found = [spectrum(one, RATE_HZ) for one in (TimeSeries((), 0), one_piece(noise[1:]), one_piece(noise))]
-    assert [one is not None for one in found] == [False, False, True]
+    runs = TimeSeries((), 0), one_piece(noise[1:]), one_piece(noise)
+    assert [spectrum(run, RATE_HZ) is not None for run in runs] == [False, False, True]
 
 
 def test_a_longer_run_has_a_finer_spectrum() -> None:
@@ -130,8 +130,8 @@ def law(gain: tuple[float, float] = GAIN) -> Integrator:
     return settings(gain=gain).integrator(NOLL)
 
 
-def theory_of(one: Integrator, delay_frames: float) -> LinearLaw:
-    return linear(one, NOLL, delay_frames, 1.0)
+def linear_law(law: Integrator, delay_frames: float) -> LinearLaw:
+    return linear(law, NOLL, delay_frames, 1.0)
 
 
 def through(setup: Settings, requests: Iterable[Request], frames: int) -> tuple[Array, Array, State]:
@@ -164,25 +164,27 @@ def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: fl
     error_nm, _, _ = through(setup, [request], len(table))
     weights = delay_weights(delay_frames)
     added = -period.astype(float) if target == "offset" else seen_of_mirror(period.astype(float), weights)
-    found = measure_lines(error_nm[lead:], added)
+    measured = measure_lines(error_nm[lead:], added)
 
-    assert [np.sort(np.round(found.frequency[found.mode == mode] * PERIOD)).tolist() for mode in range(3)] == [
-        one.tolist() for one in places
+    assert [np.sort(np.round(measured.frequency[measured.mode == mode] * PERIOD)).tolist() for mode in range(3)] == [
+        lines_of_mode.tolist() for lines_of_mode in places
     ]
-    theory, rows = theory_of(law(), delay_frames), np.arange(found.mode.size)
-    S, T = (of(theory, found.frequency)[rows, found.mode] for of in (margins.rejection, margins.noise_transfer))
-    of_s = departure(found.rejection, S, found.error, TOLERANCE_DB)
-    of_t = departure(found.noise_transfer, T, found.error, TOLERANCE_DB)
+    theory, rows = linear_law(law(), delay_frames), np.arange(measured.mode.size)
+    S, T = (of(theory, measured.frequency)[rows, measured.mode] for of in (margins.rejection, margins.noise_transfer))
+    of_s = departure(measured.rejection, S, measured.error, TOLERANCE_DB)
+    of_t = departure(measured.noise_transfer, T, measured.error, TOLERANCE_DB)
     assert of_s.judged.sum() > 0.8 * rows.size
     assert of_t.judged.sum() > 0.5 * rows.size
-    for one in (of_s, of_t):
-        assert np.array_equal(one.judged, one.within)
-        assert 0.6 < np.sqrt(np.mean((one.db[one.judged] / one.error_db[one.judged]) ** 2)) < 1.6
-    assert (np.abs(of_s.db[of_s.judged & (found.frequency > 0.02)]) < 0.5).all()
+    for compared in (of_s, of_t):
+        judged = compared.judged
+        assert np.array_equal(judged, compared.within)
+        assert 0.6 < np.sqrt(np.mean((compared.db[judged] / compared.error_db[judged]) ** 2)) < 1.6
+    assert (np.abs(of_s.db[of_s.judged & (measured.frequency > 0.02)]) < 0.5).all()
 
-    wrong = margins.rejection(theory_of(law((0.6, 0.15)), delay_frames), found.frequency)[rows, found.mode]
-    other = departure(found.rejection, wrong, found.error, TOLERANCE_DB)
-    assert not other.within[other.judged].all()
+    other_theory = linear_law(law((0.6, 0.15)), delay_frames)
+    S = margins.rejection(other_theory, measured.frequency)[rows, measured.mode]
+    of_other_gain = departure(measured.rejection, S, measured.error, TOLERANCE_DB)
+    assert not of_other_gain.within[of_other_gain.judged].all()
 
 
 def test_lines_are_odd_ascending_and_not_shared_by_modes() -> None:
@@ -194,8 +196,8 @@ def test_lines_are_odd_ascending_and_not_shared_by_modes() -> None:
         assert all_lines[0] >= 0.1 / 250 * 15_000
         assert all_lines[-1] <= 0.3 * 15_000
         assert all_lines[-1] > 0.28 * 15_000
-        for one in places:
-            assert (np.diff(one) >= 6).all()
+        for lines_of_mode in places:
+            assert (np.diff(lines_of_mode) >= 6).all()
 
 
 @pytest.mark.parametrize(

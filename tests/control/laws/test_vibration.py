@@ -65,11 +65,11 @@ def test_the_spectrum_of_a_model_agrees_with_its_states() -> None:
     model = Model(0.01, 5.0, (Line(20, 0.8, 25.0), Line(60, 2.5, 9.0)), 0.5, RATE_HZ)
     F, Q, C = model.states()
     omega = np.array([0.01, 0.1257, 0.3, 0.377, 2.0])
-    found = []
+    spectrum_nm2 = []
     for z in np.exp(1j * omega):
         passed = C @ np.linalg.inv(np.eye(len(F)) - F / z)
-        found.append(float((passed @ Q @ passed.conj()).real))
-    np.testing.assert_allclose(model.spectrum_nm2(omega), found, rtol=1e-6)
+        spectrum_nm2.append(float((passed @ Q @ passed.conj()).real))
+    np.testing.assert_allclose(model.spectrum_nm2(omega), spectrum_nm2, rtol=1e-6)
 
 
 def test_pieces_are_identified_like_one_run_and_short_ones_are_not() -> None:
