@@ -28,13 +28,13 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    def turn(item: pytest.Item) -> tuple[bool, bool, int]:
+    def start_order(item: pytest.Item) -> tuple[bool, bool, int]:
         longest = LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST)
         exclusive = _exclusive(item.path)
         assert exclusive or item.get_closest_marker("exclusive") is None, item.nodeid
         return not exclusive, FIRST.isdisjoint(item.path.parents), longest
 
-    items.sort(key=turn)
+    items.sort(key=start_order)
 
 
 @pytest.hookimpl(optionalhook=True)  # without pytest-xdist: -p no:xdist
@@ -88,9 +88,9 @@ def _private_cache(pytestconfig: pytest.Config) -> None:
 
 @pytest.fixture
 def run() -> Iterator[Run]:
-    made = open_run(new_run_id())
-    yield made
-    made.remove()
+    new_run = open_run(new_run_id())
+    yield new_run
+    new_run.remove()
 
 
 @pytest.fixture(autouse=True)
