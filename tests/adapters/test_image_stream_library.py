@@ -66,11 +66,11 @@ def test_images_of_the_c_library_are_read(path: Path) -> None:
     reader = StreamReader(path)
     for number in range(1, 100):
         library.write(image(number, "u2"))
-        got = reader.next(1)
-        assert got is not None
-        assert got.number == number
-        assert abs(got.acquired_ns - time.time_ns()) < 10**9
-        assert np.array_equal(got.pixels, image(number, "u2"))
+        received = reader.next(1)
+        assert received is not None
+        assert received.number == number
+        assert abs(received.acquired_ns - time.time_ns()) < 10**9
+        assert np.array_equal(received.pixels, image(number, "u2"))
     assert LIBRARY.ImageStreamIO_semvalue(library.memory, 9) == 10
     reader.close()
     LIBRARY.ImageStreamIO_destroyIm(library.memory)

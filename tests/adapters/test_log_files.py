@@ -167,7 +167,7 @@ def test_the_summary_replaces_the_declarations_of_a_damaged_chunk(tmp_path: Path
     assert (len(reader.damage), reader.unreadable) == (1, 0)
     path.write_bytes(path.read_bytes()[: chunks_of(path)[-1][1]])
     reader = LogReader(path, skip_damaged=True)
-    assert not any((one.key, start_of(one.sequence)) == (STEP.key, START_S) for one in reader)
+    assert not any((sample.key, start_of(sample.sequence)) == (STEP.key, START_S) for sample in reader)
     assert len(reader.damage) == 1
     assert reader.unreadable > 20
 
@@ -250,8 +250,8 @@ INVALID_LENGTHS = [
     ("records", "error", "delivered"),
     [
         *(
-            ([DECLARED, chunk(one, message(1)), chunk(message(2))], "1 is declared a second", [0, 2])
-            for one in DIFFERENT
+            ([DECLARED, chunk(record, message(1)), chunk(message(2))], "1 is declared a second", [0, 2])
+            for record in DIFFERENT
         ),
         *(
             ([chunk(STEPS, dataclasses.replace(CHANNEL, metadata={"start_s": start}), message(0))], "1 has start_s", [])
@@ -270,7 +270,7 @@ def test_contradictory_or_unchecked_records_are_damage(
     with pytest.raises(DataFileError, match=error):
         list(LogReader(path))
     reader = LogReader(path, skip_damaged=True)
-    assert [(reader.schema_of(one), one.sequence) for one in reader] == [
+    assert [(reader.schema_of(sample), sample.sequence) for sample in reader] == [
         ("lowfc.v1.ControlStep", sequence_of(7, count)) for count in delivered
     ]
     assert len(reader.damage) + reader.unreadable == 1

@@ -57,11 +57,11 @@ def test_wake_ends_the_wait_at_once_and_only_once() -> None:
 
 def test_a_message_ends_the_wait_of_another_thread() -> None:
     box, handled = Mailbox(), Mailbox()
-    got: list[Sample | None] = []
+    received: list[Sample | None] = []
 
     def loop() -> None:
         for _ in range(500):
-            got.append(box.take(PATIENCE_S))
+            received.append(box.take(PATIENCE_S))
             handled.wake()
 
     thread = threading.Thread(target=loop)
@@ -70,7 +70,7 @@ def test_a_message_ends_the_wait_of_another_thread() -> None:
         box.put(sample(count))
         handled.take(PATIENCE_S)
     thread.join()
-    assert got == [sample(count) for count in range(500)]
+    assert received == [sample(count) for count in range(500)]
     assert (box.received, box.skipped, box.missing) == (500, 0, 0)
 
 

@@ -164,18 +164,18 @@ def report(call: str, limits: str = "") -> dict[str, object]:
 
 
 def test_set_up_changes_only_blas_threads_and_garbage_collection_by_default() -> None:
-    found = report("set_up(None, None, lock_memory=False, disable_cpu_idle=False)")
-    assert found["granted"] == ["one BLAS thread", "garbage collector off"]
-    assert found["refused"] == []
-    assert (found["policy"], found["cpus"]) == (os.sched_getscheduler(0), sorted(os.sched_getaffinity(0)))
-    assert (found["collects"], found["locked_kb"]) == (False, 0)
-    assert found["frozen"] > 0
-    assert set(found["blas"]) == {1}
+    reported = report("set_up(None, None, lock_memory=False, disable_cpu_idle=False)")
+    assert reported["granted"] == ["one BLAS thread", "garbage collector off"]
+    assert reported["refused"] == []
+    assert (reported["policy"], reported["cpus"]) == (os.sched_getscheduler(0), sorted(os.sched_getaffinity(0)))
+    assert (reported["collects"], reported["locked_kb"]) == (False, 0)
+    assert reported["frozen"] > 0
+    assert set(reported["blas"]) == {1}
 
 
 def test_refused_measures_are_reported_with_their_cost() -> None:
-    found = report("set_up(50, {4096}, lock_memory=True, disable_cpu_idle=True)", UNPRIVILEGED + NO_DEVICE)
-    measures = [measure for measure, _ in found["refused"]]
+    reported = report("set_up(50, {4096}, lock_memory=True, disable_cpu_idle=True)", UNPRIVILEGED + NO_DEVICE)
+    measures = [measure for measure, _ in reported["refused"]]
     assert [measure.split(" (")[0] for measure in measures] == [
         "processors [4096]",
         "locked memory",
@@ -183,25 +183,25 @@ def test_refused_measures_are_reported_with_their_cost() -> None:
         "SCHED_FIFO priority 50",
     ]
     assert "64 kB" in measures[1]
-    assert all(len(cost) > 30 for _, cost in found["refused"])
-    assert (found["policy"], found["locked_kb"]) == (os.sched_getscheduler(0), 0)
-    assert found["granted"] == ["one BLAS thread", "garbage collector off"]
+    assert all(len(cost) > 30 for _, cost in reported["refused"])
+    assert (reported["policy"], reported["locked_kb"]) == (os.sched_getscheduler(0), 0)
+    assert reported["granted"] == ["one BLAS thread", "garbage collector off"]
 
 
 def test_a_scheduling_class_below_the_normal_one_is_kept() -> None:
-    found = report(
+    reported = report(
         "set_up_below_loop(None, None)", f"os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0)); {UNPRIVILEGED}"
     )
-    assert found["policy"] == os.SCHED_IDLE
+    assert reported["policy"] == os.SCHED_IDLE
 
 
 def test_locking_memory_does_not_allocate_reserved_memory() -> None:
     reserve = "from mmap import *; reserved = mmap(-1, 1 << 28, MAP_PRIVATE | MAP_ANONYMOUS)"
-    found = report("set_up(None, None, lock_memory=True, disable_cpu_idle=False)", reserve)
-    if found["refused"]:
-        pytest.skip(str(found["refused"]))
-    assert found["locked_kb"] > 1 << 18
-    assert found["resident_kb"] < 150_000
+    reported = report("set_up(None, None, lock_memory=True, disable_cpu_idle=False)", reserve)
+    if reported["refused"]:
+        pytest.skip(str(reported["refused"]))
+    assert reported["locked_kb"] > 1 << 18
+    assert reported["resident_kb"] < 150_000
 
 
 def fifo_permitted() -> bool:
@@ -212,26 +212,26 @@ def fifo_permitted() -> bool:
 @pytest.mark.skipif(not fifo_permitted(), reason="this user may not have SCHED_FIFO")
 def test_a_host_that_allows_it_grants_real_time() -> None:
     cpu = min(os.sched_getaffinity(0))
-    found = report(f"set_up(10, {{{cpu}}}, lock_memory=False, disable_cpu_idle=False)")
-    if found["refused"]:  # a container's root may not have CAP_SYS_NICE
-        pytest.skip(str(found["refused"]))
-    assert (found["policy"], found["priority"], found["cpus"]) == (os.SCHED_FIFO, 10, [cpu])
-    assert found["granted"][-2:] == [f"processors [{cpu}]", "SCHED_FIFO priority 10"]
+    reported = report(f"set_up(10, {{{cpu}}}, lock_memory=False, disable_cpu_idle=False)")
+    if reported["refused"]:  # a container's root may not have CAP_SYS_NICE
+        pytest.skip(str(reported["refused"]))
+    assert (reported["policy"], reported["priority"], reported["cpus"]) == (os.SCHED_FIFO, 10, [cpu])
+    assert reported["granted"][-2:] == [f"processors [{cpu}]", "SCHED_FIFO priority 10"]
 
 
 @pytest.mark.skipif(not os.access(LATENCY_DEVICE, os.W_OK), reason="this user may not disable CPU idle")
 def test_cpu_idle_stays_disabled_while_the_process_lives() -> None:
     twice = "[set_up(None, None, lock_memory=False, disable_cpu_idle=True) for _ in range(2)][-1]"
-    found = report(twice)
-    assert (found["granted"][-1], found["open"].count(LATENCY_DEVICE)) == ("processors awake", 1)
+    reported = report(twice)
+    assert (reported["granted"][-1], reported["open"].count(LATENCY_DEVICE)) == ("processors awake", 1)
 
 
 def test_the_recorder_does_not_keep_the_real_time_class_of_its_parent() -> None:
     real_time, cpu = fifo_permitted(), min(os.sched_getaffinity(0))
     limits = "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))" if real_time else ""
-    found = report(f"set_up_below_loop(None, {{{cpu}}})", limits)
-    assert (found["policy"], found["cpus"]) == (os.SCHED_OTHER if real_time else os.sched_getscheduler(0), [cpu])
-    assert found["granted"] == ["normal scheduling class", f"processors [{cpu}]"]
+    reported = report(f"set_up_below_loop(None, {{{cpu}}})", limits)
+    assert (reported["policy"], reported["cpus"]) == (os.SCHED_OTHER if real_time else os.sched_getscheduler(0), [cpu])
+    assert reported["granted"] == ["normal scheduling class", f"processors [{cpu}]"]
 
 
 def test_processes_are_spread_over_the_available_processors() -> None:

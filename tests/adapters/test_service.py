@@ -71,8 +71,8 @@ def test_a_wrong_clock_is_reported_at_the_start(
     listener = Listener(hub, clock, HEALTH)
     monkeypatch.setattr(clock, "ahead_ns", lambda: ahead_ms * 1_000_000)
     service(hub, clock, "camera")
-    found = listener.event_texts(f"CLOCK_OFF this boot's clock is {ahead_ms:+d} ms from the wall clock")
-    assert len(found) == len(listener.event_texts("CLOCK_OFF")) == reported
+    events = listener.event_texts(f"CLOCK_OFF this boot's clock is {ahead_ms:+d} ms from the wall clock")
+    assert len(events) == len(listener.event_texts("CLOCK_OFF")) == reported
 
 
 def test_health_has_the_counts_of_a_mailbox(hub: MemoryHub, clock: FakeClock) -> None:

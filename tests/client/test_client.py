@@ -108,6 +108,7 @@ def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 SIMPLE = ("open", "close", "pause", "safe", "clear", "reset", "stop")
 METHODS = {"open": Client.open_loop, "close": Client.close_loop}
+"""Methods that do not have the name of their request."""
 CALLS: tuple[tuple[Callable[[Client], object], Request], ...] = (
     *((METHODS.get(name) or getattr(Client, name), Request(0, name)) for name in ("status", *SIMPLE)),
     (lambda loop: loop.step(7), Request(0, "step", (), (7.0,))),

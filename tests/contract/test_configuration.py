@@ -63,12 +63,12 @@ and one at the margin."""
         second: int = Field(2, description="Declared.")
 
 
-def test_descriptions_of_a_class_within_a_class_and_of_one_without_source() -> None:
+def test_a_class_within_a_class_has_descriptions_and_one_without_source_has_empty_ones() -> None:
     inherited = InterlockSection.descriptions()
     own = {"first": "One line,\nand one at the margin.", "second": "Declared."}
     assert Outer.Options.descriptions() == inherited | own
-    made = create_model("Made", __base__=InterlockSection, third=(int, 3))
-    assert made.descriptions() == inherited | {"third": ""}
+    without_source = create_model("Made", __base__=InterlockSection, third=(int, 3))
+    assert without_source.descriptions() == inherited | {"third": ""}
 
 
 def test_a_configuration_round_trips_through_toml(tmp_path: Path) -> None:

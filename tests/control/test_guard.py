@@ -134,7 +134,7 @@ def test_the_waiting_time_doubles_until_a_takeover_is_final() -> None:
 
 
 @pytest.mark.parametrize(("pol_nm2", "final"), [(39.0, True), (41.0, False)], ids=["amplified", "grown"])
-def test_a_loop_amplifies_if_its_error_is_large_and_not_due_to_a_larger_disturbance(
+def test_a_loop_is_judged_to_amplify_if_its_error_is_large_and_not_due_to_a_larger_disturbance(
     pol_nm2: float, final: bool
 ) -> None:
     group = Group(usual_nm2=1.0, blocks=WORSE_BLOCKS - 1)

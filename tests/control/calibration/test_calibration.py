@@ -149,7 +149,7 @@ def test_an_unknown_estimator_is_refused() -> None:
         reconstructor(TOY.reference, RESPONSE, GOOD, 1e5, 1.0, "best")
 
 
-def test_condition_number_of_a_missing_mode_is_infinite() -> None:
+def test_the_condition_number_of_a_matrix_with_a_missing_mode_is_infinite() -> None:
     assert condition_number(np.eye(4)[:, :2]) == pytest.approx(1)
     assert condition_number(np.column_stack([np.ones(4), np.zeros(4)])) == np.inf
 

@@ -103,8 +103,8 @@ def test_a_static_aberration_and_a_jump_across_lost_frames_are_not_noise() -> No
     bank_, zero_gain = bank(windows=(500, 500)), np.zeros(MODES, np.float32)
     verdicts(bank_, 100 + drift(220, 0.0, 1.0, 13), zero_gain, 0.0)
     bank_.held(3)
-    [found] = verdicts(bank_, 300 + drift(280, 0.0, 1.0, 14), zero_gain, 0.0)
-    np.testing.assert_allclose(found.noise_nm2, 1, rtol=0.3)
+    [verdict] = verdicts(bank_, 300 + drift(280, 0.0, 1.0, 14), zero_gain, 0.0)
+    np.testing.assert_allclose(verdict.noise_nm2, 1, rtol=0.3)
 
 
 def test_a_window_without_a_decision_grows() -> None:
@@ -153,8 +153,8 @@ def test_the_reported_change_excludes_the_cross_talk_margin() -> None:
     """Of a true 20 nm with 2.7 nm of cross-talk, the loop leaves the cross-talk."""
     tilt_nm, modes_nm = _vibrating(1000, 19)
     modes_nm[:, 4] += 20
-    [found] = verdicts(bank(), modes_nm, np.full(MODES, 0.1, np.float32), 1.0, tilt_nm)
-    assert found.change_nm2[4] == pytest.approx(2.7**2 - 20**2, rel=0.05)
+    [verdict] = verdicts(bank(), modes_nm, np.full(MODES, 0.1, np.float32), 1.0, tilt_nm)
+    assert verdict.change_nm2[4] == pytest.approx(2.7**2 - 20**2, rel=0.05)
 
 
 def test_past_tilt_cross_talk_is_forgotten() -> None:
@@ -163,8 +163,8 @@ def test_past_tilt_cross_talk_is_forgotten() -> None:
     rng = np.random.default_rng(21)
     bank_ = bank(windows=(100, 10))
     gain = verdicts(bank_, modes_nm, 0 * ONES, 1.0, tilt_nm)[-1].gain
-    found = verdicts(bank_, rng.normal(0, 1, (2000, MODES)), gain, 1.0, rng.normal(0, 1, (2000, 2)))[-1]
-    assert found.power_nm2[4] == pytest.approx(1, abs=0.3)
+    last_verdict = verdicts(bank_, rng.normal(0, 1, (2000, MODES)), gain, 1.0, rng.normal(0, 1, (2000, 2)))[-1]
+    assert last_verdict.power_nm2[4] == pytest.approx(1, abs=0.3)
 
 
 def test_a_gain_due_to_tilt_cross_talk_is_removed_before_the_window_ends() -> None:

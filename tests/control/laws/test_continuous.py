@@ -29,7 +29,7 @@ LINES_HZ, LINES_MAS = (6.0, 18.0, 37.0, 71.0, 117.0), (9.0, 8.3, 5.0, 3.0, 2.0)
 OMEGA = 2 * np.pi * np.array(LINES_HZ) / RATE_HZ
 
 
-def steady(gain: float, delay: float) -> LinearLaw:
+def integrator_of_tip(gain: float, delay: float) -> LinearLaw:
     return integrator([gain], [0.0], (2,), delay, RATE_HZ)
 
 
@@ -63,7 +63,7 @@ def simulated_residual(law: LinearLaw, omega: float, timing: Timing, frames: int
 @pytest.mark.parametrize("timing", [Timing(1, 1, 0.5), Timing(2, 2, 0.9), Timing(1, 0.75, 0.5), Timing(1.4, 1.4, 0.5)])
 @pytest.mark.parametrize("omega", [0.05, 0.7, 2.0, 2 * np.pi - 0.7])
 def test_the_residual_power_of_a_wave_agrees_with_a_fine_simulation(timing: Timing, omega: float) -> None:
-    law = steady(0.4, timing.delay)
+    law = integrator_of_tip(0.4, timing.delay)
     residual_nm2 = residual_power(law, np.array([omega]), timing)[0, 0]
     assert residual_nm2 == pytest.approx(simulated_residual(law, omega, timing), rel=0.01)
 
@@ -81,12 +81,12 @@ def wheel_residual_mas(law: LinearLaw, timing: Timing) -> float:
     return float(np.sqrt(np.square(LINES_MAS) @ residual_power(law, OMEGA, timing)[:, 0]))
 
 
-def test_residuals_on_the_ideal_wheel() -> None:
+def test_the_residuals_on_the_ideal_wheel_are_known_and_the_best_law_reaches_the_floor() -> None:
     """Mas per axis, without noise; at one instant of each frame the integrator leaves 2.26 and the best law nothing."""
     now, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
-    assert wheel_residual_mas(steady(1.11, 1), now) == pytest.approx(3.528, abs=0.002)
-    assert wheel_residual_mas(steady(1.11, 1), blurred) == pytest.approx(2.944, abs=0.002)
-    assert wheel_residual_mas(steady(0.518, 2), Timing(2, 2, 0.5)) == pytest.approx(6.547, abs=0.002)
+    assert wheel_residual_mas(integrator_of_tip(1.11, 1), now) == pytest.approx(3.528, abs=0.002)
+    assert wheel_residual_mas(integrator_of_tip(1.11, 1), blurred) == pytest.approx(2.944, abs=0.002)
+    assert wheel_residual_mas(integrator_of_tip(0.518, 2), Timing(2, 2, 0.5)) == pytest.approx(6.547, abs=0.002)
     floor = float(np.sqrt(np.square(LINES_MAS) @ hold_floor(OMEGA)))
     assert floor == pytest.approx(0.7215, abs=1e-4)
     for timing in (now, blurred, Timing(1, 1, 0.9), Timing(2, 2, 0.5), Timing(1, 0.8, 0.5), Timing(1.5, 1.5, 0.5)):
@@ -109,7 +109,7 @@ def law_nulling(prediction: Callable[[Model], Array]) -> LinearLaw:
 
 
 def test_the_noise_of_the_command_has_a_closed_form() -> None:
-    law, omega = steady(0.4, 1), np.linspace(1e-6, np.pi, 4000)
+    law, omega = integrator_of_tip(0.4, 1), np.linspace(1e-6, np.pi, 4000)
     power = np.abs(commanded(law, omega, 1))[:, 0] ** 2
     assert np.trapezoid(power, omega) / np.pi == pytest.approx(0.4 / (2 - 0.4), rel=1e-3)
 
@@ -131,7 +131,7 @@ def test_means_are_interpolated_from_measurements(timing: Timing) -> None:
 
 def test_the_continuous_residual_is_recovered_from_instants() -> None:
     """For a wave and a mirror that holds; the residual at the instants alone is smaller."""
-    timing, law, k, omega = Timing.of(1, 0.0), steady(0.5, 1), np.arange(3000), 0.3
+    timing, law, k, omega = Timing.of(1, 0.0), integrator_of_tip(0.5, 1), np.arange(3000), 0.3
     wave = np.sqrt(2) * np.cos(omega * k + 1)
     mirror, c = np.zeros_like(wave), 0.0
     for frame in range(len(k)):
@@ -148,7 +148,7 @@ def test_the_continuous_residual_is_recovered_from_instants() -> None:
 
 def test_the_held_residual_is_recovered_from_noisy_measurements() -> None:
     """A wave with 1 nm of white noise: the residual of the means agrees with theory."""
-    timing, law, rng = Timing(1, 1, 0.5), steady(0.3, 1), np.random.default_rng(3)
+    timing, law, rng = Timing(1, 1, 0.5), integrator_of_tip(0.3, 1), np.random.default_rng(3)
     k, omega, frames = np.arange(20_000), 0.2, 20_000
     wave = 2 * np.sqrt(2) * np.exp(1j * (omega * k + 1))
     measured = (wave * mean_over(np.array([omega]), 0.5)).real + rng.standard_normal(frames)
@@ -168,7 +168,7 @@ def states_over(model: Model, start: float, length: float) -> Array:
     return np.real(vectors @ np.diag(means) @ np.linalg.inv(vectors))
 
 
-def test_predicted_means_of_the_states() -> None:
+def test_predicted_means_of_the_states_agree_with_a_fine_sum() -> None:
     model = Model(1e-3, 40.0, (Line(37.0, 2.0, 9.0), Line(120.0, 1.0, 1.0)), 1.0, RATE_HZ)
     for start, length in ((1.0, 1.0), (0.0, 0.5), (2.4, 1.0)):
         np.testing.assert_allclose(model.mean_over(start, length), states_over(model, start, length), atol=1e-6)

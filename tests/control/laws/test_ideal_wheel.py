@@ -69,13 +69,13 @@ def test_the_best_law_nulls_the_mean_over_the_period_of_its_command() -> None:
     assert residual_mas(bench, run, Timing.of(1.0, 0.5)) == pytest.approx(0.73, rel=0.03)
 
 
-def test_residual_of_the_integrator_with_two_frames_of_delay() -> None:
+def test_the_integrator_with_two_frames_of_delay_leaves_6_55_mas() -> None:
     _, bench = wheel(**{"camera.delay_frames": 2.0})
     bench.run(MEASURE)
     assert bench.tilt_mas(MEASURE) == pytest.approx(6.55, rel=0.03)
 
 
-def test_residual_of_lqg_at_4_khz() -> None:
+def test_lqg_at_4_khz_leaves_less_than_0_22_mas() -> None:
     config, bench = wheel(**{"camera.rate_hz": 4000.0})
     bench.run(2 * IDENTIFY)
     assert residual_mas(bench, bench.pol(), Timing.of(1.0, config.camera.exposure_fraction)) < 0.22

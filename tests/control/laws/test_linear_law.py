@@ -222,24 +222,24 @@ def test_the_transfer_functions_of_the_integrator_agree_with_theory(delay_frames
 @pytest.mark.parametrize("delay_frames", [1.0, 1.3, 1.5, 2.0, 3.0])
 @pytest.mark.parametrize("leak", [0.0, 0.01, 0.3])
 def test_the_gain_margin_ends_at_the_limiting_gain(delay_frames: float, leak: float) -> None:
-    found, highest = margins(one_mode_law(0.2, delay_frames, leak), delay_frames), limiting_gain(delay_frames, leak)
-    assert 0.2 * found.gain_margin[0] == pytest.approx(highest, rel=1e-4)
-    assert found.gain_reduction[0] == 0
+    margins_, highest = margins(one_mode_law(0.2, delay_frames, leak), delay_frames), limiting_gain(delay_frames, leak)
+    assert 0.2 * margins_.gain_margin[0] == pytest.approx(highest, rel=1e-4)
+    assert margins_.gain_reduction[0] == 0
     assert margins(one_mode_law(0.9999 * highest, delay_frames, leak), delay_frames).stable
     assert not margins(one_mode_law(1.0001 * highest, delay_frames, leak), delay_frames).stable
 
 
-def test_margins_for_gain_one_half_and_one_frame_of_delay() -> None:
+def test_the_margins_for_gain_one_half_and_one_frame_of_delay_agree_with_a_hand_calculation() -> None:
     """By hand: L = g / (z - 1), |L| = 1 at 2 sin(w/2) = g; L is nearest to -1 at pi, at a distance of 1 - g/2."""
-    found = margins(one_mode_law(0.5, 1.0), 1.0)
+    margins_ = margins(one_mode_law(0.5, 1.0), 1.0)
     omega = 2 * np.arcsin(0.25)
-    assert found.phase_margin_deg[0] == pytest.approx(np.degrees(np.pi / 2 - omega / 2), abs=0.05)
-    assert found.peak[0] == pytest.approx(1 / (1 - 0.25), rel=1e-4)
-    assert found.radius[0] == pytest.approx(0.5)
-    assert found.gain_margin[0] == pytest.approx(4, rel=1e-3)
+    assert margins_.phase_margin_deg[0] == pytest.approx(np.degrees(np.pi / 2 - omega / 2), abs=0.05)
+    assert margins_.peak[0] == pytest.approx(1 / (1 - 0.25), rel=1e-4)
+    assert margins_.radius[0] == pytest.approx(0.5)
+    assert margins_.gain_margin[0] == pytest.approx(4, rel=1e-3)
 
 
-def test_margins_for_a_true_delay_other_than_the_laws() -> None:
+def test_margins_are_those_of_the_true_delay_also_if_the_law_assumes_another() -> None:
     """A law of pseudo-open-loop modes uses its own delay; the loop has the true delay."""
     law = integrators([(0.6, 0.0)], "pol", 1.0)
     assert margins(law, 1.0).gain_margin[0] == pytest.approx(2 / 0.6, rel=1e-3)
@@ -279,10 +279,10 @@ def test_a_notch_has_the_requested_depth_and_width() -> None:
 def test_modes_without_gain_count_as_stable() -> None:
     law = one_mode_law(0.0, 1.0)
     check_stable(law, 1.0)
-    found = margins(law, 1.0)
-    assert found.stable
-    assert found.gain_margin[0] == np.inf
-    assert found.phase_margin_deg[0] == 180
+    margins_ = margins(law, 1.0)
+    assert margins_.stable
+    assert margins_.gain_margin[0] == np.inf
+    assert margins_.phase_margin_deg[0] == 180
 
 
 def test_the_refusal_of_an_unstable_law_names_the_pole() -> None:
@@ -310,9 +310,9 @@ def test_margins_of_coupled_modes_are_those_of_the_rotated_loop() -> None:
         measurement_gain=rotation @ law.measurement_gain @ rotation.T,
         command_gain=rotation @ law.command_gain @ rotation.T,
     )
-    found = margins(rotated, 1.0)
-    np.testing.assert_allclose(found.radius, 0.5, rtol=1e-5)
-    np.testing.assert_allclose(found.gain_margin, 4, rtol=1e-3)
+    margins_ = margins(rotated, 1.0)
+    np.testing.assert_allclose(margins_.radius, 0.5, rtol=1e-5)
+    np.testing.assert_allclose(margins_.gain_margin, 4, rtol=1e-3)
     np.testing.assert_allclose(rejection(rotated, FREQUENCY_HZ, 1.0), rejection(law, FREQUENCY_HZ, 1.0), rtol=1e-4)
 
 

@@ -44,22 +44,22 @@ def sequences(count: int, start: int = 1_700_000_000) -> np.ndarray:
 
 def test_the_power_of_white_noise_equals_its_variance() -> None:
     noise = np.random.default_rng(1).standard_normal((40_000, 3)) * [1.0, 2.0, 5.0]
-    found = spectrum(one_piece(noise), RATE_HZ)
-    assert found.frequency_hz[0] == 0
-    assert found.frequency_hz[-1] == RATE_HZ / 2
-    assert found.variance_nm2() == pytest.approx([1, 4, 25], rel=0.03)
+    power = spectrum(one_piece(noise), RATE_HZ)
+    assert power.frequency_hz[0] == 0
+    assert power.frequency_hz[-1] == RATE_HZ / 2
+    assert power.variance_nm2() == pytest.approx([1, 4, 25], rel=0.03)
     level = 2 * np.array([1, 4, 25]) / RATE_HZ  # one-sided, from 0 to half the rate
-    assert found.power_nm2_hz[10:-10].mean(axis=0) == pytest.approx(level, rel=0.03)
-    assert floor_nm2_hz(found) == pytest.approx(level, rel=0.05)
+    assert power.power_nm2_hz[10:-10].mean(axis=0) == pytest.approx(level, rel=0.03)
+    assert floor_nm2_hz(power) == pytest.approx(level, rel=0.05)
 
 
 def test_a_sine_keeps_its_power_and_its_frequency() -> None:
     time_s = np.arange(8192) / RATE_HZ
-    found = spectrum(one_piece(3.0 * np.sin(2 * np.pi * 40.3 * time_s)[:, None]), RATE_HZ)
-    assert found.frequency_hz[np.argmax(found.power_nm2_hz)] == pytest.approx(40.3, abs=found.spacing_hz / 2)
-    near = (np.abs(found.frequency_hz - 40.3) < 3 * found.spacing_hz)[:, None]
-    assert found.variance_nm2(near) == pytest.approx(4.5, rel=0.01)
-    assert found.variance_nm2() == pytest.approx(4.5, rel=0.01)
+    power = spectrum(one_piece(3.0 * np.sin(2 * np.pi * 40.3 * time_s)[:, None]), RATE_HZ)
+    assert power.frequency_hz[np.argmax(power.power_nm2_hz)] == pytest.approx(40.3, abs=power.spacing_hz / 2)
+    near = (np.abs(power.frequency_hz - 40.3) < 3 * power.spacing_hz)[:, None]
+    assert power.variance_nm2(near) == pytest.approx(4.5, rel=0.01)
+    assert power.variance_nm2() == pytest.approx(4.5, rel=0.01)
 
 
 def test_the_standard_error_equals_the_scatter() -> None:
@@ -76,18 +76,18 @@ def test_short_gaps_are_interpolated_and_long_gaps_split_the_run() -> None:
     present = np.ones(20, bool)
     present[5 : 5 + MAX_INTERPOLATED_FRAMES] = False
     present[12 : 13 + MAX_INTERPOLATED_FRAMES] = False
-    found = time_series(sequences(20)[present], values[present])
-    assert [len(piece) for piece in found.values] == [12, 20 - 13 - MAX_INTERPOLATED_FRAMES]
-    assert found.interpolated == MAX_INTERPOLATED_FRAMES
-    assert np.array_equal(found.values[0], values[:12])  # interpolation of a straight line is exact
-    assert np.array_equal(found.values[1], values[13 + MAX_INTERPOLATED_FRAMES :])
-    assert found.frames == 20 - 1 - MAX_INTERPOLATED_FRAMES
+    series = time_series(sequences(20)[present], values[present])
+    assert [len(piece) for piece in series.values] == [12, 20 - 13 - MAX_INTERPOLATED_FRAMES]
+    assert series.interpolated == MAX_INTERPOLATED_FRAMES
+    assert np.array_equal(series.values[0], values[:12])  # interpolation of a straight line is exact
+    assert np.array_equal(series.values[1], values[13 + MAX_INTERPOLATED_FRAMES :])
+    assert series.frames == 20 - 1 - MAX_INTERPOLATED_FRAMES
 
 
 def test_repeated_and_older_frames_are_ignored() -> None:
     order = [0, 1, 2, 2, 1, 3, 4]
-    found = time_series(sequences(5)[order], np.array(order, float)[:, None])
-    assert found.joined().ravel().tolist() == [0, 1, 2, 3, 4]
+    series = time_series(sequences(5)[order], np.array(order, float)[:, None])
+    assert series.joined().ravel().tolist() == [0, 1, 2, 3, 4]
 
 
 def test_a_camera_restart_starts_a_new_piece() -> None:
@@ -265,13 +265,13 @@ def test_known_gain_and_crosstalk_are_recovered() -> None:
     stairs, starts = build_staircase(levels_nm, 8, 10.0)
     true = np.stack([0.1 * stairs, stairs * (1 - (stairs / 50) ** 2), np.zeros_like(stairs)], axis=1)
     drift = np.linspace(0, 20, len(stairs))[:, None]
-    found = gains(true + drift + 0.2 * rng.standard_normal(true.shape), 1, levels_nm, starts + 2, 6)
-    assert found.amplitude_nm.tolist() == [4, 8, 16]
-    truth = np.stack([np.full(3, 0.1), 1 - (found.amplitude_nm / 50) ** 2, np.zeros(3)], axis=1)
-    assert (np.abs(found.gain - truth) < 4 * found.error).all()
-    assert found.error.max() < 0.02
-    assert found.within(0.05, 0.2) == [True, True, False]
-    assert found.within(0.5, 0.05) == [False] * 3
+    measured = gains(true + drift + 0.2 * rng.standard_normal(true.shape), 1, levels_nm, starts + 2, 6)
+    assert measured.amplitude_nm.tolist() == [4, 8, 16]
+    truth = np.stack([np.full(3, 0.1), 1 - (measured.amplitude_nm / 50) ** 2, np.zeros(3)], axis=1)
+    assert (np.abs(measured.gain - truth) < 4 * measured.error).all()
+    assert measured.error.max() < 0.02
+    assert measured.within(0.05, 0.2) == [True, True, False]
+    assert measured.within(0.5, 0.05) == [False] * 3
     assert gains(true + 30 * rng.standard_normal(true.shape), 1, levels_nm, starts + 2, 6).within(0.05, 0.2)[0] is None
 
 
