@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.bus.dispatch import LONG_AGO_NS, Dispatch
+from lowfc.adapters.bus.dispatch import OLD_NS, Dispatch
 from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.logs.sequence_gaps import REMEMBERED, Gaps
 from lowfc.contract.envelope import count_of, sequence_of
@@ -146,7 +146,7 @@ def test_a_single_old_message_counts_as_superseded() -> None:
     bench = Bench()
     bench.arrive(0, bench.now_ns + 10**8)
     bench.now_ns += 10**9
-    bench.arrive(1, bench.now_ns - LONG_AGO_NS)
+    bench.arrive(1, bench.now_ns - OLD_NS)
     bench.now_ns += 10**9
     bench.arrive(2, bench.now_ns - PERIOD_NS)  # late by a period, without a sign of a newer one
     assert bench.handled == [0, 2]

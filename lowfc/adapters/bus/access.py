@@ -23,8 +23,8 @@ _LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # never part of a run on sever
 class Grant:
     """Rights of a role, the common name of a certificate, as lists of keys.
 
-    It publishes Health under its role only; a mirror publishes, answers and receives under its own name only. All other
-    keys have "*" in place of a name, also those that others subscribe to and query (`subscribed`, `queried`).
+    A role publishes Health under its own name only; a mirror publishes, answers and receives under its name only. All
+    other keys have "*" in place of a name, also those that others subscribe to and query (`subscribed`, `queried`).
     """
 
     role: str
@@ -38,8 +38,8 @@ class Grant:
 
 def roles(mirrors: Iterable[str]) -> tuple[str, ...]:
     """Every role with a certificate except the router, including `mirrors` such as "mirror-dm"."""
-    alone = [role for role in Role if role is not Role.MIRROR and role not in _LOCAL]
-    return tuple(sorted([*map(str, alone), *mirrors]))
+    unnamed = [role for role in Role if role is not Role.MIRROR and role not in _LOCAL]
+    return tuple(sorted([*map(str, unnamed), *mirrors]))
 
 
 def grant(role: str) -> Grant:

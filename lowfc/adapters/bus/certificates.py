@@ -35,7 +35,7 @@ def make_certificates(
     Args:
         folder: folder of the authority; created with access for this user only.
         roles: roles to make certificates for, including the router's.
-        addresses: names and IP addresses by which other hosts reach the router; empty to renew the present ones.
+        addresses: names and IP addresses by which other hosts reach the router; empty to keep those of its certificate.
         days: validity of the certificates, days.
         renew: also renew existing certificates, with their present keys; the authority is never renewed.
 
@@ -50,14 +50,14 @@ def make_certificates(
     try:
         missing = [role for role in roles if renew or not (folder / f"{role}.pem").exists()]
         if renew and not names and (folder / f"{ROUTER}.pem").exists():
-            names = _names(folder)
+            names = _router_addresses(folder)
         if ROUTER in missing and not names:
             raise ConfigurationError(
                 "the router's certificate needs its address: give the name by which others reach it"
             )
         if renew and not (folder / CA).exists():
             raise ConfigurationError(f"{folder} has no authority whose certificates could be renewed")
-        if ROUTER not in missing and (lacking := [one.value for one in names if one not in _names(folder)]):
+        if ROUTER not in missing and (lacking := [n.value for n in names if n not in _router_addresses(folder)]):
             raise ConfigurationError(
                 f"the router's certificate is not for {', '.join(map(str, lacking))}: renew it, with all its addresses"
             )
@@ -99,12 +99,12 @@ def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]
     return key, certificate
 
 
-def _names(folder: Path) -> list[x509.GeneralName]:
+def _router_addresses(folder: Path) -> list[x509.GeneralName]:
     """Addresses of the router's present certificate."""
     file = folder / f"{ROUTER}.pem"
     with contextlib.suppress(ValueError, x509.ExtensionNotFound):
-        found = x509.load_pem_x509_certificate(file.read_bytes()).extensions
-        return list(found.get_extension_for_class(x509.SubjectAlternativeName).value)
+        extensions = x509.load_pem_x509_certificate(file.read_bytes()).extensions
+        return list(extensions.get_extension_for_class(x509.SubjectAlternativeName).value)
     raise DataFileError(f"{file} is not a router's certificate; remove it to have a new one made")
 
 
@@ -117,9 +117,9 @@ def _own_key(folder: Path, role: str) -> EllipticCurvePrivateKey:
         write_whole(file, _pem(own), mode=0o600)
         return own
     with contextlib.suppress(ValueError, TypeError):
-        found = load_pem_private_key(file.read_bytes(), password=None)
-        if isinstance(found, EllipticCurvePrivateKey):
-            return found
+        stored = load_pem_private_key(file.read_bytes(), password=None)
+        if isinstance(stored, EllipticCurvePrivateKey):
+            return stored
     raise DataFileError(f"{file} is not a key made by lowfc; remove it to have a new one made")
 
 
@@ -157,12 +157,12 @@ def _name(common: str) -> x509.Name:
 def _general_name(address: str) -> x509.GeneralName:
     with contextlib.suppress(ValueError):
         return x509.IPAddress(ipaddress.ip_address(address))
-    if not address or not address.isascii() or not set(address) <= _IN_A_NAME:
+    if not address or not address.isascii() or not set(address) <= _NAME_CHARACTERS:
         raise ConfigurationError(f"the router's address is a host's name or IP address, without port; got {address!r}")
     return x509.DNSName(address)
 
 
-_IN_A_NAME = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789.-")
+_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789.-")
 
 
 def _pem(key: EllipticCurvePrivateKey) -> bytes:

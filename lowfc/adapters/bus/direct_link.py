@@ -63,14 +63,14 @@ class DirectWriter:
         if now_s < self._retry_s:
             return
         self._retry_s = now_s + _RETRY_S
-        made = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
-            made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)  # the kernel grants up to its limit
-            made.connect(self._path)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)  # granted up to the host's limit
+            connection.connect(self._path)
         except OSError:  # no listener, or not yet
-            made.close()
+            connection.close()
         else:
-            self._socket = made
+            self._socket = connection
 
 
 class DirectCall:
@@ -94,10 +94,10 @@ class DirectReader:
     """Forwards each message once, from the socket or the bus, whichever is first.
 
     A copy is recognised by its envelope; the sequence alone is not enough, as two publishers may have started in the
-    same second. The bus is unsubscribed while the only publisher of a topic uses the socket; its messages that arrive
+    same second. The reader leaves the bus while the only publisher of a topic uses the socket; messages that arrive
     over the bus after a newer one from the socket are dropped as late. The socket keeps the publisher's order: a
-    message out of order is forwarded, and so, while the bus is unsubscribed, is a repetition of the newest. On a topic
-    with several publishers the bus stays subscribed, and a message that only the bus carried may follow a newer one.
+    message out of order is forwarded, and so, without the bus, is a repetition of the newest. On a topic with several
+    publishers the reader stays on the bus, and a message that only the bus carried may follow a newer one.
     """
 
     def __init__(
@@ -130,9 +130,9 @@ class DirectReader:
         self._turn = threading.Lock()
         self._key = key
         self._closed = False
-        self._recent, self._before = set[tuple[int, int]](), set[tuple[int, int]]()
+        self._recent, self._older = set[tuple[int, int]](), set[tuple[int, int]]()
         self._first = self._newest = -1  # sequences: first one from the socket, newest one from either path
-        self._both = False
+        self._on_both_paths = False
         self._leave_bus: Callable[[], None] | None = lambda: None  # a message may arrive before `subscribe` returns
         self._leave_bus = subscribe(self._by_bus)
         path.unlink(missing_ok=True)  # left by an earlier process: each role runs only once
@@ -155,7 +155,7 @@ class DirectReader:
                     self._forward(sample)
         except Exception as fault:
             self._failed(fault)
-        if self._both:
+        if self._on_both_paths:
             self._leave()
 
     def close(self) -> None:
@@ -165,7 +165,7 @@ class DirectReader:
         self._closed = True
         _shut_down(self._listener)
         self._accepting.join(1)
-        self._both = True
+        self._on_both_paths = True
         self._leave()
 
     def _by_bus(self, sample: Sample) -> None:
@@ -174,16 +174,16 @@ class DirectReader:
             if not late and not self._is_copy(sample):
                 self._forward(sample)
             elif not self._shared and 0 <= self._first <= sample.sequence:
-                self._both = True  # received over both paths: the bus can be unsubscribed
+                self._on_both_paths = True  # received over both paths: the bus can be unsubscribed
 
     def _is_copy(self, sample: Sample) -> bool:
         """Whether the other path brought this message; if not, remember it."""
         envelope = sample.sequence, sample.publish_time_ns
-        if envelope in self._recent or envelope in self._before:
+        if envelope in self._recent or envelope in self._older:
             return True
         self._recent.add(envelope)
         if len(self._recent) == _RECENT:
-            self._before, self._recent = self._recent, set()
+            self._older, self._recent = self._recent, set()
         return False
 
     def _forward(self, sample: Sample) -> None:
@@ -196,35 +196,35 @@ class DirectReader:
         """Unsubscribe from the bus, as messages arrive over both paths."""
         if self._leave_bus is not None:
             self._leave_bus()
-            self._leave_bus, self._both = None, False
+            self._leave_bus, self._on_both_paths = None, False
 
     def writer_gone(self) -> None:
         """Subscribe to the bus again after a writer has disconnected."""
         with self._turn:
-            self._both, self._first, self._newest = False, -1, -1
+            self._on_both_paths, self._first, self._newest = False, -1, -1
         if self._leave_bus is None and not self._closed:
             self._leave_bus = self._subscribe(self._by_bus)
 
     def _accept(self) -> None:
         """Serve one writer at a time: a new writer replaces the previous one."""
-        served: threading.Thread | None = None
+        serving: threading.Thread | None = None
         connection: socket.socket | None = None
         with self._listener:
             while True:
-                coming = None
+                accepted = None
                 with contextlib.suppress(OSError):
-                    coming, _ = self._listener.accept()
-                if coming is None and not self._closed:  # for example without free file descriptors
+                    accepted, _ = self._listener.accept()
+                if accepted is None and not self._closed:  # for example without free file descriptors
                     time.sleep(_RETRY_S)
                     continue
-                if served is not None and connection is not None:
+                if serving is not None and connection is not None:
                     _shut_down(connection)
-                    served.join()
-                if coming is None:
+                    serving.join()
+                if accepted is None:
                     return
-                connection = coming
-                served = threading.Thread(target=self._serve, args=(connection,), name="direct-link", daemon=True)
-                served.start()
+                connection = accepted
+                serving = threading.Thread(target=self._serve, args=(connection,), name="direct-link", daemon=True)
+                serving.start()
 
     def _serve(self, connection: socket.socket) -> None:
         with connection:
@@ -244,7 +244,7 @@ class DirectReader:
             self.take(bytes(buffer[: min(size, _ENVELOPE_BYTES)]), bytes(buffer[_ENVELOPE_BYTES:size]), now_ns)
 
 
-def _shut_down(one: socket.socket) -> None:
+def _shut_down(end: socket.socket) -> None:
     """Shut a socket down to wake the thread that accepts or receives on it."""
     with contextlib.suppress(OSError):
-        one.shutdown(socket.SHUT_RDWR)
+        end.shutdown(socket.SHUT_RDWR)

@@ -8,9 +8,9 @@ from lowfc.adapters.logs.sequence_gaps import Arrivals
 
 MAX_IN_A_ROW = 16
 """Messages dispatched back to back before waiting ones are skipped."""
-REST_NS = 50_000
-"""A gap of this length means that no message was waiting."""
-LONG_AGO_NS = 5_000_000
+QUEUED_WITHIN_NS = 50_000
+"""A message received within this time of the end of the previous one's dispatch was queued."""
+OLD_NS = 5_000_000
 """Age from which any message counts as superseded, or three periods if that is longer."""
 
 
@@ -43,7 +43,7 @@ class Dispatch(Arrivals):
         self._handler = handler
         self._now_ns = now_ns
         self._period_ns = period_ns
-        self._old_ns = max(LONG_AGO_NS, 3 * (period_ns or 0))
+        self._old_ns = max(OLD_NS, 3 * (period_ns or 0))
         self._superseded = superseded
         self._turn = threading.Lock()
         self._skipped = 0
@@ -60,7 +60,7 @@ class Dispatch(Arrivals):
         with self._turn:
             handler: Callable[[Sample], None] | None = self._handler
             if self._period_ns is not None:
-                queued = sample.receive_time_ns - self._done_ns <= REST_NS
+                queued = sample.receive_time_ns - self._done_ns <= QUEUED_WITHIN_NS
                 self._in_a_row = self._in_a_row + 1 if queued else 1
                 age_ns = sample.receive_time_ns - sample.publish_time_ns
                 if self._in_a_row > MAX_IN_A_ROW:

@@ -14,7 +14,7 @@ MAX_WAIT_S = 0.5
 class Mailbox(Arrivals):
     """Holds the message received last; the next one replaces it.
 
-    One thread takes. A bare lock ends its wait: in CPython this is the cheapest wait with a timeout.
+    Only one thread calls `take`. It waits on a bare lock: in CPython this is the cheapest wait with a timeout.
     """
 
     def __init__(self, key: str = "") -> None:

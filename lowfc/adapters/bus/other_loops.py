@@ -1,4 +1,4 @@
-"""Find loops on this host by listing processes, for a user in whose runtime directory none is found."""
+"""Search of this host's processes for loops, when the user's runtime directory has none."""
 
 import contextlib
 import itertools
@@ -21,16 +21,16 @@ _START_S = 600.0  # the first start computes the optical model
 
 def none_here() -> str:
     """Sentence for an error when no loop is found: the folder that was searched, and other loops on this host."""
-    found = list(other_loops())
-    if transient := [text for text, starting in found if starting]:
+    loops = list(other_loops())
+    if transient := [text for text, starting in loops if starting]:
         return f"{transient[0]}, which is starting or ending: try again in a few seconds"
     origin = f"from {_FOLDER}" if os.environ.get(_FOLDER) else f"{_FOLDER} is not set"
     message = (
-        f"no loop of user {_name(os.geteuid())} is running here: {runtime_path()} was searched ({origin}); loops of "
-        f"other users, or started with another {_FOLDER}, cannot be reached"
+        f"no loop of user {_user_name(os.geteuid())} is running here: {runtime_path()} was searched ({origin}); loops "
+        f"of other users, or started with another {_FOLDER}, cannot be reached"
     )
-    more = [f"and {len(found) - _MAX_LISTED} more"] if len(found) > _MAX_LISTED else []
-    return "; ".join([message, *(text for text, _ in found[:_MAX_LISTED]), *more])
+    unlisted = [f"and {len(loops) - _MAX_LISTED} more"] if len(loops) > _MAX_LISTED else []
+    return "; ".join([message, *(text for text, _ in loops[:_MAX_LISTED]), *unlisted])
 
 
 def other_loops() -> Iterator[tuple[str, bool]]:
@@ -41,11 +41,11 @@ def other_loops() -> Iterator[tuple[str, bool]]:
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):  # it has ended, or is not readable
             program = _program(process.cmdline())
-            above = process.parent() if program else None
-            if program and process.pid != os.getpid() and not (above and _program(above.cmdline())):
+            parent = process.parent() if program else None
+            if program and process.pid != os.getpid() and not (parent and _program(parent.cmdline())):
                 owner = process.uids().effective
-                who = "you run" if owner == os.geteuid() else f"user {_name(owner)} runs"
-                where, starting = _where(process, owner)
+                who = "you run" if owner == os.geteuid() else f"user {_user_name(owner)} runs"
+                where, starting = _runtime_directory(process, owner)
                 yield f"{who} `{program}` (process {process.pid}){where}", starting
 
 
@@ -60,22 +60,22 @@ def _program(words: Sequence[str]) -> str:
     return ""
 
 
-def _where(process: psutil.Process, owner: int) -> tuple[str, bool]:
-    """Clause on the runtime directory of a process, and whether it is new and in this user's, which needs no clause.
+def _runtime_directory(process: psutil.Process, owner: int) -> tuple[str, bool]:
+    """Clause on the runtime directory of a process, and whether this is a new process of this user in this directory.
 
-    The clause is also empty for another user's process that is not readable.
+    The clause is empty for such a process, and for another user's that is not readable.
     """
     try:
-        there = process.environ().get(_FOLDER, "")
+        folder = process.environ().get(_FOLDER, "")
     except psutil.Error:
         return "", False
-    if owner == os.geteuid() and there == os.environ.get(_FOLDER, ""):
+    if owner == os.geteuid() and folder == os.environ.get(_FOLDER, ""):
         starting = time.time() - process.create_time() < _START_S
         return "" if starting else ", but its directory is gone, as after a logout: stop and restart it", starting
-    return f", with {_FOLDER}={there}" if there else f", without {_FOLDER}", False
+    return f", with {_FOLDER}={folder}" if folder else f", without {_FOLDER}", False
 
 
-def _name(user: int) -> str:
+def _user_name(user: int) -> str:
     try:
         return pwd.getpwuid(user).pw_name
     except KeyError:

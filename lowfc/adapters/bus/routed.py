@@ -27,7 +27,7 @@ CA_KEY = "ca.key"
 
 CONNECT_MS = 1000
 LEASE_MS = 2000
-_ALERT_S = 0.5
+_ALERT_S = 0.5  # in which a router that refuses the certificate sends its TLS alert
 _ABSENT = {
     *(errno.ECONNREFUSED, errno.ECONNRESET, errno.ETIMEDOUT),
     *(errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ENETUNREACH, errno.ENETDOWN),
@@ -205,22 +205,22 @@ def require_certificate(network: Network, role: str) -> None:
 
 
 def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
-    """Warnings on this host's certificates: absent, invalid, ending within `WARN_DAYS`, or with a key open to all."""
+    """Warnings on this host's certificates: absent, invalid, ending within `WARN_DAYS`, or a key that all can read."""
     folder = user_path(network.certificates)
     roles = sorted(key.stem for key in folder.glob("*.key") if key.name != CA_KEY)
     warnings = [] if roles else [f"{folder} has no certificate with its key, ROLE.pem and ROLE.key"]
     for role in roles:
         try:
-            found = read_certificate(*certificate_files(network, role), server=role == ROUTER)
+            certificate = read_certificate(*certificate_files(network, role), server=role == ROUTER)
         except DataFileError as fault:
             warnings.append(str(fault))
             continue
         key = folder / f"{role}.key"
         if key.stat().st_mode & stat.S_IROTH:
             warnings.append(f"{key} can be read by every user of this host, who could then act as {role}: chmod o-rwx")
-        if (left := found.ends - now) < datetime.timedelta(days=WARN_DAYS):
+        if (left := certificate.ends - now) < datetime.timedelta(days=WARN_DAYS):
             days = counted(left.days, "day")
-            warnings.append(f"{role}'s certificate ends in {days}, on {found.ends:%Y-%m-%d}: lowfc certs --renew")
+            warnings.append(f"{role}'s certificate ends in {days}, on {certificate.ends:%Y-%m-%d}: lowfc certs --renew")
     return warnings
 
 

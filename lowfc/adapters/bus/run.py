@@ -242,13 +242,13 @@ def runtime_base() -> Path:
 def own_directory(path: Path) -> Path:
     """Check that `path` is a directory of this user, closed to all others and not a link; otherwise DataFileError."""
     try:
-        found = path.lstat()
+        status = path.lstat()
     except OSError as fault:  # such as a run that ends at this moment
         raise DataFileError(f"{path} cannot be read: {fault.strerror}") from fault
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077:
         raise DataFileError(
-            f"{path} should be a directory of user {os.geteuid()} with mode 700, and is {stat.filemode(found.st_mode)} "
-            f"of user {found.st_uid}; remove it if it is not somebody else's"
+            f"{path} should be a directory of user {os.geteuid()} with mode 700, and is "
+            f"{stat.filemode(status.st_mode)} of user {status.st_uid}; remove it if it is not somebody else's"
         )
     return path
 
@@ -277,7 +277,7 @@ def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], netw
     """Create the directory under another name and rename it; a later process uses the first one's directory."""
     # Monitors connect and do not listen: there may be several, and no other process connects to them.
     roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, *listeners]
-    taken = set[int]()  # a killed run would seem to be running again, and one that starts later could not listen
+    taken = set[int]()  # by other runs: a killed one would seem to run again, and one not yet started could not listen
     for other in path.parent.glob(f"*/{_LINKS}"):
         with contextlib.suppress(DataFileError):
             taken |= set(_read(other.parent).ports.values())
@@ -302,12 +302,12 @@ def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], netw
 def _read(path: Path) -> Links:
     file = path / _LINKS
     try:
-        found = json.loads(file.read_text())
-        ports = {str(role): int(port) for role, port in found["ports"].items()}
-        if found["run_id"] != path.name or not all(0 < port < 1 << 16 for port in ports.values()):
-            raise ValueError("of another run, or an invalid port")
-        network = Network.model_validate(found.get("network", {}))
-        return Links(path.name, ports, str(found["user"]), path / _CREDENTIALS, network)
+        links = json.loads(file.read_text())
+        ports = {str(role): int(port) for role, port in links["ports"].items()}
+        if links["run_id"] != path.name or not all(0 < port < 1 << 16 for port in ports.values()):
+            raise ValueError("it belongs to another run, or has an invalid port")
+        network = Network.model_validate(links.get("network", {}))
+        return Links(path.name, ports, str(links["user"]), path / _CREDENTIALS, network)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as fault:
         raise DataFileError(
             f"{file} should hold run_id, user and ports as JSON, and could not be read ({fault}); {_ADVICE}: {path}"
@@ -315,10 +315,11 @@ def _read(path: Path) -> Links:
 
 
 def free_ports(count: int, taken: AbstractSet[int] = frozenset()) -> list[int]:
-    """Return unused loopback TCP ports below the host's ephemeral range, or in it if it begins at 15000 or below.
+    """Return free loopback TCP ports; BusError if there are too few.
 
-    None of the former is `taken`; BusError if too few are free. Any outgoing connection may take an ephemeral port
-    before its role listens; one retried to such a port without a listener may be assigned it, and connect to itself.
+    They are not `taken` and below the host's ephemeral range, or any in it if the range begins at 15000 or below. An
+    outgoing connection could take an ephemeral port before its role listens, and one retried to such a port could be
+    given that port as its own, and connect to itself.
     """
     candidates = sorted({*range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))} - taken)
     chooser = random.SystemRandom()

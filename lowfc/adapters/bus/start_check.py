@@ -23,12 +23,12 @@ class StartCheck:
         self._ahead_s = round(max_ahead_h * _HOUR_S)
         self._refused = refused
         self._reported_s = self._reported_at_s = 0
-        self._compares = max_ahead_h > 0 and not clock.lockstep
+        self._enabled = max_ahead_h > 0 and not clock.lockstep
         self._allowed = 0
 
     def ahead(self, sequence: int) -> bool:
         """Whether this sequence starts too far ahead."""
-        if sequence < self._allowed or not self._compares:  # time only increases: an allowed sequence stays allowed
+        if sequence < self._allowed or not self._enabled:  # time only increases: an allowed sequence stays allowed
             return False
         now_s = self._clock.host_ns() // _NS
         self._allowed = sequence_of(now_s + self._ahead_s + 1, 0)

@@ -118,15 +118,15 @@ class ZenohRing:
 
     def drain(self) -> list[Sample]:
         """See `Ring.drain`."""
-        found: list[Sample] = []
+        samples: list[Sample] = []
         now_ns = self._bus.clock.host_ns()
         with usable(self._expression):
             while (sample := self._subscriber.try_recv()) is not None:
                 try:
-                    found.append(self._bus.read(sample, now_ns, self._key))
+                    samples.append(self._bus.read(sample, now_ns, self._key))
                 except Exception as fault:
                     self._bus.faults.add(f"{self._bus.role}: ring of", self._expression, fault)
-        return found
+        return samples
 
     def close(self) -> None:
         """See `Ring.close`."""
@@ -155,7 +155,7 @@ class ZenohBus:
             clock: clock of the run.
             monitor: whether this process is a monitor, which polls `Ring`s. It gets `latest_only` topics at display
                 rate, spare receive buffers and a single receive thread: half the cost. Set it in a process's first bus.
-            beside: bus of another role in this process, which has subscribed: its direct link is then a function call.
+            beside: bus of another role in this process, already subscribed: the direct link to it is a function call.
 
         Raises:
             BusError: the role's port is in use, or the role runs on another host; zenoh refuses the configuration, or
@@ -396,5 +396,5 @@ def _sample_across_hosts(
     offset: ClockOffset, sample: zenoh.Sample, receive_time_ns: int, key: str | None = None
 ) -> Sample:
     """As `_sample`, across hosts: the publish time converted to this host's clock."""
-    found = _sample(sample, receive_time_ns, key)
-    return found._replace(publish_time_ns=found.publish_time_ns - offset.offset_ns)
+    received = _sample(sample, receive_time_ns, key)
+    return received._replace(publish_time_ns=received.publish_time_ns - offset.offset_ns)

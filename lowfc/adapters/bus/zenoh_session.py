@@ -53,17 +53,17 @@ def close_links_at_once(session: zenoh.Session) -> None:
     def changed(event: zenoh.LinkEvent) -> None:
         if event.kind != zenoh.SampleKind.PUT or event.link.src.startswith(_SOCKET):  # a Unix socket closes at once
             return
-        far = event.link.dst.rpartition(":")[2] if event.link.dst.startswith("tls/") else ""
+        tls_port = event.link.dst.rpartition(":")[2] if event.link.dst.startswith("tls/") else ""
         for descriptor in (int(path.name) for path in Path("/proc/self/fd").iterdir()):
             with contextlib.suppress(OSError):  # not a socket, or closed since
-                found = socket.socket(fileno=descriptor)
+                opened = socket.socket(fileno=descriptor)
                 try:
-                    if found.family in (socket.AF_INET, socket.AF_INET6):
-                        found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
-                        if str(found.getpeername()[1]) == far:
-                            found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LEASE_MS)
+                    if opened.family in (socket.AF_INET, socket.AF_INET6):
+                        opened.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+                        if str(opened.getpeername()[1]) == tls_port:
+                            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LEASE_MS)
                 finally:
-                    found.detach()
+                    opened.detach()
 
     session.info.declare_link_events_listener(Callback(changed, indirect=False), history=True)
 
@@ -92,7 +92,7 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
     return {
         "mode": "peer",
         # Peers do not forward, so each connects to all others; with a timeout of -1 any start order works.
-        "listen": {"endpoints": [one for one in listening if one], "exit_on_failure": True, "timeout_ms": 0},
+        "listen": {"endpoints": [link for link in listening if link], "exit_on_failure": True, "timeout_ms": 0},
         "connect": {
             "endpoints": [
                 (_socket(links, name) if monitor else None) or _address(links, name)
