@@ -125,7 +125,7 @@ def missing(implementation: Implementation, options: argparse.Namespace) -> str:
         how = "python -m venv DIR && DIR/bin/pip install pyrtcao, then --pyrtcao DIR/bin/python"
         return f"pyrtcao is not installed in {options.pyrtcao}: {how}"
     if implementation.kernel == FUSED_KERNEL and not compiled.available():
-        return compiled.missing()
+        return compiled.advice()
     return ""
 
 

@@ -160,7 +160,7 @@ def test_a_process_with_many_starts_is_stored_once(hub: MemoryHub) -> None:
         stranger.put(health(number))
         assert camera.has_newcomers()
     assert not camera.has_newcomers()
-    assert len(camera._known) == 1
+    assert len(camera._known_starts) == 1
 
 
 def test_forged_names_do_not_fill_launcher_and_viewer(hub: MemoryHub) -> None:

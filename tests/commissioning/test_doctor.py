@@ -70,7 +70,7 @@ METAL = {
     HUGE_PAGES: "always [madvise] never\n",
     CLOCKSOURCE: "tsc\n",
     "usable_cpus": {0, 1, 2, 3},
-    "open_files": 1024,
+    "max_open_files": 1024,
     "swap": (0, 0),
     "stolen_share": 0.0,
     "load": 0.15,
@@ -182,7 +182,7 @@ def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
         ("huge pages", "warning", "always", {HUGE_PAGES: "[always] madvise never\n"}),
         ("socket buffers", "warning", "550 kB", {"proc/sys/net/ipv4/tcp_rmem": "4096 131072 550000\n"}),
         ("socket buffers", "ok", "560 kB", {"proc/sys/net/ipv4/tcp_rmem": "4096 131072 560000\n"}),
-        ("open files", "warning", "64", {"open_files": 64}),
+        ("open files", "warning", "64", {"max_open_files": 64}),
         (
             "synchronisation",
             "ok",

@@ -1,4 +1,4 @@
-"""A child process that ends with its parent; keeps its standard error."""
+"""A child process that ends with its parent; its standard error is kept in a file."""
 
 import contextlib
 import errno
@@ -49,10 +49,10 @@ class Child:
         """
         if shutil.which(self.command[0], path=(self.environment or os.environ).get("PATH")) is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self.command[0])
-        death = [sys.executable, "-I", "-S", "-c", _WRAPPER, str(self.death_signal.value), str(os.getpid())]
+        wrapper = [sys.executable, "-I", "-S", "-c", _WRAPPER, str(self.death_signal.value), str(os.getpid())]
         with self.stderr_path.open("wb") as errors, self.stdout_path.open("wb") as output:
             self.process = subprocess.Popen(  # noqa: S603  # our own programs, and the viewer's
-                [*death, *self.command],
+                [*wrapper, *self.command],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=errors,
@@ -86,7 +86,7 @@ class Child:
         """One line on how the process ended."""
         status = self.status
         if status is not None and status < 0:
-            names = {one.value: one.name for one in signal.Signals}  # without most real-time signals
+            names = {known.value: known.name for known in signal.Signals}  # without most real-time signals
             return f"{self.name} was killed by {names.get(-status, f'signal {-status}')}"
         return f"{self.name} ended with exit status {status}"
 

@@ -44,7 +44,7 @@ class HostClock:
     now_ns = host_ns
 
     def ahead_ns(self) -> int:
-        """Present lead over the wall clock."""
+        """Present lead over the wall clock, ns."""
         return self.host_ns() - time.time_ns()
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
@@ -85,7 +85,7 @@ def boot_file(base: Path | None = None) -> Path:
 
 
 def boot_offset_ns(base: Path) -> int:
-    """Offset of CLOCK_MONOTONIC from the epoch, ns; the first call since the boot fixes it.
+    """Offset to add to CLOCK_MONOTONIC for time since the epoch, ns; the first call since the boot fixes it.
 
     DataFileError if its file in `base` is damaged, or cannot be read or made.
     """
@@ -99,5 +99,5 @@ def boot_offset_ns(base: Path) -> int:
     except ValueError:
         raise DataFileError(
             f"{path} should hold this boot's clock offset in ns, got {text[:40]!r}; stop all lowfc processes, remove "
-            "it and start them again"
+            "this file and start them again"
         ) from None

@@ -1,7 +1,7 @@
 """Offset between two hosts' clocks, from the shortest of recent round trips, as in NTP.
 
-The other clock is read between query and receipt. The estimate assumes the middle, so that its error is at most half
-the round trip; the shortest round trip is therefore the best.
+The other clock is read between query and receipt. The estimate assumes that it is read in the middle, so that the error
+is at most half the round trip; the shortest round trip is therefore the best.
 """
 
 import threading

@@ -25,15 +25,15 @@ def available() -> bool:
     return importlib.util.find_spec("numba") is not None
 
 
-def missing() -> str:
-    """Advice if the fused step cannot be compiled."""
+def advice() -> str:
+    """Reason why the fused step cannot be compiled, and what to do; to be called only if it cannot."""
     if not available():
         return f"the fused step needs numba: {install_advice('fast')}"
     try:
         importlib.import_module("numba")
     except ImportError as fault:  # it may be too old for numpy
-        advice = install_advice("fast").replace("install ", "install --upgrade ")
-        return f"numba cannot be imported ({fault}); upgrade it: {advice}"
+        upgrade = install_advice("fast").replace("install ", "install --upgrade ")
+        return f"numba cannot be imported ({fault}); upgrade it: {upgrade}"
     return "this host forbids compiling at run time: allow memory that is writable and executable"
 
 
@@ -48,7 +48,7 @@ def kernel(name: str, threads: int = 1) -> Kernel:
         return NUMPY
     try:
         measure, respond, measure_blocks = _compiled()
-    except (ImportError, PermissionError):  # the second of SELinux, or of a unit with MemoryDenyWriteExecute
+    except (ImportError, PermissionError):  # PermissionError: by SELinux, or in a unit with MemoryDenyWriteExecute
         return NUMPY
     return Kernel(FUSED, measure if threads == 1 else Pool(measure, measure_blocks, threads).measure, respond)
 
@@ -132,11 +132,11 @@ def _compiled() -> list[Any]:
     options: dict[str, Any] = {"fastmath": set(FASTMATH), "error_model": "numpy"}
     for called in (functions.scan, functions.measure_blocks):
         register_jitable(**options)(called)
-    found = []
+    compiled = []
     for function, signature in signatures.items():
         shared = {"nogil": function is functions.measure_blocks}
         try:
-            found.append(njit(signature, cache=True, **options, **shared)(function))
+            compiled.append(njit(signature, cache=True, **options, **shared)(function))
         except RuntimeError:  # no writable cache folder
-            found.append(njit(signature, **options, **shared)(function))
-    return found
+            compiled.append(njit(signature, **options, **shared)(function))
+    return compiled

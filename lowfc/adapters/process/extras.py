@@ -16,7 +16,8 @@ def install_advice(extra: str) -> str:
         required = metadata.requires("lowfc") or []
     except metadata.PackageNotFoundError:  # a checkout on the path that is not installed
         return f"{pip} -e '.[{extra}]' in its checkout"
-    names = [one.partition(";")[0].strip() for one in required if re.search(rf"extra == ['\"]{extra}['\"]", one)]
+    of_extra = [line for line in required if re.search(rf"extra == ['\"]{extra}['\"]", line)]
+    names = [line.partition(";")[0].strip() for line in of_extra]
     return " ".join([pip, *(f"'{name}'" for name in names)])
 
 

@@ -18,11 +18,11 @@ import psutil
 CPUS = "sys/devices/system/cpu"
 _STA_UNSYNC, _STA_NANO, _TIME_ERROR = 0x40, 0x2000, 5
 _STAT = Path("/proc/stat")
-_MOST = 1 << 14  # bytes read of a file; of /proc/stat, beyond the beginning of the processor's line
+_MAX_READ_BYTES = 1 << 14  # of a file; of /proc/stat, beyond the beginning of the processor's line
 
 
 class Synchronisation(NamedTuple):
-    """State of CLOCK_REALTIME: kept by a daemon or not, remaining correction, and largest error."""
+    """State of CLOCK_REALTIME: whether a daemon synchronises it, the remaining correction, and the largest error."""
 
     synchronised: bool
     offset_s: float
@@ -49,11 +49,11 @@ class Host:
     def cpus(self, which: str) -> set[int]:
         """Processors in a list of the kernel: `online`, `isolated` (isolcpus), `nohz_full`."""
         read = self.text_or_nothing if which == "nohz_full" else self.text  # not every kernel has it
-        found: set[int] = set()
+        numbers: set[int] = set()
         for part in filter(None, read(f"{CPUS}/{which}").replace("(null)", "").split(",")):
             first, _, last = part.partition("-")
-            found |= set(range(int(first), int(last or first) + 1))
-        return found
+            numbers |= set(range(int(first), int(last or first) + 1))
+        return numbers
 
     def usable_cpus(self) -> set[int]:
         """Processors that this process may run on."""
@@ -71,15 +71,15 @@ class Host:
         """The kernel's clock source."""
         return self.text("sys/devices/system/clocksource/clocksource0/current_clocksource")
 
-    def open_files(self) -> int | None:
+    def max_open_files(self) -> int | None:
         """Limit on open files and sockets of this process; None without a limit."""
         limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         return None if limit == resource.RLIM_INFINITY else limit
 
     def swap(self) -> tuple[int, int]:
         """Swap space in bytes: total and used."""
-        found = psutil.swap_memory()
-        return found.total, found.used
+        memory = psutil.swap_memory()
+        return memory.total, memory.used
 
     def stolen_share(self) -> float:
         """Fraction of all processor time since boot that the hypervisor gave to other guests."""
@@ -93,20 +93,20 @@ class Host:
 
     def busy(self) -> list[tuple[str, float]]:
         """Other processes, busiest first: name (pid), and load in processors since the last call."""
-        found = [process.info for process in psutil.process_iter(["pid", "name", "cpu_percent"])]
-        shares = [
-            (f"{one['name']} ({one['pid']})", (one["cpu_percent"] or 0.0) / 100)
-            for one in found
-            if one["pid"] != os.getpid()
+        processes = [process.info for process in psutil.process_iter(["pid", "name", "cpu_percent"])]
+        loads = [
+            (f"{info['name']} ({info['pid']})", (info["cpu_percent"] or 0.0) / 100)
+            for info in processes
+            if info["pid"] != os.getpid()
         ]
-        return sorted(shares, key=lambda one: -one[1])
+        return sorted(loads, key=lambda load: -load[1])
 
     def disk(self, folder: Path) -> tuple[int, bool]:
         """Free bytes on the disk of a folder, which may not exist yet, and whether it is writable."""
-        there = self.root / folder.absolute().relative_to("/")
-        while not there.exists():
-            there = there.parent
-        return psutil.disk_usage(str(there)).free, os.access(there, os.W_OK)
+        existing = self.root / folder.absolute().relative_to("/")
+        while not existing.exists():
+            existing = existing.parent
+        return psutil.disk_usage(str(existing)).free, os.access(existing, os.W_OK)
 
     def synchronisation(self) -> Synchronisation:
         """State of CLOCK_REALTIME of the running kernel, independent of `root`."""
@@ -150,7 +150,7 @@ class Counters:
         """
         folder = f"/proc/{process}/task/{thread}"
         self._cpu = f"cpu{next(iter(cpus))} " if len(cpus) == 1 else "cpu "
-        self._stat_bytes = _STAT.read_text().index(self._cpu) + _MOST
+        self._stat_bytes = _STAT.read_text().index(self._cpu) + _MAX_READ_BYTES
         names = _STAT, f"{folder}/schedstat", f"{folder}/status", f"/proc/{process}/stat"
         self._stat, self._waits, self._switches, self._faults = (os.open(name, os.O_RDONLY) for name in names)
         group = _quota_file()
@@ -177,11 +177,12 @@ def busiest_thread(process: int, seconds: float) -> int:
 
 
 def _run_ns(process: int) -> dict[int, int]:
-    found = {}
+    """Processor time of each thread of a process so far, ns, by thread id."""
+    run_ns = {}
     for folder in Path(f"/proc/{process}/task").iterdir():
-        with contextlib.suppress(OSError):  # it has ended
-            found[int(folder.name)] = int((folder / "schedstat").read_text().split()[0])
-    return found
+        with contextlib.suppress(OSError):  # the thread has ended
+            run_ns[int(folder.name)] = int((folder / "schedstat").read_text().split()[0])
+    return run_ns
 
 
 def _quota_file() -> Path | None:
@@ -195,7 +196,7 @@ def _quota_file() -> Path | None:
     return None
 
 
-def _content(file: int, size: int = _MOST) -> str:
+def _content(file: int, size: int = _MAX_READ_BYTES) -> str:
     return os.pread(file, size, 0).decode()
 
 

@@ -42,7 +42,7 @@ def join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Serv
 
 
 def join_beside(config: Configuration, service: Service, role: str) -> Service:
-    """Join the run of a process again in another role; direct links within the process are function calls.
+    """Join the run of `service` again, in another role of the same process; direct links in it are function calls.
 
     The service manager is notified by `service` only.
     """

@@ -73,13 +73,13 @@ class Latch:
         self._keeper.join(RETRY_S)
 
     def _exists(self, file: Path) -> bool:
-        for one in (file, file.with_name(FORMER_NAME)) if file.name == NAME else (file,):
+        for path in (file, file.with_name(FORMER_NAME)) if file.name == NAME else (file,):
             try:
-                one.lstat()
+                path.lstat()
             except (FileNotFoundError, NotADirectoryError):
                 continue
             except OSError as fault:
-                self._report(one, f"{one} cannot be read ({fault.strerror}), which counts as safe")
+                self._report(path, f"{path} cannot be read ({fault.strerror}), which counts as safe")
             return True
         return False
 

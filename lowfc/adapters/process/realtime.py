@@ -80,7 +80,8 @@ def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int
 
     The controller gets its own processor if possible: other processes would evict its code and data from the caches,
     and the recorder, which receives each frame at the same time, would run first. With two processors, a simulated
-    camera needs one, and the recorder may use both: a processor whose real-time share is used up stops for 50 ms.
+    camera needs one, and the recorder may use both: on a processor whose real-time share is used up, it would stop for
+    50 ms.
 
     Args:
         cpus: available processors.

@@ -32,7 +32,7 @@ HEALTH_PERIOD_NS = 500_000_000
 WAITING_NS = 2_000_000_000
 """A ready process that waits longer than this for others reports their names."""
 PRINTED, PRINTED_NS = 10, 10_000_000_000
-"""Most warnings of one kind on standard error in this time; all are in the log."""
+"""Largest number of warnings of one kind printed on standard error within this time, ns; all are in the log."""
 WORK: dict[str, str] = {Role.CAMERA: "frame", Role.CONTROLLER: "frame", Role.MIRROR: "command"}
 """What `Service.work` counts in the processes of the loop; other processes have their own summary."""
 ProcessState = Literal["starting", "ready", "running", "stopping", "stopped"]
@@ -86,14 +86,14 @@ class Service:
         self._fault: Exception | None = None
         self._names = Names()
         self._starts: dict[str, int] = {}  # by name; in containers a restarted process has its former id
-        self._known: dict[str, int] = {}
+        self._known_starts: dict[str, int] = {}
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
         self._last_warning: Log | None = None
         self._warned: dict[str, tuple[int, int]] = {}
         self._supervisor = supervisor or Supervisor()
-        self._started_ns = self._beaten_ns = clock.host_ns()
-        self._worked = 0
+        self._started_ns = self._last_health_ns = clock.host_ns()
+        self._last_health_work = 0
         self._due_ns = 0
         self._events = self.publisher(EVENT)
         self._health = self.publisher(HEALTH, name)
@@ -157,8 +157,8 @@ class Service:
 
     def has_newcomers(self) -> bool:
         """Whether a process has joined or restarted since the last call."""
-        before, self._known = self._known, dict(self._starts)
-        return before != self._known
+        before, self._known_starts = self._known_starts, dict(self._starts)
+        return before != self._known_starts
 
     def catch_signals(self) -> None:
         """Stop at SIGTERM and SIGINT; a SIGINT while stopping ends the process at once. For the main thread."""
@@ -205,8 +205,8 @@ class Service:
             self._supervisor.alive(now_ns)
         if self._check_waiting_ns is not None and 0 < self._check_waiting_ns <= now_ns:
             self._check_waiting_ns = 0
-            if whom := self.awaited():
-                self._announce(f"waiting for {whom}")
+            if awaited := self.awaited():
+                self._announce(f"waiting for {awaited}")
         if now_ns >= self._due_ns:
             self._send_health(now_ns)
 
@@ -283,7 +283,7 @@ class Service:
     def health(self) -> wire.Health:
         """Current Health of the process."""
         now_ns = self.clock.host_ns()
-        span_s = max(now_ns - self._beaten_ns, 1) * 1e-9
+        span_s = max(now_ns - self._last_health_ns, 1) * 1e-9
         message = wire.Health(
             timestamp=timestamp(now_ns),
             process=self.name,
@@ -293,13 +293,13 @@ class Service:
             host=self._host,
             version=__version__,
             memory_bytes=resident_bytes(),
-            rate_hz=(self.work - self._worked) / span_s,
+            rate_hz=(self.work - self._last_health_work) / span_s,
             peers_alive=sorted(self.last_health),
             realtime_granted=self._granted.granted,
             realtime_refused=[f"{measure}: {cost}" for measure, cost in self._granted.refused],
             clock_offset_ns=self.clock.offset_ns,
             uptime_ns=now_ns - self._started_ns,
-            topics=[*(self._sent(one) for one in self.publishers), *map(_received, self.arrivals)],
+            topics=[*map(self._sent, self.publishers), *map(_received, self.arrivals)],
         )
         if (warning := self._last_warning) is not None:
             message.last_warning = warning.message
@@ -323,7 +323,7 @@ class Service:
         self._due_ns = now_ns + HEALTH_PERIOD_NS
         self._report_unreadable()
         message = self.health()
-        self._beaten_ns, self._worked = now_ns, self.work
+        self._last_health_ns, self._last_health_work = now_ns, self.work
         self._health.put(message.SerializeToString())
         self._supervisor.send_status(message)
 
@@ -333,7 +333,8 @@ class Service:
             return
         self.last_health[name] = health
         start_s = start_of(sample.sequence)
-        if name not in self._starts or (self._starts[name] != start_s and name != Role.VIEWER):  # may be several
+        # Several viewers may share the name, so that its start alternates.
+        if name not in self._starts or (self._starts[name] != start_s and name != Role.VIEWER):
             self._starts[name] = start_s
             self._due_ns = 0  # publish Health at the next beat, so that a newcomer does not wait for it
 

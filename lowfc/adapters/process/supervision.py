@@ -20,16 +20,16 @@ class Supervisor:
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
-        """Read the manager's socket and its timeout from the environment."""
+        """Read the manager's socket and the watchdog's timeout from the environment."""
         self.period_ns: int | None = None
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = f"\0{address[1:]}" if address.startswith("@") else address  # @: in the abstract namespace
         self._due_ns = 0
         self._sent: set[str] = set()
-        wait_us = environment.get("WATCHDOG_USEC", "")
+        timeout_us = environment.get("WATCHDOG_USEC", "")
         ours = environment.get("WATCHDOG_PID", "") in ("", str(os.getpid()))  # it may be a parent's watchdog
-        if self._address and wait_us.isdecimal() and int(wait_us) > 0 and ours:
-            self.period_ns = int(wait_us) * 1000 // 2
+        if self._address and timeout_us.isdecimal() and int(timeout_us) > 0 and ours:
+            self.period_ns = int(timeout_us) * 1000 // 2
 
     def ready(self) -> None:
         """Notify that the process is ready."""

@@ -41,7 +41,9 @@ class _Group(TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, one.get_short_help_str(limit=999)) for name, one in self.commands.items()])
+            formatter.write_dl(
+                [(name, command.get_short_help_str(limit=999)) for name, command in self.commands.items()]
+            )
 
 
 def new_app(help_text: str) -> typer.Typer:
@@ -72,7 +74,7 @@ def run_app(app: Callable[[], object]) -> NoReturn:
     try:
         try:
             app()
-        finally:  # it ends by SystemExit
+        finally:  # typer ends by SystemExit
             sys.stdout.flush()
     except OSError as fault:
         if fault.filename is None and fault.errno == errno.ENOENT:
@@ -99,7 +101,7 @@ def run_app(app: Callable[[], object]) -> NoReturn:
 def _prepare_process() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup leaves it
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # set by nohup
         signal.signal(signal.SIGHUP, _terminate)
     if os.path.expanduser("~") == "~":  # noqa: PTH111  # Path.home, and astropy with it, would raise RuntimeError
         os.environ["HOME"] = "/"
@@ -111,7 +113,7 @@ def _prepare_process() -> None:
 
 
 def _terminate(number: int, frame: object) -> None:
-    signal.signal(number, signal.SIG_IGN)  # the shell and the kernel may both send one
+    signal.signal(number, signal.SIG_IGN)  # the shell and the kernel may each send SIGHUP
     signal.raise_signal(signal.SIGTERM)
 
 

@@ -37,7 +37,8 @@ class Trial(NamedTuple):
 def try_out(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
     """Request the measures of a process of the loop, and time 1000 wake-ups per second in each scheduling class.
 
-    It runs on `cpus`, or on the caller's if none of them can be used. OSError if its process cannot start, or fails.
+    The trial runs on `cpus`, or on the caller's if none of them can be used. OSError if its process cannot start, or
+    fails.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         try:
@@ -74,8 +75,8 @@ def _try(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
 
     def request(name: str, priority: int | None = None, **measure: bool) -> None:
         measures = {"lock_memory": False, "disable_cpu_idle": False} | measure
-        if found := set_up(priority, None, **measures).refused:
-            refused[name] = found[0]
+        if refusals := set_up(priority, None, **measures).refused:
+            refused[name] = refusals[0]
 
     request("lock_memory", lock_memory=requested.lock_memory)
     request("disable_cpu_idle", disable_cpu_idle=requested.disable_cpu_idle)

@@ -74,7 +74,7 @@ def settings_under(latch: Latch, config: Configuration, event: Callable[..., Non
     configured = config.realtime.kernel
     settings = replace(factory.settings(config), kernel=compiled.kernel(configured, config.realtime.threads))
     if settings.kernel.name != configured:
-        event("KERNEL_MISSING", advice=compiled.missing())
+        event("KERNEL_MISSING", advice=compiled.advice())
     elif settings.kernel is not NUMPY:
         event("KERNEL", kernel=configured)
     if latch.safe:

@@ -82,8 +82,8 @@ def _control_step(facts: Facts) -> Check:
     """Implementation of the control step, `realtime.kernel`: numpy, or the fused step, which needs the extra `fast`."""
     available = compiled.available()
     if facts.config.realtime.kernel == FUSED:
-        return ok("the fused step") if available else warning("numpy, not the fused step", compiled.missing())
-    advice = 'realtime.kernel = "fused"' if available else compiled.missing()
+        return ok("the fused step") if available else warning("numpy, not the fused step", compiled.advice())
+    advice = 'realtime.kernel = "fused"' if available else compiled.advice()
     return note("numpy", advice, "a longer latency from frame to command: see `lowfc latency --kernel both`")
 
 
@@ -138,7 +138,7 @@ def _disk(facts: Facts) -> Check:
 )
 def _open_files(facts: Facts) -> Check:
     """Limit of open files and sockets of a process."""
-    limit = facts.host.open_files()
+    limit = facts.host.max_open_files()
     detail = "no limit" if limit is None else f"{limit}"
     return ok(detail) if limit is None or limit >= _OPEN_FILES else warning(detail)
 

@@ -88,7 +88,7 @@ def latency(
         simulated = camera == "simulated"
         kernels = KERNELS if kernel == "both" else (kernel,) if kernel is not None else ()
         if FUSED in kernels and not compiled.available():
-            raise ConfigurationError(compiled.missing())
+            raise ConfigurationError(compiled.advice())
         if trace and simulated:
             raise ConfigurationError("--trace requires prepared frames: omit --trace or --camera simulated")
         results = _measure(LatencyOptions(settings, duration, repeats, simulated, record, view, kernels, trace))
