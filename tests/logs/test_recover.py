@@ -152,7 +152,7 @@ def test_a_failed_recovery_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: BaseException
 ) -> None:
     part = small_log(tmp_path / "night.mcap", finished=False)
-    monkeypatch.setattr(recovery, "account", Mock(side_effect=fault))  # after all messages are written
+    monkeypatch.setattr(recovery, "origin", Mock(side_effect=fault))  # after all messages are written
     with pytest.raises((KeyboardInterrupt, DataFileError)) as caught:
         recover(part, tmp_path / "new.mcap")
     assert isinstance(caught.value, KeyboardInterrupt) or "cannot be written: No space left" in str(caught.value)

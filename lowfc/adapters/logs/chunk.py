@@ -78,14 +78,14 @@ def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
         CompressionError: its compression is not supported.
     """
     try:
-        _, _, size, crc, named = _FIXED.unpack_from(body)
-        (compressed,) = _COMPRESSED.unpack_from(body, _FIXED.size + named)
+        _, _, size, crc, name_length = _FIXED.unpack_from(body)
+        (compressed,) = _COMPRESSED.unpack_from(body, _FIXED.size + name_length)
     except struct.error as fault:
         raise UnsoundError("a chunk is too short") from fault
-    begin = _FIXED.size + named + _COMPRESSED.size
+    begin = _FIXED.size + name_length + _COMPRESSED.size
     if compressed != len(body) - begin:
         raise UnsoundError("the head of a chunk is damaged")
-    name = body[_FIXED.size : _FIXED.size + named]
+    name = body[_FIXED.size : _FIXED.size + name_length]
     if name not in _COMPRESSIONS:
         raise CompressionError(name[:_MAX_NAME_LENGTH].decode(errors="backslashreplace"))
     decompressed, largest_ratio = _COMPRESSIONS[name]
@@ -95,7 +95,7 @@ def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
         content = decompressed(memoryview(body)[begin:], size)
     except (RuntimeError, EOFError, zstandard.ZstdError) as fault:
         raise UnsoundError("a chunk cannot be decompressed") from fault
-    found = zlib.crc32(content)
-    if found != crc and not (may_lack_crc and crc == 0 and len(content) == size):
+    computed = zlib.crc32(content)
+    if computed != crc and not (may_lack_crc and crc == 0 and len(content) == size):
         raise UnsoundError("the checksum of a chunk is wrong")
-    return Chunk(at, _RECORD_HEAD_BYTES + len(body), found, content)
+    return Chunk(at, _RECORD_HEAD_BYTES + len(body), computed, content)

@@ -18,6 +18,7 @@ from lowfc.control.loop.safety import REASONS, Reason
 STAGES = ("transport", "wakeup", "compute", "publish", "frame_to_command")
 """Stages of the controller, whose durations are in ControlTiming."""
 
+# Type code of `array` for each column that is not float32 ("f").
 _KINDS = {"sequence": "Q", "time_ns": "q", "mode": "B", "reasons": "q", "saturated_pixels": "q", "instants": "q"}
 _BITS = 63  # of an integer column, without the sign
 
@@ -104,7 +105,7 @@ class Columns:
         self._columns: dict[str, array[Any]] = {name: array(kind) for name, kind in kinds.items()}
         self._widths = widths
         self._rows = 0
-        self._each = [(column, widths.get(name, 1)) for name, column in self._columns.items()]
+        self._with_widths = [(column, widths.get(name, 1)) for name, column in self._columns.items()]
 
     def __len__(self) -> int:
         return self._rows
@@ -125,8 +126,8 @@ class Columns:
         except OverflowError:
             self._truncate()
             raise
-        rows = len(self._each[0][0])
-        for column, width in self._each:
+        rows = len(self._with_widths[0][0])
+        for column, width in self._with_widths:
             if len(column) != rows * width:
                 self._truncate()
                 return False
@@ -139,7 +140,7 @@ class Columns:
         return column.reshape(self._rows, self._widths[name]) if name in self._widths else column
 
     def _truncate(self) -> None:
-        for column, width in self._each:
+        for column, width in self._with_widths:
             del column[self._rows * width :]
 
 
@@ -187,10 +188,10 @@ class StepRows(_Rows[Steps]):
 
     def __init__(self, modes: int) -> None:
         super().__init__(Steps, ("error_nm", "pol_nm", "command_nm"), modes)
-        self._refused = [np.nan] * modes
+        self._not_measured = [np.nan] * modes
 
     def _special(self, message: wire.ControlStep) -> dict[str, Any]:
-        measured = {"error_nm": message.error_nm or self._refused, "pol_nm": message.pol_nm or self._refused}
+        measured = {name: getattr(message, name) or self._not_measured for name in ("error_nm", "pol_nm")}
         return measured | {"reasons": bits_of(message.reasons)}
 
 
@@ -274,9 +275,9 @@ def rows_of(sequence: Sequences, among: Sequences) -> Long:
 
 def joined(values: npt.NDArray[Any], rows: Long) -> npt.NDArray[Any]:
     """Rows of `values`; NaN for row -1."""
-    found = values[rows] if values.size else np.zeros((rows.size, *values.shape[1:]), np.float32)
-    found[rows < 0] = np.nan
-    return found
+    selected = values[rows] if values.size else np.zeros((rows.size, *values.shape[1:]), np.float32)
+    selected[rows < 0] = np.nan
+    return selected
 
 
 def exposure_fraction(camera: wire.CameraState | None) -> float | None:

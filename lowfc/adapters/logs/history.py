@@ -118,7 +118,7 @@ class History:
         events: (log time in ns, message) of each event.
         health: last Health of each process, by name.
         commands_late: commands that the camera counted as late from its first Health in the log to its last,
-            restarts included; None without two of them.
+            restarts included; None with fewer than two.
         counts: number of messages, by topic key.
         published: calibrations, laws and played tables, by identity.
         span_ns: log times of the first message that is not retained, and of the last message; (0, 0) without one.
@@ -160,7 +160,7 @@ class History:
         return frame_rate_hz(self.camera, self.steps)
 
     def camera_lag_ns(self, process: str) -> int:
-        """Time to add to a frame's time for another process's clock; publish times are of the recorder's clock."""
+        """Time to add to a frame's time for another process's clock; publish times are on the recorder's clock."""
         camera, other = (self.health.get(name, wire.Health()) for name in (Role.CAMERA, process))
         return camera.router_offset_ns - other.router_offset_ns
 
@@ -178,9 +178,9 @@ class History:
         own = ("", self.calibration.id if self.calibration is not None else "")
         if not (others := [number for number, state in enumerate(states) if state.calibration_id not in own]):
             return np.ones(steps.sequence.shape, np.bool_) & self.under_camera
-        last, *later = (state.frame_sequence for state in states[others[-1] :])  # one is published at every change
-        first = max(last, next(filter(None, later), 0))  # that of a start or a `clear` has no frame
-        return (steps.sequence > first) & self.under_camera
+        last, *later = (state.frame_sequence for state in states[others[-1] :])  # a change publishes a state
+        change = max(last, next(filter(None, later), 0))  # the state of a start or a `clear` has no frame
+        return (steps.sequence > change) & self.under_camera
 
     @cached_property
     def true(self) -> Truths | None:
@@ -188,13 +188,12 @@ class History:
         rows = rows_of(self.steps.sequence, self.truths.sequence)
         if not (rows >= 0).any():
             return None
-        known = self.truths
         values = {
-            one.name: joined(getattr(known, one.name), rows)
-            for one in fields(Truths)
-            if one.name not in ("sequence", "time_ns", "instants")
+            part.name: joined(getattr(self.truths, part.name), rows)
+            for part in fields(Truths)
+            if part.name not in ("sequence", "time_ns", "instants")
         }
-        instants = np.where(rows < 0, 0, known.instants[rows])
+        instants = np.where(rows < 0, 0, self.truths.instants[rows])
         return Truths(self.steps.sequence, self.steps.time_ns, **values, instants=instants)
 
     def reader(self, topic: Topic) -> WholeLog:
@@ -224,14 +223,14 @@ def attached_configuration(log: LogReader) -> tuple[Configuration | None, list[s
 
     None if the log has no readable one: a log is never refused because of its configuration.
     """
-    name, content = next((one for one in log.attachments.items() if one[0].endswith(".toml")), ("", None))
+    name, content = next((file for file in log.attachments.items() if file[0].endswith(".toml")), ("", None))
     if content is None:
         return None, []
     try:
-        found, remarks = recorded(content)
+        configuration, remarks = recorded(content)
     except ConfigurationError as error:
         return None, [f"{log.path}: its {name} cannot be used: {error}"]
-    return found, [f"{log.path}: its {name}: {remark}" for remark in remarks]
+    return configuration, [f"{log.path}: its {name}: {remark}" for remark in remarks]
 
 
 def attached_calibration(log: LogReader, calibration_id: str) -> Calibration | None:
@@ -248,18 +247,18 @@ def attached_calibration(log: LogReader, calibration_id: str) -> Calibration | N
 
 
 class _HistoryBuilder:
-    """Fills a history message by message: columns grow here, all other content is stored in the history directly."""
+    """Fills a history message by message; columns grow here, all other content goes to the history directly."""
 
     def __init__(self, history: History) -> None:
         self._history = history
         self._calibration: wire.Calibration | None = None
-        self._cameras: list[tuple[Array, wire.CameraState]] = []  # with other settings than the one before
+        self._cameras: list[tuple[Array, wire.CameraState]] = []  # whenever its settings changed
         self._frames = Columns(sequence="Q", publish_ns="q")
         self._commands, self._stepped, self._timings = Columns(publish_ns="q"), Columns(sequence="Q"), TimingRows()
         self._mirror = Columns(sequence="Q", publish_time_ns="q", stroke_nm="f", limits="q")
         self._rows: dict[int, tuple[StepRows, TruthRows]] = {}  # by number of modes
         self._set_modes(0)
-        self._late: tuple[int, int] | None = None
+        self._last_late: tuple[int, int] | None = None  # the camera's start, and its count of late commands
 
     def add(self, message: Sample) -> None:
         """Add one message of the log."""
@@ -337,16 +336,16 @@ class _HistoryBuilder:
         np.minimum(extremes.lowest_nm, surface, out=extremes.lowest_nm)
 
     def _set_modes(self, modes: int) -> None:
-        """Go on with the rows of this number of modes; a calibration that was refused does not lose the others."""
+        """Continue the rows of this number of modes; the others are kept, in case this calibration was refused."""
         self._steps, self._truths = self._rows.setdefault(modes, (StepRows(modes), TruthRows(modes)))
 
     def _count_late(self, start_s: int, count: int) -> None:
         """Add the camera's late commands since its previous Health; a restarted camera counts from 0."""
-        if self._late is not None:
-            before_s, before = self._late
-            since = count - before if start_s == before_s else count
+        if self._last_late is not None:
+            last_start_s, last_count = self._last_late
+            since = count - last_count if start_s == last_start_s else count
             self._history.commands_late = (self._history.commands_late or 0) + max(0, since)
-        self._late = start_s, count
+        self._last_late = start_s, count
 
     def finish(self) -> None:
         """Convert all columns to arrays."""
@@ -364,16 +363,17 @@ class _HistoryBuilder:
             setattr(history.mirror, name, self._mirror.values(name))
         history.timed_sequence, history.stages_ns = self._timings.values()
         if self._cameras:
-            steps, counted = history.steps, history.under_calibration
-            if (closed := counted & (steps.mode == LoopMode.CLOSED)).any():
-                counted = closed
-            begun_ns = np.maximum.accumulate([float(from_timestamp(one.timestamp)) for _, one in self._cameras])
-            known = np.array([settings for settings, _ in self._cameras])
-            # The first with the same settings, to which a camera may have returned.
-            first = np.array([np.isclose(known, one, rtol=0.01, atol=0).all(axis=1).argmax() for one in known])
+            steps, considered = history.steps, history.under_calibration
+            if (closed := considered & (steps.mode == LoopMode.CLOSED)).any():
+                considered = closed
+            begun_ns = np.maximum.accumulate([float(from_timestamp(state.timestamp)) for _, state in self._cameras])
+            settings = np.array([settings for settings, _ in self._cameras])
+            # Number of the first state with the same settings, to which a camera may have returned.
+            first = np.array([np.isclose(settings, row, rtol=0.01, atol=0).all(axis=1).argmax() for row in settings])
             numbers = first[np.maximum(np.searchsorted(begun_ns, steps.time_ns) - 1, 0)]
-            most = np.bincount(numbers[counted]).argmax() if counted.any() else first[-1]
-            history.camera, history.under_camera = self._cameras[np.flatnonzero(first == most)[-1]][1], numbers == most
+            usual = np.bincount(numbers[considered]).argmax() if considered.any() else first[-1]
+            history.camera = self._cameras[np.flatnonzero(first == usual)[-1]][1]
+            history.under_camera = numbers == usual
 
     def _last_calibration(self) -> Calibration | None:
         history = self._history
@@ -383,16 +383,16 @@ class _HistoryBuilder:
             except ValueError as error:
                 raise DataFileError(f"{history.log.path}: {error}") from None
         calibration_id = history.controller.calibration_id if history.controller is not None else ""
-        found = attached_calibration(history.log, calibration_id) if calibration_id else None
-        if found is not None:
+        attached = attached_calibration(history.log, calibration_id) if calibration_id else None
+        if attached is not None:
             history.remarks.append(
                 f"{history.log.path}: the message of its calibration is lost; the attached one is used"
             )
-        return found
+        return attached
 
 
 def measured_timing(timing: Timing, steps: Steps, applied: Sequences, applied_ns: Integers, rate_hz: float) -> Timing:
-    """The timing by the mirror's reports: frame and time, on the camera's clock, of each applied command."""
+    """Timing from the mirror's reports: frame and time, on the camera's clock, of each applied command."""
     rows = rows_of(applied, steps.sequence)
     if not (rows >= 0).any():
         return timing

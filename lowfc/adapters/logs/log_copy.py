@@ -73,9 +73,9 @@ class LogCopy:
                 )
 
     def _add_message(self, reader: LogReader, message: Sample) -> None:
-        name = message.key, start_of(message.sequence)
-        if name not in self._channels:
-            channel = reader.channels[name]
+        publisher = message.key, start_of(message.sequence)
+        if publisher not in self._channels:
+            channel = reader.channels[publisher]
             schema_id = 0  # a channel of another tool may have no schema
             if channel.schema_id:
                 schema = reader.schemas[channel.schema_id]
@@ -83,11 +83,11 @@ class LogCopy:
                 if known not in self._schemas:
                     self._schemas[known] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
                 schema_id = self._schemas[known]
-            self._channels[name] = self._writer.register_channel(
+            self._channels[publisher] = self._writer.register_channel(
                 channel.topic, channel.message_encoding, schema_id, channel.metadata
             )
         self._writer.add_message(
-            channel_id=self._channels[name],
+            channel_id=self._channels[publisher],
             log_time=message.receive_time_ns,
             publish_time=message.publish_time_ns,
             sequence=count_of(message.sequence),

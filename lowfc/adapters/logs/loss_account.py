@@ -27,42 +27,45 @@ class _Tally:
         gaps: gaps in the received sequences.
         published: number published according to its last Health; a message sent twice counts twice.
         recorded: number recorded.
-        twice: number of those recorded that were duplicates.
-        never: frames that a camera lost and never sent, according to its Health, less `before`.
-        before: frames that it had lost at its first Health, assumed to precede the first message; None until then.
+        duplicates: number of those recorded that were duplicates.
+        never_sent: frames that a camera lost and never sent, according to its Health, less `lost_before`.
+        lost_before: frames that it had lost at its first Health, assumed to precede the first message; None until then.
         unconfirmed: number lost at the last call of `newly_lost`.
-        flushed: `recorded` and `twice` at the last flush.
+        flushed: `recorded` and `duplicates` at the last flush.
         reported: number reported as lost by `newly_lost`.
     """
 
     gaps: Gaps
     published: int = 0
     recorded: int = 0
-    twice: int = 0
-    never: int = 0
-    before: int | None = None
+    duplicates: int = 0
+    never_sent: int = 0
+    lost_before: int | None = None
     unconfirmed: int = 0
     flushed: tuple[int, int] = (0, 0)
     reported: int = 0
 
     @property
     def lost(self) -> int:
-        return max(0, self.sent - self.recorded - self.never)
+        return max(0, self.sent - self.recorded - self.never_sent)
 
     @property
     def confirmed(self) -> int:
-        """Number lost; if the camera loses frames, only those lost at the last call too, as its Health follows them."""
-        return min(self.lost, self.unconfirmed) if self.never else self.lost
+        """Number lost; if the camera loses frames, only those already lost at the last call of `newly_lost`.
+
+        The camera reports frames that it never sent in its next Health, after the gap in their sequences.
+        """
+        return min(self.lost, self.unconfirmed) if self.never_sent else self.lost
 
     @property
     def sent(self) -> int:
-        return max(self.gaps.next + self.twice, self.published) - self.gaps.first
+        return max(self.gaps.next + self.duplicates, self.published) - self.gaps.first
 
     def enter(self, count: int, *, recorded: bool, unwanted: bool) -> None:
         if count >= self.gaps.first:
             new = self.gaps.add(count)
             self.recorded += recorded
-            self.twice += recorded and not new
+            self.duplicates += recorded and not new
             if unwanted:  # never written, so the disk cannot lose it
                 self.flushed = self.flushed[0] + 1, self.flushed[1] + (not new)
 
@@ -71,7 +74,7 @@ class _Tally:
         self.recorded += other.recorded
         self.flushed = self.flushed[0] + other.flushed[0], 0
         self.reported += other.reported
-        self.never += other.never
+        self.never_sent += other.never_sent
 
 
 class LossAccount:
@@ -113,21 +116,21 @@ class LossAccount:
                 self.names.admit(topic, count.topic)
                 author = self._author_name(health.process) if topic is EVENT else ""
                 tally = self._tally(count.topic, author, start_of(sample.sequence), count.published)
-                if tally.before is None:
-                    tally.before = count.missing if tally.gaps.first else 0
-                tally.never = count.missing - tally.before
+                if tally.lost_before is None:
+                    tally.lost_before = count.missing if tally.gaps.first else 0
+                tally.never_sent = count.missing - tally.lost_before
                 if health.state == "stopped":
                     tally.published = min(count.published, 1 << COUNT_BITS)  # later ones have another start
 
     def mark_flushed(self) -> None:
         """Note that everything recorded so far has been flushed."""
         for _, tally in self._all():
-            tally.flushed = tally.recorded, tally.twice
+            tally.flushed = tally.recorded, tally.duplicates
 
     def revert(self) -> None:
         """Note that everything recorded since `mark_flushed` was lost."""
         for _, tally in self._all():
-            tally.recorded, tally.twice = tally.flushed
+            tally.recorded, tally.duplicates = tally.flushed
 
     def recorded(self) -> dict[str, int]:
         """Number of messages recorded so far, by key, including keys whose messages were all lost."""
@@ -138,12 +141,12 @@ class LossAccount:
         return +self._sum(lambda tally: tally.lost)
 
     def newly_lost(self) -> dict[str, int]:
-        """Messages lost since the last call, by key; one that arrives after its report offsets a later one."""
-        found = +self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
+        """Number of messages lost since the last call, by key; one that arrives after all offsets a later loss."""
+        lost = +self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():
             tally.reported = max(tally.reported, tally.confirmed)
             tally.unconfirmed = tally.lost
-        return found
+        return lost
 
     def _tally(self, key: str, author: str, start_s: int, first: int) -> _Tally:
         """Tally of a publisher's start; a new one begins with the message `first`."""

@@ -88,7 +88,7 @@ class WholeLog(LogReader):
         self.size, self.finished = sum(file.size for file in files), all(file.finished for file in files)
         earlier: list[Metadata | Attachment] = []
         repeated = Repeated()
-        behind = 0
+        earlier_bytes = 0
         for path, file in zip(self.paths, files, strict=True):
             part = LogReader(path, skip_damaged=self._skip_damaged, **self._options)
             self.parts.append(part)
@@ -98,8 +98,8 @@ class WholeLog(LogReader):
                 for message in part:
                     if len(self.records) != len(earlier) + len(part.records):
                         self.records = earlier + part.records
-                    if self.position != behind + part.position:
-                        self.position = behind + part.position
+                    if self.position != earlier_bytes + part.position:
+                        self.position = earlier_bytes + part.position
                         if self.progress is not None:
                             self.progress(self.position, self.size)
                     if not repeated(message):
@@ -110,7 +110,7 @@ class WholeLog(LogReader):
                     damage.why += f" ({path.name})"
                 self.damage += part.damage
                 self.unreadable += part.unreadable
-            behind += file.size
+            earlier_bytes += file.size
         self.position = self.size
         self.complete = all(part.complete for part in self.parts)
 
@@ -133,14 +133,14 @@ def named_logs(names: Sequence[Path], out: Path | None = None, *, as_json: bool 
     logs: dict[tuple[str, ...], dict[int, Path]] = {}
     for path in _files(names):
         alone = [path] == list(names)  # named by itself: its place in a recording does not matter
-        key, number = ((), 1) if alone else _place(path)
+        key, number = ((), 1) if alone else _recording_and_number(path)
         parts = logs.setdefault(key or (str(path.absolute()),), {})
         if number in parts:
             raise ConfigurationError(f"{parts[number]} and {path} are the same part of one log: name one of them")
         parts[number] = path
-    found = [tuple(parts[number] for number in sorted(parts)) for parts in logs.values()]
-    _refuse_several(found, out, as_json=as_json)
-    return found
+    sorted_logs = [tuple(parts[number] for number in sorted(parts)) for parts in logs.values()]
+    _refuse_several(sorted_logs, out, as_json=as_json)
+    return sorted_logs
 
 
 def named_log(names: Sequence[Path]) -> Parts:
@@ -150,10 +150,10 @@ def named_log(names: Sequence[Path]) -> Parts:
         ConfigurationError: several logs are named.
         DataFileError: the folder contains no log.
     """
-    found = named_logs(names)
-    if len(found) > 1:
-        raise ConfigurationError(f"this command reads one log: name one, not {_listed(found)}; the newest is `{LAST}`")
-    return found[0]
+    logs = named_logs(names)
+    if len(logs) > 1:
+        raise ConfigurationError(f"this command reads one log: name one, not {_listed(logs)}; the newest is `{LAST}`")
+    return logs[0]
 
 
 def named_files(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Path]:
@@ -170,20 +170,20 @@ def titled(paths: Parts) -> str:
 
 def metadata_at_start(path: Path) -> dict[str, dict[str, str]]:
     """Metadata before the messages of a log, by name; DataFileError if the log cannot be read."""
-    found: dict[str, dict[str, str]] = {}
+    metadata: dict[str, dict[str, str]] = {}
     with LogFile(path) as file:
-        for part in file.parts():
-            if isinstance(part, Chunk):
+        for record in file.parts():
+            if isinstance(record, Chunk):
                 break
-            if isinstance(part, Metadata):
-                found[part.name] = part.metadata
-    return found
+            if isinstance(record, Metadata):
+                metadata[record.name] = record.metadata
+    return metadata
 
 
 def _refuse_several(logs: Sequence[Parts], out: Path | None, *, as_json: bool) -> None:
     if len(logs) > 1 and (as_json or out is not None):
-        place = "--json prints one object" if as_json else "--out is one file"
-        raise ConfigurationError(f"{place}: name one log, not {_listed(logs)}")
+        limit = "--json prints one object" if as_json else "--out is one file"
+        raise ConfigurationError(f"{limit}: name one log, not {_listed(logs)}")
 
 
 def _listed(logs: Sequence[Parts]) -> str:
@@ -216,21 +216,21 @@ def _newest(folder: Path) -> list[Path]:
     # Of several files of one time prefer the recorded finished one, then a recovered one, then an unfinished one.
     best = {order[path][:2]: path for path in sorted(files, key=order.__getitem__)}
     newest = best.pop(max(best))
-    recording, number = _place(newest)
+    recording, number = _recording_and_number(newest)
     parts = {number: newest}
     for path in best.values():
         if number > 1 and _time(path) >= _time(Path(recording[-1])):
-            key, place = _place(path)
+            key, other = _recording_and_number(path)
             if key == recording:
-                parts[place] = path
-    return [parts[place] for place in sorted(parts)]
+                parts[other] = path
+    return [parts[part] for part in sorted(parts)]
 
 
 def _time(path: Path) -> str:
     return path.name.partition("Z")[0]
 
 
-def _place(path: Path) -> tuple[tuple[str, ...], int]:
+def _recording_and_number(path: Path) -> tuple[tuple[str, ...], int]:
     """Recording of a file, and the file's number in it; () and 1 if it is unreadable or of version 0.1."""
     try:
         metadata = metadata_at_start(path)

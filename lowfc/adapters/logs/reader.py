@@ -84,7 +84,7 @@ class LogReader:
         self._delivered: dict[int, tuple[str, int] | None] = {}
         self._chunks: set[int] = set()
         self._last_ns: int | None = None
-        self._spanned = 0
+        self._dated_damage = 0
         self._has_chunks = False
 
     @property
@@ -154,17 +154,17 @@ class LogReader:
         if self.unreadable and not self._skip_damaged:
             raise self._error(chunk.position, "the declaration of its messages is missing")
         if messages:
-            for damage in self.damage[self._spanned :]:
+            for damage in self.damage[self._dated_damage :]:
                 damage.before_ns = messages[0].receive_time_ns
-            self._spanned = len(self.damage)
+            self._dated_damage = len(self.damage)
             self._last_ns = messages[-1].receive_time_ns
         return messages
 
     def _messages(self, content: bytes) -> list[Sample]:
         """Decode the messages of a chunk to deliver, and store its declarations; UnsoundError if inconsistent."""
-        found: list[Sample] = []
+        samples: list[Sample] = []
         delivered, at, end = self._delivered, 0, len(content)
-        read_head, read_message, logged = HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, Sample._make
+        read_head, read_message, make_sample = HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, Sample._make
         message_opcode, head_bytes, message_bytes = int(Opcode.MESSAGE), HEAD.size, HEAD.size + _MESSAGE_HEAD.size
         try:
             while at < end:
@@ -176,7 +176,7 @@ class LogReader:
                     if channel is not None:
                         key, start = channel
                         payload = content[begin + message_bytes : at]
-                        found.append(logged((key, payload, start | count, publish_time_ns, receive_time_ns)))
+                        samples.append(make_sample((key, payload, start | count, publish_time_ns, receive_time_ns)))
                     elif number not in delivered:
                         self.unreadable += 1
                 elif opcode == Opcode.SCHEMA:
@@ -189,7 +189,7 @@ class LogReader:
             raise UnsoundError("a record in a chunk is longer than the chunk") from fault
         if at > end:
             raise UnsoundError("a record in a chunk is longer than the chunk")
-        return found
+        return samples
 
     def _declare_channel(self, channel: Channel) -> None:
         if self._declared.setdefault(channel.id, channel) != channel:

@@ -130,7 +130,7 @@ class LogFile:
             end = at + HEAD.size + length
             if needed and opcode == Opcode.CHUNK and end <= self.size:
                 end_ns = int.from_bytes(self._read(at + HEAD.size + 8, 8), "little")
-                if (there := self._channels_after(end)) and not needed(end_ns, there):
+                if (channels := self._channels_after(end)) and not needed(end_ns, channels):
                     at, intact = end, False  # the checksum of the data section needs all of it
                     continue
             try:
@@ -174,10 +174,10 @@ class LogFile:
         """Another log that begins between two positions, up to the end of the file; None without one."""
         for begin in range(at, end, _BLOCK_BYTES):
             block = self._read(begin, min(_BLOCK_BYTES, end - begin) + len(MAGIC))
-            if (found := block.find(_BEGIN)) >= 0:
-                copy = f"`tail -c +{begin + found + 1} {self.path.name} > second.mcap` copies it"
+            if (offset := block.find(_BEGIN)) >= 0:
+                copy = f"`tail -c +{begin + offset + 1} {self.path.name} > second.mcap` copies it"
                 why = f"it is another log, appended to this one; {copy}"
-                return Damage(begin + found, self.size - begin - found, why)
+                return Damage(begin + offset, self.size - begin - offset, why)
         return None
 
     def _find_summary(self) -> int | None:
@@ -199,14 +199,14 @@ class LogFile:
 
     def _channels_after(self, at: int) -> list[int]:
         """Ids of the channels in the message indexes at `at`, after a chunk; empty without an index."""
-        found = []
+        channels = []
         while len(head := self._read(at, HEAD.size + 2)) == HEAD.size + 2:
             opcode, length = HEAD.unpack_from(head)
             if opcode != Opcode.MESSAGE_INDEX or at + HEAD.size + length > self.size:
                 break
-            found.append(int.from_bytes(head[HEAD.size :], "little"))
+            channels.append(int.from_bytes(head[HEAD.size :], "little"))
             at += HEAD.size + length
-        return found
+        return channels
 
     def _resume(self, at: int, end: int) -> int:
         """Position to continue after a damaged record: its end if a record begins there, else the next intact chunk."""
@@ -222,13 +222,13 @@ class LogFile:
         start, block = at + 1, _FIRST_BLOCK_BYTES
         while start < self.size and self._bytes_to_try > 0:
             for match in CHUNK_HERE.finditer(self._read(start, block + 64)):
-                if self._chunk_at(start + match.start()):
+                if self._intact_chunk_at(start + match.start()):
                     return start + match.start()
             start, block = start + block, min(2 * block, _BLOCK_BYTES)
         data_end = 0 if self._summary is None else self._summary - HEAD.size - 4
         return data_end if data_end > at else self.size
 
-    def _chunk_at(self, at: int) -> bool:
+    def _intact_chunk_at(self, at: int) -> bool:
         _, length = HEAD.unpack(self._read(at, HEAD.size))
         at += HEAD.size
         if at + length > self.size or length > min(MAX_BYTES, self._bytes_to_try):
@@ -270,7 +270,7 @@ class LogFile:
         return None
 
     def _is_by_lowfc(self) -> bool:
-        """Whether lowfc wrote this file, and so with all checksums, by its header; True if the header is damaged."""
+        """Whether, by its header, lowfc wrote this file, and so with all checksums; True if the header is damaged."""
         head = self._read(len(MAGIC), HEAD.size)
         opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
         if opcode != Opcode.HEADER or length > _BLOCK_BYTES:
@@ -283,8 +283,9 @@ class LogFile:
 
     @cached_property
     def _unchunked(self) -> bool:
-        statistics = (parsed(Statistics, one[HEAD.size :]) for one in self._in_summary(Opcode.STATISTICS))
-        return not self._by_lowfc or any(not one.chunk_count for one in statistics)
+        """Whether messages may be outside chunks."""
+        records = (parsed(Statistics, record[HEAD.size :]) for record in self._in_summary(Opcode.STATISTICS))
+        return not self._by_lowfc or any(not statistics.chunk_count for statistics in records)
 
     def _unchunked_records(self, at: int) -> bytes:
         """Complete records from `at` on of the kinds that are usually in chunks, up to the one that exceeds 1 MB."""

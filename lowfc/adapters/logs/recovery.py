@@ -92,12 +92,12 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
         copy.add_file(reader)
         if not copy.messages and not reader.records:
             raise DataFileError(f"{source}: no part of it is intact, so there is nothing to recover")
-        copy.add_metadata(RECOVERY, account(reader, copy.messages))
+        copy.add_metadata(RECOVERY, origin(reader, copy.messages))
         copy.finish()
     return Recovery(source, reader.size, reader.finished, out, copy.messages, reader.unreadable, reader.damage)
 
 
-def account(reader: LogReader, messages: int) -> dict[str, str]:
+def origin(reader: LogReader, messages: int) -> dict[str, str]:
     """Metadata on the origin of a copy of a damaged or unfinished log."""
     return {
         "source": reader.path.name,
@@ -132,7 +132,7 @@ def missing_end_text(paths: Sequence[Path], *, finished: bool) -> str:
 def missing_parts(reader: LogReader) -> dict[str, Any]:
     """Missing parts of a log that was read to its end, for JSON: `no_end` is empty for a finished log."""
     no_end = missing_end_text(reader.paths, finished=reader.finished)
-    return {"finished": reader.finished, "no_end": no_end, "damaged": [in_words(one) for one in reader.damage]}
+    return {"finished": reader.finished, "no_end": no_end, "damaged": [in_words(damage) for damage in reader.damage]}
 
 
 def faults(damaged: Sequence[str], no_end: str) -> list[str]:

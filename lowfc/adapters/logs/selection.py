@@ -54,8 +54,8 @@ class Selection:
     @property
     def description(self) -> str:
         """Description of the selection; empty for everything."""
-        few = [name for topic, name in _DECIMATED.items() if topic not in self.excluded]
-        parts = [f"1 in {self.interval_frames} {' and '.join(few)}"] if self.interval_frames > 1 and few else []
+        names = [name for topic, name in _DECIMATED.items() if topic not in self.excluded]
+        parts = [f"1 in {self.interval_frames} {' and '.join(names)}"] if self.interval_frames > 1 and names else []
         parts += [f"without {', '.join(self._keys)}"] if self.excluded else []
         return ", ".join(parts)
 
@@ -107,7 +107,7 @@ def selection(interval_frames: int = 1, patterns: Iterable[str] = ()) -> Selecti
         ConfigurationError: a pattern matches no topic.
     """
     chosen: set[Topic] = set()
-    for pattern in (one.removeprefix("/") for one in patterns):
+    for pattern in (given.removeprefix("/") for given in patterns):
         matching = {topic for topic in TOPICS if topic.matches(pattern) or fnmatchcase(topic.key, pattern)}
         if not matching:
             keys = [topic.key for topic in TOPICS]

@@ -60,7 +60,7 @@ class LogSeries:
         self._limits = limits
         self._log: LogWriter | None = None
         self._opened_s = self._recorded_s = 0.0
-        self._recording, self._part = "", 0
+        self._recording, self._part_number = "", 0
         self._messages = self._bytes = self._longest_write_ns = 0
         self._finisher = ThreadPoolExecutor(1, "finish-log")
         self._finishing: tuple[LogWriter, Future[int]] | None = None
@@ -107,9 +107,9 @@ class LogSeries:
         except OSError as fault:
             raise DataFileError(f"{self._folder} cannot be accessed: {fault.strerror}") from fault
         if new_recording:
-            self._recording, self._part = path.stem, 0
-        self._part += 1
-        metadata = {**self._metadata, PART: {"of": self._recording, "number": str(self._part)}}
+            self._recording, self._part_number = path.stem, 0
+        self._part_number += 1
+        metadata = {**self._metadata, PART: {"of": self._recording, "number": str(self._part_number)}}
         self._log = LogWriter(path, now_ns, metadata, self._attachments, self._limits.file_mode)
         self._opened_s = time.monotonic()
         self.files.append(self._log.path)
@@ -155,7 +155,7 @@ class LogSeries:
         if self._log is not None:
             log = self._detach()
             log.abandon()
-            self._unfinished(log)
+            self._list_unfinished(log)
 
     def _detach(self) -> LogWriter:
         assert self._log is not None  # noqa: S101  # for the type checker
@@ -173,10 +173,11 @@ class LogSeries:
         try:
             self._bytes += growth_bytes.result()
         except DataFileError:
-            self._unfinished(log)
+            self._list_unfinished(log)
             raise
 
-    def _unfinished(self, log: LogWriter) -> None:
+    def _list_unfinished(self, log: LogWriter) -> None:
+        """List a file under its name with ".part"."""
         self.files[self.files.index(log.path)] = log.part
 
 
@@ -189,10 +190,12 @@ def _finish(log: LogWriter, totals: Mapping[str, str]) -> int:
 
 def shortage(folder: Path, min_free_bytes: int) -> str:
     """Sentence if a folder's disk has too little space; else empty. DataFileError if it is no accessible folder."""
-    if not (there := existing(folder)).is_dir():
-        raise DataFileError(f"no log can be recorded in {folder}: {there} is no folder; name another (recorder.folder)")
+    if not (parent := existing(folder)).is_dir():
+        raise DataFileError(
+            f"no log can be recorded in {folder}: {parent} is no folder; name another (recorder.folder)"
+        )
     try:
-        free_bytes = shutil.disk_usage(there).free
+        free_bytes = shutil.disk_usage(parent).free
     except OSError as fault:
         raise DataFileError(f"{folder} cannot be accessed: {fault.strerror}") from fault
     if free_bytes >= min_free_bytes:
@@ -205,8 +208,8 @@ def shortage(folder: Path, min_free_bytes: int) -> str:
 
 def existing(folder: Path) -> Path:
     """The folder, or its nearest existing parent; DataFileError if it cannot be accessed."""
-    there = folder.absolute()
+    absolute = folder.absolute()
     try:
-        return next(one for one in (there, *there.parents) if one.exists())
+        return next(path for path in (absolute, *absolute.parents) if path.exists())
     except OSError as fault:
         raise DataFileError(f"{folder} cannot be accessed: {fault.strerror}") from fault

@@ -10,7 +10,7 @@ from mcap.records import Attachment, Metadata
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.log_copy import LogCopy, new_log
 from lowfc.adapters.logs.parts import Parts, WholeLog, metadata_at_start, titled
-from lowfc.adapters.logs.recovery import RECOVERY, account, missing_parts
+from lowfc.adapters.logs.recovery import RECOVERY, missing_parts, origin
 from lowfc.adapters.logs.selection import SELECTION, Selection
 from lowfc.adapters.logs.writer import PART, stem_of
 from lowfc.contract.errors import DataFileError
@@ -52,7 +52,7 @@ def thin(
         if not copy.read:
             raise DataFileError(f"{titled(log)} has no messages: there is nothing to copy")
         if not reader.complete or reader.damage or reader.unreadable:
-            copy.add_metadata(RECOVERY, account(reader, copy.messages))
+            copy.add_metadata(RECOVERY, origin(reader, copy.messages))
         copy.finish()
     return {
         "file": str(out),

@@ -117,7 +117,7 @@ class LogWriter:
         self._file = BufferedWriter(self._raw)
         try:
             self._writer = begun_writer(self._file)
-            self._describe(metadata)
+            self._add_metadata(metadata)
             for attachment in attachments:
                 self._writer.add_attachment(
                     create_time=time_ns,
@@ -160,7 +160,7 @@ class LogWriter:
         """Write the final metadata, close the log, and rename it once it is on the disk."""
         try:
             self._flush()
-            self._describe(metadata)
+            self._add_metadata(metadata)
             self._writer.finish()  # type: ignore[no-untyped-call]
             self._file.flush()
             os.fsync(self._raw.fileno())
@@ -182,7 +182,7 @@ class LogWriter:
                     self.part.unlink()
             self._raw.close()
 
-    def _describe(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
+    def _add_metadata(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
         for name, entries in metadata.items():
             self._writer.add_metadata(name, {key: encodable(value) for key, value in entries.items()})
 
@@ -195,10 +195,10 @@ class LogWriter:
     def _refused(self, fault: OSError) -> DataFileError:
         """Convert an error of the disk, and truncate the file to complete records."""
         self.abandon()
-        rest = "its content is readable" if self.part.exists() else "the file was removed"
+        state = "its content is readable" if self.part.exists() else "the file was removed"
         return DataFileError(
             f"{self.part} cannot be written ({fault.strerror}) after {self.bytes_written} bytes; "
-            f"free some space or record elsewhere; {rest}"
+            f"free some space or record elsewhere; {state}"
         )
 
     def _channel(self, sample: Sample) -> int:
