@@ -52,7 +52,7 @@ def _npy(path: Path) -> npt.NDArray[np.generic]:
 def _fits(path: Path) -> tuple[npt.NDArray[np.generic], str]:
     """The first image or cube, and its unit (BUNIT), empty if it is not given."""
     with fits_file.opened(path) as hdus:
-        found = next((hdu for hdu in hdus if hdu.is_image and hdu.data is not None), None)
-        if found is None:
+        image = next((hdu for hdu in hdus if hdu.is_image and hdu.data is not None), None)
+        if image is None:
             raise ValueError("there is no image in it")
-        return np.asarray(found.data), str(found.header.get("BUNIT", "")).strip()
+        return np.asarray(image.data), str(image.header.get("BUNIT", "")).strip()

@@ -79,12 +79,12 @@ def load(path: Path, content: bytes | None = None) -> Calibration:
     return calibration
 
 
-def _read(units: fits.HDUList) -> Calibration:
-    header = units[0].header
+def _read(hdus: fits.HDUList) -> Calibration:
+    header = hdus[0].header
     arrays = {
-        attribute: fits_file.single(units, name)
+        attribute: fits_file.single(hdus, name)
         for name, attribute, _, _ in _EXTENSIONS
-        if name != _OPTIONAL or name in units
+        if name != _OPTIONAL or name in hdus
     }
     return Calibration(
         noll=tuple(int(index) for index in str(header["NOLL"]).split()),

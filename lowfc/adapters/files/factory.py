@@ -92,7 +92,7 @@ _cached_contrast_of = lru_cache(maxsize=8)(_contrast_of)
 
 
 def electrons_per_exposure(config: Configuration) -> float:
-    """Electrons per exposure of all light that enters the open circular pupil; an image times this is in electrons."""
+    """Electrons per exposure of all light that enters the open circular pupil; a twin's images are fractions of it."""
     star = config.star
     photometry = Photometry(
         star.magnitude,
@@ -276,7 +276,7 @@ def frame_noise_nm(config: Configuration, calibration: Calibration) -> Array:
 
 
 def frame_noise_nm2(config: Configuration, calibration: Calibration) -> Array:
-    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront, with that of rounding to whole DN."""
+    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront, including the rounding to whole DN."""
     camera = detector(config)
     flux_e = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain
     reference, matrix = calibration.reference.astype(float), calibration.reconstructor.astype(float)

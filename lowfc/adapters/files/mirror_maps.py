@@ -30,16 +30,17 @@ def active_actuators(config: Configuration) -> Mask | None:
     """Read the map of active actuators (rows, columns) of `mirror.active`; None if all are active.
 
     Raises:
-        ConfigurationError: the file is missing, damaged, does not fit the mirror, or holds not only 0 and 1, or no 1.
+        ConfigurationError: the file is missing, damaged, does not fit the mirror, holds other values than 0 and 1, or
+            no 1.
     """
     if not config.mirror.active:
         return None
-    found = shape_of(config, "mirror.active", config.mirror.active, units=())
-    if not np.isin(found, (0, 1)).all():
+    active = shape_of(config, "mirror.active", config.mirror.active, units=())
+    if not np.isin(active, (0, 1)).all():
         raise ConfigurationError(f"mirror.active = {config.mirror.active!r}: every value must be 0 or 1")
-    if not found.any():
+    if not active.any():
         raise ConfigurationError(f"mirror.active = {config.mirror.active!r}: no actuator is active")
-    return np.asarray(found, dtype=np.bool_)
+    return np.asarray(active, dtype=np.bool_)
 
 
 def flat_nm(config: Configuration) -> Single | None:
@@ -50,9 +51,9 @@ def flat_nm(config: Configuration) -> Single | None:
     """
     if not config.mirror.flat:
         return None
-    found = shape_of(config, "mirror.flat", config.mirror.flat)
+    flat = shape_of(config, "mirror.flat", config.mirror.flat)
     active = active_actuators(config)
-    return found if active is None else np.where(active, found, np.float32(0))
+    return flat if active is None else np.where(active, flat, np.float32(0))
 
 
 def shape_of(config: Configuration, key: str, file: str, units: tuple[str, ...] = _NM) -> Single:
@@ -64,15 +65,15 @@ def shape_of(config: Configuration, key: str, file: str, units: tuple[str, ...] 
         ConfigurationError: the file is missing, damaged or does not fit the mirror.
     """
     try:
-        found = read_shape(user_path(file), units)
+        values = read_shape(user_path(file), units)
     except DataFileError as fault:
         raise ConfigurationError(f"{key}: {fault}") from None
     grid = (config.mirror.rows, config.mirror.columns)
-    if found.shape != grid:
+    if values.shape != grid:
         raise ConfigurationError(
-            f"{key} = {file!r}: {found.shape[0]} x {found.shape[1]} values, the mirror has {grid[0]} x {grid[1]} "
+            f"{key} = {file!r}: {values.shape[0]} x {values.shape[1]} values, the mirror has {grid[0]} x {grid[1]} "
             "actuators"
         )
-    if not np.isfinite(found).all():
+    if not np.isfinite(values).all():
         raise ConfigurationError(f"{key} = {file!r}: every value must be finite")
-    return found
+    return values

@@ -61,7 +61,7 @@ def load_dark_zone(file: Traversable) -> Wedge:
     """Load the dark zone for which `lowfc design spc` made a pupil; `DARK_ZONE` if the file has no array `made_by`.
 
     Raises:
-        DataFileError: The file is missing or damaged, or its request has no such zone.
+        DataFileError: The file is missing or damaged, or the request in `made_by` has no such zone.
     """
     with _opened(file) as arrays:
         if "made_by" not in arrays:
@@ -128,7 +128,7 @@ def coronagraph_from(section: SensorSection) -> Coronagraph:
 
     Raises:
         ConfigurationError: There is no such pupil, or the Lyot stop is too small.
-        DataFileError: Its file is missing or damaged.
+        DataFileError: The pupil's file is missing or damaged.
     """
     pupil = _pupil(section)
     if section.pupil not in _WITH_LYOT_STOP:
@@ -181,8 +181,8 @@ def _pupil(section: SensorSection) -> Array:
             raise ConfigurationError(f"sensor.focal_radius must be at most {_MAX_PROLATE_RADIUS:g} for a prolate pupil")
     if section.pupil.endswith(".npz"):
         return load_pupil(file=input_file.user_path(section.pupil))
-    slip = nearest(section.pupil, ("shaped", "circle", "prolate"))
-    raise ConfigurationError(f"sensor.pupil = {section.pupil!r}: no such pupil{slip}: shaped, circle, prolate, *.npz")
+    hint = nearest(section.pupil, ("shaped", "circle", "prolate"))
+    raise ConfigurationError(f"sensor.pupil = {section.pupil!r}: no such pupil{hint}: shaped, circle, prolate, *.npz")
 
 
 def _focal_mask(section: SensorSection) -> NDArray[np.inexact]:

@@ -19,16 +19,16 @@ def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> 
     """Yield a temporary file that is renamed to `path` on success and removed on failure.
 
     A log, a directory, device or pipe at `path` is not replaced. The permissions are `mode` without the umask's bits,
-    and at most those of `source`, its origin.
+    and at most those of `source`, the file that the content comes from.
 
     Raises:
         DataFileError: the file cannot be written, or is a log.
     """
     try:
         _require_replaceable(path, source)
-        most = source.stat().st_mode & mode if source is not None and source.exists() else mode
+        permitted = source.stat().st_mode & mode if source is not None and source.exists() else mode
         part = path.with_name(f".{path.name[:_NAME_LENGTH]}.{secrets.token_hex(4)}")
-        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, most)
+        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, permitted)
         mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
         os.close(descriptor)
         try:

@@ -21,21 +21,21 @@ _POLL_S = 0.001
 
 def sum_name(channel: str) -> str:
     """Name of the sum that contains a channel; empty if the channel's name is not CACAO's."""
-    found = re.fullmatch(r"(dm\d\ddisp)\d\d", channel)
-    return found[1] if found else ""
+    match = re.fullmatch(r"(dm\d\ddisp)\d\d", channel)
+    return match[1] if match else ""
 
 
 def other_channel_names(channel: str) -> tuple[str, ...]:
     """Names of the other channels of the same mirror."""
     total = sum_name(channel)
-    return tuple(one for one in (f"{total}{index:02d}" for index in range(CHANNELS)) if total and one != channel)
+    return tuple(name for name in (f"{total}{index:02d}" for index in range(CHANNELS)) if total and name != channel)
 
 
 class OtherChannels:
     """Sum of a mirror's channels except one, in the unit of the streams.
 
     Unusable channels are left out: another grid, another layout, or a value that is not finite. A channel that is being
-    written, or whose writer died meanwhile, counts with its last complete shape, or as found if none was read before.
+    written, or whose writer died meanwhile, counts with its last complete shape, or as it is if none was read before.
     """
 
     def __init__(self, names: Iterable[str], grid: tuple[int, int]) -> None:

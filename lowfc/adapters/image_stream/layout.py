@@ -37,9 +37,9 @@ HEADER = np.dtype(
     }
 )
 NEWEST, NEWEST_START = struct.Struct("@2q64x2Q8xB"), 184
-"""Fields that change with each image, read at once: `atime`, `cnt0`, `cnt1`, `write`; and their position."""
+"""Fields that change with each image, read at once: `atime`, `cnt0`, `cnt1`, `write`; and the first byte of them."""
 TIMES = struct.Struct("<4q")
-"""`atime` and `writetime` at that position, each in seconds and nanoseconds."""
+"""`atime` and `writetime`, from byte `NEWEST_START`, each in seconds and nanoseconds."""
 KEYWORD = np.dtype(
     {
         "names": ["name", "type", "integer", "real", "text"],
@@ -85,15 +85,15 @@ class Layout(NamedTuple):
         version = header["version"].partition(b"\0")[0].decode("ascii", "backslashreplace")
         if version != VERSION:
             raise ValueError(f"has layout version {version!r}, expected {VERSION!r}")
-        axes, size = int(header["axes"]), [int(one) for one in header["size"]]
+        axes, size = int(header["axes"]), [int(length) for length in header["size"]]
         dtype = TYPES.get(int(header["type"]))
         if dtype is None:
             raise ValueError(f"has pixels of type {header['type']}, expected 1 to 10 (integer, float or double)")
         if axes not in (2, 3) or not all(size[:axes]):
             raise ValueError(f"has {axes} axes of {size}, expected columns x rows, or columns x rows x planes")
-        in_time = int(header["kind"]) & _TIME_MASK == _TIME_AXIS
+        time_axis = int(header["kind"]) & _TIME_MASK == _TIME_AXIS
         columns, rows, planes = size[0], size[1], size[2] if axes == 3 else 1
-        if planes > 1 and not in_time:
+        if planes > 1 and not time_axis:
             raise ValueError(f"is a cube of {planes} planes without a time axis, expected a circular buffer of images")
         if header["location"] != -1:
             raise ValueError(f"is in the memory of graphics card {header['location']}, expected shared memory")
@@ -106,7 +106,7 @@ class Layout(NamedTuple):
                 f"{data_bytes}"
             )
         counts = (int(header[name]) for name in ("keywords", "semaphores", "traces", "ring"))
-        layout = cls.computed(dtype, (planes, rows, columns), *counts, in_time=in_time and axes == 3)
+        layout = cls.computed(dtype, (planes, rows, columns), *counts, time_axis=time_axis and axes == 3)
         if layout.file_bytes != file_bytes:
             dao = file_bytes - layout.file_bytes == DAO_HEADER_BYTES - HEADER_BYTES
             built = "a library built with DAO_COMPAT wrote it" if dao else "a library built with other options wrote it"
@@ -123,22 +123,22 @@ class Layout(NamedTuple):
         traces: int,
         ring: int,
         *,
-        in_time: bool = False,
+        time_axis: bool = False,
     ) -> "Layout":
         """Compute the layout of a stream with these numbers of parts."""
-        data_bytes, numbers = prod(shape) * dtype.itemsize, 4 * semaphores
+        data_bytes, numbers_bytes = prod(shape) * dtype.itemsize, 4 * semaphores  # one int32 per semaphore
         parts = {
             "header": HEADER_BYTES,
             "data": data_bytes,
             "keywords": KEYWORD.itemsize * keywords,
             "semaphores": SEMAPHORE_BYTES * semaphores,
             "log": SEMAPHORE_BYTES,
-            "readers": numbers,
-            "writers": numbers,
-            "control": numbers,
-            "status": numbers,
+            "readers": numbers_bytes,
+            "writers": numbers_bytes,
+            "control": numbers_bytes,
+            "status": numbers_bytes,
             "traces": 64 * traces,
-            "times": 40 * shape[0] if in_time else 0,  # of each plane: two times of 16 bytes and a count of 8
+            "times": 40 * shape[0] if time_axis else 0,  # of each plane: two times of 16 bytes and a count of 8
             "ring_headers": 48 * ring,
             "ring": data_bytes * ring,
         }

@@ -65,10 +65,9 @@ class StreamReader:
         if stream is None or not stream.current():
             return f"there is no stream {self._path.name.removesuffix('.im.shm')!r}"
         writer = int(stream.writers[self._semaphore])
-        died = (
-            f"its writer (process {writer}) has ended" if writer > 0 and not alive(writer) else "its writer is silent"
-        )
-        return f"{died}, in the middle of an image" if stream.writing else died
+        ended = writer > 0 and not alive(writer)
+        cause = f"its writer (process {writer}) has ended" if ended else "its writer is silent"
+        return f"{cause}, in the middle of an image" if stream.writing else cause
 
     def close(self) -> None:
         """Release the semaphore."""

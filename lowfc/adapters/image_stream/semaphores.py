@@ -61,10 +61,10 @@ class Semaphores:
 
     def post_all(self) -> list[int]:
         """Post each semaphore except those at `MAX_VALUE`; return the indices posted."""
-        value, found = self._value, ctypes.byref(self._value)
+        value, reference = self._value, ctypes.byref(self._value)
         posted = []
         for index, address in enumerate(self._addresses):
-            _LIBC.sem_getvalue(address, found)
+            _LIBC.sem_getvalue(address, reference)
             if value.value < MAX_VALUE:
                 _LIBC.sem_post(address)
                 posted.append(index)

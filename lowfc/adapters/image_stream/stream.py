@@ -48,8 +48,9 @@ def stream_path(name: str) -> Path:
     if not 0 < len(name) <= _MAX_NAME_LENGTH or not name.isprintable() or "/" in name:
         limit = f"1 to {_MAX_NAME_LENGTH} characters without '/', all printable"
         raise StreamError(f"a stream's name has {limit}; got {name!r}")
-    folders = (Path(one) for one in (os.environ.get("MILK_SHM_DIR"), "/milk/shm", "/tmp") if one)  # noqa: S108
-    return next(one for one in folders if one.is_dir() or one == Path("/tmp")) / f"{name}.im.shm"  # noqa: S108
+    names = (os.environ.get("MILK_SHM_DIR"), "/milk/shm", "/tmp")  # noqa: S108
+    folders = (Path(folder) for folder in names if folder)
+    return next(folder for folder in folders if folder.is_dir() or folder == Path("/tmp")) / f"{name}.im.shm"  # noqa: S108
 
 
 class Newest(NamedTuple):
@@ -91,23 +92,23 @@ class Stream:
         self.name = path.name.removesuffix(".im.shm")
         try:
             with path.open("r+b", buffering=0) as file:
-                found = os.fstat(file.fileno())
-                if not stat.S_ISREG(found.st_mode):
+                status = os.fstat(file.fileno())
+                if not stat.S_ISREG(status.st_mode):
                     raise StreamError(f"stream {self.name!r} is not a file: {path}")
-                if found.st_size < HEADER_BYTES:
+                if status.st_size < HEADER_BYTES:
                     raise StreamAbsentError(f"stream {self.name!r} is being created: {path} is still too short")
-                self._mapping = mmap.mmap(file.fileno(), found.st_size)
+                self._mapping = mmap.mmap(file.fileno(), status.st_size)
         except FileNotFoundError:
             raise StreamAbsentError(f"there is no stream {self.name!r} ({path})") from None
         except OSError as fault:
             raise StreamError(f"stream {self.name!r} cannot be opened: {path}: {fault.strerror}") from None
-        self.identity = _identity(found)
+        self.identity = _identity(status)
         self._header = np.frombuffer(self._mapping, HEADER, 1)
         header = self._header.copy()[0]
         if not header["version"]:
             raise StreamAbsentError(f"stream {self.name!r} is being created: its header has no version yet")
         try:
-            self.layout = layout = Layout.of(header, found.st_size)
+            self.layout = layout = Layout.of(header, status.st_size)
         except ValueError as fault:
             raise StreamError(f"stream {self.name!r} {fault} ({path})") from None
         starts, count = layout.starts, layout.semaphores
@@ -122,19 +123,19 @@ class Stream:
 
     @classmethod
     def create(cls, path: Path, shape: tuple[int, int], dtype: npt.DTypeLike) -> "Stream":
-        """Create a stream (rows, columns) atomically.
+        """Create a stream of images (rows, columns) atomically.
 
         StreamError if it exists already, or cannot be created.
         """
         rows, columns = shape
-        kind = np.dtype(dtype)
-        layout = Layout.computed(kind, (1, rows, columns), 0, SEMAPHORES, TRACES, 0)
+        pixel = np.dtype(dtype)
+        layout = Layout.computed(pixel, (1, rows, columns), 0, SEMAPHORES, TRACES, 0)
         header = np.zeros(1, HEADER)
         fields: dict[str, Any] = {"version": VERSION.encode(), "name": path.name.removesuffix(".im.shm").encode()}
-        fields |= {"axes": 2, "size": (columns, rows, 0), "elements": rows * columns, "type": NUMBERS[kind]}
+        fields |= {"axes": 2, "size": (columns, rows, 0), "elements": rows * columns, "type": NUMBERS[pixel]}
         fields |= {"kind": MATRIX, "creator": os.getpid(), "shared": 1, "location": -1, "semaphores": SEMAPHORES}
-        fields |= {"traces": TRACES, "data_bytes": rows * columns * kind.itemsize}
-        fields |= {"created": _now(), "accessed": _now()}
+        fields |= {"traces": TRACES, "data_bytes": rows * columns * pixel.itemsize}
+        fields |= {"created": _now_tai(), "accessed": _now_tai()}
         try:
             with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}-") as file:
                 fields["inode"] = os.fstat(file.fileno()).st_ino
@@ -183,13 +184,13 @@ class Stream:
         """Values of the stream's keywords, by name."""
         words = np.frombuffer(self._mapping, KEYWORD, self.layout.keywords, self.layout.starts["keywords"]).copy()
         fields = {b"L": "integer", b"D": "real", b"S": "text"}
-        found = {}
+        values = {}
         for word in words:
             field = fields.get(bytes(word["type"]))
             if field is not None:
                 value = word[field].item()
-                found[_text(word["name"])] = _text(value) if isinstance(value, bytes) else value
-        return found
+                values[_text(word["name"])] = _text(value) if isinstance(value, bytes) else value
+        return values
 
     def put(self, image: npt.NDArray[np.generic], acquired_ns: int | None = None) -> None:
         """Write an image (rows, columns) to the first plane, and post the semaphores; TypeError if it does not fit."""
@@ -199,7 +200,7 @@ class Stream:
         self.data[0] = image
         if self.layout.ring:
             self._put_in_ring()
-        now = _now()
+        now = _now_tai()
         acquired = now if acquired_ns is None else divmod(acquired_ns + _tai_ahead_ns(), _NS)
         TIMES.pack_into(self._mapping, NEWEST_START, *acquired, *now)
         self._cnt0[0] += 1
@@ -222,7 +223,7 @@ class Stream:
         """Reserve a semaphore for this process; StreamError if living processes hold all of them."""
         pid = os.getpid()
         holders = self.readers.tolist()
-        free = (index for index, one in enumerate(holders) if one == pid or not alive(one))
+        free = (index for index, holder in enumerate(holders) if holder == pid or not alive(holder))
         index = holders.index(pid) if pid in holders else next(free, None)
         if index is None:
             raise StreamError(f"stream {self.name!r} has {len(holders)} semaphores, and processes {holders} hold them")
@@ -259,8 +260,8 @@ def alive(pid: int) -> bool:
     return True
 
 
-def _identity(found: os.stat_result) -> tuple[int, int, int]:
-    return found.st_dev, found.st_ino, found.st_size
+def _identity(status: os.stat_result) -> tuple[int, int, int]:
+    return status.st_dev, status.st_ino, status.st_size
 
 
 def _text(raw: bytes) -> str:
@@ -268,12 +269,16 @@ def _text(raw: bytes) -> str:
 
 
 def _since_epoch_ns(seconds: int, nanoseconds: int) -> int:
-    """Convert a header's recent time: TAI, as the C library writes it, if far enough in the future, otherwise UTC."""
+    """Convert a recent time of a header to ns since the epoch, UTC.
+
+    A time ahead of the wall clock by more than half of TAI - UTC is TAI, as the C library writes it; others are UTC.
+    """
     time_ns, ahead_ns = seconds * _NS + nanoseconds, _tai_ahead_ns()
     return time_ns - ahead_ns if ahead_ns and time_ns > time.time_ns() + ahead_ns // 2 else time_ns
 
 
-def _now() -> tuple[int, int]:
+def _now_tai() -> tuple[int, int]:
+    """Present TAI, seconds and nanoseconds."""
     return divmod(time.clock_gettime_ns(time.CLOCK_TAI), _NS)
 
 

@@ -7,8 +7,8 @@ killed.
 Measured with rerun 0.41:
 
 - `RecordingStream.log` to a hanging viewer continues until about 100 MB are unsent (this process grows by 150 MB), then
-  blocks. To a dead viewer it neither grows nor blocks; a new stream with the same ids to a new viewer on the same port
-  continues the recording.
+  blocks. With a dead viewer the process does not grow and the call does not block; a new stream with the same ids to a
+  new viewer on the same port continues the recording.
 - `disconnect`, `del`, and the end of the process block while the viewer hangs: call stop() first.
 - A browser's page must be reloaded after its server has restarted.
 - The memory limit applies to the data as counted by rerun: a viewer levelled off at 184 MB for "100MB", a headless one
@@ -167,7 +167,7 @@ class RerunViewer:
         self._stderr.close()
 
     def screenshot(self, path: Path | None = None, timeout_s: float = 20.0) -> bytes:
-        """PNG of the whole viewer once it has loaded and its image is constant, or has changed for `timeout_s`.
+        """PNG of the whole viewer once it has loaded and its image is constant, or keeps changing for `timeout_s`.
 
         Raises:
             ViewerError: the viewer does not answer, or has not loaded everything within the timeout.

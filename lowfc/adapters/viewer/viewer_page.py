@@ -9,7 +9,7 @@ import shutil
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-_PATIENCE_S = 60.0  # on a loaded host the viewer pauses for more than 10 s: a page cut short does not start
+_TIMEOUT_S = 60.0  # on a loaded host the viewer pauses for more than 10 s: a page cut short does not start
 _CHUNK_BYTES = 1 << 20
 _FORWARDED = ("Content-Type", "rerun-final-length")  # the second is used by the page's progress bar
 
@@ -27,7 +27,7 @@ class ViewerPage:
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                source = http.client.HTTPConnection(host, source_port, timeout=_PATIENCE_S)
+                source = http.client.HTTPConnection(host, source_port, timeout=_TIMEOUT_S)
                 try:
                     source.request("GET", self.path)
                     answer = source.getresponse()
