@@ -34,8 +34,8 @@ def compile_into(target: Path) -> list[Path]:
         ]
         if protoc.main(arguments) != 0:
             raise SystemExit(f"protoc refused {SOURCE}")
-        made = [Path(work) / "lowfc.desc", *sorted((Path(work) / "lowfc/v1").iterdir())]
-        return [Path(shutil.copy(path, target / path.name)) for path in made]
+        generated = [Path(work) / "lowfc.desc", *sorted((Path(work) / "lowfc/v1").iterdir())]
+        return [Path(shutil.copy(path, target / path.name)) for path in generated]
 
 
 def main() -> None:

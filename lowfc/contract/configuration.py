@@ -39,7 +39,7 @@ from lowfc.control.loop.safety import MAX_LIMIT_NM, Limits
 MIN_FRAME_AGE_NS, MIN_FRAME_TIMEOUT_NS = 20_000_000, 50_000_000
 """Minimum of max_frame_age_ms and of frame_timeout_ms if the configuration does not set them."""
 MAX_FAULTS = 20
-"""Most faults of a file that an error explains."""
+"""Largest number of faults of a file that an error explains."""
 _MAX_KEY_LENGTH = 100  # characters of an unknown key that are compared with the known ones
 _ALTERNATIVE = re.compile(
     r"\.(?:constrained-\w+|literal\[[^]]*\])|(?<=\.value)\.(?:bool|float)"
@@ -258,7 +258,7 @@ class Configuration(Section):
 
     @property
     def period_ns(self) -> int:
-        """Time between the starts of two exposures."""
+        """Frame period: time between the starts of successive exposures."""
         return round(1e9 / self.camera.rate_hz)
 
     @property
@@ -274,8 +274,8 @@ class Configuration(Section):
     @property
     def imperfections(self) -> dict[str, Any]:
         """Imperfections of the simulation that are switched on, by key."""
-        found = {key: getattr(getattr(self, key.partition(".")[0]), key.partition(".")[2]) for key in IMPERFECTIONS}
-        return {key: value for key, value in found.items() if value}
+        values = {key: getattr(getattr(self, key.partition(".")[0]), key.partition(".")[2]) for key in IMPERFECTIONS}
+        return {key: value for key, value in values.items() if value}
 
     @property
     def max_frame_age_ns(self) -> int:
@@ -356,22 +356,22 @@ def _put(path: Path | None, data: dict[str, Any], key: str, value: object, *, re
 
 def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str, FieldInfo]:
     """All keys by their dotted names, in the order of declaration."""
-    found: dict[str, FieldInfo] = {}
+    infos: dict[str, FieldInfo] = {}
     for name, info in section.model_fields.items():
         if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):
-            found |= keys(info.annotation, f"{prefix}{name}.")
+            infos |= keys(info.annotation, f"{prefix}{name}.")
         else:
-            found[prefix + name] = info
-    return found
+            infos[prefix + name] = info
+    return infos
 
 
 def _nearest(key: str, known: Sequence[str]) -> str:
     """Suffix that names the known key most similar to a wrong one, or one of a similar name in another section."""
-    names = {one.rpartition(".")[2]: one for one in reversed(known)}
-    elsewhere = difflib.get_close_matches(key.rpartition(".")[2], names, 1, 0.75)
+    by_name = {dotted.rpartition(".")[2]: dotted for dotted in reversed(known)}
+    elsewhere = difflib.get_close_matches(key.rpartition(".")[2], by_name, 1, 0.75)
     similar = difflib.get_close_matches(key, known, 1, 0.8)
-    found = similar or [names[one] for one in elsewhere] or difflib.get_close_matches(key, known, 1)
-    return f"; the nearest known one is {found[0]!r}" if found else ""
+    close = similar or [by_name[name] for name in elsewhere] or difflib.get_close_matches(key, known, 1)
+    return f"; the nearest known one is {close[0]!r}" if close else ""
 
 
 def explain(detail: Any) -> str:

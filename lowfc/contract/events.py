@@ -39,7 +39,7 @@ class Event:
 
         Control characters in the details are shown as escapes: the message is one line for a terminal.
         """
-        details = {name: _Number(one) if isinstance(one, Integral) else one for name, one in details.items()}
+        details = {name: _Number(value) if isinstance(value, Integral) else value for name, value in details.items()}
         return Log(
             timestamp=timestamp(time_ns),
             level=self.level.value,  # type: ignore[arg-type]  # the schema's enum is a plain int at run time

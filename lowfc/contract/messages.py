@@ -294,7 +294,7 @@ def from_timestamp(stamp: Timestamp) -> int:
 LATEST_NS = 1 << 62
 """Latest valid time of a message, in the year 2116."""
 SEQUENCE_BOUND = (1 << 64) - (1 << 33)
-"""Bound of valid sequences, so that neither start nor count can overflow; starts go up to the year 2106."""
+"""Valid sequences are below this, so that neither start nor count can overflow; starts go up to the year 2106."""
 
 
 def checked_time_ns(stamp: Timestamp) -> int:

@@ -30,9 +30,9 @@ class Section(BaseModel):
 
         Only help needs them: pydantic's `use_attribute_docstrings` would read the source at every import.
         """
-        sections = [one for one in reversed(cls.__mro__) if issubclass(one, Section)]
-        found = {key: text for section in sections for key, text in _docstrings(section)}
-        return {key: info.description or found.get(key, "") for key, info in cls.model_fields.items()}
+        sections = [base for base in reversed(cls.__mro__) if issubclass(base, Section)]
+        texts = {key: text for section in sections for key, text in _docstrings(section)}
+        return {key: info.description or texts.get(key, "") for key, info in cls.model_fields.items()}
 
 
 def _docstrings(section: type[Section]) -> Iterator[tuple[str, str]]:

@@ -35,15 +35,15 @@ def recorded(content: bytes) -> tuple[Configuration, list[str]]:
     while faults := _faults(data):
         of_keys = [detail for detail in faults if _is_of_key(data, detail)]
         for detail in of_keys or faults:
-            done = _mend(data, detail) if of_keys else "used as recorded"
+            consequence = _mend(data, detail) if of_keys else "used as recorded"
             if len(remarks) < MAX_FAULTS:
-                remarks.append(f"{explain(detail)}; {done}")
+                remarks.append(f"{explain(detail)}; {consequence}")
         if len(of_keys) > MAX_FAULTS:
             remarks.append(f"and {len(of_keys) - MAX_FAULTS} more")
         if not of_keys:
             return _constructed(data, {str(detail["loc"][0]) for detail in faults if detail["loc"]}), remarks
         if isinstance(interlocks := data.get("interlocks"), list):
-            data["interlocks"] = [one for one in interlocks if one is not None]
+            data["interlocks"] = [interlock for interlock in interlocks if interlock is not None]
     return Configuration.model_validate(data), remarks
 
 
@@ -86,5 +86,5 @@ def _constructed(data: dict[str, Any], contradictory: set[str]) -> Configuration
         for name, kind in _SECTIONS.items()
         if name in data
     }
-    sections["interlocks"] = [InterlockSection.model_validate(one) for one in data.get("interlocks", ())]
+    sections["interlocks"] = [InterlockSection.model_validate(table) for table in data.get("interlocks", ())]
     return Configuration.model_construct(**(data | sections))

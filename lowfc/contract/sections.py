@@ -48,7 +48,7 @@ class Gateway(Section):
     prefix: str = Field("lowfc:", pattern=r"^[A-Za-z0-9_:.-]{1,40}$")
     """Prefix of the names of all offered variables."""
     listen: WithoutNul = "127.0.0.1"
-    """Address on which it serves; default: loopback only."""
+    """Address on which the gateway serves; default: loopback only."""
     port: int = Field(5075, ge=1, le=65534)
     """TCP port; searches are answered on the next UDP port."""
     search: WithoutNul = "127.0.0.1"
@@ -82,7 +82,7 @@ class SensorSection(Section):
     focal_mask: Literal["disk", "bowtie"] = "disk"
     """Reflective focal-plane mask: a disk, or the bowtie of Fig. 3."""
     focal_radius: float = Field(4.0, ge=1, le=10)
-    """Radius of its disk, lambda/D; at most 7 for a prolate pupil."""
+    """Radius of the focal-plane mask, lambda/D; at most 7 for a prolate pupil."""
     lyot_stop: float = Field(0.9, gt=0, le=1)
     """For circle and prolate: diameter of the Lyot stop in front of the science camera, pupil diameters."""
     sam: str = "sam27d07"
@@ -155,7 +155,8 @@ class Camera(Section):
     bit_depth: int = Field(16, ge=8, le=16)
     """Bits of the converter."""
     em_gain: float = Field(1.0, ge=1, le=5000)
-    """Electron-multiplying gain; 1 for a conventional detector. Read noise, gain and full well are those after it."""
+    """Electron-multiplying gain; 1 for a conventional detector. Read noise, gain and full well are those after
+    multiplication."""
     clock_induced_charge_e: NotNegative = 0.0
     """Spurious electrons per pixel and frame before multiplication."""
     dark_current_e_s: NotNegative = 0.0
@@ -196,20 +197,20 @@ class Disturbance(Section):
     drift_slope: float = Field(2.0, ge=0, le=4)
     """Exponent of the drift's spectrum, drift_nm^2 / (2 pi^2 f^slope) per Hz; 2 for a random walk."""
     jitter_mas: NotNegative = 0.0
-    """Jitter too fast for the loop, mas rms per axis: white from half the frame rate to one and a half."""
+    """Jitter too fast for the loop, mas rms per axis: white from 0.5 to 1.5 times the frame rate."""
     shear: float = Field(0.0, ge=0, le=0.05)
     """Slow beam wander on the sensor's masks, pupil diameters rms per axis; computed to first order."""
     wheel_hz: NotNegative = 0.0
     """Initial speed of a reaction wheel, turns per second (0: none). It excites tip and tilt at its harmonics."""
     wheel_mas: NotNegative = 3.0
-    """Amplitude of its first harmonic at high speed, mas rms per axis; the others are a half to a seventh of it."""
+    """Amplitude of the wheel's first harmonic at high speed, mas rms per axis; the others have a half to a seventh."""
     wheel_course: Literal["ramp", "walk", "run-down"] = "ramp"
-    """Change of its speed: linear, random walk, or slowed by friction."""
+    """Change of the wheel's speed: linear, random walk, or slowed by friction."""
     wheel_change: float = 0.0
-    """Rate of that change: ramp, Hz per second; walk, Hz per root second; run-down, decrease at time 0 in Hz per
-    second. 0 for constant speed."""
+    """Rate of change of the wheel's speed: ramp, Hz per second; walk, Hz per root second; run-down, decrease at time 0
+    in Hz per second. 0 for constant speed."""
     second_wheel_hz: float = 0.0
-    """Initial excess speed of a second, identical wheel, so that the two beat; 0 for no second wheel."""
+    """Initial excess speed of a second, identical wheel, turns per second, so that the two beat; 0: no second wheel."""
 
     @model_validator(mode="after")
     def _possible(self) -> "Disturbance":
@@ -235,7 +236,7 @@ class Mirror(Section):
     """The deformable mirror."""
 
     name: str = Field("dm", pattern=MIRROR_NAME)
-    """Its name in the topics."""
+    """Name of the mirror in the topics."""
     rows: int = Field(34, ge=2, le=128)
     """Rows of actuators."""
     columns: int = Field(34, ge=2, le=128)
@@ -243,7 +244,7 @@ class Mirror(Section):
     pitches_per_pupil: float = Field(31.0, gt=1, le=128)
     """Actuator pitches across the pupil."""
     coupling: float = Field(0.15, gt=0, lt=1)
-    """Height of an influence function at the neighbouring actuator."""
+    """Height of an influence function at the neighbouring actuator, as a fraction of its peak."""
     stroke_nm: float = Field(1500.0, gt=0)
     """Full range of an actuator, nm of surface."""
     driver_bits: int = Field(16, ge=8, le=24)

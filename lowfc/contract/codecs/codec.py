@@ -50,7 +50,7 @@ _PIXEL = np.dtype("<u2")  # parsing its name would cost 0.2 us in every frame
 def decode_frame(payload: bytes, sequence: int, age_ns: int, *, ahead: bool = False) -> Frame:
     """Frame of a RawImage; its pixels are None if the message has no complete mono16 image.
 
-    BadMessageError if its time or sequence is out of range.
+    `ahead`: whether its sequence starts too far in the future. BadMessageError if its time or sequence is out of range.
     """
     checked_sequence(sequence)
     try:
@@ -127,11 +127,11 @@ def decode_camera(payload: bytes, start_s: int) -> CameraSettings:
     except DecodeError as error:
         raise BadMessageError(str(error)) from None
     checked_time_ns(state.timestamp)
-    found = camera_settings(state, start_s)
-    levels = (found.bias_dn, found.saturation_dn, found.gain_e_per_dn, found.em_gain, found.read_noise_e)
-    if not all(found.shape) or not np.isfinite(levels).all():
+    camera = camera_settings(state, start_s)
+    levels = (camera.bias_dn, camera.saturation_dn, camera.gain_e_per_dn, camera.em_gain, camera.read_noise_e)
+    if not all(camera.shape) or not np.isfinite(levels).all():
         raise BadMessageError("the camera settings have no pixels, or a number that is not finite")
-    return found
+    return camera
 
 
 def encode_input(report: Report, input_number: int) -> bytes:
@@ -204,7 +204,7 @@ MAX_BYTES = 16_000_000
 """Largest size of any request; the bus loses a far larger one."""
 _SMALL_BYTES = 8_000
 MAX_REQUESTER_LENGTH = 100
-"""Most characters of a requester that are kept."""
+"""Largest number of characters kept of a requester."""
 _MAX_BYTES = {
     "channel": 4 * 128 * 128 + _SMALL_BYTES,
     "note": 4 * MAX_NOTE_LENGTH + _SMALL_BYTES,

@@ -22,10 +22,10 @@ def opened(path: Path, largest_bytes: int) -> BinaryIO:
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe without a writer would wait
     try:
-        found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode):
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "not a regular file", str(path))
-        if found.st_size > largest_bytes:
+        if status.st_size > largest_bytes:
             raise _too_large(path, largest_bytes)
         return os.fdopen(descriptor, "rb")
     except BaseException:

@@ -77,9 +77,9 @@ def put_command_channels(message: wire.ControllerState, command_channels: Comman
     """Write offset, command channels and probe sequence into a state."""
     message.offset_nm.extend(command_channels.offset_nm.tolist())
     message.shift_history_nm.extend(np.concatenate(command_channels.shifts_nm).tolist())
-    for one in command_channels.channels:
-        shape, reached = one.shape_nm.tobytes(), one.reached_nm.tobytes()
-        message.channels.add(name=one.name, actuators=shape, shifts=one.shifts, reached=reached)
+    for channel in command_channels.channels:
+        shape, reached = channel.shape_nm.tobytes(), channel.reached_nm.tobytes()
+        message.channels.add(name=channel.name, actuators=shape, shifts=channel.shifts, reached=reached)
     play = command_channels.play
     if play is not None:
         message.play.target = play.target
@@ -106,18 +106,19 @@ def command_channels_of(
     offset_nm = np.array(message.offset_nm, np.float32).reshape(modes)
     shifts_nm = np.array(message.shift_history_nm, np.float32).reshape(frames, modes)
     channels = tuple(
-        Channel.of(one.name, floats(one.actuators, rows, columns), floats(one.reached, rows, columns))
-        for one in message.channels
+        Channel.of(stored.name, floats(stored.actuators, rows, columns), floats(stored.reached, rows, columns))
+        for stored in message.channels
     )
     play = None
     if message.HasField("play"):
-        one = message.play
-        if not one.id:
-            table = floats(one.table, -1, one.columns or 1)
-            played = PlayTable(one.target, table, floats(one.basis, -1, rows * columns), np.zeros(0), 0.0, "")
-            play = Play(played, one.first_sequence, len(table))
-        elif one.id not in plays:
-            raise ValueError(f"the table {one.id[:12]} of the probe sequence is missing")
+        stored_play = message.play
+        if not stored_play.id:
+            table = floats(stored_play.table, -1, stored_play.columns or 1)
+            basis = floats(stored_play.basis, -1, rows * columns)
+            played = PlayTable(stored_play.target, table, basis, np.zeros(0), 0.0, "")
+            play = Play(played, stored_play.first_sequence, len(table))
+        elif stored_play.id not in plays:
+            raise ValueError(f"the table {stored_play.id[:12]} of the probe sequence is missing")
         else:
-            play = Play(plays[one.id], one.first_sequence, one.frames)
+            play = Play(plays[stored_play.id], stored_play.first_sequence, stored_play.frames)
     return empty._replace(offset_nm=offset_nm, shifts_nm=tuple(shifts_nm), play=play).with_all(channels, to_modes)

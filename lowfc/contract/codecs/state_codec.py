@@ -57,7 +57,7 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         lease=None if lease is None else wire.Lease(until=timestamp(lease.until_ns), **fields_of(lease, _LEASE)),
         measured_nm=() if estimate is None else estimate.error_nm.tolist(),
         flux_dn=0.0 if estimate is None else estimate.flux_dn,
-        interlocks_acting=[wire.ActingInterlock(**one._asdict()) for one in conditions.acting],
+        interlocks_acting=[wire.ActingInterlock(**acting._asdict()) for acting in conditions.acting],
         **fields_of(state, _STATE),
         **fields_of(conditions, _CONDITIONS),
     )
@@ -121,18 +121,19 @@ def decode_state(
         if calibration is None or calibration.id != message.calibration_id:
             raise ValueError(f"calibration {message.calibration_id[:12]} of the controller's state is missing")
         loop = ActiveLoop.at_rest(settings, calibration)
-        law = integrator_of(message)
+        integrator = integrator_of(message)
         history = np.array(message.command_history_nm, np.float32).reshape(len(loop.history_nm), -1)
         actuators = floats(message.actuators, *calibration.grid)
         modes, prior_nm2 = len(calibration.noll), np.array(message.prior_nm2, np.float32)
-        if {law.gain.size, history.shape[1], prior_nm2.size or modes, len(message.automatic) or modes} != {modes}:
+        sizes = {integrator.gain.size, history.shape[1], prior_nm2.size or modes, len(message.automatic) or modes}
+        if sizes != {modes}:
             raise ValueError(f"the controller's state does not have {modes} modes")
         law_runner = None
         if message.HasField("law"):
             x = np.array(message.law_state, np.float32)
-            found = law_of(message.law, laws)
-            guard = _decode_guard(message.guard, found, len(history)) if message.HasField("guard") else None
-            law_runner = LawRunner(found, x, message.law_frames, guard)
+            law = law_of(message.law, laws)
+            guard = _decode_guard(message.guard, law, len(history)) if message.HasField("guard") else None
+            law_runner = LawRunner(law, x, message.law_frames, guard)
             if x.shape != linear_law.at_rest(law_runner.law).shape or law_runner.law.noll != calibration.noll:
                 raise ValueError("the law of the controller's state does not fit")
         if message.HasField("camera_expected"):
@@ -145,7 +146,7 @@ def decode_state(
             history_nm=tuple(history),
             actuators_nm=actuators,
             automatic=np.array(message.automatic or [False] * modes, bool),
-        ).with_gains(law)
+        ).with_gains(integrator)
     state = State(
         mode=LoopMode(message.mode),
         loop=loop,
@@ -160,7 +161,7 @@ def decode_state(
             lease=Lease(until_ns=from_timestamp(message.lease.until), **fields_of(message.lease, _LEASE))
             if message.HasField("lease")
             else None,
-            acting=tuple(Acting(one.number, Action(one.action), one.why) for one in message.interlocks_acting),
+            acting=tuple(Acting(lock.number, Action(lock.action), lock.why) for lock in message.interlocks_acting),
             **fields_of(message, _CONDITIONS),
         ),
         **fields_of(message, _STATE),
@@ -179,20 +180,20 @@ def _put_guard(message: wire.Guard, guard: LawGuard) -> None:
 
 def _decode_guard(message: wire.Guard, law: LinearLaw, commands: int) -> LawGuard:
     at_rest = LawGuard.of(law, [Group(**fields_of(group, Group._fields)) for group in message.groups])
-    found = at_rest._replace(
+    guard = at_rest._replace(
         **fields_of(message, ("frames", "void")),
         sums_nm2=np.array(message.sums_nm2).reshape(at_rest.sums_nm2.shape),
         virtual_nm=tuple(np.array(message.virtual_nm, np.float32).reshape(-1, len(law.noll))),
         x=np.array(message.law_state, np.float32) if message.law_state else None,
     )
     if (
-        len(found.groups) != at_rest.sums_nm2.shape[1]
-        or any(group.overruled and not group.takeovers for group in found.groups)
-        or (found.virtual_nm and len(found.virtual_nm) != commands)
-        or (found.x is not None and found.x.shape != linear_law.at_rest(law).shape)
+        len(guard.groups) != at_rest.sums_nm2.shape[1]
+        or any(group.overruled and not group.takeovers for group in guard.groups)
+        or (guard.virtual_nm and len(guard.virtual_nm) != commands)
+        or (guard.x is not None and guard.x.shape != linear_law.at_rest(law).shape)
     ):
         raise ValueError("the guard of the controller's state does not fit its law")
-    return found
+    return guard
 
 
 def reason_counts(state: State) -> list[wire.ReasonCount]:
