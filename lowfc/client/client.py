@@ -98,10 +98,10 @@ class Client:
         """
         self.run_id = the_run(run) if bus is None else run or DEFAULT_RUN
         self._requester = by_this_process(program_name())
-        self._own = self._joined = None
+        self._own_bus = self._joined = None
         if bus is None:
             self._joined = open_run(self.run_id, ())
-            bus = self._own = ZenohBus(self._joined.links, Role.OPERATOR, HostClock())
+            bus = self._own_bus = ZenohBus(self._joined.links, Role.OPERATOR, HostClock())
             deadline_s = time.monotonic() + CONNECT_S
             while not bus.peers() and time.monotonic() < deadline_s:
                 time.sleep(0.01)
@@ -118,8 +118,8 @@ class Client:
 
     def disconnect(self) -> None:
         """Leave the run; the loop continues unchanged."""
-        if self._own is not None:
-            self._own.close()
+        if self._own_bus is not None:
+            self._own_bus.close()
             self._bench.clear()  # zenoh's publishers raise an error of their own
 
     status = _plain("status")
@@ -158,7 +158,8 @@ class Client:
     def channel(self, name: str, actuators_nm: npt.ArrayLike | None = None) -> Answer:
         """Add a shape to the mirror, (rows, columns) nm of surface, as channel `name`; None removes the channel.
 
-        The sensor's zero point shifts with it, so that the loop does not undo it, except for the channel "flat".
+        The sensor's zero point shifts with the shape, so that the loop does not undo it; the channel "flat" shifts
+        nothing.
         """
         shape = floats("channel", () if actuators_nm is None else actuators_nm)
         if actuators_nm is not None and shape.shape != self.mirror_grid():
@@ -293,13 +294,13 @@ class Client:
         return self._get_message(CAMERA_STATE, wire.CameraState, Role.CAMERA)
 
     def processes(self) -> dict[str, wire.Health]:
-        """Health report of each process of the run, by name."""
-        found, names = {}, Names()
+        """Health of each process of the run, by name."""
+        reports, names = {}, Names()
         for sample in self._bus.get(HEALTH.at(ALL), timeout_s=ANSWER_S):
             with contextlib.suppress(*UNREADABLE):
                 name, health = names.health(sample.key, sample.payload)
-                found[name] = health
-        return found
+                reports[name] = health
+        return reports
 
     def laws(self) -> dict[str, LinearLaw]:
         """The control law published last, by its identity, whether or not it drives the mirror; empty before any."""

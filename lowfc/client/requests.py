@@ -99,7 +99,10 @@ DECLARED: tuple[Declaration, ...] = (
         ("law", "the linear law; none for the integrator"),
     ),
     _declared(
-        "load", "Use another calibration; the loop must be open.", "load calibration.fits", ("calibration", "all of it")
+        "load",
+        "Use another calibration; the loop must be open.",
+        "load calibration.fits",
+        ("calibration", "the complete calibration"),
     ),
     _declared("note", "Write a note to the log.", 'note "new star"', ("text", "the note")),
     _declared(
@@ -140,5 +143,5 @@ DECLARED: tuple[Declaration, ...] = (
 )
 
 
-BY_NAME = {one.key.partition("/")[2].removeprefix("request/"): one for one in DECLARED}
+BY_NAME = {declared.key.partition("/")[2].removeprefix("request/"): declared for declared in DECLARED}
 """Declarations by name, such as "gain" and "record/start"."""

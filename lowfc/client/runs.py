@@ -23,15 +23,15 @@ def the_run(name: str | None) -> str:
     runs = live_runs(name)
     if name in runs:
         return name
-    found = [] if name and (runtime_base() / name).is_dir() else [run for run in runs if run.startswith(name or "")]
-    if len(found) == 1:
-        return found[0]
+    matching = [] if name and (runtime_base() / name).is_dir() else [run for run in runs if run.startswith(name or "")]
+    if len(matching) == 1:
+        return matching[0]
     if not runs:
         raise BusError(none_here() if name is None else f"there is no run {name!r}: {none_here()}")
     if name is None:
         raise BusError(f"choose a run with --run, the beginning of its name is enough: there are {_listed(runs)}")
-    if found:
-        raise BusError(f"{name!r} is the beginning of several runs: {', '.join(found)}")
+    if matching:
+        raise BusError(f"{name!r} is the beginning of several runs: {', '.join(matching)}")
     raise BusError(
         f"there is no run {name!r}: there {'is' if len(runs) == 1 else 'are'} {_listed(runs)}{nearest(name, runs)}"
     )
@@ -47,14 +47,14 @@ def waiting_message(name: str) -> str:
     runs = live_runs()
     if name in runs:
         return ""
-    there = f"running: {_listed(runs)}{nearest(name, runs)}" if runs else "no other loop of yours is running"
-    return f"waiting for run {name!r}, which has no other process on this host yet; {there}"
+    others = f"running: {_listed(runs)}{nearest(name, runs)}" if runs else "no other loop of yours is running"
+    return f"waiting for run {name!r}, which has no other process on this host yet; {others}"
 
 
 def absence(name: str, role: Role, joined: Run | None = None) -> str:
-    """Message about a run's process to which there is no link: it is starting, stopped or absent; or of another run.
+    """Message about a process without a link: it is starting, hangs, is stopped or absent, or its run was restarted.
 
-    `joined` is the run as it was joined, if it was.
+    `joined` is the run as this process joined it; None if it has not.
     """
     if joined is not None and joined.restarted():
         return f"run {name!r} was started again: join it again, with a new Client"
@@ -76,7 +76,7 @@ def live_runs(required: str | None = None) -> dict[str, set[str]]:
     Raises:
         BusError, DataFileError: the required run is damaged.
     """
-    found: dict[str, set[str]] = {}
+    live: dict[str, set[str]] = {}
     for name in sorted(path.parent.name for path in runtime_base().glob("*/links.json")):
         try:
             roles = open_run(name, ()).links.live()
@@ -85,8 +85,8 @@ def live_runs(required: str | None = None) -> dict[str, set[str]]:
                 raise
             continue
         if roles:
-            found[name] = roles
-    return found
+            live[name] = roles
+    return live
 
 
 def _listed(runs: dict[str, set[str]]) -> str:

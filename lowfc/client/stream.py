@@ -77,10 +77,10 @@ class Stream(Generic[T]):
             sample = self._waiting.popleft()
             count = count_of(sample.sequence)
             self._gaps.setdefault(start_of(sample.sequence), Gaps(count)).add(count)
-            found = self._decode(sample)
-            if found is not None:
+            message = self._decode(sample)
+            if message is not None:
                 self._remaining -= 1
-                return found
+                return message
             self._damaged += 1
             self._expire(deadline_s)
         self.close()

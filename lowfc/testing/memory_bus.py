@@ -117,15 +117,15 @@ class MemoryBus:
         replied = threading.Semaphore(0)
         pending = 0
         for bus in list(self.hub.buses):
-            stored = [one for one in bus.publishers if key in (one.key, one.topic.at(ALL))]
-            answers.extend(_sample(one.key, *one.last, self.clock) for one in stored if one.last)
+            matching = [stored for stored in bus.publishers if key in (stored.key, stored.topic.at(ALL))]
+            answers.extend(_sample(stored.key, *stored.last, self.clock) for stored in matching if stored.last)
             start = Envelope(sequence_of(bus.start_s, 0), self.clock.host_ns())
 
             def reply(body: bytes, envelope: Envelope = start) -> None:
                 answers.append(_sample(key, body, envelope, self.clock))
                 replied.release()
 
-            for handler in [one for expression, one in bus.queryables if _covers(expression, key)]:
+            for handler in [handler for expression, handler in bus.queryables if _covers(expression, key)]:
                 pending += bus.call("queryable of", key, handler, Query(key, payload, reply))
         deadline_s = time.monotonic() + timeout_s
         while pending and replied.acquire(timeout=max(0.0, deadline_s - time.monotonic())):
