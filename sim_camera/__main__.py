@@ -5,13 +5,13 @@ import typer
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.device import run_camera
 from lowfc.device.plugins import opened
-from lowfc.device.run import PASSED_ON, Frames, WaitFor, command_of
+from lowfc.device.run import PASSED_ON, Frames, WaitFor, driver_command
 from sim_camera.driver import SimulatedCamera
 
 app = new_app("The simulated sensor camera.\n\nExample: sim-camera --run bench --config lowfc.toml")
 
 
-@app.command(cls=command_of("camera", "sim"), context_settings=PASSED_ON)
+@app.command(cls=driver_command("camera", "sim"), context_settings=PASSED_ON)
 def camera(
     context: typer.Context,
     run: RunId = DEFAULT_RUN,

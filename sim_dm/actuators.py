@@ -5,7 +5,7 @@ import numpy as np
 from lowfc.arrays import Array, Single
 
 PLAY_NM = (1.0, 4.0, 16.0, 64.0, 256.0)
-"""Half widths of the play operators, surface: hysteresis for moves of any size."""
+"""Half widths of the play operators, nm of surface: hysteresis for moves of any size."""
 CREEP_S = (0.1, 1.0, 10.0, 100.0)
 """Time constants of the creep, a decade apart, so that creep grows with the logarithm of time."""
 

@@ -13,6 +13,7 @@ from lowfc.device.watch import DriverWatch, opening
 WAIT_S = 30.0
 """Time that the first frame waits for the processes that need it."""
 SETTINGS_NS = round(1e9 / float(CAMERA_STATE.rate))
+"""Period of the published settings, and of the events on lost frames."""
 PATIENCE_S = 1.0
 """Timeout of an exposure, or three periods if that is longer."""
 REST_NS = 100_000_000
@@ -46,9 +47,9 @@ class CameraLoop:
         self._number_ns = self._lost = self._lost_due_ns = 0
         self.watch = DriverWatch(service, PATIENCE_S)
         self._settings: CameraSettings | None = None
-        self._due_ns = 0
+        self._settings_due_ns = 0
         self._publish_settings()
-        self._due_ns = 0  # publish them again with the first frame
+        self._settings_due_ns = 0  # publish them again with the first frame
         service.fill = self._fill
         service.state = "ready"
 
@@ -77,7 +78,7 @@ class CameraLoop:
                     service.clock.sleep_until_ns(service.clock.now_ns() + min(left_ns, REST_NS))
                 self._report_lost()
                 service.beat()
-        self._lost_due_ns = 0  # those of the last half second, too
+        self._lost_due_ns = 0  # also report the frames lost in the last half second
         self._report_lost()
         service.finish()
 
@@ -178,9 +179,9 @@ class CameraLoop:
         """Publish the settings when they have changed, and twice a second."""
         settings = self._driver.settings()
         time_ns = self._service.clock.now_ns() if settings.time_ns is None else settings.time_ns
-        if settings != self._settings or time_ns + settings.period_ns // 2 >= self._due_ns:
+        if settings != self._settings or time_ns + settings.period_ns // 2 >= self._settings_due_ns:
             self._states.put(camera_state(settings, time_ns).SerializeToString())
-            self._settings, self._due_ns = settings, time_ns + SETTINGS_NS
+            self._settings, self._settings_due_ns = settings, time_ns + SETTINGS_NS
             self._simulated = settings.clock == "run"
             self.watch.timeout_s = max(PATIENCE_S, 3e-9 * settings.period_ns)
         return settings

@@ -58,7 +58,7 @@ class CameraSettings:
         rows: rows of a frame, that is, of the region read.
         columns: columns of a frame.
         exposure_ns: exposure time of one frame.
-        period_ns: time between the starts of two exposures.
+        period_ns: time between the starts of successive exposures.
         gain_e_per_dn: electrons per digital number.
         bias_dn: level without light.
         read_noise_e: read noise of one pixel.
@@ -108,9 +108,11 @@ class CameraSettings:
         )
 
 
-_PUBLISHED = tuple(one.name for one in fields(CameraSettings) if one.name in wire.CameraState.DESCRIPTOR.fields_by_name)
+_PUBLISHED = tuple(
+    part.name for part in fields(CameraSettings) if part.name in wire.CameraState.DESCRIPTOR.fields_by_name
+)
 
-_LEAST = dict.fromkeys(("rows", "columns", "period_ns", "bit_depth", "number_wrap"), 1) | dict.fromkeys(
+_LOWEST = dict.fromkeys(("rows", "columns", "period_ns", "bit_depth", "number_wrap"), 1) | dict.fromkeys(
     ("exposure_ns", "region_row", "region_column"), 0
 )
 """Whole numbers among the settings, with their lowest values."""
@@ -118,9 +120,9 @@ _LEAST = dict.fromkeys(("rows", "columns", "period_ns", "bit_depth", "number_wra
 
 def camera_state(settings: CameraSettings, time_ns: int) -> wire.CameraState:
     """Message of a camera's settings; ValueError if a value is impossible."""
-    for name, least in _LEAST.items():
-        if not isinstance(value := getattr(settings, name), Integral) or value < least:
-            raise ValueError(f"{name} of the settings is {value!r}, expected a whole number of {least} or more")
+    for name, lowest in _LOWEST.items():
+        if not isinstance(value := getattr(settings, name), Integral) or value < lowest:
+            raise ValueError(f"{name} of the settings is {value!r}, expected a whole number of {lowest} or more")
     if settings.saturation_dn is None:
         settings = replace(settings, saturation_dn=2**settings.bit_depth - 1)
     for name in ("gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "em_gain"):

@@ -36,9 +36,11 @@ from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.mirror import influence_factors
 
 TICK_NS = 10_000_000
+"""Period of the calls of `tick` without commands."""
 IDLE_STATE_NS = 100_000_000
 """Period of the published state without commands; a restarted controller starts from it."""
 PICTURE_PIXELS = 64
+"""Pixels across the published picture of the surface."""
 PATIENCE_S = 0.5
 """Timeout of a call of the driver."""
 
@@ -52,7 +54,7 @@ _NONE: Single = np.zeros(0, np.float32)
 
 
 def protection_of(driver: Mirror, config: Configuration) -> MirrorProtection:
-    """Limits of a mirror: the tighter of its driver's and those of [mirror].
+    """Protection of a mirror, with the tighter of its driver's limits and those of [mirror].
 
     ConfigurationError if its grid is not that of [mirror], or if its steps are not below every limit; ValueError if a
     limit of the driver is impossible.
@@ -130,23 +132,23 @@ class MirrorLoop:
         with self.watch.over(self._close, self._fill_extra):
             while service.running:
                 time.sleep(TICK_NS * 1e-9)
-                free = self._turn.acquire(timeout=TICK_NS * 1e-9)
-                if free:
+                acquired = self._turn.acquire(timeout=TICK_NS * 1e-9)
+                if acquired:
                     try:
                         if not service.clock.lockstep and service.clock.host_ns() - self._applied_ns >= TICK_NS:
                             self._idle()
                     finally:
                         self._turn.release()
-                service.beat(alive=free)
+                service.beat(alive=acquired)
         service.finish()
 
     def _close(self) -> None:
         self._service.stop(self._service.why)  # also after a fault: no further command is passed to the driver
-        free = self._turn.acquire(timeout=CLOSE_S)  # one may still be with it, and never return
+        acquired = self._turn.acquire(timeout=CLOSE_S)  # a call of the driver may still run, and never return
         try:
             self._driver.close()
         finally:
-            if free:
+            if acquired:
                 self._turn.release()
 
     def _arrived(self, sample: Sample) -> None:
@@ -211,15 +213,15 @@ class MirrorLoop:
         """
         self.watch.begin()
         try:
-            found_nm = method(*arguments)
-            if found_nm is not None:
-                found_nm = np.array(found_nm, np.float32, order="C")  # a driver may use its array again
-                if found_nm.shape != self._protection.grid:
-                    raise ValueError(f"it returned {found_nm.shape} actuators, expected {self._protection.grid}")
-                if not finite(found_nm):
+            shape_nm = method(*arguments)
+            if shape_nm is not None:
+                shape_nm = np.array(shape_nm, np.float32, order="C")  # a driver may use its array again
+                if shape_nm.shape != self._protection.grid:
+                    raise ValueError(f"it returned {shape_nm.shape} actuators, expected {self._protection.grid}")
+                if not finite(shape_nm):
                     raise ValueError("it returned positions that are NaN or infinite, expected nm of surface")
             if self.watch.returned():
-                return found_nm
+                return shape_nm
         except Exception as fault:
             self.watch.failed(fault)
         self._known, self._returning, self._driven_nm = False, True, None
@@ -283,7 +285,7 @@ class MirrorLoop:
 
 
 def state_of(status: Status, time_ns: int, refused: Reason | None = None, *, known: bool = True) -> wire.MirrorState:
-    """Message of a mirror's state: `refused` is why the last command was refused, `known` whether its position is."""
+    """Message of a mirror's state: why the last command was `refused`, and whether the mirror's position is `known`."""
     rows, columns = status.surface_nm.shape
     following = wire.MIRROR_STATUS_FOLLOWING if status.following and known else wire.MIRROR_STATUS_EXPIRED
     return wire.MirrorState(

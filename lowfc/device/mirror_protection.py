@@ -118,7 +118,7 @@ def apply_command(
     reason = _refusal(protection, status, command)
     if reason is not None:
         return status, reason
-    assert command.actuators_nm is not None  # noqa: S101  # _refusal
+    assert command.actuators_nm is not None  # noqa: S101  # checked in _refusal
     channels = {**status.channels, command.channel: command.actuators_nm}
     target_nm = command.actuators_nm
     if len(channels) > 1:

@@ -35,7 +35,7 @@ def load(kind: Kind, name: str) -> Any:
             if module.endswith(".py") and not Path(module).is_file():
                 raise ConfigurationError(f"the driver {name!r} cannot be loaded: there is no file {module}")
             names = [section(name)] if module.endswith(".py") else module.split(".")
-            if not all(one.isidentifier() for one in (*names, *attribute.split("."))):
+            if not all(part.isidentifier() for part in (*names, *attribute.split("."))):
                 raise ConfigurationError(
                     f"the driver {name!r} cannot be loaded: file and class have names of letters, digits and _, as in "
                     "folder/my_camera.py:MyCamera: rename the file or the class"
@@ -79,7 +79,7 @@ def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = 
 
 def faults(config: Configuration, folder: Path) -> list[str]:
     """List the faults of the sections [drivers.NAME] of a configuration whose file is in `folder`, a sentence each."""
-    found, files = [], {one.stem for here in (folder, Path.cwd()) for one in here.glob("*.py")}
+    sentences, files = [], {file.stem for searched in (folder, Path.cwd()) for file in searched.glob("*.py")}
     for name in config.drivers:
         kinds = [kind for kind in KINDS if name in installed(kind)]
         module = name.partition(".")[0]
@@ -87,7 +87,7 @@ def faults(config: Configuration, folder: Path) -> list[str]:
         # an unknown name may be that of a file in any other folder
         similar = nearest(name, {*installed("camera"), *installed("mirror")})
         if not kinds and name not in files and not importable and (similar or not module.isidentifier()):
-            found.append(
+            sentences.append(
                 f"drivers.{name}: no installed driver or module has that name{similar}, and there is no file {name}.py "
                 "here; the options of folder/file.py:Class are in drivers.file"
             )
@@ -95,8 +95,8 @@ def faults(config: Configuration, folder: Path) -> list[str]:
             try:
                 options(load(kind, name), table(config, kind, name))
             except ConfigurationError as fault:
-                found.append(f"drivers.{name}: {fault}")
-    return found
+                sentences.append(f"drivers.{name}: {fault}")
+    return sentences
 
 
 def table(config: Configuration, kind: Kind, name: str) -> dict[str, Any]:
@@ -108,18 +108,18 @@ def table(config: Configuration, kind: Kind, name: str) -> dict[str, Any]:
     for other in {name, name.rpartition(":")[2]} - {expected}:
         if other in config.drivers:
             raise ConfigurationError(f"the options of {name} are in [drivers.{expected}], got [drivers.{other}]")
-    found = config.drivers.get(expected) or _nested(config.drivers, expected)
-    if found and set(found) <= set(KINDS) and all(isinstance(part, dict) for part in found.values()):
-        return dict(found.get(kind, {}))
-    return found
+    own = config.drivers.get(expected) or _nested(config.drivers, expected)
+    if own and set(own) <= set(KINDS) and all(isinstance(part, dict) for part in own.values()):
+        return dict(own.get(kind, {}))
+    return own
 
 
 def _nested(tables: dict[str, Any], name: str) -> dict[str, Any]:
     """The table of a dotted name, as TOML reads [drivers.package.module]; empty if there is none."""
-    found: Any = tables
+    nested: Any = tables
     for part in name.split("."):
-        found = found.get(part) if isinstance(found, dict) else None
-    return found if isinstance(found, dict) else {}
+        nested = nested.get(part) if isinstance(nested, dict) else None
+    return nested if isinstance(nested, dict) else {}
 
 
 def options(driver: Any, configured: dict[str, Any], words: Sequence[str] = ()) -> DriverOptions:
@@ -133,20 +133,21 @@ def options(driver: Any, configured: dict[str, Any], words: Sequence[str] = ()) 
         # In JSON, as in TOML, a list stands for a tuple, and text for a path or an enum.
         validated = model.model_validate_json(json.dumps(configured, default=str))
     except ValidationError as error:  # options missing here may be among the words
-        faults = [one for one in error.errors() if not (values and one["type"] == "missing")]
+        faults = [detail for detail in error.errors() if not (values and detail["type"] == "missing")]
     if values and not faults:
         try:
             validated = model.model_validate({**configured, **values}, strict=False)
         except ValidationError as error:
             faults = error.errors()
     if faults:
-        raise ConfigurationError("\n".join(f"options of {driver.__name__}: {_explained(one, model)}" for one in faults))
+        lines = [f"options of {driver.__name__}: {_explained(detail, model)}" for detail in faults]
+        raise ConfigurationError("\n".join(lines))
     return validated
 
 
 def options_help(driver: Any) -> list[tuple[str, str]]:
     """Command-line options of a driver's class, each with its help."""
-    found = []
+    rows = []
     model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
     descriptions = model.descriptions()
     for key, info in model.model_fields.items():
@@ -157,8 +158,8 @@ def options_help(driver: Any) -> list[tuple[str, str]]:
         kind = "|".join(words) or getattr(annotation, "__name__", str(annotation))
         default = "required" if info.is_required() else f"default: {info.get_default(call_default_factory=True)}"
         shown = "" if default.endswith((": ", "None")) else f"  [{default}]"
-        found.append((f"--{key.replace('_', '-')} <{kind}>", f"{descriptions[key]}{shown}"))
-    return found
+        rows.append((f"--{key.replace('_', '-')} <{kind}>", f"{descriptions[key]}{shown}"))
+    return rows
 
 
 def _explained(fault: Any, model: type[DriverOptions]) -> str:
@@ -174,16 +175,16 @@ def _explained(fault: Any, model: type[DriverOptions]) -> str:
 
 def _parsed(words: Sequence[str]) -> dict[str, Any]:
     """Parse a command line into values by field name; lists and tables are written as in TOML."""
-    found: dict[str, Any] = {}
-    rest = list(words)
-    while rest:
-        key, equals, value = rest.pop(0).partition("=")
-        if not key.startswith("--") or not (equals or rest):
-            raise ConfigurationError(f"options of a driver are --name value, got {' '.join([key, *rest])!r}")
-        value = value if equals else rest.pop(0)
+    values: dict[str, Any] = {}
+    remaining = list(words)
+    while remaining:
+        key, equals, value = remaining.pop(0).partition("=")
+        if not key.startswith("--") or not (equals or remaining):
+            raise ConfigurationError(f"options of a driver are --name value, got {' '.join([key, *remaining])!r}")
+        value = value if equals else remaining.pop(0)
         try:
             is_toml = value[:1] in ("[", "{")
-            found[key[2:].replace("-", "_")] = tomllib.loads(f"x = {value}")["x"] if is_toml else value
+            values[key[2:].replace("-", "_")] = tomllib.loads(f"x = {value}")["x"] if is_toml else value
         except tomllib.TOMLDecodeError:
             raise ConfigurationError(f"{key}: {value!r} is not a list or a table as in TOML") from None
-    return found
+    return values

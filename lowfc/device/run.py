@@ -21,8 +21,8 @@ from lowfc.device.plugins import Kind, load, options_help
 from lowfc.device.watch import closed_on_fault, opening
 
 
-def command_of(kind: Kind, name: str | None = None) -> type[TyperCommand]:
-    """Make a command whose help lists the options of the driver with this name or of its argument `driver`."""
+def driver_command(kind: Kind, name: str | None = None) -> type[TyperCommand]:
+    """Make a command whose help lists the options of the driver `name`, or of that in its argument `driver`."""
 
     class WithOptions(TyperCommand):
         driver = name
@@ -43,7 +43,7 @@ def command_of(kind: Kind, name: str | None = None) -> type[TyperCommand]:
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Settings of a command that passes unknown words to the driver as its options."""
-Frames = Annotated[int | None, typer.Option(min=1, help="Stop after so many frames; default: at Ctrl-C or SIGTERM.")]
+Frames = Annotated[int | None, typer.Option(min=1, help="Stop after this many frames; default: at Ctrl-C or SIGTERM.")]
 LEAVE_S = 2.0
 """Time in which a camera in the controller's process has to end."""
 WaitFor = Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; may be repeated.")]

@@ -55,7 +55,8 @@ class VoltMap:
             raise ConfigurationError(f"option order: each actuator needs its own channel below {self.channels}")
         if not (gain > 0).all():
             raise ConfigurationError("option gain_map: every gain must be above 0")
-        self._zero, self._nm = zero.ravel()[self._wired], (gain * config.mirror.nm_per_unit).ravel()[self._wired]
+        self._zero = zero.ravel()[self._wired]
+        self._nm_per_value = (gain * config.mirror.nm_per_unit).ravel()[self._wired]
         self._range = low, high = options.lowest, options.highest
         if not (low <= self._zero.min(initial=np.inf) <= self._zero.max(initial=-np.inf) <= high):
             raise ConfigurationError(f"options zero, zero_map: flat values must be within {low:g} to {high:g}")
@@ -63,12 +64,13 @@ class VoltMap:
 
     def values(self, actuators_nm: Single) -> Array:
         """Values (channels,), clipped, for actuators (rows, columns) in nm of surface; 0 for unused channels."""
-        found = np.zeros(self.channels)
-        found[self._channel] = np.clip(self._zero + actuators_nm.ravel()[self._wired] / self._nm, *self._range)
-        return found
+        values = np.zeros(self.channels)
+        wired_nm = actuators_nm.ravel()[self._wired]
+        values[self._channel] = np.clip(self._zero + wired_nm / self._nm_per_value, *self._range)
+        return values
 
     def surface_nm(self, values: Array) -> Single:
         """Actuators (rows, columns) in nm of surface for values (channels,); 0 for actuators without a channel."""
         surface = np.zeros(self._grid)
-        surface.flat[self._wired] = (values[self._channel] - self._zero) * self._nm
+        surface.flat[self._wired] = (values[self._channel] - self._zero) * self._nm_per_value
         return single(surface)

@@ -13,7 +13,7 @@ from lowfc.contract.messages import wire
 
 CHECK_S = 0.1
 PAUSES_NS = (0, 100_000_000, 200_000_000, 500_000_000, 1_000_000_000, 2_000_000_000, 4_000_000_000)
-"""Pause before the retry after the first, second, ... consecutive failure."""
+"""Pause before the retry after the first, second, ... consecutive failure, ns."""
 RECOVERED_NS = 1_000_000_000
 """A driver counts as recovered after this time without failure."""
 REPEAT_NS = 10_000_000_000
@@ -33,8 +33,8 @@ def described(fault: Exception) -> str:
         and not path.is_relative_to(_PROGRAMS)
         and "importlib" not in frame.filename
     ]
-    its_own = [frame for frame in frames if frame.filename == frames[0].filename]
-    where = f" ({Path(its_own[-1].filename).name}, line {its_own[-1].lineno})" if its_own else ""
+    of_driver = [frame for frame in frames if frame.filename == frames[0].filename]
+    where = f" ({Path(of_driver[-1].filename).name}, line {of_driver[-1].lineno})" if of_driver else ""
     return f"{type(fault).__name__}: {fault}"[:300] + where
 
 

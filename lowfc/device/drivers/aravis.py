@@ -93,7 +93,7 @@ class AravisCamera:
         self._camera = camera = self._aravis.Camera.new(name or None)
         self._name, self._lost = name or camera.get_device_id(), False  # before the signal, which may come at once
         camera.get_device().connect("control-lost", self._lose)
-        self._set(self._options)
+        self._configure(self._options)
         self._stream = camera.create_stream(None, None)
         if camera.is_gv_device():  # a resent packet would arrive too late
             self._stream.set_property("packet-resend", self._aravis.GvStreamPacketResend.NEVER)
@@ -103,7 +103,7 @@ class AravisCamera:
     def _lose(self, device: Any) -> None:
         self._lost = True
 
-    def _set(self, options: GenicamOptions) -> None:
+    def _configure(self, options: GenicamOptions) -> None:
         camera, settings = self._camera, self._settings
         camera.set_range_check_policy(self._aravis.RangeCheckPolicy.ENABLE)
         camera.set_pixel_format_from_string(options.pixel_format)

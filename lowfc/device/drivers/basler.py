@@ -46,7 +46,7 @@ class BaslerCamera:
             pylon = _pylon()
         except ConfigurationError:
             return [Need("pypylon", "", install_advice("basler"))]
-        detected = [one.GetFriendlyName() for one in pylon.TlFactory.GetInstance().EnumerateDevices()]
+        detected = [device.GetFriendlyName() for device in pylon.TlFactory.GetInstance().EnumerateDevices()]
         advice = "connect one and switch it on; PYLON_CAMEMU=1 in the environment emulates one"
         return [Need("pypylon", pylon.GetPylonVersionString(), ""), Need("a camera", ", ".join(detected), advice)]
 
@@ -84,9 +84,9 @@ class BaslerCamera:
         self._camera = camera = self._pylon.InstantCamera(factory.CreateFirstDevice(info))
         self._serial = serial or camera.GetDeviceInfo().GetSerialNumber()
         camera.Open()
-        self._set(self._options)
+        self._configure(self._options)
 
-    def _set(self, options: GenicamOptions) -> None:
+    def _configure(self, options: GenicamOptions) -> None:
         camera, settings = self._camera, self._settings
         camera.PixelFormat.Value = options.pixel_format
         camera.OffsetX.Value = camera.OffsetY.Value = 0  # otherwise the size may not fit

@@ -13,7 +13,8 @@ FRAME_ID_WRAP = 65535
 WAIT_MS = 500
 """Longest wait for a frame."""
 QUEUED = 2
-"""Frames read after the process was stopped; older ones are dropped and counted: all saw the same mirror shape."""
+"""Number of frames, the newest, that are read after the process stood still; older ones are dropped and counted as
+lost: all of them saw the same mirror shape."""
 
 
 class GenicamOptions(DriverOptions):

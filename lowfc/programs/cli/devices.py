@@ -7,7 +7,7 @@ import typer
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app
 from lowfc.device import run_camera, run_mirror
 from lowfc.device.plugins import opened
-from lowfc.device.run import PASSED_ON, Frames, WaitFor, command_of
+from lowfc.device.run import PASSED_ON, Frames, WaitFor, driver_command
 
 _DRIVER = "Name of an installed driver, module:Class or file.py:Class."
 Driver = Annotated[str, typer.Argument(help=_DRIVER, show_default=False)]
@@ -16,7 +16,7 @@ camera_app = new_app("")
 mirror_app = new_app("")
 
 
-@camera_app.command(cls=command_of("camera"), context_settings=PASSED_ON)
+@camera_app.command(cls=driver_command("camera"), context_settings=PASSED_ON)
 def camera(
     context: typer.Context,
     driver: Driver,
@@ -36,7 +36,7 @@ def camera(
     run_camera(opened("camera", driver, settings, context.args), settings, run, frames, tuple(wait_for or ()))
 
 
-@mirror_app.command(cls=command_of("mirror"), context_settings=PASSED_ON)
+@mirror_app.command(cls=driver_command("mirror"), context_settings=PASSED_ON)
 def mirror(context: typer.Context, driver: Driver, run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
     """Run a mirror: apply the commands of a run by its driver, within the mirror's own limits.
 

@@ -68,7 +68,7 @@ class IsioCamera:
                 "or set MILK_SHM_DIR to its folder"
             )
         shape = self._reader.stream.layout.shape[1:]
-        settings = options.model_dump(include={one.name for one in fields(CameraSettings)}, exclude_none=True)
+        settings = options.model_dump(include={part.name for part in fields(CameraSettings)}, exclude_none=True)
         if options.exposure_us is not None:
             settings["exposure_ns"] = round(options.exposure_us * 1e3)
         configured = CameraSettings.configured(config, *shape)
@@ -115,9 +115,9 @@ class IsioCamera:
 
     def _from_keywords(self, stream: Stream) -> dict[str, Any]:
         keywords, settings = stream.keywords(), dict[str, Any]()
-        for setting, word in self._options.keywords.items():
-            if isinstance(value := keywords.get(word), str):
-                raise StreamError(f"keyword {word!r} of stream {stream.name!r} is {value!r}, expected a number")
+        for setting, keyword in self._options.keywords.items():
+            if isinstance(value := keywords.get(keyword), str):
+                raise StreamError(f"keyword {keyword!r} of stream {stream.name!r} is {value!r}, expected a number")
             if value is not None:
                 settings[setting] = value
         if "exposure_s" in settings:

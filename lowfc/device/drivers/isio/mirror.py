@@ -88,7 +88,7 @@ class IsioMirror:
         before = 0 if total is None else total.count
         self._channel.put(actuators_nm / np.float32(self._options.nm_per_unit))
         self._count, written_s = self._channel.count, time.monotonic()
-        if total is not None and self._updated(total, before):
+        if total is not None and self._wait_for_sum(total, before):
             self._unanswered_s = math.inf
             return self._reached(total, actuators_nm)
         if self._total_expected:
@@ -129,8 +129,8 @@ class IsioMirror:
                 self._total_expected = True
         return self._total
 
-    def _updated(self, total: Stream, before: int) -> bool:
-        """Whether the sum is updated after the channel, within `SUM_WAIT_S`."""
+    def _wait_for_sum(self, total: Stream, before: int) -> bool:
+        """Wait up to `SUM_WAIT_S` until the sum has another count than `before`; return whether it has."""
         end_s = time.monotonic() + SUM_WAIT_S
         while total.count == before and time.monotonic() < end_s:
             time.sleep(_POLL_S)
@@ -139,7 +139,7 @@ class IsioMirror:
     def _check_silence(self, total: Stream | None, before: int, written_s: float) -> None:
         """RuntimeError if the sum has not followed for `SUM_SILENT_S`, so that the mirror counts as not following.
 
-        `before` is the sum's count before this command: if it has changed since the last one, the sum follows late.
+        `before` is the sum's count before this command: if it has changed since the last command, the sum follows late.
         """
         self._unanswered_s = min(self._unanswered_s, written_s) if before == self._sum_count else written_s
         self._sum_count = before
@@ -161,6 +161,6 @@ class IsioMirror:
         shape = complete_shape(total)
         if shape is None:
             return None
-        rest_nm = (shape - self._others.sum()) * np.float32(self._options.nm_per_unit) - actuators_nm
-        rest_nm -= np.median(rest_nm)
-        return actuators_nm + rest_nm if np.abs(rest_nm).max() > SAME_NM else None
+        deviation_nm = (shape - self._others.sum()) * np.float32(self._options.nm_per_unit) - actuators_nm
+        deviation_nm -= np.median(deviation_nm)
+        return actuators_nm + deviation_nm if np.abs(deviation_nm).max() > SAME_NM else None
