@@ -315,11 +315,11 @@ def _read(path: Path) -> Links:
 
 
 def free_ports(count: int, taken: AbstractSet[int] = frozenset()) -> list[int]:
-    """Return free loopback TCP ports; BusError if there are too few.
+    """Return free loopback TCP ports below the host's ephemeral range and not in `taken`; BusError if too few are free.
 
-    They are not `taken` and below the host's ephemeral range, or any in it if the range begins at 15000 or below. An
-    outgoing connection could take an ephemeral port before its role listens, and one retried to such a port could be
-    given that port as its own, and connect to itself.
+    If that range begins at 15000 or below, the ports are in it. Otherwise it is avoided: an outgoing connection could
+    take an ephemeral port before its role listens, and a connection that is retried to one without a listener could
+    be given the same port on its own side, and connect to itself.
     """
     candidates = sorted({*range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))} - taken)
     chooser = random.SystemRandom()

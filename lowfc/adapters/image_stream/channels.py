@@ -100,7 +100,7 @@ def opened(path: Path, grid: tuple[int, int]) -> Stream:
 
 
 def fits(stream: Stream, grid: tuple[int, int]) -> bool:
-    """Whether a stream holds float32 shapes (rows, columns)."""
+    """Whether a stream holds float32 shapes of this grid (rows, columns)."""
     return stream.layout.dtype == np.float32 and stream.layout.shape == (1, *grid)
 
 

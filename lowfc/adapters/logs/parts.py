@@ -31,7 +31,7 @@ _NAMED = re.compile(r"(\d{8}T\d{6}Z)(?:-(\d+))?(-[a-z].*)?\.mcap(\.part)?", re.A
 
 
 class Repeated:
-    """Detects messages that a file of a log repeats from the previous one at its start: calibrations and states.
+    """Detects messages that a file of a log repeats at its start from the file before: calibrations and states.
 
     Two lockstep runs may have the same sequences, so times of publication are compared too.
     """

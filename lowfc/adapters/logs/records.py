@@ -2,7 +2,7 @@
 
 Everything is checked by checksums. In a finished log they cover every byte: chunks and attachments have their own,
 DataEnd has that of the data section, the footer that of the summary. A log rewritten by another tool may lack checksums
-and chunks. A missing checksum of the data section is not checked, nor any other missing one in such a log.
+and chunks. In any other log only the checksum of the data section may be missing.
 """
 
 import contextlib
