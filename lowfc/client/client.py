@@ -269,7 +269,7 @@ class Client:
         if not self._get_message(CONTROLLER_STATE, wire.ControllerState, Role.CONTROLLER).calibration_id:
             remedy = "`lowfc ctl load FILE` loads one, `lowfc commission` measures one"
             raise BusError(f"no calibration is loaded in run {self.run_id!r}: {remedy}")
-        sample = self._get(CALIBRATION.key, b"", ANSWER_S)  # without one in use, the last one was refused
+        sample = self._get(CALIBRATION.key, b"", ANSWER_S)  # with none in use it may be one that was refused
         try:
             return decode_calibration(wire.Calibration.FromString(sample.payload))
         except (DecodeError, ValueError) as fault:

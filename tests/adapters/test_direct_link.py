@@ -156,7 +156,7 @@ def reader(tmp_path: Path) -> Iterator[ReaderOnTwoPaths]:
 def test_a_message_in_transit_during_the_switch_is_delivered_once(reader: ReaderOnTwoPaths) -> None:
     reader.by_socket(1, 1)
     reader.by_bus(1, 1)
-    reader.reader._leave()
+    reader.reader._leave_bus()
     assert reader.unsubscribed == 1
     reader.by_bus(2, 2)
     reader.by_socket(2, 2)
@@ -179,7 +179,7 @@ def test_messages_that_a_publisher_repeats_or_reorders_are_delivered_as_they_wer
     reader.by_socket(10, 1)
     if direct_only:
         reader.by_bus(10, 1)
-        reader.reader._leave()
+        reader.reader._leave_bus()
     for time_ns, sequence in enumerate((12, 11, 11, 3), start=2):
         reader.by_socket(sequence, time_ns)
         if not direct_only:

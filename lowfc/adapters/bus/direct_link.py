@@ -133,8 +133,8 @@ class DirectReader:
         self._recent, self._older = set[tuple[int, int]](), set[tuple[int, int]]()
         self._first = self._newest = -1  # sequences: first one from the socket, newest one from either path
         self._on_both_paths = False
-        self._leave_bus: Callable[[], None] | None = lambda: None  # a message may arrive before `subscribe` returns
-        self._leave_bus = subscribe(self._by_bus)
+        self._unsubscribe: Callable[[], None] | None = lambda: None  # a message may arrive before `subscribe` returns
+        self._unsubscribe = subscribe(self._by_bus)
         path.unlink(missing_ok=True)  # left by an earlier process: each role runs only once
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(os.fspath(path))
@@ -150,13 +150,13 @@ class DirectReader:
                 if self._first < 0:
                     self._first = sample.sequence
                 # Without the bus, a newer message is no copy; it is not remembered, and its repetition is forwarded.
-                surely_new = self._leave_bus is None and sample.sequence > self._newest
+                surely_new = self._unsubscribe is None and sample.sequence > self._newest
                 if surely_new or not self._is_copy(sample):
                     self._forward(sample)
         except Exception as fault:
             self._failed(fault)
         if self._on_both_paths:
-            self._leave()
+            self._leave_bus()
 
     def close(self) -> None:
         """Stop forwarding, without a wait for a handler that never returns; not to be called on a forwarding thread."""
@@ -166,7 +166,7 @@ class DirectReader:
         _shut_down(self._listener)
         self._accepting.join(1)
         self._on_both_paths = True
-        self._leave()
+        self._leave_bus()
 
     def _by_bus(self, sample: Sample) -> None:
         with self._turn:
@@ -192,18 +192,18 @@ class DirectReader:
                 self._newest = sample.sequence
             self._handler(sample)
 
-    def _leave(self) -> None:
+    def _leave_bus(self) -> None:
         """Unsubscribe from the bus, as messages arrive over both paths."""
-        if self._leave_bus is not None:
-            self._leave_bus()
-            self._leave_bus, self._on_both_paths = None, False
+        if self._unsubscribe is not None:
+            self._unsubscribe()
+            self._unsubscribe, self._on_both_paths = None, False
 
     def writer_gone(self) -> None:
         """Subscribe to the bus again after a writer has disconnected."""
         with self._turn:
             self._on_both_paths, self._first, self._newest = False, -1, -1
-        if self._leave_bus is None and not self._closed:
-            self._leave_bus = self._subscribe(self._by_bus)
+        if self._unsubscribe is None and not self._closed:
+            self._unsubscribe = self._subscribe(self._by_bus)
 
     def _accept(self) -> None:
         """Serve one writer at a time: a new writer replaces the previous one."""

@@ -175,21 +175,21 @@ def open_run(
             `mirrors`, it does not exist.
         DataFileError: the run's directory is damaged, or cannot be made.
     """
-    path, wanted = run_path(run_id, base), _absolute(network or Network())
+    path, requested = run_path(run_id, base), _absolute(network or Network())
     if not path.is_dir():
         if not mirrors:
             raise BusError(f"there is no run {run_id!r}")
         try:
-            _make(path, mirrors, listeners, wanted)
+            _make(path, mirrors, listeners, requested)
         except OSError as fault:
             raise DataFileError(f"{path} cannot be made: {fault.strerror}") from fault
     own_directory(path)
     links = _read(path)
-    if wanted.router and wanted != links.network and Role.LAUNCHER not in links.ports:
+    if requested.router and requested != links.network and Role.LAUNCHER not in links.ports:
         known = links.network
         where = f"on {known.router} with certificates {known.certificates!r}" if known.router else "on this host alone"
         raise BusError(
-            f"run {run_id!r} is {where}, and the configuration has {wanted.router} with {wanted.certificates!r}; "
+            f"run {run_id!r} is {where}, and the configuration has {requested.router} with {requested.certificates!r}; "
             f"{_ADVICE} ({path}), or start another run"
         )
     for role in map(mirror_role, mirrors):

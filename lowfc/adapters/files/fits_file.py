@@ -136,11 +136,11 @@ def single(hdus: fits.HDUList, name: str) -> Single:
     return np.ascontiguousarray(data, dtype=np.float32)
 
 
-def require_identity(path: Path, found: str, stated: str) -> None:
-    """Raise DataFileError if the identity stated in a file is not that of its content."""
-    if found != stated:
+def require_identity(path: Path, computed: str, stated: str) -> None:
+    """Raise DataFileError if the identity stated in a file is not the one computed from its content."""
+    if computed != stated:
         raise DataFileError(
-            f"{path}: damaged: the identity of its content is {found[:12]}, but its header states {stated[:12]}; "
+            f"{path}: damaged: the identity of its content is {computed[:12]}, but its header states {stated[:12]}; "
             "restore the file from a copy, or make it again"
         )
 

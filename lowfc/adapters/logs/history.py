@@ -357,8 +357,8 @@ class _HistoryBuilder:
         history.excluded_messages += sum(len(steps) for steps, _ in self._rows.values() if steps is not self._steps)
         history.stepped_sequence = self._stepped.values("sequence")
         history.steps, history.truths = self._steps.values(), self._truths.values()
-        for rows, kept in ((self._steps, history.steps), (self._truths, history.truths)):
-            history.excluded_messages += len(rows) - len(kept.sequence)
+        for rows, valid in ((self._steps, history.steps), (self._truths, history.truths)):
+            history.excluded_messages += len(rows) - len(valid.sequence)
         for name in ("sequence", "publish_time_ns", "stroke_nm", "limits"):
             setattr(history.mirror, name, self._mirror.values(name))
         history.timed_sequence, history.stages_ns = self._timings.values()

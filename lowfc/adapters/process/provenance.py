@@ -31,7 +31,7 @@ def provenance(run_id: str = "", seed: int | None = None) -> dict[str, str]:
         vector instructions) and blas (library, version and the kernel chosen for this processor); numba, run, seed and
         git (`git describe` of a checkout) where there is one.
     """
-    found = {
+    entries = {
         "lowfc": __version__,
         "python": platform.python_version(),
         "host": platform.node(),
@@ -45,14 +45,14 @@ def provenance(run_id: str = "", seed: int | None = None) -> dict[str, str]:
         **{library: importlib.metadata.version(library) for library in LIBRARIES},
     }
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-        found["numba"] = importlib.metadata.version("numba")
+        entries["numba"] = importlib.metadata.version("numba")
     if run_id:
-        found["run"] = run_id
+        entries["run"] = run_id
     if seed is not None:
-        found["seed"] = str(seed)
+        entries["seed"] = str(seed)
     if commit := _commit():
-        found["git"] = commit
-    return found
+        entries["git"] = commit
+    return entries
 
 
 def _cpuinfo(*names: str) -> str:

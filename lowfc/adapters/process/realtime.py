@@ -91,12 +91,12 @@ def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int
     if not others:
         return {}
     controller, *others = others
-    few = simulated and not others
+    only_two = simulated and not others
     return {
         "realtime.camera_cpus": [camera],
         "realtime.controller_cpus": [controller],
-        "realtime.mirror_cpus": [controller if few else (others or cpus)[0]],
-        "realtime.recorder_cpus": [] if few else [cpu for cpu in cpus if cpu != controller],
+        "realtime.mirror_cpus": [controller if only_two else (others or cpus)[0]],
+        "realtime.recorder_cpus": [] if only_two else [cpu for cpu in cpus if cpu != controller],
     }
 
 

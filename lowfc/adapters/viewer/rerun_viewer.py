@@ -308,8 +308,8 @@ def require_screen(show: Show | None, environment: Mapping[str, str] = os.enviro
 
 def vulkan_drivers() -> list[Path]:
     """Installed Vulkan drivers, the software renderer first."""
-    found = [path for folder in _DRIVER_FOLDERS for path in sorted(Path(folder).glob("*.json"))]
-    return sorted(found, key=lambda path: not path.name.startswith("lvp"))
+    drivers = [path for folder in _DRIVER_FOLDERS for path in sorted(Path(folder).glob("*.json"))]
+    return sorted(drivers, key=lambda path: not path.name.startswith("lvp"))
 
 
 def viewer_binary() -> Path:
