@@ -31,7 +31,7 @@ def the_run(name: str | None) -> str:
     if name is None:
         raise BusError(f"choose a run with --run, the beginning of its name is enough: there are {_listed(runs)}")
     if matching:
-        raise BusError(f"{name!r} is the beginning of several runs: {', '.join(matching)}")
+        raise BusError(f"{name!r} is the beginning of several runs' names: {', '.join(matching)}")
     raise BusError(
         f"there is no run {name!r}: there {'is' if len(runs) == 1 else 'are'} {_listed(runs)}{nearest(name, runs)}"
     )
@@ -67,7 +67,7 @@ def absence(name: str, role: Role, joined: Run | None = None) -> str:
         return f"run {name!r} has no {role}: it is starting, or was started with --no-record"
     if Role.LAUNCHER in roles:
         return f"run {name!r} is starting, and its {role} is not there yet: try again"
-    return f"no {role} is there in run {name!r}: start one, as with `{_COMMANDS[role]}`"
+    return f"run {name!r} has no {role}: start one, as with `{_COMMANDS[role]}`"
 
 
 def live_runs(required: str | None = None) -> dict[str, set[str]]:

@@ -171,7 +171,7 @@ def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
 
 
 def test_errors_name_the_file_or_option_at_fault(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="by which others reach it"):
+    with pytest.raises(ConfigurationError, match="by which other hosts reach it"):
         make(tmp_path / "none", (ROUTER,), [])
     with pytest.raises(ConfigurationError, match=r"without port; got 'host:7447'"):
         make(tmp_path / "none", (ROUTER,), ["host:7447"])

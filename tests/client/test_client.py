@@ -249,13 +249,11 @@ def test_an_absent_and_a_silent_controller_give_different_errors(controller: Fak
     controller.silent = True
     with pytest.raises(BusError, match=r"the controller of run 'default' did not answer within 0.05 s"):
         loop.open_loop()
-    with pytest.raises(BusError, match="no recorder is there in run 'default': start one, as with `lowfc record`"):
+    with pytest.raises(BusError, match="run 'default' has no recorder: start one, as with `lowfc record`"):
         loop.record(True)
     controller.bus.close()
     for ask in (loop.open_loop, loop.calibration):
-        with pytest.raises(
-            BusError, match="no controller is there in run 'default': start one, as with `lowfc controller`"
-        ):
+        with pytest.raises(BusError, match="run 'default' has no controller: start one, as with `lowfc controller`"):
             ask()
 
 
@@ -339,7 +337,7 @@ def test_the_message_about_an_absent_process_says_whether_it_is_starting_stopped
     assert "was started with --no-record" in absence("dusk", Role.RECORDER)
     listen("bench", "camera")
     for run in ("bench", "noon"):  # not started by sim-loop
-        assert absence(run, Role.CONTROLLER).startswith(f"no controller is there in run '{run}': start one")
+        assert absence(run, Role.CONTROLLER).startswith(f"run '{run}' has no controller: start one")
     with Client("bench") as loop:
         (open_run("bench").path / "links.json").touch()
         with pytest.raises(BusError, match="run 'bench' was started again: join it again, with a new Client"):
@@ -352,7 +350,7 @@ def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., 
     for name in ("night", "night-2", "noon"):
         listen(name, "controller")
     assert [the_run(word) for word in ("night", "night-", "noo")] == ["night", "night-2", "noon"]
-    with pytest.raises(BusError, match=r"'n' is the beginning of several runs: night, night-2, noon$"):
+    with pytest.raises(BusError, match=r"'n' is the beginning of several runs' names: night, night-2, noon$"):
         the_run("n")
     with pytest.raises(BusError, match=r"there is no run 'day': there are night, night-2, noon$"):
         the_run("day")

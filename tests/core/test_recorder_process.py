@@ -143,7 +143,7 @@ def test_a_recording_is_stopped_without_a_controller_and_a_second_recorder_is_re
     reader = LogReader(Path(json.loads(stopped.stdout)["log"]))
     assert (len(list(reader)) > 0, reader.complete) == (True, True)
     refused = lowfc("ctl", "status", "--run", bench.run.run_id)
-    assert f"no controller is there in run '{bench.run.run_id}'" in str(refused.exception)
+    assert f"run '{bench.run.run_id}' has no controller" in str(refused.exception)
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,7 @@ def make_certificates(
             names = _router_addresses(folder)
         if ROUTER in missing and not names:
             raise ConfigurationError(
-                "the router's certificate needs its address: give the name by which others reach it"
+                "the router's certificate needs the router's address: give the name by which other hosts reach it"
             )
         if renew and not (folder / CA).exists():
             raise ConfigurationError(f"{folder} has no authority whose certificates could be renewed")

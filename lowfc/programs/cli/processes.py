@@ -65,7 +65,7 @@ def controller(
         with Console(stderr=True).status("compiling the fused step"):
             compiled.kernel(FUSED)
     service = join(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
-    service.require(wait_for or (), _WAIT_FOR_S, "the controller does not start without")
+    service.require(wait_for or (), _WAIT_FOR_S, "the controller does not start")
     source = calibration.name if calibration is not None else "the configuration"
     latch = Latch(
         latch_files(open_run(run, (settings.mirror.name,))), lambda why: service.event("LATCH_FAILED", why=why)

@@ -93,7 +93,7 @@ def frame_source(
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
         frames, states, clock = service.publisher(FRAME), service.publisher(CAMERA_STATE), service.clock
         service.state = "ready"
-        service.require(wait_for or (), _WAIT_S, "no frame is sent without")
+        service.require(wait_for or (), _WAIT_S, "no frame is sent")
         state = camera_state(CameraSettings.configured(settings, *payloads.shape), clock.now_ns())
         states.put(state.SerializeToString())
         service.state = "running"
