@@ -147,7 +147,7 @@ def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkey
     assert len(left_out) == (2 if case == "again" else 1)
     assert all(f"stream 'dm00disp0{cause}" in left_out[0] for cause in ("5' has 7 x 6", "4' has values that are not"))
     assert done.stderr.count("other channels: not reported to the loop: busy") == (case == "busy")
-    assert done.stderr.count("not reported to the loop: no controller") == (case == "late")
+    assert done.stderr.count("not reported to the loop: run 'bench' has no controller") == (case == "late")
 
 
 @pytest.mark.parametrize("options", [["dm00"], ["dm00disp03", "--external", "dm00disp03"]])
