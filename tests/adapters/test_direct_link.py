@@ -108,8 +108,9 @@ def test_switching_to_the_direct_link_loses_and_repeats_nothing(ends: Ends) -> N
     until(lambda: controller.peers() and camera.peers())
     ends.publish(frames, 250)
     until(lambda: ends.received[-1:] == [frames.published - 1])
-    assert ends.received == sorted(set(ends.received))
-    assert ends.received == list(range(ends.received[0], frames.published))
+    first = min(ends.received)  # it may be in the socket still when the bus delivers the next ones
+    assert sorted(ends.received) == list(range(first, frames.published))
+    assert [number for number in ends.received if number != first] == list(range(first + 1, frames.published))
     assert "direct-link" in ends.threads
 
 
