@@ -32,14 +32,14 @@ CAMERAS = [Detector(), Detector(gain_e_per_dn=0.7, read_noise_e=0.4, bias_dn=90.
 
 @pytest.mark.parametrize("camera", [*CAMERAS, Detector(gain_e_per_dn=2.0, read_noise_e=0.12, bias_dn=100.5)])
 def test_noise_table_has_the_exact_distribution_at_its_levels(camera):
-    """Entries and rest together have the distribution of Poisson noise, read noise and rounding."""
+    """Entries and remainder together have the distribution of Poisson noise, read noise and rounding."""
     table = noise_table_of(camera)
-    numbers = np.arange(table.first_dn, table.first_dn + table.rest.shape[1])
+    numbers = np.arange(table.first_dn, table.first_dn + table.remainder.shape[1])
     for level in (0, 1, 2, 17, 64, 500, len(table.entries) - 1):
         entries = table.entries[level].astype(int)
         from_rest = (entries > numbers[-1]).sum()
         found = np.bincount(entries[entries <= numbers[-1]] - numbers[0], minlength=len(numbers)).astype(float)
-        found += from_rest * np.diff(table.rest[level].astype(float), prepend=0.0)
+        found += from_rest * np.diff(table.remainder[level].astype(float), prepend=0.0)
         assert 0.5 * np.abs(found / len(entries) - probabilities(camera, level * STEP_E, numbers)).sum() < 1e-7
 
 

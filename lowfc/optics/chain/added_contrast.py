@@ -2,8 +2,8 @@
 
 With the field E = E0 + i k sum a_j E_j - k^2 / 2 sum a_j a_l E_jl, the intensity's second order in a has two terms:
 the squared first-order field, and the product of the second-order field with E0. For the shaped pupil the second
-nearly cancels the first for tilt: without it, tilt would add 60 (x) or 130 (y) times as much. The first order averages
-to zero over a dark zone on both sides of the star.
+nearly cancels the first for tilt: without the second, tilt would add 60 (x) or 130 (y) times as much. The intensity's
+first order averages to zero over a dark zone on both sides of the star.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from lowfc.optics.chain.zernike import mode_group, zernikes
 BEYOND_QUADRATIC = 0.1
 """Relative difference between quadratic form and full images above which it is reported."""
 _SAMPLES_PER = 2  # samples per lambda / D: the intensity's band is 1 D to either side
-_DRAWS = 24  # random wavefronts compared
+_DRAWS = 24  # random wavefronts compared, each with both signs
 
 
 class ModalContrast:
@@ -49,24 +49,26 @@ class ModalContrast:
         """Whether full images of wavefronts with this covariance (modes, modes) differ from the form by over 10 %."""
         values, vectors = np.linalg.eigh(covariance_nm2)
         drawn = np.random.default_rng(1).standard_normal((_DRAWS, len(values)))
-        some_nm = drawn * np.sqrt(np.maximum(values, 0)) @ vectors.T
-        own = self.by_image(np.zeros(len(values)))
-        image = float(np.mean([self.by_image(one) - own for one in (*some_nm, *-some_nm)]))  # in pairs: no odd orders
-        form = float(np.einsum("nj,jl,nl->", some_nm, self.form, some_nm)) / _DRAWS
+        modes_nm = drawn * np.sqrt(np.maximum(values, 0)) @ vectors.T
+        both_signs_nm = np.vstack([modes_nm, -modes_nm])  # the odd orders cancel
+        flat = self.by_image(np.zeros(len(values)))
+        image = float(np.mean([self.by_image(wavefront_nm) - flat for wavefront_nm in both_signs_nm]))
+        form = float(np.einsum("nj,jl,nl->", modes_nm, self.form, modes_nm)) / _DRAWS
         return abs(form - image) > BEYOND_QUADRATIC * abs(image)
 
 
-def by_group(noll: Sequence[int], each: Array) -> dict[str, float]:
+def by_group(noll: Sequence[int], by_mode: Array) -> dict[str, float]:
     """Added contrast of each mode (modes,) summed over modes of one kind, such as both comas; largest first."""
-    found: dict[str, float] = {}
-    for index, one in zip(noll, each.tolist(), strict=True):
-        found[mode_group(index)] = found.get(mode_group(index), 0.0) + one
-    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
+    groups: dict[str, float] = {}
+    for index, contrast in zip(noll, by_mode.tolist(), strict=True):
+        groups[mode_group(index)] = groups.get(mode_group(index), 0.0) + contrast
+    return dict(sorted(groups.items(), key=lambda pair: -pair[1]))
 
 
 def costliest(groups: Mapping[str, float]) -> tuple[str, float]:
     """The kind of modes that adds most contrast, and its share of all that adds; `groups` is a result of `by_group`."""
-    added = [max(each, 0.0) for each in groups.values()]  # behind a classical Lyot coronagraph tilt takes light away
+    # Behind a classical Lyot coronagraph tilt removes light: its contrast is negative.
+    added = [max(contrast, 0.0) for contrast in groups.values()]
     return next(iter(groups)), added[0] / (sum(added) or 1.0)
 
 
@@ -89,12 +91,12 @@ def contrast_form(coronagraph: Coronagraph, noll: tuple[int, ...], wavelength_nm
     def image(field: Array) -> Complex:
         return np.asarray(to_focus @ coronagraph.behind(field) @ to_focus.T)
 
-    def moved(shape: Array) -> Complex:
+    def first_order(shape: Array) -> Complex:
         field = np.zeros_like(pupil)
         field[rows, columns] = pupil[rows, columns] * shape
         return image(field)[inside]
 
-    fields = np.array([moved(shape) for shape in shapes])
+    fields = np.array([first_order(shape) for shape in shapes])
     back = to_focus.T @ (image(pupil).conj() * inside) @ to_focus  # the sum over the wedge, brought back to the pupil
     back = back if lyot is None else lyot.transposed(back)
     second = (shapes * (pupil * back.real)[rows, columns]) @ shapes.T

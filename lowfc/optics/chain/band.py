@@ -47,7 +47,7 @@ def gauss_legendre(centre_nm: float, fraction: float = 0.2, count: int = 3) -> B
 def uniform(centre_nm: float, fraction: float = 0.2, count: int = 5) -> Band:
     """Evenly spaced wavelengths including both ends, equal weights, as in Sect. 3.3 of the paper.
 
-    Five have more than ten times the error of three of `gauss_legendre`.
+    Five of these wavelengths have more than ten times the error of three from `gauss_legendre`.
     """
     wavelengths = centre_nm * (1.0 + 0.5 * fraction * np.linspace(-1.0, 1.0, count))
     return _band(wavelengths, np.full(count, 1.0 / count))

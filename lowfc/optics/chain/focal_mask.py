@@ -5,7 +5,7 @@ import numpy as np
 from lowfc.arrays import Array, Complex
 from lowfc.optics.chain.grid import image_axis
 
-_FINE = 16  # subsamples of a sample, for the fraction covered by the phase spot
+_FINE = 16  # subsamples across a sample, for the fraction covered by the phase spot
 
 
 def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -> Array:

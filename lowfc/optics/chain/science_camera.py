@@ -115,8 +115,8 @@ class _Lyot:
     Attributes:
         to_y, to_x: (k, rows) and (columns, k) kernels from the cells to the opaque part.
         back_y, back_x: (rows, k) and (k, columns) kernels from the opaque part to the stop.
-        opaque: (k, k) fraction that the mask blocks.
-        stop: (rows, columns) transmission.
+        opaque: (k, k) fraction of the amplitude that the mask blocks.
+        stop: (rows, columns) amplitude transmission.
     """
 
     to_y: SingleComplex

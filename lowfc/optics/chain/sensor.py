@@ -48,7 +48,7 @@ class Sensor:
         if isinstance(self.relay, Defocus):
             reach = (self.pixels * self.binning + self.focal_mask.shape[0]) / (2.0 * self.samples_per)
             # The sum over the focal plane aliases where the phase of chirp times field advances by a wave per sample.
-            spare = 2.0  # margin, cycles: half for the bandwidth of the pupil's light, the rest for short wavelengths
+            spare = 2.0  # cycles per lambda0 / D: 0.5 for the edge of the pupil, the rest for short wavelengths
             least = reach / (self.samples_per - spare)
             if self.relay.distance < least:
                 raise ValueError(
@@ -79,7 +79,7 @@ class LightBudget:
         relay_mask: Fraction of the light on a relay-pupil mask that it transmits; 1 without such a mask.
         sensor: Fraction of the light on the relay mask that falls on the pixels.
         total: Fraction of the open circle's light that falls on the pixels.
-        peak: Fraction of the light on the pixels that falls on the brightest.
+        peak: Fraction of the light on the pixels that falls on the brightest pixel.
     """
 
     pupil: float

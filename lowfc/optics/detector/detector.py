@@ -64,14 +64,14 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
     Electrons are drawn from the Poisson distribution. Multiplication draws from the gamma distribution of a long
     register, whose excess noise doubles the variance of the photons.
 
-    If `noise_table_of` returns a table, pixels below `FAINT_E` electrons are drawn from it: the distribution of their
-    digital number. It is exact at multiples of 1/64 electron; between these the mean is exact and the variance too
-    large by at most 6e-5 electrons squared, which a chi-square test of a million draws does not detect.
+    If `noise_table_of` returns a table, it yields the digital numbers of pixels with a mean below `FAINT_E` electrons.
+    Their distribution is exact at means that are multiples of 1/64 electron. Between these the mean is exact and the
+    variance too large by at most 6e-5 electrons squared, which a chi-square test of a million draws does not detect.
 
     Args:
         detector: The detector.
         electrons: (rows, columns) mean photo-electrons in the exposure; negative values count as zero.
-        rng: Generator of all random numbers; its raw words must have 64 random bits, as all of numpy's but MT19937.
+        rng: Generator of all random numbers; its bit generator must produce 64-bit words: any of numpy's but MT19937.
 
     Raises:
         ValueError: A mean number of electrons is not finite.

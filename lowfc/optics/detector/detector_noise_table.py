@@ -2,7 +2,7 @@
 
 The distribution of the digital number for a mean of m electrons is known: Poisson, plus Gaussian, rounded. The table
 has a row for each m of a grid, with 1024 equally likely entries (Marsaglia, Tsang and Wang 2004). Each probability is
-rounded down to a multiple of 1/1024. The remainder is drawn from a second distribution, `rest`: entries equal to
+rounded down to a multiple of 1/1024. The remainder is drawn from a second distribution, `remainder`: entries equal to
 `_REMAINDER` select it. A mean between two grid values is rounded at random to one of them, so that the mean is kept.
 """
 
@@ -33,13 +33,13 @@ class NoiseTable:
     """Distributions of the digital number at the means 0, STEP_E, ... FAINT_E (means).
 
     Attributes:
-        entries: (means, entries) digital numbers, all equally likely; `_REMAINDER` where `rest` decides.
-        rest: (means, numbers) cumulative distribution of the probability that is not a multiple of 1/1024.
-        first_dn: Digital number of the first column of `rest`.
+        entries: (means, entries) digital numbers, all equally likely; `_REMAINDER` where `remainder` decides.
+        remainder: (means, numbers) cumulative distribution of the probability that is not a multiple of 1/1024.
+        first_dn: Digital number of the first column of `remainder`.
     """
 
     entries: Pixels
-    rest: Single
+    remainder: Single
     first_dn: int
 
 
@@ -68,9 +68,9 @@ def noise_table(gain_e_per_dn: float, read_noise_e: float, bias_dn: float, satur
     entries = np.full((len(probability), _ENTRIES), _REMAINDER, np.uint16)
     for row, counts in zip(entries, whole, strict=True):
         row[: counts.sum()] = np.repeat(numbers, counts)
-    rest = np.cumsum(probability - whole, axis=1)
-    rest /= np.maximum(rest[:, -1:], np.finfo(float).tiny)  # 0 if a digital number has all 1024 entries
-    return NoiseTable(entries, rest.astype(np.float32), first)
+    remainder = np.cumsum(probability - whole, axis=1)
+    remainder /= np.maximum(remainder[:, -1:], np.finfo(float).tiny)  # 0 if a digital number has all 1024 entries
+    return NoiseTable(entries, remainder.astype(np.float32), first)
 
 
 def draw(table: NoiseTable, mean_e: Single, rng: np.random.Generator) -> Pixels:
@@ -91,7 +91,7 @@ def draw(table: NoiseTable, mean_e: Single, rng: np.random.Generator) -> Pixels:
     words >>= 32 - _ENTRIES_BITS
     index ^= words.view(np.int32)  # the low bits depend on the rounding above: XOR with fresh bits
     drawn = table.entries.ravel().take(index)
-    remainder = np.flatnonzero(drawn == _REMAINDER)
-    rest = table.rest.take(index.take(remainder) >> _ENTRIES_BITS, axis=0)
-    drawn[remainder] = table.first_dn + (rest > rng.random((remainder.size, 1), np.float32)).argmax(axis=1)
+    undecided = np.flatnonzero(drawn == _REMAINDER)
+    cumulative = table.remainder.take(index.take(undecided) >> _ENTRIES_BITS, axis=0)
+    drawn[undecided] = table.first_dn + (cumulative > rng.random((undecided.size, 1), np.float32)).argmax(axis=1)
     return drawn

@@ -150,10 +150,10 @@ def on_sensor(sensor: Sensor, scale: float, functions: Array, modes: Array) -> M
     for c in range(half):
         columns = np.flatnonzero(quarter[c])
         for parity in (0, 1):
-            few = (
+            reflected = (
                 modes[row : row + 2 * columns.size].reshape(2, columns.size, modes.shape[1]) * quarter[c, columns, None]
             )
-            along_x = np.einsum("pfd,pdm->fm", pairs[:, :, columns], few)
+            along_x = np.einsum("pfd,pdm->fm", pairs[:, :, columns], reflected)
             coefficients += (pairs[parity, :, c, None, None] * along_x).reshape(len(coefficients), -1)
             row += 2 * columns.size
     return coefficients

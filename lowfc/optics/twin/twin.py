@@ -151,7 +151,7 @@ def projected_response(twin: Twin, projections: Array, opd_nm: Array | None = No
         opd_nm: Reference wavefront (used,); flat when None.
     """
     pixels = twin.to_pixels.shape[0]
-    found = np.zeros((len(projections), twin.used.size))
+    products = np.zeros((len(projections), twin.used.size))
     for operator in twin.operators:
         phasor = _phasor(twin, operator, opd_nm)
         scale = operator.weight * 4.0 * np.pi / operator.wavelength_nm
@@ -159,12 +159,12 @@ def projected_response(twin: Twin, projections: Array, opd_nm: Array | None = No
         for k, projection in enumerate(projections):
             at_points = slope * (twin.to_pixels.T @ projection.reshape(pixels, pixels) @ twin.to_pixels)
             coefficients = (operator.basis.T @ at_points @ operator.basis).ravel()
-            found[k] += ((coefficients @ operator.to_coefficients @ operator.to_modes) * phasor).real
-    return found
+            products[k] += ((coefficients @ operator.to_coefficients @ operator.to_modes) * phasor).real
+    return products
 
 
 def _phasor(twin: Twin, operator: Operator, opd_nm: Array | None) -> Array | Complex:
-    """exp(i phi) (used,) of a wavefront in nm; real ones for None."""
+    """exp(i phi) (used,) of a wavefront in nm; all 1, and real, when None."""
     if opd_nm is None:
         return np.ones(twin.used.size)
     return np.asarray(np.exp((2j * np.pi / operator.wavelength_nm) * opd_nm))

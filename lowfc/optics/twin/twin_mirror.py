@@ -31,8 +31,8 @@ class TwinMirror:
         used: The twin's used nodes.
         y_factors: (axis, rows) influence functions along y, fitted at the nodes.
         x_factors: (axis, columns) influence functions along x, fitted at the nodes.
-        reduce: (few, rows times columns) effect at the sensor of the surface that the fit omits.
-        expand: (used, few) smooth surface with the same effect at the sensor.
+        reduce: (significant, rows times columns) effect at the sensor of the surface that the fit omits.
+        expand: (used, significant) smooth surface with the same effect at the sensor.
     """
 
     used: Integers
