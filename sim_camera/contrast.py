@@ -6,7 +6,7 @@ from lowfc.arrays import Single
 from lowfc.optics.chain.added_contrast import ModalContrast
 
 IMAGES = 200
-"""Full images averaged for each value; fewer in a short run."""
+"""Full images averaged for each mean; fewer in a short run."""
 
 
 class Contrast:
@@ -39,17 +39,17 @@ class Contrast:
         `quadratic_added_contrast` is from the quadratic form.
         """
         half = self._kept[len(self._kept) // 2 :]
-        chosen = [half[int(place)] for place in np.linspace(0, len(half) - 1, min(IMAGES, len(half)))]
-        if not chosen:
+        instants = [half[int(place)] for place in np.linspace(0, len(half) - 1, min(IMAGES, len(half)))]
+        if not instants:
             return {}
         by_image = self._modal.by_image
-        dark_zone = by_image(np.zeros_like(chosen[0][0]))
-        disturbance, residual = (np.mean([by_image(pair[which]) for pair in chosen]) - dark_zone for which in (0, 1))
-        quadratic = self.quadratic(np.array([residual_nm for _, residual_nm in chosen])).sum()
+        dark_zone = by_image(np.zeros_like(instants[0][0]))
+        disturbance, residual = (np.mean([by_image(pair[which]) for pair in instants]) - dark_zone for which in (0, 1))
+        quadratic = self.quadratic(np.array([residual_nm for _, residual_nm in instants])).sum()
         return {
             "added_contrast_flat": float(disturbance),
             "added_contrast": float(residual),
-            "science_images": len(chosen),
+            "science_images": len(instants),
             "quadratic_added_contrast": float(quadratic),
             "dark_zone_contrast": dark_zone,
         }

@@ -26,11 +26,11 @@ LINES_HZ = (6.0, 18.0, 37.0, 71.0, 117.0)
 LINES_MAS = (9.0, 8.3, 5.0, 3.0, 2.0)
 _DRIFT_MAS = 3.0
 _JITTER_HZ = (0.7, 1.9, 4.3, 9.1)
-_JITTER_MAS = 1.5
+_JITTER_MAS = 1.5  # rms per axis of the four lines together: half of it for each
 _STEP_MAS = 5.0
 _STEP_PERIOD_S = 4.0
-_SCREEN_WAVES = 0.05
-_THERMAL_NM = {1: 4.0, 2: 5.0, 3: 2.5, 4: 1.5}
+_SCREEN_WAVES = 0.05  # rms over the open pupil
+_THERMAL_NM = {1: 4.0, 2: 5.0, 3: 2.5, 4: 1.5}  # rms, by radial degree
 _THERMAL_HZ = (0.003, 0.5)
 _DRIFT_HZ = (0.02, 5.0)
 _WAVES_PER_BAND = 24
@@ -197,21 +197,21 @@ def highest_hz(disturbance: Disturbance) -> float:
 
 def modes_nm(disturbance: Disturbance, first: int, count: int, rate_hz: float) -> Array:
     """Modes (count, modes) at the starts of the exposures of the frames from `first` on, nm of wavefront rms."""
-    found = _sum_of_waves(disturbance, (first + np.arange(count)) / rate_hz)
+    total_nm = _sum_of_waves(disturbance, (first + np.arange(count)) / rate_hz)
     if disturbance.lines:
         lines = _DampedLines(disturbance, rate_hz)
-        found[:, lines.modes] += lines.at(first, count)[:count].real.sum(axis=1)
-    return found
+        total_nm[:, lines.modes] += lines.at(first, count)[:count].real.sum(axis=1)
+    return total_nm
 
 
 def _sum_of_waves(disturbance: Disturbance, time_s: Array) -> Array:
     """Modes (instants, modes) at these times, without the damped lines."""
     rotations = np.exp(2j * np.pi * np.outer(time_s - time_s[0], disturbance.frequency_hz))
     waves = (rotations @ _rotated(disturbance, time_s[0])).real
-    found = waves + _square(time_s)[:, None] * disturbance.step_nm + disturbance.static_nm
+    total_nm = waves + _square(time_s)[:, None] * disturbance.step_nm + disturbance.static_nm
     for wheel in disturbance.wheels:
-        found += wheel.modes_nm(time_s)
-    return np.asarray(found)
+        total_nm += wheel.modes_nm(time_s)
+    return np.asarray(total_nm)
 
 
 def variances_nm2(disturbance: Disturbance, per_line: int = 401) -> tuple[Array, Array]:
@@ -225,8 +225,9 @@ def variances_nm2(disturbance: Disturbance, per_line: int = 401) -> tuple[Array,
         frequency_hz.append(np.abs(line.frequency_hz + line.width_hz / 2 * np.tan(np.pi * (quantiles - 0.5))))
         variance_nm2.append(np.tile(line.rms_nm**2 / per_line, (per_line, 1)))
     for wheel in disturbance.wheels:
-        for found, of_wheel in zip((frequency_hz, variance_nm2), wheel.lines(), strict=True):
-            found.append(of_wheel)
+        wheel_hz, wheel_nm2 = wheel.lines()
+        frequency_hz.append(wheel_hz)
+        variance_nm2.append(wheel_nm2)
     return np.concatenate(frequency_hz), np.concatenate(variance_nm2)
 
 
@@ -267,13 +268,13 @@ class _DampedLines:
     def _advance(self, count: int) -> Complex:
         """Vectors (count, lines, moved) of the next `count` frames."""
         drawn = self._draw(count) * np.sqrt(1 - np.abs(self._step) ** 2)[:, None]
-        found: Complex = np.empty_like(drawn)
+        vectors: Complex = np.empty_like(drawn)
         vector, step = self._vector, self._step[:, None]
         for row in range(count):
-            found[row] = vector
+            vectors[row] = vector
             vector = step * vector + drawn[row]
         self._next, self._vector = self._next + count, vector
-        return found
+        return vectors
 
 
 class Sampler:
@@ -287,7 +288,7 @@ class Sampler:
         waves = np.exp(2j * np.pi * np.outer(self._time_s, disturbance.frequency_hz))
         self._waves = np.hstack([waves.real, -waves.imag]).astype(np.float32)
         self._lines = _DampedLines(disturbance, rate_hz) if disturbance.lines else None
-        self._between = _between(disturbance.lines, instants / rate_hz, 1 / rate_hz)
+        self._end_weights = _end_weights(disturbance.lines, instants / rate_hz, 1 / rate_hz)
         self._shape = (BLOCK, len(instants), len(disturbance.noll))
         self._blocks: dict[int, Single] = {}
 
@@ -305,21 +306,24 @@ class Sampler:
         """Modes (frames, instants, modes) of the block that begins with frame `first`."""
         start_s = first / self._rate_hz
         rotated = _rotated(self._disturbance, start_s)
-        found = self._waves @ np.vstack([rotated.real, rotated.imag]).astype(np.float32)
+        total_nm = self._waves @ np.vstack([rotated.real, rotated.imag]).astype(np.float32)
         square = _square(start_s + self._time_s)[:, None] * self._disturbance.step_nm
-        found += (square + self._disturbance.static_nm).astype(np.float32)
+        total_nm += (square + self._disturbance.static_nm).astype(np.float32)
         for wheel in self._disturbance.wheels:
-            found += wheel.modes_nm(start_s + self._time_s).astype(np.float32)
-        block = found.reshape(self._shape)
+            total_nm += wheel.modes_nm(start_s + self._time_s).astype(np.float32)
+        block = total_nm.reshape(self._shape)
         if self._lines is not None:
-            vectors, (before, after) = self._lines.at(first, BLOCK), self._between
+            vectors, (before, after) = self._lines.at(first, BLOCK), self._end_weights
             moved = np.einsum("il,flm->fim", before, vectors[:-1]) + np.einsum("il,flm->fim", after, vectors[1:])
             block[:, :, self._lines.modes] += moved.real
         return block
 
 
-def _between(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) -> Complex:
-    """Weights (2, instants, lines) of a line's vectors at both ends of a period, for its conditional mean within."""
+def _end_weights(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) -> Complex:
+    """Weights (2, instants, lines) of a line's vectors at both ends of a period.
+
+    The weighted sum is the expected vector in between.
+    """
     omega = 2j * np.pi * np.array([line.frequency_hz for line in lines])
     damping = np.pi * np.array([line.width_hz for line in lines])
     time_s = time_s[:, None]
@@ -340,6 +344,7 @@ def _rotated(disturbance: Disturbance, time_s: float) -> Complex:
 
 
 def _square(time_s: Array) -> Array:
+    """The square wave, -1 or 1, at these times."""
     return np.where(np.mod(time_s, _STEP_PERIOD_S) < _STEP_PERIOD_S / 2, -1.0, 1.0)
 
 
@@ -350,7 +355,7 @@ def screen(seed: int, samples: int, spacing: float) -> Array:
     focal-plane mask passes, so that coarse nodes do not alias fine structure.
     """
     rng = np.random.default_rng([seed, 2])
-    side, finest = 4.0, 12.0
+    side, finest = 4.0, 12.0  # pupil diameters, cycles per diameter
     count = int(2 * finest * side)
     frequency = np.arange(-count // 2, count // 2 + 1) / side
     fx, fy = np.meshgrid(frequency, frequency)

@@ -48,7 +48,7 @@ _REMEMBERED = 256  # mirror states, and publication times of frames
 def disturbance_of(config: Configuration) -> Disturbance:
     """The disturbance of a configuration."""
     section, nm_per_mas = config.disturbance, tilt_nm_per_mas(config.star.diameter_m)
-    found = preset_disturbance(
+    disturbance = preset_disturbance(
         section.preset,
         config.noll,
         config.seed,
@@ -58,8 +58,8 @@ def disturbance_of(config: Configuration) -> Disturbance:
         {int(index): amplitude for index, amplitude in section.static_nm.items()},
         section.line_width,
     )
-    found = with_sources(
-        found,
+    disturbance = with_sources(
+        disturbance,
         config.camera.rate_hz,
         {int(index): per_root_s for index, per_root_s in section.drift_nm.items()},
         section.drift_slope,
@@ -67,12 +67,12 @@ def disturbance_of(config: Configuration) -> Disturbance:
         section.shear,
     )
     if not section.wheel_hz:
-        return found
+        return disturbance
     speeds_hz = section.wheel_hz, section.wheel_hz + section.second_wheel_hz
     rms_nm = np.where(np.isin(config.noll, TIP_TILT), section.wheel_mas * nm_per_mas, 0.0)
     count = 2 if section.second_wheel_hz else 1
     spinning = wheels(config.seed, speeds_hz[:count], rms_nm, section.wheel_course, section.wheel_change)
-    return replace(found, wheels=spinning)
+    return replace(disturbance, wheels=spinning)
 
 
 def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scene:
@@ -104,11 +104,11 @@ def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scen
     )
 
 
-def _centred_region(name: str, size: int, of: int) -> tuple[int, int]:
+def _centred_region(name: str, size: int, available: int) -> tuple[int, int]:
     """First and number of the rows or columns of the centred readout region; all for size 0."""
-    if size > of:
-        raise ConfigurationError(f"options of the simulated camera: {name} is {size}, the sensor has {of}")
-    return ((of - size) // 2, size) if size else (0, of)
+    if size > available:
+        raise ConfigurationError(f"options of the simulated camera: {name} is {size}, the sensor has {available}")
+    return ((available - size) // 2, size) if size else (0, available)
 
 
 class _Exposed(NamedTuple):
@@ -160,9 +160,9 @@ class SimulatedCamera:
         self._published_ns = [(0, 0)] * _REMEMBERED  # (sequence, time) of the last frames
         self._lateness = Lateness()
         self._frame_to_mirror = Durations()
-        recent = max(1, round(RECENT_S * config.camera.rate_hz))
+        recent_frames = max(1, round(RECENT_S * config.camera.rate_hz))
         nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
-        self._statistics = WavefrontAccumulator(config.noll, nm_per_mas, recent, len(self._scene.instants))
+        self._statistics = WavefrontAccumulator(config.noll, nm_per_mas, recent_frames, len(self._scene.instants))
         self._measured: dict[str, float] = {}
 
     def join(self, service: Service) -> None:

@@ -10,11 +10,11 @@ import numpy.typing as npt
 Frame = npt.NDArray[np.uint16]
 
 MAX_FRAMES_LATE = 50
-LOST_SHARE = 0.1
-HOT_SHARE = 0.1
-COSMIC_SHARE = 0.2
+LOST_SHARE = 0.1  # of the frames
+HOT_SHARE = 0.1  # of the pixels
+COSMIC_SHARE = 0.2  # of the frames
 TRACK_PIXELS = 6
-"""Length of a cosmic-ray track: fewer saturated pixels than the limit, so that the frame is used."""
+"""Length of a cosmic-ray track, pixels: below the limit of saturated pixels, so that the frame is used."""
 
 
 class Kind(StrEnum):
@@ -56,13 +56,13 @@ class Fault:
         """Random generator of this frame."""
         return np.random.default_rng([self.seed, index])
 
-    def sent(self, index: int) -> tuple[int, ...]:
+    def frames_due(self, index: int) -> tuple[int, ...]:
         """Indices of the frames that are published at the end of exposure `index`, the newest first."""
         return tuple(
             frame
             for frame in range(index, max(index - MAX_FRAMES_LATE, 0) - 1, -1)
-            for when in _due(self, frame)
-            if when == index
+            for exposure in _exposures(self, frame)
+            if exposure == index
         )
 
     def pixels(self, index: int, frame: Frame, before: Frame, dark: int, highest: int) -> Frame:
@@ -71,7 +71,7 @@ class Fault:
         Args:
             index: index of the frame.
             frame: the frame without a fault.
-            before: the detector's output before it.
+            before: the detector's output for the frame before.
             dark: value without light, DN.
             highest: value of a pixel at full well, DN.
         """
@@ -103,7 +103,7 @@ class Fault:
 
 
 @lru_cache(maxsize=2 * MAX_FRAMES_LATE)  # each exposure asks for all frames that may still be due
-def _due(fault: Fault, frame: int) -> tuple[int, ...]:
+def _exposures(fault: Fault, frame: int) -> tuple[int, ...]:
     """Indices of the exposures at whose end a frame is published."""
     match fault.kind_at(frame):
         case Kind.LOST if fault.random(frame).random() < LOST_SHARE:
@@ -123,6 +123,6 @@ def _with_track(frame: Frame, rng: np.random.Generator, highest: int) -> Frame:
     along = start + np.arange(TRACK_PIXELS)[:, None] * (np.cos(angle), np.sin(angle))
     rows, columns = along.astype(int).T
     inside = (rows >= 0) & (rows < frame.shape[0]) & (columns >= 0) & (columns < frame.shape[1])
-    found = frame.copy()
-    found[rows[inside], columns[inside]] = highest
-    return found
+    with_track = frame.copy()
+    with_track[rows[inside], columns[inside]] = highest
+    return with_track

@@ -24,10 +24,10 @@ def read_fault(file: Path) -> Fault:
         ConfigurationError: the file does not contain a fault.
     """
     try:
-        found = json.loads(file.read_text())
-        return Fault(**(found | {"kind": Kind(found["kind"])}))
-    except (OSError, ValueError, TypeError, KeyError) as fault:
-        raise ConfigurationError(f"{file}: not a fault: {fault}") from None
+        values = json.loads(file.read_text())
+        return Fault(**(values | {"kind": Kind(values["kind"])}))
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise ConfigurationError(f"{file}: not a fault: {error}") from None
 
 
 class FaultyFrames:
@@ -57,13 +57,14 @@ class FaultyFrames:
             return envelope
         self._messages.append((index, message, now_ns))
         messages = {number: (body, time_ns) for number, body, time_ns in self._messages}
-        for number in self._fault.sent(index):
+        for number in self._fault.frames_due(index):
             if number in messages:
                 earlier = EARLIER_S if self._fault.kind_at(number) is Kind.OLD_SEQUENCE else 0
                 self._publisher.put(*messages[number], sequence_of(self._start_s - earlier, number))
         return Envelope(sequence_of(self._start_s, index), now_ns)
 
     def _message(self, index: int, good: RawImage) -> bytes:
+        """The bytes published in place of a frame without a fault."""
         frame = np.frombuffer(good.data, "<u2").reshape(good.height, good.width)
         before = frame if self._before is None else self._before
         self._before = self._fault.pixels(index, frame, before, self._dark, self._highest)

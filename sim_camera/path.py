@@ -27,7 +27,7 @@ class MirrorPath:
         self._moves.append((max(min(moment, latest) + self._delay, self._moves[-1][0]), shape_nm))
 
     def over(self, start: float, instants: Array) -> tuple[list[Single], Single]:
-        """Shapes (rows, columns) in effect from `start` on, and the weight of each (instants, shapes).
+        """Shapes (rows, columns) in effect in the period from `start`, and the weight of each (instants, shapes).
 
         `instants` (instants,) are relative to `start`. Earlier shapes are dropped once the mirror has settled; those of
         a slow mirror are replaced by its position at the last move before `start`.
@@ -42,9 +42,9 @@ class MirrorPath:
         weights = np.zeros((len(instants), len(moves)), np.float32)
         weights[:, 0] = 1
         ends = [moment for moment, _ in moves[2:]] + [np.inf]
-        for row, ((moment, _), end) in enumerate(zip(moves[1:], ends, strict=False), 1):
+        for column, ((moment, _), end) in enumerate(zip(moves[1:], ends, strict=False), 1):
             since = np.maximum(np.minimum(start + instants, end) - moment, 0.0)
             remaining = np.exp(-since / self._settling) if self._settling else 1.0 * (start + instants < moment)
             weights *= remaining[:, None].astype(np.float32)
-            weights[:, row] = 1 - remaining
+            weights[:, column] = 1 - remaining
         return [shape for _, shape in moves], weights

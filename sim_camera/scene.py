@@ -13,7 +13,7 @@ from lowfc.arrays import Array, Single
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.detector.detector import Detector, expose, noise_table_of, saturation_dn
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, wavefront_rms_nm
-from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
+from lowfc.optics.twin.twin_mirror import TwinMirror, poke_wavefronts_nm, wavefront_nm
 from sim_camera.disturbance import Disturbance, Sampler, highest_hz, screen, shear_at, speeds_hz
 from sim_camera.pixels import PixelErrors
 
@@ -120,7 +120,7 @@ class Scene:
         self._basis = zernikes(disturbance.noll, *node_radii(optics)).astype(np.float32)
         self._screen = self._static_screen(disturbance.screen_nm, seed)
         self._screen_modes = np.asarray(self._project(self._screen), dtype=np.float32)
-        self._mirror_to_modes = self._mirror_projection()
+        self._mirror_to_modes = self._project(poke_wavefronts_nm(mirror)).astype(np.float32)  # (modes, actuators)
         self.instants = (np.arange(instants) + 0.5) / instants if instants > 1 else np.zeros(0)
         nodes, weights = np.zeros(0), np.ones(1)
         if instants > 1:
@@ -172,13 +172,15 @@ class Scene:
             shapes_nm, weights = [actuators_nm, *path[0]], np.hstack([0 * weights, path[1]])
         # Modes (1 + instants, modes): in row 0 at the start of the exposure, then at each instant; likewise `residual`.
         disturbance = np.concatenate([modes[:1], modes[len(modes) - len(self.instants) :]])
-        of_shapes = np.vstack([np.eye(1, len(shapes_nm), dtype=np.float32), weights])
+        shape_weights = np.vstack([np.eye(1, len(shapes_nm), dtype=np.float32), weights])
         opd_nm = disturbance @ self._basis
         opd_nm += self._screen
-        moved_nm = of_shapes @ np.array([self._mirror_nm(shape) for shape in shapes_nm])
+        mirror_nm = shape_weights @ np.array([self._mirror_nm(shape) for shape in shapes_nm])
         disturbance = disturbance + self._screen_modes
-        residual = disturbance + of_shapes @ (np.array(shapes_nm).reshape(len(shapes_nm), -1) @ self._mirror_to_modes.T)
-        mean_squares_nm2 = self._mean_squares_nm2(opd_nm), self._mean_squares_nm2(opd_nm + moved_nm)
+        residual = disturbance + shape_weights @ (
+            np.array(shapes_nm).reshape(len(shapes_nm), -1) @ self._mirror_to_modes.T
+        )
+        mean_squares_nm2 = self._mean_squares_nm2(opd_nm), self._mean_squares_nm2(opd_nm + mirror_nm)
         disturbance_rms_nm, residual_rms_nm = (float(np.sqrt(each[0])) for each in mean_squares_nm2)
         sampled = Wavefront(disturbance[0], residual[0], disturbance_rms_nm, residual_rms_nm)
         speeds_and_shear = speeds_hz(self._disturbance, index / self._rate_hz), self._shear(index)
@@ -191,6 +193,7 @@ class Scene:
         return Truth(sampled, continuous, sensed_nm, np.array([disturbance[1:], residual[1:]]), *speeds_and_shear)
 
     def _shear(self, index: int) -> Array:
+        """Shear of the beam (2,) at mid-exposure, pupil diameters; empty without shear."""
         return shear_at(self._disturbance, (index + self._exposure / 2) / self._rate_hz)
 
     def _mirror_nm(self, actuators_nm: Single) -> Single:
@@ -198,9 +201,9 @@ class Scene:
         for shape_nm, opd_nm in self._wavefronts:
             if shape_nm is actuators_nm:
                 return opd_nm
-        found = wavefront_nm(self._mirror, actuators_nm)
-        self._wavefronts = [(actuators_nm, found), *self._wavefronts[:2]]
-        return found
+        new_nm = wavefront_nm(self._mirror, actuators_nm)
+        self._wavefronts = [(actuators_nm, new_nm), *self._wavefronts[:2]]
+        return new_nm
 
     def _mean_squares_nm2(self, opd_nm: Single) -> Single:
         """Mean square over the open pupil, piston removed, of wavefronts (many, used)."""
@@ -229,10 +232,3 @@ class Scene:
         inside = np.hypot(x, y) <= 1
         basis = np.vstack([np.ones(inside.sum()), self._basis[:, inside]]).astype(np.float64)
         return np.asarray(np.linalg.lstsq(basis.T, opd_nm[inside].astype(np.float64), rcond=None)[0][1:])
-
-    def _mirror_projection(self) -> Single:
-        """(modes, actuators): modes of the wavefront, twice the surface, per nm of each actuator."""
-        rows, columns = np.divmod(self._mirror.used, self._optics.axis.size)
-        factors = self._mirror.y_factors[rows][:, :, None] * self._mirror.x_factors[columns][:, None, :]
-        surface = factors.reshape(rows.size, -1) + self._mirror.expand @ self._mirror.reduce
-        return self._project(2 * surface).astype(np.float32)

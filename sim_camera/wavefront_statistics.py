@@ -21,8 +21,9 @@ _RMS = "disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_re
 class WavefrontAccumulator:
     """Block sums over frames of the contrast added by each mode, and of the squared wavefront.
 
-    Statistics are by their names in the message: rms in nm over the open pupil, and mas per axis, at the starts of
-    exposures; continuous ones over all time, from `instants` samples of each period, absent if not computed.
+    Statistics have their names in the message: rms over the open pupil in nm, and rms of the tilt per axis in mas, at
+    the starts of exposures. Those named `continuous_...` are over all time, from `instants` samples of each period;
+    they are absent if not computed.
     """
 
     def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int = 1, instants: int = 0) -> None:
@@ -59,7 +60,7 @@ class WavefrontAccumulator:
             self._sums, self._count = [0.0] * self._values, 0
         if len(self._blocks) == MAX_BLOCKS:
             pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
-            self._blocks = [[one + other for one, other in zip(*pair, strict=True)] for pair in pairs]
+            self._blocks = [[first + second for first, second in zip(*pair, strict=True)] for pair in pairs]
             self._block *= 2
 
     def wavefront(self) -> dict[str, Any]:
@@ -78,19 +79,25 @@ class WavefrontAccumulator:
 
     def recent(self) -> dict[str, Any]:
         """Statistics over the most recent frames."""
-        found = self._recent[: self._frames]
-        return self._statistics(found.mean(axis=0)) if len(found) else {}
+        frames = self._recent[: self._frames]
+        return self._statistics(frames.mean(axis=0)) if len(frames) else {}
 
     def _squares(self, wavefront: Wavefront) -> tuple[float, ...]:
+        """Squares in nm^2 in the order of `_RMS`; those of tilt are summed over its axes."""
         disturbance_nm, residual_nm = wavefront.disturbance_nm[self._tilts], wavefront.residual_nm[self._tilts]
         pupil_nm2 = wavefront.disturbance_rms_nm**2, wavefront.residual_rms_nm**2
         return (*pupil_nm2, float(disturbance_nm @ disturbance_nm), float(residual_nm @ residual_nm))
 
     def _statistics(self, mean: npt.NDArray[np.float64]) -> dict[str, Any]:
+        """Statistics from the means over frames of the values that `add` sums."""
         flat, added, squares = mean[0], mean[1 : 1 + len(self._noll)], mean[1 + len(self._noll) :]
         divisors = np.array([1, 1, *[self._tilts.stop * self._nm_per_mas**2] * 2])
         rms = np.sqrt(squares.reshape(-1, 4) / divisors).ravel().tolist()
-        found = dict(zip((*_RMS, *(f"continuous_{name}" for name in _RMS)), rms, strict=False))
-        found |= {"instants": self._instants, "added_contrast_flat": float(flat), "added_contrast": float(added.sum())}
+        statistics = dict(zip((*_RMS, *(f"continuous_{name}" for name in _RMS)), rms, strict=False))
+        statistics |= {
+            "instants": self._instants,
+            "added_contrast_flat": float(flat),
+            "added_contrast": float(added.sum()),
+        }
         modes, share = costliest(by_group(self._noll, added)) if added.any() else ("", 0.0)
-        return found | {"costliest_modes": modes, "costliest_share": share}
+        return statistics | {"costliest_modes": modes, "costliest_share": share}

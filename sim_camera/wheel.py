@@ -90,11 +90,11 @@ class Wheel:
 def wheels(
     seed: int, speeds_hz: tuple[float, ...], rms_nm: Array, course: str = "ramp", change: float = 0.0
 ) -> tuple[Wheel, ...]:
-    """Equal wheels, one for each speed at time 0; `rms_nm` (modes,) is that of the first harmonic at high speed."""
-    found = []
+    """Wheels of equal amplitude, one for each speed at time 0; `rms_nm` (modes,): first harmonic at high speed."""
+    spinning = []
     for number, start_hz in enumerate(speeds_hz):
         rng = np.random.default_rng([seed, 7, number])
         phases = np.exp(2j * np.pi * rng.random((len(ORDERS), rms_nm.size)))
         amplitude_nm = np.sqrt(2) * np.outer(HEIGHTS, rms_nm) * phases
-        found.append(Wheel(start_hz, course, change, amplitude_nm, walk(rng, np.array([change]))))
-    return tuple(found)
+        spinning.append(Wheel(start_hz, course, change, amplitude_nm, walk(rng, np.array([change]))))
+    return tuple(spinning)

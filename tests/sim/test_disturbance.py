@@ -229,7 +229,7 @@ def fault(kind: Kind, seed: int = 5) -> Fault:
 
 
 def published(kind: Kind, seed: int = 5) -> list[int]:
-    return [frame for index in range(LAST) for frame in fault(kind, seed).sent(index)]
+    return [frame for index in range(LAST) for frame in fault(kind, seed).frames_due(index)]
 
 
 def faulty_frame(kind: Kind, index: int) -> np.ndarray:
@@ -239,7 +239,7 @@ def faulty_frame(kind: Kind, index: int) -> np.ndarray:
 @pytest.mark.parametrize("kind", Kind)
 def test_fault_changes_no_frame_outside_its_range(kind: Kind) -> None:
     for index in (1, FIRST - 1, FIRST + FRAMES + MAX_FRAMES_LATE + 1):
-        assert fault(kind).sent(index) == (index,)
+        assert fault(kind).frames_due(index) == (index,)
         assert faulty_frame(kind, index) is IMAGE
         assert fault(kind).payload(index, b"whole", 5) == b"whole"
 
@@ -258,7 +258,7 @@ def test_reordered_frames_are_swapped_in_pairs() -> None:
 
 
 def test_late_frames_are_all_published_within_fifty_frames() -> None:
-    when = {frame: index for index in range(LAST) for frame in fault(Kind.LATE).sent(index)}
+    when = {frame: index for index in range(LAST) for frame in fault(Kind.LATE).frames_due(index)}
     assert set(when) == set(range(LAST))
     late = [when[frame] - frame for frame in range(FIRST, FIRST + FRAMES)]
     assert (min(late), max(late)) == (1, MAX_FRAMES_LATE)

@@ -48,7 +48,7 @@ class LyotStop:
     """The elements of a Lyot coronagraph after its pupil: opaque mask and stop.
 
     Attributes:
-        opaque: (k, k) fraction of the amplitude that the focal-plane mask blocks, 0 to 1; this light goes to the sensor.
+        opaque: (k, k) fraction of the amplitude that the focal-plane mask blocks, 0 to 1; it goes to the sensor.
         stop: (n, n) amplitude transmission of the Lyot stop in the pupil after the mask.
         samples_per: Samples of the opaque part per lambda / D.
     """
