@@ -41,7 +41,7 @@ class Prepared:
         """Build the sensor of a section, or use `sensor` behind the section's coronagraph."""
         self.name, self.section = name, section
         self.sensor = sensor_from(section) if sensor is None else sensor
-        self._own = threading.local()
+        self._thread_local = threading.local()
 
     @property
     def paper_name(self) -> str:
@@ -49,7 +49,7 @@ class Prepared:
         kind = self.name.partition(":")[0]
         if kind not in SENSORS:
             return "sam"
-        return kind if kind == "bowtie" else self.name  # not a CLOWFS with another defocus
+        return kind if kind == "bowtie" else self.name  # the paper has no values for clowfs:MM
 
     @cached_property
     def modes(self) -> Array:
@@ -156,7 +156,7 @@ class Prepared:
 
     @contextmanager
     def _fitting(self, modes: int) -> Iterator[None]:
-        """Raise ConfigurationError for modes that the sensor cannot tell apart."""
+        """Convert the ValueError of a fit of modes that the sensor cannot distinguish to ConfigurationError."""
         try:
             yield
         except ValueError as error:
@@ -168,10 +168,10 @@ class Prepared:
 
     def model(self, modes_nm: Array) -> Array:
         """The same as `image` at the central wavelength, by the twin; thread-safe."""
-        if not hasattr(self._own, "evaluator"):
-            self._own.evaluator = Evaluator(self.twin)
+        if not hasattr(self._thread_local, "evaluator"):
+            self._thread_local.evaluator = Evaluator(self.twin)
         opd_nm = modes_nm @ self._node_modes[: len(modes_nm)]
-        return np.asarray(self._own.evaluator.image(opd_nm.astype(np.float32)), np.float64).ravel()
+        return np.asarray(self._thread_local.evaluator.image(opd_nm.astype(np.float32)), np.float64).ravel()
 
 
 @lru_cache(maxsize=1)
@@ -213,7 +213,7 @@ class Row:
         name: Object of the measurement: a sensor, a mode, an element.
         quantity: Measured quantity.
         unit: Unit of all numbers; "" if they have none.
-        measured: Our value.
+        measured: Our value; None if it cannot be computed.
         paper: The paper's value; None if it has none.
         error: Standard error of `measured` if it is a mean or scatter over trials; None if it is deterministic.
         predicted: Theoretical prediction of `measured`; None if not computed.
@@ -256,7 +256,7 @@ def _plain(value: float | str | None) -> float | str | None:
 
 def assuming(rows: Sequence[Row], assumption: str) -> list[Row]:
     """The rows with an additional assumption."""
-    return [replace(each, assumption="\n".join(filter(None, (each.assumption, assumption)))) for each in rows]
+    return [replace(row, assumption="\n".join(filter(None, (row.assumption, assumption)))) for row in rows]
 
 
 @dataclass(frozen=True)
@@ -301,7 +301,7 @@ class Context:
 class Case:
     """A table or figure: title, function that computes its rows, and function that plots it if there is a plot.
 
-    `in_text` selects the rows in the text if there are too many; it receives rows of `plain`. `about` is the
+    `in_text` tells whether text and page show a row of `plain`, if there are too many rows to show all. `about` is the
     introduction of the page of an additional table.
     """
 

@@ -41,7 +41,7 @@ def validate(
         typer.Option(
             help=f"Only this sensor, in all tables and figures but {' and '.join(WITH_FIXED_SENSORS)}: sam, bowtie, "
             "bowtie:LAYOUT, clowfs, clowfs:MM (its defocus), clowfs_tuned, zwfs, zwfs_tuned, bar, open, lyot, aplc; or "
-            "a layout, FILE.json or FILE.json:NAME. Repeat.",
+            "a layout, FILE.json or FILE.json:NAME. May be repeated.",
             show_default=False,
         ),
     ] = None,
@@ -81,10 +81,10 @@ def validate(
     fixed = [name for name in chosen if name in WITH_FIXED_SENSORS]
     if sensor and fixed:
         typer.echo(f"{', '.join(fixed)}: the sensors are fixed, --sensor has no effect there", err=True)
-    found = run(chosen, context, plots if docs is None else docs / PICTURES)
-    sys.stdout.write((to_json(found) if as_json else "\n\n".join(map(to_text, found))) + "\n")
+    results = run(chosen, context, plots if docs is None else docs / PICTURES)
+    sys.stdout.write((to_json(results) if as_json else "\n\n".join(map(to_text, results))) + "\n")
     if docs is not None and pages:
-        for table in found:
+        for table in results:
             write_page(docs, table)
     elif docs is not None:
-        write_document(docs, found)
+        write_document(docs, results)

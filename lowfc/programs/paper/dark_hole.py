@@ -22,18 +22,19 @@ from lowfc.control.loop.command_channels import FLAT
 STEPS = 20
 SEED = 5
 SETTLE = 100
-"""Frames after each step."""
+"""Frames waited for after each step."""
 WINDOW = 300
-"""Further frames after the last step, and frames after the shape is removed."""
+"""Further frames waited for after the last step, and frames after the shape is removed."""
 STEPS_COMBINED = 5
 """Number of steps combined into one on the channel that does not shift the zero point: the loop undoes nearly all of
 them, so fewer suffice to measure that fraction."""
 SHIFTED, PLAIN = "dark-hole", FLAT
-"""Channels that shift the sensor's zero point, and that do not."""
+"""A channel that shifts the sensor's zero point, and one that does not."""
 GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
 """Gains of the loop; the fraction depends on them."""
 COMMAND = "lowfc sim-loop --lockstep --rate 1000 --disturbance bench --star-magnitude -2"
 PATIENCE_S = 60.0
+"""Longest wait for the loop to start, for a frame, and for the processes to end."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +78,7 @@ def dark_hole(
         folder: folder of the log.
         step_rms_nm: rms of each step, nm of surface.
         toml: configuration.
-        base_nm: (rows, columns) nm of surface, the configured flat map: the other channel is `flat`, and the steps are
-            added to it.
+        base_nm: (rows, columns) nm of surface, the configured flat map, to which the steps on channel `flat` are added.
         seed: seed of the simulation; the configuration's if None.
 
     Raises:
@@ -86,10 +86,10 @@ def dark_hole(
     """
     (folder / "run.toml").write_text(f"{GAINS}{toml}")
     run, failure = new_run_id(), ""
-    words = [sys.executable, "-P", "-m", *COMMAND.split(), "--run", run, "--config", "run.toml", "--json"]
-    words += [] if seed is None else ["--seed", str(seed)]
+    command = [sys.executable, "-P", "-m", *COMMAND.split(), "--run", run, "--config", "run.toml", "--json"]
+    command += [] if seed is None else ["--seed", str(seed)]
     pipe = subprocess.PIPE
-    with subprocess.Popen(words, cwd=folder, text=True, stdout=pipe, stderr=pipe) as process:  # noqa: S603  # our own
+    with subprocess.Popen(command, cwd=folder, text=True, stdout=pipe, stderr=pipe) as process:  # noqa: S603  # our own
         try:
             deadline_s = time.monotonic() + PATIENCE_S
             while run not in running() and time.monotonic() < deadline_s and process.poll() is None:
@@ -150,7 +150,7 @@ def channel_results(history: History, marks: dict[str, list[int]], channel_modes
     def before(end: int, frames: int) -> Mask:
         return np.asarray(known & (sequences < end) & (sequences >= end - frames))
 
-    found = {}
+    results = {}
     for name, changed_at in marks.items():
         ends = [before(end, 3 * SETTLE // 4) for end in changed_at]
         reaction_nm = command + truths.disturbance_nm
@@ -159,7 +159,7 @@ def channel_results(history: History, marks: dict[str, list[int]], channel_modes
             np.sqrt(truths.residual_nm[before(end, WINDOW)].var(axis=0, dtype=np.float64).sum())
             for end in (changed_at[0], changed_at[-1])
         ]
-        found[name] = ChannelResult(
+        results[name] = ChannelResult(
             channel_modes_nm[:: STEPS // (len(changed_at) - 1)], reaction, np.array(residual_nm)
         )
-    return found
+    return results

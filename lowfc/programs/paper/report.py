@@ -166,14 +166,14 @@ def to_page(table: Table) -> str:
 
 
 def write_page(folder: Path, table: Table) -> None:
-    """Write the JSON file, with the rows in the text, and the page that is generated from it."""
+    """Write the JSON file of a table, with the rows that the page shows, and the page generated from it."""
     in_text = _in_text(table)
     write_whole(folder / f"{table['table']}.json", _one_row_to_a_line([in_text]).encode())
     write_whole(folder / f"{table['table']}.md", to_page(in_text).encode())
 
 
 def _in_text(table: Table) -> Table:
-    """The table with only the rows in the text."""
+    """The table with only the rows that text and page show."""
     case = CASES.get(table["table"])
     return (
         table if case is None or case.in_text is None else table | {"rows": list(filter(case.in_text, table["rows"]))}
@@ -215,12 +215,12 @@ def _trials(table: Table) -> str:
 
 
 def _cells(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]], list[str]]:
-    """Header and cells without empty columns, and the assumptions to which the numbers in the last column refer."""
+    """Header and cells without empty columns, and the numbered assumptions to which the last column refers."""
     notes = list(dict.fromkeys(line for row in rows for line in _lines(row["assumption"])))
     body = [
         [
-            *(_number(row[key]) for key in ("name", "modes", "estimator", "quantity", "paper", "measured")),
-            *(_number(row[key]) for key in ("predicted", "limit", "unit")),
+            *(_text(row[key]) for key in ("name", "modes", "estimator", "quantity", "paper", "measured")),
+            *(_text(row[key]) for key in ("predicted", "limit", "unit")),
             "".join(f"[{notes.index(line) + 1}]" for line in _lines(row["assumption"])),
         ]
         for row in rows
@@ -240,7 +240,8 @@ def _lines(assumption: str | None) -> list[str]:
     return assumption.split("\n") if assumption else []
 
 
-def _number(value: float | str | None) -> str:
+def _text(value: float | str | None) -> str:
+    """A value as text; floats have three digits."""
     if value is None:
         return ""
     if not isinstance(value, float):

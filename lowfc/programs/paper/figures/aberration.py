@@ -55,11 +55,13 @@ def _aberrated(context: Context, name: str, coma: int) -> _Aberrated:
     image, linear = ready.image(truth_nm), fits(ready, MODES)
     ready.model(truth_nm)  # builds the twin before the threads use it
 
-    def one(i: int) -> dict[str, Array]:
+    def estimate(i: int) -> dict[str, Array]:
         return estimates_nm(ready, linear, exposed_e(ready, image, context.rng("focus and coma", name, coma, i)))
 
-    found = context.map(f"{name}, coma Z{coma}", one, range(min(context.trials, REALISATIONS)))
-    return _Aberrated(ready, truth_nm, {key: truth_nm - np.stack([each[key] for each in found]) for key in ESTIMATORS})
+    results = context.map(f"{name}, coma Z{coma}", estimate, range(min(context.trials, REALISATIONS)))
+    return _Aberrated(
+        ready, truth_nm, {key: truth_nm - np.stack([each[key] for each in results]) for key in ESTIMATORS}
+    )
 
 
 def fig1(context: Context) -> list[Row]:
@@ -138,8 +140,8 @@ def fig7(context: Context) -> list[Row]:
             case = _aberrated(context, name, coma)
             basis, wavelength_nm = case.ready.open_modes[:MODES], case.ready.sensor.wavelength_nm
             root = np.linalg.cholesky(bound_nm2(case.ready))
-            drawn = context.rng("focus and coma", "limit").standard_normal((_LIMIT_DRAWS, MODES)) @ root.T
-            limit = float(residual_pv(basis, drawn).mean()) / wavelength_nm
+            drawn_nm = context.rng("focus and coma", "limit").standard_normal((_LIMIT_DRAWS, MODES)) @ root.T
+            limit = float(residual_pv(basis, drawn_nm).mean()) / wavelength_nm
             paper = _PAPER_PV_WAVES if case.ready.paper_name == "sam" else None
             for key, residuals_nm in case.residuals_nm.items():
                 mean, error = mean_and_error(residual_pv(basis, residuals_nm) / wavelength_nm)

@@ -30,11 +30,11 @@ def exposed_e(ready: Prepared, image: Array, rng: np.random.Generator) -> Array:
 
 def estimates_nm(ready: Prepared, linear: dict[str, Fit], image_e: Array) -> dict[str, Array]:
     """Estimates (modes,) from an image (pixels,) in electrons, by those of `ESTIMATORS` whose kind is in `linear`."""
-    found: dict[str, Array] = {}
+    estimates: dict[str, Array] = {}
     for kind, fit in linear.items():
         steps_nm = iterated(fit, image_e, ready.model, ITERATIONS[-1])
-        found |= {label(kind, iterations): steps_nm[iterations] for iterations in ITERATIONS}
-    return found
+        estimates |= {label(kind, iterations): steps_nm[iterations] for iterations in ITERATIONS}
+    return estimates
 
 
 def bound_nm2(ready: Prepared) -> Array:

@@ -18,8 +18,8 @@ from lowfc.programs.paper.tables.photometry import PAPER_PEAK, PAPER_SIGNAL, dif
 from lowfc.programs.paper.tables.pointing import PAPER_FOCAL_MASK, PAPER_PUPIL, PAPER_RELAY_MASK
 from lowfc.programs.paper.tables.tables import PAPER_TABLE2
 
-_CHANGED = (4, 5, 6, 7, 8)
-_DRAWN = (4, 5, 7)
+_TABLE_NOLLS = (4, 5, 6, 7, 8)
+_PLOT_NOLLS = (4, 5, 7)
 _VIEW, _VIEW_SAMPLES_PER = 10, 8
 _FAINTEST = {"focal": 1e-8, "relay": 1e-4, "sensor": 1e-5}
 
@@ -106,7 +106,7 @@ def fig4(context: Context) -> list[Row]:
                 float(np.abs(differential(ready, noll)).max()),
                 PAPER_TABLE2[noll] if ready.paper_name == "sam" else None,
             )
-            for noll in _CHANGED
+            for noll in _TABLE_NOLLS
         ]
     return assuming(
         rows,
@@ -119,7 +119,7 @@ def plot_fig4(context: Context, path: Path) -> None:
     """Draw Fig. 4: differential images of focus, astigmatism and coma."""
     ready = prepared(context.names("sam")[0])
     panels: list[plots.Panel] = []
-    for noll in _DRAWN:
+    for noll in _PLOT_NOLLS:
         change = differential(ready, noll)
         bound = float(np.abs(change).max())
         panels.append(

@@ -35,6 +35,7 @@ _DEVIATION = 0.1
 
 
 def _matched(ready: Prepared) -> Input:
+    """The interpretation of Sect. 3.1 that matches the input of Table 3."""
     return next(inputs(ready, MODES, literal=False))
 
 
@@ -47,9 +48,9 @@ def fig5(context: Context) -> list[Row]:
     """Linear fit to estimated against true coefficients of each radial degree, Fig. 5."""
     rows = []
     for name in context.names("sam"):
-        ready, found = prepared(name), _ensemble(context, name)
+        ready, estimated = prepared(name), _ensemble(context, name)
         for degree in range(1, 5):
-            truth, estimates = (values[:, degree == DEGREES].ravel() for values in _waves(ready, found))
+            truth, estimates = (values[:, degree == DEGREES].ravel() for values in _waves(ready, estimated))
             (slope, intercept), covariance = np.polyfit(truth, estimates, 1, cov=True)
             fitted = partial(Row, f"{name}, n = {degree}", modes=MODES, estimator=PINV)
             errors = np.sqrt(np.diag(covariance))
@@ -81,10 +82,10 @@ def plot_fig5(context: Context, path: Path) -> None:
     plots.draw(path, panels, f"Fig. 5. {name}, {PINV}, {len(truth)} wavefronts of Table 3. {BRIGHT}", columns=2)
 
 
-def _waves(ready: Prepared, found: Ensemble) -> tuple[Array, Array]:
-    """Truth and plain estimates (trials, modes) in waves."""
+def _waves(ready: Prepared, estimated: Ensemble) -> tuple[Array, Array]:
+    """True coefficients and their `PINV` estimates (trials, modes) in waves."""
     wavelength_nm = ready.sensor.wavelength_nm
-    return found.truth_nm / wavelength_nm, found.estimates_nm[PINV] / wavelength_nm
+    return estimated.truth_nm / wavelength_nm, estimated.estimates_nm[PINV] / wavelength_nm
 
 
 def fig6(context: Context) -> list[Row]:
@@ -128,8 +129,9 @@ def plot_fig6(context: Context, path: Path) -> None:
 
 
 def _r_squared(context: Context) -> dict[str, Array]:
-    found = {name: _ensemble(context, name) for name in context.names("sam", "bowtie", "clowfs", "zwfs")}
-    return {name: r_squared(each.estimates_nm[PINV], each.truth_nm) for name, each in found.items()}
+    """Coefficient of determination of each mode (modes,) by sensor."""
+    ensembles = {name: _ensemble(context, name) for name in context.names("sam", "bowtie", "clowfs", "zwfs")}
+    return {name: r_squared(each.estimates_nm[PINV], each.truth_nm) for name, each in ensembles.items()}
 
 
 def _r_squared_limit(ready: Prepared) -> Array:
@@ -145,17 +147,17 @@ def _pure_modes(context: Context, name: str) -> Array:
     wavelength_nm, linear = ready.sensor.wavelength_nm, fits(ready, MODES)["pinv"]
     ready.model(np.zeros(MODES))  # builds the twin before the threads use it
 
-    def one(k: int) -> Array:
-        found = np.empty((len(ITERATIONS), AMPLITUDES.size))
+    def estimate(k: int) -> Array:
+        estimates = np.empty((len(ITERATIONS), AMPLITUDES.size))
         for j, amplitude in enumerate(AMPLITUDES):
             truth_nm = np.zeros(MODES)
             truth_nm[k] = amplitude * wavelength_nm
             image_e = linear.scale_e * ready.model(truth_nm)
             steps_nm = iterated(linear, image_e, ready.model, ITERATIONS[-1])
-            found[:, j] = [steps_nm[iterations][k] / wavelength_nm for iterations in ITERATIONS]
-        return found
+            estimates[:, j] = [steps_nm[iterations][k] / wavelength_nm for iterations in ITERATIONS]
+        return estimates
 
-    return np.stack(context.map(f"{name}, pure modes", one, range(MODES)), axis=1)
+    return np.stack(context.map(f"{name}, pure modes", estimate, range(MODES)), axis=1)
 
 
 def deviations(estimates: Array) -> Array:
@@ -175,13 +177,14 @@ def linear_range(deviation: Array) -> float:
 
 @lru_cache(maxsize=8)
 def _one_wavefront(context: Context, name: str, literal: bool) -> tuple[Array, dict[str, Array]]:
+    """One random wavefront (modes,) in waves, and its estimates."""
     ready = prepared(name)
     wavelength_nm, matched = ready.sensor.wavelength_nm, _matched(ready)
     low, high = LITERAL_WAVES if literal else (matched.low, matched.high)
     truth = random_wavefronts(context.rng("fig8"), 1, NOLLS_14, low, high)[0]
     image_e = exposed_e(ready, ready.image(truth * wavelength_nm), context.rng("fig8", name))
-    found = estimates_nm(ready, fits(ready, MODES), image_e)
-    return truth, {key: modes_nm / wavelength_nm for key, modes_nm in found.items()}
+    estimates = estimates_nm(ready, fits(ready, MODES), image_e)
+    return truth, {key: modes_nm / wavelength_nm for key, modes_nm in estimates.items()}
 
 
 def fig8(context: Context) -> list[Row]:
@@ -189,13 +192,13 @@ def fig8(context: Context) -> list[Row]:
     names = context.names("sam", "clowfs", "zwfs")
     rows = [row for name in names for row in _range_rows(context, name)]
     paper = _PAPER_ERROR_WAVES if prepared(names[0]).paper_name == "sam" else None
-    one = partial(Row, names[0], modes=MODES, assumption=f"One wavefront and one exposure. {BRIGHT} {FULL_CHAIN}")
+    new_row = partial(Row, names[0], modes=MODES, assumption=f"One wavefront and one exposure. {BRIGHT} {FULL_CHAIN}")
     for literal, bounds in ((False, "matched"), (True, "literal")):
         truth, estimates = _one_wavefront(context, names[0], literal)
         for key in (PINV, WEIGHTED_2):
             worst = float(np.abs(estimates[key] - truth).max())
             what = f"largest error of a random wavefront, {bounds} input"
-            rows.append(one(what, "waves", worst, paper, estimator=key))
+            rows.append(new_row(what, "waves", worst, paper, estimator=key))
     return rows
 
 
@@ -204,12 +207,15 @@ def _range_rows(context: Context, name: str) -> Iterator[Row]:
         "Pure modes of one sign from 0.005 to 0.15 waves rms, fitted with 14 modes, no noise, images by the twin, "
         "accurate to about 1e-5; deviation: fraction by which a mode's own estimate differs from its amplitude."
     )
-    at = {"lambda/20": int(np.argmin(np.abs(AMPLITUDES - 0.05))), "lambda/10": int(np.argmin(np.abs(AMPLITUDES - 0.1)))}
-    linear = dict(zip(at, _PAPER_LINEAR.get(prepared(name).paper_name, (None, None)), strict=True))
+    columns = {
+        "lambda/20": int(np.argmin(np.abs(AMPLITUDES - 0.05))),
+        "lambda/10": int(np.argmin(np.abs(AMPLITUDES - 0.1))),
+    }
+    linear = dict(zip(columns, _PAPER_LINEAR.get(prepared(name).paper_name, (None, None)), strict=True))
     for iterations, estimates in zip(ITERATIONS, _pure_modes(context, name), strict=True):
         deviation = deviations(estimates)
         fitted = partial(Row, modes=MODES, estimator=label("pinv", iterations), assumption=assumption)
-        for amplitude, j in at.items():
+        for amplitude, j in columns.items():
             paper = linear[amplitude] if iterations == 0 else None
             yield fitted(name, f"mean deviation at {amplitude}", "", float(deviation[:, j].mean()), paper)
             yield fitted(name, f"largest deviation at {amplitude}", "", float(deviation[:, j].max()))

@@ -49,14 +49,14 @@ def _screens(context: Context, name: str, width: int) -> list[_Screen]:
     centred = ready.open_modes[:MODES] - ready.open_modes[:MODES].mean(axis=1, keepdims=True)
     ready.model(np.zeros(MODES))  # builds the twin before the threads use it
 
-    def one(i: int) -> _Screen:
+    def estimate(i: int) -> _Screen:
         opd_nm = _screen_nm(context, ready, width, i)
         image_e = exposed_e(ready, image(ready.sensor, opd_nm).ravel(), context.rng("screen", name, width, i))
-        found = estimates_nm(ready, linear, image_e)
-        found[_BEST] = np.linalg.lstsq(centred.T, opd_nm[ready.open])[0]
-        return opd_nm, found
+        modes_nm = estimates_nm(ready, linear, image_e)
+        modes_nm[_BEST] = np.linalg.lstsq(centred.T, opd_nm[ready.open])[0]
+        return opd_nm, modes_nm
 
-    return context.map(f"{name}, screens {WIDTHS[width]}", one, range(min(context.trials, SCREENS)))
+    return context.map(f"{name}, screens {WIDTHS[width]}", estimate, range(min(context.trials, SCREENS)))
 
 
 def fig9(context: Context) -> list[Row]:

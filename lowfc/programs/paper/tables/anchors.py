@@ -1,4 +1,4 @@
-"""Published results of other systems, and lowfc's by the same definitions, with the assumptions."""
+"""Published results of other systems, and lowfc's results by the same definitions, with the assumptions."""
 
 import json
 import subprocess
@@ -43,7 +43,7 @@ DRIFT_PM = 20.0
 REACHED, NOT_REACHED = "reached", "not reached"
 
 ABOUT = """An anchor is a published value and lowfc's value by the same definition. *paper* is the published value,
-*limit* lowfc's with the noise of the quantum limit of the light. Loops are the real processes in lockstep, judged by
+*limit* is lowfc's with the noise of the quantum limit of the light. Loops are the real processes in lockstep, judged by
 the true wavefront, in continuous time over the second half of a run; the means as in SCExAO are of the tilt at the
 start of each exposure, from 4 s on. A verdict compares lowfc's value (the predicted one, if theory gives one) with the
 published one.
@@ -67,7 +67,7 @@ SCEXAO = (
 )
 HICAT = (
     f"Part of {STEPS} random steps of 2 nm rms of surface on a dark hole's channel that the loop undoes (V = -2). "
-    "HiCAT digs while its low-order loop runs (A&A 663, A49, 2022; arXiv 2301.03242); reached here: below 1 %."
+    "HiCAT digs while its low-order loop runs (A&A 663, A49, 2022; arXiv 2301.03242). The verdict is reached below 1 %."
 )
 HUNDRED = (
     f"Standard deviation of a mode's mean over {AVERAGED_S:g} s of frames at {tolerance.RATE_HZ:g} Hz, V = 2, "
@@ -82,7 +82,7 @@ AGAINST_V = (
 def anchors(context: Context) -> list[Row]:
     """Rows of every anchor, with a verdict if there is a published value."""
     names = context.names(*LOOP_SENSORS)
-    rows = [row for found in map(partial(_pointing, context), names) for row in found]
+    rows = [row for name in names for row in _pointing(context, name)]
     if "sam" in context.names("sam"):
         rows += _hicat(context)
     rows += _table4(context)
@@ -91,13 +91,13 @@ def anchors(context: Context) -> list[Row]:
 
 
 def _with_verdict(row: Row, allowed: float | None = None) -> list[Row]:
-    """A row, and its verdict if a value is allowed or published; it judges `predicted` if known, else `measured`."""
-    best, ours = row.paper if allowed is None else allowed, row.measured if row.predicted is None else row.predicted
-    if best is None:
+    """A row, and its verdict if a value is allowed or published, on `predicted` if known, otherwise on `measured`."""
+    limit, ours = row.paper if allowed is None else allowed, row.measured if row.predicted is None else row.predicted
+    if limit is None:
         return [row]
     assert isinstance(ours, float)  # noqa: S101  # compared values are numbers
-    assert isinstance(best, float)  # noqa: S101
-    verdict = Row(row.name, f"verdict, {row.quantity}", "", REACHED if ours <= best else NOT_REACHED)
+    assert isinstance(limit, float)  # noqa: S101
+    verdict = Row(row.name, f"verdict, {row.quantity}", "", REACHED if ours <= limit else NOT_REACHED)
     return [row, replace(verdict, modes=row.modes, estimator=row.estimator, assumption=row.assumption)]
 
 
@@ -105,7 +105,7 @@ def _pointing(context: Context, name: str) -> list[Row]:
     """Rows of Roman's milestone and of SCExAO's sensor."""
     rows: list[Row] = []
     nm_per_mas = tilt_nm_per_mas(2.0)
-    made = partial(Row, name, unit="mas", modes=len(NOLLS_14))
+    new_row = partial(Row, name, unit="mas", modes=len(NOLLS_14))
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
         sensor = _sensor_toml(name)
@@ -119,10 +119,10 @@ def _pointing(context: Context, name: str) -> list[Row]:
             (folder / "law.toml").write_text(f'{GAINS}law = "{law}"\n{sensor}')
             run = _sim_loop(*loop, "law.toml", CLOSED_S, context.seed + 1000)
             limit = _quantum_pointing_nm(observed, name) / nm_per_mas
-            driven = partial(made, estimator="LQG")
-            rows.append(made(f"tilt, {preset}, open loop", measured=run["tilt_disturbance_mas"], assumption=LOOP))
+            new_lqg_row = partial(new_row, estimator="LQG")
+            rows.append(new_row(f"tilt, {preset}, open loop", measured=run["tilt_disturbance_mas"], assumption=LOOP))
             rows += _with_verdict(
-                driven(
+                new_lqg_row(
                     f"tilt, {preset}",
                     measured=run["tilt_residual_mas"],
                     paper=ROMAN_MAS,
@@ -131,16 +131,16 @@ def _pointing(context: Context, name: str) -> list[Row]:
                 )
             )
             if preset == "reaction-wheel":
-                rows += _with_verdict(_means_row(driven, _history(folder / run["log"]), "sky"))
+                rows += _with_verdict(_means_row(new_lqg_row, _history(folder / run["log"]), "sky"))
         context.progress(f"anchors {name}, bench", 9, 12)
         run = _sim_loop("bench", folder, "gains.toml", CLOSED_S, context.seed)
         rows += _with_verdict(
-            _means_row(partial(made, estimator="integrator"), _history(folder / run["log"]), "laboratory")
+            _means_row(partial(new_row, estimator="integrator"), _history(folder / run["log"]), "laboratory")
         )
     return rows
 
 
-def _means_row(made: Callable[..., Row], history: History, where: str) -> Row:
+def _means_row(new_row: Callable[..., Row], history: History, where: str) -> Row:
     """Row with the standard deviation of means of the true tilt after the first four seconds."""
     truths = history.true
     assert truths is not None  # noqa: S101  # a simulated loop's
@@ -149,7 +149,7 @@ def _means_row(made: Callable[..., Row], history: History, where: str) -> Row:
     blocks = len(tilt_nm) // frames
     means = tilt_nm[: blocks * frames].reshape(blocks, frames, 2).mean(axis=1) / tilt_nm_per_mas(2.0)
     spread = float(np.sqrt(means.var(axis=0, ddof=1).mean()))
-    return made(
+    return new_row(
         f"std of means over {MEAN_S:g} s, {where}",
         measured=spread,
         paper=SCEXAO_MAS[where],
@@ -159,7 +159,7 @@ def _means_row(made: Callable[..., Row], history: History, where: str) -> Row:
 
 
 def _quantum_pointing_nm(history: History, name: str) -> float:
-    """Tilt per axis predicted for LQG from this log, with the noise of the quantum limit."""
+    """Rms tilt per axis, nm, predicted for LQG from this log, with the noise of the quantum limit."""
     steps = history.steps
     models = identify_modes(time_series(steps.sequence, steps.pol_nm[:, :2]), RATE_HZ)
     scale = (EXPOSURE / RATE_HZ) / (tolerance.EXPOSURE / tolerance.RATE_HZ)
@@ -170,6 +170,7 @@ def _quantum_pointing_nm(history: History, name: str) -> float:
 
 
 def _hicat(context: Context) -> list[Row]:
+    """Row of the part of a dark hole's steps that the loop undoes."""
     context.progress("anchors, a dark hole while the loop runs", 10, 12)
     with tempfile.TemporaryDirectory() as folder:
         undone, error = dark_hole(Path(folder), 2.0, seed=context.seed).channels[SHIFTED].undone()
@@ -188,7 +189,7 @@ def _table4(context: Context) -> list[Row]:
 
 
 def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
-    """Noise of each mode's mean over `AVERAGED_S`, as one exposure of all the light with all the read noise."""
+    """Noise of each mode's mean over `AVERAGED_S`, simulated as one exposure with all the light and read noise."""
     frames = AVERAGED_S * tolerance.RATE_HZ
     sensor, light_e = prepared(name), tolerance.light_e(MAGNITUDE)
     normalised_I0, R = sensor.loop_fit(sensor.I0, sensor.H[:, : len(NOLLS_14)], light_e, tolerance.READ_NOISE_E)
@@ -198,11 +199,11 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
         image = noisy_e(rng, sensor.I0 * light_e * frames, tolerance.READ_NOISE_E * np.sqrt(frames))
         return np.asarray(R @ (image / image.sum() - normalised_I0))
 
-    found = np.array(context.map(f"anchors {name}, 100 s", trial, range(context.trials))).std(axis=0, ddof=1)
+    measured = np.array(context.map(f"anchors {name}, 100 s", trial, range(context.trials))).std(axis=0, ddof=1)
     predicted = np.sqrt(np.diag(tolerance.frame_noise_nm2(name, MAGNITUDE)) / frames)
     limit = np.sqrt(tolerance.quantum_noise_nm2(name, MAGNITUDE) / frames)
     for mode, noll in enumerate(NOLLS_14):
-        pm = 1e3 * np.array([found[mode], predicted[mode], limit[mode]])
+        pm = 1e3 * np.array([measured[mode], predicted[mode], limit[mode]])
         yield Row(
             name,
             f"Z{noll} {mode_name(noll)} over {AVERAGED_S:g} s",
@@ -264,21 +265,23 @@ def _sensor_toml(name: str) -> str:
 
 
 def _sim_loop(preset: str, folder: Path, config: str, duration_s: float, seed: int) -> dict[str, Any]:
-    words = ("--rate", f"{RATE_HZ:g}", "--disturbance", preset, "--star-magnitude", f"{MAGNITUDE:g}")
-    timed = ("--lockstep", "--duration", f"{duration_s:g}", "--seed", str(seed), "--config", config)
-    return _lowfc(folder, "sim-loop", *words, *timed)
+    source = ("--rate", f"{RATE_HZ:g}", "--disturbance", preset, "--star-magnitude", f"{MAGNITUDE:g}")
+    run = ("--lockstep", "--duration", f"{duration_s:g}", "--seed", str(seed), "--config", config)
+    return _lowfc(folder, "sim-loop", *source, *run)
 
 
-def _lowfc(folder: Path, *words: str) -> dict[str, Any]:
+def _lowfc(folder: Path, *arguments: str) -> dict[str, Any]:
     """JSON printed by a command; LowfcError if it failed."""
-    command = [sys.executable, "-P", "-m", "lowfc", *words, "--json"]
-    done = subprocess.run(  # noqa: S603  # our own program
+    command = [sys.executable, "-P", "-m", "lowfc", *arguments, "--json"]
+    process = subprocess.run(  # noqa: S603  # our own program
         command, cwd=folder, capture_output=True, text=True, check=False
     )
-    if done.returncode:
-        raise LowfcError(f"`lowfc {' '.join(words)}` ended with {done.returncode}: {done.stderr.strip()}")
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    if process.returncode:
+        raise LowfcError(
+            f"`lowfc {' '.join(arguments)}` ended with exit status {process.returncode}: {process.stderr.strip()}"
+        )
+    printed: dict[str, Any] = json.loads(process.stdout)
+    return printed
 
 
 def _history(log: Path) -> History:

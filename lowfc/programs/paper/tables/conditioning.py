@@ -23,8 +23,9 @@ from lowfc.programs.paper.tables.pointing import NM_PER_MAS
 OTHERS = ("clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned")
 """Sensors in addition to the packaged sparse apertures."""
 BARS = ((0.05, 20.0), (0.1, 20.0), (0.2, 20.0), (0.1, 0.0), (0.1, 45.0), (0.1, 90.0))
-"""Width in pupil diameters and angle in degrees."""
+"""Width of each bar in pupil diameters, and its angle in degrees."""
 HOLES = (0.09, 0.08, 0.07, 0.06, 0.05, 0.04, 0.03)
+"""Diameters of the holes, in pupil diameters."""
 
 MONOCHROMATIC = "H at the central wavelength, per nm rms of each mode over the full circle."
 FIXED_STAR = (
@@ -108,7 +109,7 @@ def _rows(kind: str, mask: Prepared) -> Iterator[Row]:
 
 
 def _noise_rows(mask: Prepared, light_e: float) -> Iterator[Row]:
-    """The noise of 14 modes, and its quantum limit."""
+    """Rows of the noise of 14 modes, and of its quantum limit; none if the mask cannot distinguish the modes."""
     sensor, modes = mask.sensor, mask.modes[:14]
     band = gauss_legendre(sensor.wavelength_nm, count=4)
 
@@ -117,7 +118,7 @@ def _noise_rows(mask: Prepared, light_e: float) -> Iterator[Row]:
 
     try:
         bound = bound_nm2(mask.I0, mask.H[:, :14])
-    except ValueError:  # the mask cannot distinguish the modes
+    except ValueError:
         return
     limit = np.diag(np.linalg.inv(quantum_information(sensor.pupil, modes, sensor.wavelength_nm, light_e)))
     in_band = bound_nm2(reference(sensor, band).ravel(), response(sensor, modes, band))

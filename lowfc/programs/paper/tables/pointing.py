@@ -23,6 +23,7 @@ FITTED = {1: (2, 14, 20), 10: (2, 14)}
 NM_PER_MAS = tilt_nm_per_mas(STAR.diameter_m)
 
 PAPER_PUPIL, PAPER_FOCAL_MASK, PAPER_RELAY_MASK = 0.147, 0.567, 0.091
+"""Throughputs, each relative to the light that reaches the element."""
 
 ASSUMPTION = (
     "Band in five wavelengths with both ends, H averaged over it, 1 e- read noise, whole electrons, total known. The "
@@ -93,7 +94,7 @@ def bound_mas(linear: Fit) -> Array:
 
 
 def predicted_mas(linear: Fit, mean_e: Array) -> Array:
-    """Standard deviations (2,) of the tilts in x and y for an image with this mean (pixels,)."""
+    """Standard deviations (2,) of the estimated tilts in x and y for an image with this mean (pixels,)."""
     spread = covariance(linear.R[:2], variance_e(mean_e, TABLE4_READ_NOISE_E))
     return np.asarray(np.sqrt(np.diag(spread)) / NM_PER_MAS)
 
@@ -110,8 +111,8 @@ def table4(context: Context) -> list[Row]:
             rows.append(Row(name, quantity, "e-", count_e, paper_count_e(sensor), assumption=exposure.assumption))
             for mas, image in images.items():
                 linear, mean_e = fits(sensor, exposure, mas), image * exposure.scale_e
-                for key, found in _realisations(context, sensor, exposure, linear, mas, mean_e).items():
-                    rows += _rows(sensor, exposure, key, linear[key], mas, mean_e, found)
+                for key, tilts_mas in _realisations(context, sensor, exposure, linear, mas, mean_e).items():
+                    rows += _rows(sensor, exposure, key, linear[key], mas, mean_e, tilts_mas)
         rows += _dimmed_rows(sensor, dimmed(sensor), images[1])
     return rows
 
@@ -125,8 +126,8 @@ def _realisations(
         image_e = noisy_e(context.rng("table4", sensor.name, exposure.name, mas, i), mean_e, TABLE4_READ_NOISE_E)
         return [estimate(each, image_e)[:2] / NM_PER_MAS for each in linear.values()]
 
-    found = context.map(f"table4 {sensor.name}, {mas} mas, {exposure.name}", trial, range(context.trials))
-    return dict(zip(linear, np.array(found).transpose(1, 0, 2), strict=True))
+    tilts_mas = context.map(f"table4 {sensor.name}, {mas} mas, {exposure.name}", trial, range(context.trials))
+    return dict(zip(linear, np.array(tilts_mas).transpose(1, 0, 2), strict=True))
 
 
 def _paper_name(sensor: Prepared) -> str:
@@ -134,11 +135,11 @@ def _paper_name(sensor: Prepared) -> str:
 
 
 def _rows(
-    sensor: Prepared, exposure: Exposure, key: tuple[int, str], linear: Fit, mas: int, mean_e: Array, found: Array
+    sensor: Prepared, exposure: Exposure, key: tuple[int, str], linear: Fit, mas: int, mean_e: Array, tilts_mas: Array
 ) -> Iterator[Row]:
-    (modes, kind), trials = key, len(found)
+    (modes, kind), trials = key, len(tilts_mas)
     predicted, bound = predicted_mas(linear, mean_e), bound_mas(linear)
-    scatter = found.std(axis=0, ddof=1)
+    scatter = tilts_mas.std(axis=0, ddof=1)
     fitted = partial(Row, sensor.name, unit="mas", modes=modes, estimator=kind)
     for axis, direction in enumerate("xy" if mas == 1 else "x"):
         yield fitted(
@@ -152,7 +153,7 @@ def _rows(
         )
     yield fitted(
         quantity=f"mean error of x tilt, {mas} mas, {exposure.name}",
-        measured=float(found[:, 0].mean() - mas),
+        measured=float(tilts_mas[:, 0].mean() - mas),
         paper=0.0,
         error=float(scatter[0] / np.sqrt(trials)),
         predicted=float(estimate(linear, mean_e)[0] / NM_PER_MAS) - mas,

@@ -44,7 +44,7 @@ ESTIMATORS = ("pinv", *(label("weighted", iterations) for iterations in ITERATIO
 
 @dataclass(frozen=True)
 class Input:
-    """An interpretation of Sect. 3.1: largest random coefficients of degrees 1 and 2 (`low`) and above, waves rms."""
+    """An interpretation of Sect. 3.1: largest coefficients, waves rms, up to degree 2 (`low`) and above it (`high`)."""
 
     name: str
     low: float
@@ -98,12 +98,12 @@ def scale_e(sensor: Prepared) -> float:
 
 
 def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit]:
-    """The linear estimators of Table 3."""
+    """The linear estimators of Table 3 by kind; `nuisances` adds one that also fits flux and shear."""
     exposure = (modes, scale_e(sensor), TABLE3_READ_NOISE_E)
-    made = {kind: sensor.fit(*exposure, kind) for kind in KINDS}
+    estimators = {kind: sensor.fit(*exposure, kind) for kind in KINDS}
     if nuisances:
-        made[WITH_NUISANCES] = sensor.fit(*exposure, "weighted", nuisance=sensor.nuisance)
-    return made
+        estimators[WITH_NUISANCES] = sensor.fit(*exposure, "weighted", nuisance=sensor.nuisance)
+    return estimators
 
 
 def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisances: bool = False) -> Ensemble:
@@ -118,9 +118,9 @@ def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisanc
     def trial(i: int) -> dict[str, Array]:
         noise = context.rng("table3", name, modes, wavefronts.name, i)
         image_e = trials.noisy_e(noise, light_e * sensor.image(truth_nm[i]), TABLE3_READ_NOISE_E)
-        found = {key: estimate(each, image_e) for key, each in linear.items()}
+        estimates_nm = {key: estimate(each, image_e) for key, each in linear.items()}
         steps_nm = iterated(linear["weighted"], image_e, sensor.model, ITERATIONS[-1])
-        return found | {label("weighted", iterations): steps_nm[iterations] for iterations in ITERATIONS}
+        return estimates_nm | {label("weighted", iterations): steps_nm[iterations] for iterations in ITERATIONS}
 
     results = context.map(f"table3 {name}, {modes} modes, {wavefronts.name}", trial, range(context.trials))
     H_e, variance = linear["weighted"].response_e, variance_e(linear["weighted"].reference_e, TABLE3_READ_NOISE_E)
@@ -139,35 +139,37 @@ def table3(context: Context) -> list[Row]:
     pupils: set[tuple[bytes, int, str]] = set()
     for name in context.names(*sparse_apertures(), *OTHERS):
         sensor = prepared(name)
-        main = name in ("sam", "clowfs")
+        in_paper = name in ("sam", "clowfs")
         for modes in MODES:
-            for wavefronts in inputs(sensor, modes, literal=main):
-                found = ensemble(context, name, modes, wavefronts, nuisances=main and wavefronts.name == "matched")
+            for wavefronts in inputs(sensor, modes, literal=in_paper):
+                estimated = ensemble(
+                    context, name, modes, wavefronts, nuisances=in_paper and wavefronts.name == "matched"
+                )
                 shown = sensor.open.tobytes(), modes, wavefronts.name
                 if shown not in pupils:
-                    rows += _input_rows(sensor, modes, wavefronts, found)
+                    rows += _input_rows(sensor, modes, wavefronts, estimated)
                     pupils.add(shown)
-                rows += _residual_rows(sensor, modes, wavefronts, found)
+                rows += _residual_rows(sensor, modes, wavefronts, estimated)
     return rows
 
 
-def _input_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble) -> Iterator[Row]:
+def _input_rows(sensor: Prepared, modes: int, wavefronts: Input, estimated: Ensemble) -> Iterator[Row]:
     drawn = partial(Row, f"input, pupil of {sensor.name}", modes=modes, assumption=wavefronts.assumption)
     for statistic, paper, (mean, error) in (
-        ("RMS", TABLE3_INPUT_WAVES, _rms(sensor, found.truth_nm)),
-        ("P-V", INPUT_PV_WAVES, _pv(sensor, found.truth_nm)),
+        ("RMS", TABLE3_INPUT_WAVES, _rms(sensor, estimated.truth_nm)),
+        ("P-V", INPUT_PV_WAVES, _pv(sensor, estimated.truth_nm)),
     ):
         yield drawn(f"{statistic}, {wavefronts.name} input", "waves", mean, paper[modes], error)
 
 
-def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble) -> Iterator[Row]:
+def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, estimated: Ensemble) -> Iterator[Row]:
     paper = PAPER_WAVES.get(sensor.paper_name, {}).get(modes, (None, None))
-    for estimator, estimates_nm in found.estimates_nm.items():
-        residuals_nm = found.truth_nm - estimates_nm
+    for estimator, estimates_nm in estimated.estimates_nm.items():
+        residuals_nm = estimated.truth_nm - estimates_nm
         assumption = "\n".join((wavefronts.assumption, NOISE, *((EVEN,) if estimator == WITH_NUISANCES else ())))
         fitted = partial(Row, sensor.name, unit="waves", modes=modes, estimator=estimator, assumption=assumption)
         for statistic, value, limit, (mean, error) in (
-            ("RMS", paper[0], found.bound_nm / sensor.sensor.wavelength_nm, _rms(sensor, residuals_nm)),
+            ("RMS", paper[0], estimated.bound_nm / sensor.sensor.wavelength_nm, _rms(sensor, residuals_nm)),
             ("P-V", paper[1], None, _pv(sensor, residuals_nm)),
         ):
             what = f"{statistic} residual, {wavefronts.name} input"

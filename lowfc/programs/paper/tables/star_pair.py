@@ -46,11 +46,12 @@ def _maps() -> tuple[Array, Array, Mask]:
     samples = 2 * int(np.ceil(DARK_ZONE.outer)) * _SAMPLES_PER
     flat = _image(np.zeros(len(NOLLS_14)), samples)
     pure_modes_nm = _SMALL_NM * np.eye(len(NOLLS_14))
-    maps = np.array([(_image(one, samples) + _image(-one, samples)) / 2 - flat for one in pure_modes_nm])
+    maps = np.array([(_image(nm, samples) + _image(-nm, samples)) / 2 - flat for nm in pure_modes_nm])
     return maps / _SMALL_NM**2, flat, wedge_samples(DARK_ZONE, samples, samples, _SAMPLES_PER)
 
 
 def _image(modes_nm: Array, samples: int) -> Array:
+    """Contrast (samples, samples) of the shaped pupil with a wavefront (modes,)."""
     ready = prepared("sam")
     wavelength_nm = ready.sensor.wavelength_nm
     return contrast(ready.coronagraph, ready.opd_nm(modes_nm), wavelength_nm, samples, samples_per=_SAMPLES_PER)
@@ -70,24 +71,24 @@ def pair_rows(name: str) -> Iterator[Row]:
     """Rows of one sensor behind the shaped pupil."""
     maps, flat, zone = _maps()
     step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
-    made = partial(Row, name, unit="", assumption=ASSUMPTION)
+    new_row = partial(Row, name, unit="", assumption=ASSUMPTION)
     gains, residual_nm2 = dict[str, Array](), dict[str, Array]()
     for star, (magnitude, _) in STARS.items():
         noise = np.diag(tolerance.frame_noise_nm2(name, magnitude)).tolist()
         best = [best_gain(step, n, tolerance.EXPOSURE) for n in noise]
         residual = [drift_residual_nm2(step, n, tolerance.EXPOSURE, g) for n, g in zip(noise, best, strict=True)]
         gains[star], residual_nm2[star] = np.array(best), np.array(residual)
-        yield made(
+        yield new_row(
             f"added contrast, {star}, V = {magnitude:g}",
             measured=float(tolerance.contrasts_of(name).form @ residual_nm2[star]),
         )
     by_noise = np.tensordot(residual_nm2["target"] - residual_nm2["reference"], maps, 1)
     shift = zero_point_nm(name)
     by_colour = _image(shift, len(flat)) - flat
-    yield made("zero-point shift by colour", unit="nm", measured=float(np.linalg.norm(shift)))
+    yield new_row("zero-point shift by colour", unit="nm", measured=float(np.linalg.norm(shift)))
     for what, change in (("I0 of the reference star", by_noise + by_colour), ("I0 measured again", by_noise)):
-        yield made(f"mean change after subtraction, {what}", measured=float(change[zone].mean()))
-        yield made(
+        yield new_row(f"mean change after subtraction, {what}", measured=float(change[zone].mean()))
+        yield new_row(
             f"rms change after subtraction, {what}",
             measured=float(np.sqrt(np.mean(change[zone] ** 2))),
             assumption=f"{ASSUMPTION}\n{MAP}",
@@ -97,7 +98,7 @@ def pair_rows(name: str) -> Iterator[Row]:
     def decayed(frames: int) -> bool:
         return float(ROLL_NM**2 * form @ (1.0 - gains["target"]) ** (2.0 * frames)) <= ROLLED
 
-    yield made(
+    yield new_row(
         f"time for a roll's step of {ROLL_NM:g} nm in every mode to decay to {ROLLED:g}, target",
         unit="s",
         measured=float((1 + bisect_left(range(1, _LONGEST_FRAMES), True, key=decayed)) / tolerance.RATE_HZ),

@@ -63,12 +63,12 @@ def table2(context: Context) -> list[Row]:
 
 def _peaks(context: Context, name: str) -> Iterator[Row]:
     sensor = prepared(name)
-    found = context.map(f"table2 {name}", lambda noll: float(np.abs(differential(sensor, noll)).max()), NOLLS_14)
+    peaks = context.map(f"table2 {name}", lambda noll: float(np.abs(differential(sensor, noll)).max()), NOLLS_14)
     assumption = (
         "lambda/30 rms with the full exp(i phi). (I - I0) / I0 is taken as the peak of |I - I0| over the peak of I0: "
         "the ratio of single pixels has no bound, because I0 has dark pixels."
     )
-    for noll, value in zip(NOLLS_14, found, strict=True):
+    for noll, value in zip(NOLLS_14, peaks, strict=True):
         what, paper = f"peak differential intensity of Z{noll}, {mode_name(noll)}", PAPER_TABLE2[noll]
         yield Row(name, what, "", value, paper if sensor.paper_name == "sam" else None, assumption=assumption)
 

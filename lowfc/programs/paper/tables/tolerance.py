@@ -34,14 +34,14 @@ ESTIMATORS: dict[Kind, str] = {"integrator": "integrator of the best gain", "lqg
 
 CHECKED_SENSORS, CHECKED_MODES, CHECKED_MAGNITUDES = ("clowfs_tuned", "zwfs_tuned"), (4, 8, 11), (2.0, 5.0)
 CHECKED_CONTRAST, SHOWN_CONTRAST = 1e-11, 1e-10
-_FRAMES_PER_TRIAL = 20  # divided by the gain: 100 trials determine a variance to 3 %
-_SHOWN, _MIDDLE = (2, 4, 8, 11), f"{SHOWN_CONTRAST:g}"
+_FRAMES_PER_TRIAL = 20  # times 1 / gain, the loop's time constant in frames: 100 trials determine a variance to 3 %
+_SHOWN_NOLLS, _SHOWN_ENDS = (2, 4, 8, 11), tuple(f"V = {magnitude}, {SHOWN_CONTRAST:g}" for magnitude in (2, 5))
 _LARGEST = 6e-9  # contrast up to which the fourth order is fitted
 
-ABOUT = """Drift rate, and amplitude of a line, of one mode that add a contrast of 1e-9, 1e-10 or 1e-11: theory of
+ABOUT = """Drift rate of one mode, and amplitude of a line in it, that add a contrast of 1e-9, 1e-10 or 1e-11: theory of
 `lowfc/design/tolerance.py`, from the contrast's Hessian (and its fourth order, which matters for tilt) and the noise of
-a frame. `--json` has every mode, star and contrast, this page four modes, two stars and 1e-10. Then twelve points by
-simulation, and a pair of stars as a coronagraph observes it: a reference of V = 2 and a target of V = 5 with another
+a frame. `--json` has every mode, star and contrast; this page has four modes, two stars and 1e-10. Then twelve points
+by simulation, and a pair of stars as a coronagraph observes it: a reference of V = 2 and a target of V = 5 with another
 colour and roll angle, one exposure subtracted from the other. Behind a symmetric pupil and a real mask, a change of
 colour changes the image by an even function of position, and the zero point of an aperture mask stays; the zero points
 of the Zernike sensor and of CLOWFS move, and I0 has to be measured again on the target.
@@ -80,21 +80,21 @@ def contrasts(pupil: str, focal_radius: float) -> Contrasts:
     """Contrast of a coronagraph's modes; the fourth order from full images."""
     section = SensorSection(pupil=pupil, focal_radius=focal_radius)
     modal = ModalContrast(coronagraph_from(section), NOLLS_14, prepared("sam").sensor.wavelength_nm)
-    own, form = modal.by_image(np.zeros(len(NOLLS_14))), np.diag(modal.form)
+    flat, form = modal.by_image(np.zeros(len(NOLLS_14))), np.diag(modal.form)
     if not (form > 0).all():
         raise ConfigurationError(
             f"with pupil = {pupil!r} some modes reduce the light in the dark zone, which is bright: no tolerance"
         )
     quartic = np.zeros(len(NOLLS_14))
-    for mode, each in enumerate(form.tolist()):
-        amplitude_nm = np.sqrt(_LARGEST / each)
+    for mode, per_nm2 in enumerate(form.tolist()):
+        amplitude_nm = np.sqrt(_LARGEST / per_nm2)
         while True:
             modes_nm = amplitude_nm * np.eye(len(NOLLS_14))[mode]
-            added = (modal.by_image(modes_nm) + modal.by_image(-modes_nm)) / 2 - own
+            added = (modal.by_image(modes_nm) + modal.by_image(-modes_nm)) / 2 - flat
             if added < _LARGEST:
                 break
             amplitude_nm *= 0.7
-        quartic[mode] = max((added - each * amplitude_nm**2) / amplitude_nm**4, 0.0)
+        quartic[mode] = max((added - per_nm2 * amplitude_nm**2) / amplitude_nm**4, 0.0)
     return Contrasts(form, quartic)
 
 
@@ -119,12 +119,12 @@ def frame_noise_nm2(name: str, magnitude: float) -> Array:
 
 def quantum_noise_nm2(name: str, magnitude: float) -> Array:
     """Variance (14,) of each mode in a frame at the quantum limit, with all 14 modes fitted."""
-    return _quantum_noise_of_one_nm2(name) / light_e(magnitude)
+    return _quantum_noise_of_one_electron_nm2(name) / light_e(magnitude)
 
 
 @lru_cache(maxsize=16)
-def _quantum_noise_of_one_nm2(name: str) -> Array:
-    """Quantum limit (14,) for the light of one electron."""
+def _quantum_noise_of_one_electron_nm2(name: str) -> Array:
+    """Variance (14,) at the quantum limit for as much light as yields one electron from the open circle."""
     sensor = prepared(name)
     information = quantum_information(sensor.sensor.pupil, sensor.modes[: len(NOLLS_14)], sensor.sensor.wavelength_nm)
     return np.asarray(np.diag(np.linalg.inv(information)))
@@ -140,12 +140,13 @@ def tolerance(context: Context) -> list[Row]:
     def rows_of(name: str) -> list[Row]:
         return list(_tolerated(name, lines))
 
-    rows = [row for found in context.map("tolerance", rows_of, names) for row in found]
+    rows = [row for of_sensor in context.map("tolerance", rows_of, names) for row in of_sensor]
     rows += _checked(context)
     return rows + [row for name in names if prepared(name).section.pupil == "shaped" for row in pair_rows(name)]
 
 
 def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterator[Row]:
+    """Rows of one sensor; `lines` are the results of `tolerated_lines`."""
     of_contrast = contrasts_of(name)
     for magnitude in MAGNITUDES:
         noise, quantum = np.diag(frame_noise_nm2(name, magnitude)), quantum_noise_nm2(name, magnitude)
@@ -153,13 +154,13 @@ def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterat
             for allowed in ALLOWED:
                 residual_nm2 = of_contrast.variance_nm2(mode, allowed)
                 where = f"Z{noll} {mode_name(noll)}, V = {magnitude:g}, {allowed:g}"
-                made = partial(Row, name)
+                new_row = partial(Row, name)
                 for kind in KINDS:
                     step, limit = (
                         tolerated_drift(residual_nm2, n[mode], EXPOSURE, kind).step_nm2 for n in (noise, quantum)
                     )
                     pm = [1e3 * float(np.sqrt(each * RATE_HZ)) for each in (step, limit)]
-                    yield made(
+                    yield new_row(
                         f"drift of {where}",
                         "pm/sqrt(s)",
                         pm[0],
@@ -169,7 +170,7 @@ def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterat
                     )
                     each_noise = np.array([noise[mode], quantum[mode]])
                     rms = 1e3 * np.sqrt(lines[kind](residual_nm2 / each_noise) * each_noise)
-                    yield made(
+                    yield new_row(
                         f"line of {where}",
                         "pm",
                         float(rms[0]),
@@ -214,7 +215,7 @@ def in_text(row: Mapping[str, Any]) -> bool:
     what = row["quantity"]
     if not what.startswith(("drift", "line")):
         return True
-    shown = any(f"of Z{noll} " in what for noll in _SHOWN) and what.endswith((f"V = 2, {_MIDDLE}", f"V = 5, {_MIDDLE}"))
+    shown = any(f"of Z{noll} " in what for noll in _SHOWN_NOLLS) and what.endswith(_SHOWN_ENDS)
     return shown and row["estimator"] == ESTIMATORS["lqg"]
 
 
@@ -225,15 +226,15 @@ def plot(context: Context, path: Path) -> None:
 
     def drifts(name: str, mode: int, quantum: bool = False) -> Array:
         residual_nm2 = contrasts_of(name).variance_nm2(mode, SHOWN_CONTRAST)
-        found = []
+        pm_per_root_s = []
         for magnitude in magnitudes.tolist():
             noise = quantum_noise_nm2(name, magnitude) if quantum else np.diag(frame_noise_nm2(name, magnitude))
             drift = tolerated_drift(residual_nm2, float(noise[mode]), EXPOSURE, "lqg")
-            found.append(1e3 * np.sqrt(drift.step_nm2 * RATE_HZ))
-        return np.array(found)
+            pm_per_root_s.append(1e3 * np.sqrt(drift.step_nm2 * RATE_HZ))
+        return np.array(pm_per_root_s)
 
     panels = []
-    for noll in _SHOWN:
+    for noll in _SHOWN_NOLLS:
         mode = NOLLS_14.index(noll)
         lines = [Curve(name, magnitudes, drifts(name, mode)) for name in names]
         lines.append(Curve("quantum limit", magnitudes, drifts(names[0], mode, quantum=True)))
