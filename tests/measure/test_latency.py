@@ -35,8 +35,8 @@ from lowfc.programs.measure.latency.frame_statistics import (
     percentiles,
     repeat_statistics,
 )
-from lowfc.programs.measure.latency.stalls import Counted, Trace, signs_of, stalls_of
-from lowfc.programs.measure.latency.summary import compare, kernel_summary, ratio, together
+from lowfc.programs.measure.latency.stalls import CountChanges, Trace, signs_of, stalls_of
+from lowfc.programs.measure.latency.summary import combine, compare, kernel_summary, ratio
 from lowfc.programs.measure.latency.text import compared, sparkline, table
 from tests.support.loops import json_of, lowfc, refusal, until
 from tools.law_bench import calibrated
@@ -165,7 +165,7 @@ def repeat(command_us: float, echo_us: float = 100, step_us: float = 50, **chang
 
 
 def test_repeats_are_combined_as_medians_with_their_range() -> None:
-    found = together([repeat(100), repeat(300), repeat(110, echo_us=20)])
+    found = combine([repeat(100), repeat(300), repeat(110, echo_us=20)])
     command = found["latency_us"]["frame_to_command"]
     assert (command["p50"], command["max"]) == (110, 300)
     assert found["spread_us"]["frame_to_command"]["p99"] == [100, 300]
@@ -217,7 +217,7 @@ def test_the_last_of_many_processors_is_read(tmp_path: Path, monkeypatch: pytest
 
 
 def test_evidence_of_a_stall_is_against_the_host_or_the_loop() -> None:
-    nothing: Any = dict.fromkeys(Counted.model_fields, 0)
+    nothing: Any = dict.fromkeys(CountChanges.model_fields, 0)
     cases: list[tuple[dict[str, float], tuple[list[str], list[str]]]] = [
         ({"bare_late_us": 250}, (["bare loop 250 us late"], [])),
         ({"bare_late_us": 249, "waited_us": 249, "minor_faults": 249, "preempted": 9}, ([], [])),
@@ -227,7 +227,7 @@ def test_evidence_of_a_stall_is_against_the_host_or_the_loop() -> None:
         ({"major_faults": 1, "minor_faults": 600}, ([], ["1 pages read", "600 pages mapped"])),
     ]
     for counted, expected in cases:
-        assert signs_of(Counted(**nothing | counted), 1000) == expected
+        assert signs_of(CountChanges(**nothing | counted), 1000) == expected
 
 
 def test_a_stall_has_only_the_counts_of_its_own_time() -> None:
@@ -256,7 +256,7 @@ def test_a_stall_has_only_the_counts_of_its_own_time() -> None:
         ("camera", 1000, 2),  # the next waking was late, too
         ("controller", 1000, 0),
     ]
-    both = together([repeat(100, stalls=found), repeat(100, stalls=found)])["stalls"]
+    both = combine([repeat(100, stalls=found), repeat(100, stalls=found)])["stalls"]
     assert (both["stalled"], len(both["stalls"]), both["bare"][0]["stalled"]) == (12, 12, 4)
     quiet = stalls_of(frames(), MS, {"camera": trace(0)})
     assert (quiet.stalled, quiet.bare[0].late_us) == (0, None)
@@ -275,18 +275,18 @@ def test_the_ratio_of_two_kernels_is_the_median_over_their_pairs() -> None:
 
 
 def test_a_difference_is_compared_with_the_spread() -> None:
-    before, after = together([repeat(100), repeat(130)]), together([repeat(120), repeat(140)])
+    before, after = combine([repeat(100), repeat(130)]), combine([repeat(120), repeat(140)])
     rows = {(row["name"], row["at"]): row for row in compare(before, after)["rows"]}
     command = rows["frame_to_command", "p50"]
     assert (command["a"], command["b"], command["difference"], command["spread"]) == (115, 130, 15, 30)
     assert (command["better"], command["beyond_spread"]) == ("a", False)
     assert command["ratio"] == pytest.approx(130 / 115)
-    far = {(row["name"], row["at"]): row for row in compare(before, together([repeat(10), repeat(11)]))["rows"]}
+    far = {(row["name"], row["at"]): row for row in compare(before, combine([repeat(10), repeat(11)]))["rows"]}
     assert far["frame_to_command", "p99"]["better"] == "b"
     assert far["frame_to_command", "p99"]["beyond_spread"] is True
     assert far["over_echo_and_step", "p50"]["b"] == pytest.approx(0.105)
     assert far["frame_to_receive", "p50"]["better"] == "same"
-    single = compare(before, together([repeat(10)]))["rows"]
+    single = compare(before, combine([repeat(10)]))["rows"]
     assert {row["spread"] for row in single} == {None}
     assert "within the spread" in compared({"a": "a.json", "b": "b.json"} | compare(before, after))
     for values in (before["latency_us"], before["spread_us"]):
@@ -295,7 +295,7 @@ def test_a_difference_is_compared_with_the_spread() -> None:
 
 
 def test_the_results_of_every_release_can_be_compared_with_present_ones() -> None:
-    today = together([repeat(100), repeat(130)])
+    today = combine([repeat(100), repeat(130)])
     files = list(HISTORY.glob("*.json"))
     assert files
     for file in files:

@@ -46,14 +46,14 @@ def trace_file(role: str) -> str:
 
 @app.command()
 def bare_loop(
-    role: Annotated[Role, typer.Argument(help="Process beside which it runs.")],
+    role: Annotated[Role, typer.Argument(help="Process beside which the bare loop runs.")],
     run: RunId = DEFAULT_RUN,
     config: ConfigFile = None,
     seconds: Annotated[float, typer.Option(help="Seconds for which frames are sent.")] = 10.0,
 ) -> None:
     """Wake once between two frames, as long as frames are sent, and record the kernel's counters."""
     if role not in TRACED:
-        raise typer.BadParameter(f"it runs beside {' or '.join(TRACED)}, not {role}")
+        raise typer.BadParameter(f"a bare loop runs beside {' or '.join(TRACED)}, not {role}")
     settings = configuration(config)
     cpus = settings.realtime.controller_cpus if role is Role.CONTROLLER else settings.realtime.camera_cpus
     priority = settings.realtime.priority
@@ -64,12 +64,12 @@ def bare_loop(
     begin_ns = int(_wait_and_read(folder / BEGIN_FILE))
     HostClock().sleep_until_ns(begin_ns)  # before the first frame, another thread may be the busiest
     counters = Counters(pid, busiest_thread(pid, WARM_UP_S / 2), cpus)
-    rows = _wake(settings, counters, begin_ns, seconds)
+    rows = _record_wakings(settings, counters, begin_ns, seconds)
     with being_written(folder / trace_file(role)) as part, part.open("wb") as file:
         np.save(file, rows)
 
 
-def _wake(config: Configuration, counters: Counters, begin_ns: int, seconds: float) -> Long:
+def _record_wakings(config: Configuration, counters: Counters, begin_ns: int, seconds: float) -> Long:
     """A row for each waking: due time, wake-up time and counts. The first frame is due at `begin_ns`."""
     clock, period_ns = HostClock(), config.period_ns
     middle_ns = begin_ns + period_ns // 2
@@ -87,6 +87,7 @@ def _wake(config: Configuration, counters: Counters, begin_ns: int, seconds: flo
 
 
 def _wait_and_read(file: Path) -> str:
+    """The text of a file once it exists; BusError if it does not within `_TIMEOUT_S`."""
     deadline_s = time.monotonic() + _TIMEOUT_S
     while not file.exists():
         if time.monotonic() > deadline_s:

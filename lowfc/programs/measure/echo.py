@@ -121,7 +121,8 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) ->
 
 
 def _answer(config: Configuration, run: Run, command: bytes) -> None:
-    done = threading.Event()
+    """Answer every frame with this command until an empty frame arrives."""
+    ended = threading.Event()
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(run.links, Role.CONTROLLER))))
     publisher = declare_publisher(session, COMMAND, COMMAND.at(config.mirror.name))
 
@@ -130,16 +131,16 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
         if sample.payload.to_bytes():
             publisher.put(command, attachment=sample.attachment)
         else:
-            done.set()
+            ended.set()
 
     subscriber = session.declare_subscriber(FRAME.key, Callback(received, indirect=False))
-    done.wait()
+    ended.wait()
     subscriber.undeclare()  # type: ignore[no-untyped-call]
     session.close()  # type: ignore[no-untyped-call]
 
 
 def _join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Run:
-    """Set this process up as that of the role in the loop; the run with the links of the two processes only."""
+    """Set this process up like the loop's process with this role; return the run with only the two processes' links."""
     prepare(config, cpus)
     run = open_run(run_id, (config.mirror.name,))
     ports = {str(role): run.links.ports[role] for role in (Role.CAMERA, Role.CONTROLLER)}

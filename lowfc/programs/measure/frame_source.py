@@ -33,7 +33,7 @@ SENT_FILE = "sent.npz"
 BEGIN_FILE = "begin"
 """File in the run's directory: time at which the first frame is due, ns."""
 
-_COUNT = 32  # different frames
+_COUNT = 32  # different frames, sent in turns
 _TILT_NM, _OTHER_NM = 3.0, 1.0  # amplitudes, nm rms
 _MAX_CYCLES = 3  # oscillations of a mode in _COUNT frames
 _WAIT_S = 60.0  # a view may have to load
@@ -43,7 +43,7 @@ app = new_app("A camera that sends prepared frames.")
 
 
 def prepared_frames(config: Configuration) -> Pixels:
-    """Noisy frames (frames, rows, columns) of the configured sensor, whose modes oscillate by a few nm."""
+    """Noisy frames (frames, rows, columns) of the configured sensor while the modes oscillate by a few nm."""
     optics = factory.twin(config, None, lambda _: None)
     evaluator, detector = Evaluator(optics), factory.detector(config)
     electrons = np.float32(factory.electrons_per_exposure(config))

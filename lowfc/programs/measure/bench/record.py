@@ -56,7 +56,7 @@ def bench_record(
 
 
 def measure(rates_hz: tuple[float, ...], seconds: float, folder: Path | None = None) -> dict[str, Any]:
-    """Record at each rate for a time, into `folder`, which is left as it was.
+    """Record at each rate for `seconds`, into a temporary folder within `folder`.
 
     Returns:
         host, payload_bytes_per_frame, copy_us_per_frame (processor time of copying the payloads) and rates. For each
@@ -110,6 +110,7 @@ def render(results: dict[str, Any]) -> str:
 
 
 def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
+    """Record at one rate; the results of `measure` for it, without `ratio`."""
     from lowfc.adapters.bus.run import new_run_id, open_run
     from lowfc.programs.launch.processes import program
     from lowfc.programs.measure.traffic import Traffic
@@ -139,7 +140,7 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
         recorder.stop(_STOP_S)
         if recorder.status:
             raise BusError(f"the recorder failed: {recorder.exit_description()}; {recorder.stderr_tail()}")
-    done = json.loads(recorder.stdout_path.read_bytes())
+    printed = json.loads(recorder.stdout_path.read_bytes())
     return {
         "rate_hz": rate_hz,
         "offered_hz": (traffic.frames - first_frame) / elapsed_s,
@@ -147,8 +148,8 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
         "cpu_share": (after.user + after.system - before.user - before.system) / elapsed_s,
         "publisher_cpu_share": own_s / elapsed_s,
         "messages_published": traffic.messages,
-        "log_bytes": _remove([Path(log) for log in done["logs"]]),
-        **{name: done[name] for name in _RECORDER_KEYS},
+        "log_bytes": _remove([Path(log) for log in printed["logs"]]),
+        **{name: printed[name] for name in _RECORDER_KEYS},
     }
 
 

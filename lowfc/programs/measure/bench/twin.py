@@ -97,14 +97,15 @@ def render(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _median_us(frame: Callable[[Any], object], wavefronts: NDArray[Any], seconds: float) -> float:
+def _median_us(compute: Callable[[Any], object], wavefronts: NDArray[Any], seconds: float) -> float:
+    """Median time to compute a frame, us, after a warm-up of three frames."""
     for wavefront in wavefronts[:3]:
-        frame(wavefront)
+        compute(wavefront)
     times: list[int] = []
     end = time.perf_counter() + seconds
     while not times or time.perf_counter() < end:
         wavefront = wavefronts[len(times) % len(wavefronts)]
         begin = time.perf_counter_ns()
-        frame(wavefront)
+        compute(wavefront)
         times.append(time.perf_counter_ns() - begin)
     return statistics.median(times) / 1000.0

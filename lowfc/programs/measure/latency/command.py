@@ -58,8 +58,8 @@ def latency(
     """Measure the latency of every frame through controller and mirror, and compare it with the host's limits.
 
     Prepared frames are sent on an absolute schedule and late frames are counted, so that stalls are not hidden. In
-    turns with the loop, a bare zenoh echo of the same sizes, one control step alone and the host's timer are measured.
-    Times are from just before a frame is published to just after its command is published.
+    turns with the loop, a bare zenoh echo of messages of the same sizes, one control step alone and the host's timer
+    are measured. Times are from just before a frame is published to just after its command is published.
 
     Example: lowfc latency --duration 10 --repeats 5 --json > latency.json
     """
@@ -67,8 +67,8 @@ def latency(
 
     if compare is not None:
         _refuse_others(context, "--compare", "--json")
-        found = _compare(compare)
-        print_result(found, compared(found), as_json=as_json)
+        comparison = _compare(compare)
+        print_result(comparison, compared(comparison), as_json=as_json)
         return
     if logs:
         _refuse_others(context, "logs", "--plot", "--json")
@@ -135,18 +135,18 @@ def _measure(options: "LatencyOptions") -> dict[str, Any]:
     begun = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     with prepared(options.config) as run, passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task("starting", total=1 + 2 * options.repeats * max(1, len(options.kernels)))
-        done = run_repeats(options, run, lambda what: bar.update(task, description=what, advance=1))
-    return kernel_summary(done) | {
+        repeats = run_repeats(options, run, lambda what: bar.update(task, description=what, advance=1))
+    return kernel_summary(repeats) | {
         "settings": {
             "rate_hz": options.config.camera.rate_hz,
             **{name: getattr(options, name) for name in ("duration_s", "repeats", "record", "view", "trace")},
             "camera": "simulated" if options.simulated else "prepared",
             "realtime": options.config.realtime.model_dump(),
         },
-        "logs": [log for one in done for log in one["logs"]],
+        "logs": [log for repeat in repeats for log in repeat["logs"]],
         "date": begun,
         "command": shlex.join(["lowfc", *sys.argv[1:]]),
-        "host": host | {name: done[-1][name] for name in ("granted", "refused")},
+        "host": host | {name: repeats[-1][name] for name in ("granted", "refused")},
     }
 
 
@@ -156,12 +156,12 @@ def _from_log(names: list[Path]) -> dict[str, Any]:
     from lowfc.adapters.logs.parts import named_log, titled
     from lowfc.adapters.process.progress import reading_bar
     from lowfc.programs.measure.latency.log import log_statistics
-    from lowfc.programs.measure.latency.summary import together
+    from lowfc.programs.measure.latency.summary import combine
 
     log = named_log(names)
     with reading_bar(Console(stderr=True)) as count:
         results, about = log_statistics(log, partial(count, f"reading {titled(log)}"))
-    return together([results]) | about
+    return combine([results]) | about
 
 
 def _compare(files: tuple[Path, Path]) -> dict[str, Any]:
@@ -169,21 +169,22 @@ def _compare(files: tuple[Path, Path]) -> dict[str, Any]:
     from lowfc.programs.measure.latency.summary import compare
 
     try:
-        found = compare(*(_result(file) for file in files))
+        comparison = compare(*(_result(file) for file in files))
     except (LookupError, TypeError, ValueError, AttributeError) as fault:
         raise DataFileError(
             f"{files[0]} and {files[1]} must be results of `lowfc latency --json`, but at least one is not: {fault!r}"
         ) from None
-    return dict(zip("ab", map(str, files), strict=True)) | found
+    return dict(zip("ab", map(str, files), strict=True)) | comparison
 
 
 def _result(file: Path) -> dict[str, Any]:
+    """The result of `lowfc latency --json` in a file; DataFileError if it has none."""
     try:
-        found = json.loads(input_file.read_whole(file, 1 << 28))
+        result = json.loads(input_file.read_whole(file, 1 << 28))
     except OSError as fault:
         raise DataFileError(f"{file} cannot be read: {fault.strerror}") from None
     except (ValueError, RecursionError) as fault:  # not UTF-8, or not JSON
         raise DataFileError(f"{file} must be a result of `lowfc latency --json`, but is not JSON: {fault}") from None
-    if not isinstance(found, dict) or "latency_us" not in found:
+    if not isinstance(result, dict) or "latency_us" not in result:
         raise DataFileError(f"{file} must be a result of `lowfc latency --json`, but has no latency_us")
-    return found
+    return result

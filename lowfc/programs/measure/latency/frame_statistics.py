@@ -35,16 +35,19 @@ SPANS = {
     "due_to_command": "  due to command",
     "due_to_mirror": "  due to mirror",
 }
-"""Names of the spans in latency_us, and their labels; percentiles in us."""
+"""Labels of the spans, by their names in latency_us."""
 ALONE = {
     "echo_us": "half a bare echo",
     "step_us": "control step alone",
     "hot_step_us": "  back to back",
     "timer_us": "timer wake-up",
 }
-"""Names and labels of the host's reference times."""
+"""Labels of the host's reference times, by their names in the results."""
 RATIOS = {"ratio": ("step_us", ""), "ratio_hot": ("hot_step_us", " of those back to back")}
-"""By ratio of frame to command to half an echo plus a step: the name of that step, and the end of the ratio's label."""
+"""Ratios by name: the latency from frame to command, over half a bare echo plus one control step.
+
+Each has the name of that step in `ALONE`, and the end of the ratio's label.
+"""
 RATIOS_AT = ("p50", "p99")
 COUNTS = {
     "frames": "frames",
@@ -60,7 +63,7 @@ COUNTS = {
     "echo_lost": "frames of the bare echo without an answer",
     "messages_lost": "messages lost by the recorder",
 }
-"""Counts of a repeat and their labels; a count is None if it does not apply."""
+"""Labels of the counts of a repeat, by their names in the results; a count is None if it does not apply."""
 
 _BINS_PER_OCTAVE = 8
 _LOWEST_US, _OCTAVES = 1.0, 20
@@ -97,10 +100,10 @@ def join(
 
     Args:
         sequence: sequence of each frame.
-        put_ns: time just before it was published.
-        due_ns: time at which it was due; None without a schedule.
-        timing: frame sequences, and the controller's stages by name as in ControlTiming.
-        mirror: frame sequence and time of each mirror state; the first state of a frame counts.
+        put_ns: time just before the frame was published.
+        due_ns: time at which the frame was due; None without a schedule.
+        timing: frame sequences, and the durations of the controller's stages, ns, by name as in ControlTiming.
+        mirror: frame sequence and publication time, ns, of each mirror state; the first state of a frame counts.
     """
     row, mirror_row = rows_of(sequence, timing[0]), rows_of(sequence, mirror[0])
     stages_us = {stage: np.append(column / 1e3, np.nan)[row] for stage, column in timing[1].items()}
@@ -159,9 +162,9 @@ def repeat_statistics(frames: Frames) -> dict[str, Any]:
     between_ns = between_ns[between_ns <= _PAUSE * np.median(between_ns)] if count > 1 else between_ns
     period_ns = float(between_ns.mean()) if between_ns.any() else 0.0
     next_ns = np.append(np.diff(put_ns), np.iinfo(np.int64).max)
-    found = {span: percentiles(values) for span, values in spans.items()}
+    latency_us = {span: percentiles(values) for span, values in spans.items()}
     return {
-        "latency_us": {span: values for span, values in found.items() if values is not None},
+        "latency_us": {span: values for span, values in latency_us.items() if values is not None},
         "histogram": {span: histogram(values).tolist() for span, values in spans.items()},
         "over_time": _over_time(put_ns, spans["frame_to_command"]),
         "rate_hz": round(1e9 / period_ns, 3) if period_ns else 0.0,
@@ -181,12 +184,14 @@ def controller_counts(health: wire.Health) -> dict[str, Any]:
     return {
         "frames_skipped": frames.skipped,
         "frames_missing": frames.missing,
-        "reasons": {reason_name(one.reason): one.count for one in health.counts if one.reason != wire.REASON_NO_FRAME},
+        "reasons": {
+            reason_name(entry.reason): entry.count for entry in health.counts if entry.reason != wire.REASON_NO_FRAME
+        },
     }
 
 
 def _over_time(put_ns: Long, command_us: Array) -> dict[str, list[float]]:
-    """Median and largest in each of up to `_TIME_PARTS` parts with equal numbers of frames, at its first frame."""
+    """Median and largest frame to command in up to `_TIME_PARTS` parts of equally many frames, and when each begins."""
     known = np.flatnonzero(np.isfinite(command_us))
     parts = np.array_split(known, min(_TIME_PARTS, known.size)) if known.size else []
     return {

@@ -85,7 +85,7 @@ def run_repeats(options: LatencyOptions, run: Run, progress: Callable[[str], Non
     """Statistics of each repeat and kernel: those of `one_loop`, and percentiles of echo, step and timer."""
     repeats, kernels = [], options.kernels or (options.config.realtime.kernel,)
     for number in range(options.repeats):
-        for kernel in kernels[:: -1 if number % 2 else 1]:
+        for kernel in kernels[:: -1 if number % 2 else 1]:  # in alternating order
             realtime = options.config.realtime.model_copy(update={"kernel": kernel})
             turn = replace(options, config=options.config.model_copy(update={"realtime": realtime}))
             write_whole(run.path / "config.toml", turn.config.to_toml().encode())
@@ -104,7 +104,7 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
     Args:
         options: options.
         run: run with the files that the processes share.
-        children: other processes than those of `lowfc latency`: the first ends by itself and writes `SENT_FILE`.
+        children: processes in place of those of `lowfc latency`; the first ends by itself and writes `SENT_FILE`.
 
     Raises:
         ProcessDiedError: a process ended unexpectedly or with an error.
@@ -134,7 +134,7 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
         state_ring = bus.ring(MIRROR_STATE, _RING)
         frame_ring = bus.ring(FRAME, _RING) if options.simulated else None
         stack.callback(stop_all, children)
-        _run(children, children[: 1 + len(traced)], drain, partial(_write_pids, run, children))
+        _run_children(children, children[: 1 + len(traced)], drain, partial(_write_pids, run, children))
         time.sleep(_SETTLE_S)
         stop_all([*children[1:], children[0]])
         time.sleep(_LAST_HEALTH_S)
@@ -179,7 +179,7 @@ def _children(options: LatencyOptions, run: Run) -> list[Child]:
     awaited += [str(Role.RECORDER)] * options.record + [str(Role.VIEWER)] * options.view
     waits = [word for name in awaited for word in ("--wait-for", name)]
     if options.simulated:
-        children[0].command += waits[-2:] if options.view else []  # it waits for the others already
+        children[0].command += waits[-2:] if options.view else []  # the simulated camera waits for the others already
     else:
         arguments = ["-m", "lowfc.programs.measure.frame_source", *_options(run), "--seconds", str(seconds), *waits]
         children[0] = program(str(Role.CAMERA), arguments, run.path / f"{Role.CAMERA}.stderr")
@@ -192,18 +192,20 @@ def _children(options: LatencyOptions, run: Run) -> list[Child]:
 
 
 def _write_pids(run: Run, children: list[Child]) -> None:
+    """Write `PROCESSES_FILE`."""
     pids = {child.name: child.process.pid for child in children if child.process is not None}
     write_whole(run.path / PROCESSES_FILE, json.dumps(pids).encode())
 
 
 def _references(options: LatencyOptions, run: Run) -> dict[str, Any]:
+    """Percentiles of the bare echo, the control step alone and the host's timer, and the number of lost echoes."""
     arguments = [*_options(run), "--seconds", str(options.duration_s / 2)]
     children = [
         program(f"echo ({verb})", ["-m", echo.__name__, verb, *arguments], run.path / f"echo-{verb}.stderr")
         for verb in ("ask", "answer")
     ]
     try:
-        _run(children, children, lambda: None)
+        _run_children(children, children, lambda: None)
     finally:
         stop_all(children)
     with np.load(run.path / echo.ECHO_FILE) as echoed, np.load(run.path / echo.ALONE_FILE) as alone:
@@ -212,20 +214,21 @@ def _references(options: LatencyOptions, run: Run) -> dict[str, Any]:
         durations_ns |= {name: alone[name.replace("_us", "_ns")] for name in ("step_us", "hot_step_us", "timer_us")}
     if not durations_ns["echo_us"].size:
         raise BusError("the bare echo returned no answer: use a longer --duration")
-    found = {name: percentiles(each_ns / 1e3) for name, each_ns in durations_ns.items()}
-    return found | {"echo_lost": int(np.sum(round_trip_ns < 0))}
+    percentiles_us = {name: percentiles(values_ns / 1e3) for name, values_ns in durations_ns.items()}
+    return percentiles_us | {"echo_lost": int(np.sum(round_trip_ns < 0))}
 
 
 def _options(run: Run) -> list[str]:
     return ["--run", run.run_id, "--config", str(run.path / "config.toml")]
 
 
-def _run(
+def _run_children(
     children: list[Child],
     awaited: list[Child],
     meanwhile: Callable[[], None],
     started: Callable[[], None] = lambda: None,
 ) -> None:
+    """Start the processes, call `started`, then call `meanwhile` repeatedly until the awaited ones have ended."""
     # Deferred: while a process forks, Python may swallow an exception of a signal handler.
     with deferred_signals() as interrupted:
         for child in children:

@@ -38,7 +38,7 @@ class Trace(NamedTuple):
     major_faults: Long
 
 
-class Counted(Result):
+class CountChanges(Result):
     """Changes of the counts from the last waking of a bare loop before a stall to the first after it.
 
     `bare_late_us` is the bare loop's largest wake-up latency in this time, both wakings included.
@@ -54,14 +54,14 @@ class Counted(Result):
 
 
 class Stall(Result):
-    """One frame that stalled; `counted` has the changes of the counts of each process."""
+    """One frame that stalled; `counted` has the changes of the counts by process."""
 
     second: float = result_field("at, s", form=".3f")
     frame_to_command_us: float | None = result_field("frame to command, us", form=".0f")
     longest: str = result_field("longest in")
     held_up_by: Cause = result_field("cause")
     signs: str = result_field("evidence")
-    counted: dict[str, Counted] = result_field()
+    counted: dict[str, CountChanges] = result_field()
 
 
 class BareLoop(Result):
@@ -90,13 +90,13 @@ class Stalls(Result):
 
     def text(self) -> str:
         """Counts, the bare loops, and the first stalls."""
-        more = len(self.stalls) - _MAX_SHOWN
+        hidden = len(self.stalls) - _MAX_SHOWN
         shown = super(Stalls, self.model_copy(update={"stalls": self.stalls[:_MAX_SHOWN]})).text()
-        return shown + (f"\nand {more} more" if more > 0 else "")
+        return shown + (f"\nand {hidden} more" if hidden > 0 else "")
 
 
-def signs_of(counted: Counted, period_us: float) -> tuple[list[str], list[str]]:
-    """Evidence against the host, and against the loop; delays too short for a stall are ignored."""
+def signs_of(counted: CountChanges, period_us: float) -> tuple[list[str], list[str]]:
+    """Evidence that the host caused a stall, and that the loop did; delays too short for a stall are ignored."""
     long_us = _MIN_PERIODS * period_us
     host = {
         f"bare loop {counted.bare_late_us:.0f} us late": counted.bare_late_us >= long_us,
@@ -117,29 +117,29 @@ def stalls_of(frames: Frames, period_ns: int, traces: Mapping[str, Trace]) -> St
     counted = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
     slow = counted & (~frames.commanded | (command_us * 1e3 > period_ns))
     end_ns = _ends_ns(frames, period_ns)
-    found = [_stall(frames, int(index), float(end_ns[index]), period_ns, traces) for index in np.flatnonzero(slow)]
-    causes = [stall.held_up_by for stall in found]
+    stalls = [_stall(frames, int(index), float(end_ns[index]), period_ns, traces) for index in np.flatnonzero(slow)]
+    causes = [stall.held_up_by for stall in stalls]
     return Stalls(
         frames=int(counted.sum()),
-        stalled=len(found),
+        stalled=len(stalls),
         of_host=causes.count("host"),
         of_loop=causes.count("loop"),
         unknown=causes.count("unknown"),
         bare=[_bare(role, trace, period_ns) for role, trace in traces.items()],
-        stalls=found,
+        stalls=stalls,
     )
 
 
-def together(repeats: Sequence[Stalls]) -> Stalls:
+def combine(repeats: Sequence[Stalls]) -> Stalls:
     """The stalls of several repeats; the percentiles of a bare loop's lateness are those of the worst repeat."""
     names = "frames", "stalled", "of_host", "of_loop", "unknown"
     bare = []
-    for loops in zip(*(one.bare for one in repeats), strict=True):
+    for loops in zip(*(repeat.bare for repeat in repeats), strict=True):
         worst = max(loops, key=lambda loop: (loop.late_us or {}).get("max", 0.0))
         sums = {name: sum(getattr(loop, name) for loop in loops) for name in ("wakings", "stalled")}
         bare.append(worst.model_copy(update=sums))
-    counts = {name: sum(getattr(one, name) for one in repeats) for name in names}
-    return Stalls(**counts, bare=bare, stalls=[stall for one in repeats for stall in one.stalls])
+    counts = {name: sum(getattr(repeat, name) for repeat in repeats) for name in names}
+    return Stalls(**counts, bare=bare, stalls=[stall for repeat in repeats for stall in repeat.stalls])
 
 
 def _ends_ns(frames: Frames, period_ns: int) -> Array:
@@ -157,7 +157,7 @@ def _stall(frames: Frames, index: int, end_ns: float, period_ns: int, traces: Ma
     command_us = float(frames.spans_us["frame_to_command"][index])
     timed = bool(np.isfinite(command_us))
     counted = {role: _counted(trace, begin_ns, end_ns) for role, trace in traces.items() if trace.woke_ns.size}
-    signs = {role: signs_of(one, period_ns / 1e3) for role, one in counted.items()}
+    signs = {role: signs_of(changes, period_ns / 1e3) for role, changes in counted.items()}
     by_host, by_loop = (any(each[which] for each in signs.values()) for which in (0, 1))
     evidence = [f"{role}: {', '.join([*host, *loop])}" for role, (host, loop) in signs.items() if host or loop]
     return Stall(
@@ -170,13 +170,14 @@ def _stall(frames: Frames, index: int, end_ns: float, period_ns: int, traces: Ma
     )
 
 
-def _counted(trace: Trace, begin_ns: int, end_ns: float) -> Counted:
+def _counted(trace: Trace, begin_ns: int, end_ns: float) -> CountChanges:
+    """Changes of the counts of a bare loop's trace over a stall."""
     last = trace.woke_ns.size - 1
     before = max(int(np.searchsorted(trace.woke_ns, begin_ns, side="right")) - 1, 0)
     after = min(int(np.searchsorted(trace.woke_ns, end_ns)), last)
     changes = {name: int(column[after] - column[before]) for name, column in trace._asdict().items()}
     late_ns = (trace.woke_ns - trace.due_ns)[before : after + 1]
-    return Counted(
+    return CountChanges(
         bare_late_us=float(late_ns.max(initial=0)) / 1e3,
         stolen_ms=changes["stolen_ns"] / 1e6,
         waited_us=changes["waited_ns"] / 1e3,
@@ -185,6 +186,7 @@ def _counted(trace: Trace, begin_ns: int, end_ns: float) -> Counted:
 
 
 def _bare(role: str, trace: Trace, period_ns: int) -> BareLoop:
+    """Wakings of the bare loop beside the process with this role."""
     late_ns = trace.woke_ns - trace.due_ns
     late_us = percentiles(late_ns / 1e3)
     return BareLoop(beside=role, wakings=late_ns.size, stalled=int(np.sum(late_ns > period_ns)), late_us=late_us)

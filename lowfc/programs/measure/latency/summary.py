@@ -15,7 +15,7 @@ COMPARED = ("p50", "p99", "p99_9")
 Repeats = Sequence[Mapping[str, Any]]
 
 
-def together(repeats: Repeats) -> dict[str, Any]:
+def combine(repeats: Repeats) -> dict[str, Any]:
     """Results of all repeats.
 
     Returns:
@@ -25,60 +25,65 @@ def together(repeats: Repeats) -> dict[str, Any]:
         of each repeat; `COUNTS` and reasons; rate_hz, the median; memory_mb, the largest of each process (live loop
         only); repeats, the percentiles of each; and stalls (`Stalls`) if they were traced.
     """
-    spans = [span for span in repeats[0]["latency_us"] if all(span in one["latency_us"] for one in repeats)]
-    each = {span: [one["latency_us"][span] for one in repeats] for span in spans}
-    found: dict[str, Any] = {
-        "latency_us": {span: median_of(values) for span, values in each.items()},
-        "spread_us": {span: spread_of(values) for span, values in each.items()},
+    spans = [span for span in repeats[0]["latency_us"] if all(span in repeat["latency_us"] for repeat in repeats)]
+    by_span = {span: [repeat["latency_us"][span] for repeat in repeats] for span in spans}
+    results: dict[str, Any] = {
+        "latency_us": {span: median_of(values) for span, values in by_span.items()},
+        "spread_us": {span: spread_of(values) for span, values in by_span.items()},
     }
-    references = {name: [one[name] for one in repeats if one.get(name)] for name in ALONE}
+    references = {name: [repeat[name] for repeat in repeats if repeat.get(name)] for name in ALONE}
     for name in RATIOS:
-        references[name] = [{at: ratio(one, at, name) for at in RATIOS_AT} for one in repeats if one.get("echo_us")]
+        references[name] = [
+            {at: ratio(repeat, at, name) for at in RATIOS_AT} for repeat in repeats if repeat.get("echo_us")
+        ]
     for name, values in references.items():
-        found[name], found[f"{name}_spread"] = (median_of(values), spread_of(values)) if values else (None, None)
+        results[name], results[f"{name}_spread"] = (median_of(values), spread_of(values)) if values else (None, None)
     for name in ("echo_us", "echo_us_spread"):
-        found[name] = found[name] and {"round_trip": found[name]}
+        results[name] = results[name] and {"round_trip": results[name]}
     for name in COUNTS:
-        counts = [one[name] for one in repeats if one.get(name) is not None]
-        found[name] = sum(counts) if counts else None
-    names = sorted({name for one in repeats for name in one["reasons"]})
-    found["reasons"] = {name: sum(one["reasons"].get(name, 0) for one in repeats) for name in names}
-    found["rate_hz"] = float(np.median([one["rate_hz"] for one in repeats]))
-    found["histogram"] = _histogram(repeats, spans)
-    found["over_time"] = [one["over_time"] for one in repeats]
-    found["repeats"] = [{name: one.get(name) for name in ("latency_us", *ALONE)} for one in repeats]
-    if memory := [one["memory_mb"] for one in repeats if "memory_mb" in one]:
-        found["memory_mb"] = {name: max(one[name] for one in memory) for name in memory[0]}
-    if traced := [one["stalls"] for one in repeats if "stalls" in one]:
-        found["stalls"] = stalls.together(traced).json_object()
-    return found
+        counts = [repeat[name] for repeat in repeats if repeat.get(name) is not None]
+        results[name] = sum(counts) if counts else None
+    names = sorted({name for repeat in repeats for name in repeat["reasons"]})
+    results["reasons"] = {name: sum(repeat["reasons"].get(name, 0) for repeat in repeats) for name in names}
+    results["rate_hz"] = float(np.median([repeat["rate_hz"] for repeat in repeats]))
+    results["histogram"] = _histogram(repeats, spans)
+    results["over_time"] = [repeat["over_time"] for repeat in repeats]
+    results["repeats"] = [{name: repeat.get(name) for name in ("latency_us", *ALONE)} for repeat in repeats]
+    if memory := [repeat["memory_mb"] for repeat in repeats if "memory_mb" in repeat]:
+        results["memory_mb"] = {name: max(processes[name] for processes in memory) for name in memory[0]}
+    if traced := [repeat["stalls"] for repeat in repeats if "stalls" in repeat]:
+        results["stalls"] = stalls.combine(traced).json_object()
+    return results
 
 
 def kernel_summary(repeats: Repeats) -> dict[str, Any]:
-    """`together` of the repeats if they have one kernel; otherwise that of the fused step, compared with numpy's.
+    """The combined repeats if all have the same kernel; otherwise those of the fused step, compared with numpy's.
 
     Returns:
         kernel: numpy, fused or both. With both: numpy_us, frame to command with numpy; kernel_ratio (p50 and p99), the
         median over the repeats of frame to command with the fused step over that with numpy; and kernel_ratio_spread.
     """
-    by_kernel = {name: [one for one in repeats if one["kernel"] == name] for name in KERNELS}
+    by_kernel = {name: [repeat for repeat in repeats if repeat["kernel"] == name] for name in KERNELS}
     if not all(by_kernel.values()):
-        return together(repeats) | {"kernel": repeats[0]["kernel"]}
-    each = [[one["latency_us"]["frame_to_command"] for one in by_kernel[name]] for name in reversed(KERNELS)]
-    ratios = [{at: fused[at] / numpy[at] for at in RATIOS_AT} for fused, numpy in zip(*each, strict=True)]
+        return combine(repeats) | {"kernel": repeats[0]["kernel"]}
+    fused_us, numpy_us = (
+        [repeat["latency_us"]["frame_to_command"] for repeat in by_kernel[name]] for name in ("fused", "numpy")
+    )
+    ratios = [{at: fused[at] / numpy[at] for at in RATIOS_AT} for fused, numpy in zip(fused_us, numpy_us, strict=True)]
     comparison = {"kernel_ratio": median_of(ratios), "kernel_ratio_spread": spread_of(ratios)}
-    return together(by_kernel["fused"]) | {"kernel": "both", "numpy_us": median_of(each[1])} | comparison
+    return combine(by_kernel["fused"]) | {"kernel": "both", "numpy_us": median_of(numpy_us)} | comparison
 
 
 def median_of(repeats: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Median over the repeats of each percentile; of the largest values, the largest."""
-    each = {at: [one[at] for one in repeats] for at in repeats[0]}
-    return {at: float(max(values) if at == "max" else np.median(values)) for at, values in each.items()}
+    """Median over the repeats of each percentile; for max, the largest."""
+    by_percentile = {at: [repeat[at] for repeat in repeats] for at in repeats[0]}
+    return {at: float(max(values) if at == "max" else np.median(values)) for at, values in by_percentile.items()}
 
 
 def spread_of(repeats: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
     """Lowest and highest over the repeats of each percentile."""
-    return {at: [float(one([each[at] for each in repeats])) for one in (min, max)] for at in repeats[0]}
+    by_percentile = {at: [repeat[at] for repeat in repeats] for at in repeats[0]}
+    return {at: [float(min(values)), float(max(values))] for at, values in by_percentile.items()}
 
 
 def ratio(repeat: Mapping[str, Any], at: str, name: str = "ratio") -> float:
@@ -98,20 +103,23 @@ def compare(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, An
     """
     both = (before, after)
     pairs = [
-        (span, at, "us", [(one["latency_us"][span][at], one["spread_us"][span][at]) for one in both])
+        (span, at, "us", [(result["latency_us"][span][at], result["spread_us"][span][at]) for result in both])
         for span in before["latency_us"]
         if span in after["latency_us"]
         for at in COMPARED
     ]
     if before["ratio"] and after["ratio"]:
         pairs += [
-            (RATIO_ROW, at, "", [(one["ratio"][at], one["ratio_spread"][at]) for one in both]) for at in RATIOS_AT
+            (RATIO_ROW, at, "", [(result["ratio"][at], result["ratio_spread"][at]) for result in both])
+            for at in RATIOS_AT
         ]
-    single = min(len(one["repeats"]) for one in both) < 2
+    single = min(len(result["repeats"]) for result in both) < 2
     return {
         "rows": [_row(*pair, single=single) for pair in pairs],
         "counts": {
-            name: [one[name] for one in both] for name in COUNTS if all(one.get(name) is not None for one in both)
+            name: [result[name] for result in both]
+            for name in COUNTS
+            if all(result.get(name) is not None for result in both)
         },
     }
 
@@ -135,7 +143,7 @@ def _row(name: str, at: str, unit: str, values: list[tuple[float, list[float]]],
 
 def _histogram(repeats: Repeats, spans: Sequence[str]) -> dict[str, Any]:
     """Counts of all repeats, without the empty bins at both ends."""
-    counts = {span: np.sum([one["histogram"][span] for one in repeats], axis=0) for span in spans}
+    counts = {span: np.sum([repeat["histogram"][span] for repeat in repeats], axis=0) for span in spans}
     filled = np.flatnonzero(np.sum(list(counts.values()), axis=0))
     first, last = int(filled[0]), int(filled[-1]) + 1
     return {

@@ -61,10 +61,10 @@ def compared(comparison: Mapping[str, Any]) -> str:
 
 def sparkline(counts: Sequence[int]) -> str:
     """Counts as blocks of logarithmic height; many bins are combined into at most `_LINE`."""
-    per = math.ceil(len(counts) / _LINE)
-    sums = [sum(counts[start : start + per]) for start in range(0, len(counts), per)]
+    bins = math.ceil(len(counts) / _LINE)  # of each block
+    sums = [sum(counts[start : start + bins]) for start in range(0, len(counts), bins)]
     highest = math.log1p(max(sums, default=0)) or 1.0
-    return "".join(_BLOCKS[math.ceil(math.log1p(one) / highest * (len(_BLOCKS) - 1))] for one in sums).rstrip()
+    return "".join(_BLOCKS[math.ceil(math.log1p(count) / highest * (len(_BLOCKS) - 1))] for count in sums).rstrip()
 
 
 def picture(results: Mapping[str, Any]) -> bytes:
@@ -72,27 +72,27 @@ def picture(results: Mapping[str, Any]) -> bytes:
     from lowfc.adapters.files.drawing import figure_class, png
 
     figure = figure_class()(figsize=(9, 8), layout="constrained")
-    counted, timed = figure.subplots(2, 1)
+    histograms, over_time = figure.subplots(2, 1)
     edges = results["histogram"]["edges_us"]
     for span in LOOP_SPANS:
         if span in results["latency_us"]:
-            counted.stairs(results["histogram"]["counts"][span], edges, label=SPANS[span])
-    counted.set(xscale="log", yscale="log", xlabel="us", ylabel="frames", title=_title(results))
-    counted.legend()
+            histograms.stairs(results["histogram"]["counts"][span], edges, label=SPANS[span])
+    histograms.set(xscale="log", yscale="log", xlabel="us", ylabel="frames", title=_title(results))
+    histograms.legend()
     begun_s = 0.0
     for number, repeat in enumerate(results["over_time"]):
         seconds = [begun_s + second for second in repeat["seconds"]]
         labels = ("largest", "median") if number == 0 else (None, None)
-        timed.plot(seconds, repeat["max_us"], ".", color="tab:red", markersize=3, label=labels[0])
-        timed.plot(seconds, repeat["p50_us"], color="tab:blue", label=labels[1])
+        over_time.plot(seconds, repeat["max_us"], ".", color="tab:red", markersize=3, label=labels[0])
+        over_time.plot(seconds, repeat["p50_us"], color="tab:blue", label=labels[1])
         begun_s = seconds[-1] if seconds else begun_s
-    timed.set(yscale="log", xlabel="s, one repeat after the other", ylabel="frame to command, us")
-    timed.legend()
+    over_time.set(yscale="log", xlabel="s, one repeat after the other", ylabel="frame to command, us")
+    over_time.legend()
     return png(figure)
 
 
-def _row(name: str, values: Mapping[str, float]) -> str:
-    return f"{name:<22}" + "".join(f"{values[at]:>9.1f}" for at in PERCENTILES)
+def _row(label: str, values: Mapping[str, float]) -> str:
+    return f"{label:<22}" + "".join(f"{values[at]:>9.1f}" for at in PERCENTILES)
 
 
 def _ratios(results: Mapping[str, Any], name: str) -> list[str]:
@@ -106,6 +106,7 @@ def _ratios(results: Mapping[str, Any], name: str) -> list[str]:
 
 
 def _remarks(results: Mapping[str, Any]) -> list[str]:
+    """Lines below the table: ratios, counts, stalls, memory, settings and host."""
     lines = []
     for name, (_, suffix) in RATIOS.items():
         if results[name]:
@@ -141,6 +142,7 @@ def _remarks(results: Mapping[str, Any]) -> list[str]:
 
 
 def _title(results: Mapping[str, Any]) -> str:
+    """The settings of the measurement in one line."""
     settings, count = results["settings"], len(results["repeats"])
     if settings.get("log"):
         left_out = f", {settings['selection']}" if settings["selection"] else ""
@@ -151,5 +153,5 @@ def _title(results: Mapping[str, Any]) -> str:
         if count > 1
         else f"{settings['duration_s']:g} s"
     )
-    reached = f" ({results['rate_hz']:.1f} Hz reached)" if results["rate_hz"] else ""  # 0: of a single frame
+    reached = f" ({results['rate_hz']:.1f} Hz reached)" if results["rate_hz"] else ""  # 0 for a single frame
     return f"{settings['rate_hz']:g} Hz{reached}, {settings['camera']} frames{also}, {times}"
