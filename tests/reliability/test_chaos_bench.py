@@ -129,7 +129,7 @@ def test_a_camera_with_another_clock_is_replaced_by_one_with_the_hosts() -> None
     assert bench.method_calls == [
         call.kill(Role.CAMERA),
         call.restart(Role.CAMERA, ["unshare", "--time", "--monotonic", "-3600", "sim-camera"]),
-        call.frames(WHILE_FRAMES),
+        call.await_steps(WHILE_FRAMES),
         call.kill(Role.CAMERA),
         call.restart(Role.CAMERA, ["sim-camera"]),
     ]

@@ -39,8 +39,8 @@ def in_simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(case, "WHILE_FRAMES", 100)
     monkeypatch.setattr(control, "WHILE_FRAMES", 100)
     monkeypatch.setattr(junk, "FLOOD_S", 0.3)
-    monkeypatch.setattr(junk, "FORGED", 60)
-    monkeypatch.setattr(control, "FLOOD", 600)
+    monkeypatch.setattr(junk, "FORGED_MESSAGES", 60)
+    monkeypatch.setattr(control, "FLOOD_VALUES", 600)
 
 
 @pytest.mark.usefixtures("in_simulated_time")

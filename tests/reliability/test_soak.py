@@ -124,7 +124,7 @@ def test_a_slow_loop_has_time_to_settle() -> None:
     waited_s: list[float] = []
     config = load(None, {"camera.rate_hz": 2.0})
     bench: Any = SimpleNamespace(config=config, wait=lambda _, __, timeout_s: waited_s.append(timeout_s))
-    ChaosBench.settled(bench, 250)
+    ChaosBench.await_settled(bench, 250)
     assert waited_s == [185.0]
 
 

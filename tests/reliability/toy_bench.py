@@ -114,7 +114,7 @@ class ToyBench(ChaosBench):
         camera.publisher(CAMERA_STATE).put(camera_state(settings, self.clock.now_ns()).SerializeToString())
         self._mirror = MirrorLoop(SimulatedMirror(DriverOptions(), self.config), mirror, self.config)
         self.restart(Role.CONTROLLER)
-        self.settled()
+        self.await_settled()
         self.mark("quiet")
 
     def mark(self, name: str) -> None:
@@ -127,8 +127,8 @@ class ToyBench(ChaosBench):
             self.expose()
         raise CaseFailedError(f"waited in vain for {what}")
 
-    def settled(self, frames: int = QUIET_FRAMES) -> None:
-        super().settled(frames)
+    def await_settled(self, frames: int = QUIET_FRAMES) -> None:
+        super().await_settled(frames)
 
     def pause(self, shortest_s: float, longest_s: float) -> None:
         self._sleep(self.rng.uniform(shortest_s, longest_s))

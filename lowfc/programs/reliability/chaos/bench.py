@@ -30,14 +30,16 @@ from lowfc.programs.launch.processes import program
 from lowfc.programs.launch.sim_loop import children_of, prepare
 
 _POLL_S = 0.02
-_QUIET_FRAMES = 250
+_QUIET_FRAMES = 250  # before a fault: one second at the default rate
 _LAST_HEALTH_S = 0.2
 SETTLED_FRAMES = 500
-"""Frames after a fault: two seconds at the default rate; the last second is judged."""
+"""Frames used after a fault: two seconds at the default rate; the last second is judged."""
 PATIENCE_S = 5.0
 """Time that a process may take to exit after the signal to stop."""
 START_S = 240.0
+"""Longest wait for the first frame."""
 WAIT_S = 60.0
+"""Longest wait for another condition, unless stated otherwise."""
 
 
 class CaseFailedError(LowfcError):
@@ -75,7 +77,7 @@ class Outcome:
         mode: last loop mode.
         lost: messages that the last recorder reports as lost, by key.
         failure: why the recording failed; empty if it did not.
-        residuals_nm: true residuals of the last 250 frames, nm rms of wavefront.
+        residuals_nm: true residuals of the last 250 frames, nm rms over the pupil.
         measurements: values measured by the case, for `--json`.
         notes: errors while the case ran.
     """
@@ -130,7 +132,7 @@ class ChaosBench:
         for topic in (HEALTH, STEP, TRUTH):
             self.bus.subscribe(topic, self._receive)
         self.wait(lambda: self._steps > 0, "the first frame", START_S)
-        self.settled(_QUIET_FRAMES)
+        self.await_settled(_QUIET_FRAMES)
         self.mark("quiet")
 
     def client(self) -> Client:
@@ -141,12 +143,12 @@ class ChaosBench:
         """Record the present time by a name."""
         self.outcome.marks[name] = HostClock().host_ns()
 
-    def frames(self, count: int) -> None:
+    def await_steps(self, count: int) -> None:
         """Wait for this many more steps of the controller."""
         last = self._steps + count
         self.wait(lambda: self._steps >= last, f"{count} steps")
 
-    def settled(self, frames: int = SETTLED_FRAMES) -> None:
+    def await_settled(self, frames: int = SETTLED_FRAMES) -> None:
         """Wait until this many frames were used with the loop closed, from now or the next closing."""
         self._closed_frames = 0
         timeout_s = WAIT_S + frames / self.config.camera.rate_hz
@@ -215,7 +217,7 @@ class ChaosBench:
         try:
             order = (Role.CAMERA, Role.CONTROLLER, self.mirror, Role.VIEWER, Role.RECORDER)
             rank = {str(name): number for number, name in enumerate(order)}
-            for child in sorted(self._started, key=lambda one: rank[one.name]):
+            for child in sorted(self._started, key=lambda child: rank[child.name]):
                 begun_s, running = time.monotonic(), child.status is None
                 child.stop(timeout_s)
                 self._record_end(child, time.monotonic() - begun_s, requested=running)
@@ -244,6 +246,7 @@ class ChaosBench:
             self.outcome.ended.append(ProcessEnd(child.name, child.status or 0, after_s, requested))
 
     def _receive(self, sample: Sample) -> None:
+        """Store a Health, a true residual or the outcome of a step."""
         topic = topic_of(sample.key)
         with contextlib.suppress(DecodeError):  # some cases send junk
             message: Any = topic.message.FromString(sample.payload)
@@ -262,9 +265,9 @@ class ChaosBench:
 
 def _alive(sessions: set[int]) -> list[str]:
     """Processes of these sessions that still exist; each child has its own session."""
-    found = []
+    alive = []
     for process in psutil.process_iter(["name", "status"]):
         with contextlib.suppress(ProcessLookupError):
             if process.pid != os.getpid() and os.getsid(process.pid) in sessions:
-                found.append(f"{process.info['name']} ({process.pid}, {process.info['status']})")
-    return found
+                alive.append(f"{process.info['name']} ({process.pid}, {process.info['status']})")
+    return alive

@@ -11,10 +11,11 @@ from typing import Any
 from lowfc.programs.reliability.chaos.bench import ChaosBench
 
 Act = Callable[[ChaosBench], None]
+"""Function that injects the fault of a case."""
 
 LOST = ("MESSAGES_LOST", "MIRROR_LOST")
 """Events of the level ERROR that many faults may cause."""
-WHILE_FRAMES = 250  # frames that a state lasts
+WHILE_FRAMES = 250  # for which a case keeps a state, such as safe mode
 
 
 @dataclass(frozen=True)
@@ -26,11 +27,11 @@ class Case:
         description: description of the fault.
         act: function that injects the fault.
         fault: kind of the fault that the camera is started with; empty for none.
-        config: keys that differ from those of other cases.
+        config: configuration keys that the case sets.
         expected: beginnings of the events that must be in the log.
         allowed: names of events of the level ERROR that may be in the log.
         safe: whether the loop must end latched safe with a flat mirror, instead of closed with the former residual.
-        bad: which frames, by number, must not be used.
+        bad: whether the frame of a number must be refused; None if all may be used.
         statuses: exit status other than 0 with which a process may end, by process.
         noisy: whether tracebacks are expected, from messages that cannot be decoded.
         lacks: function that returns why this host cannot run the case; empty if it can.
@@ -47,25 +48,25 @@ class Case:
     bad: Callable[[int], bool] | None = None
     statuses: Mapping[str, int] = field(default_factory=dict)
     noisy: bool = False
-    lacks: Callable[[], str] = str
+    lacks: Callable[[], str] = str  # which returns the empty string
 
     def run(self, bench: ChaosBench) -> None:
         """Inject the fault, and wait until the loop has recovered."""
         self.act(bench)
         if self.safe:
-            bench.frames(WHILE_FRAMES)
+            bench.await_steps(WHILE_FRAMES)
         else:
-            bench.settled()
+            bench.await_settled()
 
 
 REGISTERED: dict[str, Case] = {}
 
 
-def case(name: str, description: str, **more: Any) -> Callable[[Act], Act]:
-    """Register a function as the `act` of a case; `more` are the case's other attributes."""
+def case(name: str, description: str, **attributes: Any) -> Callable[[Act], Act]:
+    """Register a function as the `act` of a case; `attributes` are the other ones of `Case`."""
 
     def register(act: Act) -> Act:
-        REGISTERED[name] = Case(name, description, act, **more)
+        REGISTERED[name] = Case(name, description, act, **attributes)
         return act
 
     return register
@@ -85,11 +86,11 @@ def no_mounts() -> str:
 def lacking(requirement: str, *command: str) -> str:
     """Try a harmless command; return the requirement and why the command failed, or empty if it succeeded."""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603  # ours
+        process = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603  # ours
     except OSError as fault:
         return f"{requirement} ({command[0]}: {fault.strerror})"
-    why = done.stderr.strip().splitlines() or [f"{command[0]} ended with {done.returncode}"]
-    return f"{requirement} ({why[0]})" if done.returncode else ""
+    why = process.stderr.strip().splitlines() or [f"{command[0]} ended with {process.returncode}"]
+    return f"{requirement} ({why[0]})" if process.returncode else ""
 
 
 @contextlib.contextmanager

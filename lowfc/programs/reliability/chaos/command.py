@@ -54,8 +54,8 @@ def chaos(
     names = list(CASES) if all_ else case or []
     if not names:
         width = max(map(len, CASES))
-        table = "\n".join(f"{one.name:{width}}  {one.description}" for one in CASES.values())
-        listed = [{"name": one.name, "sentence": one.description} for one in CASES.values()]
+        table = "\n".join(f"{each.name:{width}}  {each.description}" for each in CASES.values())
+        listed = [{"name": each.name, "sentence": each.description} for each in CASES.values()]
         print_result({"cases": listed}, table, as_json=as_json)
         return
     _require_writable(keep or FAILED_LOGS)
@@ -78,9 +78,11 @@ def chaos(
 
 def _require_writable(folder: Path) -> None:
     """Check before the first case that logs can be kept in a folder, which may not exist yet."""
-    found = existing(folder)
-    if not found.is_dir() or not os.access(found, os.W_OK):
-        raise DataFileError(f"no logs can be kept in {folder}: {found} is no writable folder; name another with --keep")
+    nearest_folder = existing(folder)
+    if not nearest_folder.is_dir() or not os.access(nearest_folder, os.W_OK):
+        raise DataFileError(
+            f"no logs can be kept in {folder}: {nearest_folder} is no writable folder; name another with --keep"
+        )
 
 
 def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
@@ -97,7 +99,7 @@ def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
     finally:
         if keep is not None or (row["findings"] and not row["passed"]):
             row["log"] = str(folder)
-            with contextlib.suppress(OSError):  # a disk that is full meanwhile: the log stays where it is
+            with contextlib.suppress(OSError):  # if the disk has become full, the log stays where it is
                 kept = (keep or FAILED_LOGS) / f"{case.name}-{seed}"
                 kept.parent.mkdir(parents=True, exist_ok=True)
                 shutil.rmtree(kept, ignore_errors=True)
@@ -109,14 +111,16 @@ def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
 
 def _wrong(row: dict[str, Any]) -> list[str]:
     """The rules that did not hold, and what was found."""
-    return [f"{rule}: {one['found']}" for rule, one in row["findings"].items() if not one["held"]]
+    return [f"{rule}: {finding['found']}" for rule, finding in row["findings"].items() if not finding["held"]]
 
 
 def _recovery(row: dict[str, Any]) -> str:
+    """What the rule on recovery found; empty if it was not checked."""
     return str(row["findings"].get("recovery", {}).get("found", ""))
 
 
 def _judged(outcome: "Outcome", case: "Case") -> dict[str, Any]:
+    """Verdict, findings and measurements of a case that has run."""
     from lowfc.programs.reliability.chaos.evidence import read
     from lowfc.programs.reliability.chaos.rules import judge, recovered_s, restart_steps_nm
 
@@ -128,7 +132,7 @@ def _judged(outcome: "Outcome", case: "Case") -> dict[str, Any]:
         measurements["recovered_s"] = round(seconds, 3)
     return {
         "passed": all(finding.held for finding in findings),
-        "findings": {one.rule: {"held": one.held, "found": one.found} for one in findings},
+        "findings": {finding.rule: {"held": finding.held, "found": finding.found} for finding in findings},
         "figures": measurements,
     }
 

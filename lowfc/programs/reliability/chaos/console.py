@@ -23,6 +23,7 @@ from lowfc.programs.reliability.chaos.case import LOST, case
 from lowfc.programs.reliability.chaos.processes import CommandTimes
 
 SPAN_S = 5.0
+"""Duration of each phase."""
 START_S = 60.0
 FLOOD_HZ = 2000
 _STEP_S = 0.02
@@ -91,11 +92,11 @@ class TerminalConsole(contextlib.AbstractContextManager["TerminalConsole"]):
         return float(times.user + times.system)
 
     def drew(self, pattern: bytes) -> bool:
-        """Whether its recent output matches the pattern."""
+        """Whether the console's recent output matches the pattern."""
         return re.search(pattern, self._screen) is not None
 
     def press(self, keys: bytes) -> None:
-        """Type on its terminal."""
+        """Type on the console's terminal."""
         os.write(self._terminal, keys)
 
     def close(self) -> None:
@@ -118,10 +119,10 @@ class TerminalConsole(contextlib.AbstractContextManager["TerminalConsole"]):
 def _flood(bench: ChaosBench) -> Iterator[None]:
     """Publish `FLOOD_HZ` events a second within the context."""
     assert bench.bus is not None  # noqa: S101  # the bench has begun
-    publisher, clock, over = bench.bus.publisher(EVENT), HostClock(), threading.Event()
+    publisher, clock, ended = bench.bus.publisher(EVENT), HostClock(), threading.Event()
 
     def send() -> None:
-        while not over.wait(_STEP_S):
+        while not ended.wait(_STEP_S):
             for _ in range(round(FLOOD_HZ * _STEP_S)):
                 publisher.put(EVENTS["NOTE"].log("chaos", clock.now_ns(), text="flood").SerializeToString())
 
@@ -130,5 +131,5 @@ def _flood(bench: ChaosBench) -> Iterator[None]:
     try:
         yield
     finally:
-        over.set()
+        ended.set()
         thread.join()

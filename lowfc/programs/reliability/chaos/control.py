@@ -39,7 +39,7 @@ def _highest_gain(bench: ChaosBench) -> None:
     else:
         raise CaseFailedError(f"a gain of {1.01 * limiting:.3g} was accepted, although {limiting:.3g} is unstable")
     client.gain(STABLE_FRACTION * limiting)
-    bench.frames(WHILE_FRAMES)
+    bench.await_steps(WHILE_FRAMES)
     client.gain(FIXED_GAINS["control.gain"])
     client.gain(FIXED_GAINS["control.tilt_gain"], modes=[2, 3])
 
@@ -50,10 +50,10 @@ def _highest_gain(bench: ChaosBench) -> None:
     expected=("LAW_OVERRULED the integrator takes over tip and tilt",),
 )
 def _law_that_fails(bench: ChaosBench) -> None:
-    noll, known = bench.config.noll, settings(bench.config)
-    weak = integrator((0.002,) * len(noll), (0.0,) * len(noll), noll, known.delay_frames, known.rate_hz)
+    noll, loop = bench.config.noll, settings(bench.config)
+    weak = integrator((0.002,) * len(noll), (0.0,) * len(noll), noll, loop.delay_frames, loop.rate_hz)
     bench.client().law(weak)
-    bench.frames(SETTLING_FRAMES + FADING_FRAMES + (WORSE_BLOCKS + 2) * MIN_BLOCK_FRAMES)
+    bench.await_steps(SETTLING_FRAMES + FADING_FRAMES + (WORSE_BLOCKS + 2) * MIN_BLOCK_FRAMES)
 
 
 def _calibration(bench: ChaosBench) -> Calibration:
@@ -63,7 +63,7 @@ def _calibration(bench: ChaosBench) -> Calibration:
 def _load_and_close(bench: ChaosBench, calibration: Calibration) -> None:
     client = bench.client()
     client.load(calibration)
-    bench.frames(1)  # the loop closes only on frames that it can use
+    bench.await_steps(1)  # the loop closes only on frames that it can use
     client.close_loop()
 
 
@@ -76,9 +76,9 @@ def _reversed_calibration(bench: ChaosBench) -> None:
     client, good = bench.client(), _calibration(bench)
     client.open_loop()
     _load_and_close(bench, identified(replace(good, reconstructor=-good.reconstructor)))
-    bench.frames(WHILE_FRAMES)
+    bench.await_steps(WHILE_FRAMES)
     client.safe()
-    bench.frames(WHILE_FRAMES)
+    bench.await_steps(WHILE_FRAMES)
     client.clear()
     _load_and_close(bench, good)
 
@@ -103,7 +103,7 @@ def _foreign_calibration(bench: ChaosBench) -> None:
     )
     client.open_loop()
     client.load(identified(foreign))
-    bench.frames(WHILE_FRAMES)
+    bench.await_steps(WHILE_FRAMES)
     _load_and_close(bench, good)
 
 
@@ -131,12 +131,12 @@ def _damaged_calibration(bench: ChaosBench) -> None:
 @case("safed-restart", "safe mode, then the controller is killed and restarted", expected=("SAFED",), safe=True)
 def _restart_in_safe_mode(bench: ChaosBench) -> None:
     bench.client().safe()
-    bench.frames(WHILE_FRAMES)
+    bench.await_steps(WHILE_FRAMES)
     killed(Role.CONTROLLER)(bench)
 
 
 INTERLOCK = {"name": "mask", "value": True, "action": "hold", "max_age_s": 1.0, "when_old": "passes"}
-FLIPS, FLOOD, FLOOD_HZ = 40, 4000, 2000
+FLIPS, FLOOD_VALUES, FLOOD_HZ = 40, 4000, 2000
 
 
 @case(
@@ -151,7 +151,7 @@ def _interlock(bench: ChaosBench) -> None:
         client.bench("mask", flip % 2 == 0)
         bench.pause(0, 0.02)
     begun_s = time.monotonic()
-    for number in range(FLOOD):
+    for number in range(FLOOD_VALUES):
         client.bench("mask", False)
         if number > (time.monotonic() - begun_s) * FLOOD_HZ:
             time.sleep(0.01)
@@ -161,12 +161,14 @@ def _interlock(bench: ChaosBench) -> None:
 
 
 def _acting(client: Client) -> list[str]:
+    """Why each acting interlock acts."""
     state = client.status().state
-    return [] if state is None else [one.why for one in state.interlocks_acting]
+    return [] if state is None else [interlock.why for interlock in state.interlocks_acting]
 
 
 @contextlib.contextmanager
 def _moved_away(folder: Path) -> Iterator[None]:
+    """Rename a folder within the context."""
     aside = folder.rename(folder.with_name(f"{folder.name}.aside"))
     try:
         yield
@@ -174,12 +176,12 @@ def _moved_away(folder: Path) -> Iterator[None]:
         aside.rename(folder)
 
 
-def _safe_while(no_latch: Callable[[Path], contextlib.AbstractContextManager[None]], bench: ChaosBench) -> None:
+def _safe_without_latch(no_latch: Callable[[Path], contextlib.AbstractContextManager[None]], bench: ChaosBench) -> None:
     """Enter safe mode and kill the controller while the run's directory cannot hold the latch; then restart it."""
     client = bench.client()
     with no_latch(bench.run.path):
         client.safe()
-        bench.frames(WHILE_FRAMES)
+        bench.await_steps(WHILE_FRAMES)
         bench.kill(Role.CONTROLLER)
     bench.restart(Role.CONTROLLER)
 
@@ -188,12 +190,12 @@ no_latch_case = partial(case, expected=("SAFED", "LATCH_FAILED"), safe=True)
 no_latch_case(
     "safe-without-directory",
     "safe mode while the run's directory is missing; then the controller is killed and restarted",
-)(partial(_safe_while, _moved_away))
+)(partial(_safe_without_latch, _moved_away))
 no_latch_case(
     "safe-read-only",
     "safe mode while the run's directory is read-only; then the controller is killed and restarted",
     lacks=no_mounts,
-)(partial(_safe_while, read_only))
+)(partial(_safe_without_latch, read_only))
 
 
 def _other_clock(bench: ChaosBench, shift_s: int) -> None:
@@ -203,7 +205,7 @@ def _other_clock(bench: ChaosBench, shift_s: int) -> None:
         bench.kill(Role.CAMERA)
         bench.restart(Role.CAMERA, command)
         if command is not normal:
-            bench.frames(WHILE_FRAMES)
+            bench.await_steps(WHILE_FRAMES)
 
 
 case(

@@ -13,6 +13,7 @@ from lowfc.programs.reliability.chaos.processes import STALL_S, compare
 ROOM_BYTES = 3_000_000
 """Growth of the log until the disk is full: about a second of the loop."""
 SLOW_S = 3.0
+"""Duration of a slow write."""
 
 
 # The recorder with a file whose writes sleep and are timed, as on a slow disk.
@@ -68,7 +69,7 @@ def _read_only(bench: ChaosBench) -> None:
 def _slow(bench: ChaosBench) -> None:
     _on_slow_disk(bench, SLOW_S, 8, 2)
     bench.wait(lambda: bench.health[Role.RECORDER].recording.messages > 0, "a recording")
-    bench.frames(2000)  # longer than the two slow writes
+    bench.await_steps(2000)  # longer than the two slow writes
 
 
 @case("stall-disk", "a write blocks for 12 s", allowed=LOST)
@@ -90,6 +91,7 @@ def _on_slow_disk(bench: ChaosBench, seconds: float, after: int, times: int) -> 
 
 
 def _replace_recorder(bench: ChaosBench, command: list[str], *, ready: bool = True) -> None:
+    """Stop the recorder, and start one with another command line."""
     bench.signal(Role.RECORDER, signal.SIGTERM)
     bench.await_end(Role.RECORDER, 0)
     bench.restart(Role.RECORDER, command, ready=ready)

@@ -56,7 +56,7 @@ class Evidence:
         lost: messages that the recorders report as lost, by key.
         unreadable: errors of logs and messages that cannot be read.
         log_ends: time of the last message of each log, ns, and whether the log was finished.
-        messages: number of messages.
+        messages: number of messages in all logs.
     """
 
     entries: dict[Topic, list[Entry]] = field(default_factory=lambda: {topic: [] for topic in DECODED})
@@ -82,42 +82,43 @@ class Evidence:
 
 def read(folder: Path) -> Evidence:
     """Read all logs of a case, in their order."""
-    found = Evidence()
+    evidence = Evidence()
     for number, path in enumerate(sorted(folder.glob("*.mcap*"))):
         reader, last_ns = LogReader(path), 0
         try:
             for message in reader:
                 last_ns = message.receive_time_ns
-                _add(found, message, number if reader.finished else None)
+                _add(evidence, message, number if reader.finished else None)
         except DataFileError as fault:
-            found.unreadable.append(str(fault))
-        found.log_ends.append((last_ns, reader.finished))
+            evidence.unreadable.append(str(fault))
+        evidence.log_ends.append((last_ns, reader.finished))
         for name, value in reader.metadata.get("recording", {}).items():
             word, _, key = name.partition(" ")
             if word == "lost":
-                found.lost[key] += int(value)
-    return found
+                evidence.lost[key] += int(value)
+    return evidence
 
 
-def _add(found: Evidence, message: Sample, number: int | None) -> None:
-    found.messages += 1
+def _add(evidence: Evidence, message: Sample, number: int | None) -> None:
+    """Add a message; `number` is that of its log, None if the log is unfinished."""
+    evidence.messages += 1
     start_s, count = start_of(message.sequence), count_of(message.sequence)
     if start_s <= FORGED_S:
         return
     if number is not None and message.key != EVENT.key:  # all processes publish events: the publisher is ambiguous
-        found.received.setdefault((number, message.key, start_s), Gaps(count)).add(count)
-    topic = next((one for one in DECODED if one.matches(message.key)), None)
+        evidence.received.setdefault((number, message.key, start_s), Gaps(count)).add(count)
+    topic = next((topic for topic in DECODED if topic.matches(message.key)), None)
     if topic is None:
         return
     try:
         decoded: Any = topic.message.FromString(message.payload)
     except DecodeError:
-        found.unreadable.append(f"a message on {message.key} that the case did not send cannot be read")
+        evidence.unreadable.append(f"a message on {message.key} that the case did not send cannot be read")
         return
     shape = actuators(decoded) if topic in (COMMAND, MIRROR_STATE) else _NONE
     if shape is not None:
-        found.entries[topic].append(Entry(message.sequence, message.receive_time_ns, decoded, shape))
+        evidence.entries[topic].append(Entry(message.sequence, message.receive_time_ns, decoded, shape))
     elif topic is COMMAND or decoded.actuators:  # a mirror whose position is unknown reports none
-        found.unreadable.append(f"a message on {message.key} has {len(decoded.actuators)} bytes of actuators")
+        evidence.unreadable.append(f"a message on {message.key} has {len(decoded.actuators)} bytes of actuators")
     if topic is HEALTH and decoded.state == "stopped" and number is not None:
-        found.sent |= {(number, one.topic, start_s): one.published for one in decoded.topics if one.published}
+        evidence.sent |= {(number, each.topic, start_s): each.published for each in decoded.topics if each.published}

@@ -19,13 +19,13 @@ from lowfc.programs.reliability.chaos.evidence import FORGED_S
 
 FLOOD_HZ = 2000
 FLOOD_S = 2.0
-FORGED = 200
+FORGED_MESSAGES = 200
 OPERATORS = 8
 REQUESTS = 25
 _POLL_S = 0.01
 _NAMES = ("status", "open", "close", "gain", "leak", "limit", "offset", "channel", "play", "load", "law", "nonsense")
 _MAY_SUCCEED = ("status", "open", "close", "offset", "play", "law", "channel")
-"""Requests that random bytes may encode: they are sent under a name that does not exist."""
+"""Requests that random bytes may encode by chance; these are sent under a name that does not exist."""
 
 
 class Intruder:
@@ -74,8 +74,9 @@ def _flood(bench: ChaosBench) -> None:
 
 
 def _commands(bench: ChaosBench, rng: np.random.Generator) -> Iterator[wire.MirrorCommand]:
+    """Commands with random shapes: finite, not finite, too large, and of another size."""
     rows, columns = bench.config.mirror.rows, bench.config.mirror.columns
-    for number in range(FORGED):
+    for number in range(FORGED_MESSAGES):
         amplitude = float(rng.choice([1.0, 1e2, 1e4, 1e38]))
         shape = (rng.uniform(-1, 1, (rows, columns)) * amplitude).astype(np.float32)
         match number % 10:
@@ -108,7 +109,7 @@ def _forged_commands(bench: ChaosBench) -> None:
 @case("forged-frames", "frames with past sequence numbers", allowed=LOST)
 def _forged_frames(bench: ChaosBench) -> None:
     with Intruder(bench) as intruder:
-        for _ in range(FORGED):
+        for _ in range(FORGED_MESSAGES):
             pixels = intruder.rng.integers(0, 40_000, (80, 80)).astype(np.uint16)
             intruder.send(FRAME, image(pixels, HostClock().host_ns(), "forged").SerializeToString())
             time.sleep(_POLL_S)

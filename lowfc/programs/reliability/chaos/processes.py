@@ -32,7 +32,7 @@ _EVENTS: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 def killed(role: Role, after_s: tuple[float, float] = (0.1, 1.0)) -> Act:
-    """Kill a process, and restart it after a random time in this range."""
+    """Act of a case: kill a process, and restart it after a random time in this range."""
 
     def act(bench: ChaosBench) -> None:
         name = bench.process(role)
@@ -45,7 +45,7 @@ def killed(role: Role, after_s: tuple[float, float] = (0.1, 1.0)) -> Act:
 
 
 def frozen(role: Role, for_s: tuple[float, float] = (0.5, 2.0)) -> Act:
-    """Stop a process (SIGSTOP), and continue it after a random time in this range."""
+    """Act of a case: stop a process (SIGSTOP), and continue it after a random time in this range."""
 
     def act(bench: ChaosBench) -> None:
         name = bench.process(role)
@@ -91,7 +91,7 @@ def _stalled_recorder(bench: ChaosBench) -> None:
 @process_case("stall-viewer", "the viewer is stopped (SIGSTOP) for 10 s")
 def _stalled_viewer(bench: ChaosBench) -> None:
     name = bench.process(Role.VIEWER)
-    bench.settled()
+    bench.await_settled()
     compare(bench, partial(bench.stopped, name))
 
 
@@ -118,8 +118,8 @@ class CommandTimes:
         time.sleep(_SETTLE_S)  # timings still in transit belong to the phase before
         self.drain()
         time.sleep(seconds)
-        if found := self.drain():
-            self.phases[name] = found
+        if latencies := self.drain():
+            self.phases[name] = latencies
 
     def _receive(self, sample: Sample) -> None:
         self._latencies_ns.extend(wire.ControlTiming.FromString(sample.payload).frame_to_command_ns)
@@ -133,6 +133,6 @@ def compare(bench: ChaosBench, stall: Callable[[], contextlib.AbstractContextMan
         times.measure("during", STALL_S)
     times.measure("after", CALM_S)
     if len(times.phases) == 3:
-        before, during, after = (one["p99_us"] for one in times.phases.values())
+        before, during, after = (phase["p99_us"] for phase in times.phases.values())
         bench.outcome.measurements["p99_during_over_calm"] = round(during / ((before + after) / 2), 2)
         bench.outcome.measurements["p99_after_over_before"] = round(after / before, 2)

@@ -23,11 +23,13 @@ FLOOR_NM = 1.0
 FLUSHED_S = 1.0
 """Messages recorded longer than this before a kill must be in the log, which is flushed four times a second."""
 SPAN_NS = 1_000_000_000
+"""Time over which the residual is averaged before the fault and at the end."""
 RMS_FRAMES = 50
+"""Frames over which the residual is averaged to find the time of recovery."""
 ROUNDING_NM = 0.03
 """Largest difference of a mirror state from its command: the driver rounds to 0.023 nm."""
 HOLDING = frozenset(Rejection) - {Rejection.NO_MIRROR}
-"""Reasons with which a refused frame holds the command; with `NO_MIRROR` it returns to the mirror's last shape."""
+"""Reasons with which a refused frame holds the command; with `NO_MIRROR` it becomes the mirror's last shape."""
 
 
 class Finding(NamedTuple):
@@ -56,6 +58,7 @@ def judge(case: Case, outcome: Outcome, evidence: Evidence) -> list[Finding]:
 
 
 def _limits(outcome: Outcome, evidence: Evidence) -> Finding:
+    """Commands are within the controller's limits, mirror states within the mirror's."""
     config = outcome.config
     commands, states = evidence.entries[COMMAND], evidence.entries[MIRROR_STATE]
     moving = np.ones((config.mirror.rows, config.mirror.columns), bool)
@@ -103,7 +106,7 @@ def restart_steps_nm(evidence: Evidence) -> list[float]:
     states = evidence.entries[MIRROR_STATE]
     times = np.array([state.log_time_ns for state in states])
     pairs = [(command, int(np.searchsorted(times, command.log_time_ns)) - 1) for command in list(first.values())[1:]]
-    moves = [np.subtract(one.actuators_nm, states[before].actuators_nm) for one, before in pairs if before >= 0]
+    moves = [np.subtract(command.actuators_nm, states[before].actuators_nm) for command, before in pairs if before >= 0]
     return [float(np.abs(move).max()) for move in moves]
 
 
@@ -117,29 +120,30 @@ def recovered_s(outcome: Outcome, evidence: Evidence) -> float | None:
     if not started or "quiet" not in outcome.marks:
         return None
     begun_ns, quiet_ns = started[0].log_time_ns, outcome.marks["quiet"]
-    most_nm = MAX_RATIO * evidence.residual_nm(quiet_ns - SPAN_NS, quiet_ns) + FLOOR_NM
+    limit_nm = MAX_RATIO * evidence.residual_nm(quiet_ns - SPAN_NS, quiet_ns) + FLOOR_NM
     times_ns, residuals_nm = evidence.residuals_nm()
     later = times_ns >= begun_ns
     times_ns, squares = times_ns[later], residuals_nm[later] ** 2
     if squares.size < RMS_FRAMES:
         return None
     rms_nm = np.sqrt(np.convolve(squares, np.full(RMS_FRAMES, 1 / RMS_FRAMES), "valid"))
-    good = np.flatnonzero(rms_nm <= most_nm)
+    good = np.flatnonzero(rms_nm <= limit_nm)
     return float((times_ns[good[0]] - begun_ns) * 1e-9) if good.size else None
 
 
 def _number(step: Entry) -> int:
+    """Number of a step's frame since the camera's start."""
     return int(step.message.frame_sequence & 0xFFFFFFFF)
 
 
 def _bad_frames(case: Case, evidence: Evidence) -> Finding:
     """A refused frame holds the command; bad frames are refused; no frame is used twice or after a newer one."""
     commands, steps = evidence.entries[COMMAND], evidence.entries[STEP]
-    at = {(command.start_s, command.message.input_number): number for number, command in enumerate(commands)}
+    numbers = {(command.start_s, command.message.input_number): number for number, command in enumerate(commands)}
     refused = [step for step in steps if HOLDING.intersection(step.message.reasons)]
     wrong = []
     for step in refused:
-        number = at.get((step.start_s, step.message.input_number), 0)
+        number = numbers.get((step.start_s, step.message.input_number), 0)
         if number and step.message.mode != wire.LOOP_MODE_SAFE:
             before, now = commands[number - 1 : number + 1]
             adjacent = now.sequence == before.sequence + 1  # which implies the same controller
@@ -160,6 +164,7 @@ def _bad_frames(case: Case, evidence: Evidence) -> Finding:
 
 
 def _recovery(case: Case, outcome: Outcome, evidence: Evidence) -> Finding:
+    """At the end the loop is closed with the former residual; or, if the case requires it, safe with a flat mirror."""
     quiet_ns, end_ns = outcome.marks.get("quiet", 0), outcome.marks["end"]
     before = evidence.residual_nm(quiet_ns - SPAN_NS, quiet_ns)
     after = evidence.residual_nm(end_ns - SPAN_NS, end_ns)
@@ -178,6 +183,7 @@ def _recovery(case: Case, outcome: Outcome, evidence: Evidence) -> Finding:
 
 
 def _events(case: Case, evidence: Evidence) -> Finding:
+    """The log has the case's events, and no other event of the level ERROR than the case allows."""
     events = [event.message for event in evidence.entries[EVENT]]
     wrong = [
         f"no event {expected!r}"
@@ -194,6 +200,7 @@ def _events(case: Case, evidence: Evidence) -> Finding:
 
 
 def _account(outcome: Outcome, evidence: Evidence) -> Finding:
+    """Missing messages are counted as lost; the log of a killed recorder reaches to `FLUSHED_S` before its end."""
     wrong = list(evidence.unreadable)
     missing: Counter[str] = Counter()
     keys = (*evidence.lost, *outcome.lost)
@@ -223,6 +230,7 @@ def _account(outcome: Outcome, evidence: Evidence) -> Finding:
 
 
 def _processes(case: Case, outcome: Outcome) -> Finding:
+    """Processes ended in time, with an allowed status and without a traceback; none is left."""
     wrong = [f"{name} is still running" for name in outcome.alive]
     for ended in outcome.ended:
         allowed = {0, -signal.SIGTERM, case.statuses.get(ended.name, 0)}
@@ -234,7 +242,7 @@ def _processes(case: Case, outcome: Outcome) -> Finding:
         elif not ended.requested and ended.status == 0:
             wrong.append(f"{ended.name} ended by itself")
     outputs = [] if case.noisy else sorted(outcome.folder.glob("*.stderr"))
-    wrong += [f"a traceback in {one.name}" for one in outputs if "Traceback" in one.read_text(errors="replace")]
+    wrong += [f"a traceback in {path.name}" for path in outputs if "Traceback" in path.read_text(errors="replace")]
     if not {ended.name for ended in outcome.ended} & set(map(str, Role)):
         wrong.append("no process ended")
     slowest_s = max((ended.after_s for ended in outcome.ended), default=0.0)

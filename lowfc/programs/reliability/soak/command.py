@@ -9,7 +9,7 @@ from lowfc.programs.cli.output import print_result
 
 
 def soak(
-    hours: Annotated[float, typer.Option(min=0.001, max=1000, help="Duration.")],
+    hours: Annotated[float, typer.Option(min=0.001, max=1000, help="Duration, hours.")],
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:

@@ -10,7 +10,7 @@ from lowfc.control.loop.wording import counted
 from lowfc.programs.cli.result import table
 
 BLOCKS = 12
-"""Number of means to which a slope is fitted: neighbouring samples are correlated, means of many nearly are not."""
+"""Number of means to which a slope is fitted: neighbouring samples are correlated, means of many hardly."""
 WARM_UP = 0.25
 """Fraction of the time at the start that is left out, while caches and queues fill."""
 SIGNIFICANT = 3.0
@@ -31,13 +31,15 @@ class Usage(NamedTuple):
 
 def slope(times_s: Sequence[float], values: Sequence[float]) -> tuple[float, float] | None:
     """Change per hour and its standard error, fitted to means of blocks after the warm-up; None if too short."""
-    hours, found = np.asarray(times_s, np.float64) / 3600, np.asarray(values, np.float64)
+    hours, samples = np.asarray(times_s, np.float64) / 3600, np.asarray(values, np.float64)
     later = hours >= hours[0] + WARM_UP * (hours[-1] - hours[0]) if hours.size else hours
     if np.count_nonzero(later) < 2 * BLOCKS:
         return None
-    at, means = (np.array([part.mean() for part in np.array_split(one[later], BLOCKS)]) for one in (hours, found))
-    fit = scipy.stats.linregress(at, means)
-    return float(fit.slope), float(np.nan_to_num(fit.stderr))  # NaN if all are equal
+    block_hours, block_means = (
+        np.array([block.mean() for block in np.array_split(column[later], BLOCKS)]) for column in (hours, samples)
+    )
+    fit = scipy.stats.linregress(block_hours, block_means)
+    return float(fit.slope), float(np.nan_to_num(fit.stderr))  # NaN if all values are equal
 
 
 def _grew(counts: Sequence[int]) -> bool:
@@ -47,9 +49,9 @@ def _grew(counts: Sequence[int]) -> bool:
 
 
 def process_statistics(samples: Sequence[Usage]) -> dict[str, Any]:
-    """Statistics of one process."""
+    """First, largest and last usage of one process, the slope of its memory, and which resources grow."""
     times_s, memory_bytes, handles, threads = zip(*samples, strict=True)
-    memory_mb = [one / 1e6 for one in memory_bytes]
+    memory_mb = [size / 1e6 for size in memory_bytes]
     memory = slope(times_s, memory_mb)
     grows, too_short = [], ["memory", "handles", "threads"]
     if memory is not None:
@@ -57,7 +59,7 @@ def process_statistics(samples: Sequence[Usage]) -> dict[str, Any]:
         leaks = memory[0] > SIGNIFICANT * memory[1] and memory[0] * evaluated_h > MIN_GROWTH_MB
         checks = {"memory": leaks, "handles": _grew(handles), "threads": _grew(threads)}
         grows, too_short = [name for name, grew in checks.items() if grew], []
-    measured = {"memory": [round(one, 2) for one in memory_mb], "handles": handles, "threads": threads}
+    measured = {"memory": [round(mb, 2) for mb in memory_mb], "handles": handles, "threads": threads}
     ends: dict[str, Any] = {}
     for what, values in measured.items():
         unit = "_mb" if what == "memory" else ""
@@ -67,24 +69,24 @@ def process_statistics(samples: Sequence[Usage]) -> dict[str, Any]:
 
 def latency_statistics(samples: Sequence[tuple[float, float, float]]) -> dict[str, float | None]:
     """Median and drift of the latency, from samples of time, s, and p50 and p99 since the previous sample, us."""
-    times_s, *each = zip(*samples, strict=True) if samples else ((), (), ())
-    found: dict[str, float | None] = {}
-    for name, latencies_us in zip(("p50_us", "p99_us"), each, strict=True):
-        found[name] = float(np.median(latencies_us)) if latencies_us else None
-        found |= _per_hour(name, slope(times_s, latencies_us))
-    return found
+    times_s, *percentiles_us = zip(*samples, strict=True) if samples else ((), (), ())
+    statistics: dict[str, float | None] = {}
+    for name, latencies_us in zip(("p50_us", "p99_us"), percentiles_us, strict=True):
+        statistics[name] = float(np.median(latencies_us)) if latencies_us else None
+        statistics |= _per_hour(name, slope(times_s, latencies_us))
+    return statistics
 
 
-def _per_hour(name: str, found: tuple[float, float] | None) -> dict[str, float | None]:
+def _per_hour(name: str, fitted: tuple[float, float] | None) -> dict[str, float | None]:
     """A slope for JSON: null if the time was too short to judge."""
-    per_hour, error = found or (None, None)
+    per_hour, error = fitted or (None, None)
     return {f"{name}_per_hour": per_hour, f"{name}_per_hour_error": error}
 
 
 def too_short(processes: Mapping[str, Mapping[str, Any]], latency: Mapping[str, float | None]) -> list[str]:
     """Checks for which the time was too short."""
-    found = [f"the {name}'s {what}" for name, one in processes.items() for what in one["too_short"]]
-    return [*found, "the latency"] if latency["p50_us_per_hour"] is None else found
+    checks = [f"the {name}'s {what}" for name, process in processes.items() for what in process["too_short"]]
+    return [*checks, "the latency"] if latency["p50_us_per_hour"] is None else checks
 
 
 def verdict(results: Mapping[str, Any]) -> str:

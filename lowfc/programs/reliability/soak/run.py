@@ -44,11 +44,11 @@ class LogChecker:
     def gaps(self) -> int:
         """Messages missing in the logs between others of the same publisher, of topics that are recorded completely."""
         received = self._received.items()
-        return sum(one.missing for (key, _), one in received if self._selection.records_all(topic_of(key)))
+        return sum(gaps.missing for (key, _), gaps in received if self._selection.records_all(topic_of(key)))
 
     def check(self) -> None:
         """Check and remove the finished logs."""
-        for path in sorted(self._folder.glob("*.mcap"), key=lambda one: (one.stat().st_mtime_ns, one.name)):
+        for path in sorted(self._folder.glob("*.mcap"), key=lambda log: (log.stat().st_mtime_ns, log.name)):
             reader = LogReader(path)
             for message in reader:
                 self.messages += 1
@@ -61,6 +61,8 @@ class LogChecker:
 
 
 class _Soak:
+    """The samples of a running bench, and the results from them."""
+
     def __init__(self, bench: ChaosBench) -> None:
         self.bench = bench
         self.checker = LogChecker(bench.folder)
@@ -90,7 +92,7 @@ class _Soak:
         )
         frames, recording = topic_count(controller, FRAME.key), recorder.recording
         processes = {name: process_statistics(samples) for name, samples in self.usage.items()}
-        found: dict[str, Any] = {
+        measured: dict[str, Any] = {
             "hours": seconds / 3600,
             "rate_hz": round(camera.mean_rate_hz, 2),
             "frames_published": topic_count(camera, FRAME.key).published,
@@ -104,8 +106,8 @@ class _Soak:
             "processes": processes,
             "latency": latency_statistics(self.latency),
         }
-        why = [f"growth of the {name}'s {what}" for name, one in processes.items() for what in one["grows"]]
-        why += [f"{found[key]} {text}" for key, text in _MUST_BE_ZERO.items() if found[key]]
+        why = [f"growth of the {name}'s {what}" for name, process in processes.items() for what in process["grows"]]
+        why += [f"{measured[key]} {text}" for key, text in _MUST_BE_ZERO.items() if measured[key]]
         why += [f"the recording ended: {recording.failure}"] * bool(recording.failure)
         why += [f"{name} was not finished" for name in unfinished]
         if self.mode != wire.LOOP_MODE_CLOSED:
@@ -113,8 +115,8 @@ class _Soak:
             why.append(f"the loop should be closed at the end, its mode is {mode}")
         if recording.messages != self.checker.messages:
             why.append(f"the recorder reports {recording.messages} messages, the logs have {self.checker.messages}")
-        unjudged = too_short(processes, found["latency"])
-        return found | {"why": why, "too_short": unjudged, "passed": not why and not unjudged}
+        unjudged = too_short(processes, measured["latency"])
+        return measured | {"why": why, "too_short": unjudged, "passed": not why and not unjudged}
 
 
 def soak_loop(config: Configuration, seconds: float, progress: Callable[[float], None]) -> dict[str, Any]:
