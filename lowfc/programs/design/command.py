@@ -15,7 +15,7 @@ from lowfc.programs.design.full_light_request import Defocus, Spot
 from lowfc.programs.design.options import flag, with_options_of
 from lowfc.programs.design.sam_request import Search
 
-Keys = Annotated[Path, typer.Option(help="Configuration file to write.")]
+KeysFile = Annotated[Path, typer.Option(help="Configuration file to write, with the keys of [sensor].")]
 Plot = Annotated[Path | None, typer.Option(help="Plot the figures of merit against size (PNG).")]
 
 design_app = new_app("Design masks and sensors.\n\nExample: lowfc design spc --help")
@@ -65,18 +65,18 @@ def sam(
     if jobs is not None and scheduler is not None:
         raise ConfigurationError("--jobs and --scheduler exclude each other: use one")
     if resume is not None:
-        of_search = {flag(field.name) for field in fields(Search)}
+        search_options = {flag(field.name) for field in fields(Search)}
         for option in options_set(context):
-            if option in of_search:
+            if option in search_options:
                 raise ConfigurationError(f"--resume continues the search of {resume}: omit {option}")
-        search, found = read_state(resume, pupil_digest())
+        search, chains = read_state(resume, pupil_digest())
     else:
-        found = begin(search)
+        chains = begin(search)
     out = out if out is not None else Path(f"{search.name}.json")
     state = check_files(out, resume, front, plot)
     processes = min(jobs or len(os.sched_getaffinity(0)), search.chains)
     with open_executor(processes, scheduler) as executor:
-        result = design_sam(search, found, out, state, executor, front, plot)
+        result = design_sam(search, chains, out, state, executor, front, plot)
     print_result(result, render(result), as_json=as_json)
     if result["interrupted"]:
         raise typer.Exit(INTERRUPTED)
@@ -84,7 +84,7 @@ def sam(
 
 @design_app.command()
 @with_options_of(Spot)
-def zwfs(request: Spot, out: Keys = Path("zwfs.toml"), plot: Plot = None, as_json: Json = False) -> None:
+def zwfs(request: Spot, out: KeysFile = Path("zwfs.toml"), plot: Plot = None, as_json: Json = False) -> None:
     """Optimise the phase spot of a Zernike sensor.
 
     Example: lowfc design zwfs --merit contrast --out zwfs.toml
@@ -94,7 +94,7 @@ def zwfs(request: Spot, out: Keys = Path("zwfs.toml"), plot: Plot = None, as_jso
 
 @design_app.command()
 @with_options_of(Defocus)
-def clowfs(request: Defocus, out: Keys = Path("clowfs.toml"), plot: Plot = None, as_json: Json = False) -> None:
+def clowfs(request: Defocus, out: KeysFile = Path("clowfs.toml"), plot: Plot = None, as_json: Json = False) -> None:
     """Optimise the defocus of a coronagraphic low-order sensor.
 
     Example: lowfc design clowfs --merit contrast --out clowfs.toml

@@ -53,7 +53,7 @@ def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
         figure_class()
     require_folder(out, plot)
     for end in (sizes.low, sizes.high):
-        _section(sizes, end)  # refuses a size that the configuration does not allow
+        _section(sizes, end)  # validated here
     key = KEYS[sizes.kind]
 
     @cache
@@ -66,8 +66,8 @@ def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
     with threadpool_limits(1):
         focal_light = FocalLight.of(sensor_from(_section(sizes, sizes.low), WAVELENGTH_NM))
         values, best = sweep(merit_of, sizes.low, sizes.high, _POINTS)
-        found = {value: predictions(candidate(value)) for value in sorted({*values.tolist(), best})}
-        points = [_point(found[value], value, merit_of(value), goal) for value in found]
+        predicted = {value: predictions(candidate(value)) for value in sorted({*values.tolist(), best})}
+        points = [_point(predicted[value], value, merit_of(value), goal) for value in predicted]
     keys = {"kind": f'"{sizes.kind}"', **sizes.others, key: f"{best:.6g}"}
     write_whole(out, "".join(["[sensor]\n", *(f"{name} = {value}\n" for name, value in keys.items())]).encode())
     if plot is not None:
@@ -79,26 +79,27 @@ def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
         best=best,
         file=str(out),
         points=points,
-        figures_of_best=found[best],
+        figures_of_best=predicted[best],
     )
 
 
 def _section(sizes: Sizes, value: float) -> SensorSection:
+    """[sensor] of a sensor of this size; ConfigurationError if the size is not allowed."""
     keys = {"kind": sizes.kind, **sizes.others, KEYS[sizes.kind]: value}
-    return load(None, {f"sensor.{name}": one for name, one in keys.items()}).sensor
+    return load(None, {f"sensor.{name}": setting for name, setting in keys.items()}).sensor
 
 
-def _point(found: dict[str, Any], value: float, merit_of_value: float, goal: Goal) -> Point:
+def _point(predicted: dict[str, Any], value: float, merit_of_value: float, goal: Goal) -> Point:
     return Point(
         value=value,
         merit=merit_of_value,
-        throughput=found["throughput"],
-        table3_waves=found["table3_waves"][goal.estimator]["14"],
-        table4_mas=max(found["table4_mas"][goal.estimator]["2"]),
-        condition=found["condition"]["14"],
-        noise_nm=found["noise_nm"],
-        contrast_noise=found["contrast_noise"],
-        quantum_share=found["quantum_share"],
+        throughput=predicted["throughput"],
+        table3_waves=predicted["table3_waves"][goal.estimator]["14"],
+        table4_mas=max(predicted["table4_mas"][goal.estimator]["2"]),
+        condition=predicted["condition"]["14"],
+        noise_nm=predicted["noise_nm"],
+        contrast_noise=predicted["contrast_noise"],
+        quantum_share=predicted["quantum_share"],
     )
 
 
@@ -114,8 +115,8 @@ def _picture(points: list[Point], key: str, goal: Goal) -> bytes:
         "contrast_noise": "contrast from noise",
     }
     for name, label in labels.items():
-        found = [getattr(point, name) for point in points]
-        axes.semilogy(values, [one / min(found) for one in found], label=label)
+        curve = [getattr(point, name) for point in points]
+        axes.semilogy(values, [height / min(curve) for height in curve], label=label)
     axes.set(xlabel=key, ylabel="relative to minimum")
     axes.legend()
     return png(drawing)

@@ -12,7 +12,7 @@ Kind = Literal["zwfs", "clowfs"]
 
 
 class Sizes(NamedTuple):
-    """Sizes to search: kind of sensor, lowest and highest size, and other keys of [sensor]."""
+    """Sizes to search: kind of sensor, smallest and largest size in the unit of its key, and other keys of [sensor]."""
 
     kind: Kind
     low: float

@@ -21,20 +21,20 @@ def flag(name: str) -> str:
 
 def command_line(command: str, request: Any) -> str:
     """The command line that repeats a request, without options that are None."""
-    given = {flag(name): value for name, value in asdict(request).items() if value is not None}
-    return shlex.join([*command.split(), *(str(word) for option in given.items() for word in option)])
+    options = {flag(name): value for name, value in asdict(request).items() if value is not None}
+    return shlex.join([*command.split(), *(str(word) for option in options.items() for word in option)])
 
 
 def span(option: str, text: str) -> tuple[float, float]:
     """Parse LOW:HIGH, or one value for both; ValueError if it is neither, or not finite."""
     low, colon, high = text.partition(":")
     try:
-        found = float(low), float(high if colon else low)
+        limits = float(low), float(high if colon else low)
     except ValueError:
-        found = nan, nan
-    if not all(map(isfinite, found)):
+        limits = nan, nan
+    if not all(map(isfinite, limits)):
         raise ValueError(f"{option} must be a number or LOW:HIGH, got {text!r}")
-    return found
+    return limits
 
 
 def with_options_of(kind: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -63,8 +63,8 @@ def with_options_of(kind: type[Any]) -> Callable[[Callable[..., None]], Callable
             command(request, **values)
 
         _, *others = inspect.signature(command, eval_str=True).parameters.values()
-        rest = [other.replace(kind=inspect.Parameter.KEYWORD_ONLY) for other in others]
-        run.__signature__ = inspect.Signature([*options, *rest])  # type: ignore[attr-defined]
+        own_options = [other.replace(kind=inspect.Parameter.KEYWORD_ONLY) for other in others]
+        run.__signature__ = inspect.Signature([*options, *own_options])  # type: ignore[attr-defined]
         return run
 
     return decorated
@@ -72,8 +72,8 @@ def with_options_of(kind: type[Any]) -> Callable[[Callable[..., None]], Callable
 
 def _attributes(kind: type[Any]) -> dict[str, str]:
     """Descriptions of the attributes in the docstrings of a class and its bases, each on one line."""
-    found: dict[str, str] = {}
-    for one in kind.__mro__[-2::-1]:
-        _, _, text = inspect.cleandoc(one.__doc__ or "").partition("Attributes:\n")
-        found |= dict(re.findall(r"^    (\w+): ((?:.|\n {5,})+)", text, re.M))
-    return {name: " ".join(help_.split()) for name, help_ in found.items()}
+    descriptions: dict[str, str] = {}
+    for class_ in kind.__mro__[-2::-1]:
+        _, _, text = inspect.cleandoc(class_.__doc__ or "").partition("Attributes:\n")
+        descriptions |= dict(re.findall(r"^    (\w+): ((?:.|\n {5,})+)", text, re.M))
+    return {name: " ".join(help_.split()) for name, help_ in descriptions.items()}

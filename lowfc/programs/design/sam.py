@@ -30,6 +30,7 @@ from lowfc.programs.design.sam_files import FoundLayout, front, write_front, wri
 from lowfc.programs.design.sam_request import Search
 
 STATE_PERIOD_S = 10.0
+"""Shortest time between two writes of the state file."""
 
 
 def begin(search: Search) -> list[Chain]:
@@ -143,7 +144,7 @@ def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block
 
 
 def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
-    """Advance a chain by one block; runs in a worker, possibly on another machine."""
+    """Advance a chain by one block; called in a worker, possibly on another machine."""
     if pupil != pupil_digest():
         raise ConfigurationError("a worker has another shaped pupil: install the same lowfc on all machines")
     _one_thread()
@@ -152,15 +153,15 @@ def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
 
 def found_layout(search: Search, chain: Chain) -> FoundLayout:
     """The best layout of a chain, with its predictions."""
-    found = holes(chain.best, search.bounds.symmetry)
+    best = holes(chain.best, search.bounds.symmetry)
     name = f"{search.name}_{chain.index}" if search.sweeps else search.name
     goal = search.goal_of(chain.index)
     weight = "" if goal.weight is None else f" with weight {goal.weight:g}"
     masks = " and ".join(search.focal_masks)
-    purpose = f"{_described(found)}: merit {goal.merit}{weight}, focal-plane mask {masks}"
-    predicted = _predictions(search.focal_masks[0], found)
+    purpose = f"{_described(best)}: merit {goal.merit}{weight}, focal-plane mask {masks}"
+    predicted = _predictions(search.focal_masks[0], best)
     return FoundLayout(
-        Layout(name, purpose, found),
+        Layout(name, purpose, best),
         chain.best_merit,
         predicted["table3_waves"][goal.estimator][str(goal.modes)],
         max(predicted["table4_mas"][goal.estimator][str(TABLE4_MODES)]),
@@ -235,7 +236,8 @@ def _predictions(focal_mask: str, holes_: tuple[Hole, ...]) -> dict[str, Any]:
     return predictions(SamCandidate(optics, fields))
 
 
-def _described(found: Sequence[Hole]) -> str:
-    low, high = min(hole[2] for hole in found), max(hole[2] for hole in found)
+def _described(holes_: Sequence[Hole]) -> str:
+    """Number and diameters of holes, in per cent of the pupil's diameter."""
+    low, high = min(hole[2] for hole in holes_), max(hole[2] for hole in holes_)
     size = f"{low:.1%}" if low == high else f"{low:.1%} to {high:.1%}"
-    return f"{counted(len(found), 'hole')} of {size.replace('.0%', '%')}"
+    return f"{counted(len(holes_), 'hole')} of {size.replace('.0%', '%')}"

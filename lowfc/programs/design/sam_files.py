@@ -61,19 +61,19 @@ def write_state(path: Path, search: Search, pupil: str, chains: Sequence[Chain])
 
 
 def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
-    """Read the search and its chains from a file of `write_state`; DataFileError if it is none, or of another pupil."""
+    """Read a search and chains from a file of `write_state`; DataFileError if it is not one, or is of another pupil."""
     try:
         state = json.loads(input_file.read_whole(path, _MAX_BYTES))
         search = Search(**state["search"])
         chains = [Chain(**{key: _as_tuple(value) for key, value in chain.items()}) for chain in state["chains"]]
-        made_for = state["pupil"]
+        pupil_searched = state["pupil"]
         if len(chains) != search.chains:
             raise ValueError(f"{len(chains)} chains, expected {search.chains}")
     except FileNotFoundError:
         raise DataFileError(f"there is no search to resume in {path}") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataFileError(f"{path} is not the state of a search: {type(error).__name__}: {error}") from error
-    if made_for != pupil:
+    if pupil_searched != pupil:
         raise DataFileError(f"{path} belongs to a search with another shaped pupil; start a new one without --resume")
     return search, chains
 
@@ -115,7 +115,7 @@ def write_plot(path: Path, points: Sequence[FoundLayout], search: Search) -> Non
 
 
 def front(points: Sequence[FoundLayout]) -> list[FoundLayout]:
-    """The Pareto front: all points but those beaten in one table by a point that is at least as good in the other."""
+    """The Pareto front: all points but those that another point beats in one table and at least equals in the other."""
     return [
         point
         for point in points

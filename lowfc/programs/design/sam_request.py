@@ -17,7 +17,7 @@ class Search:
         merit: Figure of merit to optimise: paper, table3, table4, condition, throughput, pareto or contrast.
         estimator: pinv, or weighted for the Cramer-Rao bound. Default: weighted; pinv for the merit paper.
         modes: Modes in Table 3 and the condition number: 14 or 20.
-        weight: Weight of Table 4 in paper and pareto, 0 to 1. Default: 0.5; in pareto, a front.
+        weight: Weight of Table 4 in paper and pareto, 0 to 1. Default: 0.5; in pareto, 0 to 1 along a front.
         focal_mask: disk, bowtie or both. Default: disk; both for the merit paper.
         holes: Number of holes, or FEWEST:MOST.
         diameter: Diameter of the holes, or SMALLEST:LARGEST, in pupil diameters.
@@ -94,7 +94,7 @@ class Search:
 def _span(option: str, text: str, scale: int) -> tuple[int, int]:
     """Parse LOW:HIGH, or one value for both, in units of 1 / scale."""
     first, last = (value * scale for value in span(option, text))
-    found = round(first), round(last)
-    if abs(found[0] - first) > 1e-6 or abs(found[1] - last) > 1e-6:
+    low, high = round(first), round(last)
+    if abs(low - first) > 1e-6 or abs(high - last) > 1e-6:
         raise ValueError(f"{option} must be in steps of {1 / scale:g}, got {text!r}")
-    return found
+    return low, high

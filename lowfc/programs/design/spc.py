@@ -42,7 +42,7 @@ Value = TypeVar("Value")
 
 
 class ShapedPupil(Result):
-    """Properties of the mask found.
+    """Properties of the designed mask.
 
     `below_optimum_at_limit_fraction`: the best mask with `limit` times the required contrast is more open by at most
     this fraction of the circle; the best one with the required contrast may be still more open.
@@ -88,22 +88,23 @@ def design_spc(request: Request, out: Path, plot: Path | None, console: Console)
             raise ConfigurationError(_infeasible(request, *_interruptibly(lambda: nearest_feasible(request))))
     if last.contrast > request.contrast:
         raise ConfigurationError(
-            f"after {counted(last.number, 'program')} with {request.cells} cells the contrast is {last.contrast:.2e}, "
-            f"not {request.contrast:g}: allow more --rounds, or a lower --limit than {request.limit:g}"
+            f"after {counted(last.number, 'linear program')} with {request.cells} cells the contrast is "
+            f"{last.contrast:.2e}, not {request.contrast:g}: allow more --rounds, or a lower --limit than "
+            f"{request.limit:g}"
         )
     quarter = stored(last.quarter, request)
     made_by = np.array(json.dumps(asdict(request)))
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, quarter=quarter, made_by=made_by)
     write_whole(out, content.getvalue())
-    found = properties(quarter.astype(np.float64), request)
+    mask_properties = properties(quarter.astype(np.float64), request)
     if plot is not None:
         write_whole(plot, _picture(quarter.astype(np.float64), request))
     return ShapedPupil(
         file=str(out),
         dtype=str(quarter.dtype),
         command=command_line("lowfc design spc", request),
-        **asdict(found),
+        **asdict(mask_properties),
         focal_mask_radius_lambda_d=FOCAL_MASK_RADIUS,
         contrast_step_lambda_d=FINE_STEP,
         below_optimum_at_limit_fraction=last.bound - last.open_area,
@@ -113,18 +114,20 @@ def design_spc(request: Request, out: Path, plot: Path | None, console: Console)
 
 
 def _rounds(request: Request, console: Console) -> list[Round]:
+    """Solve the linear programs one after the other, and print each."""
     rounds: list[Round] = []
-    for found in exchange(request):
-        rounds.append(found)
+    for round_ in exchange(request):
+        rounds.append(round_)
         console.print(
-            f"{len(found.quarter):>4} cells, program {found.number:>2}: {found.points:>5} points, open area "
-            f"{found.open_area:7.3%}, contrast {found.contrast:.2e}",
+            f"{len(round_.quarter):>4} cells, program {round_.number:>2}: {round_.points:>5} points, open area "
+            f"{round_.open_area:7.3%}, contrast {round_.contrast:.2e}",
             highlight=False,
         )
     return rounds
 
 
 def _infeasible(request: Request, inner: float | None, contrast: float | None) -> str:
+    """Message for an infeasible request, with the nearest feasible inner angle and contrast."""
     ways = []
     if inner is not None:
         ways.append(f"inner angle is {inner:g} (same contrast)")
@@ -171,7 +174,7 @@ def _picture(quarter: Array, request: Request) -> bytes:
     border = edge + FINE_STEP / 2  # of the outermost samples
     decades = np.log10(np.maximum(relative_field(quarter, axis) ** 2, 1e-30))
     floor = np.log10(request.contrast) - 2.0
-    drawn = image.imshow(
+    drawn_image = image.imshow(
         decades, vmin=floor, vmax=0.0, cmap="inferno", origin="lower", extent=(-border, border, -border, border)
     )
     angles = np.deg2rad(np.linspace(-request.half_angle_deg, request.half_angle_deg, 91))
@@ -183,7 +186,7 @@ def _picture(quarter: Array, request: Request) -> bytes:
         if request.symmetry == "octant":
             image.plot(y, x, "c-", linewidth=0.8)
     image.set(title="image, log10 of contrast", xlabel="x (lambda/D)", ylabel="y (lambda/D)")
-    drawing.colorbar(drawn, ax=image)
+    drawing.colorbar(drawn_image, ax=image)
 
     axis, zone = fine_grid(request.zone)
     contrast = relative_field(quarter, axis) ** 2
