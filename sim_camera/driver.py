@@ -341,5 +341,5 @@ class SimulatedCamera:
             for name, health in sorted(self._service.last_health.items())
             if now_ns - health.timestamp.ToNanoseconds() > PATIENCE_S * 0.4e9
         ]
-        who = f"no Health from {', '.join(silent)}" if silent else "all processes are alive"
-        return f"the mirror did not apply a command for frame {self._index - 1} within {PATIENCE_S:g} s: {who}"
+        cause = f"no Health from {', '.join(silent)}" if silent else "all processes are alive"
+        return f"the mirror did not apply a command for frame {self._index - 1} within {PATIENCE_S:g} s: {cause}"

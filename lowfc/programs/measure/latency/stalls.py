@@ -79,10 +79,10 @@ class Stalls(Result):
     frames: int = result_field()
     stalled: int = result_field("stalled", "frames: no command, or more than a period from frame to command")
     of_host: int = result_field(
-        "  by the host", "frames: a bare loop was delayed too, processor time was stolen, or a quota used up"
+        "  by the host", "frames: a bare loop was delayed too, processor time was stolen, or the quota was used up"
     )
     of_loop: int = result_field(
-        "  by the loop", "frames: a process waited for a processor or for pages, no bare loop did"
+        "  by the loop", "frames: a process waited for a processor or for pages, and the host is not the cause"
     )
     unknown: int = result_field("  unknown", "frames: no counter explains them")
     bare: list[BareLoop] = result_field()

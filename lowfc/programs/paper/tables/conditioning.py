@@ -58,7 +58,7 @@ def conditioning(context: Context) -> list[Row]:
     masks += [("sensor", prepared(name)) for name in context.names(*sparse_apertures(), *OTHERS)]
     holes = [_with_holes(diameter) for diameter in HOLES]
     masks += [("holes", each) for each in holes if isinstance(each, Prepared)]
-    rows = [row for found in context.map("conditioning", lambda mask: [*_rows(*mask)], masks) for row in found]
+    rows = [row for of_mask in context.map("conditioning", lambda mask: [*_rows(*mask)], masks) for row in of_mask]
     return rows + [each for each in holes if isinstance(each, Row)]
 
 

@@ -131,7 +131,8 @@ def _realisations(
 
 
 def _paper_name(sensor: Prepared) -> str:
-    return sensor.paper_name.partition(":")[0]  # a CLOWFS of any defocus: one is fitted to this table
+    """Key of the sensor's values in `TABLE4_MAS`."""
+    return sensor.paper_name.partition(":")[0]  # also clowfs:MM, whose defocus may be fitted to this table
 
 
 def _rows(

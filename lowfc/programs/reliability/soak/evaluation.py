@@ -115,11 +115,11 @@ def render(results: dict[str, Any]) -> str:
     rows = [
         (
             name,
-            f"{one['memory_first_mb']:.1f} -> {one['memory_last_mb']:.1f}",
-            _change(one["memory_mb_per_hour"], one["memory_mb_per_hour_error"], ".2f"),
-            *(f"{one[f'{what}_first']} -> {one[f'{what}_last']}" for what in ("handles", "threads")),
+            f"{process['memory_first_mb']:.1f} -> {process['memory_last_mb']:.1f}",
+            _change(process["memory_mb_per_hour"], process["memory_mb_per_hour_error"], ".2f"),
+            *(f"{process[f'{what}_first']} -> {process[f'{what}_last']}" for what in ("handles", "threads")),
         )
-        for name, one in results["processes"].items()
+        for name, process in results["processes"].items()
     ]
     return "\n".join(
         [
