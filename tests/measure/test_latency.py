@@ -28,10 +28,10 @@ from lowfc.programs.measure.latency.frame_statistics import (
     SPANS,
     STAGES,
     WARM_UP_S,
-    Frames,
+    FrameOutcomes,
     edges_us,
+    frame_outcomes,
     histogram,
-    join,
     percentiles,
     repeat_statistics,
 )
@@ -54,7 +54,7 @@ def frames(
     mirror_lost: tuple[int, ...] = (),
     *,
     scheduled: bool = True,
-) -> Frames:
+) -> FrameOutcomes:
     """Frames published at `put_ns` (an integer: their number, 1 ms apart), `late_us` after they were due.
 
     They are commanded after `command_us` (NaN: never) and applied 50 us later, except those in `mirror_lost`.
@@ -68,7 +68,7 @@ def frames(
     applied = timed & ~np.isin(np.arange(put_ns.size), mirror_lost)
     mirror_ns = (put_ns[applied] + command_ns[applied] + 50_000).astype(np.int64)
     due_ns = put_ns - np.asarray(np.round(np.asarray(late_us) * 1e3), np.int64) if scheduled else None
-    return join(sequence, put_ns, due_ns, (sequence[timed], stages), (sequence[applied], mirror_ns))
+    return frame_outcomes(sequence, put_ns, due_ns, (sequence[timed], stages), (sequence[applied], mirror_ns))
 
 
 def test_percentiles_are_among_the_measured_values() -> None:
@@ -85,7 +85,7 @@ def test_timings_and_mirror_states_are_joined_to_their_frames() -> None:
     stages = {stage: np.array([0, 1, 3]) + value for stage, value in columns.items()}
     states = sequence[[0, 0, 3]], np.array([1200, 9999, 4200])  # two states of the first frame, none of the second
     put_ns = np.array([1000, 2000, 3000, 4000])
-    found = join(sequence, put_ns, put_ns - [5, 5, 5, 705], (timed, stages), states)
+    found = frame_outcomes(sequence, put_ns, put_ns - [5, 5, 5, 705], (timed, stages), states)
     assert found.commanded.tolist() == [True, True, False, True]
     expected_ns = {
         "frame_to_receive": [10, 11, np.nan, 13],

@@ -75,7 +75,7 @@ _BURST = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Frames:
+class FrameOutcomes:
     """Outcome of each frame, in the order of publication; all arrays are (frames,).
 
     Attributes:
@@ -89,13 +89,13 @@ class Frames:
     spans_us: Mapping[str, Array]
 
 
-def join(
+def frame_outcomes(
     sequence: Sequences,
     put_ns: Long,
     due_ns: Long | None,
     timing: tuple[Sequences, Mapping[str, Long]],
     mirror: tuple[Sequences, Long],
-) -> Frames:
+) -> FrameOutcomes:
     """Published frames with their outcomes.
 
     Args:
@@ -124,7 +124,7 @@ def join(
             "due_to_command": late_us + command_us,
             "due_to_mirror": late_us + mirror_us,
         }
-    return Frames(put_ns, (row >= 0) | (mirror_row >= 0), spans_us)
+    return FrameOutcomes(put_ns, (row >= 0) | (mirror_row >= 0), spans_us)
 
 
 def percentiles(values: npt.NDArray[Any]) -> dict[str, float] | None:
@@ -148,7 +148,7 @@ def histogram(values_us: Array) -> Long:
     return np.histogram(np.clip(known, edges[0], edges[-1]), edges)[0].astype(np.int64)
 
 
-def repeat_statistics(frames: Frames) -> dict[str, Any]:
+def repeat_statistics(frames: FrameOutcomes) -> dict[str, Any]:
     """Statistics of one repeat, the warm-up left out.
 
     A frame without a command counts as crowded out (superseded) if the next frame was published within half the mean

@@ -10,7 +10,7 @@ from lowfc.adapters.logs.parts import LogFiles, WholeLog
 from lowfc.adapters.logs.recovery import missing_parts
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME, HEALTH, MIRROR_STATE, TIMING, Role, wire
-from lowfc.programs.measure.latency.frame_statistics import controller_counts, join, repeat_statistics
+from lowfc.programs.measure.latency.frame_statistics import controller_counts, frame_outcomes, repeat_statistics
 
 _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
 
@@ -25,7 +25,9 @@ def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tup
     history = read_history(log)
     mirror = history.mirror.sequence, history.mirror.publish_time_ns
     timing = history.timed_sequence, history.stages_ns
-    statistics = repeat_statistics(join(history.frame_sequence, history.frame_publish_ns, None, timing, mirror))
+    statistics = repeat_statistics(
+        frame_outcomes(history.frame_sequence, history.frame_publish_ns, None, timing, mirror)
+    )
     if "frame_to_command" not in statistics["latency_us"]:
         raise DataFileError(
             f"{log.path} has no timed frame after its first 0.5 s: it is short, is not of a loop, or lacks {FRAME.key} "

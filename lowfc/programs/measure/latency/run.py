@@ -36,7 +36,7 @@ from lowfc.programs.measure.frame_source import BEGIN_FILE, FRAMES_FILE, SENT_FI
 from lowfc.programs.measure.latency.frame_statistics import (
     WARM_UP_S,
     controller_counts,
-    join,
+    frame_outcomes,
     percentiles,
     repeat_statistics,
 )
@@ -62,7 +62,7 @@ class LatencyOptions:
     trace: bool = False
 
 
-def fill(config: Configuration, run: Run) -> None:
+def write_shared_files(config: Configuration, run: Run) -> None:
     """Write the files that the processes share to the run's directory: calibration, configuration, frames."""
     with threadpool_limits(limits=1):  # more threads would spin, and wait for those without a processor
         prepare(config, run, Console(stderr=True))
@@ -71,11 +71,13 @@ def fill(config: Configuration, run: Run) -> None:
 
 
 @contextlib.contextmanager
-def prepared(config: Configuration, fill: Callable[[Configuration, Run], None] = fill) -> Iterator[Run]:
+def prepared(
+    config: Configuration, write_files: Callable[[Configuration, Run], None] = write_shared_files
+) -> Iterator[Run]:
     """A run with the files that its processes share; removed at the end."""
     run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
     try:
-        fill(config, run)
+        write_files(config, run)
         yield run
     finally:
         run.remove()
@@ -142,14 +144,14 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
         _check_ends(children)
     received = timings.values(), (states.values("sequence"), states.values("publish_ns"))
     if options.simulated:
-        joined = join(frames.values("sequence"), frames.values("publish_ns"), None, *received)
+        outcomes = frame_outcomes(frames.values("sequence"), frames.values("publish_ns"), None, *received)
     else:
         with np.load(run.path / SENT_FILE) as sent:
-            joined = join(sent["sequence"], sent["put_ns"], sent["due_ns"], *received)
-    statistics = repeat_statistics(joined)
+            outcomes = frame_outcomes(sent["sequence"], sent["put_ns"], sent["due_ns"], *received)
+    statistics = repeat_statistics(outcomes)
     if traced:
         traces: dict[str, Trace] = {role: Trace(*np.load(run.path / trace_file(role)).T) for role in traced}
-        statistics["stalls"] = stalls_of(joined, options.config.period_ns, traces)
+        statistics["stalls"] = stalls_of(outcomes, options.config.period_ns, traces)
     if "frame_to_command" not in statistics["latency_us"]:
         raise BusError("the controller reported no timing after the warm-up: use a longer --duration")
     controller, recording = watch.health_of(Role.CONTROLLER), watch.health_of(Role.RECORDER).recording

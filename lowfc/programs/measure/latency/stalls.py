@@ -12,7 +12,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Long
 from lowfc.programs.cli.result import Result, result_field
-from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S, Frames, percentiles
+from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S, FrameOutcomes, percentiles
 
 Cause = Literal["host", "loop", "unknown"]
 """Cause of a stall: the loop if one of its processes waited for a processor or pages, and the host is not the cause."""
@@ -111,7 +111,7 @@ def signs_of(counted: CountChanges, period_us: float) -> tuple[list[str], list[s
     return [sign for sign, holds in host.items() if holds], [sign for sign, holds in loop.items() if holds]
 
 
-def stalls_of(frames: Frames, period_ns: int, traces: Mapping[str, Trace]) -> Stalls:
+def stalls_of(frames: FrameOutcomes, period_ns: int, traces: Mapping[str, Trace]) -> Stalls:
     """The stalls among these frames, the warm-up left out; `traces` by the process of each bare loop."""
     command_us = frames.spans_us["frame_to_command"]
     counted = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
@@ -142,7 +142,7 @@ def combine(repeats: Sequence[Stalls]) -> Stalls:
     return Stalls(**counts, bare=bare, stalls=[stall for repeat in repeats for stall in repeat.stalls])
 
 
-def _ends_ns(frames: Frames, period_ns: int) -> Array:
+def _ends_ns(frames: FrameOutcomes, period_ns: int) -> Array:
     """Time of each frame's command, or of the next command if it has none."""
     sent_ns = frames.put_ns + frames.spans_us["frame_to_command"] * 1e3
     known_ns = np.where(np.isfinite(sent_ns), sent_ns, np.inf)
@@ -150,7 +150,7 @@ def _ends_ns(frames: Frames, period_ns: int) -> Array:
     return np.where(np.isfinite(known_ns), known_ns, np.minimum(next_ns, frames.put_ns.max(initial=0) + period_ns))
 
 
-def _stall(frames: Frames, index: int, end_ns: float, period_ns: int, traces: Mapping[str, Trace]) -> Stall:
+def _stall(frames: FrameOutcomes, index: int, end_ns: float, period_ns: int, traces: Mapping[str, Trace]) -> Stall:
     due_to_frame_us = frames.spans_us.get("due_to_frame", np.zeros_like(frames.spans_us["frame_to_command"]))
     begin_ns = int(frames.put_ns[index] - due_to_frame_us[index] * 1e3)
     spans_us = {name: float(frames.spans_us[span][index]) for span, name in _SPANS.items()}
