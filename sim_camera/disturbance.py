@@ -95,7 +95,8 @@ def preset_disturbance(
         wavelength_nm: central wavelength.
         scale: factor on the amplitude.
         static_nm: constant wavefront, nm rms by Noll index.
-        line_width: width of the reaction wheel's lines between half-power points, as a fraction of their frequency.
+        line_width: width of the reaction wheel's lines between half-power points, as a fraction of their frequency; 0
+            for undamped lines.
 
     Raises:
         ValueError: unknown preset.
@@ -155,7 +156,7 @@ def with_sources(
         disturbance: the disturbance without them.
         rate_hz: frame rate.
         drift_nm: random walk of modes, nm per root second by Noll index.
-        drift_slope: slope of the drift's spectrum; 2 for a random walk.
+        drift_slope: the drift's power per hertz falls as 1 / f^drift_slope; 2 for a random walk.
         jitter_nm: rms of tip and of tilt, white from 0.5 to 1.5 times the frame rate.
         shear: rms of the beam's slow wander on the sensor's masks along each axis, pupil diameters.
     """
@@ -373,7 +374,7 @@ def _thermal_nm(noll: tuple[int, ...]) -> Array:
 
 
 def _drift(rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]) -> tuple[Array, Complex]:
-    """Sine waves, evenly spaced in log frequency, whose power per hertz falls as 1/f^2."""
+    """Sine waves, evenly spaced in log frequency, whose power per hertz falls as 1/f^2; `rms_nm` (modes,): of the sum."""
     frequencies = np.geomspace(*band_hz, _WAVES_PER_BAND) * rng.uniform(0.95, 1.05, _WAVES_PER_BAND)
     weights = frequencies**-0.5
     weights *= np.sqrt(2 / np.sum(weights**2))

@@ -20,7 +20,7 @@ from sim_camera.pixels import PixelErrors
 GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 """The two Gauss-Legendre nodes in [0, 1], in exposure times: their mean is exact to third order in time."""
 _MAX_NODES = 256
-"""Largest number of nodes, which bounds the time to compute them and a frame; reached below 1 Hz."""
+"""Largest number of nodes, which bounds the time to compute them and a frame; reached at frame rates below 1 Hz."""
 
 
 @dataclass(frozen=True, slots=True)

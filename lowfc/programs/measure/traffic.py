@@ -30,7 +30,7 @@ _FRAME_SHAPE = (80, 80)
 _MIRROR = "dm"
 _TIME_NS = 1_767_225_600_000_000_000
 
-_VARIETY = 32  # a payload repeats only after the window of the log's compression
+_VARIETY = 32  # different frames: a payload repeats only beyond the window of the log's compression
 _TIMING_HZ = 10.0
 _BEAT_FRAMES = 50
 _WAIT_S = 0.05

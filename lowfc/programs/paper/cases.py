@@ -138,7 +138,10 @@ class Prepared:
         in_band: bool = False,
         nuisance: Array | None = None,
     ) -> Fit:
-        """A linear estimator of the first modes, at the central wavelength or over the band."""
+        """A linear estimator of the first modes, at the central wavelength or over the band.
+
+        `scale_e` is the electrons of the open circle's light, `kind` one of `KINDS`.
+        """
         if in_band:
             I0, H = self.band_I0, self.band_tilt_H if modes <= 2 else self.band_H
         else:

@@ -33,7 +33,7 @@ _DPI = 110
 
 
 class Line(NamedTuple):
-    """Points (n,) with a name, joined by a line or single."""
+    """Points (n,) with a name, joined by a line or drawn as markers."""
 
     name: str
     x: Array
@@ -46,7 +46,7 @@ Panel = Callable[["Figure", "Axes"], None]
 
 
 def draw(path: Path, panels: Sequence[Panel], caption: str, columns: int = 3, wide: bool = False) -> None:
-    """Draw panels in rows with a caption below, as a PNG file."""
+    """Draw panels in rows with a caption below, as a PNG file; `wide` panels have one and a half times the width."""
     figure_type = figure_class()
     columns = min(columns, len(panels))
     rows = ceil(len(panels) / columns)

@@ -140,7 +140,7 @@ class ChaosBench:
         return Client(self.run.run_id, bus=self.bus)
 
     def mark(self, name: str) -> None:
-        """Record the present time by a name."""
+        """Record the present time under a name."""
         self.outcome.marks[name] = HostClock().host_ns()
 
     def await_steps(self, count: int) -> None:
@@ -163,7 +163,7 @@ class ChaosBench:
             time.sleep(_POLL_S)
 
     def pause(self, shortest_s: float, longest_s: float) -> None:
-        """Wait for a random time."""
+        """Wait for a random time in this range."""
         time.sleep(self.rng.uniform(shortest_s, longest_s))
 
     def process(self, role: Role) -> str:
@@ -198,7 +198,7 @@ class ChaosBench:
         process.send_signal(number)
 
     def restart(self, name: str, command: list[str] | None = None, *, ready: bool = True) -> None:
-        """Restart a process that has ended, with the same or another command line; wait until it is ready."""
+        """Start a process again that has ended, with the same or another command line; if `ready`, wait until it is."""
         stderr = self.folder / f"{name}-{next(self._numbers)}.stderr"
         self._start(Child(name, command or self.children[name].command, stderr), ready=ready)
 
