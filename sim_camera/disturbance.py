@@ -374,7 +374,7 @@ def _thermal_nm(noll: tuple[int, ...]) -> Array:
 
 
 def _drift(rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]) -> tuple[Array, Complex]:
-    """Sine waves, evenly spaced in log frequency, whose power per hertz falls as 1/f^2; `rms_nm` (modes,): of the sum."""
+    """Sine waves, even in log frequency, whose power per hertz falls as 1/f^2; `rms_nm` (modes,): of their sum."""
     frequencies = np.geomspace(*band_hz, _WAVES_PER_BAND) * rng.uniform(0.95, 1.05, _WAVES_PER_BAND)
     weights = frequencies**-0.5
     weights *= np.sqrt(2 / np.sum(weights**2))

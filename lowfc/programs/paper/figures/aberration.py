@@ -71,17 +71,17 @@ def fig1(context: Context) -> list[Row]:
         rows += _between_samples(prepared(name))
         for coma in COMAS:
             case = _aberrated(context, name, coma)
-            ready, what = case.ready, f"{name}, coma Z{coma}"
+            ready, row_name = case.ready, f"{name}, coma Z{coma}"
             flat, aberrated = _contrast(ready, 0.0 * case.truth_nm), _contrast(ready, case.truth_nm)
             rows += [
-                Row(what, "contrast, flat wavefront", "", flat, _PAPER_GOAL),
-                Row(what, "contrast, aberrated", "", aberrated),
-                Row(what, "aberrated over flat", "", aberrated / flat, _PAPER_WORSE),
+                Row(row_name, "contrast, flat wavefront", "", flat, _PAPER_GOAL),
+                Row(row_name, "contrast, aberrated", "", aberrated),
+                Row(row_name, "aberrated over flat", "", aberrated / flat, _PAPER_WORSE),
             ]
             for key in _CORRECTED:
-                corrected = context.map(f"{what}, {key}", partial(_contrast, ready), case.residuals_nm[key])
+                corrected = context.map(f"{row_name}, {key}", partial(_contrast, ready), case.residuals_nm[key])
                 mean, error = mean_and_error(np.array(corrected))
-                fitted = partial(Row, what, modes=MODES, estimator=key)
+                fitted = partial(Row, row_name, modes=MODES, estimator=key)
                 rows += [
                     fitted("contrast, corrected", "", mean, error=error, limit=flat),
                     fitted("corrected over flat", "", mean / flat, error=error / flat, limit=1.0),
@@ -99,10 +99,10 @@ def _between_samples(ready: Prepared) -> list[Row]:
     columns = 2 * _VIEW * _FINE_SAMPLES_PER
     image = _image(ready, np.zeros(MODES), _FINE_SAMPLES_PER)
     zone = image[wedge_samples(ready.coronagraph.dark_zone, columns, columns, _FINE_SAMPLES_PER)]
-    what = f"{ready.name}, dark zone, {_FINE_SAMPLES_PER} samples per lambda/D"
+    row_name = f"{ready.name}, dark zone, {_FINE_SAMPLES_PER} samples per lambda/D"
     return [
-        Row(what, "largest contrast, flat wavefront", "", float(zone.max()), _PAPER_GOAL),
-        Row(what, f"samples above 1e-9, of {zone.size}", "", float((zone > _PAPER_GOAL).sum())),
+        Row(row_name, "largest contrast, flat wavefront", "", float(zone.max()), _PAPER_GOAL),
+        Row(row_name, f"samples above 1e-9, of {zone.size}", "", float((zone > _PAPER_GOAL).sum())),
     ]
 
 

@@ -140,14 +140,14 @@ def fig10(context: Context) -> list[Row]:
     for name in context.names("sam", "clowfs"):
         ready = prepared(name)
         for axis in (0, 1):
-            what, (flat_e, change_e) = f"{name}, tilt {'xy'[axis]}", _tilted_e(ready, axis)
+            row_name, (flat_e, change_e) = f"{name}, tilt {'xy'[axis]}", _tilted_e(ready, axis)
             signal_e, paper = float(np.ptp(change_e)), PAPER_SIGNAL.get(ready.paper_name)
             ratio = np.abs(change_e) / np.sqrt(variance_e(flat_e + change_e, TABLE4_READ_NOISE_E))
             rows += [
-                Row(what, "P-V change over peak", "", signal_e / float(flat_e.max()), paper),
-                Row(what, "P-V change", "e-", signal_e),
-                Row(what, "largest signal-to-noise ratio of a pixel", "", float(ratio.max())),
-                Row(what, "signal-to-noise ratio of the image", "", float(np.sqrt(np.sum(ratio**2)))),
+                Row(row_name, "P-V change over peak", "", signal_e / float(flat_e.max()), paper),
+                Row(row_name, "P-V change", "e-", signal_e),
+                Row(row_name, "largest signal-to-noise ratio of a pixel", "", float(ratio.max())),
+                Row(row_name, "signal-to-noise ratio of the image", "", float(np.sqrt(np.sum(ratio**2)))),
             ]
     return assuming(
         rows,

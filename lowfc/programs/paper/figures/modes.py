@@ -197,8 +197,8 @@ def fig8(context: Context) -> list[Row]:
         truth, estimates = _one_wavefront(context, names[0], literal)
         for key in (PINV, WEIGHTED_2):
             worst = float(np.abs(estimates[key] - truth).max())
-            what = f"largest error of a random wavefront, {bounds} input"
-            rows.append(new_row(what, "waves", worst, paper, estimator=key))
+            quantity = f"largest error of a random wavefront, {bounds} input"
+            rows.append(new_row(quantity, "waves", worst, paper, estimator=key))
     return rows
 
 
@@ -220,11 +220,11 @@ def _range_rows(context: Context, name: str) -> Iterator[Row]:
             yield fitted(name, f"mean deviation at {amplitude}", "", float(deviation[:, j].mean()), paper)
             yield fitted(name, f"largest deviation at {amplitude}", "", float(deviation[:, j].max()))
         ranges = np.array([linear_range(mode) for mode in deviation])
-        what = "amplitude of 10 % deviation"
-        yield fitted(name, f"{what}, median mode", "waves", _amplitude(float(np.median(ranges))))
-        yield fitted(name, f"{what}, worst mode", "waves", _amplitude(float(ranges.min())))
+        quantity = "amplitude of 10 % deviation"
+        yield fitted(name, f"{quantity}, median mode", "waves", _amplitude(float(np.median(ranges))))
+        yield fitted(name, f"{quantity}, worst mode", "waves", _amplitude(float(ranges.min())))
         for noll, each in zip(NOLLS_14, ranges, strict=True) if iterations == 0 else ():
-            yield fitted(f"{name}, Z{noll}", what, "waves", _amplitude(each))
+            yield fitted(f"{name}, Z{noll}", quantity, "waves", _amplitude(each))
 
 
 def _amplitude(waves: float) -> float | str:

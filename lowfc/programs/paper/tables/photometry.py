@@ -102,17 +102,17 @@ def _signals(sensor: Prepared) -> Iterator[Row]:
     in_band = float(sensor.band_I0.max() / sensor.band_I0.sum())
     yield Row(sensor.name, "brightest pixel / image, in the band", "", in_band, peak, assumption=band)
     for axis, direction in enumerate("xy"):
-        what = f"P-V of the signal of 1 mas in {direction} / brightest pixel"
+        quantity = f"P-V of the signal of 1 mas in {direction} / brightest pixel"
         ratio = float(np.ptp(tilt_signal(sensor, axis)) / sensor.band_I0.max())
-        yield Row(sensor.name, what, "", ratio, signal, assumption=band)
+        yield Row(sensor.name, quantity, "", ratio, signal, assumption=band)
 
 
 def _ratios(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
     own, paper = np.ptp(tilt_signal(clowfs, 0)) / np.ptp(tilt_signal(sam, 0)), PAPER_SIGNAL_RATIO
     for k, light in enumerate(("own photometry", "paper's electrons")):
         counts = [float(paper_count_e(each) / each.band_I0.sum()) if k else 1.0 for each in (clowfs, sam)]
-        what, ratio = f"P-V of the signal of 1 mas in electrons, {light}", float(own * counts[0] / counts[1])
-        yield Row("clowfs / sam", what, "", ratio, paper, assumption="Band in five wavelengths, x tilt.")
+        quantity, ratio = f"P-V of the signal of 1 mas in electrons, {light}", float(own * counts[0] / counts[1])
+        yield Row("clowfs / sam", quantity, "", ratio, paper, assumption="Band in five wavelengths, x tilt.")
     predicted = f"Predicted; the ratio in the paper's Table 4 is {TABLE4_MAS['sam'][1] / TABLE4_MAS['clowfs'][1]:.1f}."
     for k, light in enumerate(("paper's electrons", "own photometry")):
         scatter = []

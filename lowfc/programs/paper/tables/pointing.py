@@ -165,8 +165,8 @@ def _rows(
 def _dimmed_rows(sensor: Prepared, exposure: Exposure, tilted: Array) -> Iterator[Row]:
     """Predictions with the throughput of the paper's pupil."""
     linear = fits(sensor, exposure, 1)
-    what, paper = f"predicted std of x tilt, 1 mas, {exposure.name}", TABLE4_MAS.get(_paper_name(sensor), {}).get(1)
+    quantity, paper = f"predicted std of x tilt, 1 mas, {exposure.name}", TABLE4_MAS.get(_paper_name(sensor), {}).get(1)
     for kind in KINDS:
         std, limit = predicted_mas(linear[2, kind], tilted * exposure.scale_e), bound_mas(linear[2, kind])
         fitted = partial(Row, sensor.name, modes=2, estimator=kind, assumption=exposure.assumption)
-        yield fitted(what, "mas", float(std[0]), paper, limit=float(limit[0]))
+        yield fitted(quantity, "mas", float(std[0]), paper, limit=float(limit[0]))

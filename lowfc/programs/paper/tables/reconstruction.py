@@ -172,8 +172,8 @@ def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, estimated: E
             ("RMS", paper[0], estimated.bound_nm / sensor.sensor.wavelength_nm, _rms(sensor, residuals_nm)),
             ("P-V", paper[1], None, _pv(sensor, residuals_nm)),
         ):
-            what = f"{statistic} residual, {wavefronts.name} input"
-            yield fitted(what, measured=mean, paper=value, error=error, limit=limit)
+            quantity = f"{statistic} residual, {wavefronts.name} input"
+            yield fitted(quantity, measured=mean, paper=value, error=error, limit=limit)
 
 
 def _rms(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:

@@ -86,10 +86,13 @@ def pair_rows(name: str) -> Iterator[Row]:
     shift = zero_point_nm(name)
     by_colour = _image(shift, len(flat)) - flat
     yield new_row("zero-point shift by colour", unit="nm", measured=float(np.linalg.norm(shift)))
-    for what, change in (("I0 of the reference star", by_noise + by_colour), ("I0 measured again", by_noise)):
-        yield new_row(f"mean change after subtraction, {what}", measured=float(change[zone].mean()))
+    for reference_image, change in (
+        ("I0 of the reference star", by_noise + by_colour),
+        ("I0 measured again", by_noise),
+    ):
+        yield new_row(f"mean change after subtraction, {reference_image}", measured=float(change[zone].mean()))
         yield new_row(
-            f"rms change after subtraction, {what}",
+            f"rms change after subtraction, {reference_image}",
             measured=float(np.sqrt(np.mean(change[zone] ** 2))),
             assumption=f"{ASSUMPTION}\n{MAP}",
         )

@@ -69,8 +69,8 @@ def _peaks(context: Context, name: str) -> Iterator[Row]:
         "the ratio of single pixels has no bound, because I0 has dark pixels."
     )
     for noll, value in zip(NOLLS_14, peaks, strict=True):
-        what, paper = f"peak differential intensity of Z{noll}, {mode_name(noll)}", PAPER_TABLE2[noll]
-        yield Row(name, what, "", value, paper if sensor.paper_name == "sam" else None, assumption=assumption)
+        quantity, paper = f"peak differential intensity of Z{noll}, {mode_name(noll)}", PAPER_TABLE2[noll]
+        yield Row(name, quantity, "", value, paper if sensor.paper_name == "sam" else None, assumption=assumption)
 
 
 TABLES: dict[str, Case] = {

@@ -212,10 +212,10 @@ def _checked(context: Context) -> list[Row]:
 
 def in_text(row: Mapping[str, Any]) -> bool:
     """Whether a row is on the page and in its JSON file; `--json` prints all rows."""
-    what = row["quantity"]
-    if not what.startswith(("drift", "line")):
+    quantity = row["quantity"]
+    if not quantity.startswith(("drift", "line")):
         return True
-    shown = any(f"of Z{noll} " in what for noll in _SHOWN_NOLLS) and what.endswith(_SHOWN_ENDS)
+    shown = any(f"of Z{noll} " in quantity for noll in _SHOWN_NOLLS) and quantity.endswith(_SHOWN_ENDS)
     return shown and row["estimator"] == ESTIMATORS["lqg"]
 
 
