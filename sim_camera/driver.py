@@ -254,6 +254,7 @@ class SimulatedCamera:
             health.recent_wavefront.CopyFrom(wire.WavefrontFigures(**recent))
 
     def _start_ns(self) -> int:
+        """Start of the next exposure."""
         return self._origin_ns + self._index * self._config.period_ns
 
     def _publish_truth(self) -> None:
@@ -335,6 +336,7 @@ class SimulatedCamera:
             self._service.event(event, percent=self._lateness.percent)
 
     def _no_progress(self) -> str:
+        """Text of the error of a run in lockstep without progress."""
         now_ns = self._service.clock.host_ns()
         silent = [
             name

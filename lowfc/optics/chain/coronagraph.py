@@ -67,6 +67,7 @@ class LyotStop:
         return np.asarray(stopped - self._blocked(stopped.conj()).conj())
 
     def _blocked(self, field: Array | Complex) -> Complex:
+        """Field (n, n) in the stop's plane of the light that the mask blocks."""
         focal = to_image(np.asarray(field, np.complex128), len(self.opaque), self.samples_per, 1.0)
         return to_pupil(focal * self.opaque, len(field), self.samples_per, 1.0)
 

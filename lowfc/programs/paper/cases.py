@@ -252,6 +252,7 @@ def plain(row: Row) -> dict[str, Any]:
 
 
 def _plain(value: float | str | None) -> float | str | None:
+    """A value for JSON: floats rounded to six digits."""
     if not isinstance(value, float):
         return value
     return float(f"{value:.6g}") if isfinite(value) else str(value)  # JSON has no infinity

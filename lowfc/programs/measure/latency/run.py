@@ -221,6 +221,7 @@ def _references(options: LatencyOptions, run: Run) -> dict[str, Any]:
 
 
 def _options(run: Run) -> list[str]:
+    """Command-line options that name the run and its configuration file."""
     return ["--run", run.run_id, "--config", str(run.path / "config.toml")]
 
 
@@ -248,6 +249,7 @@ def _run_children(
 
 
 def _check_ends(children: list[Child]) -> None:
+    """Raise ProcessDiedError if a process ended with an error."""
     for child in children:
         if child.status not in (0, INTERRUPTED):
             raise died(child)

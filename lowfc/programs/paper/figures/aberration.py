@@ -49,6 +49,7 @@ class _Aberrated:
 
 @lru_cache(maxsize=8)
 def _aberrated(context: Context, name: str, coma: int) -> _Aberrated:
+    """lambda/30 of focus and of the coma with this Noll index, seen by a sensor."""
     ready = prepared(name)
     truth_nm = np.zeros(MODES)
     truth_nm[[NOLLS_14.index(4), NOLLS_14.index(coma)]] = ready.sensor.wavelength_nm / 30.0
@@ -181,6 +182,7 @@ def _image(ready: Prepared, modes_nm: Array, samples_per: int) -> Array:
 
 
 def _contrast(ready: Prepared, modes_nm: Array) -> float:
+    """Mean contrast from 4.5 to 5.5 lambda/D with a wavefront (modes,)."""
     return mean_contrast(ready.coronagraph, ready.opd_nm(modes_nm), ready.sensor.wavelength_nm, _RING)
 
 

@@ -135,6 +135,7 @@ def _r_squared(context: Context) -> dict[str, Array]:
 
 
 def _r_squared_limit(ready: Prepared) -> Array:
+    """Coefficient of determination (modes,) of estimates whose errors are at the Cramer-Rao bound."""
     wavefronts = _matched(ready)
     bounds_nm = bounds_waves(NOLLS_14, wavefronts.low, wavefronts.high) * ready.sensor.wavelength_nm
     return expected_r_squared(np.diag(bound_nm2(ready)), bounds_nm)

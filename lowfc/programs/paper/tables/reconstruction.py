@@ -186,5 +186,6 @@ def _rms(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:
 
 
 def _pv(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:
+    """Mean peak to valley over the open pupil of wavefronts, and its standard error, waves."""
     values = trials.residual_pv(sensor.open_modes[: coefficients_nm.shape[1]], coefficients_nm)
     return mean_and_error(values / sensor.sensor.wavelength_nm)

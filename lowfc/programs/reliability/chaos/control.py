@@ -141,7 +141,7 @@ FLIPS, FLOOD_VALUES, FLOOD_HZ = 40, 4000, 2000
 
 @case(
     "interlock",
-    "an interlock's value changes at random times, then arrives 2,000 times a second; the last acts until it is old",
+    "an interlock's value changes at random times, then comes 2,000 times a second; the last one acts until it expires",
     config={"interlocks": [INTERLOCK]},
     expected=("INTERLOCK_ACTS", "INTERLOCK_CLEARED"),
 )
