@@ -23,7 +23,7 @@ from lowfc.control.loop.guard import MIN_BLOCK_FRAMES, WORSE_BLOCKS
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, WHILE_FRAMES, case, no_mounts, no_other_clock, read_only
-from lowfc.programs.reliability.chaos.processes import killed
+from lowfc.programs.reliability.chaos.processes import kill_and_restart
 
 STABLE_FRACTION = 0.9
 """Fraction of the limiting gain: the loop is stable and nearly oscillates."""
@@ -132,7 +132,7 @@ def _damaged_calibration(bench: ChaosBench) -> None:
 def _restart_in_safe_mode(bench: ChaosBench) -> None:
     bench.client().safe()
     bench.await_steps(WHILE_FRAMES)
-    killed(Role.CONTROLLER)(bench)
+    kill_and_restart(Role.CONTROLLER)(bench)
 
 
 INTERLOCK = {"name": "mask", "value": True, "action": "hold", "max_age_s": 1.0, "when_old": "passes"}

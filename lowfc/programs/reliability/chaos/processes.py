@@ -31,7 +31,7 @@ _EVENTS: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-def killed(role: Role, after_s: tuple[float, float] = (0.1, 1.0)) -> Act:
+def kill_and_restart(role: Role, after_s: tuple[float, float] = (0.1, 1.0)) -> Act:
     """Act of a case: kill a process, and restart it after a random time in this range."""
 
     def act(bench: ChaosBench) -> None:
@@ -44,7 +44,7 @@ def killed(role: Role, after_s: tuple[float, float] = (0.1, 1.0)) -> Act:
     return act
 
 
-def frozen(role: Role, for_s: tuple[float, float] = (0.5, 2.0)) -> Act:
+def stop_and_continue(role: Role, for_s: tuple[float, float] = (0.5, 2.0)) -> Act:
     """Act of a case: stop a process (SIGSTOP), and continue it after a random time in this range."""
 
     def act(bench: ChaosBench) -> None:
@@ -57,28 +57,32 @@ def frozen(role: Role, for_s: tuple[float, float] = (0.5, 2.0)) -> Act:
 
 
 for _role, (_names, _) in _EVENTS.items():
-    process_case(f"kill-{_role}", f"kill -9 of the {_role}, restarted up to 1 s later", expected=_names)(killed(_role))
+    process_case(f"kill-{_role}", f"kill -9 of the {_role}, restarted up to 1 s later", expected=_names)(
+        kill_and_restart(_role)
+    )
 for _role, (_, _names) in _EVENTS.items():
-    process_case(f"freeze-{_role}", f"SIGSTOP of the {_role}, SIGCONT 0.5 to 2 s later", expected=_names)(frozen(_role))
+    process_case(f"freeze-{_role}", f"SIGSTOP of the {_role}, SIGCONT 0.5 to 2 s later", expected=_names)(
+        stop_and_continue(_role)
+    )
 process_case(
     "silent-camera",
     'kill -9 of the camera with `on_frame_timeout = "flat"` and 40 nm of static focus; restarted after 1 s',
     config={"control.on_frame_timeout": "flat", **_STATIC},
     expected=("NO_FRAMES", "CAMERA_RESTARTED"),
-)(killed(Role.CAMERA, (1.0, 1.0)))
+)(kill_and_restart(Role.CAMERA, (1.0, 1.0)))
 process_case(
     "lost-mirror",
     "kill -9 of the mirror with 40 nm of static focus; restarted after 3 s",
     config=_STATIC,
     expected=("MIRROR_LOST", "MIRROR_BACK"),
-)(killed(Role.MIRROR, (3.0, 3.0)))
+)(kill_and_restart(Role.MIRROR, (3.0, 3.0)))
 
 
 @process_case("random", "six kill -9 or SIGSTOP of random processes, at random times")
 def _at_random(bench: ChaosBench) -> None:
     for _ in range(RANDOM_FAULTS):
         role = bench.rng.choice((Role.CAMERA, Role.CONTROLLER, Role.MIRROR, Role.RECORDER))
-        act = killed(role) if bench.rng.random() < 0.5 else frozen(role, (0.1, 1.0))
+        act = kill_and_restart(role) if bench.rng.random() < 0.5 else stop_and_continue(role, (0.1, 1.0))
         act(bench)
         bench.pause(0.0, 1.0)
 
