@@ -95,7 +95,7 @@ def _violations(what: str, limits: Limits, shapes: list[Entry], moving: Mask) ->
         ("slew", slews[same].max(initial=0), limits.slew_nm),
     ):
         if value > bound:
-            yield f"{what}: {name} {value:.2f} nm above {bound:g}"
+            yield f"{what}: {name} {value:.2f} nm, above the limit of {bound:g} nm"
 
 
 def restart_steps_nm(evidence: Evidence) -> list[float]:
