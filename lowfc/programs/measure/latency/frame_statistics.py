@@ -105,8 +105,8 @@ def frame_outcomes(
         timing: frame sequences, and the durations of the controller's stages, ns, by name as in ControlTiming.
         mirror: frame sequence and publication time, ns, of each mirror state; the first state of a frame counts.
     """
-    row, mirror_row = rows_of(sequence, timing[0]), rows_of(sequence, mirror[0])
-    stages_us = {stage: np.append(column / 1e3, np.nan)[row] for stage, column in timing[1].items()}
+    timing_row, mirror_row = rows_of(sequence, timing[0]), rows_of(sequence, mirror[0])
+    stages_us = {stage: np.append(column / 1e3, np.nan)[timing_row] for stage, column in timing[1].items()}
     transport_us, command_us = stages_us["transport"], stages_us["frame_to_command"]
     mirror_us = np.where(mirror_row < 0, np.nan, (np.append(mirror[1], 0)[mirror_row] - put_ns) / 1e3)
     spans_us = {
@@ -124,11 +124,11 @@ def frame_outcomes(
             "due_to_command": late_us + command_us,
             "due_to_mirror": late_us + mirror_us,
         }
-    return FrameOutcomes(put_ns, (row >= 0) | (mirror_row >= 0), spans_us)
+    return FrameOutcomes(put_ns, (timing_row >= 0) | (mirror_row >= 0), spans_us)
 
 
 def percentiles(values: npt.NDArray[Any]) -> dict[str, float] | None:
-    """The `PERCENTILES` of the finite values, each one of these values; None without any."""
+    """The `PERCENTILES` of the finite values, each of which is one of them; None without any."""
     known = np.sort(values[np.isfinite(values)])
     if not known.size:
         return None

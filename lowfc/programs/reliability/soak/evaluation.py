@@ -52,11 +52,12 @@ def process_statistics(samples: Sequence[Usage]) -> dict[str, Any]:
     """First, largest and last usage of one process, the slope of its memory, and which resources grow."""
     times_s, memory_bytes, handles, threads = zip(*samples, strict=True)
     memory_mb = [size / 1e6 for size in memory_bytes]
-    memory = slope(times_s, memory_mb)
+    memory_slope = slope(times_s, memory_mb)
     grows, too_short = [], ["memory", "handles", "threads"]
-    if memory is not None:
+    if memory_slope is not None:
+        mb_per_hour, error = memory_slope
         evaluated_h = (times_s[-1] - times_s[0]) / 3600 * (1 - WARM_UP)
-        leaks = memory[0] > SIGNIFICANT * memory[1] and memory[0] * evaluated_h > MIN_GROWTH_MB
+        leaks = mb_per_hour > SIGNIFICANT * error and mb_per_hour * evaluated_h > MIN_GROWTH_MB
         checks = {"memory": leaks, "handles": _grew(handles), "threads": _grew(threads)}
         grows, too_short = [name for name, grew in checks.items() if grew], []
     measured = {"memory": [round(mb, 2) for mb in memory_mb], "handles": handles, "threads": threads}
@@ -64,7 +65,7 @@ def process_statistics(samples: Sequence[Usage]) -> dict[str, Any]:
     for what, values in measured.items():
         unit = "_mb" if what == "memory" else ""
         ends |= {f"{what}_first{unit}": values[0], f"{what}_most{unit}": max(values), f"{what}_last{unit}": values[-1]}
-    return {**ends, **_per_hour("memory_mb", memory), "grows": grows, "too_short": too_short}
+    return {**ends, **_per_hour("memory_mb", memory_slope), "grows": grows, "too_short": too_short}
 
 
 def latency_statistics(samples: Sequence[tuple[float, float, float]]) -> dict[str, float | None]:
