@@ -73,7 +73,7 @@ def _calibration(text: str) -> Any:
 
 _READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "modes": ("modes", lambda text: noll_of([text] if text else None)),
-    "values": ("values", lambda text: numbers(text)),
+    "values": ("values", lambda text: parse_numbers(text)),
     "text": ("text", str),
     "actuators": ("actuators_nm", _shape),
     "law": ("law", _law),
@@ -97,8 +97,8 @@ _LABELS = {
 _LAST_FIELD = "modes"
 
 
-def numbers(text: str) -> list[float]:
-    """Numbers separated by spaces or commas; ConfigurationError for anything else."""
+def parse_numbers(text: str) -> list[float]:
+    """Parse numbers separated by spaces or commas; ConfigurationError for anything else."""
     try:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
@@ -112,10 +112,10 @@ def request_action(key: str, name: str, confirm: str = "") -> Action:
     def ask(loop: Client, values: Values) -> Answer:
         if name == "gain" and values["values"] == AUTO:
             return loop.automatic_gain(_READERS["modes"][1](values["modes"]))
-        read = {_READERS[field][0]: _READERS[field][1](text) for field, text in values.items()}
+        arguments = {_READERS[field][0]: _READERS[field][1](text) for field, text in values.items()}
         if name == "channel":  # this method of the client checks the shape against the mirror's grid
-            return loop.channel(read["text"], read["actuators_nm"])
-        return loop.ask(name, **read)
+            return loop.channel(arguments["text"], arguments["actuators_nm"])
+        return loop.ask(name, **arguments)
 
     names = sorted((field for field, _ in declared.fields), key=lambda field: field == _LAST_FIELD)
     labels = ((field, _LABELS.get(field) or _LABELS.get(f"{name} {field}")) for field in names)
@@ -172,7 +172,7 @@ ACTIONS = (
         "Measure a calibration by poking the mirror.",
         (
             Field("method", "method: poke, hadamard, in-loop", lambda: "hadamard"),
-            Field("snr", "snr: signal-to-noise ratio to reach", lambda: "70"),
+            Field("snr", "snr: signal-to-noise ratio to reach in the noisiest mode", lambda: "70"),
             _OUT,
             _LOAD._replace(label="load: load it into the loop (yes, no)"),
         ),
@@ -184,4 +184,4 @@ ACTIONS = (
     request_action("n", "note"),
 )
 """Buttons in the order of the screen."""
-ALL_ACTIONS = {one.name: one for one in (*ACTIONS, SAFE)}
+ALL_ACTIONS = {action.name: action for action in (*ACTIONS, SAFE)}

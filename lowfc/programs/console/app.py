@@ -49,7 +49,7 @@ _OTHER_KEYS = (
 
 
 class Answered(Message):
-    """The answer to an action, or the reason why it failed; with the form that requested it, if there was one."""
+    """The answer to an action, or the reason why it failed, and the form that was sent for it, if any."""
 
     def __init__(self, action: Action, form: Form | None, text: str, *, ok: bool) -> None:
         super().__init__()
@@ -95,7 +95,7 @@ class Console(OrderedKeys):
     ENABLE_COMMAND_PALETTE = False
     AUTO_FOCUS = None
     BINDINGS: ClassVar[list[BindingType]] = [
-        *(Binding(f"{one.key},{one.key.upper()}", f"press({one.name!r})") for one in ACTIONS),
+        *(Binding(f"{action.key},{action.key.upper()}", f"press({action.name!r})") for action in ACTIONS),
         Binding("s,S", f"press({SAFE.name!r})"),
         Binding(IMMEDIATE_KEY, f"press({SAFE.name!r})", priority=True),
         *(Binding(key, f"choose({by})") for key, by in (("up", -1), ("down", 1))),
@@ -152,8 +152,8 @@ class Console(OrderedKeys):
         yield Static(id="tasks", markup=False)
         with Horizontal(id="keys"):
             with Grid(id="buttons"):
-                for one in ACTIONS:
-                    yield Button(Text(f"{one.key} {one.name}"), id=_id(one), compact=True)
+                for action in ACTIONS:
+                    yield Button(Text(f"{action.key} {action.name}"), id=_id(action), compact=True)
             yield Button("SAFE\nkey s or F12", id=_id(SAFE))
         yield Lines("peers")
 
@@ -194,14 +194,14 @@ class Console(OrderedKeys):
         """Show the keys."""
         rows = [
             ("s F12", "SAFE", f"At once, in a form with F12: {SAFE.description}"),
-            *((one.key, one.name, one.description) for one in ACTIONS),
+            *((action.key, action.name, action.description) for action in ACTIONS),
             *_OTHER_KEYS,
         ]
         self.push_screen(Help(rows))
 
     @on(Button.Pressed)
     def _pressed(self, event: Button.Pressed) -> None:
-        name = next((one.name for one in ALL_ACTIONS.values() if _id(one) == event.button.id), None)
+        name = next((action.name for action in ALL_ACTIONS.values() if _id(action) == event.button.id), None)
         if name is not None:
             self.set_focus(None)
             self.action_press(name)
@@ -218,7 +218,7 @@ class Console(OrderedKeys):
     def _do(self, action: Action, values: Values, form: Form | None = None) -> None:
         """Start a task, or send a request, in a new thread.
 
-        Requests of the same button wait for each other's answers, except those of SAFE.
+        A request waits for the answer to the previous one of its button; those of SAFE do not wait.
         """
         self._answer(f"{action.name}: requested", ok=True)
         previous = self._requesting.get(action.name) if action is not SAFE else None
@@ -256,7 +256,7 @@ class Console(OrderedKeys):
             if event.ok:
                 event.form.dismiss()
             else:
-                event.form.refuse(event.text)
+                event.form.show_answer(event.text)
 
     def _answer(self, text: str, *, ok: bool) -> None:
         answer = self.screen_stack[0].query_one("#answer", Static)
@@ -308,7 +308,7 @@ class Console(OrderedKeys):
             self.bell()
 
     def _watch_tasks(self) -> None:
-        for task in [one for one in self._tasks if one.status is not None]:
+        for task in [task for task in self._tasks if task.status is not None]:
             self._tasks.remove(task)
             self._answer(task.status_line, ok=not task.status)
         self._static("#tasks").display = bool(self._tasks)

@@ -31,6 +31,8 @@ TREND_S = 34
 """Span of the sparklines, one column per second."""
 _IMPORT_AFTER_S = 4.0
 """Time after which a thread does the slow imports: the first values do not need them."""
+_PUNCTUAL_S = 0.5
+"""Time between two readings up to which the values count as up to date."""
 _TREND_STEP_NS = 1_000_000_000
 _HIDDEN_REQUESTS = frozenset(("status", "configuration", "renew"))
 """Periodic requests that change nothing."""
@@ -45,9 +47,9 @@ class Reading(NamedTuple):
         verdict: verdict, tiles and facts of the view.
         frame: newest frame; None before the first.
         command_nm: modal command of the last step, (modes,); empty before the first.
-        requests: requests received since the previous reading, without those that are not shown.
+        requests: requests received since the previous reading, without `_HIDDEN_REQUESTS`.
         residual_nm: residual, nm rms of wavefront, one value per second; NaN if unknown.
-        light: flux over that of the calibration, one value per second; NaN if unknown.
+        light: flux as a fraction of the calibration's, one value per second; NaN if unknown.
     """
 
     silent_s: float | None
@@ -75,7 +77,7 @@ class Feed(Monitor):
         super().__init__(bus, clock)
         self._run_id, self._requests = run_id, bus.ring(REQUEST, 200)
         self._config: Configuration | None = None
-        self._configured: set[tuple[str, int]] = set()  # start of its controller
+        self._configured: set[tuple[str, int]] = set()  # role and start, Unix s, of the controller that sent it
         self._frame: Pixels | None = None
         self._command_nm = np.zeros(0, np.float32)
         self._trend: deque[tuple[float, float]] = deque(maxlen=TREND_S)
@@ -87,9 +89,9 @@ class Feed(Monitor):
         imports.start()
 
     def read(self) -> Reading:
-        """Process the messages received since the last call."""
+        """Process the messages received since the last call, and return the present state."""
         now_s, host_ns = time.monotonic(), self._clock.host_ns()
-        behind_s, self._read_s = max(0.0, now_s - self._read_s - 0.5), now_s
+        behind_s, self._read_s = max(0.0, now_s - self._read_s - _PUNCTUAL_S), now_s
         requests = [_request(sample) for sample in self._requests.drain()]
         snapshot = self.snapshot(host_ns, behind_s)
         state = self.watcher.state()
@@ -105,7 +107,7 @@ class Feed(Monitor):
             judge(state, per_mas),
             self._frame,
             self._command_nm,
-            [one for one in requests if one is not None],
+            [request for request in requests if request is not None],
             [residual for residual, _ in self._trend],
             [light for _, light in self._trend],
         )
@@ -121,10 +123,13 @@ class Feed(Monitor):
         return super()._complete(found) and self._config is not None
 
     def _query(self) -> None:
-        """Query in a thread, as a frozen process delays the answer; the configuration, a logged request, once."""
+        """Query in a thread, because a frozen process delays the answer.
+
+        Each query of the configuration is a request in the log, so there is one for each start of the controller.
+        """
         query = super()._query
 
-        def queries() -> None:
+        def query_all() -> None:
             with contextlib.suppress(LowfcError):  # the console ends, or there is no controller that sends Health yet
                 query()
                 controller = {known for known in self._known if known[0] == Role.CONTROLLER}
@@ -132,11 +137,14 @@ class Feed(Monitor):
                     self._config = configuration_of(Client(self._run_id, bus=self._bus))
                     self._configured = controller
 
-        threading.Thread(target=queries, name="query", daemon=True).start()
+        threading.Thread(target=query_all, name="query", daemon=True).start()
 
 
 def _request(sample: Sample) -> wire.Request | None:
-    """A request; None if it is unreadable, changes nothing, or sets automatic gains, which an event reports."""
+    """Decode a request; None if it is unreadable, in `_HIDDEN_REQUESTS`, or the controller's own for automatic gains.
+
+    An event reports the automatic gains.
+    """
     try:
         request = wire.Request.FromString(sample.payload)
         checked_time_ns(request.timestamp)

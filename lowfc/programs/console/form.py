@@ -54,15 +54,15 @@ class Form(ModalScreen[None]):
                 yield Button("OK", id="ok", compact=True, variant="primary")
                 yield Button("leave", id="leave", compact=True)
 
-    def refuse(self, why: str) -> None:
-        """Show the reason of a refusal."""
-        self.query_one("#refusal", Static).update(why)
+    def show_answer(self, text: str) -> None:
+        """Show the reason of a refusal, or that the answer is awaited."""
+        self.query_one("#refusal", Static).update(text)
 
     @on(Input.Submitted)
     @on(Button.Pressed, "#ok")
     def _filled(self) -> None:
-        self.refuse("requested, waiting for the answer")
-        self.post_message(self.Filled(self, {one.name or "": one.value.strip() for one in self.query(Input)}))
+        self.show_answer("requested, waiting for the answer")
+        self.post_message(self.Filled(self, {field.name or "": field.value.strip() for field in self.query(Input)}))
 
     @on(Button.Pressed, "#leave")
     def _leave(self) -> None:

@@ -21,7 +21,7 @@ FINE_BELOW = 0.1
 """Knobs below this gain are turned in fine steps."""
 _BAR = 8  # columns of the bar beside that of the knob
 _BEFORE = 11  # columns before the bar
-_PENDING_S = 1.0  # until the controller's state has the requested gain
+_PENDING_S = 1.0  # time for which a knob shows the requested gain: by then the controller's state has it
 
 
 class Gains(Lines):
@@ -36,11 +36,11 @@ class Gains(Lines):
 
     def __init__(self) -> None:
         super().__init__("gains")
-        self._chosen = self._top = 0  # of all knobs; the first one shown
+        self._chosen = self._top = 0  # index of the chosen knob, and of the first one shown
         self._noll: tuple[int, ...] = ()
         self._gain = np.zeros(0, np.float32)
         self._automatic: Mask = np.zeros(0, bool)
-        self._pending: dict[int, tuple[float, float]] = {}
+        self._pending: dict[int, tuple[float, float]] = {}  # requested gain, and end of `_PENDING_S`, by knob
 
     def update(self, reading: Reading) -> None:
         """Show the gains of the run."""
@@ -103,7 +103,7 @@ class Gains(Lines):
             knob, indices = self._knob(number), self._indices(number)
             at = min(round(knob / HIGHEST * _BAR), _BAR)
             lowest = float(self._gain[indices].min())
-            least = "" if lowest >= 0.99 * knob else f"{lowest:.2g}-"
+            range_start = "" if lowest >= 0.99 * knob else f"{lowest:.2g}-"
             chosen = number == self._chosen
             lines.append(
                 Text.assemble(
@@ -111,7 +111,7 @@ class Gains(Lines):
                     ("━" * at, style(BLUE)),
                     ("●", BOLD),
                     ("━" * (_BAR - at), style(GREY)),
-                    f" {least}{knob:.2g}" if least else f" {knob:.3g}",
+                    f" {range_start}{knob:.2g}" if range_start else f" {knob:.3g}",
                     (" auto" if self._automatic[indices].all() else "", DIM),
                 )
             )

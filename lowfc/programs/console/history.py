@@ -21,22 +21,22 @@ class History:
     def __init__(self) -> None:
         self._lines: deque[tuple[wire.Request | Log, int]] = deque(maxlen=_LINES)
 
-    def add(self, one: wire.Request | Log) -> None:
+    def add(self, entry: wire.Request | Log) -> None:
         """Add an event or request; an event that repeats one of the last lines replaces it."""
         times = 1
         for line in range(len(self._lines) - 1, max(-1, len(self._lines) - 1 - _SEARCHED), -1):
-            if _repeats(self._lines[line][0], one):
+            if _repeats(self._lines[line][0], entry):
                 times += self._lines[line][1]
                 del self._lines[line]
                 break
-        self._lines.append((one, times))
+        self._lines.append((entry, times))
 
     def last(self, count: int) -> Text:
         """The newest `count` lines."""
         shown = list(self._lines)[-max(1, count) :]
         return Text("\n").join(
-            panels.request_line(one) if isinstance(one, wire.Request) else panels.event_line(one, times)
-            for one, times in shown
+            panels.request_line(entry) if isinstance(entry, wire.Request) else panels.event_line(entry, times)
+            for entry, times in shown
         )
 
 

@@ -54,7 +54,7 @@ class OrderedKeys(App[str]):
             self.set_timer(_TIMEOUT_S, partial(self._next_key, self._turn))
 
     def _follow(self, node: DOMNode, turn: int) -> None:
-        """Queue behind the key in each widget that it passes, up to the application itself."""
+        """Queue a call behind the key in each widget that the key passes, up to the application, then settle."""
         if node is self or not node.call_later(self._follow, node.parent or self, turn):
             self.call_later(self._settle, turn)
 

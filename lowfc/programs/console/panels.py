@@ -138,9 +138,9 @@ def modes(reading: Reading, width: int) -> list[Text]:
     if state is None or not noll or len(noll) != len(reading.command_nm):
         return [Text("no calibration, so no modes yet", DIM)]
     columns = -(-len(noll) // _MODE_LINES)
-    each = width // columns
+    cell_width = width // columns
     cells = [
-        _mode(mode, float(command), float(limit), each - 1)
+        _mode(mode, float(command), float(limit), cell_width - 1)
         for mode, command, limit in zip(noll, reading.command_nm, state.limit_nm, strict=False)
     ]
     lines = []
@@ -159,8 +159,8 @@ def _mode(noll: int, command_nm: float, limit_nm: float, width: int) -> Text:
     bar = "█" * round(share * half)
     left, right = (f"{bar:>{half}}", " " * half) if command_nm < 0 else (" " * half, f"{bar:{half}}")
     ink = WRONG if share >= _NEAR_LIMIT else style(ORANGE)
-    known = f"{numbers_text:>11}" if numbers_text else ""
-    return Text.assemble((f"Z{noll:<3}", DIM), (left, ink), ("│", DIM), (right, ink), known)
+    numbers_column = f"{numbers_text:>11}" if numbers_text else ""
+    return Text.assemble((f"Z{noll:<3}", DIM), (left, ink), ("│", DIM), (right, ink), numbers_column)
 
 
 def facts(reading: Reading) -> Text:
@@ -174,7 +174,7 @@ def facts(reading: Reading) -> Text:
 
 
 def peers(reading: Reading, run: str) -> Text:
-    """Processes and their rates; silent ones in red."""
+    """Processes, the silent ones in red, and the frame rate."""
     line = Text(f"run {run} ", DIM)
     snapshot = reading.state.snapshot
     for name, last in sorted(snapshot.health.items()):

@@ -5,7 +5,7 @@ import re
 from lowfc.programs.console.actions import ACTIONS, SAFE
 from lowfc.programs.view.verdicts.tile import numbers
 
-_KEYS = {one.name: one.key for one in (*ACTIONS, SAFE)} | {
+_KEYS = {action.name: action.key for action in (*ACTIONS, SAFE)} | {
     "law integrator": "i",
     "record start": "r",
     "record stop": "v",
@@ -17,9 +17,9 @@ _LIST = re.compile(rf"(?<![\w.]){_NUMBER}(?: {_NUMBER}){{3,}}(?![\w.])")
 
 def phrased(text: str) -> str:
     """A sentence with the console's keys, and short enough for its lines."""
-    return _LIST.sub(lambda found: numbers([float(one) for one in found[0].split()]), _COMMAND.sub(_key, text))
+    return _LIST.sub(lambda match: numbers([float(word) for word in match[0].split()]), _COMMAND.sub(_key, text))
 
 
-def _key(found: re.Match[str]) -> str:
-    name = f"{found[1]} {found[2]}" if f"{found[1]} {found[2]}" in _KEYS else found[1]
-    return f"{name} (key {_KEYS[name]})" if name in _KEYS else found[0]
+def _key(match: re.Match[str]) -> str:
+    name = f"{match[1]} {match[2]}" if f"{match[1]} {match[2]}" in _KEYS else match[1]
+    return f"{name} (key {_KEYS[name]})" if name in _KEYS else match[0]

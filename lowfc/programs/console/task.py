@@ -18,10 +18,11 @@ class Task:
         """Start `lowfc` with these arguments, in its own session: neither Ctrl-C nor a lost terminal reaches it."""
         self.name = name
         self._began_s = time.monotonic()
-        number, path = tempfile.mkstemp(prefix=f"lowfc-{words[0]}-", suffix=".txt")
+        descriptor, path = tempfile.mkstemp(prefix=f"lowfc-{words[0]}-", suffix=".txt")
         self.output = Path(path)
-        environment = {key: value for key, value in os.environ.items() if key != "ZENOH_RUNTIME"}  # set for monitors
-        with os.fdopen(number, "wb") as stream:
+        # ZENOH_RUNTIME is set for monitors; it would delay the messages of a command that computes.
+        environment = {key: value for key, value in os.environ.items() if key != "ZENOH_RUNTIME"}
+        with os.fdopen(descriptor, "wb") as stream:
             self._process = subprocess.Popen(  # noqa: S603  # our own program
                 [sys.executable, "-P", "-m", "lowfc", *words],  # -P: import nothing from the working directory
                 stdin=subprocess.DEVNULL,
