@@ -119,8 +119,8 @@ class Feed(Monitor):
             light = state.flux if state.frame_silent_s is None else None
             self._trend.append((nan if residual_nm is None else residual_nm, nan if light is None else light))
 
-    def _complete(self, found: Snapshot) -> bool:
-        return super()._complete(found) and self._config is not None
+    def _complete(self, snapshot: Snapshot) -> bool:
+        return super()._complete(snapshot) and self._config is not None
 
     def _query(self) -> None:
         """Query in a thread, because a frozen process delays the answer.

@@ -78,10 +78,10 @@ class FoxgloveBridge:
         self.join(bus)
 
     def join(self, bus: Bus) -> None:
-        """Subscribe to a run, in place of an earlier one of its name, whose bus is closed."""
+        """Subscribe on the bus of a run; the bus of an earlier run of the same name is closed by then."""
         self._bus, self._names = bus, Names()
         self.last_states.clear()
-        # Before the service, which subscribes to Health: peers take that to mean that it has all subscriptions.
+        # Before the service subscribes to Health: to peers, that shows that the viewer has all its subscriptions.
         for topic in SHOWN:
             bus.subscribe(topic, partial(self._publish, topic))
         self.service = Service(Role.VIEWER, self._run_id, self._clock, bus)

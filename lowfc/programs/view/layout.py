@@ -108,10 +108,10 @@ def _engineering() -> rrb.Container:
         name="Frame to command, us; last bar: overflow",
         plot_legend=rrb.PlotLegend(visible=False),
     )
-    spectra_ = (_picture(path) for path in (spectra.TILTS, spectra.OTHERS))
+    spectrum_views = (_picture(path) for path in (spectra.TILTS, spectra.OTHERS))
     return rrb.Horizontal(
         rrb.Vertical(*(plot.view() for plot in wavefront.MODES), row_shares=[5, 2, 2, 2]),  # room for the modes' names
-        rrb.Vertical(wavefront.GROUPS.view(), *spectra_, mirror.STROKE.view(), row_shares=[2, 4, 4, 2]),
+        rrb.Vertical(wavefront.GROUPS.view(), *spectrum_views, mirror.STROKE.view(), row_shares=[2, 4, 4, 2]),
         rrb.Vertical(
             histogram,
             latency.STAGE_DURATIONS.view(),
@@ -123,16 +123,16 @@ def _engineering() -> rrb.Container:
 
 
 def _picture(path: str) -> rrb.View:
-    title, shown = _PICTURES[path]
-    return rrb.Spatial2DView(origin=path, name=title, visual_bounds=shown)
+    title, visual_bounds = _PICTURES[path]
+    return rrb.Spatial2DView(origin=path, name=title, visual_bounds=visual_bounds)
 
 
 def _events(*, problems: bool = False) -> rrb.View:
-    shown = [rr.TextLogLevel.WARN, rr.TextLogLevel.ERROR, rr.TextLogLevel.CRITICAL]
+    levels = [rr.TextLogLevel.WARN, rr.TextLogLevel.ERROR, rr.TextLogLevel.CRITICAL]
     return rrb.TextLogView(
         origin=loop.LOG,
         name="Warnings and errors" if problems else "Events",
-        rows=rrb.TextLogRows(filter_by_log_level=shown) if problems else None,
+        rows=rrb.TextLogRows(filter_by_log_level=levels) if problems else None,
         columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"]),
     )
 

@@ -2,8 +2,8 @@
 
 Messages wait in ring buffers that keep the newest. A render thread draws them; the main thread monitors that thread,
 the viewer's process, and the memory of this process and of the viewer. After a failure the viewer restarts, with an
-event that gives the reason; a hung window is only reported, a closed one ends the view, and a failure to
-write the file ends it with an error.
+event that gives the reason. A hung window is only reported. A closed window ends the view; a failure to write the file
+ends it with an error.
 """
 
 import contextlib

@@ -45,25 +45,25 @@ class Monitor:
         self._queried_ns = 0
 
     def snapshot(self, now_ns: int, behind_s: float = 0.0) -> Snapshot:
-        """The messages since the last call; the published states of new processes are queried for the next."""
+        """Return the messages since the last call; states published by new processes are queried, for the next call."""
         while self._answers:
             self._accumulator.add(self._answers.popleft())
         for topic, ring in self._rings.items():
             for sample in ring.drain():
                 self._accumulator.add(sample)
                 self.newest[topic] = sample
-        found = self._accumulator.snapshot(now_ns, behind_s=behind_s)
-        processes = {(name, one.start_s) for name, one in found.health.items()}
-        incomplete = Role.CONTROLLER in found.health and not self._complete(found)
+        snapshot = self._accumulator.snapshot(now_ns, behind_s=behind_s)
+        processes = {(name, last.start_s) for name, last in snapshot.health.items()}
+        incomplete = Role.CONTROLLER in snapshot.health and not self._complete(snapshot)
         if not processes <= self._known or (incomplete and now_ns - self._queried_ns > _QUERY_AGAIN_NS):
             self._known, self._queried_ns = processes, now_ns
             self._query()
-        self.watcher.feed(found)
-        return found
+        self.watcher.feed(snapshot)
+        return snapshot
 
-    def _complete(self, found: Snapshot) -> bool:
+    def _complete(self, snapshot: Snapshot) -> bool:
         """Whether everything that is queried of the controller is known; subclasses may query more."""
-        return None not in (found.calibration, found.controller)
+        return None not in (snapshot.calibration, snapshot.controller)
 
     def _query(self) -> None:
         """Query the states published earlier."""

@@ -61,15 +61,15 @@ def draw_logs(
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
         for number, message in enumerate(reader):
             if renderer is None:
-                found, remarks = (config, []) if config else attached_configuration(reader)
-                if found is None:
+                known_config, remarks = (config, []) if config else attached_configuration(reader)
+                if known_config is None:
                     remarks.append(
                         "the default configuration is used for pupil and telescope, because the log has no readable one"
                     )
                 drawn.remarks += remarks
-                own = found or Configuration()
-                renderer = make_renderer(own)
-                accumulator = Accumulator(SIMULATED_START_NS if own.lockstep else None)
+                used_config = known_config or Configuration()
+                renderer = make_renderer(used_config)
+                accumulator = Accumulator(SIMULATED_START_NS if used_config.lockstep else None)
             if number == 0:
                 recorded = reader.metadata.get("lowfc", {})
                 previous_run, run, host = run, recorded.get("run", "") or run, host or recorded.get("host", "")

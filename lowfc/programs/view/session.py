@@ -38,8 +38,8 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
     """
     require_folder(target.written)
     run = open_run(run_id, ())
-    own = run.path / "config.toml"
-    config = config or load(own if own.exists() else None)
+    run_config = run.path / "config.toml"
+    config = config or load(run_config if run_config.exists() else None)
     clock = clock_of(config)
     with contextlib.ExitStack() as stack:
         if target.save is not None:
@@ -57,8 +57,8 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
         except ViewError as error:
             if target.part is None:
                 raise
-            rest = target.part.replace(f"{target.save}.part")
-            raise ViewError(f"{error}; the part written so far is in {rest}") from error
+            unfinished = target.part.replace(f"{target.save}.part")
+            raise ViewError(f"{error}; the part written so far is in {unfinished}") from error
         if not view.service.last_health and target.written is not None:
             raise ViewError(f"no message of run {run_id!r} has arrived: nothing is written")
         if target.picture is not None and view.viewer is not None:

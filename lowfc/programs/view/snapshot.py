@@ -74,7 +74,7 @@ class Wavefronts(NamedTuple):
 
 
 class LastHealth(NamedTuple):
-    """A process's last Health, when it was sent (host clock), the first one since its start, and that start, unix s."""
+    """A process's last Health, sent at `time_ns` (host clock), and the first since its start, `start_s` (Unix time)."""
 
     time_ns: int
     health: wire.Health
@@ -109,14 +109,14 @@ class Snapshot:
     """New data, and the latest states.
 
     Attributes:
-        time_ns: time on the timeline: that of the newest step, or frame without a controller, plus the time since. In
-            lockstep it is simulated time.
+        time_ns: time on the timeline: that of the newest step (without a controller: frame), plus the host time since
+            then. In lockstep it is simulated time.
         host_ns: time of the host clock, as are `sent_ns` (last message of each topic) and `LastHealth`.
         steps, truths, timings, events: new rows and events; timings are the durations of the controller's stages.
         frame, mirror, surface: newest frame (DN, at `frame_ns`), state and surface over the pupil (nm); None without a
             new one since the last snapshot, or since the last complete one if this is `complete`. If there is a
             controller, `frame_ns` is at most `time_ns`, because the camera's clock may be ahead.
-        calibration, camera, controller, health: the latest of each; None before the first.
+        calibration, camera, controller: the latest of each; None before the first. health: the latest by process.
         complete: whether all new data are included; otherwise only the newest pictures, and rows and events wait.
         behind_s: delay of this snapshot.
         ended: end of the logs, in their last snapshot.
@@ -310,7 +310,8 @@ class Accumulator:
     def _newest_of(self, topic: Topic, decode: Callable[[bytes], Any], *, complete: bool) -> Any:
         """The newest message of a topic, decoded; None without a new one that can be read.
 
-        A slow camera may send one frame between two complete snapshots: the second of these has it again.
+        A complete snapshot has the newest message since the last complete one, even if an incomplete one had it too:
+        some panels draw only complete snapshots.
         """
         found = None
         if (payload := self._newest.pop(topic, None)) is not None:

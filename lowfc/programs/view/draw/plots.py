@@ -82,7 +82,7 @@ class Plot:
 
 
 class Axes:
-    """A box with axes and ticks of its own, for logarithms too: rerun's plots have none, and drop the oldest points."""
+    """A box with its own axes, possibly logarithmic, and ticks; rerun's plots lack these and drop the oldest points."""
 
     def __init__(self, path: str, width: float) -> None:
         self.path = path
@@ -94,7 +94,7 @@ class Axes:
     def fit(
         self, stream: rr.RecordingStream, x: tuple[float, float], y: tuple[float, float], x_ticks: Ticks, y_ticks: Ticks
     ) -> None:
-        """Set the first and last value of each axis; the grid is drawn when it changes."""
+        """Set the first and last value of each axis and its ticks; the grid is redrawn only if they change."""
         fitted = x, y, tuple(x_ticks), tuple(y_ticks)
         if fitted == self._fitted:
             return

@@ -51,7 +51,7 @@ class Pointing(Panel):
         mas = np.concatenate([piece for _, piece in self._pieces] or [mas[:0]])
         if not len(mas):
             return
-        mas = mas[:: -ceil(len(mas) / _MAX_POINTS)][::-1]  # with the newest
+        mas = mas[:: -ceil(len(mas) / _MAX_POINTS)][::-1]  # every nth point, counted from the newest
         at(stream, snapshot.time_ns)
         if self._scale.fit(mas, snapshot.time_ns):
             self._draw_rings(stream)

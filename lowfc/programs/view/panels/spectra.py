@@ -53,17 +53,17 @@ class Spectra(Panel):
         if not steady.feed(snapshot) or calibration is None or not self.due(snapshot):
             return
         rate_hz = frame_rate_hz(snapshot.camera, snapshot.steps)
-        run = time_series(*steady.rows())
-        found = spectrum(run, rate_hz) if rate_hz else None
+        series = time_series(*steady.rows())
+        spectra = spectrum(series, rate_hz) if rate_hz else None
         noll = np.array(calibration.noll)
         law = steady.law if steady.mode == LoopMode.CLOSED else None
         at(stream, snapshot.time_ns)
         for axes, modes in zip(self._axes, (noll <= _HIGHEST_TILT, noll > _HIGHEST_TILT), strict=True):
             frequency_hz, powers = np.zeros(0), list[Array]()
             state = ": too few frames yet" if modes.any() else ": no such modes"
-            if found is not None and modes.any():
-                state = f", last {run.frames / rate_hz:.1f} s"
-                frequency_hz, powers = power_curves(found, modes, law, rate_hz)
+            if spectra is not None and modes.any():
+                state = f", last {series.frames / rate_hz:.1f} s"
+                frequency_hz, powers = power_curves(spectra, modes, law, rate_hz)
             if powers:
                 self._fit(stream, axes, rate_hz, np.concatenate(powers))
             axes.draw(stream, np.log10(frequency_hz), [np.log10(power) for power in powers], _COLOURS, _WIDTHS)
@@ -83,20 +83,20 @@ class Spectra(Panel):
         axes.fit(stream, x, (low, high), x_ticks, y_ticks)
 
 
-def power_curves(found: Spectrum, modes: Mask, law: LawInForce | None, rate_hz: float) -> tuple[Array, list[Array]]:
+def power_curves(spectra: Spectrum, modes: Mask, law: LawInForce | None, rate_hz: float) -> tuple[Array, list[Array]]:
     """Frequency, Hz, and the power of some modes, nm^2/Hz: pseudo-open-loop, error and, for an integrator, prediction.
 
-    `found` has the spectra of the errors, then those of the pseudo-open-loop, all with noise; `law` is None for an open
+    `spectra` has those of the errors, then those of the pseudo-open-loop, all with noise; `law` is None for an open
     loop. A constant wavefront has no curves.
     """
-    error, pol = found.power_nm2_hz[:, : modes.size], found.power_nm2_hz[:, modes.size :]
+    error, pol = spectra.power_nm2_hz[:, : modes.size], spectra.power_nm2_hz[:, modes.size :]
     columns = [pol[:, modes].sum(axis=1), error[:, modes].sum(axis=1)]
     if law is not None and not law.linear:
         integrating = integrator(law.gain, law.leak, tuple(range(2, 2 + modes.size)), law.delay_frames, rate_hz)
-        passed = rejection(integrating, found.frequency_hz)[:, modes] ** 2
+        passed = rejection(integrating, spectra.frequency_hz)[:, modes] ** 2
         columns.append((passed * pol[:, modes]).sum(axis=1))
     if not any(column[1:].any() for column in columns):
         return np.zeros(0), []
-    frequency_hz, means = in_bins(found.frequency_hz, columns)
+    frequency_hz, means = in_bins(spectra.frequency_hz, columns)
     least = _LEAST * max(float(mean.max()) for mean in means)
     return frequency_hz, [np.maximum(mean, least) for mean in means]

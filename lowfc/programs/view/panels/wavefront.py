@@ -76,10 +76,10 @@ class Wavefront(Panel):
         flat = f"with a flat mirror, {kind if true else 'pseudo-open-loop'}"
         RMS.name(stream, {flat: GREY, f"residual, {kind}": GREEN})
         degrees = np.array([noll_to_orders(index)[0] for index in noll])
-        found = sorted(set(degrees.tolist()))
-        self._groups = [np.flatnonzero(degrees == degree) for degree in found]
-        group_names = [_GROUPS.get(degree, f"radial degree {degree}") for degree in found]
-        colours = [_GROUP_COLOURS[number % len(_GROUP_COLOURS)] for number in range(len(found))]
+        distinct_degrees = sorted(set(degrees.tolist()))
+        self._groups = [np.flatnonzero(degrees == degree) for degree in distinct_degrees]
+        group_names = [_GROUPS.get(degree, f"radial degree {degree}") for degree in distinct_degrees]
+        colours = [_GROUP_COLOURS[number % len(_GROUP_COLOURS)] for number in range(len(distinct_degrees))]
         GROUPS.name(stream, dict(zip(group_names, colours, strict=True)))
         self._tilts = [noll.index(index) for index in TIP_TILT if index in noll]
         TILT.name(stream, {f"{names[row]}, {kind}": (BLUE, ORANGE)[n] for n, row in enumerate(self._tilts)})

@@ -72,7 +72,7 @@ class RunState:
         wavefront: rms of the last second; once the controller was stopped, of its last second with a step. `latest` is
             the rms of the last 0.3 s. With `true`, both are the simulation's true wavefront, otherwise measured.
         comparison: residual of the loop, and of the best gains.
-        latency_us: p50 and p99 from frame to command in the same second.
+        latency_us: p50 and p99 from frame to command in the second of `wavefront`.
         mirror_state: last state of the mirror; None before the first.
         note: last note of the operator.
     """

@@ -87,7 +87,7 @@ def _loop(state: RunState) -> Tile:
     if held := _held(reported):
         advice = f"The loop is closed and holds its command: {held}."
         return tile("HOLDING", f"closed, but {held}: command held", Level.WARNING, advice)
-    if mirror.life is Liveness.SILENT:  # logs of version 0.1 do not report it
+    if mirror.life is Liveness.SILENT:  # in logs of version 0.1, that is not a mirror fault
         return tile("CLOSED", "but the mirror is silent", Level.WARNING)
     if camera.life is Liveness.STOPPED:
         advice = "The camera was stopped: the loop is closed and holds its command."
@@ -125,8 +125,8 @@ def _since(state: wire.ControllerState | None) -> str:
 
 
 def _open(state: RunState) -> Tile:
-    shape, found = "mirror holds its last shape", state.wavefront
-    if found is not None and found.residual_nm > WORSE * found.open_nm:
+    shape, rms = "mirror holds its last shape", state.wavefront
+    if rms is not None and rms.residual_nm > WORSE * rms.open_nm:
         shape += ", worse than a flat mirror: `lowfc ctl safe` flattens it"
     level, advice = Level.NEUTRAL, "The loop is open: nothing is corrected, `lowfc ctl close` closes it."
     if state.why.startswith(CAMERA_MISFIT):
@@ -168,7 +168,7 @@ def _mirror(state: RunState) -> Tile:
         )
         return tile("AT LIMIT", f"{words}: {how}; {value} {of}", Level.BAD if often else Level.WARNING, advice)
     if limit_nm and used_nm > NEAR_STROKE * limit_nm:
-        advice = f"The mirror has used {value} of its stroke: little is left. Offload the slow part of it."
+        advice = f"The mirror has used {value} of its stroke: little is left. Offload the slow part of the command."
         return tile(value, f"{of}: nearly all", Level.WARNING, advice)
     return tile(value, f"{of}, no limit acts", Level.GOOD)
 

@@ -26,32 +26,32 @@ UNCORRECTED = ("OPEN", "SAFE", "IDLE", "WAITING", "DEAD", "NO CONTROLLER")
 
 def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
     """Tile WAVEFRONT: the residual, compared with a flat mirror."""
-    tile, found, comparison = partial(Tile, "WAVEFRONT"), state.wavefront, state.comparison
-    if found is None:
+    tile, rms, comparison = partial(Tile, "WAVEFRONT"), state.wavefront, state.comparison
+    if rms is None:
         return tile("?", "not measured now")
-    residual = rounded(found.residual_nm)
-    value, flat, more = f"{residual} nm rms", f"{rounded(found.open_nm)} nm with a flat mirror", "true"
+    residual = rounded(rms.residual_nm)
+    value, flat, remarks = f"{residual} nm rms", f"{rounded(rms.open_nm)} nm with a flat mirror", "true"
     if not state.true:
-        more = f"measured, {_without_noise(found.residual_nm, comparison)}" if comparison else "measured, with noise"
-    if nm_per_mas and found.tilt_open_nm:
-        tilt, before = (rounded(one / nm_per_mas) for one in (found.tilt_residual_nm, found.tilt_open_nm))
-        more = f"tilt {tilt} of {before} mas per axis; {more}"
+        remarks = f"measured, {_without_noise(rms.residual_nm, comparison)}" if comparison else "measured, with noise"
+    if nm_per_mas and rms.tilt_open_nm:
+        tilt, before = (rounded(one / nm_per_mas) for one in (rms.tilt_residual_nm, rms.tilt_open_nm))
+        remarks = f"tilt {tilt} of {before} mas per axis; {remarks}"
     if loop.value == "ENDED":
-        return tile(f"last: {residual} nm", f"of {flat}; {more}")
+        return tile(f"last: {residual} nm", f"of {flat}; {remarks}")
     if loop.level is not Level.GOOD:
-        return tile(value, f"{'not corrected;' if loop.value in UNCORRECTED else 'of'} {flat}; {more}")
+        return tile(value, f"{'not corrected;' if loop.value in UNCORRECTED else 'of'} {flat}; {remarks}")
     if state.true and shaped(state.snapshot.controller):
         why = f"The wavefront is {value}, including the shapes of offset and channels; {flat}."
-        return tile(value, f"with offset and channels; {flat}; {more}", advice=why)
-    raw, latest = found.open_nm / found.residual_nm if found.residual_nm else 1.0, state.latest
+        return tile(value, f"with offset and channels; {flat}; {remarks}", advice=why)
+    raw, latest = rms.open_nm / rms.residual_nm if rms.residual_nm else 1.0, state.latest
     if raw < 1 / WORSE and latest is not None and latest.residual_nm > WORSE * latest.open_nm:
         level = Level.BAD if raw < 1 / DIVERGING else Level.WARNING
         advice = f"The loop does harm: {residual} nm rms, {flat}. Lower the gain or open the loop."
-        return tile(value, f"worse than {flat}; {more}", level, advice)
+        return tile(value, f"worse than {flat}; {remarks}", level, advice)
     noise_nm = comparison.noise_nm if comparison is not None and not state.true else 0.0
-    level, why = merit(factor(found.residual_nm, found.open_nm, noise_nm), comparison)
+    level, why = merit(factor(rms.residual_nm, rms.open_nm, noise_nm), comparison)
     compared = f"{raw:.1f} x better than" if raw >= 1 else "of"
-    return tile(value, f"{compared} {flat}; {more}", level, f"The residual is {value}, compared with {flat}{why}.")
+    return tile(value, f"{compared} {flat}; {remarks}", level, f"The residual is {value}, compared with {flat}{why}.")
 
 
 def contrast(known: wire.WavefrontFigures, *, now: bool) -> Tile:
@@ -75,8 +75,8 @@ def merit(reduction: float, comparison: ResidualComparison | None) -> tuple[Leve
     if comparison is None:
         return (Level.GOOD, "") if reduction >= GOOD_FACTOR else (Level.NEUTRAL, ": little is corrected")
     if comparison.residual_nm > hypot(NEAR_BEST * comparison.best_nm, NOISE_FLOOR * comparison.noise_nm):
-        times = comparison.residual_nm / max(comparison.best_nm, 1e-9)
-        return Level.NEUTRAL, f", {times:.1f} x the residual of the best gains: run `lowfc tune`"
+        ratio = comparison.residual_nm / max(comparison.best_nm, 1e-9)
+        return Level.NEUTRAL, f", {ratio:.1f} x the residual of the best gains: run `lowfc tune`"
     if reduction >= GOOD_FACTOR:
         return Level.GOOD, ""
     best = comparison.residual_nm <= NEAR_BEST * comparison.best_nm
