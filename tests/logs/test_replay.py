@@ -449,7 +449,7 @@ def test_frames_are_kept_within_a_limit_of_memory(monkeypatch: pytest.MonkeyPatc
     assert np.array_equal(found[49].pixels, pixels + 49)
     assert [one is not None for one in found].count(True) == 4
     assert store.frame(49, 48, 0) is None
-    assert store.frame(49, 48, 0, last=True) is not None
+    assert store.frame(49, 48, 0, any_time=True) is not None
 
 
 @pytest.fixture(scope="module")

@@ -68,8 +68,8 @@ def export(
 
     if (decimate is None and topics) or (decimate is not None and (to is not None or frames or force)):
         raise ConfigurationError(
-            "--to, --frames and --force convert the log; --topics needs --decimate, which writes a smaller log: use "
-            "one or the other"
+            "--topics requires --decimate, which writes a smaller log; --to, --frames and --force convert the log: use "
+            "--decimate or these"
         )
     console = Console(stderr=True)
     for log in named_logs(logs, out, as_json=as_json):

@@ -58,7 +58,8 @@ def publish(
         run_id: name of the run; created if it does not exist.
         speed: 2 is twice as fast, a large number as fast as possible. Subscribers that do not keep up lose messages, as
             with a live camera.
-        topics: keys or shell patterns of keys; if empty, all but commands, of the loop's roles that are not live.
+        topics: keys or shell patterns of keys; if empty, all topics of the loop's roles that are not live, except
+            commands.
         allow_commands: publish commands too, and frames even if they would move a live mirror.
         wait_for: roles that must be running and connected before the first message; their topics are not published.
 
@@ -98,7 +99,7 @@ class Player:
         self._speed = speed
         self._publishers: dict[str, Publisher | None] = {}
         self._excluded: dict[str, str] = {}
-        self._errors = Durations()
+        self._timing_errors = Durations()
         self._behind = 0
         self._first_log_ns = self._last_log_ns = 0
         self._begun_ns = self._sent_ns = 0
@@ -123,19 +124,19 @@ class Player:
                     progress_due_ns = self._sent_ns + _PROGRESS_NS
                     self._service.beat()
                     bar.update(task, completed=log.position, total=log.size, description=_utc(message.receive_time_ns))
-        if self._service.running and not self._initial_keys and not self._errors.count:
+        if self._service.running and not self._initial_keys and not self._timing_errors.count:
             left_out = ", ".join(f"{key} ({why})" for key, why in sorted(self._excluded.items()))
-            rest = f" but {left_out}" if left_out else ""
-            raise DataFileError(f"{titled(log.paths)}: no message of the selected topics{rest}")
-        p50_ns, p99_ns = self._errors.percentiles_ns(0.5, 0.99)
+            excluded = f"; left out: {left_out}" if left_out else ""
+            raise DataFileError(f"{titled(log.paths)}: no message of the selected topics{excluded}")
+        p50_ns, p99_ns = self._timing_errors.percentiles_ns(0.5, 0.99)
         return {
-            "messages": self._errors.count + len(self._initial_keys),
+            "messages": self._timing_errors.count + len(self._initial_keys),
             "published": {key: one.published for key, one in sorted(self._publishers.items()) if one is not None},
             "left_out": dict(sorted(self._excluded.items())),
             "messages_of_impossible_time": self._impossible,
             "span_s": (self._last_log_ns - self._first_log_ns) * 1e-9,
             "took_s": (self._sent_ns - self._begun_ns) * 1e-9,
-            "timing_error_us": {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "max": self._errors.max_ns / 1e3},
+            "timing_error_us": {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "max": self._timing_errors.max_ns / 1e3},
             "messages_behind": self._behind,
             **missing_parts(log),
             "selection": [log.selection.description] if log.selection.description else [],
@@ -172,7 +173,7 @@ class Player:
             return
         self._sent_ns = publisher.put(message.payload, None, message.sequence).publish_time_ns
         late_ns = self._sent_ns - due_ns
-        self._errors.add(abs(late_ns))
+        self._timing_errors.add(abs(late_ns))
         self._behind += late_ns > BEHIND_NS
 
     def _sleep_until(self, due_ns: int) -> None:

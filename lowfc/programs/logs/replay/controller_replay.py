@@ -106,8 +106,9 @@ class ControllerReplay:
         self._settings: Settings | None = None
         self._state: State | None = None
         self._recent_states: deque[State] = deque(maxlen=_STATES_KEPT)
+        # Empty: the steps before the next state belong to another segment, which counts them.
         self._unchecked_because = _BEFORE if begun_ns >= context.segment.from_ns else ""
-        self._counts_earlier = bool(self._unchecked_because)
+        self._counts_earlier = bool(self._unchecked_because)  # whether steps before the adopted state are counted
 
     def take(self, message: Sample, kind: type[Message]) -> None:
         """Add one of the controller's messages, and replay as far as possible."""
@@ -169,20 +170,20 @@ class ControllerReplay:
                 before_log = self._first_number is not None and number < self._first_number
                 self._reset(_BEFORE if before_log else "after an input that the log does not have")
                 continue
-            late = ended or now_ns - entry.receive_time_ns > PATIENCE_NS
-            if not late and entry.command is None and entry.leads_to_command and self._state.loop is not None:
+            overdue = ended or now_ns - entry.receive_time_ns > PATIENCE_NS
+            if not overdue and entry.command is None and entry.leads_to_command and self._state.loop is not None:
                 return
             rule = changed_rule(entry.logged) if self._context.former is not None else ""
-            if rule and number not in self._states and not late:
+            if rule and number not in self._states and not overdue:
                 return  # the replay may have to continue from the state after it
-            input_ = self._input(entry, late=late)
+            input_ = self._input(entry, overdue=overdue)
             if input_ is not None and rule and number in self._states:
                 del self._entries[number]
                 self._apply_changed_rule(rule, input_, self._states.pop(number))
             elif input_ is not None:
                 del self._entries[number]
                 self._check(entry, input_)
-            elif late:
+            elif overdue:
                 self._reset(f"after {'an input' if entry.logged is None else 'a frame'} that the log does not have")
             else:
                 return
@@ -200,7 +201,7 @@ class ControllerReplay:
             self.retry_pending = True
 
     def _adopt(self) -> bool:
-        """Continue from the earliest complete state whose calibration is known."""
+        """Continue from the earliest complete state whose calibration is known; False without one, or at the end."""
         if not self.retry_pending:
             return False
         self.retry_pending = False
@@ -258,15 +259,15 @@ class ControllerReplay:
         self.retry_pending = True
         self._recent_states.clear()
 
-    def _input(self, entry: _Entry, *, late: bool) -> Input | None:
-        """The controller's input; None if the log does not have it (yet). If `late`, nothing more will arrive."""
+    def _input(self, entry: _Entry, *, overdue: bool) -> Input | None:
+        """The controller's input; None if the log does not have it (yet). If `overdue`, nothing more will arrive."""
         match entry.logged:
             case wire.ControlStep() as step:
                 late_ns = 0 if self._settings is None else self._settings.max_frame_age_ns + 1
                 age_ns = late_ns if wire.REASON_LATE in step.reasons else 0
-                # If late, a frame with another time is used: the step then differs, which the comparison reports.
+                # If overdue, a frame with another time is used: the step then differs, which the comparison reports.
                 frame = self._context.frames.frame(
-                    step.frame_sequence, from_timestamp(step.timestamp), age_ns, last=late
+                    step.frame_sequence, from_timestamp(step.timestamp), age_ns, any_time=overdue
                 )
                 if frame is not None and wire.REASON_AHEAD in step.reasons:
                     frame = frame._replace(ahead=True)
@@ -282,7 +283,7 @@ class ControllerReplay:
         return None
 
     def _apply_changed_rule(self, rule: str, input_: Input, logged: wire.ControllerState) -> None:
-        """Apply an input whose rule has changed since; if the result differs, continue from the logged state."""
+        """Apply an input whose rule has changed since the log. If the result differs, continue from the log's state."""
         assert self._settings is not None  # noqa: S101  # there is a state
         assert self._state is not None  # noqa: S101
         state, _ = advance(self._settings, self._state, input_)

@@ -1,4 +1,4 @@
-"""Logs of other versions: the fields to compare, and the rules that were changed on purpose since."""
+"""Logs of other versions: the fields to compare, and the controller's rules that have changed on purpose since."""
 
 import contextlib
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ _NOT_COMPARED = {"lowfc.v1.Request": ("reply", "law", "table", "columns", "actua
 
 
 def changed_rule(logged: Message | None) -> str:
-    """The rule of an input that was different in former versions; empty if unchanged."""
+    """The present rule for an input, if former versions had another one; otherwise empty."""
     if isinstance(logged, wire.Request) and logged.accepted:
         return _REQUEST_RULES.get(logged.name, "")
     if isinstance(logged, wire.ControlInput) and logged.HasField("camera"):

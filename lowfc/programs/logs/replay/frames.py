@@ -37,12 +37,12 @@ class Frames:
         """Remember the frame of a logged step."""
         self._steps.append((step.frame_sequence, from_timestamp(step.timestamp)))
 
-    def frame(self, sequence: int, time_ns: int, age_ns: int, *, last: bool = False) -> Frame | None:
-        """The frame of this sequence and time; if `last` and there is none, the sequence's newest without a step."""
+    def frame(self, sequence: int, time_ns: int, age_ns: int, *, any_time: bool = False) -> Frame | None:
+        """The frame of this sequence and time. Without it, if `any_time`: the sequence's newest without a step."""
         found = []
         for payload in self._payloads.get(sequence, ()):
             with contextlib.suppress(BadMessageError):  # the controller skipped it, too
                 found.append(codec.decode_frame(payload, sequence, age_ns))
         exact = next((frame for frame in found if frame.time_ns == time_ns), None)
         unused = (frame for frame in reversed(found) if (sequence, frame.time_ns) not in self._steps)
-        return next(unused, None) if exact is None and last else exact
+        return next(unused, None) if exact is None and any_time else exact

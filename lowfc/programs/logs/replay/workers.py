@@ -129,7 +129,7 @@ def _replay_segment(
 
 
 def _is_former(reader: LogReader) -> bool:
-    """Whether another version recorded a log, by its messages if the beginning with the version is lost."""
+    """Whether another version recorded a log; judged by its schemas if its beginning, with the version, is lost."""
     if version := reader.metadata.get("lowfc", {}).get("lowfc"):
         return version != __version__
     present = declaration(STEP.message).SerializeToString()

@@ -95,8 +95,8 @@ def _measurement_terms(stretch: Stretch, noise: SensorNoise | None) -> tuple[Ent
         unknown = (None, f"requires {missing}")
         return unknown, unknown
     linear = "linear part of (error - true residual): fit to a constant, the residual and the command"
-    rest = "remainder of (error - true residual) beyond the noise of a frame"
-    return (split.crosstalk, f"{linear}, {_THROUGH}"), (split.nonlinearity, f"{rest}, {_THROUGH}")
+    remainder = "remainder of (error - true residual) beyond the noise of a frame"
+    return (split.crosstalk, f"{linear}, {_THROUGH}"), (split.nonlinearity, f"{remainder}, {_THROUGH}")
 
 
 def _columns(term: Term | None, masks: Masks) -> Results:

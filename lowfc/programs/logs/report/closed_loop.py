@@ -71,7 +71,8 @@ def longest_stretch(run: Run) -> Stretch | None:
     laws = np.searchsorted([law.first for law in run.laws], np.arange(steps.sequence.size), side="right") - 1
     known = np.array([*(law.known for law in run.laws), False])  # the last for steps before the first law
     linear = np.array([*(law.linear is not None for law in run.laws), False])
-    overruled = linear[laws] & (steps.reasons >> Limit.LAW_OVERRULED & 1 == 1)  # the next state names it
+    # Until the next state names the overruled groups, only the steps show that there are any.
+    overruled = linear[laws] & (steps.reasons >> Limit.LAW_OVERRULED & 1 == 1)
     closed = (steps.mode == LoopMode.CLOSED) & known[laws] & ~overruled & history.under_calibration
     edges = np.flatnonzero(np.diff(np.where(closed, laws, -1), prepend=-1, append=-1))
     if not (spans := [(first, last) for first, last in pairwise(edges.tolist()) if closed[first]]):

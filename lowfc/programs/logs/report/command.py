@@ -33,10 +33,10 @@ def report(
     """
     from lowfc.adapters.logs.parts import named_logs
 
-    found = named_logs(logs, out, as_json=as_json)
+    named = named_logs(logs, out, as_json=as_json)
     if out is not None and out.suffix not in _ENDINGS:  # a report replaces an earlier one, and nothing else
         raise DataFileError(f"a report is an HTML page: use --out FILE.html, not {out}")
-    for log in found:
+    for log in named:
         _report(log, out, as_json)
 
 
@@ -59,16 +59,16 @@ def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
         require_page()
     with counting_bar(Console(stderr=True), TimeElapsedColumn()) as count:
         run = read_run(log, partial(count, f"reading {titled(log)}"))
-        found = report_of(run)
+        run_report = report_of(run)
         if target is not None:
-            made = page(found, lambda name: count(f"drawing {name}", 1, 1))
-            write_whole(target, made.encode(), log[0])
+            html = page(run_report, lambda name: count(f"drawing {name}", 1, 1))
+            write_whole(target, html.encode(), log[0])
     for remark in run.history.remarks:
         sys.stderr.write(f"warning: {remark}\n")
     if as_json:
         # A log may hold values that JSON cannot represent, such as NaN.
-        sys.stdout.write(json.dumps(to_jsonable_python(found.results, inf_nan_mode="null")) + "\n")
+        sys.stdout.write(json.dumps(to_jsonable_python(run_report.results, inf_nan_mode="null")) + "\n")
     else:
-        verdict = found.results["verdict"]
+        verdict = run_report.results["verdict"]
         because = f": {verdict['because']}" if verdict["because"] else ""
         sys.stdout.write(printable(f"{verdict['heading']}{because}\n{target}\n", keep=LINES))

@@ -123,14 +123,14 @@ def _residual(figure: "Figure", report: Report) -> bool:
         ("error", "measured error", CLOSED, False),
         ("open_error", "measured error, loop open", OPEN, False),
     )
-    there = [kind for kind in kinds if modes and modes[0][f"{kind[0]}_rms_nm"] is not None]
-    if len(there) > 1:
-        there = [kind for kind in there if kind[0] != "open_error"]
-    if not there:
+    present = [kind for kind in kinds if modes and modes[0][f"{kind[0]}_rms_nm"] is not None]
+    if len(present) > 1:
+        present = [kind for kind in present if kind[0] != "open_error"]
+    if not present:
         return False
     axes = figure.subplots()
-    width = 0.8 / len(there)
-    for place, (key, label, colour, filled) in enumerate(there):
+    width = 0.8 / len(present)
+    for place, (key, label, colour, filled) in enumerate(present):
         heights = [mode[f"{key}_rms_nm"] for mode in modes]
         left = np.arange(len(modes)) - 0.4 + (place + 0.5) * width
         look: dict[str, Any] = {"facecolor": colour}
@@ -141,7 +141,7 @@ def _residual(figure: "Figure", report: Report) -> bool:
     axes.set_xticks(range(len(modes)), names, rotation=35, ha="right", rotation_mode="anchor")
     axes.set_ylabel("nm rms")
     axes.grid(visible=False, axis="x")
-    axes.legend(ncols=len(there), loc="upper right")
+    axes.legend(ncols=len(present), loc="upper right")
     return True
 
 
@@ -203,8 +203,7 @@ def _budget(figure: "Figure", report: Report) -> bool:
         for place, (name, values, limits) in enumerate(rows):
             if values[group] is None:
                 continue
-            whole = name in ("sum of the terms", "true residual")
-            colour = CLOSED if name == "true residual" else INK if whole else COLOURS["other"]
+            colour = {"sum of the terms": INK, "true residual": CLOSED}.get(name, COLOURS["other"])
             limited = group in limits
             look: dict[str, Any] = {"facecolor": colour}
             if limited:

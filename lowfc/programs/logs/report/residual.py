@@ -70,13 +70,13 @@ def residual_results(run: Run, stretch: Stretch | None) -> Results:
     }
 
 
-def binned_rms(run: Run, most: int = 300) -> dict[str, Array]:
-    """Rms of all modes in nm before and after correction over `time_s`, in a limited number of bins."""
+def binned_rms(run: Run, max_bins: int = 300) -> dict[str, Array]:
+    """Rms of all modes in nm before and after correction, in at most `max_bins` bins; `time_s` is the start of each."""
     steps, true = run.history.steps, run.history.true
     columns = {"pseudo_open_loop": steps.pol_nm, "error": steps.error_nm}
     if true is not None:
         columns |= {"disturbance": true.modes_disturbance_rms_nm, "residual": true.modes_residual_rms_nm}
-    starts = bin_starts(steps.sequence.size, most)
+    starts = bin_starts(steps.sequence.size, max_bins)
     found = {"time_s": run.step_s[starts]}
     for name, column in columns.items():
         if column.size:
@@ -88,9 +88,9 @@ def binned_rms(run: Run, most: int = 300) -> dict[str, Array]:
     return found
 
 
-def bin_starts(rows: int, most: int) -> Integers:
-    """First row of each bin; bins have equal width and limited number."""
-    return np.arange(0, rows, max(1, -(-rows // most)))
+def bin_starts(rows: int, max_bins: int) -> Integers:
+    """First row of each bin: at most `max_bins` bins of equal numbers of rows, only the last may have fewer."""
+    return np.arange(0, rows, max(1, -(-rows // max_bins)))
 
 
 def _contrast(true: Truths, rows: Integers, config: Configuration | None) -> Results | None:

@@ -93,18 +93,20 @@ def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None
     log = WholeLog(files, skip_damaged=True)
     log.progress = progress
     history = read_history(log)
-    history.true  # noqa: B018  # cached, as joined by the frames' own sequences
+    history.true  # noqa: B018  # joined and cached now, by the sequences that the frames have in the log
     steps, known = history.steps, np.flatnonzero(history.steps.reasons >> Rejection.AHEAD & 1 == 0)
-    if 0 < known.size < steps.sequence.size:  # those of a camera whose clock is ahead count as the step before
+    if 0 < known.size < steps.sequence.size:
+        # A step whose frame is ahead of the clock gets sequence and time of the step before.
         rows = known[np.maximum(np.searchsorted(known, np.arange(steps.sequence.size), "right") - 1, 0)]
         history.steps = replace(steps, sequence=steps.sequence[rows], time_ns=steps.time_ns[rows])
     return Run(history, _laws_in_force(history))
 
 
 def row_after(history: History, frame_sequence: int, time: Timestamp) -> int:
-    """Row after the last step of a frame; without it the first later one, or by the controller's time.
+    """Row of the first step after those of a frame.
 
-    The camera's frames may have the time of another clock.
+    If the frame has no step: row of the first later frame since the same start of the camera or, without one, of the
+    first step after `time`. That is a time of the controller's clock; the camera may have another one.
     """
     sequence = history.steps.sequence
     rows = np.flatnonzero(sequence == frame_sequence)

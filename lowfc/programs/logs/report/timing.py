@@ -41,7 +41,7 @@ def intervals_ns(run: Run) -> dict[str, Long]:
 
 
 def latencies_ns(history: History) -> dict[str, Long]:
-    """Durations of the controller's stages, and from the frame's publication to the mirror's first state with it."""
+    """Durations of the controller's stages, and from the frame to the first mirror state with its command, as sent."""
     rows = rows_of(history.frame_sequence, history.mirror.sequence)
     applied = rows >= 0
     to_mirror = history.mirror.publish_time_ns[rows[applied]] - history.frame_publish_ns[applied]
@@ -49,7 +49,7 @@ def latencies_ns(history: History) -> dict[str, Long]:
 
 
 def percentiles_us(durations_ns: Long) -> Results:
-    """Count, percentiles and maximum; None for each without durations."""
+    """Count, percentiles and maximum; without durations, count 0 and None for each of the others."""
     if not durations_ns.size:
         return {"count": 0, **dict.fromkeys([*PERCENTILES, "max"])}
     values = np.percentile(durations_ns, list(PERCENTILES.values())) * 1e-3

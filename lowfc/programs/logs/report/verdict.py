@@ -122,8 +122,8 @@ def _delay(results: Results) -> Results:
         return _check("delay", UNKNOWN, "this log does not show whether commands were in time")
     if late < _MANY_LATE * steps:
         return _check("delay", GOOD, f"{counted(late, 'command')} late")
-    acted = "after the start of the next exposure, and acted one frame later than the law expects"
-    return _check("delay", LOOK, f"{counted(late, 'command')} came {acted}")
+    how_late = "after the start of the next exposure, and acted one frame later than the law expects"
+    return _check("delay", LOOK, f"{counted(late, 'command')} came {how_late}")
 
 
 def _frames(results: Results) -> Results:

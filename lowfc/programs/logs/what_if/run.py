@@ -41,7 +41,8 @@ class SeenCommands(NamedTuple):
     """Commands seen by the exposures of consecutive steps.
 
     Attributes:
-        delay_frames: the measured delay if it differs from the controller's, else the controller's; with `weights`.
+        delay_frames: the measured delay, rounded if it is nearly whole, where it differs from the controller's;
+            otherwise the controller's. `weights` are its `delay_weights`.
         seen_nm: (steps, modes); NaN where a frame was not used and the delay is the controller's.
         torn: (steps,) True where the command seen is not one of the steps', because a message was not received.
     """
@@ -60,7 +61,7 @@ class SeenCommands(NamedTuple):
         controller_delay: float,
         measured_delay: float | None,
     ) -> "SeenCommands":
-        """Commands of these steps, the first of which is used; the controller's states give the loop's target."""
+        """Commands seen by these steps; the first one's frame was used. The states give the loop's target."""
         weights = delay_weights(controller_delay).astype(np.float32)
         target_nm = _target_nm(states, steps.sequence, steps.error_nm.shape[1])
         assumed_nm = steps.error_nm + target_nm - steps.pol_nm
@@ -75,7 +76,7 @@ class SeenCommands(NamedTuple):
 
 
 class LoggedRun:
-    """Steps of a log with distinct exposures, from the first used one.
+    """Steps of a log with distinct exposures, from the first step whose frame was used.
 
     Attributes:
         steps: these steps; `missing`: (steps,) number of exposures without a step before each.
@@ -118,7 +119,10 @@ class LoggedRun:
 
     @property
     def uncorrected(self) -> Mask:
-        """Modes (modes,) for which automatic gains weighted the reconstructor at the end of the run."""
+        """Modes (modes,) that automatic gains did not correct at the end of the run.
+
+        They weighted the reconstructor for these modes.
+        """
         state = self.history.controller
         modes = len(self.calibration.noll)
         if state is None or state.calibration_id != self.calibration.id or len(state.prior_nm2) != modes:
@@ -231,7 +235,10 @@ def _law_and_delay(history: History, calibration: Calibration) -> tuple[Integrat
     if state is not None and len(state.gain) == len(calibration.noll):
         return integrator_of(state), state.delay_frames
     if history.configuration is None:
-        raise DataFileError(f"{history.log.path}: its gains and delay are unknown: it has no controller state")
+        raise DataFileError(
+            f"{history.log.path}: its gains and delay are unknown: it has no configuration, and no controller state "
+            "for its modes"
+        )
     known = settings(history.configuration)
     if any(known.auto_gain):
         raise DataFileError(
