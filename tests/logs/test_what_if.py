@@ -383,7 +383,7 @@ def test_an_offset_is_not_reported_as_a_missing_command() -> None:
     last.frame_sequence = toy.frame_sequence(39)
     logged.controllers = states
     run = LoggedRun(logged)
-    assert not run.torn.any()
+    assert not run.command_lost.any()
     np.testing.assert_array_equal(run.seen_nm, 0)
 
 
@@ -410,7 +410,7 @@ def test_rows_of_settling_open_loop_and_refused_or_saturated_frames_are_not_comp
     pol = np.full((60, 3), 4, np.float32)
     pol[20] -= 1  # exposed with a command missing from the log: settling restarts
     run = LoggedRun(history(60, pol_nm=pol))
-    assert np.flatnonzero(run.torn).tolist() == [20]
+    assert np.flatnonzero(run.command_lost).tolist() == [20]
     assert rows_compared(run) == [*range(10, 20), *range(30, 60)]
 
     error[:6] = np.nan  # the run begins with the first used frame

@@ -44,10 +44,10 @@ MAX_EARLIER_EVENTS = 1000
 """Largest number of events shown from before the start of the view."""
 
 _RECORDER_S = 3.0  # after which a recorder without Health counts as absent
-_FILE_S = 60.0
+_FILE_S = 60.0  # for the last data to be written to a file
 _POLL_S = 0.1
 _CHECK_S = 1.0
-_FROZEN_S = 3.0
+_FROZEN_S = 3.0  # between two checks, after which this process counts as stopped meanwhile
 _MAX_RENEWALS = 5
 _RENEWALS_S = 60.0
 

@@ -41,7 +41,7 @@ def intervals_ns(run: Run) -> dict[str, Long]:
 
 
 def latencies_ns(history: History) -> dict[str, Long]:
-    """Durations of the controller's stages, and from the frame to the first mirror state with its command, as sent."""
+    """Durations of the controller's stages, and from a frame's publication to the mirror's first state for it."""
     rows = rows_of(history.frame_sequence, history.mirror.sequence)
     applied = rows >= 0
     to_mirror = history.mirror.publish_time_ns[rows[applied]] - history.frame_publish_ns[applied]

@@ -270,9 +270,9 @@ def _log_warnings(run: LoggedRun) -> list[str]:
             f"another calibration or camera setting was in use for {counted(int(before), 'step')}: modes and rate are "
             "those of the others"
         )
-    if torn := np.count_nonzero(run.torn):
+    if lost := np.count_nonzero(run.command_lost):
         found.append(
-            f"the log lacks some commands: {counted(int(torn), 'frame')} exposed with a missing one, and the settling "
+            f"the log lacks some commands: {counted(int(lost), 'frame')} exposed with a missing one, and the settling "
             "time after each, are left out"
         )
     return found

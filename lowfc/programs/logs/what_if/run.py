@@ -34,7 +34,7 @@ from lowfc.control.loop.safety import LoopMode
 
 DELAY_DIFFERS = 0.05
 """Difference in frames beyond which a measured delay is not the controller's, or not a whole number."""
-_TORN_NM = 0.01  # difference of the command seen from the logged commands that shows a missing one
+_COMMAND_LOST_NM = 0.01  # difference between the command seen and the logged ones that shows that one is missing
 
 
 class SeenCommands(NamedTuple):
@@ -44,13 +44,13 @@ class SeenCommands(NamedTuple):
         delay_frames: the measured delay, rounded if it is nearly whole, where it differs from the controller's;
             otherwise the controller's. `weights` are its `delay_weights`.
         seen_nm: (steps, modes); NaN where a frame was not used and the delay is the controller's.
-        torn: (steps,) True where the command seen is not one of the steps', because a message was not received.
+        command_lost: (steps,) True where the command seen is not one of the steps': the log lacks it.
     """
 
     delay_frames: float
     weights: Single
     seen_nm: Single
-    torn: Mask
+    command_lost: Mask
 
     @classmethod
     def of(
@@ -66,13 +66,14 @@ class SeenCommands(NamedTuple):
         target_nm = _target_nm(states, steps.sequence, steps.error_nm.shape[1])
         assumed_nm = steps.error_nm + target_nm - steps.pol_nm
         computed_nm = seen_nm(weights, steps.command_nm, missing, assumed_nm[0])
-        torn: Mask = np.abs(computed_nm - assumed_nm).max(axis=1) > _TORN_NM
+        command_lost: Mask = np.abs(computed_nm - assumed_nm).max(axis=1) > _COMMAND_LOST_NM
         if measured_delay is None or abs(measured_delay - controller_delay) <= DELAY_DIFFERS:
-            return cls(controller_delay, weights, assumed_nm, torn)
+            return cls(controller_delay, weights, assumed_nm, command_lost)
         rounded = round(measured_delay)
         delay_frames = float(rounded) if abs(measured_delay - rounded) <= DELAY_DIFFERS else measured_delay
         weights = delay_weights(delay_frames).astype(np.float32)
-        return cls(delay_frames, weights, seen_nm(weights, steps.command_nm, missing, assumed_nm[0]), torn)
+        seen = seen_nm(weights, steps.command_nm, missing, assumed_nm[0])
+        return cls(delay_frames, weights, seen, command_lost)
 
 
 class LoggedRun:
@@ -89,7 +90,8 @@ class LoggedRun:
         controller_delay: delay assumed by the controller, frames; `measured_delay`, from `measured_from`, is None if
             it cannot be measured; the comparison uses `delay_frames`, with `weights`.
         played: (steps,) True during a probe sequence, which moves the mirror in addition to the commands.
-        seen: commands seen by the exposures; `delay_frames`, `weights`, `seen_nm` and `torn` are those of `seen`.
+        seen: commands seen by the exposures; `delay_frames`, `weights`, `seen_nm` and `command_lost` are those of
+            `seen`.
     """
 
     def __init__(self, history: History) -> None:
@@ -115,7 +117,7 @@ class LoggedRun:
         self.seen = SeenCommands.of(
             self.steps, self.missing, history.controllers, self.controller_delay, self.measured_delay
         )
-        self.delay_frames, self.weights, self.seen_nm, self.torn = self.seen
+        self.delay_frames, self.weights, self.seen_nm, self.command_lost = self.seen
 
     @property
     def uncorrected(self) -> Mask:
@@ -147,7 +149,7 @@ class LoggedRun:
         if not (closed & usable).any():
             over = "no usable frame in closed loop" if closed.any() else "the loop was never closed"
             closed = np.ones_like(closed)
-        since = frames_since(self.torn, closed, missing)
+        since = frames_since(self.command_lost, closed, missing)
         settling = max(settling_frames(law.gain, law.leak, self.history.rate_hz) for law in laws)
         settling = min(settling, int(since.max()) // 2)
         rows = usable & (since >= settling) & (steps.saturated_pixels == 0)

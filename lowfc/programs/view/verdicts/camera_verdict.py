@@ -57,8 +57,8 @@ def frames(state: RunState) -> Tile:
     lost = state.recent["skipped"] + state.recent["missing"]
     period_ns = state.snapshot.period_ns
     nominal_hz = 1e9 / period_ns if period_ns else 0.0
-    due = max(state.recent["steps"] + lost, RECENT_S * nominal_hz, 1)
-    return worst_of((_rate(state, nominal_hz), _lost(state, lost, due), _refused(state, due)))
+    expected = max(state.recent["steps"] + lost, RECENT_S * nominal_hz, 1)
+    return worst_of((_rate(state, nominal_hz), _lost(state, lost, expected), _refused(state, expected)))
 
 
 def _rate(state: RunState, nominal_hz: float) -> Tile:
@@ -69,7 +69,7 @@ def _rate(state: RunState, nominal_hz: float) -> Tile:
         return tile("UNUSED", "frames arrive, but no controller uses them")
     value = hertz(rate_hz)
     if rate_hz < SLOW * nominal_hz:
-        advice = f"The camera runs at {rate_hz:.3g} Hz, not at {nominal_hz:.3g} Hz: the host does not keep up."
+        advice = f"The camera runs at {rate_hz:.3g} Hz, not at {nominal_hz:.3g} Hz: camera or host does not keep up."
         return tile(value, f"slow: nominal {nominal_hz:.3g} Hz", Level.WARNING, advice)
     unused = {"skipped": state.recent["skipped"], "never arrived": state.recent["missing"]}
     unused["refused"] = sum(state.recent[reason] for reason in REFUSED)
@@ -78,16 +78,16 @@ def _rate(state: RunState, nominal_hz: float) -> Tile:
     return tile(value, f"{detail}{', simulated time' if state.simulated else ''}", Level.GOOD)
 
 
-def _lost(state: RunState, lost: int, due: float) -> Tile:
+def _lost(state: RunState, lost: int, expected: float) -> Tile:
     kinds = {"skipped (controller busy)": state.recent["skipped"], "never arrived": state.recent["missing"]}
     named = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
-    advice = f"{counted(lost, 'frame')} lost {state.lately}, {100 * lost / due:.2g} %: {named}. "
-    level = Level.BAD if lost > MANY_LOST * due else Level.WARNING if lost >= FEW * due else Level.NEUTRAL
+    advice = f"{counted(lost, 'frame')} lost {state.lately}, {100 * lost / expected:.2g} %: {named}. "
+    level = Level.BAD if lost > MANY_LOST * expected else Level.WARNING if lost >= FEW * expected else Level.NEUTRAL
     advice += "Free the host's processors or lower the rate."
     return Tile("FRAMES", f"{lost} LOST", f"{named}, {state.lately}", level, advice)
 
 
-def _refused(state: RunState, due: float) -> Tile:
+def _refused(state: RunState, expected: float) -> Tile:
     all_are, refused = all_refused(state, _FRAME_REASONS), sum(state.recent[reason] for reason in _FRAME_REASONS)
     commonest = max(_FRAME_REASONS, key=lambda reason: (state.now if all_are else state.recent)[reason])
     word, advised = REFUSED[commonest]
@@ -96,7 +96,7 @@ def _refused(state: RunState, due: float) -> Tile:
         return Tile("FRAMES", "REFUSED", f"all: {word}", Level.BAD, advice)
     remedy = advised if state.now[commonest] else "it has ended"
     advice = f"{counted(refused, 'frame')} refused {state.lately}, {word}: {remedy}."
-    level = Level.WARNING if refused >= FEW * due else Level.NEUTRAL
+    level = Level.WARNING if refused >= FEW * expected else Level.NEUTRAL
     return Tile("FRAMES", f"{refused} REFUSED", f"{word}, {state.lately}", level, advice)
 
 

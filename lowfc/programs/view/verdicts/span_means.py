@@ -57,8 +57,8 @@ class SpanMeans:
         """Light (spans,) of used frames as a fraction of the calibration's; NaN in a span without one."""
         return _means(self._sums[:, _LIGHT])[:, 0]
 
-    def add(self, time_ns: Long, where: slice, values: npt.NDArray[np.floating]) -> None:
-        """Add rows (rows, columns) at their times to the sums in the columns `where`, and count them."""
+    def add(self, time_ns: Long, columns: slice, values: npt.NDArray[np.floating]) -> None:
+        """Add rows (rows, values) at their times to the sums in these columns, and count them in the first of these."""
         if self.begin_ns is None and time_ns.size:
             self.begin_ns = int(time_ns.min())
         after_ns = time_ns - (self.begin_ns or 0)
@@ -73,7 +73,7 @@ class SpanMeans:
             self._sums = self._sums[0::2] + self._sums[1::2]
         if last >= len(self._sums):
             self._sums = np.pad(self._sums, ((0, last + 1 - len(self._sums)), (0, 0)))
-        np.add.at(self._sums[:, where], after_ns // self.span_ns, np.pad(values, ((0, 0), (1, 0)), constant_values=1))
+        np.add.at(self._sums[:, columns], after_ns // self.span_ns, np.pad(values, ((0, 0), (1, 0)), constant_values=1))
 
     @property
     def _wavefront(self) -> Array:
