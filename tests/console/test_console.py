@@ -462,10 +462,10 @@ def test_a_disconnected_console_reports_it_and_hides_the_values(run: LiveRun, mo
         with monkeypatch.context() as disconnected:
             disconnected.setattr(run.hub, "lose", lambda role, key, envelope: role == "operator")
             await screen.until(lambda: screen.text("verdict").startswith("NOT CONNECTED"))
-            assert not screen.app.screen.query_one("#tiles").visible
-            assert not screen.app.screen.query_one("#gains").visible
+            await screen.until(lambda: not screen.app.screen.query_one("#tiles").visible)
+            await screen.until(lambda: not screen.app.screen.query_one("#gains").visible)
         await screen.until(lambda: not screen.text("verdict").startswith("NOT CONNECTED"))
-        assert screen.app.screen.query_one("#tiles").visible
+        await screen.until(lambda: screen.app.screen.query_one("#tiles").visible)
         assert screen.app.screen.query_one("#tiles").size.height == 9, "seven tiles, CONTRAST and VIEW"
 
     operate(run, scenario)
