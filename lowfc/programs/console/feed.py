@@ -143,7 +143,7 @@ class Feed(Monitor):
 def _request(sample: Sample) -> wire.Request | None:
     """Decode a request; None if it is unreadable, in `_HIDDEN_REQUESTS`, or the controller's own for automatic gains.
 
-    An event reports the automatic gains.
+    An event reports these gains.
     """
     try:
         request = wire.Request.FromString(sample.payload)

@@ -66,11 +66,10 @@ def export(
     from lowfc.adapters.logs.thinning import thin
     from lowfc.adapters.process.progress import reading_bar
 
-    if (decimate is None and topics) or (decimate is not None and (to is not None or frames or force)):
-        raise ConfigurationError(
-            "--topics requires --decimate, which writes a smaller log; --to, --frames and --force convert the log: use "
-            "--decimate or these"
-        )
+    if decimate is None and topics:
+        raise ConfigurationError("--topics chooses what a smaller log keeps: add --decimate, such as --decimate 1")
+    if decimate is not None and (to is not None or frames or force):
+        raise ConfigurationError("--decimate writes a smaller log, without --to, --frames and --force: leave these out")
     console = Console(stderr=True)
     for log in named_logs(logs, out, as_json=as_json):
         if decimate is not None:

@@ -18,8 +18,7 @@ DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
 """Fractions of the expected light. Below a fifth the controller refuses frames by default; at half the noise is 1.4
 times larger; more than twice is not the calibrated star."""
 HEALTH_OVERDUE_S = 4.0
-"""Time without a frame after which a camera that still sends Health is known to run: a dead one counts as silent by
-then."""
+"""Time without a frame after which a camera that is not silent is known to run: by then a dead one is silent."""
 
 REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.DARK: ("too dark", "the star is gone; check pointing, shutter and clouds"),
