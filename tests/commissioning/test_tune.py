@@ -172,7 +172,7 @@ def test_tuning_uses_the_steps_of_a_running_loop() -> None:
     assert run.closed
     assert (run.source, run.noll, run.timing) == ("folded", NOLL, Timing.of(1.0, 0.5))
     assert run.rate_hz == pytest.approx(1000)
-    assert run.warnings == ("4 steps lost on the way to this command",)
+    assert run.warnings == ("4 steps lost between the controller and this program",)
     assert run.pol.frames == pytest.approx(5500, abs=5)
 
     result = result_of(run, *tuned(run, "lqg"), "lqg")

@@ -66,8 +66,8 @@ def tune(
             best, gains = tuned(telemetry, controller)
         except ValueError as error:
             raise DataFileError(f"{telemetry.source}: {error}") from None
-        found = result_of(telemetry, best, gains, controller)
-    found.files, found.applied = [str(file) for file in (out, plot) if file is not None], None
+        result = result_of(telemetry, best, gains, controller)
+    result.files, result.applied = [str(file) for file in (out, plot) if file is not None], None
     if out is not None:
         save(best.law, out)
     if plot is not None:
@@ -76,26 +76,26 @@ def tune(
         with Client(run) as loop:
             integrator = controller == "integrator"
             answer = apply_gains(loop, gains.gain.tolist(), telemetry.noll) if integrator else loop.law(best.law)
-        found.applied = answer.sentence
-    print_result(found, as_json=as_json)
+        result.applied = answer.sentence
+    print_result(result, as_json=as_json)
 
 
 def apply_gains(loop: "Client", gains: list[float], noll: tuple[int, ...]) -> "Answer":
     """Let the integrator drive the mirror with these gains; on refusal the previous law stays in force."""
     from lowfc.contract.codecs.law_codec import driving
 
-    before = driving(loop.status().state, loop.laws())
-    if before is None:
+    previous_law = driving(loop.status().state, loop.laws())
+    if previous_law is None:
         return loop.gain(gains, noll)
     loop.law(None)  # only the integrator has gains
     try:
         return loop.gain(gains, noll)
     except BaseException as fault:
         try:
-            loop.law(before)
-        except LowfcError as another:
+            loop.law(previous_law)
+        except LowfcError as second_fault:
             raise RequestRefusedError(
-                f"{fault}; the integrator now drives the mirror, because the law {before.name!r} could not be "
-                f"restored: {another}"
+                f"{fault}; the integrator now drives the mirror, because the law {previous_law.name!r} could not be "
+                f"restored: {second_fault}"
             ) from None
         raise

@@ -54,8 +54,8 @@ class Telemetry:
         true_nm2: mean products of the true residual at the start of each exposure (modes, modes); None if unknown.
         continuous_rms_nm: rms of the true residual over all time (modes,); None if unknown.
         nm_per_mas: wavefront rms of a tilt of 1 mas; None if the telescope's diameter is unknown.
-        contrast: contrast added by the modes, with `noise_nm2`, the computed covariance (modes, modes) of one frame's
-            noise; None without a science image.
+        contrast: contrast added by the modes; None without a science image.
+        noise_nm2: computed covariance (modes, modes) of one frame's noise; None without a science image.
         warnings: doubts about the results.
     """
 
@@ -158,7 +158,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
             played |= during_probe(steps.sequence, state.play.first_sequence, state.play.frames)
     steps, usable = _without_probes(steps, seen, assumed, played)
     timing = Timing.of(seen.delay_frames, config.camera.exposure_fraction)
-    lost = [f"{counted(stream.lost, 'step')} lost on the way to this command"] if stream.lost else []
+    lost = [f"{counted(stream.lost, 'step')} lost between the controller and this program"] if stream.lost else []
     return _telemetry(
         loop.run_id,
         rate_hz,
@@ -192,7 +192,8 @@ def _from_first_used(run_id: str, steps: Steps) -> Steps:
 def _without_probes(steps: Steps, seen: SeenCommands, assumed: float, played: Mask) -> tuple[Steps, Mask]:
     """The steps with pseudo-open-loop modes for the measured delay, and the usable ones (steps,).
 
-    Steps with a probe sequence (`played`) get the mode 0, which is not closed: the time to settle after it is excluded.
+    Steps with a probe sequence (`played`) get mode 0, as if the loop were not closed, so that the time to settle after
+    the sequence is excluded, too.
     """
     pol_nm = steps.pol_nm if seen.delay_frames == assumed else steps.error_nm - seen.seen_nm
     usable = np.isfinite(pol_nm).all(axis=1) & ~seen.command_lost & ~played & (steps.saturated_pixels == 0)
@@ -215,18 +216,23 @@ def _telemetry(
     laws: tuple[Integrator, LinearLaw | None],
     steps: Steps,
     usable: Mask,
-    true: tuple[Single | None, Single | None],
+    true_residual: tuple[Single | None, Single | None],
     config: Configuration | None,
     calibration: Calibration,
     warnings: Sequence[str],
 ) -> Telemetry:
+    """The usable steps after the loop has settled in closed loop, or all usable ones if those are too few.
+
+    `laws` are the integrator and the linear law in force, if any. `true_residual` has the residual at the start of each
+    exposure and its rms over all time (steps, modes).
+    """
     was_closed, index = steps.mode == LoopMode.CLOSED, np.arange(len(steps.mode))
-    opened = np.flatnonzero(~was_closed)
-    last_opened = np.concatenate([[-1], opened])[np.searchsorted(opened, index)]
-    settling, frames_closed = settling_frames(laws[0].gain, laws[0].leak), index - last_opened
+    not_closed = np.flatnonzero(~was_closed)
+    last_not_closed = np.concatenate([[-1], not_closed])[np.searchsorted(not_closed, index)]
+    settling, frames_closed = settling_frames(laws[0].gain, laws[0].leak), index - last_not_closed
     if laws[1] is not None:
         settling = SETTLING_FRAMES + FADING_FRAMES + margins.settling_frames(laws[1], timing.delay)
-    settling = min(settling, int(frames_closed.max()) - FEWEST)  # enough frames are left
+    settling = min(settling, int(frames_closed.max()) - FEWEST)  # leave enough frames
     closed, rows = True, usable & was_closed & (frames_closed > max(settling, _SETTLING_S * rate_hz))
     pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if pol.longest < FEWEST:
@@ -240,7 +246,7 @@ def _telemetry(
     if Limit.LAW_OVERRULED in count_reasons(steps.reasons[rows]):
         warnings = [*warnings, "in some of these frames the integrator drove in place of a law (LAW_OVERRULED)"]
     contrast = known_contrast(config) if config is not None and config.noll == calibration.noll else None
-    known = [None if each is None else each[rows & np.isfinite(each).all(axis=1)] for each in true]
+    known = [None if each is None else each[rows & np.isfinite(each).all(axis=1)] for each in true_residual]
     true_nm, rms_nm = (each if each is not None and len(each) else None for each in known)
     return Telemetry(
         source=source,

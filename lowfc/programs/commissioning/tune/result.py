@@ -123,7 +123,7 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
     achieved_nm = _achieved_nm(run, gains.noise_nm)
     has_truth = run.true_nm2 is not None or run.continuous_rms_nm is not None
     if achieved_nm is not None and now_nm is not None and run.continuous_rms_nm is None:
-        # The frames give the residual at one instant per frame; theory adds that between these instants.
+        # The frames give the residual at one instant per frame; theory adds the residual between these instants.
         sampled_nm = predicted_nm(now, best.models, Timing.sampled(run.timing.delay))
         achieved_nm = np.sqrt(np.maximum(achieved_nm**2 + now_nm**2 - sampled_nm**2, 0.0))
     columns = {
@@ -179,25 +179,29 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
     from lowfc.adapters.files.drawing import figure_class, png
 
     drawing = figure_class()(figsize=(10, 8), layout="constrained")
-    found = spectrum(run.pol, run.rate_hz)
-    assert found is not None  # noqa: S101  # tuning needs more frames than a spectrum
-    largest = np.argsort(-found.variance_nm2())[:2]
-    for axes, place in zip(drawing.subplots(2, 1, sharex=True), largest.tolist(), strict=False):
-        model = best.models[place]
-        omega = 2 * np.pi * found.frequency_hz[1:] / run.rate_hz
+    pol_spectrum = spectrum(run.pol, run.rate_hz)
+    assert pol_spectrum is not None  # noqa: S101  # tuning needs more frames than a spectrum
+    largest = np.argsort(-pol_spectrum.variance_nm2())[:2]
+    for axes, mode in zip(drawing.subplots(2, 1, sharex=True), largest.tolist(), strict=False):
+        model = best.models[mode]
+        omega = 2 * np.pi * pol_spectrum.frequency_hz[1:] / run.rate_hz
         one_sided = 2 / run.rate_hz
         modelled = one_sided * (model.spectrum_nm2(omega) + model.noise_nm2)
-        noise_nm2 = np.array([one.noise_nm2 for one in best.models])
+        noise_nm2 = np.array([each.noise_nm2 for each in best.models])
         measured = np.repeat((model.spectrum_nm2(omega) + model.noise_nm2)[:, None], len(noise_nm2), axis=1)
-        residual = one_sided * residual_spectrum(best.law, omega, measured, noise_nm2, run.timing)[:, place]
-        axes.loglog(found.frequency_hz[1:], found.power_nm2_hz[1:, place], color="0.6", label="pseudo-open-loop")
+        residual = one_sided * residual_spectrum(best.law, omega, measured, noise_nm2, run.timing)[:, mode]
+        axes.loglog(
+            pol_spectrum.frequency_hz[1:], pol_spectrum.power_nm2_hz[1:, mode], color="0.6", label="pseudo-open-loop"
+        )
         closed = spectrum(run.error, run.rate_hz) if run.closed else None
         if closed is not None:
-            binned_hz, (power,) = in_bins(closed.frequency_hz, [closed.power_nm2_hz[:, place]])
+            binned_hz, (power,) = in_bins(closed.frequency_hz, [closed.power_nm2_hz[:, mode]])
             axes.loglog(binned_hz, power, color="tab:orange", label="error, measured")
-        axes.loglog(found.frequency_hz[1:], modelled, color="tab:blue", lw=1, label="model")
-        axes.loglog(found.frequency_hz[1:], residual, color="tab:green", label=f"residual, {best.kinds[place]}, theory")
-        axes.set(ylabel=f"Z{run.noll[place]} {mode_name(run.noll[place])}, nm$^2$/Hz")
+        axes.loglog(pol_spectrum.frequency_hz[1:], modelled, color="tab:blue", lw=1, label="model")
+        axes.loglog(
+            pol_spectrum.frequency_hz[1:], residual, color="tab:green", label=f"residual, {best.kinds[mode]}, theory"
+        )
+        axes.set(ylabel=f"Z{run.noll[mode]} {mode_name(run.noll[mode])}, nm$^2$/Hz")
         axes.legend()
     axes.set(xlabel="Hz")
     return png(drawing)
@@ -254,15 +258,15 @@ def _tilt_mas(run: Telemetry, rms_nm: Array | None) -> float | None:
 
 
 def _doubts(run: Telemetry, open_mas: float | None, stable: bool) -> list[str]:
-    found = []
+    doubts = []
     if not run.closed and open_mas is not None and open_mas > OPTICAL_GAIN_MAS:
-        found.append(
+        doubts.append(
             f"an open loop with {open_mas:.1f} mas rms of tilt per axis, above {OPTICAL_GAIN_MAS:g}: the optical gain "
             "of the sensor is low, and some lines are spurious; close the loop with any stable gain and tune again"
         )
     if not stable:
-        found.append("the present law is unstable with this delay: theory cannot predict it")
-    return found
+        doubts.append("the present law is unstable with this delay: theory cannot predict its residual")
+    return doubts
 
 
 def _finite(value: float) -> float | None:
