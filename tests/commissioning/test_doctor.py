@@ -435,7 +435,7 @@ def test_real_time_rights_are_shown_applied_and_removed(tmp_path: Path, monkeypa
     assert device.stat().st_mode & 0o777 == 0o600
     for other in (b"somebody's own\n", b"\xff"):
         (tmp_path / next(iter(permissions.FILES))).write_bytes(other)
-        with pytest.raises(ConfigurationError, match="own"):
+        with pytest.raises(ConfigurationError, match="exists with other contents"):
             permissions.apply(tmp_path, "me")
     for fault in (OSError("Read-only file system: '/etc'"), LookupError("no such group: 'lowfc'")):
         monkeypatch.setattr(permissions, "apply", Mock(side_effect=fault))

@@ -15,19 +15,19 @@ from lowfc.optics.detector.detector import expose
 from lowfc.optics.twin.twin import Twin
 from lowfc.optics.twin.twin_mirror import TwinMirror
 
-_FRAMES = 100  # exposed to compare their flux with the light's
+_FRAMES = 100  # simulated frames, whose flux in DN is compared with that of the light on the detector
 
 WavefrontFunction = Callable[[Twin, TwinMirror], Array]
 """Computes the wavefront at the used nodes, nm, from a twin and the mirror on its nodes."""
 
 
 def analytic(config: Configuration, console: Console, at: WavefrontFunction | None = None) -> Calibration:
-    """Compute I0, H and R, eqs. (6) to (12), and cache the optical model; errors as `factory.analytic_calibration`.
+    """Compute I0, H and R, eqs. (6) to (12), and cache the optical model; raises as `factory.analytic_calibration`.
 
     Args:
         config: Configuration of the instrument.
         console: Terminal for the progress bar and warnings.
-        at: Computes the wavefront at the zero point; flat when None.
+        at: Computes the wavefront of the zero point; flat if None.
     """
 
     def warn(text: str) -> None:
@@ -45,16 +45,16 @@ def analytic(config: Configuration, console: Console, at: WavefrontFunction | No
             f"Z{calibration.noll[worst]}: noise is {noise_nm[worst]:.0f} nm rms per frame, more than its modal "
             f"limit of {limit_nm[worst]:g} nm: the star is too faint, or the mask cannot distinguish so many modes"
         )
-    camera, flux_dn = factory.detector(config), calibration.flux_dn
-    light_e = calibration.reference * flux_dn * camera.gain_e_per_dn / camera.em_gain
-    frames = expose(camera, np.tile(light_e, (_FRAMES, 1)), np.random.Generator(np.random.SFC64(1)))
-    shares = (frames - calibration.dark).sum(axis=1) / flux_dn
-    share = float(shares.mean())
-    if abs(share - 1) > 0.1 + 3 * shares.std() / np.sqrt(_FRAMES):
+    detector, flux_dn = factory.detector(config), calibration.flux_dn
+    light_e = calibration.reference * flux_dn * detector.gain_e_per_dn / detector.em_gain
+    frames = expose(detector, np.tile(light_e, (_FRAMES, 1)), np.random.Generator(np.random.SFC64(1)))
+    flux_ratios = (frames - calibration.dark).sum(axis=1) / flux_dn
+    flux_ratio = float(flux_ratios.mean())
+    if abs(flux_ratio - 1) > 0.1 + 3 * flux_ratios.std() / np.sqrt(_FRAMES):
         why = (
             "dark pixels are cut off at 0 DN: raise camera.bias_dn"
-            if share > 1
+            if flux_ratio > 1
             else "faint pixels are rounded down to whole DN: camera.gain_e_per_dn is too large for the read noise"
         )
-        warn(f"the frames' flux is {100 * share:.0f} % of the light's, which distorts the modes: {why}")
+        warn(f"the frames' flux is {100 * flux_ratio:.0f} % of the light's, which distorts the modes: {why}")
     return calibration

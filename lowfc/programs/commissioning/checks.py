@@ -11,7 +11,7 @@ from lowfc.control.loop.wording import counted
 
 S = TypeVar("S")
 
-_WIDTH = 120  # without a terminal
+_WIDTH = 120  # columns of a report that is not printed on a terminal
 
 
 class Status(StrEnum):
@@ -47,7 +47,7 @@ class Check(NamedTuple):
 
 
 Severity = Callable[[str, str], Check]
-"""Function that makes a Check from a finding and an advice: `note`, `warning` or `wrong`."""
+"""Function that makes a Check from a finding and advice: `note`, `warning` or `wrong`."""
 
 
 def ok(got: str) -> Check:
@@ -71,10 +71,10 @@ def wrong(got: str, advice: str) -> Check:
 
 
 def judged(
-    name: str, expected: str, good: bool, got: str, advice: str, but: str = "", severity: Severity = wrong
+    name: str, expected: str, good: bool, got: str, advice: str, got_if_bad: str = "", severity: Severity = wrong
 ) -> Check:
-    """A named check: `ok(got)` if good; otherwise `but`, by default `got`, with the advice."""
-    check = ok(got) if good else severity(but or got, advice)
+    """A named check: `ok(got)` if good; otherwise `severity` of `got_if_bad`, by default `got`, and the advice."""
+    check = ok(got) if good else severity(got_if_bad or got, advice)
     return check._replace(name=name, expected=expected)
 
 
@@ -92,27 +92,27 @@ class Table(Generic[S]):
         Args:
             name: Name of the check.
             expected: Requirement of the contract.
-            advice: Recommended action for a warning that has no advice.
-            cost: Consequence of ignoring the advice.
+            advice: Recommended action, for a warning of the function that gives none.
+            cost: Consequence of ignoring this advice.
         """
 
-        def enter(function: Callable[[S], Check | None]) -> Callable[[S], object]:
+        def register(function: Callable[[S], Check | None]) -> Callable[[S], object]:
             self.functions[name] = Check(Status.WARNING, "", advice, cost, name, expected), function
             return function
 
-        return enter
+        return register
 
     def run(self, subject: S, unknown: tuple[type[Exception], ...] = ()) -> Iterator[Check]:
         """Run every check on `subject`; a check that raises one of the `unknown` exceptions gives a note."""
         for template, function in self.functions.values():
             try:
-                found = function(subject)
+                result = function(subject)
             except unknown as fault:
-                found = note(f"not known: {fault}")
-            if found is not None and found.status is Status.WARNING and not found.advice:
-                yield template._replace(got=found.got)
-            elif found is not None:
-                yield found._replace(name=template.name, expected=template.expected)
+                result = note(f"not known: {fault}")
+            if result is not None and result.status is Status.WARNING and not result.advice:
+                yield template._replace(got=result.got)
+            elif result is not None:
+                yield result._replace(name=template.name, expected=template.expected)
 
 
 def print_report(
@@ -122,8 +122,8 @@ def print_report(
 
     Args:
         checks: The results, in the order of the report.
-        worst_first: Statuses to count.
-        fields: JSON key to attribute of a check.
+        worst_first: Statuses to count, the worst first.
+        fields: Attribute of a check by JSON key.
         about: Other members of the JSON object; None for a text table.
     """
     numbers = Counter(check.status for check in checks)

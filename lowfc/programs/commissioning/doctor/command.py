@@ -35,7 +35,7 @@ def doctor(
 ) -> None:
     """Check this host for real-time operation; for each problem, show the remedy and the consequence.
 
-    Only --apply and --undo change anything or require root. The checks request real-time measures as the loop does, in
+    Only --apply and --undo change anything or require root. The checks request real-time settings as the loop does, in
     a separate process.
 
     Example: lowfc doctor --config lowfc.toml --strict

@@ -10,7 +10,7 @@ from lowfc.programs.commissioning.checks import Check, judged, ok, wrong
 
 
 def device_checks(name: str, config: Configuration) -> Iterator[Check]:
-    """Check each requirement of the camera and mirror driver of this name, without opening the driver."""
+    """Check each requirement of the camera and mirror drivers of this name, without opening them."""
     for kind in _kinds(name):
         what = f"{kind} {name}"
         try:

@@ -17,8 +17,8 @@ class Facts:
     Attributes:
         host: the host, as reported by its kernel.
         config: configuration of the loop.
-        trial: refused real-time measures and wake-up latencies, or the error if the trial failed.
-        busy: other processes during the measurement, as from `Host.busy`.
+        trial: refused real-time settings and wake-up latencies, or the error if the trial failed.
+        busy: name and load, in processors, of the other processes during the measurement, from `Host.busy`.
     """
 
     host: Host
@@ -27,8 +27,8 @@ class Facts:
     busy: tuple[tuple[str, float], ...]
 
     @property
-    def tried(self) -> Trial:
-        """Refused real-time measures and wake-up latencies; OSError if the trial failed."""
+    def completed_trial(self) -> Trial:
+        """Refused real-time settings and wake-up latencies; OSError if the trial failed."""
         if isinstance(self.trial, OSError):
             raise self.trial
         return self.trial
@@ -47,7 +47,7 @@ class Facts:
 
 
 def gather(host: Host, config: Configuration, seconds: float) -> Facts:
-    """Request the loop's real-time measures, measure wake-ups in each class, and note other busy processes."""
+    """Request the loop's real-time settings, measure wake-ups in each class, and note other busy processes."""
     facts = Facts(host, config, OSError("not tried"), ())
     host.busy()  # the next call reports the load since this one
     try:

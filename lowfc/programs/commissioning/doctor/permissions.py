@@ -14,7 +14,7 @@ _RULE = f"""# The loop's processes disable CPU idle states (realtime.disable_cpu
 SUBSYSTEM=="misc", KERNEL=="cpu_dma_latency", GROUP="{GROUP}", MODE="0660"
 """
 FILES = {"etc/security/limits.d/90-lowfc.conf": _LIMITS, "etc/udev/rules.d/90-lowfc-user.rules": _RULE}
-"""Contents by path; the names differ from those in `deploy`, which --undo does not remove."""
+"""Contents by path below the root. The files of `deploy` have other names, so that --undo leaves them in place."""
 
 
 def shown(root: Path) -> str:
@@ -30,7 +30,7 @@ def apply(root: Path, user: str) -> list[str]:
     """Write the files, create the group with this user, and give the group access to the device; return the actions.
 
     Raises:
-        ConfigurationError: not root, or a file is not lowfc's.
+        ConfigurationError: not root, or a file exists with other contents.
         OSError: a file cannot be written, or a command failed.
         LookupError: the group was not created.
     """
@@ -38,7 +38,9 @@ def apply(root: Path, user: str) -> list[str]:
     for name, text in FILES.items():
         file = root / name
         if file.exists() and file.read_bytes() != text.encode():
-            raise ConfigurationError(f"{file} is not lowfc's own: move it away, or add its lines by hand")
+            raise ConfigurationError(
+                f"{file} exists with other contents: move it away, or add the lines of --setup to it by hand"
+            )
     done = []
     for name, text in FILES.items():
         file = root / name
@@ -70,17 +72,17 @@ def undo(root: Path) -> list[str]:
         done.append(f"{root / DEVICE} is accessible to root only")
     try:
         return [*done, _run("groupdel", "--prefix", str(root), GROUP)]
-    except OSError as fault:  # there is no such group, or it is that of the services' user
+    except OSError as fault:  # there is no such group, or it is the primary group of the services' user
         return [*done, str(fault)]
 
 
 def _require_root(option: str) -> None:
     if os.geteuid() != 0:
-        raise ConfigurationError(f"lowfc doctor {option} changes the host and needs root; --setup shows what it does")
+        raise ConfigurationError(f"lowfc doctor {option} changes the host and needs root; --setup shows the settings")
 
 
 def _run(*words: str) -> str:
-    """Run a command of the host; return its text. OSError if it does not exist or fails."""
+    """Run a command of the host; return its command line. OSError if it does not exist or fails."""
     program = shutil.which(words[0], path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin") or words[0]
     run = subprocess.run([program, *words[1:]], capture_output=True, text=True, check=False)  # noqa: S603  # as shown
     if run.returncode:

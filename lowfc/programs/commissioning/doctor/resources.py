@@ -20,7 +20,7 @@ CHECKS: Table[Facts] = Table()
 
 _STALL_S = 0.1  # stall of a reader that socket buffers should outlast
 _OPEN_FILES = 256  # needed by a process
-_LIMITS = "`lowfc doctor --setup` (memlock unlimited in limits.d), or the service's LimitMEMLOCK=infinity"
+_MEMLOCK_ADVICE = "`lowfc doctor --setup` (memlock unlimited in limits.d), or the service's LimitMEMLOCK=infinity"
 
 
 @CHECKS.check("locked memory")
@@ -28,9 +28,9 @@ def _locked_memory(facts: Facts) -> Check:
     """Locking a process's memory, requested as by the loop."""
     if not facts.config.realtime.lock_memory:
         return note("not requested by the configuration: realtime.lock_memory = false")
-    if refused := facts.tried.refused.get("lock_memory"):
+    if refused := facts.completed_trial.refused.get("lock_memory"):
         what, cost = refused
-        return warning(f"refused: {what}", _LIMITS, cost)
+        return warning(f"refused: {what}", _MEMLOCK_ADVICE, cost)
     return ok("granted")
 
 
@@ -41,11 +41,11 @@ def _swap(facts: Facts) -> Check:
     if not total_bytes:
         return ok("none")
     detail = f"{used_bytes / 1e6:.0f} MB in use of {total_bytes / 1e6:.0f} MB"
-    if facts.config.realtime.lock_memory and "lock_memory" not in facts.tried.refused:
+    if facts.config.realtime.lock_memory and "lock_memory" not in facts.completed_trial.refused:
         return ok(f"{detail}; the loop's memory is locked")
     return warning(
         f"{detail}; the loop's memory is not locked",
-        f"swapoff --all; or {_LIMITS}",
+        f"swapoff --all; or {_MEMLOCK_ADVICE}",
         "a page that was swapped out stalls the loop for milliseconds",
     )
 
@@ -68,12 +68,12 @@ def _huge_pages(facts: Facts) -> Check:
     cost="threads of a small matrix product wait for each other on the loop's processors",
 )
 def _blas(facts: Facts) -> Check:
-    """Linear algebra of numpy, and whether it can be limited to one thread, as in the loop."""
+    """Libraries of linear algebra in numpy, and whether they can be limited to one thread, as in the loop."""
     names = ", ".join(f"{name}, {counted(threads, 'thread')}" for name, threads in sorted(_blas_threads().items()))
     with threadpool_limits(limits=1):
         limited = _blas_threads()
     if limited and max(limited.values()) == 1:
-        return ok(f"{names}; the loop limits it to one")
+        return ok(f"{names}; the loop limits them to one")
     return warning(names or f"none that threadpoolctl knows, in numpy {np.__version__}")
 
 
@@ -116,11 +116,11 @@ def _disk(facts: Facts) -> Check:
     section, rate_hz = facts.config.recorder, facts.config.camera.rate_hz
     folder = user_path(section.folder)
     free_bytes, writable = facts.host.disk(folder)
-    growth = bytes_per_s(facts.config, configured_selection(facts.config))
-    lasts_s = max(0.0, free_bytes - section.min_free_mb * 1e6) / growth
+    growth_bytes_per_s = bytes_per_s(facts.config, configured_selection(facts.config))
+    lasts_s = max(0.0, free_bytes - section.min_free_mb * 1e6) / growth_bytes_per_s
     detail = (
         f"{folder.absolute()}: {free_bytes / 1e9:.1f} GB free, enough for {lasts_s / 3600:.1f} h at {rate_hz:g} Hz, "
-        f"{growth * 3.6e-6:.1f} GB an hour"
+        f"{growth_bytes_per_s * 3.6e-6:.1f} GB an hour"
     )
     if not writable:
         return warning(f"{detail}; not writable", "set recorder.folder to a writable folder", "nothing is recorded")

@@ -23,7 +23,7 @@ _SLOW_SOURCES = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
 _SLOW_READING_NS = 1000
 _READINGS = 200  # of the clock, timed together
 _PART_OF_PERIOD = 0.1  # acceptable p99 of the wake-up, in frame periods
-_STOLEN = 1e-3  # larger shares of stolen time are called much
+_STOLEN = 1e-3  # share of stolen time above which it is called much
 _BUSY = 0.1  # smallest share of a processor that is reported
 _BUSY_SHOWN = 3
 
@@ -34,7 +34,7 @@ def _scheduling_class(facts: Facts) -> Check:
     priority = facts.config.realtime.priority
     if not priority:
         return note("the configuration requests normal scheduling: realtime.priority = 0")
-    if refused := facts.tried.refused.get("priority"):
+    if refused := facts.completed_trial.refused.get("priority"):
         what, cost = refused
         advice = f"`lowfc doctor --setup` (rtprio {priority} in limits.d), or the service's LimitRTPRIO={priority}"
         return warning(f"refused: {what}", advice, cost)
@@ -64,7 +64,7 @@ def _processors(facts: Facts) -> Check:
     usable, online = facts.host.usable_cpus(), facts.host.cpus("online")
     detail = f"{len(usable)} usable ({ranges(usable)}) of {len(online)}"
     named = facts.named_cpus
-    if named and (missing := named - facts.tried.cpus):
+    if named and (missing := named - facts.completed_trial.cpus):
         return warning(
             f"{detail}; the configuration names {ranges(missing)}",
             "correct realtime.camera_cpus, controller_cpus, mirror_cpus and recorder_cpus",
@@ -98,8 +98,8 @@ def _isolation(facts: Facts) -> Check:
         return ok(detail)
     return warning(
         f"{detail}; the configuration names {ranges(named) or 'none'}",
-        "name isolated ones in realtime.camera_cpus, controller_cpus and mirror_cpus",
-        f"unused; {cost}",
+        "name isolated processors in realtime.camera_cpus, controller_cpus and mirror_cpus",
+        cost,
     )
 
 
@@ -136,14 +136,14 @@ def _idle_states(facts: Facts) -> Check:
     """Depth of processor sleep: the driver and the longest exit latency of the states in use."""
     host, folder = facts.host, f"{CPUS}/cpu{min(facts.host.usable_cpus())}/cpuidle"
     driver, states = host.text(f"{CPUS}/cpuidle/current_driver"), sorted((host.root / folder).glob("state*"))
-    read = [[host.text(f"{folder}/{state.name}/{key}") for key in ("latency", "name", "disable")] for state in states]
-    used = [(int(exit_us), name) for exit_us, name, disabled in read if disabled == "0"]
+    rows = [[host.text(f"{folder}/{state.name}/{key}") for key in ("latency", "name", "disable")] for state in states]
+    used = [(int(exit_us), name) for exit_us, name, disabled in rows if disabled == "0"]
     if driver == "none" or not used:
         return note(f"driver {driver}, no states shown; in a virtual machine the hypervisor decides")
     exit_us, deepest = max(used)
     detail = f"driver {driver}, deepest state {deepest} with {exit_us} us to wake"
     if facts.config.realtime.disable_cpu_idle:
-        if refused := facts.tried.refused.get("disable_cpu_idle"):
+        if refused := facts.completed_trial.refused.get("disable_cpu_idle"):
             what, cost = refused
             return warning(
                 f"{detail}; not granted: {what}",
@@ -166,7 +166,7 @@ def _kernel(facts: Facts) -> Check:
     words = facts.host.text("proc/version").split()
     release = words[2]
     advice = "boot with preempt=full, or a kernel with PREEMPT_RT"
-    cost = "a system call of another program delays a frame until it is done"
+    cost = "a frame may have to wait for the end of another program's system call"
     if "PREEMPT_RT" in words:
         return ok(f"{release}, PREEMPT_RT")
     if "PREEMPT_DYNAMIC" in words:
@@ -203,7 +203,7 @@ def _virtualisation(facts: Facts) -> Check:
 
 @CHECKS.check(
     "clock source",
-    advice="boot with clocksource=tsc, on x86 with tsc=reliable where the processor's counter is sound",
+    advice="on x86, boot with clocksource=tsc, and with tsc=reliable if the processor's counter is stable",
     cost="every process reads the time several times a frame",
 )
 def _clock_source(facts: Facts) -> Check:
@@ -253,10 +253,10 @@ def _boot_clock(facts: Facts) -> Check:
 )
 def _wake_up(facts: Facts) -> Check:
     """Lateness of a timer wake-up, 1000 times in one second, in normal scheduling and, if granted, SCHED_FIFO."""
-    wake_up = wake_up_us(facts.tried)
+    wake_up = wake_up_us(facts.completed_trial)
     detail = "; ".join(
-        f"{name}: p50 {one['p50']:.0f} us, p99 {one['p99']:.0f} us, max {one['max']:.0f} us"
-        for name, one in wake_up.items()
+        f"{name}: p50 {late_us['p50']:.0f} us, p99 {late_us['p99']:.0f} us, max {late_us['max']:.0f} us"
+        for name, late_us in wake_up.items()
     )
     best = list(wake_up.values())[-1]
     period_us = facts.config.period_ns / 1e3
@@ -277,7 +277,7 @@ def wake_up_us(trial: Trial) -> dict[str, dict[str, float]]:
 
 @CHECKS.check(
     "load",
-    advice="end them, or keep them off the loop's processors",
+    advice="end other busy processes, or keep them off the loop's processors",
     cost="with normal scheduling they delay the loop; under SCHED_FIFO they still evict its caches",
 )
 def _load(facts: Facts) -> Check:
