@@ -24,7 +24,7 @@ from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.commission import commissioning
 from lowfc.programs.commissioning.commission.commissioning import Commissioning, CommissionOptions, provisional_path
 from lowfc.programs.commissioning.commission.first_calibration import linear_nm
-from lowfc.programs.commissioning.commission.first_light import Sensor, referenced
+from lowfc.programs.commissioning.commission.first_light import Sensor, calibration_with_reference
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, Agreement, agreement_checks
 from tests.support.in_process_loop import InProcessLoop, computed
 from tests.support.loops import lowfc, refusal
@@ -95,7 +95,7 @@ class Bench:
 @pytest.fixture(scope="module", autouse=True)
 def _few_frames() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commissioning, "MIN_PREDICTED", 300)
+        patch.setattr(commissioning, "MIN_RESIDUAL_FRAMES", 300)
         patch.setattr(pokes, "DELAY_FRAMES", 240)
         yield
 
@@ -149,9 +149,9 @@ def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench,
     bench, results = commissioned
     bench.loop.open_loop()
     before = bench.loop.status().state
-    text = bench.steps(close=False)._close(1.0)
-    assert "predicted measured error in closed loop, at a gain of 0.1 in place of automatic gains: " in text
-    assert "`lowfc ctl close` closes it" in text
+    text = bench.steps(close=False)._predict_and_close(1.0)
+    assert "predicted error in closed loop with noise, at a gain of 0.1 in place of automatic gains: " in text
+    assert "`lowfc ctl close` closes the loop" in text
     after = bench.loop.status().state
     assert (after.mode, after.gain, after.automatic) == (wire.LOOP_MODE_OPEN, before.gain, before.automatic)
     open_nm = np.array([step.pol_nm for step in bench.loop.steps(300)])
@@ -176,11 +176,11 @@ def test_a_wrong_sign_fails_the_check_with_automatic_gains(
     bench.loop.load(identified(replace(good, reconstructor=R)))
     steps = bench.steps()
     with bench.loop.reserved("a test"), pytest.raises(CalibrationError, match=r"nm rms, but .* was predicted"):
-        steps._close(1.0)
+        steps._predict_and_close(1.0)
     advice = steps._how_to_continue(None)
     assert "is saved in" in advice
     assert "the closed loop did not behave as predicted: check the sign" in advice
-    assert "`lowfc ctl reset` removes its command from the mirror" in advice
+    assert "`lowfc ctl reset` removes the loop's command from the mirror" in advice
     state = bench.loop.status().state
     assert (state.mode, list(state.automatic)) == (wire.LOOP_MODE_OPEN, [True, True, False])
     bench.loop.load(good)
@@ -196,7 +196,7 @@ def test_with_a_linear_law_its_own_residual_is_predicted(commissioned: tuple[Ben
     before = bench.loop.status().state
     steps = bench.steps()
     with bench.loop.reserved("a test"):
-        steps._close(1.0)
+        steps._predict_and_close(1.0)
     assert steps._results["measured_error_nm"] == pytest.approx(steps._results["predicted_error_nm"], rel=0.15)
     assert steps._results["predicted_error_nm"] < 0.9 * results["predicted_error_nm"]
     after = bench.loop.status().state
@@ -301,9 +301,9 @@ def test_a_hot_pixel_at_full_well_is_not_the_star() -> None:
     camera, frames = camera_settings(configured(CONFIG)), np.full((16, 80, 80), 200)
     frames[:, 0, 0] = camera.saturation_dn
     sensor = Sensor(camera, np.full(6400, 100.0), (np.arange(6400) > 0).astype(float), measured=False)
-    assert referenced(sensor, frames, computed(CONFIG.to_toml()), str).flux_dn == 6399 * 100
+    assert calibration_with_reference(sensor, frames, computed(CONFIG.to_toml()), str).flux_dn == 6399 * 100
     with pytest.raises(CalibrationError, match="the brightest good pixel is at 16383 of 16383 DN"):
-        referenced(sensor._replace(good=np.ones(6400)), frames, computed(CONFIG.to_toml()), str)
+        calibration_with_reference(sensor._replace(good=np.ones(6400)), frames, computed(CONFIG.to_toml()), str)
 
 
 def test_a_camera_that_differs_from_the_configuration_is_refused(tmp_path: Path) -> None:

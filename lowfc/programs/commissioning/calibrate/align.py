@@ -45,7 +45,7 @@ class AlignResult(Result):
 
 
 def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResult:
-    """Fit the sensor's geometry and write the computed calibration for its pixels; CalibrationError if none fits."""
+    """Fit the sensor's geometry and write the computed calibration for its pixels; CalibrationError without a fit."""
     require_folder(out)
     console = Console(stderr=True)
     with Client(run) as loop, loop.reserved("lowfc calibrate align"):
@@ -56,24 +56,24 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
         flux_dn = float(light_dn.reshape(-1) @ before.good)
         computed = analytic(config, console)
         try:
-            found = align(light_dn, computed.reference.astype(np.float64).reshape(computed.shape))
+            alignment = align(light_dn, computed.reference.astype(np.float64).reshape(computed.shape))
         except ValueError as error:
             raise CalibrationError(str(error)) from None
-        calibration = on_sensor(config, computed, found.geometry, flux_dn, before)
+        calibration = on_sensor(config, computed, alignment.geometry, flux_dn, before)
         mode = int(np.argmax(np.linalg.norm(calibration.response, axis=0)))
         amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_nm(config, calibration)[mode]))
         poke = Player(loop, calibration, reporter(console)).first_poke(mode, first_poke_plan(amplitude_nm))
         if poke.response @ calibration.response[:, mode] < 0:
-            found = replace(found, geometry=found.geometry.rotated_180())
-            calibration = on_sensor(config, computed, found.geometry, flux_dn, before)
+            alignment = replace(alignment, geometry=alignment.geometry.rotated_180())
+            calibration = on_sensor(config, computed, alignment.geometry, flux_dn, before)
         write(calibration, out, loop if load else None)
     return AlignResult(
-        **asdict(found.geometry),
-        pixels_per_lambda_d=found.geometry.scale * computed_scale(config),
+        **asdict(alignment.geometry),
+        pixels_per_lambda_d=alignment.geometry.scale * computed_scale(config),
         flux_dn=flux_dn,
-        background_dn=found.background,
-        residual=found.residual,
-        other_parity_residual=found.other_parity,
+        background_dn=alignment.background,
+        residual=alignment.residual,
+        other_parity_residual=alignment.other_parity,
         file=str(out),
     )
 
@@ -91,7 +91,7 @@ def on_sensor(
     good = before.good.astype(np.float64)
     try:
         I0, H = normalise_flux(np.maximum(I0, 0), H, good)
-        made = replace(
+        calibration = replace(
             computed,
             reference=single(I0),
             response=single(H),
@@ -105,10 +105,10 @@ def on_sensor(
             operator_hash="",
             camera=before.camera,
         )
-        R = compute_reconstructor(config, made, None, estimator=config.control.estimator).matrix
+        R = compute_reconstructor(config, calibration, None, estimator=config.control.estimator).matrix
     except (ValueError, CalibrationError) as error:
         raise CalibrationError(f"too little of the image falls on the sensor: {error}") from None
-    return identified(replace(made, reconstructor=single(R)))
+    return identified(replace(calibration, reconstructor=single(R)))
 
 
 def computed_scale(config: Configuration) -> float:
@@ -117,12 +117,12 @@ def computed_scale(config: Configuration) -> float:
     return 1 / (optics.pitch * optics.binning)
 
 
-def in_words(found: Alignment, scale: float) -> str:
+def in_words(alignment: Alignment, scale: float) -> str:
     """Text of the image's geometry and its residual; `scale` in pixels per lambda/D."""
-    geometry = found.geometry
+    geometry = alignment.geometry
     return (
         f"{scale:.4f} pixels per lambda/D, centre at row {geometry.row:.2f}, column "
         f"{geometry.column:.2f}, rotation {geometry.rotation_deg:.2f} degrees, "
-        f"{'reflected' if geometry.parity < 0 else 'not reflected'}; {found.residual:.1%} of the image differs from "
-        f"the computed one ({found.other_parity:.1%} with the other parity)"
+        f"{'reflected' if geometry.parity < 0 else 'not reflected'}; {alignment.residual:.1%} of the image differs "
+        f"from the computed one ({alignment.other_parity:.1%} with the other parity)"
     )

@@ -58,8 +58,8 @@ def calibrate(
         bool,
         typer.Option(
             "--load",
-            help="Load the result into the loop. A closed loop is opened for it and closed again; with --method "
-            "analytic it must be open.",
+            help="Load the result into the loop. A closed loop is opened for this and closed again; --method "
+            "analytic requires an open loop.",
         ),
     ] = False,
     compare: Annotated[tuple[Path, Path] | None, typer.Option(help="Only compare two calibration files.")] = None,
@@ -70,7 +70,7 @@ def calibrate(
     The measured calibration is checked on separate frames. If it is not recommended, it is written as
     NAME.rejected.fits and not loaded, and the exit status is 1.
 
-    The mirror returns to its shape, also after Ctrl-C; --resume then continues after the completed cycles.
+    The mirror returns to its previous shape, also after Ctrl-C; --resume then continues after the completed cycles.
 
     Example: lowfc calibrate --method poke --snr 300 --out night.fits
     """

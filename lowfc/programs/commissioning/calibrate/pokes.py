@@ -121,11 +121,11 @@ class Pokes:
             seed = SEED + 1000 * (number + 1)
             return poke_plan.dither(self._modes, amplitude_nm, PIECE, DITHER_HOLD, seed)
         patterns = poke_plan.hadamard_patterns if request.method == "hadamard" else poke_plan.poke_patterns
-        rest = max(16, len(poke_plan.SIGNS) * HOLD)
+        rest_frames = max(16, len(poke_plan.SIGNS) * HOLD)
         shapes = patterns(self._modes, amplitude_nm)
         # a different order in each pair of cycles, so that their scatter shows vibrations
         shapes = np.random.default_rng([SEED, number // 2]).permutation(shapes)
-        return poke_plan.cycle(shapes, HOLD, SETTLE, rest, backwards=number % 2 == 1)
+        return poke_plan.cycle(shapes, HOLD, SETTLE, rest_frames, backwards=number % 2 == 1)
 
     def _amplitude(self) -> float:
         """The requested or default amplitude, within the mirror's slew limit."""

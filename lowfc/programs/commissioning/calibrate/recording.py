@@ -41,11 +41,11 @@ _LIMITS = frozenset(Limit) - {Limit.LAW_OVERRULED}  # those that end a probe seq
 
 
 class PlayInterruptedError(CalibrationError):
-    """A device restarted or stalled during the pokes, which must be repeated."""
+    """A device restarted or stalled during the pokes: repeat them."""
 
 
 class PokesNotSeenError(CalibrationError):
-    """The frames show no response to the pokes, which may be too small."""
+    """The frames show no response to the pokes: they may be too small."""
 
 
 class Recording(NamedTuple):
@@ -73,8 +73,8 @@ class Recording(NamedTuple):
         """The loop's own command as seen by each exposure (frames, modes)."""
         frames = np.arange(self.steps[-1] + 1)
         newest = np.maximum(np.searchsorted(self.steps, frames, "right") - 1, 0)  # for a missing step, the one before
-        all_of_them = np.ones(len(self.steps), np.bool_)
-        return seen(self.command_nm[newest], _weights(delay_frames), self.steps, all_of_them)[self._steps_of_frames]
+        every_step = np.ones(len(self.steps), np.bool_)
+        return seen(self.command_nm[newest], _weights(delay_frames), self.steps, every_step)[self._steps_of_frames]
 
     def usable(self, plan: Plan, delay_frames: float) -> Mask:
         """Whether each frame may be used (frames,)."""
@@ -103,7 +103,8 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
         basis_nm: Shapes (shapes, actuators), nm of surface.
         table: Amplitude of each shape (frames, shapes).
 
-    CalibrationError if the sequence was ended, and as PlayInterruptedError if camera or mirror restarted or stalled.
+    CalibrationError if the sequence was ended; its subclass PlayInterruptedError if camera or mirror restarted or
+    stalled.
     """
     loop.check_lease()
     with _streams(loop) as (frames, steps):
@@ -122,7 +123,7 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
                 image = next(frames)
             else:
                 if first <= step.frame_sequence:
-                    mode = _check(loop, step, mode, over=step.frame_sequence > last)
+                    mode = _checked_mode(loop, step, mode, over=step.frame_sequence > last)
                     _check_devices(mirror, step.frame_sequence, first)
                     recorded.append(step)
                     _check_refused(recorded)
@@ -150,14 +151,14 @@ def check_size(shape: tuple[int, ...], before: Calibration) -> None:
 
 
 def warn_of_additions(loop: Client, report: Report) -> None:
-    """Report the offset and the channels that a new reference image contains, since the loop adds them to it."""
+    """Report the offset and the channels that a new reference image contains, as a loop with it adds them again."""
     state = loop.status().state or wire.ControllerState()
-    added = [f"channel {one.name}" for one in state.channels if one.shifts]
+    added = [f"channel {channel.name}" for channel in state.channels if channel.shifts]
     added += ["the offset"] * any(state.offset_nm)
     if added:
         report(
-            f"warning: the new reference image contains {', '.join(added)}, and a loop with it adds that again: set "
-            "the offset to zero, and remove the channels, or keep their shapes on the channel flat"
+            f"warning: the new reference image contains {', '.join(added)}, and a loop with it adds them again: "
+            "set the offset to zero, and remove the channels, or keep their shapes on the channel flat"
         )
 
 
@@ -173,10 +174,10 @@ def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
             raise
 
 
-def _check(loop: Client, step: Step, before: LoopMode | None, *, over: bool) -> LoopMode:
+def _checked_mode(loop: Client, step: Step, before: LoopMode | None, *, over: bool) -> LoopMode:
     """The mode of a step; raise if the probe sequence was ended."""
     if not over and before is not None and step.mode is not before:
-        loop.check_lease()  # its error names who ended it
+        loop.check_lease()  # its error names who ended the lease
         raise CalibrationError(
             f"the loop went from {before.name.lower()} to {step.mode.name.lower()} during the pokes, which ended them; "
             "do not operate the loop during a calibration"

@@ -25,7 +25,7 @@ from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrat
 MAX_NOISE_RATIO = 1.5
 """Largest accepted ratio of the noise of the measured R to that of the computed R, at the same flux. A sensor far from
 its zero point exceeds it."""
-_OTHER_SENSOR = 0.5  # error of an element of R H from which on a model is that of another sensor or orientation
+_OTHER_SENSOR = 0.5  # error of an element of R H from which a model counts as that of another sensor or orientation
 DELAY_TOLERANCE_FRAMES = 0.1
 """Largest difference between measured and configured delay without a warning, frames."""
 
@@ -141,13 +141,13 @@ def measured_calibration(
     config: Configuration, before: Calibration, measured: Measured, request: CalibrationRequest
 ) -> tuple[Calibration, Reconstruction]:
     """The calibration from cycles of pokes, with dark, mask and mirror commands of the previous one."""
-    names = dict.fromkeys([*measured.initial.estimator.removesuffix(FIRST).split("+"), request.method])
+    estimators = dict.fromkeys([*measured.initial.estimator.removesuffix(FIRST).split("+"), request.method])
     calibration = replace(
         before,
         reference=before.reference if measured.reference is None else single(measured.reference),
         response=single(measured.response),
         flux_dn=measured.flux_dn,
-        estimator="+".join(names),
+        estimator="+".join(estimators),
         operator_hash="",
     )
     reconstruction = compute_reconstructor(
@@ -260,60 +260,63 @@ def judge(
     )
 
 
-def comparison(one: Calibration, other: Calibration) -> Comparison:
+def comparison(first: Calibration, second: Calibration) -> Comparison:
     """Differences of two calibrations: I0 and H of the second, as measured with R of the first."""
-    if not comparable(one, other):
+    if not comparable(first, second):
         raise CalibrationError(
             "calibrations with different sensors or modes cannot be compared: the first has "
-            f"{one.shape[0]} x {one.shape[1]} pixels and modes {_span(one)}, the second {other.shape[0]} x "
-            f"{other.shape[1]} and {_span(other)}"
+            f"{first.shape[0]} x {first.shape[1]} pixels and modes {_span(first)}, the second {second.shape[0]} x "
+            f"{second.shape[1]} pixels and modes {_span(second)}"
         )
-    both = (one.good * other.good).astype(np.float64)
-    R = one.reconstructor.astype(np.float64)
-    talk = cross_talk(R, other.response)
-    shift = R @ ((other.reference - one.reference) * both)
-    commands = one.modes_to_actuators, other.modes_to_actuators
+    good_in_both = (first.good * second.good).astype(np.float64)
+    R = first.reconstructor.astype(np.float64)
+    talk = cross_talk(R, second.response)
+    shift = R @ ((second.reference - first.reference) * good_in_both)
+    commands = first.modes_to_actuators, second.modes_to_actuators
     return Comparison(
-        modes=len(one.noll),
-        noll=list(one.noll),
-        estimators=[one.estimator, other.estimator],
+        modes=len(first.noll),
+        noll=list(first.noll),
+        estimators=[first.estimator, second.estimator],
         cross_talk=float(np.abs(talk).max()),
         gain=(1 + np.diag(talk)).tolist(),
         reference_shift_nm=shift.tolist(),
-        flux_ratio=other.flux_dn / one.flux_dn,
-        dark_shift_dn=float(np.median(other.dark - one.dark)),
-        bad_pixels=[int(np.count_nonzero(each.good == 0)) for each in (one, other)],
+        flux_ratio=second.flux_dn / first.flux_dn,
+        dark_shift_dn=float(np.median(second.dark - first.dark)),
+        bad_pixels=[int(np.count_nonzero(each.good == 0)) for each in (first, second)],
         same_commands=bool(commands[0].shape == commands[1].shape and np.array_equal(*commands)),
     )
 
 
 def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array, response: Array) -> Array:
-    """Modes (modes, actuators) that R measures of each actuator: modal shapes measured, others modelled.
+    """Modes (modes, actuators) that R measures for each actuator: for modal shapes as measured, for others as modelled.
 
-    A common factor between model and measurement, as of the mirror's stroke or sign, applies to the others, too. A
-    negative one counts only if focus or spherical has it: what reverses these reverses all shapes, but half a turn of
-    most sensors reverses tip and tilt alone. For a sensor of another size or orientation than the model's, the others
-    are those of the calibration before, or projected onto the modal shapes.
+    A common factor between measurement and model, such as that of the mirror's stroke or sign, also applies to other
+    shapes. A negative factor is accepted only if focus or spherical is among the modes: a mirror of the opposite sign
+    reverses all modes, but half a turn of most sensors reverses tip and tilt alone. If the sensor has another size or
+    orientation than the model, the other shapes are those of the calibration in use, or else their projection onto the
+    modal shapes.
     """
     commands, own = before.modes_to_actuators.astype(np.float64), before.actuators_to_modes.astype(np.float64)
     inverse, product = np.linalg.pinv(commands), matrix @ response  # R H is the identity unless R is regularised
     known = matrix @ np.linalg.pinv(before.reconstructor.astype(np.float64)) @ own if own.size else product @ inverse
     optics = factory.twin(config, None, lambda _: None)
-    light = twin_reference(optics)
+    twin_image = twin_reference(optics)
     candidates = [known]
-    if light.shape == before.shape:
+    if twin_image.shape == before.shape:
         on_nodes = factory.mirror_on_twin(config, optics, lambda _: None)
-        modelled = factory.actuators_to_modes(matrix, light.reshape(-1), before.good.astype(float), optics, on_nodes)
+        modelled = factory.actuators_to_modes(
+            matrix, twin_image.reshape(-1), before.good.astype(float), optics, on_nodes
+        )
         if own.size:
             modelled[:, ~own.any(axis=0)] = 0  # actuators that are not active
         candidates.insert(0, modelled)
     symmetric = any(noll_to_orders(index)[1] == 0 for index in before.noll)
-    for found in candidates:
-        modes = found @ commands
+    for candidate in candidates:
+        modes = candidate @ commands
         factor = float(np.vdot(modes, product)) / (float(np.vdot(modes, modes)) or 1.0)
         error = factor * modes - product
         if (factor > 0 or symmetric) and np.abs(error).max() < _OTHER_SENSOR:
-            return np.asarray(factor * found - error @ inverse)
+            return np.asarray(factor * candidate - error @ inverse)
     return np.asarray(product @ inverse)
 
 

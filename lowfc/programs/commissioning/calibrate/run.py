@@ -88,7 +88,7 @@ class Calibrator:
         self._computed = computed
         self.noise_nm = factory.frame_noise_nm(self.config, self.before)
         self._closed = request.method == "in-loop"
-        if not self._closed:  # which keeps the reference image
+        if not self._closed:  # the in-loop method keeps the reference image
             warn_of_additions(loop, report)
         self.pokes = Pokes(self.config, self.before, self.noise_nm, request)
         self._progress = progress
@@ -138,7 +138,7 @@ class Calibrator:
         return state.mode if state is not None else wire.LOOP_MODE_OPEN
 
     def run(self, delay: Delay | None = None) -> CalibrationData:
-        """Measure the delay, unless given, which also checks that pokes are detected; then measure the response."""
+        """Measure the delay, which shows that pokes are detected, unless it is given; then measure the response."""
         delay = self.delay() if delay is None else delay
         return CalibrationData(self._cycles(delay), delay)
 
@@ -165,24 +165,24 @@ class Calibrator:
         mode = self._quietest_mode
         plan = self.pokes.delay(mode)
         self._show("detecting pokes", max(self.pokes.cycles(), self.completed), self.completed)
-        found = self._player.first_poke(mode, plan)
-        self._compare_response(found.response, mode)
+        delay = self._player.first_poke(mode, plan)
+        self._compare_response(delay.response, mode)
         self._report(
-            f"pokes of Z{self.before.noll[mode]} are detected after {found.delay_frames:.3f} +- "
-            f"{found.error_frames:.3f} frames, {found.delay_frames * self.config.period_ns * 1e-6:.3g} ms (from the "
+            f"pokes of Z{self.before.noll[mode]} are detected after {delay.delay_frames:.3f} +- "
+            f"{delay.error_frames:.3f} frames, {delay.delay_frames * self.config.period_ns * 1e-6:.3g} ms (from the "
             "end of an exposure to the end of the exposure that sees the resulting command)"
         )
-        return found
+        return delay
 
     def _compare_response(self, response: Array, mode: int) -> None:
         known = self.before.response[:, mode].astype(np.float64)
-        like = correlation(response, known)
-        if abs(like) < _MIN_CORRELATION:
+        image_correlation = correlation(response, known)
+        if abs(image_correlation) < _MIN_CORRELATION:
             self._report(
                 f"warning: the image of Z{self.before.noll[mode]} differs from that of the calibration in use "
-                f"(correlation {like:.2f}): is the sensor aligned (`lowfc calibrate align`)?"
+                f"(correlation {image_correlation:.2f}): is the sensor aligned (`lowfc calibrate align`)?"
             )
-        elif like < 0:
+        elif image_correlation < 0:
             self._report(
                 f"warning: Z{self.before.noll[mode]} has the opposite sign of the calibration in use: the mirror or "
                 "the camera is reflected or rotated; do not close the loop with that calibration"
@@ -208,15 +208,15 @@ class Calibrator:
                 sums = sums.plus(self._player.cycle(pokes.cycle(done), delay.delay_frames))
                 store(path, sums, self._conditions)
                 self.completed = sums.cycles
-            found = fit_response(sums)
-            more = pokes.more_cycles(needed, float(found.error.max()))
-            if more <= needed:
-                return found
+            measured = fit_response(sums)
+            required = pokes.more_cycles(needed, float(measured.error.max()))
+            if required <= needed:
+                return measured
             self._report(
-                f"the cycles scatter more than photon and read noise: {more} cycles instead of {needed}; "
-                + self._to_go(more, needed)
+                f"the cycles scatter more than photon and read noise: {required} cycles instead of {needed}; "
+                + self._to_go(required, needed)
             )
-            needed = more
+            needed = required
 
     def _show(self, doing: str, needed: int, done: int) -> None:
         total = self.pokes.frames(needed)
@@ -233,8 +233,8 @@ class Calibrator:
         full_rank = [each for each in candidates if np.linalg.matrix_rank(each.matrix) == len(before.noll)]
         if not full_rank:
             raise CalibrationError(
-                "neither the optical model nor the calibration in use distinguishes all modes on these pixels, but R "
-                "requires one that does: `lowfc calibrate align` computes it for this sensor"
+                "neither the optical model nor the calibration in use distinguishes all modes on these pixels, as R "
+                "requires: `lowfc calibrate align` computes a calibration for this sensor"
             )
         camera = factory.detector(self.config)
         variance = pixel_variance(
@@ -250,21 +250,21 @@ def partial_of(out: Path) -> Path:
     return out.with_name(out.name + ".part.npz")
 
 
-def store(path: Path, sums: Sums, what: dict[str, Any]) -> None:
-    """Write the completed cycles, with method, amplitude and calibration as `what`; DataFileError if that fails."""
+def store(path: Path, sums: Sums, conditions: dict[str, Any]) -> None:
+    """Write the completed cycles, with their method, amplitude and calibration; DataFileError if that fails."""
     stream = io.BytesIO()
     arrays = sums._asdict() | {"initial": sums.initial.matrix, "estimator": sums.initial.estimator}
-    np.savez(stream, what=np.array(json.dumps(what, sort_keys=True)), **arrays)
+    np.savez(stream, what=np.array(json.dumps(conditions, sort_keys=True)), **arrays)
     write_whole(path, stream.getvalue())
 
 
-def resumed(path: Path, what: dict[str, Any]) -> Sums:
-    """Read completed cycles; DataFileError if there are none, the file is damaged or of another calibration."""
-    before, sums = stored_cycles(path)
-    for key, value in what.items():
-        if before.get(key) != value:
+def resumed(path: Path, conditions: dict[str, Any]) -> Sums:
+    """Read completed cycles; DataFileError if there are none, or the file is damaged or of other conditions."""
+    stored, sums = stored_cycles(path)
+    for key, value in conditions.items():
+        if stored.get(key) != value:
             raise DataFileError(
-                f"{path} is of another calibration: {key} is {before.get(key)} in the file, now {value}; remove the "
+                f"{path} is of another calibration: {key} is {stored.get(key)} in the file, now {value}; remove the "
                 "file, or omit --resume"
             )
     return sums

@@ -132,19 +132,19 @@ def zero_point(config: Configuration, text: str) -> tuple[str, WavefrontFunction
 
 
 def _modes(text: str) -> dict[int, float]:
-    found: dict[int, float] = {}
+    modes_nm: dict[int, float] = {}
     for part in text.split(","):
         index, _, value = part.partition("=")
         try:
             mode, amplitude_nm = int(index), float(value)
         except ValueError:
             raise ConfigurationError(f"--at must be modes in nm, as in 4=15,7=-10, or a file; got {part!r}") from None
-        if mode < 2 or mode in found or not np.isfinite(amplitude_nm):
+        if mode < 2 or mode in modes_nm or not np.isfinite(amplitude_nm):
             raise ConfigurationError(
                 f"--at: {part!r} is not a Noll index of 2 or more, named once, and its amplitude in nm"
             )
-        found[mode] = amplitude_nm
-    return found
+        modes_nm[mode] = amplitude_nm
+    return modes_nm
 
 
 def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, load: bool) -> DarkResult:
@@ -156,11 +156,11 @@ def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, loa
             check_size(cube.shape[1:], before)
         elif cube.shape[1:] != before.shape:
             raise DataFileError(f"{file}: its frames have {cube.shape[1:]} pixels, the calibration {before.shape}")
-        found = measure_dark(cube.reshape(len(cube), -1))
-        check_dark(found.dark_dn, before.reference.astype(np.float64), before.flux_dn)
-        write(with_dark(before, found.dark_dn, found.good, *noise), out, loop if load else None)
-    counts = {name: int(np.count_nonzero(getattr(found, name))) for name in ("hot", "noisy", "dead")}
-    level, noise_dn = float(np.median(found.dark_dn)), float(np.median(found.noise_dn))
+        measured = measure_dark(cube.reshape(len(cube), -1))
+        check_dark(measured.dark_dn, before.reference.astype(np.float64), before.flux_dn)
+        write(with_dark(before, measured.dark_dn, measured.good, *noise), out, loop if load else None)
+    counts = {name: int(np.count_nonzero(getattr(measured, name))) for name in ("hot", "noisy", "dead")}
+    level, noise_dn = float(np.median(measured.dark_dn)), float(np.median(measured.noise_dn))
     return DarkResult(frames=len(cube), dark_dn=level, noise_dn=noise_dn, **counts, file=str(out))
 
 

@@ -20,7 +20,7 @@ def commission(
     ] = 400,
     dark: Annotated[Path | None, typer.Option(help="Dark frames: a FITS or .npy cube (frames, rows, columns).")] = None,
     no_dark: Annotated[
-        bool, typer.Option("--no-dark", help="Use the camera's bias as the dark, and all pixels.")
+        bool, typer.Option("--no-dark", help="Use the camera's bias as the dark, and treat all pixels as good.")
     ] = False,
     snr: Annotated[
         float | None,
@@ -54,8 +54,8 @@ def commission(
 
     if dark is not None and no_dark:
         raise ConfigurationError("--dark FILE and --no-dark exclude each other: use one")
-    resumes = resume and (provisional_path(out).exists() or out.exists())
-    if dark is None and not no_dark and not resumes and not sys.stdin.isatty():
+    will_resume = resume and (provisional_path(out).exists() or out.exists())
+    if dark is None and not no_dark and not will_resume and not sys.stdin.isatty():
         raise ConfigurationError(
             "without a terminal nobody can be asked to block the star for a dark: give dark frames with --dark FILE, "
             "or use the camera's bias with --no-dark"
@@ -70,8 +70,8 @@ def commission(
     def confirm(what: str) -> None:
         typer.confirm(what, default=True, abort=True, err=True)
 
-    with Client(run) as loop, loop.reserved("lowfc commission") as lease, percentage_bar(console) as shown:
+    with Client(run) as loop, loop.reserved("lowfc commission") as lease, percentage_bar(console) as bar:
         config = configuration_of(loop)
-        progress = lease.expecting(shown, config.camera.rate_hz)
-        found, text = Commissioning(loop, config, analytic(config, console), options, report, progress, confirm).run()
-    print_result(found, text, as_json=as_json)
+        progress = lease.expecting(bar, config.camera.rate_hz)
+        results, text = Commissioning(loop, config, analytic(config, console), options, report, progress, confirm).run()
+    print_result(results, text, as_json=as_json)

@@ -31,7 +31,12 @@ from lowfc.programs.commissioning.calibrate.result import finish_calibration
 from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of, stored_cycles
 from lowfc.programs.commissioning.calibrate.tasks import images
 from lowfc.programs.commissioning.commission.first_calibration import aligned, first_delay, linear_nm, poked
-from lowfc.programs.commissioning.commission.first_light import Sensor, camera_fits, darkened, referenced
+from lowfc.programs.commissioning.commission.first_light import (
+    Sensor,
+    calibration_with_reference,
+    checked_camera,
+    with_measured_dark,
+)
 
 METHOD = "hadamard"
 DEFAULT_SNR = 50.0
@@ -45,7 +50,7 @@ It is stable at any usual delay; with a wrong sign the error grows tenfold in 25
 """
 MAX_OF_PREDICTED = 1.5
 """Largest ratio of measured to predicted error in the closed loop."""
-MIN_PREDICTED = 1000
+MIN_RESIDUAL_FRAMES = 1000
 """Smallest number of frames, after settling, for the prediction of the residual and for its measurement."""
 STEPS = (
     *("camera", "dark and bad pixels", "reference image", "delay", "orientation and sign", "poke amplitude"),
@@ -90,7 +95,7 @@ class Commissioning:
         self._report, self._progress, self._confirm = report, progress, confirm
         self._results: dict[str, Any] = {}
         self._delay: Delay | None = None
-        self._kept: Path | None = None  # file of the provisional calibration, once that is in use
+        self._provisional_file: Path | None = None  # file of the provisional calibration, once that is in use
         self._advice = ""  # text after an early end, once the calibration is loaded
 
     def run(self) -> tuple[dict[str, Any], str]:
@@ -99,11 +104,11 @@ class Commissioning:
         if options.resume and not first_file.is_file():
             if options.out.is_file():
                 raise CalibrationError(
-                    f"nothing to resume: {options.out} is finished; `lowfc ctl load {options.out}` loads it; without "
-                    "--resume a new one is started"
+                    f"nothing to resume: {options.out} is finished; `lowfc ctl load {options.out}` loads it; --force "
+                    "in place of --resume starts a new commissioning"
                 )
             self._report(f"nothing to resume beside {options.out}: starting from the beginning")
-        before = self._open()
+        before = self._prepare_loop()
         try:
             return self._carry_out(first_file)
         except BaseException:
@@ -114,9 +119,9 @@ class Commissioning:
         """Text after a commissioning that ended early: the calibration in use, and how to continue."""
         if self._advice:
             return self._advice
-        if self._kept is None:
+        if self._provisional_file is None:
             return "no calibration was changed"
-        text = f"the completed steps are kept in {self._kept}: the same command with --resume continues"
+        text = f"the completed steps are kept in {self._provisional_file}: the same command with --resume continues"
         with contextlib.suppress(LowfcError):
             if before is not None:
                 self._loop.check_lease()
@@ -140,10 +145,10 @@ class Commissioning:
                 )
             self._report(f"resuming from {first_file} with its dark: --dark, --no-dark and --frames have no effect")
         else:
-            first = self._first()
+            first = self._provisional()
             calibration_file.save(first, first_file)
             partial_of(options.out).unlink(missing_ok=True)  # cycles of a former commissioning
-        self._kept = first_file
+        self._provisional_file = first_file
         self._loop.load(first)
         player = Player(self._loop, first, self._report)
         delay = self._delay if self._delay is not None else first_delay(player, config)
@@ -151,14 +156,14 @@ class Commissioning:
         if resume:
             amplitude_nm = float(stored_cycles(partial_of(options.out))[0]["amplitude_nm"])
         else:
-            self._step("poke amplitude")
+            self._announce("poke amplitude")
             default_nm = Pokes(config, first, factory.frame_noise_nm(config, first), self._request()).amplitude_nm
             amplitude_nm = linear_nm(player, config, delay, default_nm)
-        self._step("response")
+        self._announce("response")
         request = self._request(amplitude_nm, resume=resume)
         calibrator = Calibrator(self._loop, request, self._report, self._progress, self._computed)
         data = calibrator.run(delay)
-        self._step("verdict")
+        self._announce("verdict")
         calibration, result = finish_calibration(calibrator, request, data, self._computed)
         self._results |= result.json_object()
         if not result.recommended:
@@ -171,17 +176,17 @@ class Commissioning:
         for path in (first_file, partial_of(options.out)):
             path.unlink(missing_ok=True)
         self._report(result.text())
-        return self._results, self._close(delay.delay_frames)
+        return self._results, self._predict_and_close(delay.delay_frames)
 
     def _request(self, amplitude_nm: float | None = None, *, resume: bool = False) -> CalibrationRequest:
         options = self._options
         snr = options.snr or (DEFAULT_SNR if options.cycles is None else MIN_SNR)
         return CalibrationRequest(METHOD, options.out, snr, options.cycles, amplitude_nm, resume)
 
-    def _step(self, name: str) -> None:
+    def _announce(self, name: str) -> None:
         self._report(f"[{STEPS.index(name) + 1}/{len(STEPS)}] {name}")
 
-    def _open(self) -> Calibration | None:
+    def _prepare_loop(self) -> Calibration | None:
         """Check mode and mirror, and open a closed loop; return the calibration in use, if any."""
         state = self._state()
         if state.mode == wire.LOOP_MODE_SAFE:
@@ -203,37 +208,40 @@ class Commissioning:
             raise CalibrationError("the controller did not report its state")
         return state
 
-    def _first(self) -> Calibration:
-        self._step("camera")
+    def _provisional(self) -> Calibration:
+        """Measure the provisional calibration: dark, reference image, delay, and a first response."""
+        self._announce("camera")
         frames = list(self._loop.frames(CAMERA_FRAMES))
-        camera = camera_fits(self._config, self._loop.camera_state(), frames, self._report)
-        self._step("dark and bad pixels")
+        camera = checked_camera(self._config, self._loop.camera_state(), frames, self._report)
+        self._announce("dark and bad pixels")
         options, pixels = self._options, camera.shape[0] * camera.shape[1]
         sensor = Sensor(camera, np.full(pixels, float(camera.bias_dn)), np.ones(pixels), measured=False)
         if options.dark is not None:
-            sensor = darkened(camera, images(options.dark), self._report)
+            sensor = with_measured_dark(camera, images(options.dark), self._report)
         elif options.no_dark:
             self._report(f"no dark: the camera's bias of {camera.bias_dn:g} DN for all pixels, and no bad pixels")
         else:
             self._confirm("block the star; is it dark?")
-            sensor = darkened(camera, next_frames(self._loop, options.frames), self._report)
+            sensor = with_measured_dark(camera, next_frames(self._loop, options.frames), self._report)
             self._confirm("unblock the star; is it visible?")
-        self._step("reference image")
-        before = referenced(sensor, next_frames(self._loop, options.frames), self._computed, self._report)
-        self._step("delay")
+        self._announce("reference image")
+        before = calibration_with_reference(
+            sensor, next_frames(self._loop, options.frames), self._computed, self._report
+        )
+        self._announce("delay")
         player = Player(self._loop, before, self._report)
         self._delay = delay = first_delay(player, self._config)
-        self._step("orientation and sign")
+        self._announce("orientation and sign")
         first = aligned(self._config, self._computed, before, delay, self._report, self._results)
         return poked(player, self._config, delay) if first is None else first
 
-    def _close(self, delay_frames: float) -> str:
+    def _predict_and_close(self, delay_frames: float) -> str:
         """Predict the residual; if requested, close the loop and compare."""
         controller, settling, automatic = self._law_of_check()
-        frames = settling + max(MIN_PREDICTED, settling)
-        self._step("prediction")
+        frames = settling + max(MIN_RESIDUAL_FRAMES, settling)
+        self._announce("prediction")
         try:
-            opened = self._steps(frames)
+            opened = self._observe(frames)
             weights = delay_weights(max(delay_frames, 1.0)).astype(np.float32)
             missing = missing_before(opened.sequence)
             predicted = _rms_nm(counterfactual(controller, weights, opened.pol_nm, missing)[0], settling)
@@ -241,10 +249,12 @@ class Commissioning:
             raise CalibrationError(f"the residual cannot be predicted: {error}") from None
         self._results["predicted_error_nm"] = predicted
         gain = f", at a gain of {CHECK_GAIN:g} in place of automatic gains" if automatic else ""
-        text = f"predicted measured error in closed loop{gain}: {predicted:.3g} nm rms, from {frames} open-loop frames"
+        text = (
+            f"predicted error in closed loop with noise{gain}: {predicted:.3g} nm rms, from {frames} open-loop frames"
+        )
         if not self._options.close:
-            return f"{text}\n`lowfc ctl close` closes it"
-        self._step("closed loop")
+            return f"{text}\n`lowfc ctl close` closes the loop"
+        self._announce("closed loop")
         with self._fixed_gains(automatic):
             measured = self._measured_nm(frames, settling, predicted)
         return f"{text}\nmeasured in closed loop: {measured:.3g} nm rms, {measured / predicted:.2f} of the prediction"
@@ -286,11 +296,11 @@ class Commissioning:
         """Close the loop and measure its error, nm rms; a failure opens it, unless another operator ended the lease."""
         first = self._loop.close_loop().frame_sequence
         try:
-            closed = self._steps(frames, LoopMode.CLOSED, first)
+            closed = self._observe(frames, LoopMode.CLOSED, first)
             self._advice = (
                 f"the calibration is saved in {self._options.out} and loaded, but the closed loop did not behave as "
                 "predicted: check the sign of the mirror, the delay and the disturbance before you close it; "
-                "`lowfc ctl reset` removes its command from the mirror"
+                "`lowfc ctl reset` removes the loop's command from the mirror"
             )
             measured = _rms_nm(closed.error_nm, settling)
             self._results["measured_error_nm"] = measured
@@ -308,7 +318,7 @@ class Commissioning:
             raise
         return measured
 
-    def _steps(self, frames: int, mode: LoopMode = LoopMode.OPEN, first: int = 0) -> Steps:
+    def _observe(self, frames: int, mode: LoopMode = LoopMode.OPEN, first: int = 0) -> Steps:
         steps: list[Step] = []
         self._report(f"observing {frames} frames, {frames / self._config.camera.rate_hz:.0f} s")
         for step in self._loop.steps():
@@ -328,6 +338,6 @@ class Commissioning:
 def _rms_nm(error_nm: Single, settling: int) -> float:
     """Root mean square of the measured error of all modes, noise included, after the settling frames."""
     used = np.isfinite(error_nm).all(axis=1) & (np.arange(len(error_nm)) >= settling)
-    if used.sum() < MIN_PREDICTED / 2:  # a few may be refused, such as late ones
+    if used.sum() < MIN_RESIDUAL_FRAMES / 2:  # the others may have been refused, such as late frames
         raise ValueError(f"{int(used.sum())} frames after {settling} of settling are too few for a residual")
     return float(np.linalg.norm(rms(error_nm, used)))

@@ -23,13 +23,13 @@ FIRST_NM = AMPLITUDE_NM["poke"]
 MAX_FIRST_NM = 32.0
 """Largest amplitude of the first pokes, which is doubled until they are detected, nm rms of wavefront."""
 MAX_MISFIT = 0.35
-"""Largest residual of the image after the fit of the computed one; above it the sensor is not the configured one."""
-MIN_LIKENESS = 0.5
+"""Largest rms of the image minus the fitted computed one, relative to that of the image; else it is another sensor."""
+MIN_CORRELATION = 0.5
 """Smallest correlation of a poke's image with the computed one; below it the sensor is not the configured one."""
-CYCLES = 12  # of pokes, from which the response is measured without an optical model
-MAX_NOT_LINEAR = 0.1
-"""Largest relative difference of the gains at full and half amplitude; `_SURE` standard errors are added to it."""
-_SURE = 3.0  # standard errors
+CYCLES = 12  # cycles of pokes that measure the response without an optical model
+MAX_NONLINEARITY = 0.1
+"""Largest relative difference of the gains at full and half amplitude, beyond `_STANDARD_ERRORS` standard errors."""
+_STANDARD_ERRORS = 3.0
 
 
 def first_delay(player: Player, config: Configuration) -> Delay:
@@ -39,7 +39,7 @@ def first_delay(player: Player, config: Configuration) -> Delay:
     while True:
         amplitude_nm = min(amplitude_nm, most_nm)
         try:
-            found = player.first_poke(0, first_poke_plan(amplitude_nm))
+            delay = player.first_poke(0, first_poke_plan(amplitude_nm))
             break
         except PokesNotSeenError:
             if amplitude_nm >= min(MAX_FIRST_NM, most_nm):
@@ -47,10 +47,10 @@ def first_delay(player: Player, config: Configuration) -> Delay:
             report(f"pokes of {amplitude_nm:g} nm are not detected: amplitude doubled")
             amplitude_nm *= 2
     report(
-        f"pokes of Z{before.noll[0]} of {amplitude_nm:g} nm are detected after {found.delay_frames:.3f} +- "
-        f"{found.error_frames:.3f} frames, {found.delay_frames * config.period_ns * 1e-6:.3g} ms"
+        f"pokes of Z{before.noll[0]} of {amplitude_nm:g} nm are detected after {delay.delay_frames:.3f} +- "
+        f"{delay.error_frames:.3f} frames, {delay.delay_frames * config.period_ns * 1e-6:.3g} ms"
     )
-    return found
+    return delay
 
 
 def aligned(
@@ -61,34 +61,36 @@ def aligned(
     report: Report,
     results: dict[str, Any],
 ) -> Calibration | None:
-    """The computed calibration on the sensor's pixels, with the sign from the poke; None for another sensor.
+    """The computed calibration on the sensor's pixels, with the sign from the poke.
 
-    The sensor's geometry is added to `results`.
+    None if the sensor is not the configured one. The sensor's geometry is added to `results`.
     """
     image = (before.reference * before.flux_dn).reshape(before.shape).astype(np.float64)
     model = computed.reference.astype(np.float64).reshape(computed.shape)
     try:
-        found = align(image, model)
-        calibration = on_sensor(config, computed, found.geometry, before.flux_dn, before)
+        alignment = align(image, model)
+        calibration = on_sensor(config, computed, alignment.geometry, before.flux_dn, before)
     except (ValueError, CalibrationError) as error:
         report(f"the image cannot be compared with the computed one: {error}")
         return None
-    like = correlation(poke.response, calibration.response[:, 0])
-    if like < 0:
-        found = replace(found, geometry=found.geometry.rotated_180())
-        calibration = on_sensor(config, computed, found.geometry, before.flux_dn, before)
-        like = correlation(poke.response, calibration.response[:, 0])
-    scale = found.geometry.scale * computed_scale(config)
-    report(f"{in_words(found, scale)}; the poke's image correlates by {like:.2f} with the computed one")
-    if found.residual > MAX_MISFIT or like < MIN_LIKENESS:
+    poke_correlation = correlation(poke.response, calibration.response[:, 0])
+    if poke_correlation < 0:
+        alignment = replace(alignment, geometry=alignment.geometry.rotated_180())
+        calibration = on_sensor(config, computed, alignment.geometry, before.flux_dn, before)
+        poke_correlation = correlation(poke.response, calibration.response[:, 0])
+    scale = alignment.geometry.scale * computed_scale(config)
+    report(
+        f"{in_words(alignment, scale)}; correlation of the poke's image with the computed one: {poke_correlation:.2f}"
+    )
+    if alignment.residual > MAX_MISFIT or poke_correlation < MIN_CORRELATION:
         report("this is not the configured sensor: the response is measured without the optical model")
         return None
     results |= {
         "pixels_per_lambda_d": scale,
-        "rotation_deg": found.geometry.rotation_deg,
-        "parity": found.geometry.parity,
-        "image_residual": found.residual,
-        "poke_correlation": like,
+        "rotation_deg": alignment.geometry.rotation_deg,
+        "parity": alignment.geometry.parity,
+        "image_residual": alignment.residual,
+        "poke_correlation": poke_correlation,
     }
     calibration = replace(calibration, reference=before.reference, estimator=f"{calibration.estimator}{FIRST}")
     return identified(calibration)
@@ -112,7 +114,7 @@ def poked(player: Player, config: Configuration, poke: Delay) -> Calibration:
 def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: float) -> float:
     """Amplitude at which all modes may be poked at once, nm rms of each.
 
-    It is the default, halved if single pokes at full and half amplitude show that the sensor is not linear.
+    It is `default_nm`, halved if single pokes at full and half amplitude show that the sensor is not linear.
     """
     first = player.before
     R, modes = first.reconstructor.astype(np.float64), len(first.noll)
@@ -120,18 +122,18 @@ def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: f
     gains = np.empty((2, 2, modes))
     _report_time(player, config, gains[..., 0].size)
     for level, amplitude_nm in enumerate((top_nm, top_nm / 2)):
-        for again in range(2):
-            plan = _poke_cycle(modes, amplitude_nm, again)
-            gains[level, again] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
-    off = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
-    # variance of the difference of both mean gains, from two values each: at least its average over modes
+        for repetition in range(2):
+            plan = _poke_cycle(modes, amplitude_nm, repetition)
+            gains[level, repetition] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
+    difference = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
+    # variance of the difference of the two mean gains, each of two values; at least its average over the modes
     squares = np.square(np.diff(gains, axis=1)).mean(axis=(0, 1)) / 2
     error = np.sqrt(np.maximum(squares, squares.mean()))
-    worst = int((off - _SURE * error).argmax())
-    chosen_nm = default_nm / 2 if off[worst] > MAX_NOT_LINEAR + _SURE * error[worst] else default_nm
+    worst = int((difference - _STANDARD_ERRORS * error).argmax())
+    chosen_nm = default_nm / 2 if difference[worst] > MAX_NONLINEARITY + _STANDARD_ERRORS * error[worst] else default_nm
     player.report(
-        f"the gains at {top_nm:.3g} nm and at half of that differ by {off[worst]:.1%} (+- {error[worst]:.1%}; "
-        f"Z{first.noll[worst]}): {chosen_nm:.3g} nm in each mode"
+        f"the gains at {top_nm:.3g} nm and at half of that differ by {difference[worst]:.1%} (+- {error[worst]:.1%}; "
+        f"Z{first.noll[worst]}); amplitude of each mode: {chosen_nm:.3g} nm"
     )
     return chosen_nm
 

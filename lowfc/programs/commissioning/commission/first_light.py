@@ -42,7 +42,7 @@ class Sensor(NamedTuple):
     measured: bool
 
 
-def camera_fits(
+def checked_camera(
     config: Configuration, state: wire.CameraState, images: Sequence[Frame], report: Report
 ) -> CameraSettings:
     """The camera's settings; CalibrationError if frames or configuration do not agree with them."""
@@ -75,19 +75,21 @@ def camera_fits(
     return replace(camera_settings(state), start_s=0)
 
 
-def darkened(camera: CameraSettings, frames: npt.NDArray[np.number], report: Report) -> Sensor:
+def with_measured_dark(camera: CameraSettings, frames: npt.NDArray[np.number], report: Report) -> Sensor:
     """A sensor with dark and bad pixels from dark frames (frames, rows, columns)."""
     if frames.shape[1:] != camera.shape:
         raise CalibrationError(f"the dark frames have {frames.shape[1:]} pixels, the camera {camera.shape}")
     try:
-        found = measure_dark(frames.reshape(len(frames), -1))
+        measured = measure_dark(frames.reshape(len(frames), -1))
     except ValueError as error:
         raise CalibrationError(str(error)) from None
-    report(str(found))
-    return Sensor(camera, found.dark_dn, found.good, measured=True)
+    report(str(measured))
+    return Sensor(camera, measured.dark_dn, measured.good, measured=True)
 
 
-def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibration, report: Report) -> Calibration:
+def calibration_with_reference(
+    sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibration, report: Report
+) -> Calibration:
     """A calibration with the reference image of these frames (frames, rows, columns), and no response yet.
 
     Its modes and the mirror's commands are those of a computed calibration.
@@ -96,15 +98,15 @@ def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibra
     brightest_dn = int((pixels.max(axis=0) * (sensor.good > 0)).max())
     if brightest_dn > _FULL * saturation_dn:
         raise CalibrationError(
-            f"the brightest good pixel is at {brightest_dn} of {saturation_dn:g} DN; shorten the exposure until it is "
-            "below half of full well; hot pixels are excluded by a dark, but not with --no-dark"
+            f"the brightest good pixel is at {brightest_dn} of {saturation_dn:g} DN; shorten the exposure until this "
+            "pixel is below half of full well; a hot pixel is excluded by a dark, but not with --no-dark"
         )
     image = pixels.astype(np.float64).mean(axis=0) - sensor.dark_dn
     flux_dn = float(image @ sensor.good)
     noise_dn = float(np.std(pixels.astype(np.float64) @ sensor.good)) / np.sqrt(len(frames))
     if not flux_dn > max(10 * noise_dn, 0.0):
         raise CalibrationError(
-            f"no flux above the dark: {flux_dn:.4g} DN in total, with a noise of "
+            f"no flux above the dark: {flux_dn:.4g} DN in total, with a standard error of "
             f"{noise_dn:.2g} DN; is the star blocked now, or was it not blocked for the dark?"
         )
     reference = image * sensor.good / flux_dn
