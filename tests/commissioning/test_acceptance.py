@@ -23,8 +23,8 @@ from lowfc.programs.commissioning.acceptance.probe import (
     AcceptanceResult,
     ProbeResponse,
     _announced,
-    chosen,
     logged_responses,
+    selected_modes,
 )
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
 from tests.support.loops import refusal
@@ -141,7 +141,7 @@ def test_linearity_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain(
     (response,) = responses_of(loop, linearity, hold_frames=7, cycles=3, modes=(2,))
     result = linearity.judge([response], loop.config)
     assert result.passed, result.text()
-    assert len(str(response.what)) < 100, "the note of any number of cycles is short"
+    assert len(str(response.parameters)) < 100, "the note of any number of cycles is short"
     (mode,) = result.modes
     assert mode.levels[1].gain == pytest.approx(1.0, abs=0.03)
     assert [row.amplitude_nm for row in mode.levels] == pytest.approx([6, 12, 24])
@@ -262,9 +262,9 @@ def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_of_its_
 
 
 def test_modes_default_to_all_and_must_be_controlled() -> None:
-    assert chosen((), (2, 3)) == (2, 3)
+    assert selected_modes((), (2, 3)) == (2, 3)
     with pytest.raises(AcceptanceError, match="99"):
-        chosen((99,), (2, 3))
+        selected_modes((99,), (2, 3))
 
 
 def test_malformed_modes_and_options_without_effect_on_a_log_are_refused() -> None:

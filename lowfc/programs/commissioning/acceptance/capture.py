@@ -20,7 +20,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
     Kind,
     ModeResult,
     ProbeResponse,
-    chosen,
+    selected_modes,
 )
 
 KIND: Kind = "capture-range"
@@ -50,22 +50,22 @@ def play(live: Live, *, modes: Sequence[int]) -> list[ProbeResponse]:
     Each shape is ramped up and down at half the slew limit: if that takes few frames, it equals closing the loop on a
     static error. After a shape that was not corrected, the command is reset to zero.
     """
-    plan = [trials for noll in chosen(modes, live.loop.noll) if (trials := _trials(live, noll))]
+    plan = [trials for noll in selected_modes(modes, live.loop.noll) if (trials := _trials(live, noll))]
     live.expect(sum(len(table) for trials in plan for _, table, _ in trials))
-    found = []
+    responses = []
     for trials in plan:
-        for number, (what, table, shape) in enumerate(trials):
-            found.append(live.play(KIND, what, LoopMode.CLOSED, table, shape))
-            if not removed(found[-1]):
+        for number, (parameters, table, shape) in enumerate(trials):
+            responses.append(live.play(KIND, parameters, LoopMode.CLOSED, table, shape))
+            if not removed(responses[-1]):
                 live.skip(sum(len(table) for _, table, _ in trials[number + 1 :]))
                 live.return_to_zero()
                 live.set_mode(LoopMode.CLOSED)
                 break
-    return found
+    return responses
 
 
 def _trials(live: Live, noll: int) -> list[tuple[dict[str, Any], Single, Single]]:
-    """Trials of a mode, smallest amplitude first: announcement, staircase and shape; empty if its gain is zero."""
+    """Trials of a mode, smallest amplitude first: parameters, staircase and shape; empty if its gain is zero."""
     row, law = live.loop.noll.index(noll), live.loop.law
     if isinstance(law, Integrator) and not law.gain[row]:
         return []
@@ -79,14 +79,14 @@ def _trials(live: Live, noll: int) -> list[tuple[dict[str, Any], Single, Single]
     for level_nm in (np.outer(SIZES, (1.0, -1.0)).ravel() * _required_nm(live.configuration, noll)).tolist():
         stairs, starts = build_staircase([0.0, level_nm], hold, step_nm)
         zero_start, level_start = starts.tolist()
-        what = {
+        parameters = {
             "noll": noll,
             "level_nm": level_nm,
             "before": [zero_start + hold - averaged, zero_start + hold],
             "after": [level_start + hold - averaged, level_start + hold],
         }
         frames = len(stairs) - (hold - 1)  # the next trial starts with its own hold at zero
-        trials.append((what, stairs[:frames].astype(np.float32)[:, None], shape))
+        trials.append((parameters, stairs[:frames].astype(np.float32)[:, None], shape))
     return trials
 
 
@@ -95,10 +95,10 @@ def removed(trial: ProbeResponse) -> bool:
     if trial.limits_hit:
         return False
     trial.check(LoopMode.CLOSED)
-    row = trial.loop.noll.index(trial.what["noll"])
-    before, after = (slice(*trial.what[name]) for name in ("before", "after"))
+    row = trial.loop.noll.index(trial.parameters["noll"])
+    before, after = (slice(*trial.parameters[name]) for name in ("before", "after"))
     commands = trial.filled(trial.command_nm)
-    return captured(trial.filled(trial.error_nm), commands, row, trial.what["level_nm"], before, after)
+    return captured(trial.filled(trial.error_nm), commands, row, trial.parameters["level_nm"], before, after)
 
 
 def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> CaptureResult:
@@ -106,8 +106,10 @@ def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> Capt
     if not trials:
         raise AcceptanceError("the gains of the tested modes are zero: they have no capture range")
     modes = []
-    for noll in dict.fromkeys(trial.what["noll"] for trial in trials):
-        of_mode = {trial.what["level_nm"]: trial for trial in trials if trial.what["noll"] == noll}  # the last of each
+    for noll in dict.fromkeys(trial.parameters["noll"] for trial in trials):
+        of_mode = {
+            trial.parameters["level_nm"]: trial for trial in trials if trial.parameters["noll"] == noll
+        }  # the last trial of each level
         converged = {level_nm: removed(trial) for level_nm, trial in of_mode.items()}
         sizes = sorted({abs(level_nm) for level_nm in converged})
         lost = [abs(level_nm) for level_nm, success in converged.items() if not success]
@@ -127,14 +129,14 @@ def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> Capt
     return CaptureResult(test=KIND, passed=all(mode.passed for mode in modes), trials=len(trials), modes=modes)
 
 
-def draw(found: dict[str, Any], figure: Any) -> None:
+def draw(result: dict[str, Any], figure: Any) -> None:
     """Draw a bar of the capture range of each mode, with a mark at the required one."""
     ax = figure.subplots()
-    x = np.arange(len(found["modes"]))
-    colours = ["C0" if mode["passed"] else "C3" for mode in found["modes"]]
-    ax.bar(x, [mode["captured_nm"] for mode in found["modes"]], color=colours, label="converges from")
-    ax.plot(x, [mode["required_nm"] for mode in found["modes"]], "k_", markersize=14, label="required")
-    ax.set_xticks(x, [f"Z{mode['noll']}" for mode in found["modes"]])
+    x = np.arange(len(result["modes"]))
+    colours = ["C0" if mode["passed"] else "C3" for mode in result["modes"]]
+    ax.bar(x, [mode["captured_nm"] for mode in result["modes"]], color=colours, label="converges from")
+    ax.plot(x, [mode["required_nm"] for mode in result["modes"]], "k_", markersize=14, label="required")
+    ax.set_xticks(x, [f"Z{mode['noll']}" for mode in result["modes"]])
     ax.set_ylabel("nm rms of wavefront")
     ax.legend()
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 acceptance_app = new_app(
     "Test a loop against its requirements, live or from its log.\n\n"
-    "Exit status 0 only if it passed.\n\nExample: lowfc acceptance rejection"
+    "Exit status 0 only if the test passed.\n\nExample: lowfc acceptance rejection"
 )
 
 Plot = Annotated[Path | None, typer.Option(help="Plot the result to this file (PNG).", show_default=False)]

@@ -20,7 +20,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
     Kind,
     ModeResult,
     ProbeResponse,
-    chosen,
+    selected_modes,
 )
 
 KIND: Kind = "linearity"
@@ -30,7 +30,7 @@ _SPARE_FRAMES = 2  # skipped in addition to the delay, while the mirror settles
 
 
 class Level(Result):
-    """Gain of a mode and its largest cross-talk at one amplitude; `within` is None if too noisy to judge."""
+    """Gain of a mode and its largest cross-talk at one amplitude; `within`: within the requirements, None if unsure."""
 
     amplitude_nm: float = result_field()
     gain: float = result_field()
@@ -84,37 +84,40 @@ def play(live: Live, *, hold_frames: int, cycles: int, modes: Sequence[int]) -> 
     """
     skipped = int(np.ceil(live.loop.delay_frames)) + _SPARE_FRAMES
     if hold_frames <= skipped:
-        raise AcceptanceError(f"{hold_frames} frames at each level are too few: the first {skipped} do not show it yet")
+        raise AcceptanceError(
+            f"{hold_frames} frames at each level are too few: the first {skipped} do not show the level yet"
+        )
     plan = []
-    for noll in chosen(modes, live.loop.noll):
+    for noll in selected_modes(modes, live.loop.noll):
         shape = live.calibration.modes_to_actuators[:, live.loop.noll.index(noll)][None]
         step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
         levels_nm = levels(np.array(AMPLITUDES) * live.configuration.acceptance.linear_nm, cycles)
         stairs, _ = build_staircase(levels_nm, hold_frames, step_nm)
         plan.append(({"noll": noll, "averaged": hold_frames - skipped}, stairs.astype(np.float32)[:, None], shape))
     live.expect(sum(len(table) for _, table, _ in plan))
-    return [live.play(KIND, what, LoopMode.OPEN, table, shape) for what, table, shape in plan]
+    return [live.play(KIND, parameters, LoopMode.OPEN, table, shape) for parameters, table, shape in plan]
 
 
 def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> LinearityResult:
     """Evaluate gain and cross-talk from the probe sequences; AcceptanceError if the loop was disturbed meanwhile."""
     required, modes = configuration.acceptance, []
-    for response in {one.what["noll"]: one for one in responses}.values():  # the last one of each mode
+    for response in {each.parameters["noll"]: each for each in responses}.values():  # the last one of each mode
         response.check(LoopMode.OPEN)
-        what, noll = response.what, response.loop.noll
-        levels_nm, starts = _levels(response.table[:, 0].astype(float), what["averaged"])
-        found = gains(response.filled(response.error_nm), noll.index(what["noll"]), levels_nm, starts, what["averaged"])
-        within = found.within(required.gain_error, required.crosstalk)
+        parameters, noll = response.parameters, response.loop.noll
+        levels_nm, starts = _levels(response.table[:, 0].astype(float), parameters["averaged"])
+        mode = noll.index(parameters["noll"])
+        measured = gains(response.filled(response.error_nm), mode, levels_nm, starts, parameters["averaged"])
+        within = measured.within(required.gain_error, required.crosstalk)
         rows = []
-        for row, amplitude_nm in enumerate(found.amplitude_nm.tolist()):
-            other = int(np.argmax(np.abs(found.crosstalk[row])))
+        for row, amplitude_nm in enumerate(measured.amplitude_nm.tolist()):
+            other = int(np.argmax(np.abs(measured.crosstalk[row])))
             rows.append(
                 Level(
                     amplitude_nm=amplitude_nm,
-                    gain=float(found.gain[row, found.mode]),
-                    gain_error=float(found.error[row, found.mode]),
-                    crosstalk=float(found.crosstalk[row, other]),
-                    crosstalk_error=float(found.error[row, other]),
+                    gain=float(measured.gain[row, measured.mode]),
+                    gain_error=float(measured.error[row, measured.mode]),
+                    crosstalk=float(measured.crosstalk[row, other]),
+                    crosstalk_error=float(measured.error[row, other]),
                     crosstalk_noll=noll[other],
                     within=within[row],
                 )
@@ -124,8 +127,8 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> L
         passed = linear_nm >= required.linear_nm * (1 - 1e-6)
         modes.append(
             LinearityMode(
-                noll=what["noll"],
-                name=mode_name(what["noll"]),
+                noll=parameters["noll"],
+                name=mode_name(parameters["noll"]),
                 passed=passed,
                 too_noisy=not passed and beyond > required.linear_nm * (1 + 1e-6),
                 linear_nm=linear_nm,
@@ -147,24 +150,24 @@ def _levels(stairs: Array, averaged: int) -> tuple[Array, Integers]:
     edges = np.flatnonzero(np.diff(stairs, prepend=np.nan, append=np.nan))
     hold = min(frames for frames in np.diff(edges).tolist() if frames > 1)  # a value between levels lasts for one
     starts = np.concatenate([np.arange(at, end - hold + 1, hold) for at, end in pairwise(edges)])
-    starts = starts[stairs[starts] != 0]  # it ends at zero
+    starts = starts[stairs[starts] != 0]  # the staircase ends at zero
     return stairs[starts], starts + hold - averaged
 
 
-def draw(found: dict[str, Any], figure: Any) -> None:
+def draw(result: dict[str, Any], figure: Any) -> None:
     """Draw gain and cross-talk against amplitude."""
     axes = figure.subplots(1, 2, sharex=True)
-    for number, mode in enumerate(found["modes"]):
+    for number, mode in enumerate(result["modes"]):
         names = ("amplitude_nm", "gain", "gain_error", "crosstalk", "crosstalk_error")
         x, gain, gain_error, crosstalk, crosstalk_error = ([row[name] for row in mode["levels"]] for name in names)
         style = {"color": f"C{number % 10}", "marker": "o", "markersize": 3, "linewidth": 1}
         axes[0].errorbar(x, gain, gain_error, label=f"Z{mode['noll']}", **style)
         axes[1].errorbar(x, np.abs(crosstalk), crosstalk_error, **style)
     for side in (-1, 1):
-        axes[0].axhline(1 + side * found["required_gain_error"], color="grey", linestyle=":")
-    axes[1].axhline(found["required_crosstalk"], color="grey", linestyle=":")
+        axes[0].axhline(1 + side * result["required_gain_error"], color="grey", linestyle=":")
+    axes[1].axhline(result["required_crosstalk"], color="grey", linestyle=":")
     for ax, title in zip(axes, ("gain: measured / true amplitude", "largest cross-talk"), strict=True):
-        ax.axvline(found["required_nm"], color="grey", linestyle=":")
+        ax.axvline(result["required_nm"], color="grey", linestyle=":")
         ax.set_title(title)
         ax.set_xlabel("amplitude of the mode, nm rms of wavefront")
         ax.grid(alpha=0.3)

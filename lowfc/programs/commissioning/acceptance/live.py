@@ -27,7 +27,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
 )
 
 _OTHER_BYTES = 1000  # of a request to play, besides its table and shapes
-_LAW = ("gain", "leak", "limit_nm", "law", "calibration_id")
+_LAW_FIELDS = ("gain", "leak", "limit_nm", "law", "calibration_id")
 
 
 class Live:
@@ -54,7 +54,7 @@ class Live:
         try:
             yield self
         finally:
-            self.client.check_lease()  # after somebody ended the lease, the loop is theirs
+            self.client.check_lease()  # if another operator ended it, leave the loop to them
             self.client.stop()
             now = LoopMode(self._state().mode)
             if now in (LoopMode.OPEN, LoopMode.CLOSED) and now is not self._initial_mode:
@@ -93,7 +93,7 @@ class Live:
             pass
 
     def play(
-        self, kind: Kind, what: dict[str, Any], mode: LoopMode, table: Single, basis: Single | None = None
+        self, kind: Kind, parameters: dict[str, Any], mode: LoopMode, table: Single, basis: Single | None = None
     ) -> ProbeResponse:
         """Play a table and return the loop's response; without shapes in `basis` the table is added to the offset.
 
@@ -103,14 +103,16 @@ class Live:
         modes = len(self.calibration.noll)
         basis = np.zeros((modes, 0), np.float32) if basis is None else basis
         frames, columns = table.shape
-        most = (max_bytes("play") - _OTHER_BYTES - basis.nbytes) // (table.itemsize * max(columns, 1))
-        if columns and frames > most:
-            longest_s = most / self.loop.rate_hz
+        most_frames = (max_bytes("play") - _OTHER_BYTES - basis.nbytes) // (table.itemsize * max(columns, 1))
+        if columns and frames > most_frames:
+            longest_s = most_frames / self.loop.rate_hz
             raise AcceptanceError(f"a probe sequence of {columns} columns takes at most {longest_s:.0f} s: shorten it")
         self.set_mode(mode)
         before = self._state()
         steps, watch = self.client.steps(), self.client.mirror_watch()
-        first = self.client.note(ANNOUNCEMENT + json.dumps({"test": kind, **what, "frames": frames})).frame_sequence
+        first = self.client.note(
+            ANNOUNCEMENT + json.dumps({"test": kind, **parameters, "frames": frames})
+        ).frame_sequence
         if columns:
             answer = self.client.play(basis, table) if basis.size else self.client.play_offset(table)
             first = answer.frame_sequence
@@ -128,14 +130,14 @@ class Live:
         steps.close()
         self._done += frames
         after = self._state()
-        if [getattr(before, name) for name in _LAW] != [getattr(after, name) for name in _LAW]:
+        if [getattr(before, name) for name in _LAW_FIELDS] != [getattr(after, name) for name in _LAW_FIELDS]:
             raise AcceptanceError("gains or control law changed during the measurement: measure again")
         watch.read()
         if columns and watch.interruption:
             raise AcceptanceError(f"{watch.interruption} during the measurement: measure again")
         loop = loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws())
         target = "" if not columns else MIRROR if basis.size else OFFSET
-        return probe_response(what, loop, target, table, basis, first, steps_as_columns(recorded, modes))
+        return probe_response(parameters, loop, target, table, basis, first, steps_as_columns(recorded, modes))
 
     def _state(self) -> wire.ControllerState:
         state = self.client.status().state

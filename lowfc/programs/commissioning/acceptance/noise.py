@@ -33,7 +33,7 @@ class NoiseMode(ModeResult):
     expected_nm: float = result_field("expected", "nm", ".3f")
     open_nm: float = result_field("open", "nm", ".3f")
     closed_nm: float = result_field("closed", "nm", ".3f")
-    residual_floor_nm: float = result_field("residual from it", "nm", ".3f")
+    residual_floor_nm: float = result_field("residual from noise", "nm", ".3f")
     open_rms_nm: float = result_field("error open", "nm", ".3f")
     closed_rms_nm: float = result_field("error closed", "nm", ".3f")
 
@@ -57,13 +57,13 @@ def play(live: Live, *, duration_s: float) -> list[ProbeResponse]:
     """Record the loop without a probe: open, then closed, each for `duration_s`."""
     frames = max(round(duration_s * live.loop.rate_hz), SHORTEST)
     live.expect(frames * len(_LOOPS))
-    nothing = np.zeros((frames, 0), np.float32)
-    return [live.play(KIND, {"loop": name}, mode, nothing) for name, mode in _LOOPS.items()]
+    no_probe = np.zeros((frames, 0), np.float32)
+    return [live.play(KIND, {"loop": name}, mode, no_probe) for name, mode in _LOOPS.items()]
 
 
 def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> NoiseResult:
     """Evaluate the noise of both recordings; AcceptanceError if one is missing, too short, or was disturbed."""
-    by_loop = {response.what["loop"]: response for response in responses}
+    by_loop = {response.parameters["loop"]: response for response in responses}
     if set(by_loop) != set(_LOOPS):
         raise AcceptanceError(
             f"an open-loop and a closed-loop recording are needed, found {', '.join(by_loop) or 'none'}"
@@ -106,14 +106,14 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> N
     )
 
 
-def draw(found: dict[str, Any], figure: Any) -> None:
+def draw(result: dict[str, Any], figure: Any) -> None:
     """Draw measured and expected noise of each mode."""
     ax = figure.subplots()
-    x = np.arange(len(found["modes"]))
+    x = np.arange(len(result["modes"]))
     for name, marker in (("expected_nm", "k_"), ("open_nm", "C0o"), ("closed_nm", "C1s"), ("residual_floor_nm", "C2^")):
         label = name.removesuffix("_nm").replace("_", " ")
-        ax.semilogy(x, [mode[name] for mode in found["modes"]], marker, label=label)
-    ax.set_xticks(x, [f"Z{mode['noll']}" for mode in found["modes"]])
+        ax.semilogy(x, [mode[name] for mode in result["modes"]], marker, label=label)
+    ax.set_xticks(x, [f"Z{mode['noll']}" for mode in result["modes"]])
     ax.set_ylabel("nm rms of wavefront per frame")
     ax.grid(alpha=0.3)
     ax.legend()

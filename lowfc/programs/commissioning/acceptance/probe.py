@@ -37,7 +37,8 @@ _LIMIT_BITS = sum(1 << limit for limit in LIMITS)
 
 ANNOUNCEMENT = "acceptance "
 """First word of a note that announces a test; its parameters follow as JSON."""
-_CHANGES = ("gain", "leak", "limit", "law", "load", "offset", "channel", "reset", "stop")
+_DISTURBING = ("gain", "leak", "limit", "law", "load", "offset", "channel", "reset", "stop")
+"""Requests that make a measurement unusable."""
 
 
 class AcceptanceError(LowfcError):
@@ -53,7 +54,7 @@ class ModeResult(Result):
     too_noisy: bool = result_field(default=False)
 
     def remarks(self) -> Sequence[str]:
-        """The verdict at the end of the row, unless it passed."""
+        """The verdict at the end of the row, unless the mode passed."""
         return [] if self.passed else ["too noisy" if self.too_noisy else "FAILED"]
 
 
@@ -107,7 +108,7 @@ class ProbeResponse:
     """Response of the loop to one probe sequence, or a recording without a probe, frame by frame.
 
     Attributes:
-        what: parameters from the announcing note.
+        parameters: parameters of the test, from the announcing note.
         target: `mirror` or `offset`, which the probe was added to; empty without a probe.
         table: probe amplitudes (frames, columns); (frames, 0) without a probe.
         basis: probe shapes (columns, actuators), nm of surface.
@@ -117,7 +118,7 @@ class ProbeResponse:
         reasons: bit `1 << reason` for each reason of a frame (frames,).
     """
 
-    what: dict[str, Any]
+    parameters: dict[str, Any]
     loop: Loop
     target: str
     table: Single
@@ -166,7 +167,7 @@ class ProbeResponse:
         return np.stack([np.interp(rows, rows[present], column[present]) for column in values.T], axis=1)
 
 
-def chosen(requested: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:
+def selected_modes(requested: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:
     """The requested Noll indices, by default all; AcceptanceError if the loop does not control one of them."""
     unknown = sorted(set(requested) - set(noll))
     if unknown:
@@ -180,15 +181,15 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
     announced = _announced(history.requests, kind)
     if calibration is None or not announced:
         raise DataFileError(f"{path}: contains no `lowfc acceptance {kind}`")
-    modes, found = len(calibration.noll), []
-    for what, request in announced:
-        frames = what.pop("frames")
+    modes, responses = len(calibration.noll), []
+    for parameters, request in announced:
+        frames = parameters.pop("frames")
         first, play = request.frame_sequence, request.name == "play"
         sequence = history.steps.sequence
         limited = sequence[(sequence >= first) & (history.steps.reasons & _LIMIT_BITS != 0)].tolist()
         end = min([first + frames, *limited[:1]])  # a limit that acts ends the measurement
         for other in history.requests:
-            if other.accepted and other.name in _CHANGES and first < other.frame_sequence < end:
+            if other.accepted and other.name in _DISTURBING and first < other.frame_sequence < end:
                 raise DataFileError(f"{path}: request {other.name!r} disturbed the measurement")
         times_ns = history.steps.time_ns[(sequence >= first) & (sequence < end)]
         for _, event in history.events:
@@ -196,9 +197,9 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
             event_ns = from_timestamp(event.timestamp) - history.camera_lag_ns(event.name)
             if interrupted and times_ns.size and times_ns[0] <= event_ns <= times_ns[-1]:
                 raise DataFileError(f"{path}: {event.message}, during the measurement")
-        asked_ns = from_timestamp(request.timestamp)  # a later state has no frame after a `clear`
+        request_ns = from_timestamp(request.timestamp)  # not its frame: a state after a `clear` has none
         states = [state for state in history.controllers if len(state.gain) == modes]
-        before = [state for state in states if from_timestamp(state.timestamp) <= asked_ns]
+        before = [state for state in states if from_timestamp(state.timestamp) <= request_ns]
         if not before:
             raise DataFileError(f"{path}: does not contain the state of the controller before the test")
         decoded = codec.request(request, request.name, 0, plays=history.published.plays)
@@ -206,35 +207,40 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
         in_use = history.published.calibrations.get(before[-1].calibration_id, calibration)
         loop = loop_of(before[-1], in_use, history.rate_hz, history.published.laws)
         table = decoded.table if play else np.zeros((frames, 0), np.float32)
-        found.append(probe_response(what, loop, request.text if play else "", table, basis, first, history.steps))
-    return found
+        target = request.text if play else ""
+        responses.append(probe_response(parameters, loop, target, table, basis, first, history.steps))
+    return responses
 
 
 def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[str, Any], wire.Request]]:
-    found: list[tuple[dict[str, Any], wire.Request]] = []
-    what: dict[str, Any] | None = None
+    announced: list[tuple[dict[str, Any], wire.Request]] = []
+    parameters: dict[str, Any] | None = None
     for request in requests:
         if request.name == "note" and request.accepted and request.text.startswith(ANNOUNCEMENT):
             try:
-                what = json.loads(request.text.removeprefix(ANNOUNCEMENT))
+                parameters = json.loads(request.text.removeprefix(ANNOUNCEMENT))
             except (ValueError, RecursionError):
-                what = None  # another note that starts with the same word
-            if not isinstance(what, dict) or what.pop("test", None) != kind or not isinstance(what.get("frames"), int):
-                what = None
+                parameters = None  # another note that starts with the same word
+            if (
+                not isinstance(parameters, dict)
+                or parameters.pop("test", None) != kind
+                or not isinstance(parameters.get("frames"), int)
+            ):
+                parameters = None
             elif kind == "noise-floor":  # it has no probe sequence
-                found.append((what, request))
-                what = None
-        elif request.name == "play" and what is not None:
+                announced.append((parameters, request))
+                parameters = None
+        elif request.name == "play" and parameters is not None:
             if request.accepted:
-                found.append((what, request))
-            what = None
-    # the last of each, so that one that was stopped and repeated does not count
-    latest = {str([what.get(key) for key in ("noll", "level_nm", "loop")]): (what, request) for what, request in found}
+                announced.append((parameters, request))
+            parameters = None
+    # only the last of each counts: an earlier one was stopped and repeated
+    latest = {str([each[0].get(key) for key in ("noll", "level_nm", "loop")]): each for each in announced}
     return list(latest.values())
 
 
 def probe_response(
-    what: dict[str, Any], loop: Loop, target: str, table: Single, basis: Single, first: int, steps: Steps
+    parameters: dict[str, Any], loop: Loop, target: str, table: Single, basis: Single, first: int, steps: Steps
 ) -> ProbeResponse:
     """The steps of a probe sequence from frame `first` on, one row per frame; the rate is measured from these steps."""
     frames = len(table)
@@ -248,7 +254,7 @@ def probe_response(
     mode, reasons = np.zeros(frames, np.uint8), np.zeros(frames, np.int64)
     error_nm[rows], pol_nm[rows], command_nm[rows] = steps.error_nm, steps.pol_nm, steps.command_nm
     mode[rows], reasons[rows] = steps.mode, steps.reasons
-    return ProbeResponse(what, loop, target, table, basis, error_nm, pol_nm, command_nm, mode, reasons)
+    return ProbeResponse(parameters, loop, target, table, basis, error_nm, pol_nm, command_nm, mode, reasons)
 
 
 def loop_of(

@@ -25,7 +25,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
     Kind,
     ModeResult,
     ProbeResponse,
-    chosen,
+    selected_modes,
 )
 
 KIND: Kind = "rejection"
@@ -112,7 +112,7 @@ def play(
         seed: Seed of the phases.
     """
     noll, rate_hz, required = live.loop.noll, live.loop.rate_hz, live.configuration.acceptance
-    tested = chosen(modes, noll)
+    tested = selected_modes(modes, noll)
     frames = round(duration_s * rate_hz)
     try:
         bins = lines(frames, len(tested), lines_per_mode, required.lowest_hz / rate_hz, required.highest_of_rate)
@@ -137,7 +137,7 @@ def transfer_function(response: ProbeResponse) -> Lines:
             f"the integrator drove in place of the law {response.loop.name!r} (LAW_OVERRULED): load the law again, or "
             "`lowfc ctl law integrator`, then measure again"
         )
-    period = response.table[-response.what["period_frames"] :].astype(float)
+    period = response.table[-response.parameters["period_frames"] :].astype(float)
     added = -period if response.target == OFFSET else seen_of_mirror(period, delay_weights(response.loop.delay_frames))
     return measure_lines(response.filled(response.error_nm)[-len(period) :], added)
 
@@ -145,18 +145,18 @@ def transfer_function(response: ProbeResponse) -> Lines:
 def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> RejectionResult:
     """Compare the last multisine with theory; AcceptanceError if the loop was disturbed meanwhile."""
     response = responses[-1]
-    found, rate_hz = transfer_function(response), response.loop.rate_hz
+    measured, rate_hz = transfer_function(response), response.loop.rate_hz
     tolerance_db = configuration.acceptance.rejection_db
-    frequency_hz = found.frequency * rate_hz
-    line_rows = np.arange(found.mode.size)
+    frequency_hz = measured.frequency * rate_hz
+    line_rows = np.arange(measured.mode.size)
     law, delay_frames = response.loop.linear, response.loop.delay_frames
-    theory_s = margins.rejection(law, frequency_hz, delay_frames)[line_rows, found.mode]
-    theory_t = margins.noise_transfer(law, frequency_hz, delay_frames)[line_rows, found.mode]
-    departure_s = departure(found.rejection, theory_s, found.error, tolerance_db)
-    departure_t = departure(found.noise_transfer, theory_t, found.error, tolerance_db)
+    theory_s = margins.rejection(law, frequency_hz, delay_frames)[line_rows, measured.mode]
+    theory_t = margins.noise_transfer(law, frequency_hz, delay_frames)[line_rows, measured.mode]
+    departure_s = departure(measured.rejection, theory_s, measured.error, tolerance_db)
+    departure_t = departure(measured.noise_transfer, theory_t, measured.error, tolerance_db)
     modes = []
     for mode, noll in enumerate(response.loop.noll):
-        rows = np.flatnonzero(found.mode == mode)
+        rows = np.flatnonzero(measured.mode == mode)
         if rows.size:
             rejection = _comparison(departure_s, rows, frequency_hz)
             noise = _comparison(departure_t, rows, frequency_hz)
@@ -184,20 +184,20 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> R
         tolerance_db=tolerance_db,
         lowest_hz=float(frequency_hz.min()),
         highest_hz=float(frequency_hz.max()),
-        lines=int(found.mode.size),
+        lines=int(measured.mode.size),
         lines_judged=int(np.count_nonzero(departure_s.judged)),
         largest_departure_db=_largest(departure_s),
         largest_noise_departure_db=_largest(departure_t),
         modes=modes,
         points=[
             {
-                "noll": response.loop.noll[found.mode[row]],
+                "noll": response.loop.noll[measured.mode[row]],
                 "frequency_hz": float(frequency_hz[row]),
-                "rejection": float(np.abs(found.rejection[row])),
+                "rejection": float(np.abs(measured.rejection[row])),
                 "rejection_theory": float(theory_s[row]),
                 "rejection_error_db": float(departure_s.error_db[row]),
                 "rejection_judged": bool(departure_s.judged[row]),
-                "noise_transfer": float(np.abs(found.noise_transfer[row])),
+                "noise_transfer": float(np.abs(measured.noise_transfer[row])),
                 "noise_transfer_theory": float(theory_t[row]),
                 "noise_transfer_error_db": float(departure_t.error_db[row]),
                 "noise_transfer_judged": bool(departure_t.judged[row]),
@@ -207,14 +207,14 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> R
     )
 
 
-def draw(found: dict[str, Any], figure: Any) -> None:
+def draw(result: dict[str, Any], figure: Any) -> None:
     """Draw rejection and noise transfer side by side: measured points and theory."""
     axes = figure.subplots(1, 2, sharex=True)
     for ax, name, title in zip(
         axes, ("rejection", "noise_transfer"), ("rejection |S|", "noise transfer |T|"), strict=True
     ):
-        for number, mode in enumerate(found["modes"]):
-            points = [point for point in found["points"] if point["noll"] == mode["noll"]]
+        for number, mode in enumerate(result["modes"]):
+            points = [point for point in result["points"] if point["noll"] == mode["noll"]]
             hz = [point["frequency_hz"] for point in points]
             colour = f"C{number % 10}"
             ax.loglog(hz, [point[f"{name}_theory"] for point in points], "-", color=colour, linewidth=1)
