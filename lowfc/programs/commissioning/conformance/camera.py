@@ -14,7 +14,7 @@ from lowfc.contract.messages import CAMERA_STATE, FRAME, RawImage, Role, from_ti
 from lowfc.programs.commissioning.conformance.connection import NS, Collected, Connection, Received
 from lowfc.programs.commissioning.conformance.publisher import LATE_NS
 
-TURN_S = 0.02
+POLL_S = 0.02
 PICTURES = 50
 """Number of frames whose pixels are stored."""
 
@@ -59,7 +59,7 @@ class Camera(Collected):
         self.states: list[wire.CameraState | None] = []
         self.answers: list[Received] = []
 
-    def take(self, message: Received) -> None:
+    def store(self, message: Received) -> None:
         """Store a message for the checks, frames without their pixels."""
         if message.key == FRAME.key:
             try:
@@ -72,7 +72,7 @@ class Camera(Collected):
                 self.states.append(wire.CameraState.FromString(message.payload))
             except DecodeError:
                 self.states.append(None)
-        super().take(message)
+        super().store(message)
 
     def _frame(self, message: Received, image: RawImage) -> None:
         data, envelope, highest = image.data, message.envelope, None
@@ -113,7 +113,7 @@ def watch(connection: Connection, seconds: float, advance: Callable[[float], Non
     camera, begun_ns = Camera(connection), connection.now_ns()
     while (elapsed_s := (connection.now_ns() - begun_ns) / NS) < seconds:
         advance(elapsed_s)
-        camera.collect(min(TURN_S, seconds - elapsed_s))
+        camera.collect(min(POLL_S, seconds - elapsed_s))
     camera.seconds = seconds
     camera.answers = connection.ask(CAMERA_STATE.key)
     return camera

@@ -53,14 +53,14 @@ def camera(
     from lowfc.programs.commissioning.conformance.settings import agreement_checks
 
     settings = None if config is None else configuration(config)
-    found = _run_with(Role.CAMERA, run)
-    with _connection(found, Role.OPERATOR) as connection, passing_bar(Console(stderr=True)) as bar:
+    joined = _run_with(Role.CAMERA, run)
+    with _connection(joined, Role.OPERATOR) as connection, passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task(f"observing the camera for {duration:g} s", total=duration)
         observed = watch(connection, duration, lambda done_s: bar.update(task, completed=done_s))
     checks = list(camera_checks(observed))
     if settings is not None and observed.settings is not None:
         checks += agreement_checks(settings, observed.settings)
-    _end("camera", found.run_id, checks, as_json)
+    _report_and_exit("camera", joined.run_id, checks, as_json)
 
 
 @conformance_app.command()
@@ -75,7 +75,7 @@ def mirror(
 
     The check takes the place of the controller, which must not be running. Ordinary commands are 5 % of the
     smallest limit, with alternating sign. Unless --gentle, the mirror is also raised by up to 10 nm, to see it relax;
-    if it passes, commands then exceed its stroke, slew and neighbour limits. At the end it returns to its shape.
+    if no check fails, commands then exceed its stroke, slew and neighbour limits. At the end it returns to its shape.
 
     Example: lowfc conformance mirror --run bench --config lowfc.toml
     """
@@ -90,13 +90,15 @@ def mirror(
     settings = configuration(config)
     if settings.lockstep:
         raise ConfigurationError("lockstep = true: in simulated time a mirror has no command timeout; remove the key")
-    found = _run_with(mirror_role(settings.mirror.name), run)
-    if Role.CONTROLLER in found.links.live():
-        raise BusError(f"run {found.run_id!r} has a controller, but only one process may command the mirror: stop it")
-    with _connection(found, Role.CONTROLLER) as connection, passing_bar(Console(stderr=True)) as bar:
+    joined = _run_with(mirror_role(settings.mirror.name), run)
+    if Role.CONTROLLER in joined.links.live():
+        raise BusError(
+            f"run {joined.run_id!r} has a controller, but only one process may command the mirror: stop the controller"
+        )
+    with _connection(joined, Role.CONTROLLER) as connection, passing_bar(Console(stderr=True)) as bar:
         task, dialogue = bar.add_task("the mirror", total=None), Dialogue(connection, Expected(settings))
         checks = mirror_checks(dialogue, duration, lambda what: bar.update(task, description=what), gentle=gentle)
-    _end(f"mirror-{settings.mirror.name}", found.run_id, checks, as_json)
+    _report_and_exit(f"mirror-{settings.mirror.name}", joined.run_id, checks, as_json)
 
 
 def _run_with(role: str, name: str | None) -> "Run":
@@ -110,7 +112,7 @@ def _run_with(role: str, name: str | None) -> "Run":
             raise BusError(f"several runs have a {role} ({', '.join(found)}): choose one with --run")
         if not found:
             raise BusError(
-                f"no run on this host has a {role}: start yours with the session file of "
+                f"no run on this host has a {role}: start the device with the session file of "
                 f"`lowfc config zenoh --role {role} --run NAME --make`, and name the run with --run"
             )
         name = found[0]
@@ -137,7 +139,7 @@ def _connection(run: "Run", role: str) -> "Iterator[Connection]":
         connection.close()
 
 
-def _end(device: str, run_id: str, checks: list[Check], as_json: bool) -> None:
+def _report_and_exit(device: str, run_id: str, checks: list[Check], as_json: bool) -> None:
     print_report(checks, STATUSES, FIELDS, {"device": device, "run": run_id} if as_json else None)
     if any(check.status is Status.WRONG for check in checks):
         raise typer.Exit(1)

@@ -131,9 +131,9 @@ class Collected:
         """Wait, then store the messages that have arrived."""
         self.connection.wait(seconds)
         for message in self.connection.received():
-            self.take(message)
+            self.store(message)
 
-    def take(self, message: Received) -> None:
+    def store(self, message: Received) -> None:
         """Store a message."""
         self.messages.append(message)
 
@@ -147,7 +147,7 @@ class Collected:
         return ", ".join(sorted({message.key for message in self.messages})) or "nothing"
 
     @property
-    def failing(self) -> str:
+    def driver_failure(self) -> str:
         """Last failure, else last warning, of the device's process if its driver has ever failed; empty otherwise."""
         for message in reversed(self.on(EVENT.key)):
             with contextlib.suppress(DecodeError):

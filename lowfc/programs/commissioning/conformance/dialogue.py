@@ -17,11 +17,12 @@ from lowfc.programs.commissioning.conformance.connection import NS, Collected, C
 ANSWER_S = 0.5
 """Timeout for an answer; a slower mirror cannot be used in a loop."""
 VALID_NS = NS
+"""Validity of an ordinary test command."""
 MODAL_NM = (0.5, -0.25)
 """Modal command of every test command."""
 CHANNEL = "lowfc"
 """The controller's channel, so that its next command replaces the test's."""
-TURN_S = 0.002
+POLL_S = 0.002
 
 Show = Callable[[str], None]
 
@@ -86,9 +87,9 @@ class Dialogue(Collected):
         self._next = 1
         self._commanded_nm: Single = np.zeros(expected.grid, np.float32)
 
-    def take(self, message: Received) -> None:
+    def store(self, message: Received) -> None:
         """Store a message, and decode it if it is a state."""
-        super().take(message)
+        super().store(message)
         if message.key == self.key:
             try:
                 self.states.append((message, wire.MirrorState.FromString(message.payload)))
@@ -126,7 +127,7 @@ class Dialogue(Collected):
         """States received in the next `seconds`."""
         before, end_ns = len(self.states), self.connection.now_ns() + round(seconds * NS)
         while (remaining_ns := end_ns - self.connection.now_ns()) > 0:
-            self.collect(min(TURN_S, remaining_ns / NS))
+            self.collect(min(POLL_S, remaining_ns / NS))
         return [state for _, state in self.states[before:]]
 
     def since(self, time_ns: int) -> list[tuple[Received, wire.MirrorState]]:
@@ -182,7 +183,7 @@ class Dialogue(Collected):
                     return state, sent_ns, message.receive_time_ns - sent_ns
             if self.connection.now_ns() >= sent_ns + ANSWER_S * NS:
                 return None, sent_ns, 0
-            self.collect(TURN_S)
+            self.collect(POLL_S)
 
     def go(self, surface_nm: Single) -> wire.MirrorState | None:
         """Move to a shape in steps of at most half the slew limit; return the last answer, None if one was missing."""

@@ -44,7 +44,7 @@ def _frames(camera: Camera) -> Check:
     count = len(camera.published)
     if not count:
         advice = (
-            camera.failing
+            camera.driver_failure
             or "is the camera in this run, does it use the session file of `lowfc config zenoh --role camera` and this "
             "key?"
         )
@@ -68,11 +68,16 @@ def _frame_time(camera: Camera) -> Check:
     exposure_ns = 0 if camera.settings is None else camera.settings.exposure_ns
     got = f"{age_ns / 1e6:.3g} ms before the publish time"
     if age_ns < -_AGE_NS:
-        return wrong(f"{-age_ns / 1e6:.3g} ms after the publish time", "use the same clock for both")
+        return wrong(
+            f"{-age_ns / 1e6:.3g} ms after the publish time",
+            "use the same clock for the timestamp and the publish time",
+        )
     if age_ns > _READOUT_NS + exposure_ns:
-        return wrong(got, "use the same clock for both, in nanoseconds since the epoch")
+        return wrong(got, "use the same clock for the timestamp and the publish time, in nanoseconds since the epoch")
     if exposure_ns > _AGE_NS and 0.9 * exposure_ns <= age_ns < 1.5 * exposure_ns:
-        advice = "about one exposure: is this the start of the exposure? Ignore this if the readout takes so long"
+        advice = (
+            "about one exposure: is the timestamp the start of the exposure? Ignore this if the readout takes so long"
+        )
         return warning(got, advice)
     return ok(got)
 
@@ -102,7 +107,7 @@ def _bytes(camera: Camera) -> Check:
 @FRAMES.check("shape", "the same rows and columns in every frame")
 def _shape(camera: Camera) -> Check:
     got = ", ".join(f"{rows} x {columns}" for rows, columns in camera.shapes)
-    return ok(got) if len(camera.shapes) == 1 else wrong(got, "keep one region while the loop runs")
+    return ok(got) if len(camera.shapes) == 1 else wrong(got, "keep one region of interest while the loop runs")
 
 
 @FRAMES.check("steadiness", "frames at a constant rate during the whole check")
@@ -124,7 +129,7 @@ def _steadiness(camera: Camera) -> Check:
     if longest_ns > max(_SILENT_PERIODS * period_ns, _OWN_WAIT_NS):
         return warning(got, "what delays the camera? Check the host with `lowfc doctor`")
     if late_ns > _JITTER * period_ns:
-        return warning(got, "jitter costs delay: real-time scheduling for the publisher (`lowfc doctor`)")
+        return warning(got, "jitter costs delay: use real-time scheduling for the publisher (`lowfc doctor`)")
     return ok(got)
 
 
@@ -151,7 +156,7 @@ def _light(camera: Camera) -> Check | None:
     if highest <= state.bias_dn + 10 * noise_dn:
         got = f"brightest pixel {highest} DN, bias {state.bias_dn:g} DN"
         return warning(got, "no light: is the shutter open and the star on the sensor?")
-    full = np.mean([np.mean(one >= highest) for one in camera.pixels])
+    full = np.mean([np.mean(pixels >= highest) for pixels in camera.pixels])
     if 0 <= state.saturation_dn - highest < 1 and full > _FULL:
         got = f"{100 * full:.0f} % of the pixels at {highest} DN"
         return warning(got, "shorten the exposure: saturated pixels measure nothing")
@@ -167,7 +172,7 @@ def _byte_order(camera: Camera) -> Check | None:
     if as_is > _SMOOTHER * swapped:
         got = f"the image is {as_is / max(swapped, 1e-9):.0f} times smoother with the bytes swapped: big-endian?"
         return wrong(got, "write the low byte of each pixel first")
-    values = np.unique(np.concatenate([one.reshape(-1) for one in camera.pixels]))
+    values = np.unique(np.concatenate([pixels.reshape(-1) for pixels in camera.pixels]))
     bits = int(np.bitwise_or.reduce(values))
     spare = (bits & -bits).bit_length() - 1 if bits else 0
     if spare >= 2 and values.size > _VARIED:

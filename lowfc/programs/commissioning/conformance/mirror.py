@@ -48,7 +48,7 @@ def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool 
         if gentle or _bad(found):
             untried = warning("not tested: another check failed", "correct that first")
             if gentle:
-                untried = warning("not tested: --gentle", "test them without --gentle before the loop is closed")
+                untried = warning("not tested: --gentle", "test the limits without --gentle before the loop is closed")
             found.append(untried._replace(name="limits", expected="stroke, slew and neighbour limits of the driver"))
         else:
             show("limits")
@@ -191,15 +191,15 @@ def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single) -> str:
         "rotated by 180 degrees": got[::-1, ::-1],
     }
     similarity = {
-        how: float((commanded * one).sum() / max(np.linalg.norm(commanded) * np.linalg.norm(one), 1e-30))
-        for how, one in turns.items()
-        if one.shape == commanded.shape
+        how: float((commanded * turned).sum() / max(np.linalg.norm(commanded) * np.linalg.norm(turned), 1e-30))
+        for how, turned in turns.items()
+        if turned.shape == commanded.shape
     }
-    how = max(similarity, key=lambda one: abs(similarity[one]))
+    how = max(similarity, key=lambda name: abs(similarity[name]))
     if abs(similarity[how]) < 0.9:
-        return "the shapes are unrelated: check the driver's order of the actuators"
+        return "the reported and the commanded shape are unrelated: check the driver's order of the actuators"
     scale = float((commanded * turns[how]).sum() / (commanded**2).sum())
-    advice = f"the commanded shape {how}, times {scale:.3g}"
+    advice = f"the reported shape is the commanded one {how}, times {scale:.3g}"
     if abs(scale - 2) < 0.02:
         advice += ": report surface, not wavefront"
     elif abs(scale - 1e-3) < 1e-4:
@@ -236,7 +236,7 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
         earlier = max(0, state.frame_sequence - 1) if name == "old command refused" else None
         sequence, _ = mirror.put(target_nm, sequence=earlier, cut=cut)
         after = mirror.listen(_REFUSAL_S)
-        bad = [one for one in after if mirror.moved(before_nm, one) or one.frame_sequence == sequence]
+        bad = [each for each in after if mirror.moved(before_nm, each) or each.frame_sequence == sequence]
         got = "it was applied" if bad and mirror.surface_nm(bad[-1]) is not None else "the state is not a finite grid"
         advice = "before any move, check shape, byte count, isfinite, and frame_sequence not below the last"
         yield judged(name, expected, not bad, "nothing changed", advice, got)
@@ -247,14 +247,14 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
         return
     mirror.listen(_SETTLE_S)
     sequence, _ = mirror.put(base_nm, sequence=max(0, state.frame_sequence - 1), clear_id=mirror.connection.now_ns())
-    followed = any(one.frame_sequence == sequence for one in mirror.listen(_REFUSAL_S))
+    followed = any(each.frame_sequence == sequence for each in mirror.listen(_REFUSAL_S))
     expected = "a command with a new clear_id is applied, although its frame_sequence is below the last"
     advice = "reset the newest frame_sequence on a new clear_id: otherwise an operator's clear has no effect"
     yield judged("clear", expected, followed, "it was applied", advice, "it was not applied", warning)
 
 
 def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator[Check]:
-    """Raise the mirror, let the command expire while refused ones arrive, then let one of long validity expire."""
+    """Raise the mirror, let the command expire while invalid ones arrive, then let one of long validity expire."""
     raised_nm = base_nm + np.float32(raised_by_nm)
     _, sent_ns, _ = mirror.ask(raised_nm, EXPIRES_NS)
     mirror.listen(EXPIRES_NS / 2e9)
@@ -307,7 +307,15 @@ def _limit_checks(mirror: Dialogue) -> Iterator[Check]:
     too_far_nm = min(_FAR * slew_nm, _NEAR * stroke_nm)
     fits = _BEYOND * apart_nm / 2 <= _NEAR * stroke_nm and mirror.reachable(_BEYOND * apart_nm)
     for name, words, reason, limit_nm, commanded_nm, shape, possible in (
-        ("stroke", "no actuator above", wire.REASON_STROKE, stroke_nm, _BEYOND * stroke_nm, uniform, _rises(mirror)),
+        (
+            "stroke",
+            "no actuator above",
+            wire.REASON_STROKE,
+            stroke_nm,
+            _BEYOND * stroke_nm,
+            uniform,
+            _reaches_stroke(mirror),
+        ),
         ("slew", "no move above", wire.REASON_SLEW, slew_nm, too_far_nm, uniform, too_far_nm >= _BEYOND * slew_nm),
         ("neighbours", "no step above", wire.REASON_NEIGHBOUR, apart_nm, _BEYOND * apart_nm, peak, fits),
     ):
@@ -320,15 +328,15 @@ def _limit_checks(mirror: Dialogue) -> Iterator[Check]:
             if state is None or where_nm is None:
                 check = wrong("no answer", "apply the command as far as the limits allow: a refusal stops the loop")
             else:
-                found_nm = _highest_nm(mirror, where_nm) if shape is uniform else float(np.ptp(where_nm[neighbours]))
-                check = _within_limit(state, reason, found_nm, limit_nm + mirror.expected.tolerance_nm)
+                reached_nm = _highest_nm(mirror, where_nm) if shape is uniform else float(np.ptp(where_nm[neighbours]))
+                check = _within_limit(state, reason, reached_nm, limit_nm + mirror.expected.tolerance_nm)
         yield check._replace(name=name, expected=expected)
         mirror.go(flat_nm)
 
 
-def _within_limit(state: wire.MirrorState, reason: wire.Reason, found_nm: float, most_nm: float) -> Check:
-    got = f"{found_nm:.4f} nm"
-    if found_nm > most_nm:
+def _within_limit(state: wire.MirrorState, reason: wire.Reason, reached_nm: float, most_nm: float) -> Check:
+    got = f"{reached_nm:.4f} nm"
+    if reached_nm > most_nm:
         return wrong(got, "clip every command in the driver: do not rely on the controller's limits")
     if reason in state.limits_hit:
         return ok(got)
@@ -336,7 +344,7 @@ def _within_limit(state: wire.MirrorState, reason: wire.Reason, found_nm: float,
     return warning(f"{got}, but limits_hit does not name the limit", advice)
 
 
-def _rises(mirror: Dialogue) -> bool:
+def _reaches_stroke(mirror: Dialogue) -> bool:
     """Move the mirror to 90 % of its stroke, in moves of half the slew limit; return whether it reached that."""
     stroke_nm = mirror.expected.limits.stroke_nm
     mirror.go(np.zeros(mirror.expected.grid, np.float32))

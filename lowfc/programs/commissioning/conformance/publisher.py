@@ -31,7 +31,7 @@ def _envelope(device: Collected) -> Check | None:
     bare = [message.attachment for message in messages if message.envelope is None]
     if not bare:
         return ok(f"on all of {len(messages)} messages") if messages else None
-    sizes = sorted({"none" if one is None else f"{len(one)} bytes" for one in bare})
+    sizes = sorted({"none" if attachment is None else f"{len(attachment)} bytes" for attachment in bare})
     got = f"{len(bare)} of {len(messages)} messages with {', '.join(sizes)}"
     return wrong(got, "attach it to every message; its bytes are in docs/reference/device_messages.md")
 
@@ -115,7 +115,9 @@ def _health(device: Collected) -> Check:
         return warning("no timestamp", "set it: a silent process is recognised by it")
     if last.driver_failures > first.driver_failures:
         failures = counted(last.driver_failures - first.driver_failures, "failure")
-        return warning(f"{failures} of its driver: {device.failing}", "correct this first: other checks may fail by it")
+        return warning(
+            f"{failures} of its driver: {device.driver_failure}", "correct this first: it may make other checks fail"
+        )
     return ok(f"{len(payloads)} in {device.seconds:.1f} s, state {last.state!r}")
 
 

@@ -29,7 +29,7 @@ def _settings(camera: Camera) -> Check:
         got = f"{unreadable} of {count} are not a lowfc.v1.CameraState"
         return wrong(got, "encode the message as declared")
     if not count:
-        advice = camera.failing or "publish it: calibration, noise and the check for a changed camera use it"
+        advice = camera.driver_failure or "publish it: calibration, noise and the check for a changed camera use it"
         return wrong(f"none in {camera.seconds:g} s", advice)
     if camera.seconds >= 2 and not 1 < count / camera.seconds < 20:
         return warning(f"{count / camera.seconds:.1f} a second", "publish them twice a second")
@@ -90,7 +90,9 @@ def _size(camera: Camera) -> Check | None:
     if camera.shapes == [size]:
         return ok(got)
     swapped = camera.shapes == [size[::-1]]
-    return wrong(got, "exchange rows and columns" if swapped else "publish the size of the region that is sent")
+    return wrong(
+        got, "exchange rows and columns" if swapped else "publish the size of the region of interest that is sent"
+    )
 
 
 @SETTINGS.check("settings' range", "no pixel above saturation_dn or the converter's largest value")
@@ -110,11 +112,11 @@ def _period(camera: Camera) -> Check | None:
     period_ns = float(np.median(spans)) if spans.size else 0.0
     if (state := camera.settings) is None or period_ns <= 0 or not state.period_ns:
         return None
-    off = abs(period_ns / state.period_ns - 1)
+    difference = abs(period_ns / state.period_ns - 1)
     got = f"{period_ns / 1e6:.5g} ms, period_ns {state.period_ns / 1e6:.5g} ms"
-    if off > 0.1:
+    if difference > 0.1:
         return wrong(got, "publish the real period: gains and spectra depend on it")
-    return warning(got, "publish the real period: spectra depend on it") if off > 0.01 else ok(got)
+    return warning(got, "publish the real period: spectra depend on it") if difference > 0.01 else ok(got)
 
 
 @SETTINGS.check(
@@ -174,16 +176,17 @@ PERIODS_OF_TIMEOUT = 1.5
 def agreement_checks(config: Configuration, state: wire.CameraState) -> Iterator[Check]:
     """Compare a camera's settings with the configuration of its loop."""
     ours = CameraSettings.configured(config, state.rows, state.columns)
-    for one in AGREEMENTS:
-        configured, found = float(getattr(ours, one.field)), float(getattr(state, one.field))
-        if one.field == "em_gain":
-            found = max(found, 1.0)  # a camera without multiplication may report 0
-        divisor = _NS_PER_MS if one.unit == "ms" else 1.0
-        got, expected = (f"{value / divisor:.6g} {one.unit}".rstrip() for value in (found, configured))
-        agree, advice = abs(found - configured) <= one.tolerance * abs(configured), f"it is used for: {one.use}"
-        expected, severity = f"{expected}, as configured", wrong if one.needed else warning
-        advice = f"set {one.key}, or the camera; {advice}"
-        yield judged(f"{one.field} and {one.key}", expected, agree, got, advice, severity=severity)
+    for agreement in AGREEMENTS:
+        field, unit = agreement.field, agreement.unit
+        configured, reported = float(getattr(ours, field)), float(getattr(state, field))
+        if field == "em_gain":
+            reported = max(reported, 1.0)  # a camera without multiplication may report 0
+        divisor = _NS_PER_MS if unit == "ms" else 1.0
+        got, expected = (f"{value / divisor:.6g} {unit}".rstrip() for value in (reported, configured))
+        agree = abs(reported - configured) <= agreement.tolerance * abs(configured)
+        expected, severity = f"{expected}, as configured", wrong if agreement.needed else warning
+        advice = f"set {agreement.key}, or the camera; it is used for: {agreement.use}"
+        yield judged(f"{field} and {agreement.key}", expected, agree, got, advice, severity=severity)
     frame_timeout_ms, period_ms = config.frame_timeout_ns * 1e-6, state.period_ns * 1e-6
     enough, got = frame_timeout_ms >= PERIODS_OF_TIMEOUT * period_ms, f"{frame_timeout_ms:g} ms"
     expected = f"at least {PERIODS_OF_TIMEOUT:g} frame periods of {period_ms:g} ms"
