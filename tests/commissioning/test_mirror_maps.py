@@ -236,7 +236,7 @@ def test_the_configured_law_is_requested_at_the_start(tmp_path: Path, calibratio
     assert state.mode is LoopMode.OPEN
     assert state.loop.law_runner.law.name == "leaky"
     with pytest.raises(ConfigurationError, match="the law is of the modes"):
-        StartUp(config).refused(requests[0], "the law is of the modes 2 to 15, the loop of 2 to 9")
+        StartUp(config).handle_refusal(requests[0], "the law is of the modes 2 to 15, the loop of 2 to 9")
 
 
 def test_a_controller_does_not_start_without_a_configured_file(tmp_path: Path) -> None:

@@ -294,7 +294,7 @@ def test_each_log_of_a_run_can_be_read_alone(bench: Bench) -> None:
         attachments=[Attachment("a.toml", "application/toml", b"[a]")],
     )
     peers = bench.recorder._peers
-    until(lambda: len(peers._states) == 3 and not peers._new_processes and peers._answers is None)
+    until(lambda: len(peers._states) == 3 and not peers._query_due and peers._answers is None)
     (second,) = put(calibrations, 1)
     put_until(frames, lambda: len(bench.recorder._series.files) == 3)
     summary = bench.stop()

@@ -33,8 +33,8 @@ class CameraReports:
         """End a `wait`; from any thread."""
         self._mailbox.wake()
 
-    def take(self, sample: Sample) -> None:
-        """Decode the settings in a message and pass them on."""
+    def apply(self, sample: Sample) -> None:
+        """Decode the settings in a message and pass them to the callback."""
         try:
             settings = codec.decode_camera(sample.payload, start_of(sample.sequence))
         except BadMessageError as fault:
@@ -56,7 +56,7 @@ class CameraReports:
         deadline_ns = clock.host_ns() + (LOCKSTEP_WAIT_NS if clock.lockstep else 0)
         while self._service.running:
             for sample in self._service.bus.get(CAMERA_STATE.key, timeout_s=0.2):
-                self.take(sample)
+                self.apply(sample)
                 return
             if clock.host_ns() >= deadline_ns:
                 return

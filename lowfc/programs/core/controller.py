@@ -57,7 +57,7 @@ from lowfc.programs.core.mirror_reports import MirrorReports
 from lowfc.programs.core.start_up import StartUp, settings_under
 
 TICK_NS = 10_000_000
-"""Period at which the held command is repeated without frames."""
+"""Period at which the held command is repeated while no frame arrives."""
 MIRROR_PATIENCE_S = 1.0
 """Longest time that the start waits for the mirror to report its shape."""
 STATE_PERIOD_NS = 1_000_000_000
@@ -152,7 +152,7 @@ class Controller:
             self._update_latch()
             for sample in self._camera.query() if self._state.conditions.camera_awaited else ():
                 with self._lock:
-                    self._camera.take(sample)
+                    self._camera.apply(sample)
             self._service.beat()
         self._unsubscribe_frames()
         with self._lock:
@@ -235,7 +235,7 @@ class Controller:
     def _between_frames(self, camera: Sample | None) -> None:
         """Apply new camera settings, bench values and mirror reports; without frames, hold the command."""
         if camera is not None:
-            self._camera.take(camera)
+            self._camera.apply(camera)
         if not self._service.clock.lockstep:
             self._bench.update()
             if self._mirror.due:
@@ -326,8 +326,8 @@ class Controller:
             loop, grid = self._state.loop, shape.actuators_nm.shape
             if loop is not None and grid != loop.calibration.grid:
                 raise CalibrationError(
-                    f"the mirror has {grid} actuators, the calibration is for {loop.calibration.grid}; use the "
-                    "mirror's own calibration"
+                    f"the mirror has {grid} actuators, the calibration is for {loop.calibration.grid}: load a "
+                    "calibration of this mirror"
                 )
             self._apply_report(shape)
         if lockstep:
@@ -355,7 +355,7 @@ class Controller:
             if not reply.accepted and request.name == "law" and misfit(self._state):
                 self._service.event("LAW_NOT_IN_FORCE", why=reply.text)  # the loop stays open
             elif not reply.accepted:
-                self._start_up.refused(request, reply.text)
+                self._start_up.handle_refusal(request, reply.text)
                 break
 
     def _advance(self, input_: Input) -> Outputs:

@@ -91,7 +91,7 @@ class Offload:
 
 
 class LastSecond:
-    """Modal error and flux of the frames used in the last second; of the newest if they are faster than configured."""
+    """Modal error and flux of the frames used in the last second; of the newest at a rate above the configured."""
 
     def __init__(self, period_ns: int) -> None:
         self._rows = np.zeros((max(1, SECOND_NS // period_ns + 1), 3))

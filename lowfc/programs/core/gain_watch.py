@@ -24,11 +24,14 @@ STAR_STEP = 0.2
 HARMFUL_WINDOWS = 3
 """Consecutive windows in which an open loop would have had a smaller residual, before this is reported."""
 CAUTIOUS_GAIN = 0.05
-"""Highest gain of the other modes after a window with uncorrected tip and tilt, which resemble them in second order."""
+"""Highest gain of modes other than tip and tilt after a window with uncorrected tip and tilt.
+
+The second-order response of the sensor to tip and tilt resembles these modes.
+"""
 MIN_FRAMES = 50
 """Smallest number of frames in a window."""
 REQUESTER = "automatic gains"
-_ACTIONS = {"": "nothing is done", "open": "the loop opens", "law": "the integrator takes over"}
+_REACTIONS = {"": "nothing is done", "open": "the loop opens", "law": "the integrator takes over"}
 """Reaction to harm in words, by the name of its request."""
 
 
@@ -100,9 +103,9 @@ class GainWatch:
             return NOTHING
         self._newest = newest
         same_camera = newest >> COUNT_BITS == before >> COUNT_BITS
-        held = newest - before - 1 if same_camera and newest > before else 1  # it may be lower after a clear
-        added = loop.command_channels
-        playing = added is not None and added.play is not None
+        held = newest - before - 1 if same_camera and newest > before else 1  # after a clear, the number may be lower
+        channels = loop.command_channels
+        playing = channels is not None and channels.play is not None
         if (
             step.error_nm is None
             or step.pol_nm is None
@@ -114,7 +117,7 @@ class GainWatch:
             return NOTHING
         if held:
             self._hold(held)
-        open_nm = step.pol_nm if added is None else step.pol_nm - added.offset_nm
+        open_nm = step.pol_nm if channels is None else step.pol_nm - channels.offset_nm
         closed = step.mode is LoopMode.CLOSED and not state.returning_to_zero
         flux_ratio = self._flux_change(step.flux_dn)
         if flux_ratio:
@@ -166,10 +169,10 @@ class GainWatch:
             return
         self._identity, self._weighting = identity, None
         tilt = np.isin(loop.calibration.noll, TIP_TILT)
-        both = tilt if tilt.sum() == len(TIP_TILT) else None
+        tilt_of_others = tilt if tilt.sum() == len(TIP_TILT) else None
         self._groups = [
             _Group(mask, cross_talk, self._settings, loop, window_s)
-            for mask, cross_talk, window_s in ((tilt, None, TILT_S), (~tilt, both, OTHERS_S))
+            for mask, cross_talk, window_s in ((tilt, None, TILT_S), (~tilt, tilt_of_others, OTHERS_S))
             if mask.any()
         ]
         self._former_flux_dn, self.closing_harm = 0.0, ""
@@ -250,7 +253,7 @@ class GainWatch:
             added = f"{np.diag(self._contrast) @ harm_nm2:.1e} of contrast, "
         names, indices = ", ".join(f"Z{index}" for index in harmful_modes), ",".join(map(str, harmful_modes))
         return (
-            f"closing adds {added}{harm_nm2.sum() ** 0.5:.3g} nm rms at this star and these gains, of {names}: "
+            f"closing adds {added}{harm_nm2.sum() ** 0.5:.3g} nm rms in {names}, with this star and these gains: "
             f"`lowfc ctl gain auto --modes {indices}` chooses their gains, `lowfc ctl gain 0 --modes {indices}` leaves "
             "them uncorrected"
         )
@@ -300,7 +303,7 @@ class GainWatch:
             "modes": ", ".join(f"Z{index}" for index in noll[culprits]),
             "closed_nm": float(np.sqrt(open_nm2 + worse)),
             "open_nm": float(np.sqrt(open_nm2)),
-            "action": _ACTIONS[reaction],
+            "action": _REACTIONS[reaction],
         }
         return [PendingEvent("LOOP_HARMS", details)]
 

@@ -49,7 +49,7 @@ def check_files(config: Configuration) -> None:
         raise ConfigurationError("\n".join(dict.fromkeys(faults)))
 
 
-def law(config: Configuration) -> LinearLaw | None:
+def _configured_law(config: Configuration) -> LinearLaw | None:
     """The law of `control.law`, checked for the loop's delay and rate; None for the integrator."""
     file = config.control.law
     if not file:
@@ -87,7 +87,7 @@ class StartUp:
 
     def __init__(self, config: Configuration) -> None:
         self._file, self._flat_nm = config.mirror.flat, _checked_flat_nm(config)
-        self._law_file, self._law = config.control.law, law(config)
+        self._law_file, self._law = config.control.law, _configured_law(config)
         _check_gains(config)
 
     def requests(self, state: State, time_ns: int) -> list[Request]:
@@ -103,14 +103,14 @@ class StartUp:
         if self._flat_nm is not None:
             adopted_nm = _adopted_nm(state, self._flat_nm)
             if adopted_nm is not None:
-                rest_nm = (adopted_nm - self._flat_nm).reshape(-1)
-                if np.abs(rest_nm).max() <= ADOPTED_NM:
-                    rest_nm[:] = 0
-                requests.append(request("channel", text=ADOPTED, actuators_nm=rest_nm))
+                remainder_nm = (adopted_nm - self._flat_nm).reshape(-1)
+                if np.abs(remainder_nm).max() <= ADOPTED_NM:
+                    remainder_nm[:] = 0
+                requests.append(request("channel", text=ADOPTED, actuators_nm=remainder_nm))
             requests.append(request("channel", text=FLAT, actuators_nm=self._flat_nm.reshape(-1)))
         return requests
 
-    def refused(self, request: Request, why: str) -> None:
+    def handle_refusal(self, request: Request, why: str) -> None:
         """Raise if a refused request leaves the loop different from the configuration.
 
         An adopted shape that cannot be split stays whole; the later requests are then not sent.
@@ -126,7 +126,7 @@ def _adopted_nm(state: State, flat_nm: Single) -> Single | None:
     loop = state.loop
     if loop is None or loop.command_channels is None:
         return None
-    shapes = [one.shape_nm for one in loop.command_channels.channels if one.name == ADOPTED]
+    shapes = [channel.shape_nm for channel in loop.command_channels.channels if channel.name == ADOPTED]
     if not shapes:
         return None
     flattened = shapes[0].reshape(-1), flat_nm.reshape(-1)
@@ -138,7 +138,9 @@ def _checked_flat_nm(config: Configuration) -> Single | None:
     shape_nm = flat_nm(config)
     if shape_nm is not None:
         acting = limit(factory.settings(config).limits, shape_nm, shape_nm).reasons
-        names = [reason.name.lower() for reason in acting if reason is not Limit.SLEW]  # it is approached within slew
+        names = [
+            reason.name.lower() for reason in acting if reason is not Limit.SLEW
+        ]  # the mirror approaches the flat map in steps within the slew limit
         if names:
             raise ConfigurationError(
                 f"mirror.flat = {config.mirror.flat!r}: beyond the limits of [safety]: {', '.join(names)}"
@@ -156,10 +158,10 @@ def _check_gains(config: Configuration) -> None:
 
 
 def _check_law_modes(config: Configuration) -> None:
-    linear_law = law(config)
+    linear_law = _configured_law(config)
     if linear_law is not None and linear_law.noll != config.noll:
         raise ConfigurationError(
-            f"control.law = {config.control.law!r}: it is for modes {_modes(linear_law.noll)}, the sensor's "
+            f"control.law = {config.control.law!r}: this law is for modes {_modes(linear_law.noll)}, the sensor's "
             f"{config.sensor.modes} modes are {_modes(config.noll)}"
         )
 

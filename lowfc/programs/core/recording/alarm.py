@@ -1,9 +1,9 @@
 """Runs the command of `recorder.on_event` when an event of its level or above occurs.
 
-The recorder runs it, because a run has at most one, which receives every event and is not in the loop; a console may
-be closed, or open twice. A thread in the normal scheduling class starts the command, which inherits that class. Events
-during the command, and for `recorder.on_event_every_s` after it, wait; then, or when the recorder ends, it is run once,
-for the worst of them.
+The recorder runs it, because a run has at most one recorder, which receives every event and is not in the loop; a
+console may be closed, or open twice. A thread in the normal scheduling class starts the command, which inherits that
+class. Events during the command, and for `recorder.on_event_every_s` after it, wait; then, or when the recorder ends,
+the command is run once, for the worst of them.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from lowfc.contract.printable import printable
 TIMEOUT_S = 60.0
 """Time after which a command is killed."""
 _MAX_WAITING_EVENTS = 1000
-_END_S = 2.0  # a service manager then kills it
+_END_S = 2.0  # for which a recorder that ends waits for the command; a service manager then kills the command
 _LEVELS: dict[int, str] = {level.value: level.name.lower() for level in Level}
 _OWN = EVENTS["ON_EVENT_FAILED"].name
 
@@ -37,15 +37,15 @@ class Alarm:
         """Run the command from the next event on; its failure is published as an event that does not trigger it."""
         self._command, self._level, self._min_interval_s, self._service = command, level, min_interval_s, service
         self._waiting: deque[Log] = deque(maxlen=_MAX_WAITING_EVENTS)
-        self._arrived, self._ended, self._ends_s = threading.Event(), threading.Event(), math.inf
+        self._arrived, self._closing, self._deadline_s = threading.Event(), threading.Event(), math.inf
         service.bus.subscribe(EVENT, self._receive)
         self._thread = threading.Thread(target=self._work, name="on-event", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Run the command for the events that wait, after one that runs; wait up to `_END_S` for its end."""
-        self._ends_s = time.monotonic() + _END_S
-        self._ended.set()
+        self._deadline_s = time.monotonic() + _END_S
+        self._closing.set()
         self._arrived.set()
         self._thread.join(2 * _END_S)
 
@@ -62,8 +62,8 @@ class Alarm:
             events = [self._waiting.popleft() for _ in range(len(self._waiting))]
             if events:
                 self._run(max(events, key=lambda event: event.level), len(events) - 1)
-                self._ended.wait(self._min_interval_s)
-            if self._ended.is_set() and not self._waiting:
+                self._closing.wait(self._min_interval_s)
+            if self._closing.is_set() and not self._waiting:
                 return
 
     def _run(self, event: Log, others: int) -> None:
@@ -85,11 +85,11 @@ class Alarm:
                 start_new_session=True,
             )
             due_s = time.monotonic() + TIMEOUT_S
-            while (status := command.poll()) is None and time.monotonic() < min(due_s, self._ends_s):
+            while (status := command.poll()) is None and time.monotonic() < min(due_s, self._deadline_s):
                 time.sleep(0.02)
             if status:
                 self._fail(f"it ended with exit status {status}")
-            elif status is None and not self._ended.is_set():
+            elif status is None and not self._closing.is_set():
                 with contextlib.suppress(OSError):  # it has ended, or runs as another user
                     os.killpg(command.pid, signal.SIGKILL)
                 command.wait()

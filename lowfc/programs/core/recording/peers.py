@@ -17,7 +17,7 @@ class Peers:
         self.newest: dict[str, Sample] = {}
         self._bus = bus
         self._states: dict[str, tuple[int, str]] = {}
-        self._new_processes = False
+        self._query_due = False
         self._queried: set[tuple[str, int]] = set()
         self._thread = ThreadPoolExecutor(1, "query")
         self._answers: Future[list[Sample]] | None = None
@@ -26,13 +26,13 @@ class Peers:
         """Store the state of a process, unless a later start of it has reported already."""
         name, start_s = name_in(HEALTH, sample.key), start_of(sample.sequence)
         known_s, _ = self._states.get(name, (-1, ""))
-        self._new_processes |= start_s > known_s
+        self._query_due |= start_s > known_s
         if start_s >= known_s:
             self._states[name] = start_s, health.state
 
-    def stopped(self, but: str) -> bool:
-        """Whether all processes except the one named have reported that they stopped."""
-        return all(state == "stopped" for name, (_, state) in self._states.items() if name != but)
+    def stopped(self, except_name: str) -> bool:
+        """Whether all processes except `except_name` have reported that they stopped."""
+        return all(state == "stopped" for name, (_, state) in self._states.items() if name != except_name)
 
     def store(self, sample: Sample) -> bool:
         """Store a calibration or state unless a newer one is known; return whether it is new."""
@@ -61,16 +61,16 @@ class Peers:
 
     def query_soon(self) -> None:
         """Query at the next opportunity: a message may have been lost."""
-        self._new_processes = True
+        self._query_due = True
 
     def query_in_background(self, *, start: bool) -> list[Sample]:
-        """With `start`, query if a process is new; return the new messages among the answers since the last call.
+        """With `start`, query if a query is due; return the new messages among the answers since the last call.
 
         A thread does the query, because a frozen process answers late.
         """
-        if start and self._new_processes and self._answers is None:
+        if start and self._query_due and self._answers is None:
             self._answers = self._thread.submit(self._query_all)
-            self._new_processes = False
+            self._query_due = False
         if self._answers is None or not self._answers.done():
             return []
         answers, self._answers = self._answers, None

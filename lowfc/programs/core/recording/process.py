@@ -35,9 +35,9 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
         BusError: another recorder is recording this run.
         DataFileError: a file cannot be read, or no log can be written in the folder.
     """
-    log, realtime = config.recorder, config.realtime
+    recorder_section, realtime = config.recorder, config.realtime
     limits, selection = log_limits(config), configured_selection(config)
-    if short := shortage(input_file.user_path(log.folder), limits.min_free_bytes):
+    if short := shortage(input_file.user_path(recorder_section.folder), limits.min_free_bytes):
         raise DataFileError(short)
 
     def announced_bytes_per_s(camera: wire.CameraState | None) -> float:
@@ -57,7 +57,7 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
             bus,
             clock,
             run.run_id,
-            input_file.user_path(log.folder),
+            input_file.user_path(recorder_section.folder),
             metadata={"lowfc": origin},
             attachments=attachments,
             limits=limits,
@@ -70,8 +70,9 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
             write_whole(run.path / "config.toml", shared, mode=MODE)
         recorder.catch_signals()
         recorder.service.announces = True
-        if log.on_event:
-            alarm = Alarm(recorder.service, log.on_event, Level[log.on_event_level.upper()], log.on_event_every_s)
+        if recorder_section.on_event:
+            level = Level[recorder_section.on_event_level.upper()]
+            alarm = Alarm(recorder.service, recorder_section.on_event, level, recorder_section.on_event_every_s)
             held.callback(alarm.close)
         return recorder.run()
 

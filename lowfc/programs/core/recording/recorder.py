@@ -316,14 +316,14 @@ class Recorder:
         deadline_s = time.monotonic() + _DRAIN_S
         while not self._skip_drain:
             self._iterate()
-            if self._peers.stopped(but=self.service.name) or time.monotonic() >= deadline_s:
+            if self._peers.stopped(except_name=self.service.name) or time.monotonic() >= deadline_s:
                 return
             time.sleep(_ITERATION_S)
 
     def _close(self) -> Summary:
         self._report_losses()
         self._iterate()
-        while self._stopping:  # an operator's request is answered
+        while self._stopping:  # until the operator's request to stop is answered
             time.sleep(_ITERATION_S)
             self._iterate()
         self._flush()

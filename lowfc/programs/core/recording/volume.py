@@ -53,9 +53,9 @@ def estimate(config: Configuration, camera: wire.CameraState | None = None) -> s
     recorded = configured_selection(config)
     min_free_bytes = config.recorder.min_free_mb * 1e6
     growth = growth_in_words(bytes_per_s(config, recorded, camera), user_path(config.recorder.folder), min_free_bytes)
-    rows, columns, whose = _frame_size(config, camera)
-    chosen = f" ({recorded.description})" if recorded.description else ""
-    size = f"{rows} x {columns} pixels{whose}{chosen}"
+    rows, columns, source = _frame_size(config, camera)
+    selected = f" ({recorded.description})" if recorded.description else ""
+    size = f"{rows} x {columns} pixels{source}{selected}"
     return f"recording into {config.recorder.folder}: {growth}, at {config.camera.rate_hz:g} Hz and {size}"
 
 
@@ -67,7 +67,7 @@ def growth_in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: flo
 
 
 def _frame_size(config: Configuration, camera: wire.CameraState | None) -> tuple[int, int, str]:
-    """Rows and columns of a frame, and whose they are in words: if not known, those of the simulated camera."""
+    """Rows and columns of a frame; and a text which says so, if they are not reported but the simulated camera's."""
     if camera is not None and camera.rows and camera.columns:
         return camera.rows, camera.columns, ""
     side = PUPIL_IMAGE_PIXELS if config.sensor.kind == "zwfs" else Sensor.pixels
