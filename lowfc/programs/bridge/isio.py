@@ -66,7 +66,7 @@ def bridge_isio(
                 steps = StepStreams(bus, clock, prefix)
                 others = ExternalChannels(Client(run_id, bus=bus), bus, names, nm_per_unit) if names else None
                 streams = f"{prefix}_error, _command, _residual and _flux"
-                sys.stderr.write(f"run {run_id!r} as streams {streams}; Ctrl-C ends it\n")
+                sys.stderr.write(f"publishing run {run_id!r} as streams {streams}; Ctrl-C ends this\n")
                 while not joined.restarted():
                     steps.pass_on()
                     if others is not None:

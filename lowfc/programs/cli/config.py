@@ -105,7 +105,7 @@ def config_check(
     check_files(settings)
     configured_selection(settings)
     if wrong := faults(settings, config.parent):
-        raise ConfigurationError("\n".join(f"{config}: {one}" for one in wrong))
+        raise ConfigurationError("\n".join(f"{config}: {fault}" for fault in wrong))
     if calibration is None:
         analytic(settings, Console(stderr=True))
     else:
@@ -122,11 +122,11 @@ def config_zenoh(
 
     Example: lowfc config zenoh --role camera --run bench
     """
-    made = None
+    created = None
     if make and not run_path(run or DEFAULT_RUN).is_dir():
         part, _, mirror = role.partition("-")
         keys = {"mirror.name": mirror} if part == Role.MIRROR and mirror else {}
-        made = open_run(run or DEFAULT_RUN, (load(None, keys).mirror.name,))
+        created = open_run(run or DEFAULT_RUN, (load(None, keys).mirror.name,))
     try:
         joined = open_run((run or DEFAULT_RUN) if make else the_known_run(run), ())
     except BusError as fault:
@@ -135,8 +135,8 @@ def config_zenoh(
     local = sorted({*links.ports, "bench", "operator", "launcher"})
     known = roles(links.mirrors) if links.network.router else local
     if role not in known:
-        if made is not None:
-            made.remove()
+        if created is not None:
+            created.remove()
         raise BusError(f"run {joined.run_id!r} has no role {role!r}; its roles are {', '.join(known)}")
     HostClock()  # writes the offset of the clock to a file, which the program reads
     typer.echo(json.dumps(session_config(links, role), indent=2))

@@ -75,7 +75,8 @@ _EACH = "One value for all modes, or one for each mode."
 Values = Annotated[list[float], typer.Argument(help=_EACH, parser=number)]
 Gains = Annotated[list[str], typer.Argument(help=f"{_EACH[:-1]}; or {AUTO}.", parser=gain_word)]
 ValuesIfAny = Annotated[list[float] | None, typer.Argument(help=f"{_EACH} nm rms of wavefront.", parser=number)]
-Zero = Annotated[bool, typer.Option(ZERO, help="Set it to zero.")]
+ZeroOffset = Annotated[bool, typer.Option(ZERO, help="Set the offset to zero.")]
+ZeroChannel = Annotated[bool, typer.Option(ZERO, help="Set the channel to zero.")]
 Frames = Annotated[int, typer.Argument(help="Number of frames with the loop closed.", parser=frame_count)]
 Text = Annotated[str, typer.Argument(help="The note.")]
 Purpose = Annotated[str, typer.Argument(help="What will be moved.")]
@@ -162,14 +163,16 @@ def _note(text: Text, run: AnyRun = None, as_json: Json = False) -> None:
 
 
 def _offset(
-    values: ValuesIfAny = None, modes: Modes = None, zero: Zero = False, run: AnyRun = None, as_json: Json = False
+    values: ValuesIfAny = None, modes: Modes = None, zero: ZeroOffset = False, run: AnyRun = None, as_json: Json = False
 ) -> None:
     if zero == bool(values):
         raise ConfigurationError(f"offset requires values or {ZERO}")
     _request_and_print(run, as_json, lambda loop: loop.offset([0.0] if zero else values or (), noll_of(modes)))
 
 
-def _channel(name: Channel, file: Shape = None, zero: Zero = False, run: AnyRun = None, as_json: Json = False) -> None:
+def _channel(
+    name: Channel, file: Shape = None, zero: ZeroChannel = False, run: AnyRun = None, as_json: Json = False
+) -> None:
     from lowfc.adapters.files.mirror_maps import read_shape
 
     if zero == (file is not None):
@@ -196,7 +199,7 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
         state = loop.status().state
         assert state is not None  # noqa: S101  # a status reply always has one
     known = json_object(state, run=loop.run_id)
-    names = sorted({one.name for one in state.settings.interlocks})
+    names = sorted({interlock.name for interlock in state.settings.interlocks})
     unused = "" if name in names else f"; no interlock uses it (they use {', '.join(names)})" if names else ""
     acting = f"interlocks: {interlocks(known)}" if names else "no interlock is configured"
     result = {"run": loop.run_id, "name": name, "value": parsed, "interlocks": known["interlocks"]}

@@ -124,7 +124,9 @@ def router(
 
 
 def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) -> None:
-    """List the processes of a run, and the clock offsets of their hosts from the router; store the connection to it.
+    """List the processes of a run, and the clock offsets of their hosts from the router.
+
+    With a router, other commands on this host then find the run without its configuration.
 
     Example: lowfc hosts --config lowfc.toml --run bench
     """
@@ -141,7 +143,7 @@ def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) 
         run = the_known_run(run)
     run = run or DEFAULT_RUN  # with a router, all processes of the run may be on other hosts
     with ExitStack() as stack:
-        exists = run_path(run).is_dir()  # a list without an answer creates no run
+        exists = run_path(run).is_dir()  # without an answer no run is created
         base = None if exists else Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lowfc-")))
         mirrors = () if exists else (settings.mirror.name,)
         links = open_run(run, mirrors, base, network=settings.network).links
@@ -151,7 +153,7 @@ def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) 
         processes = Client(run, bus=bus).processes()
     if not processes:
         raise BusError(f"no process of run {run!r} reports its health")
-    name = next((health.run_id for health in processes.values() if health.run_id), run)  # the router has one run
+    name = next((health.run_id for health in processes.values() if health.run_id), run)  # a router has one run
     if links.network.router:
         if name == run:
             open_run(run, mirrors, network=settings.network)  # ctl and view now find it without the configuration

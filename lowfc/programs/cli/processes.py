@@ -97,7 +97,10 @@ def record(
     ] = None,
     topics: Annotated[
         list[str] | None,
-        typer.Option(help="Record only these of frames, mirror state and surface, truth, timing; repeat."),
+        typer.Option(
+            help="Optional topic to record, or a pattern, among frames, mirror state and surface, truth and "
+            "timing; repeat for several. Default: all."
+        ),
     ] = None,
     words: Annotated[list[str] | None, typer.Argument(hidden=True)] = None,
     as_json: Json = False,
@@ -129,7 +132,7 @@ def record(
     run_config = run_path(run) / "config.toml"
     settings = configuration(run_config if config is None and run_config.exists() else config, overrides)
     joined = open_run(run, (settings.mirror.name,), network=settings.network)
-    shared = None  # without this call's options
+    shared = None  # configuration for the run's other processes, without the options of this command
     if config is not None and Role.LAUNCHER not in joined.links.ports:
         shared = load(config).to_toml().encode()
     if not joined.links.network.router and (waiting := waiting_message(run)):

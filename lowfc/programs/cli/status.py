@@ -166,9 +166,9 @@ def _contrast_row(known: dict[str, Any]) -> dict[str, str]:
 
 
 def law_in_words(known: dict[str, Any]) -> str:
-    """Text of the law in force and of the modes that the guard returned to the integrator."""
+    """Text of the law in force and of the modes that the integrator drives in its place."""
     law, weight = known["law"], known["law"]["weight"]
-    fading = "" if weight == 1 else f" with weight {weight:.2f}; the integrator has the rest"
+    fading = "" if weight == 1 else f" with weight {weight:.2f}; the integrator has weight {1 - weight:.2f}"
     overruled_modes = f"; overruled: the integrator drives {' and '.join(law['overruled'])}" if law["overruled"] else ""
     return f"{law['name']}{fading}{overruled_modes}"
 

@@ -32,16 +32,16 @@ BENCH_PERIOD_S = 0.25
 def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
     """Serve a run by EPICS PV Access: values as PVs, requests as puts, and other servers' PVs as bench values.
 
-    It waits for the run while it is stopped, and joins it again.
+    While the run is stopped, the gateway waits; then it joins the run again.
 
     Example: lowfc gateway epics --run bench
     """
     protocol()  # raises now if p4p is missing
     import_late_modules()
     joined = open_run(the_run(run), ())
-    run_id, of_run = joined.run_id, joined.path / "config.toml"
-    known = configuration(config) if config is not None or not of_run.exists() else load(of_run)
-    clock, signalled = clock_of(known), list[int]()  # an Event may lock up in the handler of a second signal
+    run_id, run_config = joined.run_id, joined.path / "config.toml"
+    settings = configuration(config) if config is not None or not run_config.exists() else load(run_config)
+    clock, signalled = clock_of(settings), list[int]()  # an Event may lock up in the handler of a second signal
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda number, _: signalled.append(number))
     bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
@@ -54,9 +54,9 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
 
     with contextlib.ExitStack() as stack:
         stack.callback(lambda: bus.close())
-        gateway = EpicsGateway(known.gateway, tuple(variables()), request)
+        gateway = EpicsGateway(settings.gateway, tuple(variables()), request)
         stack.callback(gateway.close)
-        where = f"{known.gateway.listen}:{gateway.port}, PVs {known.gateway.prefix}*"
+        where = f"{settings.gateway.listen}:{gateway.port}, PVs {settings.gateway.prefix}*"
         sys.stderr.write(f"gateway: run {run_id} by PV Access at {where}\n")
         while True:
             _serve(Client(run_id, bus=bus), Watch(bus, clock), gateway, ended)
@@ -82,7 +82,7 @@ def _serve(loop: Client, watch: Watch, gateway: EpicsGateway, ended: Callable[[]
             due_s = now_s + PERIOD_S
             view = watch.update()
             status = json_object(view.state, view.processes, loop.run_id)
-            values = {one.name: one.read(view, status) for one in gateway.variables if one.read is not None}
+            values = {each.name: each.read(view, status) for each in gateway.variables if each.read is not None}
             gateway.update(values, "" if view.connected else "the controller does not answer")
         gateway.changed.wait(max(0.0, min(due_s, bench_s) - time.monotonic()))
         time.sleep(MIN_PERIOD_S)

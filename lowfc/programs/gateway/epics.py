@@ -66,7 +66,7 @@ class EpicsGateway:
             self._server = p4p.server.Server(providers=[provided], conf=served, useenv=False)
         except RuntimeError as fault:
             raise BusError(f"cannot serve PV Access on {address}:{port}: {fault}") from None
-        if self.port != port:  # the library would serve on another one
+        if self.port != port:  # the library would serve on another port
             self._server.stop()
             raise BusError(f"cannot serve PV Access on {address}:{port}: it is in use; set another gateway.port")
         searched = {"EPICS_PVA_ADDR_LIST": config.search, "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
@@ -92,9 +92,9 @@ class EpicsGateway:
                 pv.post(value, timestamp=time.time())
                 continue
             why = fault or ("not measured now" if one.kind is Kind.NUMBER and np.isnan(value) else "")
-            news = str(np.asarray(value).tolist()), why  # as text, since NaN differs from itself
-            if self._last.get(one.name) != news:
-                self._last[one.name] = news
+            update = str(np.asarray(value).tolist()), why  # as text, since NaN differs from itself
+            if self._last.get(one.name) != update:
+                self._last[one.name] = update
                 pv.post(value, severity=_INVALID if why else 0, message=why, timestamp=time.time())
 
     def close(self) -> None:
@@ -106,11 +106,11 @@ class EpicsGateway:
 
     def _receiver(self, name: str) -> Callable[[Any], None]:
         def received(value: Any) -> None:
-            found = _value_of(value)
-            if found is None:
+            bench_value = _value_of(value)
+            if bench_value is None:
                 self.bench.pop(name, None)
             else:
-                self.bench[name] = found
+                self.bench[name] = bench_value
             self.changed.set()
 
         return received

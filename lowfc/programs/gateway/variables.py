@@ -1,6 +1,7 @@
 """Process variables of a gateway, independent of its protocol: readings, and writable variables that send requests.
 
-A request with a `lowfc ctl` command that changes something is offered if it takes numbers or one text, for all modes.
+A request that changes something and has a `lowfc ctl` command is offered if it takes nothing, numbers or one text. It
+concerns all modes.
 """
 
 from collections.abc import Callable, Iterator
@@ -91,27 +92,31 @@ READINGS = (
 )
 
 
-def _request(one: Declaration) -> Variable | None:
-    fields, name = {field for field, _ in one.fields}, one.name
-    if not one.example or not fields <= {"modes", "values", "text", "lease_id"} or name in ("status", "configuration"):
+def _request(declared: Declaration) -> Variable | None:
+    fields, name = {field for field, _ in declared.fields}, declared.name
+    if (
+        not declared.example
+        or not fields <= {"modes", "values", "text", "lease_id"}
+        or name in ("status", "configuration")
+    ):
         return None
     put: Put
-    if one.key.startswith("lowfc/record/"):
+    if declared.key.startswith("lowfc/record/"):
         starts = name == "start"
         name, kind, put = f"record_{name}", Kind.BOOLEAN, lambda loop, value: loop.record(starts)
     elif "text" in fields and "modes" not in fields:  # for `gain`, the numbers rather than the text
-        kind, put = Kind.TEXT, lambda loop, value: loop.ask(one.name, text=value)
+        kind, put = Kind.TEXT, lambda loop, value: loop.ask(declared.name, text=value)
     elif "values" in fields:
-        kind, put = Kind.NUMBERS, lambda loop, value: loop.ask(one.name, values=value)
+        kind, put = Kind.NUMBERS, lambda loop, value: loop.ask(declared.name, values=value)
     else:
-        kind, put = Kind.BOOLEAN, lambda loop, value: loop.ask(one.name)
-    return Variable(name, kind, "", one.description, None, put)
+        kind, put = Kind.BOOLEAN, lambda loop, value: loop.ask(declared.name)
+    return Variable(name, kind, "", declared.description, None, put)
 
 
 def variables() -> Iterator[Variable]:
     """All variables: readings, writable if a request has the same name, then the other requests."""
-    puts = {variable.name: variable for one in DECLARED if (variable := _request(one)) is not None}
+    puts = {variable.name: variable for declared in DECLARED if (variable := _request(declared)) is not None}
     for reading in READINGS:
-        declared = puts.pop(reading.name, None)
-        yield reading if declared is None else reading._replace(put=declared.put)
+        request = puts.pop(reading.name, None)
+        yield reading if request is None else reading._replace(put=request.put)
     yield from puts.values()

@@ -54,20 +54,20 @@ def sim_loop(
     watch = Watch({}, [])
     children: list[Child] = []
     run = _new_run(config, name)
-    ends = contextlib.ExitStack()
+    cleanup = contextlib.ExitStack()
     try:
-        ends.callback(run.remove)
-        ends.callback(stop_all, children)
+        cleanup.callback(run.remove)
+        cleanup.callback(stop_all, children)
         console.print(f"run {run.run_id}", highlight=False)
         if record:
             console.print(estimate(config), highlight=False, markup=False, soft_wrap=True)
         try:
             bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # its listener marks the run as starting
         except BusError:
-            if run.links.live():  # another launcher of this name was faster: the directory is its own
-                ends.pop_all()
+            if run.links.live():  # another launcher of this name was faster: the directory is that launcher's
+                cleanup.pop_all()
             raise
-        ends.callback(bus.close)
+        cleanup.callback(bus.close)
         bus.subscribe(HEALTH, watch.add_health)
         bus.subscribe(EVENT, watch.add_event)
         prepare(config, run, console)
@@ -81,7 +81,7 @@ def sim_loop(
         log = watch.health_of(Role.RECORDER).recording.file
         raise ProcessDiedError(f"{fault}\nrecorded until then: {log}" if log else str(fault)) from fault
     finally:
-        ends.close()
+        cleanup.close()
     return {"run": run.run_id} | summary(watch, record, config.camera.rate_hz if config.lockstep else None)
 
 
@@ -202,11 +202,11 @@ def deferred_signals() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         caught.append(number)
 
-    before = {number: signal.signal(number, catch) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous_handlers = {number: signal.signal(number, catch) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: bool(caught)
     finally:
-        for number, handler in before.items():
+        for number, handler in previous_handlers.items():
             signal.signal(number, handler)
 
 
