@@ -30,7 +30,7 @@ from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate import align as calibrate_align
 from lowfc.programs.commissioning.calibrate import command, pokes
 from lowfc.programs.commissioning.calibrate import tasks as calibrate_commands
-from lowfc.programs.commissioning.calibrate.align import on_sensor
+from lowfc.programs.commissioning.calibrate.align import most_reversed_mode, on_sensor
 from lowfc.programs.commissioning.calibrate.command import calibrate_app
 from lowfc.programs.commissioning.calibrate.run import Calibrator
 from lowfc.programs.commissioning.calibrate.tasks import zero_point
@@ -324,6 +324,12 @@ def test_a_poke_resolves_the_rotation_by_180_degrees(noiseless_loop: InProcessLo
     assert (result["pixels_per_lambda_d"], result["parity"]) == (pytest.approx(4, rel=0.003), 1)
     calibration = calibration_file.load(Path("aligned.fits"))
     assert np.abs(cross_talk(calibration.reconstructor, noiseless_loop.calibration().response)).max() < 0.05
+
+
+def test_the_rotation_is_resolved_by_a_mode_that_it_reverses() -> None:
+    y, x = np.mgrid[-1.5:2, -1.5:2]
+    images = np.stack([x, 9 * (x**2 + y**2), 2 * y], axis=2).reshape(16, 3).astype(np.float32)
+    assert most_reversed_mode(images, (4, 4)) == 2, "not the largest response, which is the same in both orientations"
 
 
 def test_an_aligned_calibration_expects_the_light_of_the_good_pixels(

@@ -1,7 +1,8 @@
 """Placement of a real sensor's image relative to the computed one: scale, centre, rotation, parity.
 
-The image of a flat wavefront through a pupil without phase is unchanged by a rotation of 180 degrees, so the reference
-image alone leaves this ambiguity. In the wrong orientation every mode has the opposite sign: one poke resolves it.
+The image of a flat wavefront through a pupil that is symmetric or without phase is unchanged by a rotation of 180
+degrees, so the reference image alone leaves this ambiguity. In the wrong orientation tip, tilt and other odd modes have
+the opposite sign, and without phase in the pupil all modes: a poke of an odd mode resolves it.
 """
 
 from dataclasses import dataclass, replace

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from lowfc.adapters.files import factory
 from lowfc.adapters.files.whole_file import require_folder
-from lowfc.arrays import single
+from lowfc.arrays import Single, single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
@@ -60,7 +60,7 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
         except ValueError as error:
             raise CalibrationError(str(error)) from None
         calibration = on_sensor(config, computed, alignment.geometry, flux_dn, before)
-        mode = int(np.argmax(np.linalg.norm(calibration.response, axis=0)))
+        mode = most_reversed_mode(computed.response, computed.shape)
         amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_nm(config, calibration)[mode]))
         poke = Player(loop, calibration, reporter(console)).first_poke(mode, first_poke_plan(amplitude_nm))
         if poke.response @ calibration.response[:, mode] < 0:
@@ -76,6 +76,15 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
         other_parity_residual=alignment.other_parity,
         file=str(out),
     )
+
+
+def most_reversed_mode(response: Single, shape: tuple[int, int]) -> int:
+    """Index of the mode whose response changes most under a rotation of the image by 180 degrees.
+
+    A sensor with phase in its pupil, such as clowfs, has the same response to focus in both orientations.
+    """
+    images = response.astype(np.float64).reshape(*shape, -1)
+    return int(np.argmax(np.linalg.norm(images - images[::-1, ::-1], axis=(0, 1))))
 
 
 def on_sensor(

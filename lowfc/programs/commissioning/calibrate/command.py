@@ -175,7 +175,7 @@ def align(
 ) -> None:
     """Fit how the sensor is placed relative to the computed image; write the computed calibration for its pixels.
 
-    A rotation by 180 degrees does not change the image but reverses every mode: a poke resolves the ambiguity.
+    A rotation by 180 degrees does not change the image but reverses tip and tilt: a poke resolves the ambiguity.
 
     Example: lowfc calibrate align --out aligned.fits
     """
