@@ -263,3 +263,5 @@ def test_zenohs_errors_are_shown_without_source_locations() -> None:
     assert plain(zenoh.ZError("invalid configuration at zenoh/src/api/session.rs:12.\nmore")) == "invalid configuration"
     timeout = "Unable to connect to any of [Single(tcp/127.0.0.1:99)]. Timeout!"
     assert plain(zenoh.ZError(f"{timeout} at /root/zenoh/orchestrator.rs:388.")) == timeout
+    for whole in ("no peer among [tcp/127.0.0.1:99]", "an invalid key: [a/**b] cannot be used"):
+        assert plain(zenoh.ZError(whole)) == whole

@@ -14,9 +14,10 @@ _PLACE = re.compile(r"\s*\bat /?\S+\.rs:\d+\.?")
 
 def plain(fault: zenoh.ZError) -> str:
     """Cause of an error, without zenoh's source locations and component names."""
-    text = _PLACE.sub("", str(fault).partition("\n")[0])
-    cause = text.rpartition(": [")[2]  # an IPv6 address has brackets, too
-    return cause.strip(" .").removesuffix("]")[:_LONGEST]
+    text = _PLACE.sub("", str(fault).partition("\n")[0]).strip(" .")
+    if text.endswith("]") and ": [" in text:  # the cause; an IPv6 address has brackets, too
+        text = text[:-1].rpartition(": [")[2]
+    return text[:_LONGEST]
 
 
 @contextmanager
