@@ -193,7 +193,7 @@ class DirectReader:
             self._handler(sample)
 
     def _leave_bus(self) -> None:
-        """Unsubscribe from the bus, as messages arrive over both paths."""
+        """Unsubscribe from the bus; nothing happens without a subscription."""
         if self._unsubscribe is not None:
             self._unsubscribe()
             self._unsubscribe, self._on_both_paths = None, False

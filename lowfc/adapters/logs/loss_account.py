@@ -105,7 +105,7 @@ class LossAccount:
         tally.enter(count, recorded=recorded or unwanted, unwanted=unwanted)
 
     def reconcile(self, sample: Sample, health: wire.Health) -> None:
-        """Use a publisher's own counts from its Health; losses before the first Health or message of it do not count.
+        """Use a publisher's own counts from its Health; losses before its first Health or message do not count.
 
         Raises:
             BadMessageError: the Health has too many names; its remaining counts are ignored.

@@ -154,8 +154,8 @@ def integrator_block(gain: float, leak: float, signal: Signal, delay_frames: flo
 
     For the latter, e[k] = pol[k] + sum_j w_j c[k-1-j], for which the block stores commands. During missing frames pol
     is predicted to cancel the stored commands, so that the command keeps its value, apart from the leak. Above a gain
-    of 0.99 / w_0 this prediction would be unstable in an open loop, so it is damped: the command then goes back, at
-    gains that keep the margins by up to a quarter of its last change.
+    of 0.99 / w_0 this prediction would be unstable in an open loop, so it is damped: the command then goes back. At
+    gains that keep the margins it goes back by at most a quarter of its last change.
     """
     if signal == "error":
         return Block(np.zeros((1, 1)), np.array([-gain]), np.array([1 - leak]), np.zeros((1, 1)), np.ones(1))

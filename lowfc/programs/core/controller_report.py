@@ -91,7 +91,7 @@ class Offload:
 
 
 class LastSecond:
-    """Modal error and flux of the frames used in the last second; of the newest at a rate above the configured."""
+    """Modal error and flux of the frames used in the last second; at a higher rate than configured, of the newest."""
 
     def __init__(self, period_ns: int) -> None:
         self._rows = np.zeros((max(1, SECOND_NS // period_ns + 1), 3))

@@ -67,7 +67,7 @@ def growth_in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: flo
 
 
 def _frame_size(config: Configuration, camera: wire.CameraState | None) -> tuple[int, int, str]:
-    """Rows and columns of a frame; and a text which says so, if they are not reported but the simulated camera's."""
+    """Rows and columns of a frame, and a remark if no camera reports them, and they are the simulated camera's."""
     if camera is not None and camera.rows and camera.columns:
         return camera.rows, camera.columns, ""
     side = PUPIL_IMAGE_PIXELS if config.sensor.kind == "zwfs" else Sensor.pixels

@@ -128,7 +128,7 @@ def frame_outcomes(
 
 
 def percentiles(values: npt.NDArray[Any]) -> dict[str, float] | None:
-    """The `PERCENTILES` of the finite values, each of which is one of them; None without any."""
+    """The `PERCENTILES` of the finite values, not interpolated: each is one of the values; None without any."""
     known = np.sort(values[np.isfinite(values)])
     if not known.size:
         return None
