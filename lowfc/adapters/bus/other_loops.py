@@ -45,7 +45,7 @@ def other_loops() -> Iterator[tuple[str, bool]]:
             if program and process.pid != os.getpid() and not (parent and _program(parent.cmdline())):
                 owner = process.uids().effective
                 who = "you run" if owner == os.geteuid() else f"user {_user_name(owner)} runs"
-                where, starting = _runtime_directory(process, owner)
+                where, starting = _directory_clause(process, owner)
                 yield f"{who} `{program}` (process {process.pid}){where}", starting
 
 
@@ -60,8 +60,8 @@ def _program(words: Sequence[str]) -> str:
     return ""
 
 
-def _runtime_directory(process: psutil.Process, owner: int) -> tuple[str, bool]:
-    """Clause on the runtime directory of a process, and whether this is a new process of this user in this directory.
+def _directory_clause(process: psutil.Process, owner: int) -> tuple[str, bool]:
+    """Clause on the runtime directory of a process, and whether it is a new process of this user and directory.
 
     The clause is empty for such a process, and for another user's that is not readable.
     """

@@ -138,9 +138,8 @@ def _checked_flat_nm(config: Configuration) -> Single | None:
     shape_nm = flat_nm(config)
     if shape_nm is not None:
         acting = limit(factory.settings(config).limits, shape_nm, shape_nm).reasons
-        names = [
-            reason.name.lower() for reason in acting if reason is not Limit.SLEW
-        ]  # the mirror approaches the flat map in steps within the slew limit
+        # The mirror approaches the flat map in steps within the slew limit.
+        names = [reason.name.lower() for reason in acting if reason is not Limit.SLEW]
         if names:
             raise ConfigurationError(
                 f"mirror.flat = {config.mirror.flat!r}: beyond the limits of [safety]: {', '.join(names)}"

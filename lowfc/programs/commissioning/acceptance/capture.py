@@ -107,9 +107,8 @@ def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> Capt
         raise AcceptanceError("the gains of the tested modes are zero: they have no capture range")
     modes = []
     for noll in dict.fromkeys(trial.parameters["noll"] for trial in trials):
-        of_mode = {
-            trial.parameters["level_nm"]: trial for trial in trials if trial.parameters["noll"] == noll
-        }  # the last trial of each level
+        # The last trial of each level.
+        of_mode = {trial.parameters["level_nm"]: trial for trial in trials if trial.parameters["noll"] == noll}
         converged = {level_nm: removed(trial) for level_nm, trial in of_mode.items()}
         sizes = sorted({abs(level_nm) for level_nm in converged})
         lost = [abs(level_nm) for level_nm, success in converged.items() if not success]
