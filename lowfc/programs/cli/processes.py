@@ -98,8 +98,8 @@ def record(
     topics: Annotated[
         list[str] | None,
         typer.Option(
-            help="Optional topic to record, or a pattern, among frames, mirror state and surface, truth and "
-            "timing; repeat for several. Default: all."
+            help="Topic or pattern to record among frames, mirror state, mirror surface, truth and timing; repeat for "
+            "several. Default: all."
         ),
     ] = None,
     words: Annotated[list[str] | None, typer.Argument(hidden=True)] = None,
