@@ -150,7 +150,7 @@ def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench,
     bench.loop.open_loop()
     before = bench.loop.status().state
     text = bench.steps(close=False)._predict_and_close(1.0)
-    assert "predicted error in closed loop with noise, at a gain of 0.1 in place of automatic gains: " in text
+    assert "predicted error with noise in closed loop, at a gain of 0.1 in place of automatic gains: " in text
     assert "`lowfc ctl close` closes the loop" in text
     after = bench.loop.status().state
     assert (after.mode, after.gain, after.automatic) == (wire.LOOP_MODE_OPEN, before.gain, before.automatic)

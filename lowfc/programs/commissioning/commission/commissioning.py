@@ -250,7 +250,7 @@ class Commissioning:
         self._results["predicted_error_nm"] = predicted
         gain = f", at a gain of {CHECK_GAIN:g} in place of automatic gains" if automatic else ""
         text = (
-            f"predicted error in closed loop with noise{gain}: {predicted:.3g} nm rms, from {frames} open-loop frames"
+            f"predicted error with noise in closed loop{gain}: {predicted:.3g} nm rms, from {frames} open-loop frames"
         )
         if not self._options.close:
             return f"{text}\n`lowfc ctl close` closes the loop"
