@@ -195,7 +195,7 @@ def test_a_log_without_the_selected_topics_is_an_error(log: Path, run: Run) -> N
 def test_a_log_with_only_topics_of_a_live_controller_is_an_error_that_says_so(log: Path, run: Run) -> None:
     service = SimpleNamespace(running=True, clock=HostClock(), beat=lambda: None)
     selection = Selection(run.links, ["lowfc/control/ste*"], {"controller"})
-    with pytest.raises(DataFileError, match=rf"selected topics but {STEP.key} \(controller is live\)"):
+    with pytest.raises(DataFileError, match=rf"selected topics; left out: {STEP.key} \(controller is live\)"):
         Player(service, {}, selection, 1.0).play([log], Console(quiet=True))
 
 
