@@ -21,9 +21,9 @@ _RMS = "disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_re
 class WavefrontAccumulator:
     """Block sums over frames of the contrast added by each mode, and of the squared wavefront.
 
-    Statistics have their names in the message: rms over the open pupil in nm, and rms of the tilt per axis in mas, at
-    the starts of exposures. Those named `continuous_...` are over all time, from `instants` samples of each period;
-    they are absent if not computed.
+    Statistics are named as in the message `WavefrontFigures`: rms over the open pupil in nm, and rms of the tilt per
+    axis in mas, at the starts of exposures. Those named `continuous_...` are over whole periods, from `instants`
+    samples of each; they are absent if not computed.
     """
 
     def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int = 1, instants: int = 0) -> None:
@@ -46,7 +46,10 @@ class WavefrontAccumulator:
         self._recent = np.zeros((recent, self._values))
 
     def add(self, truth: Truth, added_flat: float = 0.0, added: Single | None = None) -> None:
-        """Add a frame's truth, the contrast added by its disturbance, and by each mode (modes,) of its residual."""
+        """Add a frame's truth, the contrast added by its disturbance with a flat mirror, and by each residual mode.
+
+        `added` is (modes,).
+        """
         contrasts = [added_flat, *([0.0] * len(self._noll) if added is None else added.tolist())]
         values = (*contrasts, *self._squares(truth.sampled))
         if truth.continuous is not None:

@@ -1,4 +1,7 @@
-"""The guard in the simulated loop, with moved lines and with good laws: the table in docs/howto/tuning.md."""
+"""The guard of a law in the simulated loop: laws whose lines have shifted in frequency, and laws that fit.
+
+The table in docs/howto/tuning.md.
+"""
 
 import timeit
 from collections.abc import Callable
@@ -27,8 +30,8 @@ from tools.shared import Results, formatted_table
 SEEDS = tuple(range(1, 21))
 MOVED = (("reaction-wheel-ideal", 1.02), ("reaction-wheel", 1.05), ("reaction-wheel", 1.10))
 MAGNITUDES = (0.0, 2.0, 5.0)
-STEPS_MAS = 5.0
-"""Half the height of a square wave of period 4 s in tip and tilt."""
+AMPLITUDE_MAS = 5.0
+"""Amplitude of a square wave of period 4 s in tip and tilt, so that its steps are twice as large."""
 MINUTES = 10.0
 _IDENTIFY, _SETTLE, _BEFORE = 48_000, 12_000, 2_000
 """Frames: for identification of a law, in open loop, and in closed loop before the lines move."""
@@ -93,7 +96,7 @@ def tilt_after_move(
 
 def times_overruled(case: Case, seed: int, minutes: float = MINUTES) -> int:
     """Number of times a good law is overruled, with steps and lines that wander within their width."""
-    bench = case.bench(case.configured(seed), case.law, STEPS_MAS)
+    bench = case.bench(case.configured(seed), case.law, AMPLITUDE_MAS)
     bench.run(round(minutes * 60 * RATE_HZ), record=False)
     if bench.frames_refused:
         raise RuntimeError(f"{bench.frames_refused} frames were refused")
@@ -113,16 +116,20 @@ def measure() -> Results:
 
 
 def cost_us(law: LinearLaw) -> dict[str, float]:
-    """Least time that the guard adds to a frame, while the law drives and while it is virtual."""
+    """Least time, us, that the guard adds to a frame while the law drives, and while it is overruled."""
     modes = len(law.noll)
     zeros, value_nm = np.zeros(modes, np.float32), np.ones(modes, np.float32)
-    loop = Integrator(zeros + np.float32(0.5), zeros, zeros + np.float32(150)), ((0, np.float32(1)),), (zeros,)
+    integrator_and_history = (
+        Integrator(zeros + np.float32(0.5), zeros, zeros + np.float32(150)),
+        ((0, np.float32(1)),),
+        (zeros,),
+    )
     driving, x = LawGuard.of(law), at_rest(law)
     virtual = LawGuard.of(law, [Group(True, driving.spans.faded, 1)] * 2)
     found = {}
     for name, guard in (("driving", driving), ("virtual", virtual)):
-        begun, _ = guard.judged(law, x, *loop, value_nm, value_nm, limited=False)
-        step = partial(begun.judged, law, x, *loop, value_nm, value_nm, limited=False)
+        begun, _ = guard.judged(law, x, *integrator_and_history, value_nm, value_nm, limited=False)
+        step = partial(begun.judged, law, x, *integrator_and_history, value_nm, value_nm, limited=False)
         found[name] = 1e6 * min(timeit.repeat(step, repeat=1000, number=20)) / 20
     return found
 
@@ -166,13 +173,13 @@ def render(results: Results) -> str:
     )
     cost = results["cost_us"]
     complete = all(len(found) == len(SEEDS) for found in results["good"].values())
-    partly = "" if complete else f" Of the {len(SEEDS)} runs for each V the others were not yet measured."
+    partly = "" if complete else f" For some V not all of the {len(SEEDS)} runs have been measured."
     return (
         f"{rows}\nTrue tilt from 1 s to 3 s after the lines moved, V = 0, 1 kHz. Laws are LQG, "
         f"identified from {_IDENTIFY / RATE_HZ:g} s of the closed loop; the integrator has the best gains for the same "
-        f"frames. Good laws, for {results['minutes']:g} minutes each, with unmodelled steps of {2 * STEPS_MAS:g} mas "
-        f"every 2 s, were overruled: {good}.{partly} With a law of 14 modes the guard adds {cost['driving']:.1f} us "
-        f"to a frame while the law drives, {cost['virtual']:.1f} us while it does not. Modes, with noise "
-        "of the covariance that R gives for the images, pass through the live loop's own `advance`; no images are "
+        f"frames. Good laws, for {results['minutes']:g} minutes each, with unmodelled steps of {2 * AMPLITUDE_MAS:g} "
+        f"mas every 2 s, were overruled: {good}.{partly} With a law of 14 modes the guard adds {cost['driving']:.1f} "
+        f"us to a frame while the law drives, {cost['virtual']:.1f} us while it does not. The live "
+        "loop's own `advance` gets modes with noise of the covariance that image noise has after R; no images are "
         "simulated."
     )

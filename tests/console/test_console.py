@@ -350,7 +350,7 @@ def test_a_repeated_event_has_one_line_with_its_count() -> None:
     assert len(history.last(5).plain.splitlines()) == 4, "a repetition after 10 s has its own line"
 
 
-def test_texts_name_keys_for_commands_and_ranges_for_long_lists() -> None:
+def test_the_console_replaces_commands_by_keys_and_long_lists_by_ranges() -> None:
     assert phrased("`lowfc ctl clear` first, when it is safe") == "clear (key k) first, when it is safe"
     assert phrased("`lowfc ctl record start` goes on") == "record start (key r) goes on"
     assert phrased("`lowfc ctl permit` and `lowfc tune`") == "`lowfc ctl permit` and `lowfc tune`"
@@ -376,7 +376,7 @@ def test_tasks_are_commands_with_the_options_of_their_form(run: LiveRun, monkeyp
     operate(run, scenario)
 
 
-def test_a_task_has_a_home_directory_for_a_tilde_and_loads_its_result_by_yes_or_no() -> None:
+def test_a_task_expands_a_tilde_and_its_load_field_takes_yes_or_no() -> None:
     dark = ALL_ACTIONS["dark"]
     out = str(Path.home() / "dark.fits")
     assert dark.command({"frames": "9", "out": "~/dark.fits"}, RUN)[3:7] == ["--frames", "9", "--out", out]
@@ -417,11 +417,13 @@ def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatc
     )
     configurations.append(CONFIG)
     until(lambda: console_feed.read() and console_feed._configured)
-    assert not console_feed._complete(Mock(controller=None)), "its state is queried again, too"
+    assert not console_feed._complete(Mock(controller=None)), "a controller whose state is unknown is queried again"
     asked = ask.call_count
-    console_feed._query()  # as is repeated while there is no calibration
+    console_feed._query()  # as repeated while there is no calibration
     until(lambda: not any(thread.name == "query" for thread in threading.enumerate()))
-    assert (ask.call_count, console_feed._config) == (asked, CONFIG), "each query is a request in the log"
+    assert (ask.call_count, console_feed._config) == (asked, CONFIG), (
+        "a known configuration is not requested again: each request is in the log"
+    )
 
 
 def test_a_request_is_in_the_log_of_every_console(run: LiveRun) -> None:

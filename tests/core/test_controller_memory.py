@@ -424,10 +424,9 @@ def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: C
     mirror.publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
     assert controller._mirror.first() is not None
     healths = mirror.publisher(HEALTH, "mirror-dm")
-    for _ in range(2):
-        healths.put(wire.Health(command_refused=99).SerializeToString())
-        fault = controller._mirror.fault(State(commanded=True))
-    assert fault == "refuses commands: 99"
+    for reason, fault in ((99, ""), (99, "refuses commands: 99"), (98, "refuses commands: 98"), (0, "")):
+        healths.put(wire.Health(command_refused=reason).SerializeToString())
+        assert controller._mirror.fault(State(commanded=True)) == fault
 
 
 def test_a_warm_up_changes_no_state_publishes_nothing_and_loses_no_settings(

@@ -24,6 +24,7 @@ from lowfc.device import (
     run_camera,
 )
 from lowfc.device.camera_loop import CameraLoop
+from lowfc.device.driver import CameraExtras
 from lowfc.device.mirror_loop import protection_of
 from lowfc.device.run import camera_beside
 from lowfc.programs.commissioning.doctor.devices import device_checks
@@ -304,8 +305,13 @@ def test_lockstep_refuses_a_camera_in_the_controllers_process() -> None:
         pass
 
 
-def test_lockstep_refuses_a_camera_that_does_not_wait_for_the_mirror() -> None:
-    camera = Ramp(Ramp.Options(), CONFIG)
+class RampWithExtras(Ramp, CameraExtras):
+    """The ramp with the default of every optional method."""
+
+
+@pytest.mark.parametrize("kind", [Ramp, RampWithExtras])
+def test_lockstep_refuses_a_camera_that_does_not_wait_for_the_mirror(kind: type[Ramp]) -> None:
+    camera = kind(Ramp.Options(), CONFIG)
     with pytest.raises(ConfigurationError, match="in lockstep a camera waits for the mirror"):
         run_camera(camera, load(None, {"lockstep": True}), "none")
     assert camera.closed

@@ -115,7 +115,7 @@ class ToyBench(ChaosBench):
         self._mirror = MirrorLoop(SimulatedMirror(DriverOptions(), self.config), mirror, self.config)
         self.restart(Role.CONTROLLER)
         self.await_settled()
-        self.mark("quiet")
+        self.mark("settled")
 
     def mark(self, name: str) -> None:
         self.outcome.marks[name] = self.clock.host_ns()

@@ -58,8 +58,8 @@ class Publisher(Protocol):
     """Publishes one topic under one key.
 
     Attributes:
-        published: number of messages so far, including `skipped`.
-        skipped: number of sequences without a message: frames that the camera lost.
+        published: count of the next message: that of the messages so far plus `skipped`.
+        skipped: number of counts for which no message was published, as the camera lost the frame.
         handed_ns: time at which the last message was handed to the direct link, otherwise to the bus, host clock.
     """
 
@@ -120,7 +120,7 @@ class Bus(Protocol):
         ...
 
     def restart(self) -> None:
-        """Begin a new start of this process: publishers count from 0, as when a camera restarts its frame numbers."""
+        """Give the messages a new start time; publishers count from 0, as when a camera restarts its frame numbers."""
         ...
 
     def close(self) -> None:
@@ -160,7 +160,7 @@ class Faults:
         self._lock = threading.Lock()
 
     def add(self, place: str, key: str, fault: Exception) -> None:
-        """Count a fault at a place (such as "camera: handler of") and a key; a bad message counts as unreadable."""
+        """Count a fault at a `place`, such as "camera: handler of", and a key; a bad message counts as unreadable."""
         if isinstance(fault, UNREADABLE):
             self.add_unreadable(key, fault)
             return

@@ -52,8 +52,8 @@ def covariance_nm2(model: Model) -> Array:
 def _riccati(A: Array, Q: Array, C: Array) -> Array:
     """Covariance X = A (X - X C' C X / (1 + C X C')) A' + Q of the states before a frame, by doubling.
 
-    Each iteration doubles the number of filtered frames, from a start of zero covariance. Lines that are nearly
-    undamped put poles next to the unit circle, which scipy's `solve_discrete_are` cannot separate.
+    Each iteration of this structure-preserving algorithm doubles the number of filtered frames, from zero covariance.
+    Nearly undamped lines put poles next to the unit circle, which scipy's `solve_discrete_are` cannot separate.
 
     Raises:
         ValueError: it does not converge.

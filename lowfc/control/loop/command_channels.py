@@ -1,8 +1,9 @@
 """Additions to the loop's command: static channels, an offset of its target, a table played frame by frame.
 
-A channel is a mirror shape set by another user, such as a dark hole. The sensor sees it, so the sensor's zero point
-shifts with it (Subedi et al. 2015, Sect. 1 and 4), after the delay of a command, and the loop does not remove it; of
-the channels, only `FLAT` shifts nothing. A probe sequence ("play") is for calibration and tests and shifts nothing.
+A channel is a mirror shape from a source other than the control law, such as one that digs a dark hole. The sensor sees
+it, so the sensor's zero point shifts with it (Subedi et al. 2015, Sect. 1 and 4), after the delay of a command, and the
+loop does not remove it; of the channels, only `FLAT` shifts nothing. A probe sequence ("play") is for calibration and
+tests and shifts nothing.
 """
 
 from typing import NamedTuple
@@ -65,7 +66,7 @@ class PlayTable(NamedTuple):
         target: `MIRROR`: a row holds the factors of the shapes in `basis` (columns, actuators), nm of surface; or
             `OFFSET`: a row is added to the loop's target, nm of wavefront of each mode.
         largest: (columns,) largest absolute number of each column.
-        reach_nm: on the mirror, an upper bound of every actuator's deviation from zero, nm of surface.
+        reach_nm: for `MIRROR`, an upper bound of every actuator's deviation from zero, nm of surface; else 0.
         id: identity of target, rows and basis.
     """
 
@@ -250,7 +251,8 @@ def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
         raise ValueError(f"a probe sequence has a row per frame and a column per shape or mode, got {rows.shape}")
     columns = rows.shape[1]
     if target == MIRROR and (not basis.size or basis.size % columns):
-        raise ValueError(f"a probe sequence on a mirror needs {counted(columns, 'shape')}, got {basis.size} actuators")
+        shapes = f"{counted(columns, 'shape')} of equal size"
+        raise ValueError(f"a probe sequence on a mirror needs {shapes}, got {basis.size} actuators in all")
     if max(rows.size, basis.size) > MAX_PROBE_NUMBERS:
         raise ValueError(
             f"a probe sequence has at most {MAX_PROBE_NUMBERS} numbers, {MAX_PROBE_NUMBERS // columns} rows of "

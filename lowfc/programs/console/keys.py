@@ -42,7 +42,7 @@ class OrderedKeys(App[str]):
             await self._next_key(self._turn)
 
     async def _next_key(self, turn: int) -> None:
-        """Send the next key, unless this was already done after the key of this turn."""
+        """Send the next key, unless it has been sent since `turn`."""
         if turn != self._turn:
             return
         self._turn += 1
@@ -54,7 +54,7 @@ class OrderedKeys(App[str]):
             self.set_timer(_TIMEOUT_S, partial(self._next_key, self._turn))
 
     def _follow(self, node: DOMNode, turn: int) -> None:
-        """Queue a call behind the key in each widget that the key passes, up to the application, then settle."""
+        """Follow the key up from widget to widget to the application, by calls queued behind it, and then settle."""
         if node is self or not node.call_later(self._follow, node.parent or self, turn):
             self.call_later(self._settle, turn)
 

@@ -59,7 +59,7 @@ class MirrorReports:
     def fault(self, state: State) -> str:
         """Fault of the mirror, as a predicate after "the mirror"; empty if there is none.
 
-        A fault in the mirror's Health counts after two in a row: the first may predate the last command.
+        It counts after two Healths in a row with a fault, even if different: the first may predate the last command.
         """
         now_ns = self._service.clock.host_ns()
         self._due_ns = now_ns + CHECK_PERIOD_NS
@@ -67,7 +67,7 @@ class MirrorReports:
             self._received_ns = now_ns
             before, report = self._health_fault, self._reports.popleft()
             self._health_fault = _fault_in(report) if state.commanded else ""
-            if self._health_fault == before or not self._health_fault:
+            if before or not self._health_fault:
                 self._fault = self._health_fault
             if not self._fault and state.loop is not None:
                 shape = MirrorShape(now_ns, state.loop.actuators_nm, state.loop.history_nm[0])
@@ -77,7 +77,7 @@ class MirrorReports:
         return self._fault if self._reported else "has not reported yet"
 
     def last(self) -> MirrorShape | None:
-        """The shape commanded at the last but one Health before a fault: the last that the mirror surely applied."""
+        """The shape commanded two Healths before a fault, the newest that the mirror has certainly applied."""
         return self._commanded[0] if self._commanded else None
 
     def close(self) -> None:

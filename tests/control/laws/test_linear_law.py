@@ -251,7 +251,7 @@ def test_margins_are_those_of_the_true_delay_also_if_the_law_assumes_another() -
 @pytest.mark.parametrize("true_frames", [1.0, 1.5, 2.0, 3.0])
 @pytest.mark.parametrize("signal", ["error", "pol"])
 def test_a_stable_loop_settles(gain: float, true_frames: float, signal: Signal) -> None:
-    """After a step, with a true delay other than the law's."""
+    """A loop that `margins` calls stable settles after a step, also if the true delay is not the law's."""
     law = integrators([(gain, 0.0)], signal, 1.0)
     margins_ = margins(law, true_frames)
     if abs(margins_.radius[0] - 1) > 0.03:  # nearer to 1, 400 frames do not show which it is

@@ -92,7 +92,7 @@ def measure(rates_hz: tuple[float, ...], seconds: float, folder: Path | None = N
 
 def render(results: dict[str, Any]) -> str:
     """The result of `measure` as a table."""
-    lines = [f"{'loop':>8} {'processor':>10} {'of copying':>11} {'messages':>9} {'lost':>6} {'longest wait':>13} "
+    lines = [f"{'loop':>8} {'processor':>10} {'x copying':>11} {'messages':>9} {'lost':>6} {'longest wait':>13} "
              f"{'unflushed':>10} {'write':>9}"]  # fmt: skip
     lines += [
         f"{rate['offered_hz']:>5.0f} Hz {100 * rate['cpu_share']:>8.1f} % {rate['ratio']:>9.1f} x "
@@ -101,8 +101,8 @@ def render(results: dict[str, Any]) -> str:
         for rate in results["rates"]
     ]
     lines.append(
-        f"processor: all threads of the recorder, share of one processor; copying a frame's "
-        f"{results['payload_bytes_per_frame']:.0f} bytes to the same disk takes {results['copy_us_per_frame']:.1f} us. "
+        f"processor: all threads of the recorder, share of one processor, and as a multiple of copying a frame's "
+        f"{results['payload_bytes_per_frame']:.0f} bytes to the same disk ({results['copy_us_per_frame']:.1f} us). "
         "Longest wait: from a message's arrival until it is written; unflushed: until it survives a kill -9; write: "
         "one write to the disk."
     )

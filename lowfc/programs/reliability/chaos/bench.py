@@ -133,7 +133,7 @@ class ChaosBench:
             self.bus.subscribe(topic, self._receive)
         self.wait(lambda: self._steps > 0, "the first frame", START_S)
         self.await_settled(_QUIET_FRAMES)
-        self.mark("quiet")
+        self.mark("settled")
 
     def client(self) -> Client:
         """A client in the role of an operator, on this process's connection."""

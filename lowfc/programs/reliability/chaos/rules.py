@@ -29,7 +29,7 @@ RMS_FRAMES = 50
 ROUNDING_NM = 0.03
 """Largest difference of a mirror state from its command: the driver rounds to 0.023 nm."""
 HOLDING = frozenset(Rejection) - {Rejection.NO_MIRROR}
-"""Reasons with which a refused frame holds the command; with `NO_MIRROR` it becomes the mirror's last shape."""
+"""Rejections that hold the command unless a channel moves; after `NO_MIRROR` it becomes the mirror's last shape."""
 
 
 class Finding(NamedTuple):
@@ -85,14 +85,14 @@ def _violations(what: str, limits: Limits, shapes: list[Entry], moving: Mask) ->
         yield f"{what} that is not finite"
         return
     surface[:, ~moving] = np.nan
-    moves = np.diff([shape.sequence for shape in shapes])
-    same = (np.diff([shape.start_s for shape in shapes]) == 0) & (moves > 0)
-    slews = np.nanmax(np.abs(np.diff(surface, axis=0)), axis=(1, 2)) / np.maximum(moves, 1)
+    commands_apart = np.diff([shape.sequence for shape in shapes])
+    same_publisher = (np.diff([shape.start_s for shape in shapes]) == 0) & (commands_apart > 0)
+    slews = np.nanmax(np.abs(np.diff(surface, axis=0)), axis=(1, 2)) / np.maximum(commands_apart, 1)
     neighbours = max(np.nanmax(np.abs(np.diff(surface, axis=axis)), initial=0) for axis in (1, 2))
     for name, value, bound in (
         ("stroke", np.nanmax(np.abs(surface)), limits.stroke_nm),
         ("neighbours", neighbours, limits.neighbour_nm),
-        ("slew", slews[same].max(initial=0), limits.slew_nm),
+        ("slew", slews[same_publisher].max(initial=0), limits.slew_nm),
     ):
         if value > bound:
             yield f"{what}: {name} {value:.2f} nm, above the limit of {bound:g} nm"
@@ -117,10 +117,10 @@ def recovered_s(outcome: Outcome, evidence: Evidence) -> float | None:
     """
     steps = evidence.entries[STEP]
     started = [step for step in steps if step.message.error_nm and step.start_s > steps[0].start_s]
-    if not started or "quiet" not in outcome.marks:
+    if not started or "settled" not in outcome.marks:
         return None
-    begun_ns, quiet_ns = started[0].log_time_ns, outcome.marks["quiet"]
-    limit_nm = MAX_RATIO * evidence.residual_nm(quiet_ns - SPAN_NS, quiet_ns) + FLOOR_NM
+    begun_ns, settled_ns = started[0].log_time_ns, outcome.marks["settled"]
+    limit_nm = MAX_RATIO * evidence.residual_nm(settled_ns - SPAN_NS, settled_ns) + FLOOR_NM
     times_ns, residuals_nm = evidence.residuals_nm()
     later = times_ns >= begun_ns
     times_ns, squares = times_ns[later], residuals_nm[later] ** 2
@@ -131,7 +131,7 @@ def recovered_s(outcome: Outcome, evidence: Evidence) -> float | None:
     return float((times_ns[good[0]] - begun_ns) * 1e-9) if good.size else None
 
 
-def _number(step: Entry) -> int:
+def _frame_number(step: Entry) -> int:
     """Number of a step's frame since the camera's start."""
     return int(step.message.frame_sequence & 0xFFFFFFFF)
 
@@ -148,25 +148,25 @@ def _bad_frames(case: Case, evidence: Evidence) -> Finding:
             before, now = commands[number - 1 : number + 1]
             adjacent = now.sequence == before.sequence + 1  # which implies the same controller
             if adjacent and not np.array_equal(now.actuators_nm, before.actuators_nm):
-                wrong.append(f"a command was made from frame {_number(step)}, which was refused")
+                wrong.append(f"a command was made from frame {_frame_number(step)}, which was refused")
     newest: dict[int, int] = {}
     for step in steps:
         if step.message.error_nm:
             last = newest.get(step.start_s, -1)
             if step.message.frame_sequence <= last:
-                wrong.append(f"frame {_number(step)} was used after a newer one, or twice")
+                wrong.append(f"frame {_frame_number(step)} was used after a newer one, or twice")
             newest[step.start_s] = max(step.message.frame_sequence, last)
     if case.bad is not None:
-        bad = [step for step in steps if case.bad(_number(step))]
-        wrong += [f"bad frame {_number(step)} was used" for step in bad if step.message.error_nm]
+        bad = [step for step in steps if case.bad(_frame_number(step))]
+        wrong += [f"bad frame {_frame_number(step)} was used" for step in bad if step.message.error_nm]
         wrong += [] if bad else ["no bad frame was received"]
     return _finding("bad frames", wrong, f"{len(refused)} refused, {len(steps)} steps")
 
 
 def _recovery(case: Case, outcome: Outcome, evidence: Evidence) -> Finding:
     """At the end the loop is closed with the former residual; or, if the case requires it, safe with a flat mirror."""
-    quiet_ns, end_ns = outcome.marks.get("quiet", 0), outcome.marks["end"]
-    before = evidence.residual_nm(quiet_ns - SPAN_NS, quiet_ns)
+    settled_ns, end_ns = outcome.marks.get("settled", 0), outcome.marks["end"]
+    before = evidence.residual_nm(settled_ns - SPAN_NS, settled_ns)
     after = evidence.residual_nm(end_ns - SPAN_NS, end_ns)
     if np.isnan(after) and outcome.failure and outcome.residuals_nm:  # the recording ended before the loop did
         after = float(np.sqrt(np.mean(np.square(outcome.residuals_nm))))
@@ -200,7 +200,7 @@ def _events(case: Case, evidence: Evidence) -> Finding:
 
 
 def _account(outcome: Outcome, evidence: Evidence) -> Finding:
-    """Missing messages are counted as lost; the log of a killed recorder reaches to `FLUSHED_S` before its end."""
+    """Missing messages are counted as lost; the log of a killed recorder ends less than `FLUSHED_S` before the kill."""
     wrong = list(evidence.unreadable)
     missing: Counter[str] = Counter()
     keys = (*evidence.lost, *outcome.lost)
