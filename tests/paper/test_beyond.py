@@ -206,7 +206,8 @@ def test_only_requested_sensors_are_anchored_and_simulated(monkeypatch):
 def test_a_loop_that_fails_is_an_error_with_its_reason(monkeypatch, tmp_path):
     failed = SimpleNamespace(returncode=2, stderr="error: no such sensor\n")
     monkeypatch.setattr(anchors.subprocess, "run", lambda *_, **__: failed)
-    with pytest.raises(LowfcError, match=r"`lowfc sim-loop .* bench .*` ended with exit status 2: error: no such"):
+    message = r"`lowfc sim-loop .* bench .*` ended with exit status 2: error: no such sensor$"
+    with pytest.raises(LowfcError, match=message):
         anchors._sim_loop("bench", tmp_path, "gains.toml", 1.0, 1)
 
 
