@@ -78,7 +78,7 @@ def modal_case(case: tuple[str, str, float]) -> Results:
     For bright stars, the residual with fixed gains too.
     """
     sensor, preset, magnitude = case
-    form, dark_zone = _contrast(sensor)
+    form, dark_zone_contrast = _contrast(sensor)
     try:
         _noise_nm2(sensor, magnitude)
     except CalibrationError as saturated:
@@ -86,7 +86,7 @@ def modal_case(case: tuple[str, str, float]) -> Results:
     residual_nm2 = np.array([_closed_nm2(*case, seed, _AUTO) for seed in SEEDS])
     disturbance_nm2 = np.array([_open_nm2(preset, seed) for seed in SEEDS])
     open_nm = np.sqrt(disturbance_nm2.sum(axis=1).mean())
-    row = _row(case, (residual_nm2 - disturbance_nm2) @ np.diag(form), dark_zone, open_nm, residual_nm2)
+    row = _row(case, (residual_nm2 - disturbance_nm2) @ np.diag(form), dark_zone_contrast, open_nm, residual_nm2)
     if magnitude in BRIGHT and preset != "quiet":
         seeds = SEEDS[:2]
         fixed = np.array(
@@ -103,7 +103,7 @@ def modal_case(case: tuple[str, str, float]) -> Results:
 def imaged_case(case: tuple[str, str, float]) -> Results:
     """As `modal_case` without fixed gains, with every image simulated."""
     sensor, preset, magnitude = case
-    form, dark_zone = _contrast(sensor)
+    form, dark_zone_contrast = _contrast(sensor)
     calibration = calibrated(_configured(sensor, preset, magnitude, 1, _AUTO))
     changes, residual_nm2, disturbance_nm2 = [], [], []
     for seed in SEEDS:
@@ -117,10 +117,12 @@ def imaged_case(case: tuple[str, str, float]) -> Results:
         disturbance_nm2.append(np.square(disturbance).mean(axis=0))
         changes.append((residual_nm2[-1] - disturbance_nm2[-1]) @ np.diag(form))
     open_nm = np.sqrt(np.sum(disturbance_nm2, axis=1).mean())
-    return _row(case, np.array(changes), dark_zone, open_nm, np.array(residual_nm2)) | {"images": True}
+    return _row(case, np.array(changes), dark_zone_contrast, open_nm, np.array(residual_nm2)) | {"images": True}
 
 
-def _row(case: tuple[str, str, float], change: Array, dark_zone: float, open_nm: float, residual_nm2: Array) -> Results:
+def _row(
+    case: tuple[str, str, float], change: Array, dark_zone_contrast: float, open_nm: float, residual_nm2: Array
+) -> Results:
     sensor, preset, magnitude = case
     error = float(change.std(ddof=1) / np.sqrt(len(change)))
     return {
@@ -129,7 +131,7 @@ def _row(case: tuple[str, str, float], change: Array, dark_zone: float, open_nm:
         "magnitude": magnitude,
         "change": float(change.mean()),
         "error": error,
-        "own": dark_zone,
+        "own": dark_zone_contrast,
         "open_nm": float(open_nm),
         "closed_nm": float(np.sqrt(residual_nm2.sum(axis=1).mean())),
     }

@@ -16,7 +16,7 @@ class Target(NamedTuple):
     """A target for one quantity.
 
     Attributes:
-        quantity: its name.
+        quantity: name of the measured quantity.
         limit: largest value that meets the target.
         values: measured, one for each turn.
         form: format of a value.
