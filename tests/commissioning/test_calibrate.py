@@ -95,8 +95,8 @@ def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, 
     calibration, data = calibrated(loop, method, 4)
     assert abs(data.delay.delay_frames - delay) < 0.05
     assert data.measured.error.max() < 0.02
-    error = np.abs(cross_talk(calibration.reconstructor, before.response))
-    assert (error - 4 * data.measured.error[:, None]).max() < 0.02
+    talk = np.abs(cross_talk(calibration.reconstructor, before.response))
+    assert (talk - 4 * data.measured.error[:, None]).max() < 0.02
     assert np.allclose(
         calibration.actuators_to_modes @ calibration.modes_to_actuators, np.eye(len(calibration.noll)), atol=1e-4
     )

@@ -34,14 +34,12 @@ def test_the_photon_budget_of_a_fainter_star_has_less_light_and_more_tilt_noise(
     assert 10**0.6 < more_mas / tilt_mas < 10**1.2  # between photon noise alone and read noise alone
 
 
-def test_the_loop_design_lists_limiting_gains_and_residuals_that_grow_with_the_delay(
+def test_in_the_loop_design_limiting_gains_agree_with_theory_and_residuals_grow_with_the_delay(
     run: Callable[..., list[str]],
 ) -> None:
     rows = [[float(word) for word in line.split()] for line in run("loop_design")[2:]]
-    assert [row[1] for row in rows if row[0] in (1, 2)] == [
-        2,
-        1,
-    ]  # limiting gain of a delay d: 2 sin(pi / (2 (2d - 1)))
+    # The limiting gain with a delay d is 2 sin(pi / (2 (2d - 1))).
+    assert [row[1] for row in rows if row[0] in (1, 2)] == [2, 1]
     residuals = [row[3] for row in rows]
     assert residuals == sorted(residuals)
 
@@ -56,7 +54,7 @@ def test_a_log_becomes_a_data_frame_with_a_column_for_each_mode(run: Callable[..
     assert rows[-1][1] == "163.0"
 
 
-def test_a_night_compared_with_itself_is_the_same(run: Callable[..., list[str]]) -> None:
+def test_a_night_compared_with_itself_has_the_same_verdict_and_values(run: Callable[..., list[str]]) -> None:
     log = str(ROOT / "tests/golden/0.1/night.mcap")
     lines = run("compare_nights", f"{log} {log}")
     assert lines[:3] == ["verdict", "    Not a good run", "    Not a good run"]
