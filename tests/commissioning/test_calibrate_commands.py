@@ -95,9 +95,8 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
 ) -> None:
     loop = noiseless_loop
     check = Calibrator.check
-    delay_measurement_frames = (
-        DELAY_FRAMES + 2 * 8
-    )  # for measuring the delay, before the first report of the time to go
+    # For measuring the delay, before the first report of the time to go.
+    delay_measurement_frames = DELAY_FRAMES + 2 * 8
     monkeypatch.setattr(Calibrator, "check", Mock(side_effect=KeyboardInterrupt))
     before = loop.calibration()
     words = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]

@@ -419,7 +419,7 @@ def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatc
     until(lambda: console_feed.read() and console_feed._configured)
     assert not console_feed._complete(Mock(controller=None)), "a controller whose state is unknown is queried again"
     asked = ask.call_count
-    console_feed._query()  # as repeated while there is no calibration
+    console_feed._query()  # repeated while there is no calibration
     until(lambda: not any(thread.name == "query" for thread in threading.enumerate()))
     assert (ask.call_count, console_feed._config) == (asked, CONFIG), (
         "a known configuration is not requested again: each request is in the log"

@@ -141,7 +141,7 @@ def test_a_silent_or_recreated_stream_is_reported_once(folder: Path, monkeypatch
     path = folder / "camnsv.im.shm"
     writer = PlainStream.make(path, COLUMNS, ROWS, UINT16)
     driver, events = camera()
-    driver._image_s += 9.0  # as if the last image were newer than two periods
+    driver._image_s += 9.0  # as if the last image were less than two periods old
     assert driver.expose() is None
     assert events.events() == ["STARTED"]
     driver._image_s -= 9.0

@@ -168,9 +168,8 @@ def test_loops_are_judged_by_the_published_pointing(monkeypatch):
         assert 0 < row.limit * tilt_nm_per_mas(2.0) < 2.0, "of a line of 14 nm rms that the law has in its model"
     for where, verdict in (("sky", anchors.REACHED), ("laboratory", anchors.NOT_REACHED)):
         row = rows[f"std of means over 2 s, {where}"]
-        assert row.measured == pytest.approx(
-            0.05 * np.sqrt(10 / 9)
-        )  # ten means of +-0.05 mas, in 24 s without the first four
+        # Ten means of +-0.05 mas, in 24 s without the first four.
+        assert row.measured == pytest.approx(0.05 * np.sqrt(10 / 9))
         assert rows[f"verdict, {row.quantity}"].measured == verdict
     driven = [
         [("sim-loop", preset, False), ("tune", "", False), ("sim-loop", preset, True)]

@@ -45,7 +45,7 @@ TO_MODES = np.linalg.pinv(TOY.modes_to_actuators)
 QUIET_FRAMES = 150
 CAMERA_PID = 1
 PATIENCE_FRAMES = 3000
-"""Frames after which a condition is waited for in vain."""
+"""Number of frames after which a wait for a condition fails."""
 
 
 class ImmediateController(Controller):
