@@ -172,7 +172,7 @@ def test_a_basler_camera_is_configured_and_failed_buffers_count_as_lost_frames(e
     driver = BaslerCamera(GenicamOptions(**OPTIONS, gain=6.0, pixel_format="Mono12"), CONFIG)
     camera = driver._camera
     camera.ExposureAuto.Value = camera.GainAuto.Value = "Continuous"
-    driver._set(GenicamOptions(**OPTIONS, gain=6.0, pixel_format="Mono12"))
+    driver._configure(GenicamOptions(**OPTIONS, gain=6.0, pixel_format="Mono12"))
     assert (camera.ExposureAuto.Value, camera.GainAuto.Value) == ("Off", "Off")
     assert (camera.Width.Value, camera.Height.Value, camera.OffsetX.Value, camera.OffsetY.Value) == (80, 60, 32, 16)
     assert (camera.Gain.Value, camera.TriggerMode.Value) == (pytest.approx(6.0, abs=0.1), "Off")
@@ -225,7 +225,7 @@ def test_an_aravis_camera_is_configured_and_incomplete_frames_count_as_lost(fake
     settings = {**OPTIONS, "rate_hz": 100.0, "camera": "127.0.0.1", "pixel_format": "Mono16"}
     driver = AravisCamera(GenicamOptions(**settings, gain=2.0), CONFIG)
     driver._camera.set_gain_auto(driver._aravis.Auto.CONTINUOUS)
-    driver._set(GenicamOptions(**settings, gain=2.0))
+    driver._configure(GenicamOptions(**settings, gain=2.0))
     assert driver._camera.get_gain_auto() == driver._aravis.Auto.OFF
     region = driver._camera.get_region()
     assert (region.x, region.y, region.width, region.height) == (32, 16, 80, 60)
