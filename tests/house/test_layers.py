@@ -51,8 +51,8 @@ PURE_MODULES = (
     "sim_camera.wavefront_statistics",
 )
 PURE_IMPORTS = (
-    *("numpy", "scipy", "abc", "bisect", "collections", "dataclasses", "enum", "functools", "hashlib", "itertools"),
-    *("math", "operator", "types", "typing"),
+    *("numpy", "scipy", "abc", "array", "bisect", "collections", "dataclasses", "enum", "functools", "hashlib"),
+    *("itertools", "math", "operator", "types", "typing"),
 )
 # A generator made from a seed is a value; the functions of numpy.random have global state.
 FROM_A_SEED = ("Generator", "default_rng", "SeedSequence", "SFC64", "PCG64")

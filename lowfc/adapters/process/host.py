@@ -5,6 +5,7 @@ A reading raises OSError if it is not available, and ValueError or LookupError i
 
 import contextlib
 import ctypes
+import functools
 import os
 import resource
 import sys
@@ -202,7 +203,16 @@ def _content(file: int, size: int = _MAX_READ_BYTES) -> str:
 
 def resident_bytes(process: int | None = None) -> int:
     """Resident memory of a process (None: this one); psutil.NoSuchProcess if it does not exist."""
-    return int(psutil.Process(process).memory_info().rss)
+    if process is not None:
+        return int(psutil.Process(process).memory_info().rss)
+    pages = _content(_own_memory(os.getpid())).split()[1]  # several times as fast as psutil, for every Health
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")
+
+
+@functools.lru_cache(1)
+def _own_memory(process: int) -> int:
+    """The open file with the size of this process's memory; `process` is its id, which a fork changes."""
+    return os.open(f"/proc/{process}/statm", os.O_RDONLY)
 
 
 class Timex(ctypes.Structure):

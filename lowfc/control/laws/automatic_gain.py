@@ -28,7 +28,6 @@ FEW = 3
 """Number of modes below which each is judged by itself only; with more, the majority is evidence for each."""
 MAX_INJECTED = 0.1
 """Ratio of injected noise to correctable power below which a first window chooses the least gain instead of 0."""
-
 SURE = 4.0
 """Standard errors above which the cross-talk of tip and tilt into another mode counts as certain."""
 SUSPECTED = 2.0
@@ -166,6 +165,8 @@ class GainBank:
             return gain
         now = self._row_of(gain)
         cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts[-EARLY:])
+        if (now > 1).all() and not cross_talk_nm.any():
+            return gain  # no mode can change: saves most of the time
         blocks = self._handicapped(suspected_nm)[:, :-1]
         own = blocks[:, now, np.arange(now.size)]
         beyond = blocks - own[:, None]

@@ -83,6 +83,8 @@ class GainWatch:
         self._former_flux_dn = 0.0
         self._changed_in_a_row = 0
         self._mode = LoopMode.IDLE
+        self._noise_conditions: tuple[object, ...] = ()
+        self._last_noise_nm2: Array | None = None
         self.closing_harm = ""
 
     def observe(self, step: Step, state: State) -> Actions:
@@ -260,10 +262,13 @@ class GainWatch:
 
     def _noise_nm2(self, loop: ActiveLoop) -> Array | None:
         """Noise variance of one frame (modes,) at this star's flux; None if the camera's gain is unknown."""
-        covariance = noise_covariance_nm2(
-            loop.calibration, self._former_flux_dn or loop.calibration.flux_dn, loop.camera
-        )
-        return None if covariance is None else np.diag(covariance)
+        flux_dn = self._former_flux_dn or loop.calibration.flux_dn
+        conditions = loop.calibration.id, loop.camera, flux_dn
+        if conditions != self._noise_conditions:
+            covariance = noise_covariance_nm2(loop.calibration, flux_dn, loop.camera)
+            self._last_noise_nm2 = None if covariance is None else np.diag(covariance)
+            self._noise_conditions = conditions
+        return self._last_noise_nm2
 
     def _gain_request(self, step: Step, loop: ActiveLoop, gain: Single) -> Request:
         """The request for gains (modes,), with the prior of the uncorrected modes for R."""
