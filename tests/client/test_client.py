@@ -613,7 +613,7 @@ def test_mode_lists_are_parsed() -> None:
     assert noll_of(["2", "3"]) == noll_of(["2,3"]) == (2, 3)
     assert noll_of(["4-7, 11"]) == (4, 5, 6, 7, 11)
     assert noll_of(["3,2-4"]) == (3, 2, 4)
-    for word in ("x", "2-", "-2", "2.5", "11-4", "2,11-4", "", ",", "2-9999999999"):
+    for word in ("0", "x", "2-", "-2", "2.5", "11-4", "2,11-4", "", ",", "2-9999999999"):
         with pytest.raises(ConfigurationError, match="as in 2,3 or 4-11"):
             noll_of([word])
 

@@ -25,7 +25,7 @@ def noll_of(words: Sequence[str] | None) -> tuple[int, ...]:
     for part in [part for part in joined.split(",") if part] or [joined]:
         first, dash, last = part.partition("-")
         last = last if dash else first
-        if not (first.isdecimal() and last.isdecimal() and int(first) <= int(last) <= HIGHEST):
+        if not (first.isdecimal() and last.isdecimal() and 0 < int(first) <= int(last) <= HIGHEST):
             raise ConfigurationError(f"--modes takes Noll indices, as in 2,3 or 4-11; got {part!r}")
         found += range(int(first), int(last) + 1)
     return tuple(dict.fromkeys(found))
