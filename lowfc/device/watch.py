@@ -35,7 +35,11 @@ def described(fault: Exception) -> str:
     ]
     of_driver = [frame for frame in frames if frame.filename == frames[0].filename]
     where = f" ({Path(of_driver[-1].filename).name}, line {of_driver[-1].lineno})" if of_driver else ""
-    return f"{type(fault).__name__}: {fault}"[:300] + where
+    try:
+        text = str(fault)
+    except Exception:  # as in a driver that returns a number from `__str__`
+        text = "(its __str__ fails)"
+    return f"{type(fault).__name__}: {text}"[:300] + where
 
 
 @contextmanager

@@ -34,6 +34,13 @@ GOOD = np.full((3, 4), 7, np.uint16)
 MS = 1_000_000
 
 
+class UnprintableError(Exception):
+    """Exception whose text is no string."""
+
+    def __str__(self) -> str:
+        return 7  # type: ignore[return-value]
+
+
 class Camera:
     """Camera whose exposures are returned by functions, in turn."""
 
@@ -76,6 +83,7 @@ def run_camera_loop(*exposures: Callable[[], Any], frames: int, settings: Camera
     ("bad", "message"),
     [
         (Mock(side_effect=OSError("the cable")), "OSError: the cable"),
+        (Mock(side_effect=UnprintableError), "UnprintableError: (its __str__ fails)"),
         (good(pixels=GOOD[1:]), "shape (2, 4)"),
         (good(pixels=np.full((3, 4), np.nan)), "float64"),
         (good(end_ns=1 << 62), "s ahead of the monotonic clock"),
@@ -86,7 +94,7 @@ def run_camera_loop(*exposures: Callable[[], Any], frames: int, settings: Camera
         (lambda: "nothing", "expose() returned str"),
         (good(pixels=GOOD.tolist()), "pixels of Exposure are list"),
     ],
-    ids=["raises", "shape", "NaN", "future", "past", "NaN time", "negative loss", "huge loss", "nonsense", "list"],
+    ids=["raises", "text", "shape", "NaN", "future", "past", "NaN time", "negative loss", "huge loss", "str", "list"],
 )
 def test_camera_failures_are_reported_once_counted_and_retried(bad: Callable[[], Any], message: str) -> None:
     recovered = [good()] * 251  # more than 1 s at 250 Hz
