@@ -152,10 +152,10 @@ class CameraLoop:
             )
         number = None if exposure.number is None else int(exposure.number)  # numpy's integers overflow
         if number is not None and self._number is not None:
-            step = (number - self._number) % settings.number_wrap
+            step = (number - self._number) % int(settings.number_wrap)
             if step == 0:
                 raise ValueError(f"it returned frame number {number} twice")
-            max_step = MAX_LOST_FRAMES + MAX_RATE_RATIO * (now_ns - self._number_ns) // settings.period_ns
+            max_step = MAX_LOST_FRAMES + MAX_RATE_RATIO * (now_ns - self._number_ns) // int(settings.period_ns)
             if step > max_step:  # a restart: the controller then waits for the settings
                 self._service.bus.restart()
                 self._settings = None
@@ -179,7 +179,7 @@ class CameraLoop:
         """Publish the settings when they have changed, and twice a second."""
         settings = self._driver.settings()
         time_ns = self._service.clock.now_ns() if settings.time_ns is None else settings.time_ns
-        if settings != self._settings or time_ns + settings.period_ns // 2 >= self._settings_due_ns:
+        if settings != self._settings or time_ns + int(settings.period_ns) // 2 >= self._settings_due_ns:
             self._states.put(camera_state(settings, time_ns).SerializeToString())
             self._settings, self._settings_due_ns = settings, time_ns + SETTINGS_NS
             self._simulated = settings.clock == "run"

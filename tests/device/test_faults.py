@@ -51,7 +51,7 @@ class Camera:
         return self.current
 
     def expose(self) -> Exposure | None:
-        self.clock.advance(self.current.period_ns)
+        self.clock.advance(int(self.current.period_ns))
         return next(self.exposures)()
 
     def close(self) -> None: ...
@@ -197,6 +197,13 @@ def test_frame_numbers_are_unwrapped_and_gaps_count_as_lost_frames() -> None:
     frames = next(count for count in listener.messages(HEALTH)[-1].topics if count.topic == FRAME.key)
     assert (frames.published, frames.missing) == (9, 4)
     assert listener.event_texts("FRAMES_LOST") == ["FRAMES_LOST 2 frames lost by the camera"] * 2, "the last at the end"
+
+
+@pytest.mark.parametrize("kind", [np.uint32, np.uint64])
+def test_whole_numbers_of_the_settings_may_be_numpy_integers(kind: Any) -> None:
+    settings = replace(SETTINGS, period_ns=kind(SETTINGS.period_ns), number_wrap=kind(SETTINGS.number_wrap))
+    bench = CameraBench(*[good(number=number) for number in (65_535, 1, 30_000, 0)], settings=settings)
+    assert None not in [bench.loop._next_frame() for _ in range(4)], bench.listener.event_texts("DRIVER_FAILED")
 
 
 def test_lost_frames_without_numbers_are_counted() -> None:
