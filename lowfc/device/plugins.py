@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import ValidationError
 
@@ -128,7 +128,7 @@ def options(driver: Any, configured: dict[str, Any], words: Sequence[str] = ()) 
     ConfigurationError if one is unknown or wrong.
     """
     model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
-    values, faults = _parsed(words), []
+    values, faults = {key: _choice(model, key, value) for key, value in _parsed(words).items()}, []
     try:
         # In JSON, as in TOML, a list stands for a tuple, and text for a path or an enum.
         validated = model.model_validate_json(json.dumps(configured, default=str))
@@ -154,12 +154,20 @@ def options_help(driver: Any) -> list[tuple[str, str]]:
         annotation = info.annotation
         if get_args(annotation)[1:] == (NoneType,):
             annotation = get_args(annotation)[0]
-        words = [word for word in get_args(annotation) if isinstance(word, str)]
-        kind = "|".join(words) or getattr(annotation, "__name__", str(annotation))
+        choices = get_args(annotation) if get_origin(annotation) is Literal else ()
+        kind = "|".join(map(str, choices)) or getattr(annotation, "__name__", str(annotation))
         default = "required" if info.is_required() else f"default: {info.get_default(call_default_factory=True)}"
         shown = "" if default.endswith((": ", "None")) else f"  [{default}]"
         rows.append((f"--{key.replace('_', '-')} <{kind}>", f"{descriptions[key]}{shown}"))
     return rows
+
+
+def _choice(model: type[DriverOptions], key: str, value: Any) -> Any:
+    """The choice of a Literal that a word of the command line stands for, such as the number 2; else the word."""
+    annotation = model.model_fields[key].annotation if key in model.model_fields else None
+    parts = annotation, *get_args(annotation)
+    choices = {str(choice): choice for part in parts if get_origin(part) is Literal for choice in get_args(part)}
+    return choices.get(str(value), value)
 
 
 def _explained(fault: Any, model: type[DriverOptions]) -> str:

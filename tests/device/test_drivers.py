@@ -4,6 +4,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -46,6 +47,7 @@ class Ramp:
         """Level before the first frame, DN."""
         ports: tuple[int, ...] = ()
         """A list."""
+        binning: Literal[1, 2] | None = None
 
     def __init__(self, options: Options, config: Configuration) -> None:
         self.level, self.closed = options.level, False
@@ -104,6 +106,8 @@ def test_options_come_from_configuration_and_command_line() -> None:
     for table, words in (({"level": 3}, ("--level", "5", "--ports=[1, 2]")), ({"level": 5, "ports": [1, 2]}, ())):
         options = plugins.options(Ramp, table, words)
         assert (options.level, options.ports) == (5, (1, 2))
+    assert plugins.options(Ramp, {}, ("--binning", "2")).binning == 2
+    assert ("--binning <1|2>", "") in plugins.options_help(Ramp)
     assert plugins._parsed(("--total", "", "--stream=")) == {"total": "", "stream": ""}
     nested = load(None, {"drivers": {"package": {"module": {"level": 6}}}})
     assert plugins.opened("camera", "package.module:Class", nested, (), Ramp).level == 6
@@ -111,7 +115,7 @@ def test_options_come_from_configuration_and_command_line() -> None:
         serial = {"camera": "an option, not the part for cameras"}
         assert plugins.table(load(None, {"drivers.basler": serial}), kind, "basler") == serial
     for table, words, why in [
-        ({"levle": 1}, (), "there is no 'levle'; there are level, ports"),
+        ({"levle": 1}, (), "there is no 'levle'; there are level, ports, binning"),
         ({"level": "7"}, (), "level = '7'"),
         ({}, ("--level", "x"), "level = 'x'"),
         ({}, ("level",), "--name value"),
