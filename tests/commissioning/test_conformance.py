@@ -479,6 +479,14 @@ def test_actuators_configured_as_fixed_are_no_fault(dead: list[int], untested: d
     assert mirror_faults(mirror, config) == untested
 
 
+def test_many_actuators_without_a_channel_are_no_error_of_scale() -> None:
+    round_mirror = Mirror(state=shaped(lambda shape: np.where(np.arange(42).reshape(6, 7) % 7 < 5, shape, 0)))
+    checks = mirror_checks(Dialogue(round_mirror, Expected(CONFIG)), 0.2, lambda _: None)
+    (applied,) = (check for check in checks if check.name == "applied")
+    assert (applied.status, applied.got[:23]) == (WRONG, "12 of 42 actuators off,")
+    assert "exclude those without a channel in the map mirror.active" in applied.advice
+
+
 def test_the_report_has_advice_for_failed_checks(capsys: pytest.CaptureFixture[str]) -> None:
     checks = list(camera_checks(watch(Camera(frame=setting(encoding="16UC1")), 1.0, lambda _: None)))
     print_report(checks, STATUSES, FIELDS, None)
