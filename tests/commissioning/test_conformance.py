@@ -479,6 +479,13 @@ def test_actuators_configured_as_fixed_are_no_fault(dead: list[int], untested: d
     assert mirror_faults(mirror, config) == untested
 
 
+def test_an_unknown_position_names_the_failure_of_the_driver() -> None:
+    why = "DRIVER_FAILED the driver failed and will be tried again: ValueError: it returned () actuators"
+    failed = Mirror(state=setting(actuators=b""), health=setting(driver_failures=1, last_warning=why))
+    checks = mirror_checks(Dialogue(failed, Expected(CONFIG)), 0.2, lambda _: None)
+    assert [check.advice for check in checks if check.name == "grid"] == [why]
+
+
 def test_many_actuators_without_a_channel_are_no_error_of_scale() -> None:
     round_mirror = Mirror(state=shaped(lambda shape: np.where(np.arange(42).reshape(6, 7) % 7 < 5, shape, 0)))
     checks = mirror_checks(Dialogue(round_mirror, Expected(CONFIG)), 0.2, lambda _: None)

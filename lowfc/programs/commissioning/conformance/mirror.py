@@ -92,7 +92,7 @@ def _grid(mirror: Dialogue, state: wire.MirrorState) -> Check:
     if (state.rows, state.columns) != mirror.expected.grid:
         return wrong(got, "set mirror.rows and mirror.columns of the configuration, or the driver's grid")
     if len(state.actuators) != size:
-        return wrong(got, f"send float32, row by row: {size} bytes")
+        return wrong(got, mirror.driver_failure or f"send float32, row by row: {size} bytes")
     odd = np.count_nonzero(~np.isfinite(np.frombuffer(state.actuators, "<f4")))
     if odd:
         return wrong(f"{odd} not finite", "report 0, not NaN, for a missing actuator")
