@@ -177,9 +177,13 @@ def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wir
     got = f"{away.size} of {off_nm.size} actuators off, by {float(off_nm.max()):.3g} nm at most"
     if away.size <= off_nm.size // 10:
         return warning(got, f"are they dead? Exclude them in the map mirror.active: {', '.join(map(str, away[:8]))}")
-    moved_nm = np.where(expected.moving, np.abs(where_nm - base_nm), 0)
-    if not (moved_nm.flat[away] > expected.tolerance_nm).any() and moved_nm.max() > expected.tolerance_nm:
-        return wrong(got, "they do not move, the others do: exclude those without a channel in the map mirror.active")
+    moved = (np.abs(where_nm - base_nm) > expected.tolerance_nm) & expected.moving
+    if not moved.flat[away].any():
+        advice = "they do not move, the others do: exclude those without a channel in the map mirror.active"
+        if not moved.any():
+            step = f"step is above {np.abs(commanded_nm - base_nm).max():.3g} nm, set mirror.driver_bits"
+            advice = f"none moves: does the driver send the values? If its {step}"
+        return wrong(got, advice)
     return wrong(got, _difference(base_nm, commanded_nm, where_nm))
 
 
