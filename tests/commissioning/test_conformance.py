@@ -479,6 +479,19 @@ def test_actuators_configured_as_fixed_are_no_fault(dead: list[int], untested: d
     assert mirror_faults(mirror, config) == untested
 
 
+@pytest.mark.parametrize(
+    ("health", "text"),
+    [
+        (lambda message: setting(last_warning="FRAMES_LOST 1 frame")(failing(message)), "see DRIVER_FAILED in its"),
+        (lambda message: setting(last_warning="DRIVER_HANGS for 2 s")(failing(message)), "DRIVER_HANGS for 2 s"),
+        (setting(process="mycam"), "name the process 'camera', as its key does"),
+    ],
+)
+def test_the_check_of_health_names_the_drivers_failure_and_the_expected_process(health: Any, text: str) -> None:
+    checks = camera_checks(watch(Camera(health=health), 3.0, lambda _: None))
+    assert [text in check.got + check.advice for check in checks if check.name == "health"] == [True]
+
+
 def test_an_unknown_position_names_the_failure_of_the_driver() -> None:
     why = "DRIVER_FAILED the driver failed and will be tried again: ValueError: it returned () actuators"
     failed = Mirror(state=setting(actuators=b""), health=setting(driver_failures=1, last_warning=why))

@@ -20,6 +20,7 @@ from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, wire
 
 NS = 1_000_000_000
 EVERYTHING = "lowfc/**"
+_FAILURES = "DRIVER_FAILED", "DRIVER_HANGS"
 
 
 class Received(NamedTuple):
@@ -148,16 +149,18 @@ class Collected:
 
     @property
     def driver_failure(self) -> str:
-        """Last failure, else last warning, of the device's process if its driver has ever failed; empty otherwise."""
+        """Last failure of the device's driver, or where to find it; empty if the driver has never failed."""
         for message in reversed(self.on(EVENT.key)):
             with contextlib.suppress(DecodeError):
                 event = Log.FromString(message.payload)
-                if event.name == self.process and event.message.startswith(("DRIVER_FAILED", "DRIVER_HANGS")):
+                if event.name == self.process and event.message.startswith(_FAILURES):
                     return event.message
         for message in reversed(self.on(HEALTH.at(self.process))):
             with contextlib.suppress(DecodeError):
                 health = wire.Health.FromString(message.payload)
-                return health.last_warning if health.driver_failures else ""
+                warning = health.last_warning
+                known = warning if warning.startswith(_FAILURES) else "see DRIVER_FAILED in its terminal or its log"
+                return known if health.driver_failures else ""
         return ""
 
     @cached_property

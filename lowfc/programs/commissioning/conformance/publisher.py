@@ -106,7 +106,7 @@ def _health(device: Collected) -> Check:
         return wrong("it is not a lowfc.v1.Health", "encode the message as declared")
     rate_hz = len(payloads) / device.seconds
     if last.process != device.process:
-        return warning(f"process is {last.process!r}", f"name the process {device.process!r}, as its key does")
+        return warning(f"process is {last.process!r}", f"name the process '{device.process}', as its key does")
     if device.seconds >= 2 and not 1 < rate_hz < 10:
         return warning(f"{rate_hz:.1f} a second", "publish it twice a second")
     if not any(count.published for count in last.topics):
