@@ -231,6 +231,15 @@ def test_doctor_reports_a_fault_in_the_requirements_of_a_users_driver(monkeypatc
     assert f"[drivers.{__name__}]" in missing_option.advice
 
 
+def test_doctor_shows_what_a_driver_found_as_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    needs = [Need("a device", Path("/dev/mirror"), ""), ("a fan", 2, ""), Need("a licence", None, "buy it")]  # type: ignore[arg-type]
+    monkeypatch.setattr(IdleMirror, "needs", lambda options: needs, raising=False)
+    _, *checks = device_checks(f"{__name__}:IdleMirror", CONFIG)
+    assert [check.got for check in checks] == ["/dev/mirror", "2", "not found"]
+    monkeypatch.setattr(IdleMirror, "needs", lambda options: "a licence", raising=False)
+    assert "requirements cannot be checked: TypeError" in [*device_checks(f"{__name__}:IdleMirror", CONFIG)][1].got
+
+
 class FailingSettings(Ramp):
     def settings(self) -> CameraSettings:
         raise RuntimeError("no link")

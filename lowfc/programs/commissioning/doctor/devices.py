@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError
-from lowfc.device import plugins
+from lowfc.device import Need, plugins
 from lowfc.device.watch import opening
 from lowfc.programs.commissioning.checks import Check, judged, ok, wrong
 
@@ -29,13 +29,13 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
         yield ok(f"{driver.__module__}:{driver.__qualname__}")._replace(name=what)
         try:
             with opening("its requirements cannot be checked"):
-                needs = list(getattr(driver, "needs", lambda _: ())(options))
+                needs = getattr(driver, "needs", lambda _: ())(options)
+                needs = [Need(*(str(part or "") for part in need)) for need in needs]  # found may be a path, or None
         except ConfigurationError as fault:
             yield wrong(str(fault), "correct its method `needs`, or what that calls")._replace(name=what)
             continue
         for need in needs:
-            found = need.found
-            yield judged(f"{what}: {need.what}", "", bool(found), found or "not found", need.advice)
+            yield judged(f"{what}: {need.what}", "", bool(need.found), need.found or "not found", need.advice)
 
 
 def _kinds(name: str) -> list[plugins.Kind]:
