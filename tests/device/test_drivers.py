@@ -192,6 +192,7 @@ class Own:
         serial: str
         wait_s: float | None = None
         mode: Literal["slow", "fast"] | None = None
+        config: str = ""
 
     settings = expose = apply = close = None
 '''
