@@ -253,7 +253,7 @@ class Mirror(Protocol):
 
 
 class MirrorExtras:
-    """Optional methods of a mirror, independent of each other."""
+    """Optional methods of a mirror, independent of each other; the defaults do nothing."""
 
     def join(self, service: Service) -> None:
         """Called when the process has joined its run; `service` has its clock, publishers, bus and events."""
@@ -264,7 +264,7 @@ class MirrorExtras:
         Without this method, or if it returns None, the mirror is driven to flat at the start; after a fault its last
         commanded shape is taken as its position.
         """
-        raise NotImplementedError
+        return None
 
     def beside(self) -> Single | None:
         """Shape (rows, columns), nm of surface, added by other programs; the stroke limit applies to the sum."""

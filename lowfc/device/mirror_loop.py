@@ -88,7 +88,8 @@ class MirrorLoop:
         self._driver = driver
         self._service = service
         self._protection = protection_of(driver, config)
-        self._settle = getattr(driver, "settle", None)
+        settle = getattr(driver, "settle", None)
+        self._settle = None if getattr(settle, "__func__", None) is MirrorExtras.settle else settle
         self._beside = getattr(driver, "beside", None)
         getattr(driver, "join", _NO_EXTRAS.join)(service)
         self._fill_extra = getattr(driver, "fill", _NO_EXTRAS.fill)

@@ -19,7 +19,7 @@ from lowfc.contract.envelope import count_of, sequence_of, start_of
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, HEALTH, MIRROR_STATE, wire
 from lowfc.control.loop.safety import Limit, Rejection
-from lowfc.device import CameraSettings, Exposure, Single, geometry
+from lowfc.device import CameraSettings, Exposure, MirrorExtras, Single, geometry
 from lowfc.device.camera_loop import CameraLoop
 from lowfc.device.driver import camera_state
 from lowfc.device.mirror_loop import MirrorLoop
@@ -395,6 +395,14 @@ def test_a_mirror_that_fails_at_the_start_is_retried() -> None:
     bench.tick()
     assert bench.command(30.0).refused == 0
     assert mirror.heights_nm == [0.0, 0.0, 30.0]
+
+
+def test_a_mirror_may_derive_from_the_class_of_optional_methods() -> None:
+    mirror = type("Derived", (Mirror, MirrorExtras), {})()
+    bench = MirrorBench(mirror)
+    assert bench.command(30.0).refused == 0
+    assert mirror.heights_nm == [0.0, 30.0]
+    assert bench.listener.events() == ["STARTED"]
 
 
 @pytest.mark.parametrize("fault", [lambda: 1 / 0, lambda: np.full((4, 5), np.nan)], ids=["raises", "NaN"])
