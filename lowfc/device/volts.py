@@ -53,8 +53,8 @@ class VoltMap:
         self.channels = int(self._channel.max(initial=-1)) + 1 if channels is None else channels
         if len(set(self._channel)) < len(self._channel) or self._channel.max(initial=-1) >= self.channels:
             raise ConfigurationError(f"option order: each actuator needs its own channel below {self.channels}")
-        if not (gain > 0).all():
-            raise ConfigurationError("option gain_map: every gain must be above 0")
+        if not (gain.ravel()[self._wired] > 0).all():
+            raise ConfigurationError("option gain_map: the gain of every actuator with a channel must be above 0")
         self._zero = zero.ravel()[self._wired]
         self._nm_per_value = (gain * config.mirror.nm_per_unit).ravel()[self._wired]
         self._range = low, high = options.lowest, options.highest
