@@ -221,6 +221,7 @@ def test_doctor_checks_the_requirements_of_a_driver(monkeypatch: pytest.MonkeyPa
         *("camera sim ok", "camera sim: a cable ok", "camera sim: a camera wrong", "mirror sim wrong")
     ]
     assert [check.advice for check in checks[1:3]] == ["", "switch it on"]
+    assert "[drivers.sim.mirror] of a configuration" in checks[3].advice
 
 
 def test_doctor_reports_a_fault_in_the_requirements_of_a_users_driver(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,8 @@ from lowfc.programs.commissioning.checks import Check, judged, ok, wrong
 
 def device_checks(name: str, config: Configuration) -> Iterator[Check]:
     """Check each requirement of the camera and mirror drivers of this name, without opening them."""
-    for kind in _kinds(name):
+    kinds = _kinds(name)
+    for kind in kinds:
         what = f"{kind} {name}"
         try:
             driver = plugins.load(kind, name)
@@ -21,9 +22,8 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
         try:
             options = plugins.options(driver, plugins.table(config, kind, name))
         except ConfigurationError as fault:
-            advice = (
-                f"set it in [drivers.{plugins.section(name)}] of a configuration, and give that file with --config FILE"
-            )
+            section = f"drivers.{plugins.section(name)}" + (f".{kind}" if len(kinds) > 1 else "")
+            advice = f"set it in [{section}] of a configuration, and give that file with --config FILE"
             yield wrong(str(fault), advice)._replace(name=what)
             continue
         yield ok(f"{driver.__module__}:{driver.__qualname__}")._replace(name=what)
