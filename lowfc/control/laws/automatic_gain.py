@@ -74,29 +74,29 @@ class GainBank:
     """
 
     def __init__(
-        self, kept: Single, limit_nm: Single, weights: Weights, delay_frames: float, windows: tuple[int, int]
+        self, leak: Single, limit_nm: Single, weights: Weights, delay_frames: float, windows: tuple[int, int]
     ) -> None:
-        """Make a bank with a mode for each element of `kept`.
+        """Make a bank with a mode for each element of `leak`.
 
         Args:
-            kept: (modes,) 1 - leak.
+            leak: (modes,) of the integrators.
             limit_nm: (modes,) largest command.
             weights: Which commands an exposure sees.
             delay_frames: The loop's delay.
             windows: Frames of the first window, and of each later one before it grows.
         """
-        halvings = int(np.log2(highest_gain(delay_frames) / MIN_GAIN))
-        rows = highest_gain(delay_frames) * 0.5 ** np.arange(halvings, -1.0, -1)
+        highest = min(highest_gain(delay_frames, mode_leak) for mode_leak in np.unique(leak).tolist())
+        rows = highest * 0.5 ** np.arange(int(np.log2(highest / MIN_GAIN)), -1.0, -1)
         self.rows = np.concatenate([[0], rows]).astype(np.float32)
-        gain = np.repeat(self.rows[:, None], kept.size, axis=1)
-        self._at_rest = VirtualIntegrators.at_rest(gain, kept, limit_nm, weights)
+        gain = np.repeat(self.rows[:, None], leak.size, axis=1)
+        self._at_rest = VirtualIntegrators.at_rest(gain, 1 - leak, limit_nm, weights)
         self._windows = windows
         self._closed = self._throughout = False
         self._waiting = 0  # frames in the arrays below that have not been summed
         self._errors_nm = np.zeros((TOGETHER, *gain.shape), np.float32)
-        self._loop_nm = np.zeros((TOGETHER, kept.size), np.float32)
+        self._loop_nm = np.zeros((TOGETHER, leak.size), np.float32)
         self._tilts_nm = np.zeros((TOGETHER, 2), np.float32)
-        self.use_reconstructor(np.eye(kept.size))
+        self.use_reconstructor(np.eye(leak.size))
         self.restart()
 
     def restart(self) -> None:

@@ -54,7 +54,7 @@ class _Group:
         frames = [max(round(seconds * rate_hz), MIN_FRAMES) for seconds in (FIRST_S, window_s)]
         self.mask, self.tilt = mask, tilt
         self.bank = GainBank(
-            1 - loop.integrator.leak[mask],
+            loop.integrator.leak[mask],
             loop.integrator.limit_nm[mask],
             loop.delay_weights,
             settings.delay_frames,

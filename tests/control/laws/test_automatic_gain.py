@@ -15,11 +15,13 @@ MODES = 30
 ONES = np.ones(MODES, np.float32)
 
 
-def bank(delay_frames: float = 1.0, windows: tuple[int, int] = (1000, 500), modes: int = MODES) -> GainBank:
+def bank(
+    delay_frames: float = 1.0, windows: tuple[int, int] = (1000, 500), modes: int = MODES, leak: float = 0.0
+) -> GainBank:
     weights = tuple(
         (lag, weight) for lag, weight in enumerate(delay_weights(delay_frames).astype(np.float32)) if weight
     )
-    return GainBank(ONES[:modes], 1e6 * ONES[:modes], weights, delay_frames, windows)
+    return GainBank(leak * ONES[:modes], 1e6 * ONES[:modes], weights, delay_frames, windows)
 
 
 def verdicts(
@@ -54,6 +56,11 @@ def test_white_noise_gets_no_gain() -> None:
         noise = rng.normal(0, 10, (300, MODES)) * (1 + 4 * (rng.random((300, 1)) < 0.02))
         granted += np.count_nonzero(verdicts(bank(windows=(300, 1000)), noise, zero_gain, 100.0)[0].gain)
     assert granted <= 1
+
+
+@pytest.mark.parametrize("leak", [0.0, 0.3])
+def test_the_highest_gain_of_a_bank_keeps_the_margins_with_its_leak(leak: float) -> None:
+    assert bank(leak=leak).rows[-1] == pytest.approx(highest_gain(1.0, leak))
 
 
 @pytest.mark.parametrize(("step_nm", "delay_frames"), [(0.1, 1.0), (1.0, 1.0), (1.0, 2.0), (20.0, 1.0)])
