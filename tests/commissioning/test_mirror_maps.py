@@ -209,6 +209,19 @@ def test_the_flat_map_is_applied_at_the_start(tmp_path: Path, calibration: Calib
     assert not StartUp(load(None)).requests(state, 0)
 
 
+@pytest.mark.parametrize("age_s", [1, 6])
+def test_the_flat_map_is_applied_during_a_permit_from_before_the_mirror_was_known(
+    tmp_path: Path, calibration: Calibration, age_s: int
+) -> None:
+    """The controller ended, as the refused request left the loop without the configured flat map."""
+    config = load(None, {"mirror.flat": saved(tmp_path, "flat.npy", wavy(120.0))})
+    settings = factory.settings(config)
+    state, _ = advance(settings, State(), Load(0, calibration, "test"))
+    state, _ = advance(settings, state, Request(0, "permit", values=(5.0,), text="moving the mask", lease_id=7))
+    (request,) = StartUp(config).requests(state, age_s * 10**9)
+    assert advance(settings, state, request)[1].reply.accepted
+
+
 @pytest.mark.parametrize("command_reported", [True, False])
 def test_a_restarted_controller_does_not_apply_the_flat_map_twice(
     tmp_path: Path, calibration: Calibration, command_reported: bool

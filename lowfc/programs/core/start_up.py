@@ -94,9 +94,12 @@ class StartUp:
         """The requests in the order to send them, once the mirror's shape is known.
 
         If the mirror already has the flat map, from an earlier controller, the flat map is subtracted from the adopted
-        shape and added as a channel of its own, so that nothing moves.
+        shape and added as a channel of its own, so that nothing moves. A lease, granted before the mirror was known,
+        does not refuse them: they have its identity.
         """
-        request = partial(Request, time_ns, requester="the configuration")
+        lease = state.conditions.lease
+        lease_id = 0 if lease is None or lease.ended or lease.over(time_ns, 0) else lease.id
+        request = partial(Request, time_ns, requester="the configuration", lease_id=lease_id)
         requests: list[Request] = []
         if self._law is not None:
             requests.append(request("law", law=self._law))
