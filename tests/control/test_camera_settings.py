@@ -267,6 +267,8 @@ def test_safe_mode_from_before_the_start_remains() -> None:
     assert names(all_outputs) == ["NOT_CALIBRATED", "MODE_CHANGED", "SAFED"]
     _, all_outputs = feed(safe, state, odd(1))
     assert not surfaces(all_outputs).any()
+    for load in (Load(0, calibration(), "a file"), Request(0, "load", calibration=calibration())):
+        assert sorted(names(feed(safe, State(), load)[1])) == ["CALIBRATION_LOADED", "MODE_CHANGED", "SAFED"]
 
 
 @pytest.mark.parametrize("begin", [idle, other_size])

@@ -78,10 +78,7 @@ def loaded(
         mode, cause = LoopMode.OPEN, wrong
     elif before_mode is LoopMode.IDLE and mode is LoopMode.CLOSED and loop.automatic.any():
         mode, cause = LoopMode.OPEN, MEASURED_FIRST
-    if mode is not before_mode:
-        events.append(mode_event(before_mode, mode, cause))
-        state = in_mode(state, mode, time_ns, cause)
-    return state, events
+    return _changed(state, mode, time_ns, cause, events), events
 
 
 def safe_pending(settings: Settings, state: State) -> bool:

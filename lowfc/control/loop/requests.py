@@ -285,7 +285,7 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
     after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
     loop = _active_loop(after)  # an offset beyond its limit, which may have been lowered, is no reason to refuse
     check_offset(loop, np.minimum(np.abs(loop.channels_or_empty().offset_nm), loop.integrator.limit_nm))
-    others = (event for event in events if event.name != "MODE_CHANGED")  # `answer` adds it
+    others = (event for event in events if event.name not in ("MODE_CHANGED", "SAFED"))  # `answer` adds these
     return after, f"calibration {request.calibration.id[:12]}", *others
 
 
