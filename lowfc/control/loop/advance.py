@@ -269,6 +269,7 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
         action = "relaxing the mirror to flat" if flatten else "holding the command"
         events.append(PendingEvent("NO_FRAMES", {"silent_ms": tick.silent_ns / 1e6, "action": action}))
         counts = _counted(counts, (Rejection.NO_FRAME,))
+    if silent:
         loop = end_probe(loop, state.frame_sequence, f"no frame for {tick.silent_ns / 1e6:.0f} ms", events)
     if flatten or safe:
         loop = step_to_flat(settings, loop)
