@@ -86,7 +86,7 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
     whole = int(pairs.argmax())
     if pairs[whole] < 0.5 * np.abs(factors).sum() or factors[-1] > 0.5 * total:
         raise ValueError(
-            f"the response to a poke is spread over several frames, or later than {LAGS - 1} frames: the delay "
+            f"the response to a poke is spread over several frames, or later than {LAGS - 1.5:g} frames: the delay "
             "cannot be measured; are frames lost, or commands late?"
         )
     fraction = float(np.clip(factors[whole + 1] / pairs[whole], 0, 1))
