@@ -79,8 +79,8 @@ ADVICE: dict[str, Advice] = {
         "keep it if it is a dark hole; else `lowfc ctl channel adopted --zero`.",
     ),
     "LAW_NOT_IN_FORCE": Advice(
-        "the law of `control.law` was refused: the camera's settings do not fit the calibration.",
-        "restore the camera's settings, or load a calibration for them; then `lowfc ctl law FILE`. The loop is open.",
+        "the law of `control.law` was refused: no calibration is loaded, or the camera's settings do not fit it.",
+        "load a calibration for the camera's settings, or restore them; then `lowfc ctl law FILE`.",
     ),
     "LAW_OVERRULED": Advice(
         "the guard found that the law's residual exceeds the integrator's, or that the loop amplifies.",

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.files import factory
+from lowfc.adapters.files import factory, law_file
 from lowfc.adapters.process.clock import HostClock, SimulatedClock
 from lowfc.adapters.process.latch import Latch
 from lowfc.adapters.process.service import Service
@@ -416,6 +416,21 @@ def test_start_requests_wait_for_the_mirror_and_the_cameras_settings(calibration
             controller._between_frames(None)
             assert controller._start_pending is awaited
         assert [channel.name for channel in controller._state.loop.command_channels.channels] == ["flat"]
+
+
+def test_without_a_calibration_the_configured_law_is_not_in_force(tmp_path: Path) -> None:
+    """The controller ended, so that a bench could not be commissioned again with its configuration."""
+    noll = CONFIG.noll
+    law_file.save(integrator([0.3] * len(noll), [0.0] * len(noll), noll, 1.0, CONFIG.camera.rate_hz), tmp_path / "law")
+    config = configured(lockstep=False, control__law=str(tmp_path / "law"))
+    hub, _, controller = alone(None, Latch([tmp_path / "safe"]), config)
+    events: list[bytes] = []
+    MemoryBus(hub, "operator", HostClock()).subscribe(EVENT, lambda sample: events.append(sample.payload))
+    shape = wire.MirrorState(rows=GRID[0], columns=GRID[1], actuators=bytes(4 * GRID[0] * GRID[1]))
+    MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
+    controller._report_mirror()
+    controller._between_frames(None)
+    until(lambda: any(b"LAW_NOT_IN_FORCE" in event for event in events))
 
 
 def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: Calibration, tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.durations import Durations
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Input, Load, MirrorReport, Outputs, Reply, Report, Request, Tick
-from lowfc.control.loop.loading import holding_cause, misfit, safe_pending
+from lowfc.control.loop.loading import holding_cause, misfit, safe_pending, uncalibrated
 from lowfc.control.loop.requests import CONFIGURATION, MAX_REPLY_LENGTH, prepared
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
@@ -352,8 +352,8 @@ class Controller:
         self._start_pending = False
         for request in self._start_up.requests(self._state, self._service.clock.now_ns()):
             reply = self._carry_out_internal(request, lock=contextlib.nullcontext())
-            if not reply.accepted and request.name == "law" and misfit(self._state):
-                self._service.event("LAW_NOT_IN_FORCE", why=reply.text)  # the loop stays open
+            if not reply.accepted and request.name == "law" and (misfit(self._state) or uncalibrated(self._state)):
+                self._service.event("LAW_NOT_IN_FORCE", why=reply.text)  # the loop stays open or idle
             elif not reply.accepted:
                 self._start_up.handle_refusal(request, reply.text)
                 break
