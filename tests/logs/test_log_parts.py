@@ -20,6 +20,8 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import BENCH, CALIBRATION, CONTROLLER_STATE, FRAME, topic_of, wire
+from lowfc.programs.logs.report.results import report_of
+from lowfc.programs.logs.report.source import read_run
 from tests.support.loops import json_of, lowfc, refusal
 from tests.support.report_log import METADATA, SyntheticLog
 from tests.support.toy import START
@@ -172,6 +174,14 @@ def test_a_command_gives_the_same_results_for_ten_files_as_for_one(
     monkeypatch.chdir(ten_files_and_one(words[0] == "tune"))  # tuning needs some two thousand frames
     ten, one = (without_files(json_of(words[0], log, *words[1:])) for log in (LAST, f"one/{LAST}"))
     assert ten == one
+
+
+def test_a_report_says_that_a_file_between_two_others_is_missing(folder: Path, samples: list[Sample]) -> None:
+    files = recorded(folder, samples, 4)
+    for named, text in ((files[2:], "complete, no message lost"), (files[::2], "a file between the first and")):
+        report = report_of(read_run(named)).results
+        assert report["verdict"]["checks"][0]["text"].startswith(text)
+        assert report["log"]["complete"] == (named == files[2:])
 
 
 def test_acceptance_reads_several_files(folder: Path, samples: list[Sample]) -> None:

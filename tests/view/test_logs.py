@@ -95,6 +95,20 @@ def test_the_verdict_has_the_losses_of_the_log_and_not_of_earlier_ones(
     assert (log.detail, log.level) == (detail, Level.GOOD if "nothing" in detail else Level.WARNING)
 
 
+def test_the_verdict_says_that_a_file_of_the_log_is_missing(
+    tmp_path: Path, shown: Shown, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    night, logs = SyntheticLog(), []
+    for number in ("1", "3"):
+        monkeypatch.setitem(report_log.METADATA, "part", {"of": "night", "number": number})
+        logs.append(night.frames(50).write(tmp_path / f"night-{number}.mcap"))
+        night.samples.clear()
+    drawn(*logs)
+    log = tile(shown[-1], "LOG")
+    assert (log.value, log.level) == ("INCOMPLETE", Level.WARNING)
+    assert log.detail.startswith("1 file missing between the first and the last; night-3, ")
+
+
 def test_the_verdict_on_a_log_of_a_fraction_of_a_second_has_its_losses(shown: Shown) -> None:
     drawn(Path(__file__).parents[1] / "golden" / "0.1" / "night.mcap")
     assert tile(shown[-1], "FRAMES").detail.startswith("of 163 frames: 1 lost, ")

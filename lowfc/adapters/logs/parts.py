@@ -168,6 +168,14 @@ def titled(paths: Parts) -> str:
     return str(paths[0]) if len(paths) == 1 else f"{paths[0]} to {paths[-1].name} ({len(paths)} files)"
 
 
+def missing_between(paths: Sequence[Path]) -> int:
+    """Number of files missing between the first and the last file of each recording."""
+    numbers: dict[tuple[str, ...], list[int]] = {}
+    for recording, number in map(_recording_and_number, paths):
+        numbers.setdefault(recording, []).append(number)
+    return sum(max(known) - min(known) + 1 - len({*known}) for known in numbers.values())
+
+
 def metadata_at_start(path: Path) -> dict[str, dict[str, str]]:
     """Metadata before the messages of a log, by name; DataFileError if the log cannot be read."""
     metadata: dict[str, dict[str, str]] = {}

@@ -9,6 +9,7 @@ from pathlib import Path
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.logs.history import LAST_NS, REORDERING_NS, attached_configuration
+from lowfc.adapters.logs.parts import missing_between
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import in_words, missing_end_text
 from lowfc.adapters.logs.writer import PART
@@ -119,7 +120,8 @@ def draw_logs(
             lost[reader.metadata.get(PART, {}).get("of", log.name)] = int(account)
     if renderer is None:
         raise DataFileError(f"nothing to show in {', '.join(map(str, logs))}: no message that a view shows")
-    ended = LogEnd(logs[-1].name.partition(".")[0], run, host, no_end, damaged, sum(lost.values()), stroke_nm)
+    name, gone = logs[-1].name.partition(".")[0], missing_between(logs)
+    ended = LogEnd(name, run, host, no_end, damaged, gone, sum(lost.values()), stroke_nm)
     renderer.draw(accumulator.snapshot(last_ns, ended=ended))
     if accumulator.unreadable:
         drawn.remarks.append(f"{counted(accumulator.unreadable, 'message')} could not be read")

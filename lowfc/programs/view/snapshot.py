@@ -91,6 +91,7 @@ class LogEnd:
         run, host: name of their run, and host of the recorder.
         no_end: why one of them has no end; empty if all were finished.
         damaged: number of damaged stretches that were left out.
+        missing_files: number of files missing between the first and the last.
         lost: number of messages lost, from the recorder's accounts at the end of its recordings.
         stroke_nm: largest deviation of an actuator from flat in any mirror state; None without one.
     """
@@ -100,6 +101,7 @@ class LogEnd:
     host: str
     no_end: str
     damaged: int
+    missing_files: int
     lost: int
     stroke_nm: float | None
 

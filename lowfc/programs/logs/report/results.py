@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from lowfc.adapters.logs.parts import missing_between
 from lowfc.contract.messages import TRUTH
 from lowfc.programs.logs.report import course
 from lowfc.programs.logs.report.budget import budget_results
@@ -69,7 +70,7 @@ def _log(run: Run) -> Results:
         "selection": log.selection.description,
         "bytes": log.size,
         "finished": log.finished,
-        "complete": log.complete and not log.damage,
+        "complete": log.complete and not log.damage and not missing_between(log.paths),
         "stopped": account.get("stopped") or None,
         "recovery": recovery_in_words(log.metadata) or None,
         "damage": [{"byte": damage.position, "bytes": damage.length, "why": damage.why} for damage in log.damage],

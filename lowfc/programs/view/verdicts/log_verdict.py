@@ -174,6 +174,9 @@ def _log(state: RunState, ended: LogEnd) -> Tile:
     if ended.damaged:
         advice = f"The log is damaged, {parts} left out: see `lowfc info`."
         return Tile("LOG", "DAMAGED", f"{parts} left out; {detail}", Level.WARNING, advice)
+    if ended.missing_files:
+        missing = f"{counted(ended.missing_files, 'file')} missing between the first and the last"
+        return Tile("LOG", "INCOMPLETE", f"{missing}; {detail}", Level.WARNING, f"The log is incomplete: {missing}.")
     if ended.no_end:
         return Tile("LOG", "NO END", f"{detail} up to here", Level.WARNING, f"{ended.no_end.capitalize()}.")
     if messages:
