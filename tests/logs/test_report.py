@@ -532,6 +532,16 @@ def test_text_of_a_log_is_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert text.count("3 $x^2$") == 2, "in the drawing and in the table"
 
 
+@pytest.mark.usefixtures("without_drawings")
+def test_a_page_says_how_many_events_it_leaves_out(tmp_path: Path) -> None:
+    night = SyntheticLog()
+    for number in range(2100):
+        night.put(EVENT, Log(name="camera", message=f"E{number} x", level=3 if number < 300 else 2))
+    report = report_of(read_run(night.write(tmp_path / "x.mcap")))
+    left_out = ["100", str(len(report.results["events"]) - 2000)]
+    assert re.findall(r"<p>(\d+) more are in the log", page(report)) == left_out
+
+
 def test_the_timeline_has_requests_of_the_whole_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     night = uneventful(SyntheticLog(), 3)
     for number in range(601):
