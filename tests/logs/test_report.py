@@ -354,6 +354,9 @@ def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
     assert (check["level"], check["text"]) == ("unknown", "the loop was not closed in this log")
     check = results["verdict"]["checks"][3]
     assert (check["name"], check["level"]) == ("commands", "unknown")
+    night.start_controller()
+    log = results_of(night.frames(10).write(tmp_path / "y.mcap"))["verdict"]["checks"][0]
+    assert log["text"] == "300 messages without the calibration's modes or with impossible values, left out"
 
 
 def test_frames_before_other_modes_led_to_commands_and_a_refused_calibration_loses_none(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from lowfc.adapters.logs.selection import selection
 from lowfc.adapters.process.extras import package_required
 from lowfc.adapters.process.terminal import Json, Logs
 from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.control.loop.wording import counted
 from lowfc.programs.cli.output import print_result
 
 if TYPE_CHECKING:
@@ -138,8 +139,8 @@ def render(results: dict[str, Any]) -> str:
     lines = [f"recorded           {results['selection']}"] if results["selection"] else []
     lines += [f"{', '.join(results['files'])}: {results['steps']} steps of {results['modes']} modes{frames}"]
     if results["steps_left_out"]:
-        what = "with the modes of another calibration or impossible values"
-        lines.append(f"left out           {results['steps_left_out']} steps {what}")
+        what = "without the calibration's modes or with impossible values"
+        lines.append(f"left out           {counted(results['steps_left_out'], 'message')} {what}")
     lines += faults(results["damaged"], results["no_end"])
     lines += [f"configuration      {remark}" for remark in results["remarks"]]
     return "\n".join(lines)

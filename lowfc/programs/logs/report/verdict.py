@@ -48,8 +48,8 @@ def _record(results: Results) -> Results:
     if log["messages_lost"]:
         faults.append(f"{counted(log['messages_lost'], 'message')} lost")
     if log["steps_left_out"]:
-        what = "with the modes of another calibration or impossible values"
-        faults.append(f"{counted(log['steps_left_out'], 'step')} {what}, left out")
+        what = "without the calibration's modes or with impossible values"
+        faults.append(f"{counted(log['steps_left_out'], 'message')} {what}, left out")
     if faults:
         return _check("log", BAD if log["stopped"] else LOOK, "; ".join(faults))
     if log["messages_lost"] is None:
