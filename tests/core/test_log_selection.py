@@ -66,6 +66,8 @@ def test_steps_and_commands_are_never_left_out() -> None:
     assert {topic.key for topic in TOPICS if topic.optional} == {topic.key for topic in (*chosen.excluded, TRUTH)}
     assert selection() == EVERYTHING == selection(1, ["lowfc/*"])
     assert selection(1, ["/lowfc/mirror/dm/state"]).excluded == {FRAME, SURFACE, TIMING, TRUTH}
+    for pattern in ("lowfc/mirror/dm/*", "lowfc/mirror/*", "*/mirror/*/*"):
+        assert selection(1, [pattern]).excluded == {FRAME, TIMING, TRUTH}
     assert Selection.of(chosen.metadata) == chosen
     assert Selection.of({"selection": {"every": "-3", "left_out": "nothing"}}) == EVERYTHING
     with pytest.raises(ConfigurationError, match="did you mean 'lowfc/camera/frame'"):

@@ -108,7 +108,8 @@ def selection(interval_frames: int = 1, patterns: Iterable[str] = ()) -> Selecti
     """
     chosen: set[Topic] = set()
     for pattern in (given.removeprefix("/") for given in patterns):
-        matching = {topic for topic in TOPICS if topic.matches(pattern) or fnmatchcase(topic.key, pattern)}
+        name = (pattern.split("/")[2:3] or [""])[0]  # the place of a mirror's name, as in lowfc/mirror/dm/*
+        matching = {topic for topic in TOPICS if topic.matches(pattern) or fnmatchcase(topic.at(name), pattern)}
         if not matching:
             keys = [topic.key for topic in TOPICS]
             raise ConfigurationError(
