@@ -18,6 +18,7 @@ from lowfc.adapters.files.array_file import read_array
 from lowfc.adapters.files.layouts import load_layout
 from lowfc.adapters.files.sensors import load_pupil
 from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.recovery import recover
 from lowfc.contract.codecs import input_file
 from lowfc.contract.configuration import MAX_FAULTS, load
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
@@ -106,6 +107,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "state.json": lambda path: read_state(path, "pupil"),
     "mcap": lambda path: list(LogReader(path)),
     "replay.mcap": lambda path: replay_files([path], 0.0, 1, lambda done: None),
+    "recover.mcap": lambda path: recover(path, path.with_name("out.mcap")),
 }
 
 

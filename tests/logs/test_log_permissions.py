@@ -1,5 +1,6 @@
 """Permissions of a log: its owner may read it, and others as `recorder.file_mode` allows."""
 
+import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.core.recording.process import log_limits
+from tests.support.loops import refusal
 from tests.support.mutated_logs import small_log
 
 
@@ -64,6 +66,18 @@ def test_a_log_is_not_replaced_by_another_file(tmp_path: Path) -> None:
         with pytest.raises(DataFileError, match="is a log, which is never overwritten"):
             refusing()
     assert log.read_bytes() == before
+
+
+@pytest.mark.parametrize("command", ["info", "recover", "replay"])
+@pytest.mark.parametrize("name", ["last", "night.mcap", "night.mcap.part"])
+def test_a_folder_without_permission_is_an_error_and_no_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, name: str
+) -> None:
+    def denied(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "stat", denied)
+    assert "cannot be read" in refusal(command, tmp_path / "of another user" / name, kind=DataFileError)
 
 
 def test_the_recorder_uses_the_configured_mode() -> None:

@@ -98,7 +98,7 @@ class LogCopy:
 
 def refuse_existing(path: Path) -> None:
     """Raise DataFileError if the file, to which a log is to be written, exists."""
-    if path.exists():
+    if os.access(path, os.F_OK):
         raise DataFileError(f"{path} already exists; a log is never overwritten; name another one with --out")
 
 

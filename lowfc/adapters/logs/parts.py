@@ -1,6 +1,7 @@
 """The files (parts) of one recording: find those that belong together, find the newest log, read them as one log."""
 
 import contextlib
+import os
 import re
 from collections.abc import Generator, Iterator, Sequence
 from operator import itemgetter
@@ -200,7 +201,7 @@ def _listed(logs: Sequence[Parts]) -> str:
 
 def _files(names: Sequence[Path]) -> Iterator[Path]:
     for name in names:
-        if name.name == LAST and not name.exists():
+        if name.name == LAST and not os.access(name, os.F_OK):  # without permission, Path.exists raises an error
             yield from _newest(name.parent if len(name.parts) > 1 else Path(Recorder().folder))
         else:
             yield name

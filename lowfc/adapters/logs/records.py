@@ -7,6 +7,7 @@ and chunks. In any other log only the checksum of the data section may be missin
 
 import contextlib
 import io
+import os
 import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator
@@ -79,7 +80,7 @@ class LogFile:
             self.size = self._file.seek(0, io.SEEK_END)
         except OSError as fault:
             finished = Path(str(path).removesuffix(UNFINISHED))
-            hint = f"; it is finished now: {finished}" if finished != path and finished.exists() else ""
+            hint = f"; it is finished now: {finished}" if finished != path and os.access(finished, os.F_OK) else ""
             raise DataFileError(f"{path} cannot be read: {fault.strerror}{hint}") from fault
         if not self.size:
             self._file.close()

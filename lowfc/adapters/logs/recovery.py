@@ -8,7 +8,7 @@ from typing import Any
 
 from lowfc.adapters.logs.log_copy import LogCopy, new_log, refuse_existing
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.records import Damage
+from lowfc.adapters.logs.records import Damage, LogFile
 from lowfc.adapters.logs.writer import UNFINISHED, being_recorded, stem_of
 from lowfc.contract.errors import DataFileError
 from lowfc.control.loop.wording import counted
@@ -77,7 +77,9 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
     Raises:
         DataFileError: `source` is no log, has no intact part or is being recorded; `out` exists or cannot be written.
     """
-    if source.exists() and being_recorded(source):
+    with LogFile(source):  # raises an error if it cannot be read
+        pass
+    if being_recorded(source):
         raise DataFileError(f"{source} is being recorded, and nothing is lost: `lowfc ctl record stop` finishes it")
     refuse_existing(out)
     reader = LogReader(source, topics=(), skip_damaged=True)

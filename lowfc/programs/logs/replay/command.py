@@ -1,5 +1,6 @@
 """The command `lowfc replay`."""
 
+import os
 import time
 from typing import Annotated
 
@@ -52,7 +53,7 @@ def replay_log(
     from lowfc.programs.logs.replay.workers import replay_files
 
     files = named_files(logs)
-    total = sum(path.stat().st_size for path in files if path.exists())
+    total = sum(path.stat().st_size for path in files if os.access(path, os.R_OK))
     begun_s = time.monotonic()
     with reading_bar(Console(stderr=True)) as count:
         account = replay_files(files, tolerance, jobs or 0, lambda done: count("replaying", done, total), kernel or "")
