@@ -125,6 +125,32 @@ def test_a_connection_that_ends_in_the_handshake_is_not_reported_as_a_rejected_c
     assert "refused" in router_trouble(network, "camera")
 
 
+def test_the_routers_certificate_is_accepted_under_the_strict_verification_of_python_3_13(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(tmp_path, (ROUTER, "camera"), ["127.0.0.1"])
+    listening, default = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.create_default_context
+    listening.load_cert_chain(tmp_path / "router.pem", tmp_path / "router.key")
+
+    def strict(cafile: str) -> ssl.SSLContext:
+        context = default(cafile=cafile)
+        context.verify_flags |= ssl.VERIFY_X509_STRICT
+        return context
+
+    monkeypatch.setattr(ssl, "create_default_context", strict)
+    with listening.wrap_socket(socket.create_server(("127.0.0.1", 0)), server_side=True) as server:
+
+        def serve() -> None:
+            with contextlib.suppress(ssl.SSLError):  # a refusal is the client's to report
+                server.accept()[0].close()
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        network = Network(router=f"tls/127.0.0.1:{server.getsockname()[1]}", certificates=str(tmp_path))
+        assert router_trouble(network, "camera") == ""
+        thread.join()
+
+
 def test_a_certificate_is_checked_as_its_peers_check_it(tmp_path: Path) -> None:
     made_at = datetime.datetime.now(datetime.UTC)
     make(tmp_path, (ROUTER, "camera"), ["localhost"], 100)
