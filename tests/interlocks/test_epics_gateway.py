@@ -43,7 +43,7 @@ class Variables(dict[str, "Variables.Shared"]):
 
     class Shared:
         def __init__(self, nt: Any, initial: Any, handler: Any = None, queue: Any = None) -> None:
-            self.nt, self.handler, self.queue = nt, handler, queue
+            self.nt, self.initial, self.handler, self.queue = nt, initial, handler, queue
             self.posts: list[tuple[Any, int, str]] = []
 
         def post(self, value: Any, timestamp: float, severity: int = 0, message: str = "") -> None:
@@ -138,6 +138,8 @@ def test_a_variable_is_posted_when_it_changes_and_is_invalid_with_a_fault(pvs: V
         "night:close": "?",
         "night:frame": "image",
     }
+    severities = {pv.initial["alarm.severity"] for pv in pvs.values() if pv.nt != "image"}
+    assert severities == {3}, "a value is invalid before the first update"
     values = {"mode": "closed", "rate": 1000.0, "error": np.array([1.0, 2.0])}
     served.update(values, "")
     served.update(values | {"rate": 999.0, "frame": np.ones((1, 2))}, "")

@@ -48,6 +48,7 @@ class EpicsGateway:
                 continue
             nt = p4p.nt.NTScalar(_CODES[one.kind], display=True)
             described = {"value": _EMPTY[one.kind], "display.description": one.description, "display.units": one.unit}
+            described |= {"alarm.severity": _INVALID, "alarm.message": "not read yet"}
             handler: dict[str, Any] = {}
             if one.put is not None:  # a thread for each PV: by default p4p has four for all, and `safe` would wait
                 handler["queue"] = p4p.util.ThreadedWorkQueue(maxsize=0, daemon=True).start()
