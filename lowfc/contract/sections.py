@@ -47,13 +47,15 @@ class Gateway(Section):
 
     prefix: str = Field("lowfc:", pattern=r"^[A-Za-z0-9_:.-]{1,40}$")
     """Prefix of the names of all offered variables."""
-    listen: WithoutNul = "127.0.0.1"
+    listen: WithoutNul = Field("127.0.0.1", min_length=1)
     """Address on which the gateway serves; default: loopback only."""
     port: int = Field(5075, ge=1, le=65534)
     """TCP port; searches are answered on the next UDP port."""
     search: WithoutNul = "127.0.0.1"
     """Addresses searched for variables of other servers, separated by spaces."""
-    bench: dict[Annotated[str, Field(pattern=BENCH_NAME)], str] = Field(default_factory=dict)
+    bench: dict[Annotated[str, Field(pattern=BENCH_NAME)], Annotated[str, Field(min_length=1)]] = Field(
+        default_factory=dict
+    )
     """Variables of other servers that become bench values: name of the value = name of the variable."""
 
 

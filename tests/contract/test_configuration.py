@@ -136,6 +136,8 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(
         ("safety.slew_nm", 0),
         *((key, "a\0b") for key in ("gateway.search", "network.certificates", "recorder.folder", "recorder.on_event")),
         ("network.router", "tls/a\0b:7447"),
+        ("gateway.listen", ""),  # the library would listen on all addresses
+        ("gateway.bench.mask", ""),
     ],
 )
 def test_an_invalid_value_is_reported_in_one_line_with_key_and_value(key: str, value: object) -> None:
