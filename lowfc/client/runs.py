@@ -1,5 +1,7 @@
 """Find the runs on this host."""
 
+import contextlib
+
 from lowfc.adapters.bus.other_loops import none_here
 from lowfc.adapters.bus.run import Run, open_run, run_path, runtime_base
 from lowfc.contract.errors import BusError, DataFileError, nearest
@@ -17,7 +19,7 @@ def the_run(name: str | None) -> str:
     """Find a run by its name or a unique prefix, or the only run if `name` is None; it may be without a controller.
 
     Raises:
-        BusError: there is no such run, or it is stopped; there is none at all, or more than one.
+        BusError: there is no such run, or it or its router is stopped; there is none at all, or more than one.
         DataFileError: the run's directory is damaged.
     """
     runs = live_runs(name)
@@ -26,6 +28,9 @@ def the_run(name: str | None) -> str:
     matching = [] if name and (runtime_base() / name).is_dir() else [run for run in runs if run.startswith(name or "")]
     if len(matching) == 1:
         return matching[0]
+    if silent := _silent_routers(name) if name or not runs else "":
+        before = "" if name else f"{none_here()}; "
+        raise BusError(f"{before}{silent}: is it running, and can this host reach it?")
     if not runs:
         raise BusError(none_here() if name is None else f"there is no run {name!r}: {none_here()}")
     if name is None:
@@ -35,6 +40,16 @@ def the_run(name: str | None) -> str:
     raise BusError(
         f"there is no run {name!r}: there {'is' if len(runs) == 1 else 'are'} {_listed(runs)}{nearest(name, runs)}"
     )
+
+
+def _silent_routers(name: str | None) -> str:
+    """Clauses on the routers of stored runs, or of the one of that name, for runs that are not live."""
+    clauses = []
+    for run in _stored():
+        with contextlib.suppress(BusError, DataFileError, OSError):
+            if name in (None, run) and (router := open_run(run, ()).links.network.router):
+                clauses.append(f"the router of run {run!r} at {router} does not answer")
+    return "; ".join(clauses)
 
 
 def the_known_run(name: str | None) -> str:
@@ -77,7 +92,7 @@ def live_runs(required: str | None = None) -> dict[str, set[str]]:
         BusError, DataFileError: the required run is damaged.
     """
     live: dict[str, set[str]] = {}
-    for name in sorted(path.parent.name for path in runtime_base().glob("*/links.json")):
+    for name in _stored():
         try:
             roles = open_run(name, ()).links.live()
         except (BusError, DataFileError, OSError):
@@ -87,6 +102,11 @@ def live_runs(required: str | None = None) -> dict[str, set[str]]:
         if roles:
             live[name] = roles
     return live
+
+
+def _stored() -> list[str]:
+    """Names of all runs with a directory on this host."""
+    return sorted(path.parent.name for path in runtime_base().glob("*/links.json"))
 
 
 def _listed(runs: dict[str, set[str]]) -> str:

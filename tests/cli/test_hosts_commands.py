@@ -103,6 +103,16 @@ def test_a_run_that_cannot_be_joined_hides_no_other() -> None:
     assert text.splitlines()[1] == f"across  cannot be joined: {why}"
 
 
+@pytest.mark.usefixtures("own_runtime")
+def test_a_run_whose_router_does_not_answer_is_not_called_absent() -> None:
+    open_run("stopped")
+    open_run("across", network=NETWORK)
+    silent = f"the router of run 'across' at {NETWORK.router} does not answer: is it running"
+    assert refusal("ctl", "status", "--run", "across", kind=BusError).startswith(silent)
+    assert silent in refusal("ctl", "status", kind=BusError)
+    assert "there is no run 'stopped'" in refusal("ctl", "status", "--run", "stopped", kind=BusError)
+
+
 @pytest.mark.usefixtures("toml")
 @pytest.mark.parametrize("words", [("record",), ("config", "zenoh", "--role", "camera"), ("sim-loop",)], ids=" ".join)
 def test_a_name_of_a_run_that_is_too_long_or_empty_is_refused(words: tuple[str, ...]) -> None:
