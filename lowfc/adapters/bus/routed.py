@@ -137,8 +137,9 @@ def router_trouble(network: Network, role: str) -> str:
     except ssl.SSLEOFError:
         return "the connection was closed during the handshake: the router is shutting down, or it is another program"
     except ssl.SSLError as fault:
+        why = ": ".join(filter(None, (fault.reason or str(fault), getattr(fault, "verify_message", ""))))
         raise BusError(
-            f"the router at {network.router} and {certificate} do not accept each other ({fault.reason or fault}): "
+            f"the router at {network.router} and {certificate} do not accept each other ({why.strip('.')}): "
             f"both must be signed by {ca}, valid today, and the router's made for the name {host!r}; see lowfc certs"
         ) from fault
     except OSError as fault:
