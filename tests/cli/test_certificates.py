@@ -186,7 +186,9 @@ def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
         f"{role}'s certificate ends in {WARN_DAYS - 1} days, on {date:%Y-%m-%d}: lowfc certs --renew"
         for role in ("camera", "router")
     ]
-    assert len(ending_certificates(network, now + (CA_DAYS - WARN_DAYS + 1) * day)) == 3, "the authority ends first"
+    warnings = ending_certificates(network, now + (CA_DAYS - WARN_DAYS + 1) * day)
+    assert len(warnings) == 3, "the authority ends first"
+    assert warnings[2].endswith("with its authority's ca.pem: make all anew in an empty folder (lowfc certs)")
     (tmp_path / "viewer.key").chmod(0o644)
     (warning,) = ending_certificates(network, now)
     assert "viewer.key can be read by every user" in warning

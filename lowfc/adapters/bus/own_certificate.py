@@ -14,10 +14,14 @@ _ROUNDS = 4  # of the handshake; three are needed
 
 
 class OwnCertificate(NamedTuple):
-    """A certificate's common name (its role), and the end of its validity or the authority's, whichever is first."""
+    """A certificate's common name (its role), and the end of its validity or the authority's, whichever is first.
+
+    `ends_with_authority`: the authority's is first, so that a renewal of the certificate does not help.
+    """
 
     name: str
     ends: datetime.datetime
+    ends_with_authority: bool
 
 
 def read_certificate(authority: Path, certificate: Path, key: Path, *, server: bool = False) -> OwnCertificate:
@@ -47,11 +51,14 @@ def read_certificate(authority: Path, certificate: Path, key: Path, *, server: b
         own: dict[str, Any] = {**(verifying.getpeercert() or {})}
         name = dict(pair for part in own["subject"] for pair in part)["commonName"]
         authorities: list[dict[str, Any]] = verifier.get_ca_certs()
-        last_s = min(ssl.cert_time_to_seconds(issued["notAfter"]) for issued in (own, *authorities))
+        last_s, authority_last_s = (
+            min(ssl.cert_time_to_seconds(issued["notAfter"]) for issued in each) for each in ([own], authorities)
+        )
     except (OSError, KeyError, ValueError) as fault:  # ssl.SSLError is an OSError
         why = getattr(fault, "verify_message", "") or getattr(fault, "reason", "") or getattr(fault, "strerror", "")
         raise DataFileError(
             f"{certificate} is not a valid certificate of {key} signed by {authority} ({why or fault}): make it where "
             "the authority's key is (lowfc certs --renew) and copy it here; is this host's clock right?"
         ) from fault
-    return OwnCertificate(name, datetime.datetime.fromtimestamp(last_s, datetime.UTC))
+    ends = datetime.datetime.fromtimestamp(min(last_s, authority_last_s), datetime.UTC)
+    return OwnCertificate(name, ends, authority_last_s < last_s)
