@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer, Client
 from lowfc.client.bench import bench_message
@@ -228,7 +229,7 @@ def signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-@pytest.mark.usefixtures("signals")
+@pytest.mark.usefixtures("signals", "own_runtime")
 def test_the_command_serves_a_run_until_it_is_stopped(
     pvs: Variables, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -275,12 +276,12 @@ def test_the_command_serves_a_run_until_it_is_stopped(
         if pv.nt == "image":
             os.kill(os.getpid(), signal.SIGTERM)
 
+    open_run("bench")  # no process listens on its ports: the gateway waits for them
     (tmp_path / "config.toml").write_text('[gateway]\nbench = { mask = "BENCH:MASK" }\n')
     real_watch = command.Watch
     monkeypatch.setattr(command, "Watch", watch_and_use)
     monkeypatch.setattr(pvs.Shared, "post", post)
     monkeypatch.setattr(command, "ZenohBus", make_bus)
-    monkeypatch.setattr(command, "the_run", lambda run: run)
     monkeypatch.setattr(
         command,
         "open_run",

@@ -12,7 +12,7 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.join import clock_of
 from lowfc.adapters.process.terminal import AnyRun, ConfigFile, configuration
 from lowfc.client import Client
-from lowfc.client.runs import the_run
+from lowfc.client.runs import the_known_run
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import Role
 from lowfc.programs.cli.status import json_object
@@ -38,7 +38,7 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
     """
     protocol()  # raises now if p4p is missing
     import_late_modules()
-    joined = open_run(the_run(run), ())
+    joined = open_run(the_known_run(run), ())
     run_id, run_config = joined.run_id, joined.path / "config.toml"
     settings = configuration(config) if config is not None or not run_config.exists() else load(run_config)
     clock, signalled = clock_of(settings), list[int]()  # an Event may lock up in the handler of a second signal
