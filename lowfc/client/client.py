@@ -345,7 +345,7 @@ class Client:
                 name=name,
                 modes=[index(mode) for mode in np.atleast_1d(modes).tolist()] if np.size(modes) else [],
                 values=np.atleast_1d(np.asarray(values, np.float64)).tolist(),
-                text=text,
+                text=required(name, text, str),
                 actuators=b"" if actuators_nm is None else actuators_nm.tobytes(),
                 table=b"" if table is None else table.tobytes(),
                 columns=0 if table is None else table.shape[1],
