@@ -353,6 +353,7 @@ def test_a_repeated_event_has_one_line_with_its_count() -> None:
 def test_the_console_replaces_commands_by_keys_and_long_lists_by_ranges() -> None:
     assert phrased("`lowfc ctl clear` first, when it is safe") == "clear (key k) first, when it is safe"
     assert phrased("`lowfc ctl record start` goes on") == "record start (key r) goes on"
+    assert phrased("`lowfc ctl gain 0 --modes 5,7` leaves") == "gain 0, modes 5,7 (key g) leaves"
     assert phrased("`lowfc ctl permit` and `lowfc tune`") == "`lowfc ctl permit` and `lowfc tune`"
     assert phrased("gain is now 0.5 0.5 0.05 0.01: below 2") == "gain is now 0.01 to 0.5 (4 modes): below 2"
     assert phrased("1.9 1.9 1.9 1.9 1.9") == "1.9 (5 modes)"

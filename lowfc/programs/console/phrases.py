@@ -10,7 +10,7 @@ _KEYS = {action.name: action.key for action in (*ACTIONS, SAFE)} | {
     "record start": "r",
     "record stop": "v",
 }
-_COMMAND = re.compile(r"`lowfc ctl (\w+)(?: (\w+))?[^`]*`")
+_COMMAND = re.compile(r"`lowfc ctl (\w+)(?: (\w+))?( --modes [^` ]*)?[^`]*`")
 _NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
 _LIST = re.compile(rf"(?<![\w.]){_NUMBER}(?: {_NUMBER}){{3,}}(?![\w.])")
 
@@ -22,4 +22,7 @@ def phrased(text: str) -> str:
 
 def _key(match: re.Match[str]) -> str:
     name = f"{match[1]} {match[2]}" if f"{match[1]} {match[2]}" in _KEYS else match[1]
-    return f"{name} (key {_KEYS[name]})" if name in _KEYS else match[0]
+    if name not in _KEYS:
+        return match[0]
+    values = f" {match[2]}, {match[3].removeprefix(' --')}" if match[3] else ""
+    return f"{name}{values} (key {_KEYS[name]})"
