@@ -150,6 +150,9 @@ def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkey
     assert done.stderr.count("not reported to the loop: run 'bench' has no controller") == (case == "late")
 
 
-@pytest.mark.parametrize("options", [["dm00"], ["dm00disp03", "--external", "dm00disp03"]])
+@pytest.mark.parametrize(
+    "options",
+    [["dm00"], ["dm00disp03", "--external", "dm00disp03"], ["", "--external", "dm00disp04", "--external", "dm00disp"]],
+)
 def test_the_loops_own_channel_has_a_number_and_is_not_external(options: list[str]) -> None:
     assert "--external" in refusal("bridge", "isio", "--beside", *options, kind=ConfigurationError)

@@ -13,7 +13,7 @@ from google.protobuf.message import DecodeError
 from lowfc.adapters.bus.bus import Bus
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.image_stream.channels import OtherChannels, fits, other_channel_names
+from lowfc.adapters.image_stream.channels import OtherChannels, fits, other_channel_names, sum_name
 from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, StreamError, stream_path
 from lowfc.adapters.process.clock import Clock, HostClock
 from lowfc.adapters.process.realtime import lower_priority
@@ -57,6 +57,8 @@ def bridge_isio(
         )
     if beside in names:
         raise ConfigurationError(f"{beside} is the loop's own channel (--beside): leave out --external {beside}")
+    for total in (name for name in names if sum_name(f"{name}00") == name):
+        raise ConfigurationError(f"--external {total} is the sum, with the loop's own channel: name single channels")
     lower_priority()
     run_id, clock = the_known_run(run), HostClock()
     with contextlib.suppress(KeyboardInterrupt):
