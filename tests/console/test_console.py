@@ -308,8 +308,9 @@ def test_a_knob_is_chosen_and_shown_whatever_the_number_of_modes(monkeypatch: py
     knobs = Gains()
     monkeypatch.setattr(knobs, "post_message", turned.append)
 
-    def update(*noll: int) -> None:
-        snapshot = SimpleNamespace(controller=wire.ControllerState(gain=[0.5] * len(noll)), noll=noll)
+    def update(*noll: int, gain: float = 0.5, automatic: tuple[bool, ...] = ()) -> None:
+        controller = wire.ControllerState(gain=[gain] * len(noll), automatic=automatic)
+        snapshot = SimpleNamespace(controller=controller, noll=noll)
         knobs.update(SimpleNamespace(state=SimpleNamespace(snapshot=snapshot)))
 
     update(2, 3, 4, 5, 6, 7)
@@ -318,6 +319,9 @@ def test_a_knob_is_chosen_and_shown_whatever_the_number_of_modes(monkeypatch: py
     knobs.turn(1)
     knobs.automatic()
     assert [turn.modes for turn in turned] == [(2, 3), (2, 3)]
+    for gain, automatic in ((np.inf, ()), (np.nan, ()), (0.5, (True,))):  # of another program
+        update(2, 3, gain=gain, automatic=automatic)
+        assert [line.plain for line in knobs._lines] == ["gains are not known yet"]
     monkeypatch.setattr(Gains, "size", Size(60, 5))
     update(*range(2, 37))
     for _ in range(8):

@@ -45,7 +45,8 @@ class Gains(Lines):
     def update(self, reading: Reading) -> None:
         """Show the gains of the run."""
         state, noll = reading.state.snapshot.controller, reading.state.snapshot.noll
-        if state is None or len(state.gain) != len(noll):
+        lengths = set() if state is None else {len(state.gain), len(state.automatic or state.gain)}
+        if state is None or lengths != {len(noll)} or not np.isfinite(list(state.gain)).all():
             self._noll = ()
         else:
             self._noll, self._gain = noll, np.array(state.gain, np.float32)
