@@ -30,7 +30,7 @@ from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate import align as calibrate_align
 from lowfc.programs.commissioning.calibrate import command, pokes
 from lowfc.programs.commissioning.calibrate import tasks as calibrate_commands
-from lowfc.programs.commissioning.calibrate.align import most_reversed_mode, on_sensor
+from lowfc.programs.commissioning.calibrate.align import on_sensor, oriented
 from lowfc.programs.commissioning.calibrate.command import calibrate_app
 from lowfc.programs.commissioning.calibrate.run import Calibrator
 from lowfc.programs.commissioning.calibrate.tasks import zero_point
@@ -325,10 +325,18 @@ def test_a_poke_resolves_the_rotation_by_180_degrees(noiseless_loop: InProcessLo
     assert np.abs(cross_talk(calibration.reconstructor, noiseless_loop.calibration().response)).max() < 0.05
 
 
-def test_the_rotation_is_resolved_by_a_mode_that_it_reverses() -> None:
-    y, x = np.mgrid[-1.5:2, -1.5:2]
-    images = np.stack([x, 9 * (x**2 + y**2), 2 * y], axis=2).reshape(16, 3).astype(np.float32)
-    assert most_reversed_mode(images, (4, 4)) == 2, "not the largest response, which is the same in both orientations"
+@pytest.mark.parametrize("geometry", [Geometry(1.0, 40.2, 39.5, -168.0, parity) for parity in (1, -1)])
+def test_pokes_resolve_a_reflection_that_does_not_change_the_image(geometry: Geometry) -> None:
+    """The image of a flat wavefront through the symmetric pupil is symmetric about both axes without a mask."""
+    config = load(None, SMALL_MIRROR | {"sensor.kind": "clowfs", "sensor.modes": 3})
+    computed = analytic(config, SILENT)
+    image = computed.reference.astype(float).reshape(80, 80)
+    alignment = align(onto(image, geometry, (80, 80)), image)
+    H = onto(computed.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
+    found, calibration, correlation = oriented(config, computed, alignment, 1e5, computed, lambda mode: H[:, mode])
+    assert found.geometry.parity == geometry.parity
+    assert correlation > 0.99
+    assert np.abs(cross_talk(calibration.reconstructor, H)).max() < 0.01
 
 
 def test_an_aligned_calibration_expects_the_light_of_the_good_pixels(

@@ -2,7 +2,8 @@
 
 The image of a flat wavefront through a pupil that is symmetric or without phase is unchanged by a rotation of 180
 degrees, so the reference image alone leaves this ambiguity. In the wrong orientation tip, tilt and other odd modes have
-the opposite sign, and without phase in the pupil all modes: a poke of an odd mode resolves it.
+the opposite sign, and without phase in the pupil all modes: a poke of an odd mode resolves it. If a reflection does not
+change the image either, as without a mask in the relay pupil, it takes pokes of tip and tilt.
 """
 
 from dataclasses import dataclass, replace
@@ -16,6 +17,8 @@ from lowfc.arrays import Array, Complex
 
 _ANGLES = 72
 """Number of initial rotations, spread over 180 degrees."""
+_ALIKE, _EXACT = 2.0, 0.01
+"""Ratio to the better parity's residual, and residual, below either of which the other parity is possible, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +54,7 @@ class Alignment:
         background: Background of each real pixel, in the same unit.
         residual: Rms of real minus fitted image, relative to the rms of the real image.
         other_parity: The same residual for the other parity.
+        orientations: Geometries that the image does not distinguish.
     """
 
     geometry: Geometry
@@ -58,6 +62,7 @@ class Alignment:
     background: float
     residual: float
     other_parity: float
+    orientations: list[Geometry]
 
 
 def onto(image: Array, geometry: Geometry, shape: tuple[int, int]) -> Array:
@@ -103,15 +108,17 @@ def align(real: Array, computed: Array) -> Alignment:
         guesses.sort(key=lambda each: each[0])
         fits.append(min((_refine(spline, guess, real) for _, guess in guesses[:3]), key=lambda each: each[0]))
     fits.sort(key=lambda each: each[0])
-    (residual, best), (other, _) = fits
+    (residual, best), (other, reflected) = fits
     if residual > 0.5:
         raise ValueError(
             f"the image does not resemble the computed reference: {residual:.0%} of it remains after the best fit; is "
             "this the sensor and the mask of the configuration?"
         )
     _, flux, background = _residual(_sample(spline, best, real.shape), real)
-    rotation = (best.rotation_deg + 90) % 180 - 90
-    return Alignment(replace(best, rotation_deg=rotation), flux, background, residual, other)
+    possible = [best, reflected] if other < max(_ALIKE * residual, _EXACT) else [best]
+    possible = [replace(each, rotation_deg=(each.rotation_deg + 90) % 180 - 90) for each in possible]
+    orientations = [orientation for each in possible for orientation in (each, each.rotated_180())]
+    return Alignment(possible[0], flux, background, residual, other, orientations)
 
 
 def _doubled(shape: tuple[int, ...]) -> tuple[int, int]:

@@ -1,6 +1,6 @@
 """`lowfc calibrate align`: resample the computed calibration to the pixels of a real sensor."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -9,13 +9,14 @@ from rich.console import Console
 
 from lowfc.adapters.files import factory
 from lowfc.adapters.files.whole_file import require_folder
-from lowfc.arrays import Single, single
+from lowfc.arrays import Array, single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
 from lowfc.control.calibration.alignment import Alignment, Geometry, align, onto
 from lowfc.control.calibration.calibration import Calibration, normalise_flux
+from lowfc.control.calibration.response_fit import correlation
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, first_poke_plan, largest_nm
@@ -59,13 +60,13 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
             alignment = align(light_dn, computed.reference.astype(np.float64).reshape(computed.shape))
         except ValueError as error:
             raise CalibrationError(str(error)) from None
-        calibration = on_sensor(config, computed, alignment.geometry, flux_dn, before)
-        mode = most_reversed_mode(computed.response, computed.shape)
-        amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_nm(config, calibration)[mode]))
-        poke = Player(loop, calibration, reporter(console)).first_poke(mode, first_poke_plan(amplitude_nm))
-        if poke.response @ calibration.response[:, mode] < 0:
-            alignment = replace(alignment, geometry=alignment.geometry.rotated_180())
-            calibration = on_sensor(config, computed, alignment.geometry, flux_dn, before)
+        player = Player(loop, on_sensor(config, computed, alignment.geometry, flux_dn, before), reporter(console))
+
+        def poke(mode: int) -> Array:
+            amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_nm(config, player.before)[mode]))
+            return player.first_poke(mode, first_poke_plan(amplitude_nm)).response
+
+        alignment, calibration, _ = oriented(config, computed, alignment, flux_dn, before, poke)
         write(calibration, out, loop if load else None)
     return AlignResult(
         **asdict(alignment.geometry),
@@ -76,15 +77,6 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
         other_parity_residual=alignment.other_parity,
         file=str(out),
     )
-
-
-def most_reversed_mode(response: Single, shape: tuple[int, int]) -> int:
-    """Index of the mode whose response changes most under a rotation of the image by 180 degrees.
-
-    A sensor with phase in its pupil, such as clowfs, has the same response to focus in both orientations.
-    """
-    images = response.astype(np.float64).reshape(*shape, -1)
-    return int(np.argmax(np.linalg.norm(images - images[::-1, ::-1], axis=(0, 1))))
 
 
 def on_sensor(
@@ -118,6 +110,26 @@ def on_sensor(
     except (ValueError, CalibrationError) as error:
         raise CalibrationError(f"too little of the image falls on the sensor: {error}") from None
     return identified(replace(calibration, reconstructor=single(R)))
+
+
+def oriented(
+    config: Configuration,
+    computed: Calibration,
+    alignment: Alignment,
+    flux_dn: float,
+    before: Calibration,
+    poke: Callable[[int], Array],
+) -> tuple[Alignment, Calibration, float]:
+    """The possible orientation that fits `poke`, the response to tip, and to tilt if needed, and its calibration.
+
+    The third value is the mean correlation of these responses with the computed ones; the others as for `on_sensor`.
+    """
+    candidates = [on_sensor(config, computed, each, flux_dn, before) for each in alignment.orientations]
+    modes = range(min(len(candidates) // 2, len(computed.noll)))
+    responses = [poke(mode) for mode in modes]
+    scores = [np.mean([correlation(responses[k], each.response[:, k]) for k in modes]) for each in candidates]
+    best = int(np.argmax(scores))
+    return replace(alignment, geometry=alignment.orientations[best]), candidates[best], float(scores[best])
 
 
 def computed_scale(config: Configuration) -> float:

@@ -232,7 +232,7 @@ class Commissioning:
         player = Player(self._loop, before, self._report)
         self._delay = delay = first_delay(player, self._config)
         self._announce("orientation and sign")
-        first = aligned(self._config, self._computed, before, delay, self._report, self._results)
+        first = aligned(player, self._config, self._computed, delay, self._results)
         return poked(player, self._config, delay) if first is None else first
 
     def _predict_and_close(self, delay_frames: float) -> str:

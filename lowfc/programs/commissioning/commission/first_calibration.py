@@ -1,11 +1,12 @@
 """The provisional calibration: from the image of one poke and the computed response, or from pokes of all modes."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from lowfc.arrays import single
+from lowfc.arrays import Array, single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
@@ -13,10 +14,9 @@ from lowfc.control.calibration import poke_plan
 from lowfc.control.calibration.alignment import align
 from lowfc.control.calibration.calibration import FIRST, Calibration
 from lowfc.control.calibration.delay_fit import Delay
-from lowfc.control.calibration.response_fit import correlation
-from lowfc.programs.commissioning.calibrate.align import computed_scale, in_words, on_sensor
+from lowfc.programs.commissioning.calibrate.align import computed_scale, in_words, on_sensor, oriented
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, first_poke_plan, largest_nm
-from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError, Report
+from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError
 from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 
 FIRST_NM = AMPLITUDE_NM["poke"]
@@ -32,14 +32,14 @@ MAX_NONLINEARITY = 0.1
 _STANDARD_ERRORS = 3.0
 
 
-def first_delay(player: Player, config: Configuration) -> Delay:
-    """Delay and image of a poke of the first mode, with increasing amplitude until it is detected."""
+def first_delay(player: Player, config: Configuration, mode: int = 0) -> Delay:
+    """Delay and image of a poke of a mode, with increasing amplitude until it is detected."""
     before, report = player.before, player.report
-    amplitude_nm, most_nm = FIRST_NM, float(largest_nm(config, before)[0])
+    amplitude_nm, most_nm = FIRST_NM, float(largest_nm(config, before)[mode])
     while True:
         amplitude_nm = min(amplitude_nm, most_nm)
         try:
-            delay = player.first_poke(0, first_poke_plan(amplitude_nm))
+            delay = player.first_poke(mode, first_poke_plan(amplitude_nm))
             break
         except PokesNotSeenError:
             if amplitude_nm >= min(MAX_FIRST_NM, most_nm):
@@ -47,37 +47,30 @@ def first_delay(player: Player, config: Configuration) -> Delay:
             report(f"pokes of {amplitude_nm:g} nm are not detected: amplitude doubled")
             amplitude_nm *= 2
     report(
-        f"pokes of Z{before.noll[0]} of {amplitude_nm:g} nm are detected after {delay.delay_frames:.3f} +- "
+        f"pokes of Z{before.noll[mode]} of {amplitude_nm:g} nm are detected after {delay.delay_frames:.3f} +- "
         f"{delay.error_frames:.3f} frames, {delay.delay_frames * config.period_ns * 1e-6:.3g} ms"
     )
     return delay
 
 
 def aligned(
-    config: Configuration,
-    computed: Calibration,
-    before: Calibration,
-    poke: Delay,
-    report: Report,
-    results: dict[str, Any],
+    player: Player, config: Configuration, computed: Calibration, poke: Delay, results: dict[str, Any]
 ) -> Calibration | None:
-    """The computed calibration on the sensor's pixels, with the sign from the poke.
+    """The computed calibration on the sensor's pixels, with the sign from the poke of the first mode.
 
     None if the sensor is not the configured one. The sensor's geometry is added to `results`.
     """
+    before, report = player.before, player.report
     image = (before.reference * before.flux_dn).reshape(before.shape).astype(np.float64)
     model = computed.reference.astype(np.float64).reshape(computed.shape)
     try:
         alignment = align(image, model)
-        calibration = on_sensor(config, computed, alignment.geometry, before.flux_dn, before)
+        on_sensor(config, computed, alignment.geometry, before.flux_dn, before)
     except (ValueError, CalibrationError) as error:
         report(f"the image cannot be compared with the computed one: {error}")
         return None
-    poke_correlation = correlation(poke.response, calibration.response[:, 0])
-    if poke_correlation < 0:
-        alignment = replace(alignment, geometry=alignment.geometry.rotated_180())
-        calibration = on_sensor(config, computed, alignment.geometry, before.flux_dn, before)
-        poke_correlation = correlation(poke.response, calibration.response[:, 0])
+    responses = partial(_poke_response, player, config, poke)
+    alignment, calibration, poke_correlation = oriented(config, computed, alignment, before.flux_dn, before, responses)
     scale = alignment.geometry.scale * computed_scale(config)
     report(
         f"{in_words(alignment, scale)}; correlation of the poke's image with the computed one: {poke_correlation:.2f}"
@@ -94,6 +87,10 @@ def aligned(
     }
     calibration = replace(calibration, reference=before.reference, estimator=f"{calibration.estimator}{FIRST}")
     return identified(calibration)
+
+
+def _poke_response(player: Player, config: Configuration, first_poke: Delay, mode: int) -> Array:
+    return (first_delay(player, config, mode) if mode else first_poke).response
 
 
 def poked(player: Player, config: Configuration, poke: Delay) -> Calibration:
