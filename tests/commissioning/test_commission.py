@@ -263,6 +263,14 @@ def test_a_resumed_commissioning_continues_and_reports_an_operator_who_opens_the
     assert (state.mode, state.calibration_id) == (wire.LOOP_MODE_OPEN, calibration_file.load(bench.out).id)
 
 
+def test_a_commissioning_is_not_resumed_with_other_modes_or_commands(tmp_path: Path) -> None:
+    bench, same = Bench(tmp_path, NOISELESS), computed(NOISELESS.to_toml())
+    for other in (computed(CONFIG.to_toml()), identified(replace(same, modes_to_actuators=-same.modes_to_actuators))):
+        calibration_file.save(other, provisional_path(bench.out))
+        with pytest.raises(CalibrationError, match="other modes, or commands of the mirror, than the configuration"):
+            bench.commission(resume=True)
+
+
 def test_a_failed_commissioning_restores_the_previous_calibration(commissioned: tuple[Bench, dict[str, Any]]) -> None:
     bench, _ = commissioned
     before = bench.loop.calibration().id

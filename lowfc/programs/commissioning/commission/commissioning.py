@@ -136,7 +136,12 @@ class Commissioning:
         options, config = self._options, self._config
         resumed = options.resume and first_file.is_file()
         if resumed:
-            first = calibration_file.load(first_file)
+            first, commands = calibration_file.load(first_file), self._computed.modes_to_actuators
+            same_modes = first.noll == self._computed.noll and first.grid == self._computed.grid
+            if not (same_modes and np.allclose(first.modes_to_actuators, commands, atol=1e-3)):
+                raise CalibrationError(
+                    f"{first_file} is for other modes, or commands of the mirror, than the configuration: omit --resume"
+                )
             camera = self._loop.camera()
             if camera is not None and camera.shape != first.shape:
                 raise CalibrationError(
