@@ -49,13 +49,16 @@ def measure_dark(frames: npt.NDArray[np.number]) -> Dark:
     """Dark and bad pixels from frames (frames, pixels) without light, DN.
 
     Raises:
-        ValueError: there are too few frames, or they are not dark.
+        ValueError: there are too few frames, values are not finite, or the frames are not dark.
     """
     count = len(frames)
     if count < 16:
         raise ValueError(f"a dark takes at least 16 frames, got {count}")
     values = frames.astype(np.float64)
     mean, noise = values.mean(axis=0), values.std(axis=0, ddof=1)
+    if bad := int(np.count_nonzero(~np.isfinite(mean))):
+        which = "1 pixel of the dark frames has" if bad == 1 else f"{bad} pixels of the dark frames have"
+        raise ValueError(f"{which} values that are not finite: replace them by numbers")
     level, typical = float(np.median(mean)), float(np.median(noise))
     mean_spread = max(_spread(mean), typical / np.sqrt(count), 1e-3)
     noise_spread = max(_spread(noise), typical / np.sqrt(2 * count), 1e-3)
