@@ -291,17 +291,18 @@ def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
     assert result["hot"] < 5
 
 
-@pytest.mark.parametrize("words", ["", "reference", "align", "dark --star-blocked"])
+@pytest.mark.parametrize("words", ["", "reference", "align", "dark --star-blocked", "dark --file cube.npy"])
 def test_frames_of_another_size_than_the_calibration_are_refused(
     loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:
     other = replace(loop.calibration(), shape=(64, 100))
     monkeypatch.setattr(loop, "calibration", lambda: other)
     monkeypatch.setattr(loop, "camera", lambda: CameraSettings(0, (80, 80), 100.0, 40100.0))
+    np.save("cube.npy", np.full((16, 64, 100), 100))
     with pytest.raises(
         CalibrationError, match=r"80 x 80 pixels and are refused as WRONG_SIZE: .* is for 64 x 100: load"
     ):
-        json_of(*words.split(), *(["--frames", "16"] if words else []))
+        json_of(*words.split(), *(["--frames", "16"] if words and "--file" not in words else []))
 
 
 def test_the_computed_calibration_is_resampled_to_a_scaled_and_rotated_sensor(loop: InProcessLoop) -> None:

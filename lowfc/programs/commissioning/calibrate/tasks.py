@@ -188,8 +188,11 @@ def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
     """The calibration in use; the camera's read noise per pixel, e-, and gain, e-/DN."""
     camera = factory.detector(configuration_of(loop))
     noise = factory.equivalent_read_noise_e(camera), camera.gain_e_per_dn / camera.em_gain
+    before = replace(loop.calibration(), camera=loop.camera())
+    if before.camera is not None:  # also if no frame is used: a file has one size
+        check_size(before.camera.shape, before)
     try:
-        yield replace(loop.calibration(), camera=loop.camera()), noise
+        yield before, noise
     except ValueError as error:
         raise CalibrationError(str(error)) from None
 
