@@ -493,6 +493,15 @@ def test_the_noise_of_a_mode_is_compared_with_its_own_limit(config: Configuratio
     assert "more than its modal limit of 0.001 nm" in printed.getvalue()
 
 
+def test_a_mirror_that_does_not_span_the_pupil_causes_a_warning() -> None:
+    printed = StringIO()
+    analytic(load(None, {"mirror.rows": 8, "mirror.columns": 8, "sensor.modes": 6}), Console(file=printed, width=400))
+    assert "8 x 8 actuators at 31 pitches per pupil make at most" in printed.getvalue()
+    printed = StringIO()
+    analytic(load(None, SMALL_MIRROR), Console(file=printed))
+    assert not printed.getvalue()
+
+
 @pytest.mark.parametrize(
     ("keys", "why"), [({"bias_dn": 0.0}, "raise camera.bias_dn"), ({"gain_e_per_dn": 10.0}, "rounded down"), ({}, "")]
 )

@@ -17,6 +17,9 @@ from lowfc.optics.twin.twin_mirror import TwinMirror
 
 _FRAMES = 100  # simulated frames, whose flux in DN is compared with that of the light on the detector
 
+_MIN_REACH = 0.1
+"""Fraction of a modal limit that the mirror's stroke allows, below which mirror and modes do not fit together."""
+
 WavefrontFunction = Callable[[Twin, TwinMirror], Array]
 """Computes the wavefront at the used nodes, nm, from a twin and the mirror on its nodes."""
 
@@ -44,6 +47,14 @@ def analytic(config: Configuration, console: Console, at: WavefrontFunction | No
         warn(
             f"Z{calibration.noll[worst]}: noise is {noise_nm[worst]:.0f} nm rms per frame, more than its modal "
             f"limit of {limit_nm[worst]:g} nm: the star is too faint, or the mask cannot distinguish so many modes"
+        )
+    mirror, reach_nm = config.mirror, config.safety.stroke_nm / np.abs(calibration.modes_to_actuators).max(axis=0)
+    worst = int(np.argmin(reach_nm / limit_nm))
+    if reach_nm[worst] < _MIN_REACH * limit_nm[worst]:
+        warn(
+            f"{mirror.rows} x {mirror.columns} actuators at {mirror.pitches_per_pupil:g} pitches per "
+            f"pupil make at most {reach_nm[worst]:.2g} nm rms of Z{calibration.noll[worst]} within safety.stroke_nm: "
+            "check mirror.rows, mirror.columns and mirror.pitches_per_pupil, or use fewer modes"
         )
     detector, flux_dn = factory.detector(config), calibration.flux_dn
     light_e = calibration.reference * flux_dn * detector.gain_e_per_dn / detector.em_gain
