@@ -366,7 +366,9 @@ def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str
 
 
 def _nearest(key: str, known: Sequence[str]) -> str:
-    """Suffix that names the known key most similar to a wrong one, or one of a similar name in another section."""
+    """Suffix that names the known key most similar to a wrong one, in any section, or the quotes as the fault."""
+    if key in known:
+        return "; write it without quotes, which make it one name"
     by_name = {dotted.rpartition(".")[2]: dotted for dotted in reversed(known)}
     elsewhere = difflib.get_close_matches(key.rpartition(".")[2], by_name, 1, 0.75)
     similar = difflib.get_close_matches(key, known, 1, 0.8)

@@ -195,6 +195,11 @@ def test_config_show_sets_only_keys_that_were_set(tmp_path: Path) -> None:
     assert load(write(tmp_path, uncommented)) == Configuration(), "each key can be uncommented unchanged"
 
 
+def test_a_quoted_key_with_dots_is_not_said_to_be_nearest_to_itself(tmp_path: Path) -> None:
+    message = error_of(write(tmp_path, '"camera.rate_hz" = 100'))
+    assert message.endswith("unknown key 'camera.rate_hz'; write it without quotes, which make it one name")
+
+
 def test_errors_name_the_key_as_written() -> None:
     assert error_of(None, {"control.gain": [1.0], "camera.rate_hz": "x"}).splitlines() == [
         "camera.rate_hz = 'x': must be a valid number",
