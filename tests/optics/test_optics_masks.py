@@ -168,6 +168,7 @@ def test_damaged_pupil_files_are_named(tmp_path):
         (np.full((4, 4), np.nan), "between 0 and 1"),
         (np.ones((2, 3)), "square"),
         (np.zeros((4, 4)), "some light"),
+        (np.full((4, 4), 0.45), "exceeds one half, got at most 0.45"),
         (np.ones((4, 4)) + 0j, "real numbers"),
         (np.float64(1.0), "square"),
         (np.ones((0, 0)), "square"),

@@ -77,8 +77,8 @@ def from_quarter(quarter: ArrayLike, samples: int) -> Array:
         samples: Points across the diameter, a multiple of twice the number of cells.
 
     Raises:
-        ValueError: The quadrant is not real and square, has values outside 0..1 or no light, or `samples` is not a
-            multiple of twice its cells.
+        ValueError: The quadrant is not real and square, has values outside 0..1 or none above one half, or `samples`
+            is not a multiple of twice its cells.
     """
     array = np.asarray(quarter)
     if array.dtype.kind not in "buif":
@@ -91,7 +91,10 @@ def from_quarter(quarter: ArrayLike, samples: int) -> Array:
     repeat, remainder = divmod(samples, 2 * quarter.shape[0])
     if remainder or not repeat:
         raise ValueError(f"samples must be a multiple of {2 * quarter.shape[0]}, got {samples}")
-    if not quarter.any():
-        raise ValueError("a quadrant must let some light through")
+    if not quarter.max() > 0.5:
+        raise ValueError(
+            "a quadrant must let some light through: wavefronts are judged where its transmission exceeds one half, "
+            f"got at most {quarter.max():g}"
+        )
     right = np.vstack([quarter[::-1], quarter])
     return np.kron(np.hstack([right[:, ::-1], right]), np.ones((repeat, repeat)))
