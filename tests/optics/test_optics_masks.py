@@ -50,6 +50,13 @@ def test_hole_positions_follow_x_and_y():
     assert (columns.mean() + 0.5) / 100 - 0.5 == pytest.approx(0.3)
 
 
+def test_a_hole_between_the_samples_is_refused():
+    layout = Layout("tiny", "", ((0.2, 0.1, 0.07), (0.0, 0.0, 0.001)))
+    with pytest.raises(ValueError, match=r"tiny: the hole at \(0.0, 0.0\) is lost between points 0\.002 D apart"):
+        transmission(layout, 512)
+    assert transmission(layout, 512, 16)[256, 256] > 0
+
+
 @pytest.mark.parametrize(
     ("holes", "message"),
     [

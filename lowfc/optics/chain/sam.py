@@ -71,10 +71,19 @@ def transmission(layout: Layout, samples: int, points: int = 1) -> Array:
         layout: The holes.
         samples: Samples across the pupil.
         points: Points evaluated across a sample in each direction; 1 for its centre only.
+
+    Raises:
+        ValueError: A hole is so small that it holds no point.
     """
     u = pupil_axis(samples * points)
     mask = np.zeros((samples * points, samples * points), np.bool_)
     for x, y, diameter in layout.holes:
         box = np.ix_(*(np.flatnonzero(np.abs(u - centre) <= diameter / 2.0) for centre in (y, x)))
-        mask[box] += np.hypot(u[box[0]] - y, u[box[1]] - x) <= diameter / 2.0
+        inside = np.hypot(u[box[0]] - y, u[box[1]] - x) <= diameter / 2.0
+        if not inside.any():
+            raise ValueError(
+                f"{layout.name}: the hole at ({x}, {y}) is lost between points {1 / u.size:.2g} D apart, as its "
+                f"diameter is {diameter:g} D: lengths are in pupil diameters; for tiny holes raise sensor.hole_samples"
+            )
+        mask[box] += inside
     return np.asarray(mask.reshape(samples, points, samples, points).mean(axis=(1, 3)))
