@@ -14,7 +14,7 @@ from lowfc.adapters.files.sensors import load_pupil
 from lowfc.contract.sections import SensorSection
 from lowfc.design import sam_search
 from lowfc.design.goal import MERITS, Goal, merit, paper_ratios, predictions
-from lowfc.design.merit import contrast_noise, covariance_nm2, table3_waves
+from lowfc.design.merit import contrast_noise, covariance_nm2, table3_waves, throughput
 from lowfc.design.sam_merit import TABLE3_NONLINEARITY_WAVES, SamCandidate, build_optics, hole_fields
 from lowfc.design.sam_search import BLOCK, Bounds, advance, holes, images, start
 from lowfc.optics.chain.band import monochromatic, uniform
@@ -86,8 +86,9 @@ def test_sum_over_holes_agrees_with_the_field_of_the_full_chain(pupil, modes):
     three = Layout("three", "", ((0.2, -0.3, 0.07), (-0.414, 0.102, 0.12), (0.0, 0.05, 0.2)))
     fields = np.sum([hole_fields(fine, hole) for hole in three.holes], axis=0)
     u = pupil_axis(512)
-    # Fraction of each sample that a hole covers, by the sample's distance from the hole's edge.
-    covered = [np.clip((d / 2 - np.hypot(u[:, None] - y, u - x)) * 512 + 0.5, 0, 1) for x, y, d in three.holes]
+    # Fraction of each sample that a hole covers, by the sample's distance from an edge at which the area is the hole's.
+    radii = {d: np.sqrt(d**2 / 4 - 1 / (12 * 512**2)) for *_, d in three.holes}
+    covered = [np.clip((radii[d] - np.hypot(u[:, None] - y, u - x)) * 512 + 0.5, 0, 1) for x, y, d in three.holes]
     for mask, allowed in ((sum(covered), 1e-6), (transmission(three, 512), 5e-3)):
         for k, amplitude in {0: pupil, 1: pupil * modes[0], 13: pupil * modes[12]}.items():
             truth = to_image(relay_of(amplitude) * mask, 160, 8, 1.0)
@@ -116,6 +117,15 @@ def test_predictions_agree_with_the_full_chain(pupil, modes, layout, fields, opt
         C = noise_nm2(I0, H, electrons(Photometry(), 0.05), 1.0, estimator)
         expected = np.sqrt(np.diag(C)) / tilt_nm_per_mas(2.0)
         assert predicted["table4_mas"][estimator]["2"] == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize(("diameter", "allowed"), [(0.03, 0.02), (0.01, 0.05)])
+def test_light_through_small_holes_agrees_with_the_full_chain(pupil, optics, diameter, allowed):
+    rings = [(0.12 * ring * np.cos(k), 0.12 * ring * np.sin(k), diameter) for ring in (1, 2, 3) for k in range(6)]
+    fields = np.sum([hole_fields(optics, hole) for hole in rings], axis=0)
+    mask = transmission(Layout("small", "", tuple(rings)), 512, 4)
+    I0 = at_pixels(np.abs(to_image(relay_of(pupil) * mask, 160, 8, 1.0)) ** 2)
+    assert throughput(SamCandidate(optics, fields).central("disk")) == pytest.approx(I0.sum(), rel=allowed)
 
 
 def test_merits_agree_with_their_definitions(optics, fields):
