@@ -35,7 +35,7 @@ class Goal:
             one exposure of Table 4's star.
         estimator: "pinv", or "weighted" for the Cramer-Rao bound.
         modes: Number of modes in "table3", "pareto" and "condition".
-        weight: Weight of Table 4 in "pareto" and "paper", 0 to 1. None: 1/2 in "paper"; in a "pareto" search each chain
+        weight: As in "pareto" and "paper" above, 0 to 1. None: 1/2 in "paper"; in a "pareto" search each chain
             has its own weight.
     """
 
