@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lowfc.arrays import Array, Mask
 from lowfc.optics.chain.grid import pupil_axis
@@ -62,13 +61,6 @@ def influence_factors(mirror: Mirror, coordinates: Array, actuators: int) -> Arr
     distance = coordinates[:, None] - actuator_axis(mirror, actuators)
     width = 1.0 / (mirror.pitches_per_pupil * np.sqrt(-np.log(mirror.coupling)))
     return np.asarray(np.exp(-((distance / width) ** 2)))
-
-
-def surface_nm(
-    y_factors: NDArray[np.floating], actuators_nm: NDArray[np.floating], x_factors: NDArray[np.floating]
-) -> NDArray[np.floating]:
-    """Surface (y points, x points) in nm, for actuators (rows, columns) in nm and the factors of both axes."""
-    return np.asarray(y_factors @ actuators_nm @ x_factors.T)
 
 
 def active_actuators(mirror: Mirror) -> Mask:
