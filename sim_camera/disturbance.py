@@ -196,25 +196,6 @@ def highest_hz(disturbance: Disturbance) -> float:
     return float(max([0.0, *disturbance.frequency_hz, *lines, *harmonics]))
 
 
-def modes_nm(disturbance: Disturbance, first: int, count: int, rate_hz: float) -> Array:
-    """Modes (count, modes) at the starts of the exposures of the frames from `first` on, nm of wavefront rms."""
-    total_nm = _sum_of_waves(disturbance, (first + np.arange(count)) / rate_hz)
-    if disturbance.lines:
-        lines = _DampedLines(disturbance, rate_hz)
-        total_nm[:, lines.modes] += lines.at(first, count)[:count].real.sum(axis=1)
-    return total_nm
-
-
-def _sum_of_waves(disturbance: Disturbance, time_s: Array) -> Array:
-    """Modes (instants, modes) at these times, without the damped lines."""
-    rotations = np.exp(2j * np.pi * np.outer(time_s - time_s[0], disturbance.frequency_hz))
-    waves = (rotations @ _rotated(disturbance, time_s[0])).real
-    total_nm = waves + _square(time_s)[:, None] * disturbance.step_nm + disturbance.static_nm
-    for wheel in disturbance.wheels:
-        total_nm += wheel.modes_nm(time_s)
-    return np.asarray(total_nm)
-
-
 def variances_nm2(disturbance: Disturbance, per_line: int = 401) -> tuple[Array, Array]:
     """Frequencies (n,) in Hz of waves, damped lines and wheels, and the variance at each (n, modes), nm^2.
 

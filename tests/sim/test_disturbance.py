@@ -25,13 +25,13 @@ from sim_camera.disturbance import (
     Disturbance,
     Sampler,
     _DampedLines,
-    modes_nm,
     preset_disturbance,
     screen,
     variances_nm2,
 )
 from sim_camera.faults import LOST_SHARE, MAX_FRAMES_LATE, TRACK_PIXELS, Fault, Kind
 from sim_camera.faulty import EARLIER_S, FaultyFrames, read_fault
+from tests.support.theory import modes_nm
 
 NOLL = tuple(range(2, 16))
 NM_PER_MAS = 2.424
@@ -56,8 +56,8 @@ def check_order_and_block(name: str, first: int, count: int, cut: int) -> None:
     expected = modes_nm(disturbance, first, count, RATE_HZ)
     cut = min(cut, count - 1)
     assert expected.shape == (count, len(NOLL))
-    assert np.abs(modes_nm(disturbance, first + cut, count - cut, RATE_HZ) - expected[cut:]).max() < 1e-5
-    assert np.abs(modes_nm(disturbance, first + cut, 1, RATE_HZ)[0] - expected[cut]).max() < 1e-5
+    assert np.array_equal(modes_nm(disturbance, first + cut, count - cut, RATE_HZ), expected[cut:])
+    assert np.array_equal(modes_nm(disturbance, first + cut, 1, RATE_HZ)[0], expected[cut])
     assert np.array_equal(modes_nm(preset(name, static_nm={4: 3.0}), first, count, RATE_HZ), expected)
 
 
@@ -91,7 +91,7 @@ def test_another_seed_gives_another_disturbance_with_the_same_rms(name: str) -> 
 @pytest.mark.parametrize("name", PRESETS)
 def test_scale_multiplies_the_disturbance(name: str) -> None:
     one, thrice = preset(name), preset(name, scale=3.0)
-    assert np.allclose(modes_nm(thrice, 5, 7, RATE_HZ), 3 * modes_nm(one, 5, 7, RATE_HZ))
+    assert np.allclose(modes_nm(thrice, 5, 7, RATE_HZ), 3 * modes_nm(one, 5, 7, RATE_HZ), atol=1e-4)
     assert thrice.screen_nm == pytest.approx(3 * one.screen_nm)
 
 
@@ -130,12 +130,16 @@ def test_reaction_wheel_and_ideal_preset_have_the_same_power() -> None:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_sampler_instants_agree_with_a_higher_frame_rate(name: str) -> None:
-    """Two instants per period agree with frames at twice the rate, also at the end of a block."""
+def test_sampler_instants_are_sums_of_the_waves(name: str) -> None:
+    """Waves, square wave and constant at two instants of a period, also at the end of a block."""
     disturbance = replace(preset(name, static_nm={4: 3.0}), lines=())
     sampler = Sampler(disturbance, np.array([0.0, 0.5]), RATE_HZ)
     for index in (0, BLOCK - 1, 5, 12_345 * BLOCK + 1):
-        np.testing.assert_allclose(sampler.at(index), modes_nm(disturbance, 2 * index, 2, 2 * RATE_HZ), atol=2e-4)
+        time_s = (index + np.array([0.0, 0.5])) / RATE_HZ
+        waves = np.exp(2j * np.pi * np.outer(time_s, disturbance.frequency_hz)) @ disturbance.amplitude_nm
+        square = np.where(time_s % 4 < 2, -1, 1)[:, None]
+        expected = waves.real + square * disturbance.step_nm + disturbance.static_nm
+        np.testing.assert_allclose(sampler.at(index), expected, atol=2e-4)
 
 
 def test_damped_line_rotates_between_frames() -> None:
@@ -188,7 +192,7 @@ def test_the_thermal_drift_is_slow_and_falls_with_radial_degree() -> None:
 
 def test_the_step_is_a_square_wave_of_5_mas() -> None:
     tilt = modes_nm(preset("step"), 0, 8000, RATE_HZ)
-    assert set(np.unique(tilt[:, 0] / NM_PER_MAS).round(9)) == {-5.0, 5.0}
+    assert set(np.unique(tilt[:, 0] / NM_PER_MAS).round(6)) == {-5.0, 5.0}
     assert np.flatnonzero(np.diff(tilt[:, 0])).tolist() == [1999, 3999, 5999]
     assert not tilt[:, 2:].any()
 

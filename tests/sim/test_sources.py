@@ -12,9 +12,10 @@ from lowfc.adapters.files.factory import shear_slopes, twin
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.optics.twin.twin import reference
-from sim_camera.disturbance import modes_nm, shear_at, variances_nm2
+from sim_camera.disturbance import shear_at, variances_nm2
 from sim_camera.driver import disturbance_of, scene
 from sim_camera.wheel import HEIGHTS, ORDERS, SOFT_HZ, Wheel, walk, wheels
+from tests.support.theory import modes_nm
 
 FLAT = np.zeros((34, 34), np.float32)
 TIME_S = np.arange(0, 20, 1e-4)

@@ -20,6 +20,7 @@ from lowfc.control.laws.linear_law import (
 from lowfc.control.laws.pi_notch import Notch, pi_notch
 from lowfc.control.laws.stability import delay_weights, open_loop
 from lowfc.control.laws.vibration import Model
+from sim_camera.disturbance import Disturbance, Sampler
 
 
 def law_of(
@@ -86,6 +87,12 @@ def realised(model: Model, frames: int, seed: int = 0) -> Array:
         x = F @ x + step
         disturbance_nm[row] = C @ x
     return disturbance_nm + np.sqrt(model.noise_nm2) * rng.standard_normal((frames, 1))
+
+
+def modes_nm(disturbance: Disturbance, first: int, count: int, rate_hz: float) -> Array:
+    """Modes (count, modes) of a disturbance at the starts of the exposures of the frames from `first` on."""
+    sampler = Sampler(disturbance, np.zeros(1), rate_hz)
+    return np.array([sampler.at(index)[0] for index in range(first, first + count)], np.float64)
 
 
 _GAIN, _ZERO = np.array([0.5, 0.3, 0.1]), np.zeros(3)

@@ -18,9 +18,9 @@ from lowfc.control.laws.tuning import (
 )
 from lowfc.control.laws.vibration import Model
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.disturbance import modes_nm, preset_disturbance
+from sim_camera.disturbance import preset_disturbance
 from sim_camera.driver import disturbance_of
-from tests.support.theory import integrators, noise_transfer, realised, rejection, run
+from tests.support.theory import integrators, modes_nm, noise_transfer, realised, rejection, run
 from tools import laws
 from tools.law_bench import Bench, calibrated, configured, tuned, with_lines_moved
 

@@ -14,8 +14,8 @@ from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.tuning import predicted_nm
 from lowfc.control.laws.vibration import FEWEST, Line, Model, identify, resolution_hz
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.disturbance import LINES_HZ, modes_nm, preset_disturbance
-from tests.support.theory import realised, run
+from sim_camera.disturbance import LINES_HZ, preset_disturbance
+from tests.support.theory import modes_nm, realised, run
 
 RATE_HZ = 1000.0
 NM_PER_MAS = tilt_nm_per_mas(2.0)
