@@ -1,6 +1,6 @@
 """Sections of the configuration: the instrument (star, sensor, camera, disturbance, mirror), interlocks, gateways."""
 
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -8,7 +8,6 @@ from lowfc.contract.network import Section as Section
 from lowfc.contract.network import WithoutNul
 
 Preset = Literal["quiet", "bench", "thermal", "reaction-wheel", "reaction-wheel-ideal", "step", "kolmogorov"]
-PRESETS: tuple[str, ...] = get_args(Preset)
 
 MIRROR_NAME = r"^[a-z][a-z0-9_]{0,49}$"
 """Regular expression for the name of a mirror; its role, "mirror-NAME", fits a certificate."""

@@ -4,6 +4,7 @@ import json
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import FRAME, image
-from lowfc.contract.sections import PRESETS
+from lowfc.contract.sections import Preset
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.disturbance import (
@@ -38,6 +39,7 @@ NM_PER_MAS = 2.424
 WHEEL = "reaction-wheel"
 IDEAL = "reaction-wheel-ideal"
 RATE_HZ = 1000.0
+PRESETS = get_args(Preset)
 
 
 def preset(name: str, seed: int = 1, **more: object) -> Disturbance:
