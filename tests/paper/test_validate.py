@@ -29,7 +29,7 @@ from lowfc.programs.paper.report import (
     write_document,
 )
 from lowfc.programs.paper.tables import anchors, conditioning
-from lowfc.programs.paper.tables.reconstruction import ESTIMATORS, WITH_NUISANCES
+from lowfc.programs.paper.tables.reconstruction import WITH_NUISANCES
 from lowfc.programs.paper.tables.tables import TABLES
 from tests.support.loops import json_of, lowfc
 
@@ -37,6 +37,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "measured"
 SAM = "sam27d07_bal14"
 FEW = 4
 RMS = "RMS residual, matched input"
+ESTIMATORS = ("pinv", "weighted", "weighted + 1 iteration", "weighted + 2 iterations")
 LIGHT = ("paper's electrons", "own photometry")
 
 

@@ -39,9 +39,6 @@ def label(kind: str, iterations: int) -> str:
     return kind if iterations == 0 else f"{kind} + {iterations} iteration{'s' * (iterations > 1)}"
 
 
-ESTIMATORS = ("pinv", *(label("weighted", iterations) for iterations in ITERATIONS))
-
-
 @dataclass(frozen=True)
 class Input:
     """An interpretation of Sect. 3.1: largest coefficients, waves rms, up to degree 2 (`low`) and above it (`high`)."""
