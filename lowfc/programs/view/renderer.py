@@ -62,11 +62,6 @@ class Renderer:
         self._panels: list[Panel | None] = [self._started(make) for make in self._makers]
         self._retry_ns = [0] * len(self._makers)
 
-    @property
-    def panels(self) -> list[Panel]:
-        """Panels that are drawn."""
-        return [panel for panel in self._panels if panel is not None]
-
     def draw(self, snapshot: Snapshot) -> None:
         """Draw a snapshot."""
         for number, panel in enumerate(self._panels):
