@@ -97,7 +97,6 @@ class Bench:
         self._begin(config, Load(0, first, "bench") if isinstance(first, Calibration) else first)
         self.watch = GainWatch(self.settings, config.control.on_harm, factory.contrast_of(config).form)
         self.world = config if world is None else world
-        self._other_disturbance = disturbance
         self.scene = scene(self.world, disturbance)
         self.start_mirror()
         self._weights = delay_weights(self.world.camera.delay_frames).astype(np.float32)
@@ -123,11 +122,6 @@ class Bench:
         """Begin a new record."""
         self.steps: list[Step] = []
         self.truths: list[Truth] = []
-
-    def change_star(self, magnitude: float) -> None:
-        """Point at a star of this V magnitude."""
-        star = self.config.star.model_copy(update={"magnitude": magnitude})
-        self.scene = scene(self.world.model_copy(update={"star": star}), self._other_disturbance)
 
     def ask(self, name: str, **fields: Any) -> None:
         """Send an operator's request; ValueError if it is refused."""

@@ -21,6 +21,7 @@ from lowfc.control.loop.inputs import Input, Load, Request
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.core.gain_watch import MIN_FRAMES, GainWatch
+from sim_camera.driver import scene
 from tests.support.in_process_loop import SMALL_MIRROR
 from tests.support.toy import CAMERA, FLUX_DN, feed, frame, frame_sequence, loaded, settings
 from tests.support.toy import calibration as toy_calibration
@@ -381,7 +382,7 @@ def test_a_fainter_star_lowers_the_gains_and_restarts_their_measurement() -> Non
     loop = bench(2.0)
     loop.run(560, record=False)
     gains_before = gains(loop)
-    loop.change_star(3.5)
+    loop.scene = scene(configuration(3.5))
     loop.run(150, record=False)
     assert named(loop, "STAR_CHANGED")[0]["ratio"] == pytest.approx(0.25, rel=0.1)
     assert (gains(loop) <= 0.5 * gains_before).all()
