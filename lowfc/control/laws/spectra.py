@@ -101,7 +101,7 @@ def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSe
     missing = np.diff(sequence) - np.uint64(1)
     cuts = np.flatnonzero(missing > MAX_INTERPOLATED_FRAMES) + 1
     pieces = [
-        _even((numbers - numbers[0]).astype(np.int64), rows)
+        interpolated((numbers - numbers[0]).astype(np.int64), rows, int(numbers[-1] - numbers[0]) + 1)
         for numbers, rows in zip(np.split(sequence, cuts), np.split(values, cuts), strict=True)
     ]
     return TimeSeries(tuple(pieces), int(missing[missing <= MAX_INTERPOLATED_FRAMES].sum()))
@@ -151,9 +151,8 @@ def in_bins(frequency_hz: Array, columns: Sequence[Array], per_decade: int = 20)
     return means[0], means[1:]
 
 
-def _even(position: Integers, rows: Array) -> Array:
-    """Rows at every position from the first to the last, interpolated where there is none."""
-    everywhere = np.arange(position[-1] + 1)
-    if everywhere.size == position.size:
+def interpolated(position: Integers, rows: Array, frames: int) -> Array:
+    """Rows (frames, columns) from those at increasing positions, interpolated where there is none."""
+    if frames == position.size:
         return rows
-    return np.stack([np.interp(everywhere, position, column) for column in rows.T], axis=1)
+    return np.stack([np.interp(np.arange(frames), position, column) for column in rows.T], axis=1)

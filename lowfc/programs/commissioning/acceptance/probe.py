@@ -24,6 +24,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws import margins
 from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw, integrator
+from lowfc.control.laws.spectra import interpolated
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.programs.cli.result import Result, result_field
@@ -161,10 +162,7 @@ class ProbeResponse:
     def filled(self, values: Array) -> Array:
         """`values` (frames, modes) with missing frames interpolated."""
         present = np.isfinite(values).all(axis=1)
-        if present.all():
-            return values
-        rows = np.arange(len(values))
-        return np.stack([np.interp(rows, rows[present], column[present]) for column in values.T], axis=1)
+        return interpolated(np.flatnonzero(present), values[present], len(values))
 
 
 def selected_modes(requested: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:
