@@ -175,17 +175,16 @@ class Bench:
             path = self._path.over(index, self.scene.instants)
             frame = self.frame(pixels)
             outputs = self.process_input(frame)
-            self._record_and_watch(outputs)
-            if outputs.step is None or outputs.step.pol_nm is None:
-                self.frames_refused += 1
-            elif record:
-                self.steps.append(outputs.step)
+            if self._record_and_watch(outputs, record):
                 self.truths.append(self.scene.truth(index, exposed_nm, path))
             if outputs.command is not None:
                 self.move_mirror(frame, outputs.command)
 
-    def _record_and_watch(self, outputs: Outputs) -> None:
-        """Record events, and apply the requests of the gain watch as the controller does."""
+    def _record_and_watch(self, outputs: Outputs, record: bool) -> bool:
+        """Record events, and apply the requests of the gain watch as the controller does.
+
+        With `record`, keep the step of a frame that was used; return whether it was kept.
+        """
         events = list(outputs.events)
         if outputs.step is not None and self.watch is not None:
             actions = self.watch.observe(outputs.step, self.state)
@@ -193,6 +192,12 @@ class Bench:
             for request in actions.requests:
                 events += self.process_input(request).events
         self.events += [(self._index - 1, event) for event in events]
+        if outputs.step is None or outputs.step.pol_nm is None:
+            self.frames_refused += 1
+            return False
+        if record:
+            self.steps.append(outputs.step)
+        return record
 
     def pol(self) -> TimeSeries:
         """Pseudo-open-loop modes (frames, modes) of the record."""

@@ -13,7 +13,7 @@ from lowfc.arrays import Array, Pixels, Single
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.stability import delay_weights
-from lowfc.control.loop.inputs import Frame, Load
+from lowfc.control.loop.inputs import Load
 from lowfc.programs.core.gain_watch import GainWatch
 from sim_camera.disturbance import BLOCK, Disturbance, Sampler
 from sim_camera.driver import disturbance_of
@@ -115,18 +115,13 @@ class ModalBench(Bench):
             )
             modes_nm = self._sampler.at(self._index)
             pixels = _encoded(modes_nm[:2].mean(axis=0) + mirror_nm + noise_nm[count % _NOISE_BLOCK])
-            time_ns = 10**18 + self._index * self.config.period_ns
-            outputs = self.process_input(Frame((1 << 32) + self._index, time_ns, 0, pixels))
             self._index += 1
-            self._record_and_watch(outputs)
+            outputs = self.process_input(self.frame(pixels))
             newest_nm = self._mirror_shapes_nm[0]
             if outputs.command is not None:
                 newest_nm = 2 * outputs.command.actuators_nm.ravel()
             self._mirror_shapes_nm = [newest_nm, *self._mirror_shapes_nm[:-1]]
-            if outputs.step is None or outputs.step.pol_nm is None:
-                self.frames_refused += 1
-            elif record:
-                self.steps.append(outputs.step)
+            if self._record_and_watch(outputs, record):
                 self._squares.append(np.square(modes_nm[2:] + mirror_nm).mean(axis=0))
 
     def residual_nm(self, *, continuous: bool = True) -> Array:
