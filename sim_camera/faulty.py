@@ -9,7 +9,7 @@ import numpy as np
 
 from lowfc.adapters.bus.bus import Publisher
 from lowfc.contract.envelope import Envelope, sequence_of, start_of
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, raised_as
 from lowfc.contract.messages import RawImage, from_timestamp, image
 from sim_camera.faults import MAX_FRAMES_LATE, Fault, Frame, Kind
 
@@ -23,11 +23,9 @@ def read_fault(file: Path) -> Fault:
     Raises:
         ConfigurationError: the file does not contain a fault.
     """
-    try:
+    with raised_as(ConfigurationError, (OSError, ValueError, TypeError, KeyError), f"{file}: not a fault"):
         values = json.loads(file.read_text())
         return Fault(**(values | {"kind": Kind(values["kind"])}))
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise ConfigurationError(f"{file}: not a fault: {error}") from None
 
 
 class FaultyFrames:

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Single
-from lowfc.contract.errors import RequestRefusedError, brief
+from lowfc.contract.errors import RequestRefusedError, brief, raised_as
 
 T = TypeVar("T")
 ARGUMENT_ERRORS = (ValueError, TypeError, OverflowError)
@@ -15,10 +15,8 @@ ARGUMENT_ERRORS = (ValueError, TypeError, OverflowError)
 
 def floats(name: str, values: npt.ArrayLike) -> Single:
     """Values of any shape, in their unit, as float32; RequestRefusedError if some are not numbers."""
-    try:
+    with raised_as(RequestRefusedError, ARGUMENT_ERRORS, f"{name} refused"):
         return np.asarray(values, np.float32)
-    except ARGUMENT_ERRORS as fault:
-        raise RequestRefusedError(f"{name} refused: {fault}") from None
 
 
 def required(name: str, value: object, kind: type[T]) -> T:

@@ -31,7 +31,7 @@ from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step
 from lowfc.contract.codecs.calibration_codec import camera_settings, decode_calibration, encode_calibration
 from lowfc.contract.codecs.codec import max_bytes
 from lowfc.contract.codecs.law_codec import wire_law
-from lowfc.contract.errors import BusError, LowfcError, RequestRefusedError
+from lowfc.contract.errors import BusError, LowfcError, RequestRefusedError, raised_as
 from lowfc.contract.messages import (
     BENCH,
     CALIBRATION,
@@ -270,10 +270,8 @@ class Client:
             remedy = "`lowfc ctl load FILE` loads one, `lowfc commission` measures one"
             raise BusError(f"no calibration is loaded in run {self.run_id!r}: {remedy}")
         sample = self._get(CALIBRATION.key, b"", ANSWER_S)  # with none in use it may be one that was refused
-        try:
+        with raised_as(BusError, (DecodeError, ValueError), f"the answer to {CALIBRATION.key} is not a calibration"):
             return decode_calibration(wire.Calibration.FromString(sample.payload))
-        except (DecodeError, ValueError) as fault:
-            raise BusError(f"the answer to {CALIBRATION.key} is not a calibration: {fault}") from None
 
     def mirror_grid(self) -> tuple[int, int]:
         """Rows and columns of the mirror's actuators, also without a calibration; BusError if no controller answers."""
@@ -340,7 +338,7 @@ class Client:
             BusError: no controller is running, or it is too slow.
             RequestRefusedError: the controller refused, with its reason.
         """
-        try:
+        with raised_as(RequestRefusedError, ARGUMENT_ERRORS, f"{name} refused"):
             message = wire.Request(
                 name=name,
                 modes=[index(mode) for mode in np.atleast_1d(modes).tolist()] if np.size(modes) else [],
@@ -353,8 +351,6 @@ class Client:
                 lease_id=(self._lease.id if self._lease is not None else 0) if lease_id is None else lease_id,
                 requester=self._requester,
             )
-        except ARGUMENT_ERRORS as fault:
-            raise RequestRefusedError(f"{name} refused: {fault}") from None
         if calibration is not None:
             message.calibration.MergeFromString(encode_calibration(required(name, calibration, Calibration), 0))
         payload = message.SerializeToString()
@@ -384,16 +380,12 @@ class Client:
 
     def _get_message(self, topic: Topic, kind: type[M], role: Role) -> M:
         """The last message that a process published on a topic; BusError if there is none."""
-        try:
+        with raised_as(BusError, DecodeError, f"the answer to {topic.key} is not a {kind.DESCRIPTOR.full_name}"):
             return kind.FromString(self._get(topic.key, b"", ANSWER_S, role).payload)
-        except DecodeError as fault:
-            raise BusError(f"the answer to {topic.key} is not a {kind.DESCRIPTOR.full_name}: {fault}") from None
 
     def _answer(self, name: str, sample: Sample) -> Answer:
-        try:
+        with raised_as(BusError, DecodeError, f"the answer to {name} is not a lowfc.v1.Request"):
             message = wire.Request.FromString(sample.payload)
-        except DecodeError as fault:
-            raise BusError(f"the answer to {name} is not a lowfc.v1.Request: {fault}") from None
         if not message.accepted:
             raise RequestRefusedError(f"{name} refused: {message.reply} (run {self.run_id})")
         state = message.state if message.HasField("state") else None

@@ -12,7 +12,8 @@ Numerical code raises ValueError; the adapters above it name the file or the key
 """
 
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 
 
@@ -44,6 +45,17 @@ class BadMessageError(BusError):
 
 class RequestRefusedError(LowfcError):
     """The controller refused an operator's request."""
+
+
+@contextmanager
+def raised_as(
+    kind: type[Exception], caught: type[Exception] | tuple[type[Exception], ...], about: object = ""
+) -> Iterator[None]:
+    """Raise the exceptions `caught` in the block as errors of this kind; their text follows `about` and a colon."""
+    try:
+        yield
+    except caught as error:
+        raise kind(f"{about}: {error}" if about else str(error)) from None
 
 
 _BRIEF = reprlib.Repr()

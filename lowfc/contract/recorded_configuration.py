@@ -6,7 +6,7 @@ from pydantic import BaseModel, ValidationError
 
 from lowfc.contract import toml_text
 from lowfc.contract.configuration import MAX_FAULTS, Configuration, explain
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, raised_as
 from lowfc.contract.former_names import renamed_keys
 from lowfc.contract.sections import InterlockSection
 
@@ -26,11 +26,9 @@ def recorded(content: bytes) -> tuple[Configuration, list[str]]:
     Raises:
         ConfigurationError: it is not a readable TOML file.
     """
-    try:
+    with raised_as(ConfigurationError, ValueError, "not a readable TOML file"):
         data = toml_text.parsed(content)
         renamed_keys(data)
-    except ValueError as error:
-        raise ConfigurationError(f"not a readable TOML file: {error}") from None
     remarks: list[str] = []
     while faults := _faults(data):
         of_keys = [detail for detail in faults if _is_of_key(data, detail)]

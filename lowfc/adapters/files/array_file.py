@@ -9,7 +9,7 @@ from numpy.lib.format import read_array as read_npy
 
 from lowfc.adapters.files import fits_file
 from lowfc.contract.codecs import input_file
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import DataFileError, raised_as
 from lowfc.contract.printable import printable
 
 
@@ -42,11 +42,11 @@ def read_array(
 
 
 def _npy(path: Path) -> npt.NDArray[np.generic]:
-    with input_file.opened(path, fits_file.MAX_BYTES) as stream:
-        try:
-            return np.asarray(read_npy(stream, allow_pickle=False))
-        except TokenError as error:
-            raise ValueError(f"its header cannot be read: {error}") from None
+    with (
+        input_file.opened(path, fits_file.MAX_BYTES) as stream,
+        raised_as(ValueError, TokenError, "its header cannot be read"),
+    ):
+        return np.asarray(read_npy(stream, allow_pickle=False))
 
 
 def _fits(path: Path) -> tuple[npt.NDArray[np.generic], str]:

@@ -16,7 +16,7 @@ from lowfc.adapters.files.twin_cache import load_or_build, load_or_fit_mirror
 from lowfc.arrays import Array, single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import CalibrationError, ConfigurationError, LowfcError
+from lowfc.contract.errors import CalibrationError, ConfigurationError, LowfcError, raised_as
 from lowfc.contract.messages import fields_of
 from lowfc.contract.sections import InterlockSection, SensorSection
 from lowfc.control.calibration.calibration import Calibration, noise_nm2, normalise_flux, reconstructor, unnormalised
@@ -61,10 +61,8 @@ def twin(config: Configuration, progress: Progress | None, warn: Callable[[str],
         ConfigurationError: the optics have fewer modes than `sensor.rank`.
     """
     spec = replace(_TWINS[config.sensor.nodes], rank=config.sensor.rank)
-    try:
+    with raised_as(ConfigurationError, ValueError, "sensor"):
         return load_or_build(sensor(config, warn), spec, band(config), progress, notice=warn)
-    except ValueError as error:
-        raise ConfigurationError(f"sensor: {error}") from None
 
 
 def contrast_of(config: Configuration) -> ModalContrast:
@@ -107,7 +105,7 @@ def electrons_per_exposure(config: Configuration) -> float:
 def detector(config: Configuration) -> Detector:
     """The camera's detector."""
     camera = config.camera
-    try:
+    with raised_as(ConfigurationError, ValueError, "camera"):
         return Detector(
             camera.gain_e_per_dn,
             camera.read_noise_e,
@@ -118,8 +116,6 @@ def detector(config: Configuration) -> Detector:
             config.dark_e,
             camera.photon_noise == "exact",
         )
-    except ValueError as error:
-        raise ConfigurationError(f"camera: {error}") from None
 
 
 def mirror(config: Configuration) -> Mirror:
@@ -214,17 +210,13 @@ def analytic_calibration(
     light = I0.reshape(-1)
     I0, H = normalise_flux(light, H, good)
     nuisance = _nuisance(config, light, good)
-    try:
+    with raised_as(CalibrationError, ValueError, f"sensor.kind = {config.sensor.kind!r}, {len(nolls)} modes"):
         R = reconstructor(I0, H, good, flux_e, equivalent_read_noise_e(camera), config.control.estimator, nuisance)
-    except ValueError as error:
-        raise CalibrationError(f"sensor.kind = {config.sensor.kind!r}, {len(nolls)} modes: {error}") from None
     _check_exposure(config, light)
 
     active = active_actuators(config)
-    try:
+    with raised_as(ConfigurationError, ValueError, "mirror"):
         commands = modes_to_actuators(mirror(config), nolls, active)
-    except ValueError as error:
-        raise ConfigurationError(f"mirror: {error}") from None
     sensed = actuators_to_modes(R, light, good, optics, on_nodes, opd_nm)
     if active is not None:
         sensed[:, ~active.reshape(-1)] = 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lowfc.contract.codecs import input_file
-from lowfc.contract.errors import ConfigurationError, DataFileError, brief, nearest
+from lowfc.contract.errors import ConfigurationError, DataFileError, brief, nearest, raised_as
 from lowfc.optics.chain import sam as sams
 
 SHIPPED = resources.files("lowfc") / "data" / "sam_layouts.json"
@@ -68,10 +68,8 @@ def parse_layout(file: Traversable, name: str, entry: Any) -> sams.Layout:
             f'{file}: layout {name} must have "hole_diameter" and "holes" as pairs [x, y], or as [x, y, diameter], in '
             f"pupil diameters ({type(error).__name__}: {brief(str(error))})"
         ) from error
-    try:
+    with raised_as(DataFileError, ValueError, file):
         sams.check(layout)
-    except ValueError as error:
-        raise DataFileError(f"{file}: {error}") from error
     return layout
 
 

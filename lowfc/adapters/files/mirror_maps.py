@@ -7,7 +7,7 @@ import numpy as np
 from lowfc.arrays import Mask, Single, single
 from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError, raised_as
 
 _NM = ("nm", "nanometer", "nanometers")
 
@@ -64,10 +64,8 @@ def shape_of(config: Configuration, key: str, file: str, units: tuple[str, ...] 
     Raises:
         ConfigurationError: the file is missing, damaged or does not fit the mirror.
     """
-    try:
+    with raised_as(ConfigurationError, DataFileError, key):
         values = read_shape(user_path(file), units)
-    except DataFileError as fault:
-        raise ConfigurationError(f"{key}: {fault}") from None
     grid = (config.mirror.rows, config.mirror.columns)
     if values.shape != grid:
         raise ConfigurationError(

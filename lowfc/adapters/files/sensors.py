@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lowfc.adapters.files.layouts import layout_warnings, load_layout
 from lowfc.arrays import Array
 from lowfc.contract.codecs import input_file
-from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
+from lowfc.contract.errors import ConfigurationError, DataFileError, nearest, raised_as
 from lowfc.contract.sections import SENSORS, SensorSection, sensor_keys
 from lowfc.optics.chain import sam as sams
 from lowfc.optics.chain.coronagraph import DARK_ZONE, Coronagraph, LyotStop, Wedge
@@ -47,14 +47,10 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
     """
     with _opened(file) as arrays:
         quarter = np.asarray(arrays["quarter"])
-    try:
+    with raised_as(DataFileError, ValueError, file):
         from_quarter(quarter, 2 * max(len(np.atleast_1d(quarter)), 1))
-    except ValueError as error:
-        raise DataFileError(f"{file}: {error}") from error
-    try:
+    with raised_as(ConfigurationError, ValueError, "pupil sampling"):
         return from_quarter(quarter, samples)
-    except ValueError as error:
-        raise ConfigurationError(f"pupil sampling: {error}") from error
 
 
 def load_dark_zone(file: Traversable) -> Wedge:
@@ -97,7 +93,7 @@ def sensor_from(
     """
     section = SensorSection() if section is None else section
     pupil = _pupil(section)
-    try:
+    with raised_as(ConfigurationError, ValueError, "sensor"):
         focal_mask = _focal_mask(section)
         match section.kind:
             case "clowfs":
@@ -114,8 +110,6 @@ def sensor_from(
                     warn(text)
                 relay = ApertureMask(sams.transmission(layout, len(pupil), section.hole_samples))
         return Sensor(pupil, focal_mask, relay, wavelength_nm)
-    except ValueError as error:
-        raise ConfigurationError(f"sensor: {error}") from error
 
 
 def sensor_named(name: str) -> Sensor:

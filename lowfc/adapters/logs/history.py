@@ -34,7 +34,7 @@ from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import start_of
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError, raised_as
 from lowfc.contract.messages import (
     CALIBRATION,
     CAMERA_STATE,
@@ -378,10 +378,8 @@ class _HistoryBuilder:
     def _last_calibration(self) -> Calibration | None:
         history = self._history
         if self._calibration is not None:
-            try:
+            with raised_as(DataFileError, ValueError, history.log.path):
                 return decode_calibration(self._calibration)
-            except ValueError as error:
-                raise DataFileError(f"{history.log.path}: {error}") from None
         calibration_id = history.controller.calibration_id if history.controller is not None else ""
         attached = attached_calibration(history.log, calibration_id) if calibration_id else None
         if attached is not None:

@@ -4,7 +4,7 @@ from math import isfinite
 
 from google.protobuf.message import DecodeError
 
-from lowfc.contract.errors import BadMessageError
+from lowfc.contract.errors import BadMessageError, raised_as
 from lowfc.contract.messages import checked_time_ns, from_timestamp, timestamp, wire
 from lowfc.control.loop.interlocks import MAX_TEXT_LENGTH, Action, BenchReport, Interlock, Value
 
@@ -24,10 +24,8 @@ def decode_bench_value(payload: bytes) -> Value:
     """Value of a received BenchValue; BadMessageError if it cannot be read or is invalid."""
     if len(payload) > MAX_BYTES:
         raise BadMessageError(f"a bench value has at most {MAX_BYTES} bytes, got {len(payload)}")
-    try:
+    with raised_as(BadMessageError, DecodeError):
         message = wire.BenchValue.FromString(payload)
-    except DecodeError as error:
-        raise BadMessageError(str(error)) from None
     checked_time_ns(message.timestamp)
     return _checked(message)
 
@@ -54,10 +52,8 @@ def value_of(message: wire.BenchValue) -> Value:
 
 
 def _checked(message: wire.BenchValue) -> Value:
-    try:
+    with raised_as(BadMessageError, ValueError):
         return value_of(message)
-    except ValueError as error:
-        raise BadMessageError(str(error)) from None
 
 
 def wire_report(report: BenchReport) -> wire.BenchReport:

@@ -10,7 +10,7 @@ from lowfc.arrays import Single
 from lowfc.contract.codecs.bench_codec import report_of, wire_report
 from lowfc.contract.codecs.calibration_codec import camera_settings, decode_calibration, wire_camera
 from lowfc.contract.codecs.law_codec import law_header, law_of, wire_law
-from lowfc.contract.errors import BadMessageError
+from lowfc.contract.errors import BadMessageError, raised_as
 from lowfc.contract.messages import (
     MONO16,
     RawImage,
@@ -122,10 +122,8 @@ def decode_camera(payload: bytes, start_s: int) -> CameraSettings:
 
     BadMessageError if it cannot be read, has no pixels, or a number in it is invalid.
     """
-    try:
+    with raised_as(BadMessageError, DecodeError):
         state = wire.CameraState.FromString(payload)
-    except DecodeError as error:
-        raise BadMessageError(str(error)) from None
     checked_time_ns(state.timestamp)
     camera = camera_settings(state, start_s)
     levels = (camera.bias_dn, camera.saturation_dn, camera.gain_e_per_dn, camera.em_gain, camera.read_noise_e)

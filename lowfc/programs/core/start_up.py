@@ -14,7 +14,7 @@ from lowfc.adapters.process.latch import Latch
 from lowfc.arrays import Single
 from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
+from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError, raised_as
 from lowfc.control.kernel.tables import NUMPY
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import check_law
@@ -153,10 +153,8 @@ def _checked_flat_nm(config: Configuration) -> Single | None:
 def _check_gains(config: Configuration) -> None:
     settings = factory.settings(config)
     for key, gain, leak in zip(("tilt_gain", "gain"), settings.gain, settings.leak, strict=True):
-        try:
+        with raised_as(ConfigurationError, ValueError, f"control.{key}"):
             check_gains([gain], [leak], settings.delay_frames)
-        except ValueError as fault:
-            raise ConfigurationError(f"control.{key}: {fault}") from None
 
 
 def _check_law_modes(config: Configuration) -> None:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, raised_as
 
 
 def flag(name: str) -> str:
@@ -56,10 +56,8 @@ def with_options_of(kind: type[Any]) -> Callable[[Callable[..., None]], Callable
     def decorated(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
         def run(**values: Any) -> None:
-            try:
+            with raised_as(ConfigurationError, ValueError):
                 request = kind(**{option.name: values.pop(option.name) for option in options})
-            except ValueError as error:
-                raise ConfigurationError(str(error)) from error
             command(request, **values)
 
         _, *others = inspect.signature(command, eval_str=True).parameters.values()

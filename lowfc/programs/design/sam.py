@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.files.sensors import load_pupil
 from lowfc.adapters.process.progress import counting_bar
-from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.contract.errors import ConfigurationError, LowfcError, raised_as
 from lowfc.control.loop.wording import counted
 from lowfc.design.goal import predictions
 from lowfc.design.paper import TABLE4_MODES
@@ -35,10 +35,8 @@ STATE_PERIOD_S = 10.0
 
 def begin(search: Search) -> list[Chain]:
     """Start the chains of a new search at random layouts; ConfigurationError if the holes cannot be placed."""
-    try:
+    with raised_as(ConfigurationError, ValueError):
         return [start(search.bounds, search.seed, i, search.steps) for i in range(search.chains)]
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
 
 
 def design_sam(

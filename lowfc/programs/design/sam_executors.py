@@ -12,7 +12,7 @@ from typing import Any
 
 from lowfc.adapters.process.child import interrupt_blocked
 from lowfc.adapters.process.extras import package_required
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, raised_as
 
 DASK_TIMEOUT_S = 10.0
 
@@ -75,11 +75,11 @@ def is_lost(error: BaseException) -> bool:
 
 @contextmanager
 def _dask(address: str) -> Iterator[Executor]:
-    try:
-        with package_required("--scheduler requires Dask", "cluster"):
-            client: Any = import_module("distributed").Client(address, timeout=DASK_TIMEOUT_S)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"no Dask scheduler answers at {address!r}: {error}") from error
+    with (
+        raised_as(ConfigurationError, (OSError, ValueError), f"no Dask scheduler answers at {address!r}"),
+        package_required("--scheduler requires Dask", "cluster"),
+    ):
+        client: Any = import_module("distributed").Client(address, timeout=DASK_TIMEOUT_S)
     for name in ("distributed", "distributed.client"):  # a lost scheduler is reported by us, without a traceback
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:

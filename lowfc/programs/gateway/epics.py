@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.adapters.process.extras import package_required
-from lowfc.contract.errors import BusError, LowfcError
+from lowfc.contract.errors import BusError, LowfcError, raised_as
 from lowfc.contract.sections import Gateway
 from lowfc.control.loop.interlocks import MAX_TEXT_LENGTH, Value
 from lowfc.programs.gateway.variables import Kind, Put, Variable
@@ -63,10 +63,8 @@ class EpicsGateway:
             "EPICS_PVAS_BEACON_ADDR_LIST": address,
         }
         provided = {f"{config.prefix}{name}": pv for name, pv in self._pvs.items()}
-        try:
+        with raised_as(BusError, RuntimeError, f"cannot serve PV Access on {address}:{port}"):
             self._server = p4p.server.Server(providers=[provided], conf=served, useenv=False)
-        except RuntimeError as fault:
-            raise BusError(f"cannot serve PV Access on {address}:{port}: {fault}") from None
         if self.port != port:  # the library would serve on another port
             self._server.stop()
             raise BusError(f"cannot serve PV Access on {address}:{port}: it is in use; set another gateway.port")

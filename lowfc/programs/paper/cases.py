@@ -2,8 +2,8 @@
 
 import threading
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from math import isfinite
@@ -17,7 +17,7 @@ from lowfc.adapters.files.layouts import layout_names
 from lowfc.adapters.files.sensors import coronagraph_from, sensor_from
 from lowfc.adapters.files.twin_cache import load_or_build
 from lowfc.arrays import Array, Mask
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, raised_as
 from lowfc.contract.sections import SENSORS, SensorSection, sensor_keys
 from lowfc.control.calibration.calibration import normalise_flux, reconstructor
 from lowfc.design.estimators import Fit, fit
@@ -157,13 +157,9 @@ class Prepared:
         with self._fitting(H.shape[1]):
             return I0_normalised, reconstructor(I0_normalised, H_normalised, good, flux_e, read_noise_e)
 
-    @contextmanager
-    def _fitting(self, modes: int) -> Iterator[None]:
+    def _fitting(self, modes: int) -> AbstractContextManager[None]:
         """Convert the ValueError of a fit of modes that the sensor cannot distinguish to ConfigurationError."""
-        try:
-            yield
-        except ValueError as error:
-            raise ConfigurationError(f"sensor {self.name}, {modes} modes: {error}") from error
+        return raised_as(ConfigurationError, ValueError, f"sensor {self.name}, {modes} modes")
 
     @cached_property
     def _node_modes(self) -> Array:

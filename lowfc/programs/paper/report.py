@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.process.progress import counting_bar
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError, raised_as
 from lowfc.programs.cli.result import table as text_table
 from lowfc.programs.paper.cases import Case, Context, plain, prepared
 from lowfc.programs.paper.figures import aberration, light, modes, screens
@@ -115,13 +115,11 @@ def run(names: Sequence[str], context: Context, plots: Path | None = None) -> li
             progress(name, 0, 1)
             case = CASES[name]
             table = {"table": name, "title": case.title, "trials": context.trials, "seed": context.seed, "plot": None}
-            try:
+            with raised_as(ConfigurationError, ConfigurationError, name):
                 rows = [plain(row) for row in case.run(context)]
                 if plots is not None and case.plot is not None:
                     table["plot"] = f"{name}.png"
                     case.plot(context, plots / f"{name}.png")
-            except ConfigurationError as error:
-                raise ConfigurationError(f"{name}: {error}") from error
             tables.append(table | {"rows": rows})
     return tables
 

@@ -13,7 +13,7 @@ from lowfc.arrays import Array, single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import CalibrationError
+from lowfc.contract.errors import CalibrationError, raised_as
 from lowfc.control.calibration.alignment import Alignment, Geometry, align, onto
 from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.control.calibration.response_fit import correlation
@@ -56,10 +56,8 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
         light_dn = pixels.mean(axis=0) - before.dark.reshape(before.shape).astype(np.float64)
         flux_dn = float(light_dn.reshape(-1) @ before.good)
         computed = analytic(config, console)
-        try:
+        with raised_as(CalibrationError, ValueError):
             alignment = align(light_dn, computed.reference.astype(np.float64).reshape(computed.shape))
-        except ValueError as error:
-            raise CalibrationError(str(error)) from None
         player = Player(loop, on_sensor(config, computed, alignment.geometry, flux_dn, before), reporter(console))
 
         def poke(mode: int) -> Array:
@@ -90,7 +88,7 @@ def on_sensor(
     I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, before.shape).reshape(-1)
     H = onto(computed.response.astype(np.float64).reshape(shape), geometry, before.shape).reshape(pixels, -1)
     good = before.good.astype(np.float64)
-    try:
+    with raised_as(CalibrationError, (ValueError, CalibrationError), "too little of the image falls on the sensor"):
         I0, H = normalise_flux(np.maximum(I0, 0), H, good)
         calibration = replace(
             computed,
@@ -107,8 +105,6 @@ def on_sensor(
             camera=before.camera,
         )
         R = compute_reconstructor(config, calibration, None, estimator=config.control.estimator).matrix
-    except (ValueError, CalibrationError) as error:
-        raise CalibrationError(f"too little of the image falls on the sensor: {error}") from None
     return identified(replace(calibration, reconstructor=single(R)))
 
 

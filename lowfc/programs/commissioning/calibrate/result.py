@@ -11,7 +11,7 @@ from lowfc.adapters.files import calibration_file, factory
 from lowfc.arrays import Array, single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import CalibrationError
+from lowfc.contract.errors import CalibrationError, raised_as
 from lowfc.control.calibration.calibration import FIRST, Calibration, comparable
 from lowfc.control.calibration.regularised import Reconstruction, advice, reconstruct
 from lowfc.control.calibration.response_fit import MAX_ELEMENT, MAX_ELEMENT_RMS, Check, Measured, cross_talk
@@ -131,10 +131,8 @@ def compute_reconstructor(
     flux_e = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain
     arrays = calibration.reference, calibration.response, calibration.good
     I0, H, good = (array.astype(np.float64) for array in arrays)
-    try:
+    with raised_as(CalibrationError, ValueError):
         return reconstruct(I0, H, initial, good, flux_e, factory.equivalent_read_noise_e(camera), **options)
-    except ValueError as error:
-        raise CalibrationError(str(error)) from None
 
 
 def measured_calibration(

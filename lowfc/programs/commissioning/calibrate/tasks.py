@@ -18,7 +18,7 @@ from lowfc.arrays import Array, single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
+from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError, raised_as
 from lowfc.control.calibration.adapted import with_dark, with_reference
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.dark_frames import check_dark, measure_dark
@@ -191,10 +191,8 @@ def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
     before = replace(loop.calibration(), camera=loop.camera())
     if before.camera is not None:  # also if no frame is used: a file has one size
         check_size(before.camera.shape, before)
-    try:
+    with raised_as(CalibrationError, ValueError):
         yield before, noise
-    except ValueError as error:
-        raise CalibrationError(str(error)) from None
 
 
 def write(calibration: Calibration, out: Path, loop: Client | None) -> Calibration:

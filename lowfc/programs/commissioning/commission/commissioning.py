@@ -15,7 +15,7 @@ from lowfc.arrays import Single
 from lowfc.client import Client
 from lowfc.contract.codecs.law_codec import driving, integrator_of
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import CalibrationError, LowfcError
+from lowfc.contract.errors import CalibrationError, LowfcError, raised_as
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay
@@ -245,13 +245,11 @@ class Commissioning:
         controller, settling, automatic = self._law_of_check()
         frames = settling + max(MIN_RESIDUAL_FRAMES, settling)
         self._announce("prediction")
-        try:
+        with raised_as(CalibrationError, ValueError, "the residual cannot be predicted"):
             opened = self._observe(frames)
             weights = delay_weights(max(delay_frames, 1.0)).astype(np.float32)
             missing = missing_before(opened.sequence)
             predicted = _rms_nm(counterfactual(controller, weights, opened.pol_nm, missing)[0], settling)
-        except ValueError as error:
-            raise CalibrationError(f"the residual cannot be predicted: {error}") from None
         self._results["predicted_error_nm"] = predicted
         gain = f", at a gain of {CHECK_GAIN:g} in place of automatic gains" if automatic else ""
         text = (

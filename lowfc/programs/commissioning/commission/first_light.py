@@ -11,7 +11,7 @@ from lowfc.arrays import Array
 from lowfc.client import Frame
 from lowfc.contract.codecs.calibration_codec import camera_settings
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import CalibrationError
+from lowfc.contract.errors import CalibrationError, raised_as
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.dark_frames import check_dark, measure_dark
@@ -79,10 +79,8 @@ def with_measured_dark(camera: CameraSettings, frames: npt.NDArray[np.number], r
     """A sensor with dark and bad pixels from dark frames (frames, rows, columns)."""
     if frames.shape[1:] != camera.shape:
         raise CalibrationError(f"the dark frames have {frames.shape[1:]} pixels, the camera {camera.shape}")
-    try:
+    with raised_as(CalibrationError, ValueError):
         measured = measure_dark(frames.reshape(len(frames), -1))
-    except ValueError as error:
-        raise CalibrationError(str(error)) from None
     report(str(measured))
     return Sensor(camera, measured.dark_dn, measured.good, measured=True)
 
@@ -111,10 +109,8 @@ def calibration_with_reference(
         )
     reference = image * sensor.good / flux_dn
     if sensor.measured:
-        try:
+        with raised_as(CalibrationError, ValueError):
             check_dark(sensor.dark_dn, reference, flux_dn)
-        except ValueError as error:
-            raise CalibrationError(str(error)) from None
     modes = len(computed.noll)
     report(f"flux {flux_dn:.4g} DN per frame, mean of {len(frames)} frames")
     return replace(

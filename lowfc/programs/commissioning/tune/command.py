@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from lowfc.adapters.process.terminal import AnyRun, Json, LogsOrLive
-from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError, RequestRefusedError
+from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError, RequestRefusedError, raised_as
 from lowfc.programs.cli.result import print_result
 
 if TYPE_CHECKING:
@@ -62,10 +62,8 @@ def tune(
             telemetry = telemetry_from_run(loop, live or 0.0, lambda passed_s: bar.update(task, completed=passed_s))
     with passing_bar(console) as bar:
         bar.add_task(f"tuning {controller}", total=None)
-        try:
+        with raised_as(DataFileError, ValueError, telemetry.source):
             best, gains = tuned(telemetry, controller)
-        except ValueError as error:
-            raise DataFileError(f"{telemetry.source}: {error}") from None
         result = result_of(telemetry, best, gains, controller)
     result.files, result.applied = [str(file) for file in (out, plot) if file is not None], None
     if out is not None:

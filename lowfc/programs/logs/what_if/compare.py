@@ -10,7 +10,7 @@ from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.recovery import missing_end_text
 from lowfc.arrays import Array, Mask, Single
 from lowfc.contract.codecs.calibration_codec import identified
-from lowfc.contract.errors import CalibrationError, ConfigurationError
+from lowfc.contract.errors import CalibrationError, ConfigurationError, raised_as
 from lowfc.contract.messages import MIRROR_STATE
 from lowfc.control.calibration.calibration import ESTIMATORS, Calibration, reconstructor
 from lowfc.control.laws.continuous import continuous_residual_nm2
@@ -194,7 +194,7 @@ def _reconstructed(calibration: Calibration, estimator: str, run: LoggedRun) -> 
     if configuration is None:
         raise ConfigurationError(f"{path}: has no configuration, so the noise of a pixel is unknown")
     camera = detector(configuration)
-    try:
+    with raised_as(CalibrationError, ValueError, f"{path}: {estimator} reconstructor"):
         R = reconstructor(
             calibration.reference.astype(float),
             calibration.response.astype(float),
@@ -203,8 +203,6 @@ def _reconstructed(calibration: Calibration, estimator: str, run: LoggedRun) -> 
             equivalent_read_noise_e(camera),
             estimator,
         )
-    except ValueError as error:
-        raise CalibrationError(f"{path}: {estimator} reconstructor: {error}") from None
     return identified(replace(calibration, reconstructor=R.astype(np.float32), estimator=estimator))
 
 

@@ -14,7 +14,7 @@ from lowfc.adapters.files.factory import settings
 from lowfc.adapters.process.terminal import configuration
 from lowfc.arrays import Mask, Single
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import ConfigurationError, nearest
+from lowfc.contract.errors import ConfigurationError, nearest, raised_as
 from lowfc.control.calibration.calibration import ESTIMATORS
 from lowfc.control.laws.integrator import TIP_TILT, Integrator
 from lowfc.control.laws.what_if import Controller
@@ -94,11 +94,9 @@ def law(what: WhatIf, noll: tuple[int, ...], logged: Integrator) -> Integrator:
         values[:] = what.overrides.get(key, values)
         values[tilts] = what.overrides.get(f"tilt_{key}", values[tilts])
         changed.append(values)
-    try:
+    with raised_as(ConfigurationError, ValueError, "--set"):
         gain, leak, limit_nm = changed
         return Integrator(gain, leak, limit_nm)
-    except ValueError as error:
-        raise ConfigurationError(f"--set: {error}") from None
 
 
 def logged_gains(what: WhatIf, noll: tuple[int, ...]) -> Mask:
