@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from astropy.io.fits.verify import VerifyWarning
 
 from lowfc.adapters.bus.run import Run
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.realtime import spread
+from lowfc.arrays import Pixels, Single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.errors import ConfigurationError
@@ -21,9 +21,6 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.programs.measure.frame_source import FRAMES_FILE
 from lowfc.programs.measure.latency.run import prepared
-
-Single = npt.NDArray[np.float32]
-Frames = npt.NDArray[np.uint16]
 
 FRAMES = 8
 """Different frames of each size."""
@@ -76,7 +73,7 @@ def configuration(size: Size, rate_hz: float, **realtime: Any) -> Configuration:
     return load(None, overrides, spread(os.sched_getaffinity(0), simulated=False))
 
 
-def random_calibration(size: Size, config: Configuration) -> tuple[Calibration, Frames]:
+def random_calibration(size: Size, config: Configuration) -> tuple[Calibration, Pixels]:
     """A random calibration, and frames (frames, rows, columns) whose noise is 1 nm rms in every mode."""
     rng = np.random.default_rng(size.bytes)
     light_dn = _LIGHT_DN * rng.uniform(0.5, 1.5, size.pixels)
