@@ -7,7 +7,6 @@ Needs a Vulkan driver: `apt install mesa-vulkan-drivers libvulkan1`.
 import contextlib
 import os
 import random
-import signal
 import subprocess
 import sys
 import tempfile
@@ -67,9 +66,8 @@ class PictureRun(ChaosBench):
     def stop_controller_repeatedly(self) -> None:
         """Stop the controller repeatedly for 40 ms."""
         for _ in range(12):
-            self.signal(Role.CONTROLLER, signal.SIGSTOP)
-            time.sleep(0.04)
-            self.signal(Role.CONTROLLER, signal.SIGCONT)
+            with self.stopped(Role.CONTROLLER):
+                time.sleep(0.04)
             time.sleep(0.3)
 
 
