@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -102,11 +103,8 @@ class MirrorLoop:
         self._y_factors: Single = influence_factors(mirror, axis, mirror.rows).astype(np.float32)
         self._x_factors: Single = influence_factors(mirror, axis, mirror.columns).astype(np.float32)
         self._refused: Reason | None = None
-        self._start_check = StartCheck(
-            service.clock,
-            config.control.max_start_ahead_h,
-            lambda start, here: service.event("START_AHEAD", what="commands", start=start, here=here),
-        )
+        report_ahead = partial(service.event, "START_AHEAD", what="commands")
+        self._start_check = StartCheck(service.clock, config.control.max_start_ahead_h, report_ahead)
         flat_nm = np.zeros(self._protection.grid, np.float32)
         self._status = Status(flat_nm, flat_nm)
         self._known = self._returning = False

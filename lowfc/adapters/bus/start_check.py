@@ -13,11 +13,11 @@ _NS = 1_000_000_000
 class StartCheck:
     """Compares the start in received sequences with this host's clock."""
 
-    def __init__(self, clock: Clock, max_ahead_h: float, refused: Callable[[str, str], None]) -> None:
+    def __init__(self, clock: Clock, max_ahead_h: float, refused: Callable[..., None]) -> None:
         """Refuse starts more than `max_ahead_h` hours ahead of `clock`; 0 or a simulated clock disables the check.
 
-        `refused` is called with the start and this host's time, both UTC, when the refused start changes, at most once
-        a second.
+        `refused` is called with the refused `start` and this host's time, `here`, both UTC, when the start changes, at
+        most once a second.
         """
         self._clock = clock
         self._ahead_s = round(max_ahead_h * _HOUR_S)
@@ -37,7 +37,7 @@ class StartCheck:
         start_s = start_of(sequence)
         if start_s != self._reported_s and now_s != self._reported_at_s:  # a faulty sender must not fill the log
             self._reported_s, self._reported_at_s = start_s, now_s
-            self._refused(_utc(start_s), _utc(now_s))
+            self._refused(start=_utc(start_s), here=_utc(now_s))
         return True
 
 

@@ -81,11 +81,8 @@ class Controller:
         self._gain_requests: deque[Request] = deque()
         self._latched_safe = latch.safe
         self._safe_signalled = False
-        self._start_check = StartCheck(
-            service.clock,
-            config.control.max_start_ahead_h,
-            lambda start, here: service.event("START_AHEAD", what="frames", start=start, here=here),
-        )
+        report_ahead = partial(service.event, "START_AHEAD", what="frames")
+        self._start_check = StartCheck(service.clock, config.control.max_start_ahead_h, report_ahead)
         warms_up = config.realtime.cache_warmup and not config.lockstep
         self._warmup = CacheWarmup(config.period_ns) if warms_up else None
         self._last_sample: Sample | None = None
