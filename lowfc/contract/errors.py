@@ -51,11 +51,15 @@ class RequestRefusedError(LowfcError):
 def raised_as(
     kind: type[Exception], caught: type[Exception] | tuple[type[Exception], ...], about: object = ""
 ) -> Iterator[None]:
-    """Raise the exceptions `caught` in the block as errors of this kind; their text follows `about` and a colon."""
+    """Raise the exceptions `caught` in the block as errors of this kind; their text follows `about` and a colon.
+
+    The text of an error of the system is its reason alone.
+    """
     try:
         yield
     except caught as error:
-        raise kind(f"{about}: {error}" if about else str(error)) from None
+        text = getattr(error, "strerror", None) or error
+        raise kind(f"{about}: {text}" if about else str(text)) from None
 
 
 _BRIEF = reprlib.Repr()

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from lowfc.adapters.bus import DEFAULT_RUN as DEFAULT_RUN
 from lowfc.contract.codecs.input_file import user_path
-from lowfc.contract.errors import BusError, DataFileError, brief
+from lowfc.contract.errors import BusError, DataFileError, brief, raised_as
 from lowfc.contract.messages import Role
 from lowfc.contract.network import Network
 
@@ -179,10 +179,8 @@ def open_run(
     if not path.is_dir():
         if not mirrors:
             raise BusError(f"there is no run {run_id!r}")
-        try:
+        with raised_as(DataFileError, OSError, f"{path} cannot be made"):
             _make(path, mirrors, listeners, requested)
-        except OSError as fault:
-            raise DataFileError(f"{path} cannot be made: {fault.strerror}") from fault
     own_directory(path)
     links = _read(path)
     if requested.router and requested != links.network and Role.LAUNCHER not in links.ports:
@@ -241,10 +239,8 @@ def runtime_base() -> Path:
 
 def own_directory(path: Path) -> Path:
     """Check that `path` is a directory of this user, closed to all others and not a link; otherwise DataFileError."""
-    try:
+    with raised_as(DataFileError, OSError, f"{path} cannot be read"):  # such as a run that ends at this moment
         status = path.lstat()
-    except OSError as fault:  # such as a run that ends at this moment
-        raise DataFileError(f"{path} cannot be read: {fault.strerror}") from fault
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077:
         raise DataFileError(
             f"{path} should be a directory of user {os.geteuid()} with mode 700, and is "

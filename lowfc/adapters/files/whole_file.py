@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError, raised_as
 
 _NAME_LENGTH = 50  # characters of the final name in that of the temporary file, which must not be too long
 
@@ -60,14 +60,12 @@ def require_folder(*files: Path | None) -> None:
     """
     written = [file for file in files if file is not None]
     for file in written:
-        try:
+        with raised_as(DataFileError, OSError, f"{file} cannot be written"):
             if not file.parent.is_dir():
                 raise DataFileError(f"{file} cannot be written: there is no directory {file.parent}")
             _require_replaceable(file)
             with tempfile.TemporaryFile(dir=file.parent):
                 pass
-        except OSError as error:
-            raise DataFileError(f"{file} cannot be written: {error.strerror}") from error
     if len({os.path.realpath(file) for file in written}) < len(written):  # Path.resolve fails on a loop of links
         raise ConfigurationError(f"these must be different files: {', '.join(map(str, written))}")
 
@@ -80,10 +78,10 @@ def _require_replaceable(path: Path, source: Path | None = None) -> None:
         raise OSError(errno.EINVAL, "not a regular file")
     from mcap.writer import MCAP0_MAGIC  # slow
 
-    try:
-        with path.open("rb") as file:
-            is_log = file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
-    except OSError as fault:
-        raise DataFileError(f"{path} is not overwritten: cannot read whether it is a log: {fault.strerror}") from fault
+    with (
+        raised_as(DataFileError, OSError, f"{path} is not overwritten: cannot read whether it is a log"),
+        path.open("rb") as file,
+    ):
+        is_log = file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
     if is_log or (source is not None and source.exists() and path.samefile(source)):
         raise DataFileError(f"{path} is a log, which is never overwritten; choose another name")

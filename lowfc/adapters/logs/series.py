@@ -10,7 +10,7 @@ from pathlib import Path
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.writer import FILE_MODE, PART, Attachment, LogWriter, log_path
 from lowfc.adapters.process.clock import Clock
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import DataFileError, raised_as
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +102,8 @@ class LogSeries:
     def begin(self, first: Iterable[Sample], *, new_recording: bool = True) -> None:
         """Begin a file of a new or of the present recording with the messages `first`, on which later ones depend."""
         now_ns = self._clock.host_ns()
-        try:
+        with raised_as(DataFileError, OSError, f"{self._folder} cannot be accessed"):
             path = log_path(self._folder, now_ns)
-        except OSError as fault:
-            raise DataFileError(f"{self._folder} cannot be accessed: {fault.strerror}") from fault
         if new_recording:
             self._recording, self._part_number = path.stem, 0
         self._part_number += 1
@@ -143,10 +141,8 @@ class LogSeries:
     def remove(self) -> None:
         """Remove the files, all finished; the caller knows that they hold no messages of other processes."""
         while self.files:
-            try:
+            with raised_as(DataFileError, OSError, f"{self.files[-1]} is empty and cannot be removed"):
                 self.files[-1].unlink(missing_ok=True)
-            except OSError as fault:
-                raise DataFileError(f"{self.files[-1]} is empty and cannot be removed: {fault.strerror}") from fault
             self.files.pop()
         self._messages = self._bytes = 0
 
@@ -194,10 +190,8 @@ def shortage(folder: Path, min_free_bytes: int) -> str:
         raise DataFileError(
             f"no log can be recorded in {folder}: {parent} is no folder; name another (recorder.folder)"
         )
-    try:
+    with raised_as(DataFileError, OSError, f"{folder} cannot be accessed"):
         free_bytes = shutil.disk_usage(parent).free
-    except OSError as fault:
-        raise DataFileError(f"{folder} cannot be accessed: {fault.strerror}") from fault
     if free_bytes >= min_free_bytes:
         return ""
     return (
@@ -209,7 +203,5 @@ def shortage(folder: Path, min_free_bytes: int) -> str:
 def existing(folder: Path) -> Path:
     """The folder, or its nearest existing parent; DataFileError if it cannot be accessed."""
     absolute = folder.absolute()
-    try:
+    with raised_as(DataFileError, OSError, f"{folder} cannot be accessed"):
         return next(path for path in (absolute, *absolute.parents) if path.exists())
-    except OSError as fault:
-        raise DataFileError(f"{folder} cannot be accessed: {fault.strerror}") from fault

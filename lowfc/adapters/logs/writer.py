@@ -27,7 +27,7 @@ from mcap.writer import CompressionType, Writer
 from lowfc import __version__
 from lowfc.adapters.bus.bus import Sample
 from lowfc.contract.envelope import count_of, start_of
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import DataFileError, raised_as
 from lowfc.contract.messages import Topic, topic_of
 from lowfc.contract.printable import encodable
 
@@ -109,11 +109,9 @@ class LogWriter:
         self._schemas: dict[str, int] = {}
         if self.part.exists() or path.exists():
             raise DataFileError(f"{path} already exists; a log is never overwritten")
-        try:
+        with raised_as(DataFileError, OSError, f"{self.part} cannot be created"):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._raw = _File(self.part, file_mode)
-        except OSError as fault:
-            raise DataFileError(f"{self.part} cannot be created: {fault.strerror}") from fault
         self._file = BufferedWriter(self._raw)
         try:
             self._writer = begun_writer(self._file)

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from lowfc.adapters.bus.run import runtime_base, runtime_path, write_once
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import DataFileError, raised_as
 
 SIMULATED_START_NS = 1_767_225_600_000_000_000
 """2026-01-01T00:00:00Z, the start of every lockstep run."""
@@ -90,10 +90,8 @@ def boot_offset_ns(base: Path) -> int:
     DataFileError if its file in `base` is damaged, or cannot be read or made.
     """
     path = boot_file(base)
-    try:
+    with raised_as(DataFileError, OSError, f"{path} cannot be read or made"):
         text = write_once(path, str(time.time_ns() - time.monotonic_ns()))
-    except OSError as fault:
-        raise DataFileError(f"{path} cannot be read or made: {fault.strerror}") from fault
     try:
         return int(text)
     except ValueError:

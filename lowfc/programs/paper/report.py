@@ -101,10 +101,8 @@ def run(names: Sequence[str], context: Context, plots: Path | None = None) -> li
         prepared(name)  # report an invalid name before the work, not after it
     if plots is not None:
         figure_class()
-        try:
+        with raised_as(DataFileError, OSError, f"the folder {plots} cannot be created"):
             plots.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise DataFileError(f"the folder {plots} cannot be created: {error.strerror}") from error
     with counting_bar(Console(stderr=True), MofNCompleteColumn(), TimeElapsedColumn()) as count, threadpool_limits(1):
 
         def progress(what: str, done: int, total: int) -> None:

@@ -15,7 +15,7 @@ from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.realtime import set_up_below_loop
 from lowfc.contract.codecs import input_file
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import DataFileError, raised_as
 from lowfc.contract.events import Level
 from lowfc.contract.messages import Role, wire
 from lowfc.programs.core.recording.alarm import Alarm
@@ -90,7 +90,5 @@ def _launched_processes(run: Run) -> AbstractSet[str]:
 
 
 def _attachment(path: Path, media_type: str) -> Attachment:
-    try:
+    with raised_as(DataFileError, OSError, f"{path} cannot be read for the log"):
         return Attachment(path.name, media_type, input_file.read_whole(path, _MAX_ATTACHMENT_BYTES))
-    except OSError as fault:
-        raise DataFileError(f"{path} cannot be read for the log: {fault.strerror}") from fault
