@@ -44,7 +44,6 @@ from lowfc.contract.messages import (
     STEP,
     Log,
     Role,
-    Topic,
     image,
     wire,
 )
@@ -55,7 +54,8 @@ from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.programs.cli.modes import noll_of
 from lowfc.programs.cli.status import json_object, text
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from tests.support.in_process_loop import ReportingBus
 from tests.support.loops import lowfc, until
 from tests.support.recording import Bench, bodies_of, put
 from tests.support.toy import NOLL, calibration
@@ -447,19 +447,6 @@ def test_mirror_watch_reports_a_mirror_that_stopped_following(refused: int, why:
     report(wire.MIRROR_STATUS_FOLLOWING)
     watch.read()
     assert watch.interruption == f"the mirror 'dm' did not follow commands, because {why}"
-
-
-class ReportingBus(MemoryBus):
-    """A bus on which `report` is called at each subscription of a ring."""
-
-    def __init__(self, hub: MemoryHub, report: Callable[[], object]) -> None:
-        super().__init__(hub, "operator", HostClock())
-        self._report = report
-
-    def ring(self, topic: Topic, capacity: int) -> MemoryRing:
-        ring = super().ring(topic, capacity)
-        self._report()
-        return ring
 
 
 # Streams.

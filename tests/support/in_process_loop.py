@@ -59,16 +59,16 @@ class Reservation:
         return progress
 
 
-class OperatorBus(MemoryBus):
-    """Connection of an operator's program; a frame is exposed at each subscription of a ring."""
+class ReportingBus(MemoryBus):
+    """Connection of an operator's program; `report` is called at each subscription of a ring."""
 
-    def __init__(self, loop: "InProcessLoop") -> None:
-        super().__init__(loop.hub, "operator", HostClock())
-        self._loop = loop
+    def __init__(self, hub: MemoryHub, report: Callable[[], object]) -> None:
+        super().__init__(hub, "operator", HostClock())
+        self._report = report
 
     def ring(self, topic: Topic, capacity: int) -> MemoryRing:
         ring = super().ring(topic, capacity)
-        self._loop.expose()
+        self._report()
         return ring
 
 
@@ -103,7 +103,7 @@ class InProcessLoop(Client):
         self._bench = Bench(config, flat if calibration is None else calibration, world=world)
         self.scene = self._bench.scene
         self.hub = MemoryHub()
-        self._operator = OperatorBus(self)
+        self._operator = ReportingBus(self.hub, self.expose)
         self.start_mirror()
         self._lose = lose
         self._listeners: list[tuple[str, deque[Any]]] = []
