@@ -6,7 +6,6 @@ import sys
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import aotpy
 import numpy as np
@@ -39,7 +38,6 @@ from lowfc.contract.messages import (
     Topic,
     from_timestamp,
     image,
-    wire,
 )
 from lowfc.programs.logs.export.command import Format, export_log, render
 from tests.support import toy
@@ -63,29 +61,24 @@ def a_night() -> SyntheticLog:
     night.request("leak", (0.0,))
     night.frames(STEPS // 2)
     for topic, number in ((COMMAND, WITHOUT_COMMAND), (TRUTH, WITHOUT_TRUTH)):
-        del night.samples[[place for place, one in enumerate(night.samples) if topic.matches(one.key)][number]]
-    held = COMMAND.message.FromString(payloads_of(night, COMMAND)[0])
-    held.actuators = bytes(4 * ACTUATORS)  # type: ignore[attr-defined]
+        del night.samples[night.places(topic)[number]]
+    held = night.messages(COMMAND)[0]
+    held.actuators = bytes(4 * ACTUATORS)
     night.put(COMMAND, held)  # repeated without a new frame
     return night
 
 
-def payloads_of(night: SyntheticLog, topic: Topic) -> list[bytes]:
-    return [sample.payload for sample in night.samples if topic.matches(sample.key)]
-
-
 NIGHT = a_night()
-STEPS_SENT = [STEP.message.FromString(payload) for payload in payloads_of(NIGHT, STEP)]
-SEQUENCES = [step.frame_sequence for step in STEPS_SENT]  # type: ignore[attr-defined]
-TIMES_NS = [from_timestamp(step.timestamp) for step in STEPS_SENT]  # type: ignore[attr-defined]
-FRAMES = np.array([decode_frame(payload, 0, 0).pixels for payload in payloads_of(NIGHT, FRAME)])
+STEPS_SENT = NIGHT.messages(STEP)
+SEQUENCES = [step.frame_sequence for step in STEPS_SENT]
+TIMES_NS = [from_timestamp(step.timestamp) for step in STEPS_SENT]
+FRAMES = np.array([decode_frame(NIGHT.samples[place].payload, 0, 0).pixels for place in NIGHT.places(FRAME)])
 
 
 def sent(topic: Topic, name: str, width: int = MODES) -> Array:
     """A quantity of each step, as float32; NaN if it was not sent."""
     rows = np.full((STEPS, width), np.nan, np.float32)
-    for payload in reversed(payloads_of(NIGHT, topic)):
-        body: Any = topic.message.FromString(payload)
+    for body in reversed(NIGHT.messages(topic)):
         value = getattr(body, name)
         if len(value):
             rows[SEQUENCES.index(body.frame_sequence)] = np.frombuffer(value, "<f4") if name == "actuators" else value
@@ -93,9 +86,7 @@ def sent(topic: Topic, name: str, width: int = MODES) -> Array:
 
 
 def written(path: Path, *without: Topic, finish: bool = True) -> Path:
-    night = a_night()
-    night.samples = [one for one in night.samples if not any(topic.matches(one.key) for topic in without)]
-    return night.write(path, finish=finish)
+    return a_night().without(*without).write(path, finish=finish)
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +151,7 @@ def test_fits_tables_and_images_have_the_values_of_the_messages(log: Path, tmp_p
     assert units_of == {"error_nm": "nm", "time_ns": "ns", "compute_us": "us", "flux_dn": "adu"}
     np.testing.assert_array_equal(table["sequence"], SEQUENCES)
     np.testing.assert_array_equal(table["error_nm"], sent(STEP, "error_nm"))
-    np.testing.assert_array_equal(table["flux_dn"], np.float32([one.flux_dn for one in STEPS_SENT]))  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(table["flux_dn"], np.float32([one.flux_dn for one in STEPS_SENT]))
     assert table["reasons"][REFUSED].strip() == "dark"
     assert table["time_utc"][1] == f"{np.datetime64(TIMES_NS[1], 'ns')}"
 
@@ -215,7 +206,7 @@ def test_an_aot_file_describes_the_system_to_aotpy(log: Path, tmp_path: Path) ->
 def test_aot_has_the_weighted_reconstructor_and_no_gains_that_a_linear_law_replaces(tmp_path: Path) -> None:
     night = a_night()
     night.law(0.1)
-    state = wire.ControllerState.FromString(payloads_of(night, CONTROLLER_STATE)[-1])
+    state = night.messages(CONTROLLER_STATE)[-1]
     state.prior_nm2[:], state.weighting_flux_dn = [0, 0, 16], toy.FLUX_DN
     state.camera_expected.CopyFrom(wire_camera(toy.CAMERA))
     night.put(CONTROLLER_STATE, state)
@@ -278,8 +269,9 @@ def test_a_log_without_steps_or_calibration_is_refused(tmp_path: Path, topic: To
 def test_a_failed_export_leaves_no_file(tmp_path: Path, to: Format, frame: Message | None, reason: str) -> None:
     """Frames of several sizes, an image of another kind, or no frames at all."""
     night = a_night()
-    night.samples = [one for one in night.samples if frame is not None or one.key != FRAME.key]
-    if frame is not None:
+    if frame is None:
+        night.without(FRAME)
+    else:
         night.put(FRAME, frame)
     path = night.write(tmp_path / "night.mcap")
     with pytest.raises(DataFileError, match=f"{reason}.*; export without --frames"):
@@ -329,8 +321,7 @@ def test_a_log_is_not_replaced_even_if_forced(log: Path, tmp_path: Path, name: s
 @pytest.mark.parametrize("to", [Format.NPZ, Format.FITS])  # AOT copies frames as FITS does
 def test_frames_are_not_held_in_memory(tmp_path: Path, to: Format) -> None:
     frames, shape = 90, (200, 200)
-    night = a_night()
-    night.samples = [one for one in night.samples if one.key not in (FRAME.key, TIMING.key)]
+    night = a_night().without(FRAME, TIMING)
     for number in range(frames):
         noise = np.random.default_rng(number).integers(0, 65536, shape, dtype=np.uint16)
         night.put(FRAME, image(noise, number, "sensor"))
@@ -347,8 +338,8 @@ def test_frames_are_not_held_in_memory(tmp_path: Path, to: Format) -> None:
 
 def test_a_loop_mode_of_a_newer_version_is_exported_by_its_number(tmp_path: Path) -> None:
     night = a_night()
-    step = STEP.message.FromString(payloads_of(night, STEP)[-1])
-    step.mode = 9  # type: ignore[attr-defined]
+    step = night.messages(STEP)[-1]
+    step.mode = 9
     night.put(STEP, step)
     export_log(night.write(tmp_path / "night.mcap"), Format.CSV, tmp_path / "out.csv", console=QUIET)
     assert "mode 9" in (tmp_path / "out.csv").read_text().splitlines()[-1]

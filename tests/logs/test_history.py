@@ -21,7 +21,6 @@ from lowfc.contract.messages import (
     TIMING,
     TRUTH,
     Log,
-    Message,
     Topic,
     timestamp,
     wire,
@@ -30,15 +29,6 @@ from tests.support.report_log import TOY_CALIBRATION, SyntheticLog
 from tests.support.toy import NOLL, PERIOD_NS, START, calibration
 
 STEPS = 20
-
-
-def change_one(night: SyntheticLog, topic: Topic, change: Callable[[Any], object]) -> None:
-    """Change one message of a topic, the tenth from the end."""
-    position = [index for index, sample in enumerate(night.samples) if topic.matches(sample.key)][-10]
-    sample = night.samples[position]
-    message: Message = topic.message.FromString(sample.payload)
-    change(message)
-    night.samples[position] = sample._replace(payload=message.SerializeToString())
 
 
 def history_of(night: SyntheticLog, path: Path) -> History:
@@ -61,7 +51,7 @@ def history_of(night: SyntheticLog, path: Path) -> History:
 )
 def test_an_invalid_step_is_left_out_of_every_column(tmp_path: Path, change: Callable[[Any], object]) -> None:
     night = SyntheticLog().frames(STEPS)
-    change_one(night, STEP, change)
+    night.change(STEP, -10, change)
     steps = (history := history_of(night, tmp_path / "x.mcap")).steps
     assert history.excluded_messages == 1
     assert {len(getattr(steps, column)) for column in steps.__slots__} == {STEPS - 1}
@@ -78,7 +68,7 @@ def test_late_commands_after_a_restart_of_the_camera_are_counted(tmp_path: Path)
 
 def test_the_camera_is_that_of_most_steps_and_steps_under_another_are_marked(tmp_path: Path) -> None:
     night = SyntheticLog().frames(STEPS)
-    settings = next(wire.CameraState.FromString(one.payload) for one in night.samples if CAMERA_STATE.matches(one.key))
+    settings = night.messages(CAMERA_STATE)[0]
     for factor, frames in ((2, 5), (1, 5)):
         settings.timestamp.CopyFrom(timestamp(night.now_ns))
         settings.period_ns = factor * PERIOD_NS
@@ -92,8 +82,7 @@ def test_the_camera_is_that_of_most_steps_and_steps_under_another_are_marked(tmp
 def test_the_attached_calibration_replaces_a_lost_message(tmp_path: Path) -> None:
     night = SyntheticLog().frames(STEPS)
     complete = history_of(night, tmp_path / "complete.mcap")
-    night.samples = [one for one in night.samples if not CALIBRATION.matches(one.key)]
-    history = read_history(LogReader(night.write(tmp_path / "x.mcap", attached=TOY_CALIBRATION)))
+    history = read_history(LogReader(night.without(CALIBRATION).write(tmp_path / "x.mcap", attached=TOY_CALIBRATION)))
     assert complete.calibration is not None
     assert history.calibration is not None
     assert history.calibration.id == complete.calibration.id
@@ -109,7 +98,7 @@ def test_the_attached_calibration_replaces_a_lost_message(tmp_path: Path) -> Non
 
 def test_a_repeated_reason_sets_one_bit(tmp_path: Path) -> None:
     night = SyntheticLog().frames(STEPS)
-    change_one(night, STEP, lambda step: step.reasons.extend([62, 62, 5]))
+    night.change(STEP, -10, lambda step: step.reasons.extend([62, 62, 5]))
     history = history_of(night, tmp_path / "x.mcap")
     assert history.excluded_messages == 0
     assert history.steps.reasons.max() == 1 << 62 | 1 << 5
@@ -132,7 +121,7 @@ def test_an_invalid_message_is_left_out_of_every_column(
 ) -> None:
     night = SyntheticLog().frames(STEPS)
     before = history_of(night, tmp_path / "before.mcap")
-    change_one(night, topic, change)
+    night.change(topic, -10, change)
     history = history_of(night, tmp_path / "x.mcap")
     for kind, name in ((MIRROR_STATE, "mirror"), (TRUTH, "truths")):
         count, columns = len(getattr(before, name).sequence), getattr(history, name)
@@ -155,7 +144,7 @@ def test_a_message_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
 
 def test_a_log_begins_with_its_first_message_that_is_not_retained(tmp_path: Path) -> None:
     night = SyntheticLog()
-    state = next(sample for sample in night.samples if CAMERA_STATE.matches(sample.key))
+    state = night.samples[night.places(CAMERA_STATE)[0]]
     night.samples = []
     night.frames(STEPS)
     first_ns, last_ns = night.samples[0].receive_time_ns, max(sample.receive_time_ns for sample in night.samples)

@@ -356,6 +356,13 @@ def test_an_input_of_a_former_version_whose_rule_has_changed_is_named_and_replay
     assert replay(night.messages).different  # of this version
 
 
+def raise_actuator(command: Any, number: int) -> None:
+    """Change one actuator of a command by the smallest amount."""
+    surface = np.frombuffer(command.actuators, np.float32).copy()
+    surface[number] = np.nextafter(surface[number], np.float32(np.inf))
+    command.actuators = surface.tobytes()
+
+
 def tampered(night: Night, topic: Topic, number: int, change: str) -> Account:
     """Change one message slightly, and replay."""
     messages = list(night.messages)
@@ -363,9 +370,7 @@ def tampered(night: Night, topic: Topic, number: int, change: str) -> Account:
     index = places[number]
     body = topic.message.FromString(messages[index].payload)
     if change == "actuators":
-        surface = np.frombuffer(body.actuators, np.float32).copy()  # type: ignore[attr-defined]
-        surface[7] = np.nextafter(surface[7], np.float32(np.inf))
-        body.actuators = surface.tobytes()  # type: ignore[attr-defined]
+        raise_actuator(body, 7)
     else:
         exec(change, {"body": body})  # noqa: S102  # the test's own text
     messages[index] = messages[index]._replace(payload=body.SerializeToString())
@@ -526,12 +531,7 @@ def test_a_finished_log_with_a_damaged_summary_is_not_called_cut_off(log: Path, 
 
 def test_a_forged_command_and_another_host_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     night = report_log.SyntheticLog().frames(STEPS)
-    place = [index for index, sample in enumerate(night.samples) if COMMAND.matches(sample.key)][700]
-    command = wire.MirrorCommand.FromString(night.samples[place].payload)
-    surface = np.frombuffer(command.actuators, np.float32).copy()
-    surface[13] = np.nextafter(surface[13], np.float32(np.inf))
-    command.actuators = surface.tobytes()
-    night.samples[place] = night.samples[place]._replace(payload=command.SerializeToString())
+    night.change(COMMAND, 700, lambda command: raise_actuator(command, 13))
     features = provenance()["cpu_features"] + " abacus"
     monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"numpy": "1.0", "cpu_features": features}})
     forged = night.write(tmp_path / "forged.mcap")

@@ -284,8 +284,7 @@ def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> N
 
 @pytest.mark.usefixtures("without_drawings")
 def test_a_report_says_that_the_calibration_of_its_steps_is_missing(tmp_path: Path) -> None:
-    night = SyntheticLog().frames(20)
-    night.samples = [one for one in night.samples if one.key != CALIBRATION.key]
+    night = SyntheticLog().frames(20).without(CALIBRATION)
     report = report_of(read_run(night.write(tmp_path / "x.mcap")))
     texts = {check["name"]: check["text"] for check in report.results["verdict"]["checks"]}
     assert texts["loop"] == "this log has no calibration, without which its 20 control steps cannot be read"
@@ -315,8 +314,8 @@ def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(
     good_night: SyntheticLog, tmp_path: Path
 ) -> None:
     night = SyntheticLog()
-    night.samples = [sample for sample in good_night.samples if sample.key != TRUTH.key]
-    results = results_of(night.write(tmp_path / "x.mcap"))
+    night.samples = good_night.samples
+    results = results_of(night.without(TRUTH).write(tmp_path / "x.mcap"))
     terms = {term["name"]: term for term in results["error_budget"]["terms"]}
     for name in ("cross-talk and aliasing", "nonlinearity"):
         assert terms[name]["missing"]
@@ -344,8 +343,7 @@ def test_a_log_of_an_open_loop_has_neither_spectra_nor_budget(tmp_path: Path) ->
 
 
 def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.samples = [sample for sample in night.samples if sample.key != CALIBRATION.key]
+    night = SyntheticLog().without(CALIBRATION)
     night._state = State()
     night.frames(300)
     results = results_of(night.write(tmp_path / "x.mcap"))
@@ -404,19 +402,15 @@ def test_a_camera_ahead_and_a_clear_for_a_lower_start_move_no_law_and_no_request
 
 def test_a_law_whose_step_is_lost_is_found_also_with_another_clock_of_the_camera(tmp_path: Path) -> None:
     night = SyntheticLog().frames(50).request("gain", (0.2,)).frames(50)
-    del night.samples[[row for row, one in enumerate(night.samples) if STEP.matches(one.key)][49]]
-    for row, one in enumerate(night.samples):
-        if STEP.matches(one.key):
-            step = wire.ControlStep.FromString(one.payload)
-            step.timestamp.seconds -= 3600
-            night.samples[row] = one._replace(payload=step.SerializeToString())
+    del night.samples[night.places(STEP)[49]]
+    for number in range(len(night.places(STEP))):
+        night.change(STEP, number, lambda step: setattr(step.timestamp, "seconds", step.timestamp.seconds - 3600))
     results = results_of(night.write(tmp_path / "x.mcap"))
     assert (results["laws"][-1]["from_s"], results["requests"][-1]["time_s"]) == pytest.approx((0.05, 0.05))
 
 
 def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -> None:
-    night = SyntheticLog().frames(300)
-    night.samples = [sample for sample in night.samples if sample.key != CONTROLLER_STATE.key]
+    night = SyntheticLog().frames(300).without(CONTROLLER_STATE)
     results = results_of(night.write(tmp_path / "x.mcap"))
     assert results["mode_steps"] == {"closed": 300}
     why = "the law with which the loop was closed is not in this log, or the integrator took over some of its modes"

@@ -1,6 +1,6 @@
 """A log of the toy's loop, with the messages of the real controller's `advance`, without processes."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -161,6 +161,25 @@ class SyntheticLog:
         payload = message if isinstance(message, bytes) else message.SerializeToString()
         sent_ns = self.now_ns + late_ns
         self.samples.append(Sample(key, payload, sequence, sent_ns, sent_ns + 50_000))
+
+    def places(self, topic: Topic) -> list[int]:
+        """Indices of the samples of a topic."""
+        return [place for place, one in enumerate(self.samples) if topic.matches(one.key)]
+
+    def messages(self, topic: Topic) -> list[Any]:
+        """Decoded messages of a topic."""
+        return [topic.message.FromString(self.samples[place].payload) for place in self.places(topic)]
+
+    def change(self, topic: Topic, number: int, change: Callable[[Any], object]) -> None:
+        """Change one message of a topic."""
+        change(message := self.messages(topic)[number])
+        place = self.places(topic)[number]
+        self.samples[place] = self.samples[place]._replace(payload=message.SerializeToString())
+
+    def without(self, *topics: Topic) -> Self:
+        """Remove the messages of these topics."""
+        self.samples = [one for one in self.samples if not any(topic.matches(one.key) for topic in topics)]
+        return self
 
     def write(
         self,

@@ -39,6 +39,7 @@ from tests.support import report_log
 from tests.support.mutated_logs import chunks_of, flipped
 from tests.support.report_log import SyntheticLog
 from tests.support.stage import Tape, accumulated, snapshot_of, tile, values_of
+from tests.support.toy import GRID
 from tests.support.viewers import views
 
 Shown = list[Verdict]
@@ -127,8 +128,7 @@ def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) ->
     assert tile(end, "FRAMES").value == "50 UNUSED"
     assert "of 1000 frames: 0 lost, 50 refused (50 too dark)" in tile(end, "FRAMES").detail
     assert (end.level, "in safe mode for 0.2 s" in end.headline) == (Level.WARNING, True)
-    truths = [wire.Truth.FromString(one.payload) for one in night.samples if one.key == TRUTH.key][:800]
-    rms_nm = float(np.sqrt(np.mean([one.residual_rms_nm**2 for one in truths])))
+    rms_nm = float(np.sqrt(np.mean([one.residual_rms_nm**2 for one in night.messages(TRUTH)[:800]])))
     assert float(tile(end, "WAVEFRONT").value.split()[0]) == pytest.approx(rms_nm, rel=0.05)
     assert f"worst 1 s: {tile(end, 'WAVEFRONT').value.split()[0]} nm" in tile(end, "WAVEFRONT").detail
 
@@ -144,7 +144,7 @@ def test_the_time_of_a_slow_loop_and_of_a_frame_with_a_wrong_clock_is_counted(
 ) -> None:
     monkeypatch.setattr(report_log, "PERIOD_NS", 2_000_000_000)
     night = SyntheticLog().frames(10)
-    step = next(wire.ControlStep.FromString(one.payload) for one in night.samples if one.key == STEP.key)
+    step = night.messages(STEP)[0]
     step.timestamp.CopyFrom(timestamp(0))
     step.reasons.append(Rejection.OUT_OF_ORDER.value)
     night.put(STEP, step)
@@ -187,8 +187,7 @@ def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: S
     night = SyntheticLog().health("recorder", state="running")
     drawn(night.write(tmp_path / "night.mcap", messages_lost="3"))
     assert shown[-1].headline.startswith("Log without a step of the controller. The recorder lost 3 messages")
-    night.samples = [one for one in night.samples if one.key != EVENT.key]
-    done, tape = drawn(night.write(tmp_path / "states.mcap"))
+    done, tape = drawn(night.without(EVENT).write(tmp_path / "states.mcap"))
     assert (done.log_s, tape.logged[tiles.TILES][-1][0]) == (0, night.samples[-1].receive_time_ns)
     assert [one.value for one in shown[-1].tiles] == ["NOT CLOSED", "?", "1000 Hz", "?", "?", "?", "FINISHED"]
 
@@ -272,7 +271,7 @@ def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_th
 
 def test_a_log_begins_with_its_first_frame_and_not_with_an_older_calibration(tmp_path: Path) -> None:
     night = SyntheticLog().frames(100)
-    calibration = next(one for one in night.samples if one.key == CALIBRATION.key)
+    calibration = night.samples[night.places(CALIBRATION)[0]]
     earlier_ns = calibration.receive_time_ns - 3600 * 10**9
     night.samples = [calibration._replace(receive_time_ns=ns) for ns in (earlier_ns, night.now_ns)] + night.samples
     done, tape = drawn(night.write(tmp_path / "night.mcap"))
@@ -283,7 +282,7 @@ def test_a_log_begins_with_its_first_frame_and_not_with_an_older_calibration(tmp
 def test_a_frame_of_a_camera_whose_clock_is_ahead_does_not_move_the_time_line(tmp_path: Path) -> None:
     night = SyntheticLog().frames(300)
     ahead_ns = night.now_ns + 3600 * 10**9
-    step = next(wire.ControlStep.FromString(one.payload) for one in night.samples if one.key == STEP.key)
+    step = night.messages(STEP)[0]
     step.timestamp.CopyFrom(timestamp(ahead_ns))
     step.reasons.append(Rejection.AHEAD.value)
     night.put(FRAME, image(np.zeros((8, 8), np.uint16), ahead_ns, "sensor"))
@@ -299,10 +298,8 @@ def test_a_frame_of_a_camera_whose_clock_is_ahead_does_not_move_the_time_line(tm
 
 def test_the_largest_stroke_of_a_log_is_taken_over_all_mirror_states(tmp_path: Path, shown: Shown) -> None:
     night = SyntheticLog().frames(300)
-    number = [place for place, one in enumerate(night.samples) if MIRROR_STATE.matches(one.key)][101]
-    state = wire.MirrorState.FromString(night.samples[number].payload)
-    state.actuators = np.full(state.rows * state.columns, -350, "<f4").tobytes()
-    night.samples[number] = night.samples[number]._replace(payload=state.SerializeToString())
+    actuators = np.full(GRID, -350, "<f4").tobytes()
+    night.change(MIRROR_STATE, 101, lambda state: setattr(state, "actuators", actuators))
     drawn(night.write(tmp_path / "night.mcap"))
     assert tile(shown[-1], "MIRROR").value == "50 %"
 
@@ -352,7 +349,7 @@ def test_earlier_events_are_read_from_the_log_finished_or_not(tmp_path: Path, fi
     night.frames(100)
     night.event("RECORDING_STOPPED", why="operator asked")
     night.write(tmp_path / "night.mcap", finish=finish)
-    expected = [one for one in night.samples if one.key == EVENT.key]
+    expected = [night.samples[place] for place in night.places(EVENT)]
     found = earlier_events(recorder_of(tmp_path / "night.mcap", platform.node()), 0)
     assert [(one.sequence, one.payload) for one in found] == [(one.sequence, one.payload) for one in expected]
     accumulator = accumulated([*expected[-1:], *found])  # the last one also arrived on the bus

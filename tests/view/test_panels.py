@@ -62,8 +62,7 @@ def rendered(snapshot: Snapshot) -> Tape:
 def test_every_step_and_truth_is_drawn_under_its_name() -> None:
     night = synthetic_log()
     tape = rendered(snapshot_of(night.samples))
-    steps = [wire.ControlStep.FromString(one.payload) for one in night.samples if one.key == STEP.key]
-    truths = [wire.Truth.FromString(one.payload) for one in night.samples if one.key == TRUTH.key]
+    steps, truths = night.messages(STEP), night.messages(TRUTH)
     assert len(steps) == len(truths) == FRAMES
     measured = ((wavefront.ERROR, "error_nm"), (wavefront.POL, "pol_nm"), (wavefront.COMMAND, "command_nm"))
     for plot, field in measured:
@@ -86,8 +85,7 @@ def test_every_step_and_truth_is_drawn_under_its_name() -> None:
 def test_without_truth_the_wavefront_is_labelled_measured() -> None:
     night = synthetic_log(truth=False)
     tape = rendered(snapshot_of(night.samples))
-    steps = [wire.ControlStep.FromString(one.payload) for one in night.samples if one.key == STEP.key]
-    rms_nm = [[np.hypot.reduce(step.pol_nm), np.hypot.reduce(step.error_nm)] for step in steps]
+    rms_nm = [[np.hypot.reduce(step.pol_nm), np.hypot.reduce(step.error_nm)] for step in night.messages(STEP)]
     np.testing.assert_allclose(tape.column(wavefront.RMS.path)[1], rms_nm, rtol=1e-5)
     assert tape.names(wavefront.RMS.path) == ["with a flat mirror, pseudo-open-loop", "residual, measured"]
     assert wavefront.TRUTH.path not in tape.rows
