@@ -1,6 +1,6 @@
 """`lowfc tune`: results, files and errors, on a log made by the live loop's own `advance`; and law files."""
 
-import json
+import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -32,22 +32,13 @@ from lowfc.programs.commissioning.tune.command import apply_gains
 from lowfc.programs.commissioning.tune.data import Telemetry, telemetry_from_log, telemetry_from_run
 from lowfc.programs.commissioning.tune.result import result_of, tuned
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
-from tests.support.loops import lowfc
+from tests.support.loops import json_of, refusal
 from tests.support.report_log import SyntheticLog
 from tests.support.theory import LAWS
 from tests.support.toy import NOLL, PERIOD_NS, frame_sequence
 
 KEYS = {"sensor.modes": 3, "camera.rate_hz": 1000, "control.tilt_gain": 0.4, "control.gain": 0.2}
 CONFIG = load(None, KEYS | SMALL_MIRROR)
-
-
-def tune(*words: object) -> dict[str, Any]:
-    """The JSON of a command that must succeed."""
-    done = lowfc("tune", *words, "--json")
-    if done.exception is not None:
-        raise done.exception
-    result: dict[str, Any] = json.loads(done.stdout)
-    return result
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +90,7 @@ def test_the_command_writes_the_law_and_draws_it(
     log: Path, tuned_as: Callable[[str], tuple[Tuned, Gains]], tmp_path: Path
 ) -> None:
     out, plot = tmp_path / "law.fits", tmp_path / "law.png"
-    result = tune(log, "--controller", "lqg", "--out", out, "--plot", plot)
+    result = json_of("tune", log, "--controller", "lqg", "--out", out, "--plot", plot)
     assert result["files"] == [str(out), str(plot)]
     assert plot.read_bytes()[:4] == b"\x89PNG"
     assert law_file.load(out).id == tuned_as("lqg")[0].law.id
@@ -112,7 +103,7 @@ def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path)
     table = 20 * np.sin(2 * np.pi * 31 * np.arange(500) * PERIOD_NS * 1e-9).astype(np.float32)[:, None]
     night.request("play", text="mirror", actuators_nm=shape, table=table)
     night.frames(2900)
-    result = tune(night.write(tmp_path / "played.mcap"))
+    result = json_of("tune", night.write(tmp_path / "played.mcap"))
     assert result["delay_frames"] == 1.0
     assert result["warnings"] == []
     assert result["frames"] < 2900
@@ -121,7 +112,7 @@ def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path)
 
 def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
     path = SyntheticLog().request("open").frames(2150).write(tmp_path / "open.mcap")
-    result = tune(path)
+    result = json_of("tune", path)
     assert not result["closed"]
     assert result["modes"][0]["achieved_nm"] is None
     assert result["warnings"] == []
@@ -337,30 +328,25 @@ def test_the_previous_law_is_restored_without_an_answer_or_the_error_says_that_i
 def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
     night = SyntheticLog().request("close").frames(2700).request("open")
     night.load(identified(replace(night.calibration, flux_dn=1.0)))  # the frames of the former one do not count
-    with pytest.raises(
-        DataFileError, match="tuning requires at least 2048 consecutive frames, 2 s; the longest sequence of good"
-    ):
-        tune(night.request("close").frames(700).write(tmp_path / "short.mcap"))
+    short = night.request("close").frames(700).write(tmp_path / "short.mcap")
+    error = refusal("tune", short, kind=DataFileError)
+    assert "tuning requires at least 2048 consecutive frames, 2 s; the longest sequence of good" in error
 
 
 def test_tune_never_overwrites_a_log(log: Path) -> None:
-    with pytest.raises(DataFileError, match="is a log, which is never overwritten"):
-        tune(log, "--out", log)
+    assert "is a log, which is never overwritten" in refusal("tune", log, "--out", log, kind=DataFileError)
 
 
 def test_a_missing_package_is_reported_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ConfigurationError, match=r"pip install .*matplotlib"):
-        tune("none.mcap", "--plot", "law.png")
+    error = refusal("tune", "none.mcap", "--plot", "law.png", kind=ConfigurationError)
+    assert re.search(r"pip install .*matplotlib", error)
 
 
 def test_tune_needs_either_a_log_or_a_running_loop() -> None:
-    with pytest.raises(ConfigurationError, match="give one LOG, or observe a running loop"):
-        tune()
-    with pytest.raises(ConfigurationError, match="give one LOG"):
-        tune("x.mcap", "--live", 3.0)
-    with pytest.raises(ConfigurationError, match="--run has no effect"):
-        tune("x.mcap", "--run", "bench")
+    assert "give one LOG, or observe a running loop" in refusal("tune", kind=ConfigurationError)
+    assert "give one LOG" in refusal("tune", "x.mcap", "--live", 3.0, kind=ConfigurationError)
+    assert "--run has no effect" in refusal("tune", "x.mcap", "--run", "bench", kind=ConfigurationError)
 
 
 @pytest.mark.parametrize("law", [*LAWS.values(), integrator([0.1] * 20, [0.0] * 20, tuple(range(2, 22)), 1.0, 1e3)])
