@@ -1,6 +1,7 @@
 """`lowfc calibrate` and its subcommands: files, results, errors, other wavefronts; on a loop in one process."""
 
 import json
+import re
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -12,7 +13,6 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from rich.console import Console
-from typer.testing import CliRunner
 
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.progress import counting_bar, progress_lines
@@ -31,10 +31,10 @@ from lowfc.programs.commissioning.calibrate import align as calibrate_align
 from lowfc.programs.commissioning.calibrate import command, pokes
 from lowfc.programs.commissioning.calibrate import tasks as calibrate_commands
 from lowfc.programs.commissioning.calibrate.align import on_sensor, oriented
-from lowfc.programs.commissioning.calibrate.command import calibrate_app
 from lowfc.programs.commissioning.calibrate.run import Calibrator
 from lowfc.programs.commissioning.calibrate.tasks import zero_point
 from tests.support.in_process_loop import BRIGHT, SMALL_MIRROR, InProcessLoop
+from tests.support.loops import json_of, lowfc, refusal
 
 CONFIG = BRIGHT | {"sensor.modes": 3}
 RATE_HZ, DELAY_FRAMES = 250, 240
@@ -71,14 +71,6 @@ def connect(loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "Client", lambda run: loop)
 
 
-def json_of(*words: str) -> dict[str, Any]:
-    """The JSON of a command that must succeed."""
-    done = CliRunner().invoke(calibrate_app, [*words, "--json"], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    result: dict[str, Any] = json.loads(done.stdout)
-    return result
-
-
 def toml(config: Configuration) -> str:
     Path("test.toml").write_text(config.to_toml())
     return "test.toml"
@@ -100,7 +92,7 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
     monkeypatch.setattr(Calibrator, "check", Mock(side_effect=KeyboardInterrupt))
     before = loop.calibration()
     words = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]
-    done = CliRunner().invoke(calibrate_app, words)
+    done = lowfc("calibrate", *words)
     assert done.exit_code == 130
     assert done.stderr.splitlines()[-1].startswith("kept in night.fits.part.npz: 4 cycles; the same command")
     assert "4 cycles of 226 frames and 3 check cycles; about" in done.stderr
@@ -108,7 +100,7 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
     assert loop.calibration().id == before.id
     monkeypatch.setattr(Calibrator, "check", check)
     cycle_frames = len(loop.surfaces_nm) - delay_measurement_frames
-    resumed = CliRunner().invoke(calibrate_app, [*words, "--resume", "--json"])
+    resumed = lowfc("calibrate", *words, "--resume", "--json")
     check_frames = len(loop.surfaces_nm) - cycle_frames - 2 * delay_measurement_frames
     assert frames_to_go(resumed.stderr) == pytest.approx(check_frames, abs=0.6 * RATE_HZ)
     assert frames_to_go(done.stderr) == pytest.approx(cycle_frames + check_frames, abs=0.6 * RATE_HZ)
@@ -126,11 +118,11 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
     assert (result["recommended"], result["snr"]) == (True, 20)
     assert loop.calibration().id == calibration.id != before.id
     assert list(Path().glob("*.part.npz")) == []
-    same = json_of("--compare", "night.fits", "night.fits")
+    same = json_of("calibrate", "--compare", "night.fits", "night.fits")
     assert same["cross_talk"] < 1e-4
     assert same["same_commands"]
     assert same["reference_shift_nm"] == [0.0] * 3
-    done = CliRunner().invoke(calibrate_app, ["--compare", "night.fits", "night.fits"])
+    done = lowfc("calibrate", "--compare", "night.fits", "night.fits")
     assert "largest cross-talk" in done.stdout
 
 
@@ -158,12 +150,12 @@ def test_a_calibration_in_closed_loop_is_loaded_and_the_loop_closed_again(
     monkeypatch.setattr(command, "print_result", lambda *_, **__: None)
     loop.close_loop()
     words = ["--method", "in-loop", "--out", "night.fits", "--load"]
-    done = CliRunner().invoke(calibrate_app, words, catch_exceptions=False)
+    done = lowfc("calibrate", *words)
     assert "the loop is opened to load the calibration and closed again afterwards" in done.stderr
     assert (loop.calibration().id, loop.status().state.mode) == (new_calibration.id, wire.LOOP_MODE_CLOSED)
     assert not part.exists()
     refuse = True
-    done = CliRunner().invoke(calibrate_app, words)
+    done = lowfc("calibrate", *words)
     assert "load refused" in str(done.exception)
     assert "kept in night.fits.part.npz: 4 cycles" in done.stderr
     assert part.exists()
@@ -178,7 +170,7 @@ def test_cycles_that_are_not_kept_are_not_reported(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Calibrator, "run", run)
-    done = CliRunner().invoke(calibrate_app, ["--out", "night.fits"])
+    done = lowfc("calibrate", "--out", "night.fits")
     assert done.exit_code == 130
     assert "kept in" not in done.stderr
 
@@ -192,7 +184,7 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
     connect(loop, monkeypatch)
     before = loop.calibration()
     words = ["--cycles", "4", "--snr", "200", "--out", "night.fits", "--load"]
-    done = CliRunner().invoke(calibrate_app, [*words, "--json"])
+    done = lowfc("calibrate", *words, "--json")
     assert done.exit_code == 1
     result = json.loads(done.stdout)
     assert not result["recommended"]
@@ -213,7 +205,7 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
 
     assert "cross-talk on separate frames" not in str(result["faults"])
     monkeypatch.setattr(Calibrator, "check", check_shifted)
-    done = CliRunner().invoke(calibrate_app, [*words, "--resume"])
+    done = lowfc("calibrate", *words, "--resume")
     assert done.exit_code == 1
     assert "verdict: NOT RECOMMENDED" in done.stdout
     assert "cross-talk on separate frames" in done.stdout
@@ -248,45 +240,45 @@ def test_progress_without_a_terminal_is_a_line_every_10_s_with_the_time_to_go_of
 
 
 def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:
-    result = json_of("reference", "--frames", "200", "--out", "there.fits")
+    result = json_of("calibrate", "reference", "--frames", "200", "--out", "there.fits")
     shift = dict(zip(result["noll"], result["reference_shift_nm"], strict=True))
     assert shift[4] == pytest.approx(6.0, abs=0.6)
     calibration = calibration_file.load(Path("there.fits"))
     assert np.abs(cross_talk(calibration.reconstructor, calibration.response)).max() < 1e-3
     assert np.array_equal(calibration.response, loop.calibration().response)
     loop.offset(5.0, [4])  # the new reference includes the offset, which would move the loop once more
-    done = CliRunner().invoke(calibrate_app, ["reference", "--frames", "16"], catch_exceptions=False)
+    done = lowfc("calibrate", "reference", "--frames", "16")
     assert "the new reference image contains the offset" in " ".join(done.stderr.split())
     loop.ask("lease", values=60.0, text="somebody", lease_id=2)
-    with pytest.raises(RequestRefusedError, match="reserved for somebody"):
-        json_of("reference", "--frames", "200", "--out", "there.fits")
+    words = ("calibrate", "reference", "--frames", "200", "--out", "there.fits")
+    assert "reserved for somebody" in refusal(*words, kind=RequestRefusedError)
 
 
 def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
     loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(CalibrationError, match=r"not dark: .*; block the star"):
-        json_of("dark", "--star-blocked", "--frames", "50")
+    error = refusal("calibrate", "dark", "--star-blocked", "--frames", "50", kind=CalibrationError)
+    assert re.search(r"not dark: .*; block the star", error)
     rng = np.random.default_rng(5)
     cube = np.rint(100 + 1.5 * rng.standard_normal((64, 80, 80)))
     cube[:, 40, 41] += 500
     fits.PrimaryHDU(cube.astype(np.int16)).writeto("dark.fits")
-    result = json_of("dark", "--file", "dark.fits", "--out", "masked.fits")
+    result = json_of("calibrate", "dark", "--file", "dark.fits", "--out", "masked.fits")
     assert (result["hot"], result["noisy"], result["dead"]) == (1, 0, 0)
     calibration = calibration_file.load(Path("masked.fits"))
     assert calibration.good.reshape(80, 80)[40, 41] == 0
     assert not calibration.reconstructor[:, 40 * 80 + 41].any()
     fits.PrimaryHDU(cube[:, :20].astype(np.int16)).writeto("small.fits")
-    with pytest.raises(DataFileError, match=r"frames have \(20, 80\) pixels, the calibration \(80, 80\)"):
-        json_of("dark", "--file", "small.fits")
+    error = refusal("calibrate", "dark", "--file", "small.fits", kind=DataFileError)
+    assert "frames have (20, 80) pixels, the calibration (80, 80)" in error
     np.save("cube.npy", cube)
-    assert json_of("dark", "--file", "cube.npy")["frames"] == 64
+    assert json_of("calibrate", "dark", "--file", "cube.npy")["frames"] == 64
     np.save("cube.npy", cube + 0.03 * loop.calibration().flux_dn * loop.calibration().reference.reshape(80, 80))
-    with pytest.raises(CalibrationError, match=r"3\.\d% of the star's light is in them"):
-        json_of("dark", "--file", "cube.npy")
+    error = refusal("calibrate", "dark", "--file", "cube.npy", kind=CalibrationError)
+    assert re.search(r"3\.\d% of the star's light is in them", error)
     dark = InProcessLoop(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
     connect(dark, monkeypatch)
-    result = json_of("dark", "--star-blocked", "--frames", "50", "--out", "night.fits")
+    result = json_of("calibrate", "dark", "--star-blocked", "--frames", "50", "--out", "night.fits")
     assert result["dark_dn"] == pytest.approx(100, abs=0.5)
     assert result["hot"] < 5
 
@@ -299,10 +291,9 @@ def test_frames_of_another_size_than_the_calibration_are_refused(
     monkeypatch.setattr(loop, "calibration", lambda: other)
     monkeypatch.setattr(loop, "camera", lambda: CameraSettings(0, (80, 80), 100.0, 40100.0))
     np.save("cube.npy", np.full((16, 64, 100), 100))
-    with pytest.raises(
-        CalibrationError, match=r"80 x 80 pixels and are refused as WRONG_SIZE: .* is for 64 x 100: load"
-    ):
-        json_of(*words.split(), *(["--frames", "16"] if words and "--file" not in words else []))
+    frames = ["--frames", "16"] if words and "--file" not in words else []
+    error = refusal("calibrate", *words.split(), *frames, kind=CalibrationError)
+    assert re.search(r"80 x 80 pixels and are refused as WRONG_SIZE: .* is for 64 x 100: load", error)
 
 
 def test_the_computed_calibration_is_resampled_to_a_scaled_and_rotated_sensor(loop: InProcessLoop) -> None:
@@ -320,7 +311,7 @@ def test_the_computed_calibration_is_resampled_to_a_scaled_and_rotated_sensor(lo
 
 
 def test_a_poke_resolves_the_rotation_by_180_degrees(noiseless_loop: InProcessLoop) -> None:
-    result = json_of("align", "--out", "aligned.fits", "--frames", "200")
+    result = json_of("calibrate", "align", "--out", "aligned.fits", "--frames", "200")
     assert (result["pixels_per_lambda_d"], result["parity"]) == (pytest.approx(4, rel=0.003), 1)
     calibration = calibration_file.load(Path("aligned.fits"))
     assert np.abs(cross_talk(calibration.reconstructor, noiseless_loop.calibration().response)).max() < 0.05
@@ -347,7 +338,7 @@ def test_an_aligned_calibration_expects_the_light_of_the_good_pixels(
     good = before.good.reshape(80, 80).copy()
     good[:36] = 0
     monkeypatch.setattr(loop, "calibration", lambda: replace(before, good=good.reshape(-1)))
-    result = json_of("align", "--out", "aligned.fits", "--frames", "16")
+    result = json_of("calibrate", "align", "--out", "aligned.fits", "--frames", "16")
     light_dn = (next(loop.frames(1)).pixels.reshape(-1) - before.dark) @ good.reshape(-1)
     assert light_dn < 0.9 * before.flux_dn
     assert calibration_file.load(Path("aligned.fits")).flux_dn == pytest.approx(light_dn, rel=0.01)
@@ -356,11 +347,11 @@ def test_an_aligned_calibration_expects_the_light_of_the_good_pixels(
 
 def test_a_computed_calibration_may_truncate_singular_values(loop: InProcessLoop) -> None:
     config = toml(loop.config)
-    result = json_of("--method", "analytic", "--config", config, "--out", "all.fits")
+    result = json_of("calibrate", "--method", "analytic", "--config", config, "--out", "all.fits")
     assert result["kept"] == [1.0] * 3
     smallest = result["singular_values"][-1] / result["singular_values"][0]
     truncated_result = json_of(
-        "--method", "analytic", "--config", config, "--out", "few.fits", "--truncate", str(1.01 * smallest)
+        "calibrate", "--method", "analytic", "--config", config, "--out", "few.fits", "--truncate", str(1.01 * smallest)
     )
     assert np.count_nonzero(truncated_result["kept"]) == 2
     whole, truncated = (calibration_file.load(Path(name)) for name in ("all.fits", "few.fits"))
@@ -369,14 +360,14 @@ def test_a_computed_calibration_may_truncate_singular_values(loop: InProcessLoop
     assert np.allclose(
         truncated.actuators_to_modes @ whole.modes_to_actuators, truncated.reconstructor @ whole.response, atol=1e-4
     )
-    done = CliRunner().invoke(calibrate_app, ["--method", "analytic", "--config", config, "--out", "all.fits"])
+    done = lowfc("calibrate", "--method", "analytic", "--config", config, "--out", "all.fits")
     assert "no regularisation needed" in done.stdout
 
 
 def test_a_truncation_keeps_the_fit_of_a_background(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     fitted = load(None, {"sensor.kind": "zwfs", "control.nuisance": ["background"]} | SMALL_MIRROR)
-    json_of("--method", "analytic", "--config", toml(fitted), "--out", "few.fits", "--truncate", "0.3")
+    json_of("calibrate", "--method", "analytic", "--config", toml(fitted), "--out", "few.fits", "--truncate", "0.3")
     calibration = calibration_file.load(Path("few.fits"))
     assert calibration.estimator == "weighted+background+regularised"
     assert np.linalg.matrix_rank(calibration.reconstructor) < len(calibration.noll)
@@ -387,9 +378,9 @@ def test_a_truncation_keeps_the_fit_of_a_background(tmp_path: Path, monkeypatch:
 
 def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop) -> None:
     config = toml(loop.config)
-    json_of("--method", "analytic", "--config", config, "--out", "flat.fits")
-    json_of("--method", "analytic", "--config", config, "--out", "there.fits", "--at", "3=-10,4=15")
-    result = json_of("--compare", "flat.fits", "there.fits")
+    json_of("calibrate", "--method", "analytic", "--config", config, "--out", "flat.fits")
+    json_of("calibrate", "--method", "analytic", "--config", config, "--out", "there.fits", "--at", "3=-10,4=15")
+    result = json_of("calibrate", "--compare", "flat.fits", "there.fits")
     assert result["estimators"] == ["weighted", "weighted+at 3=-10,4=15"]
     assert result["cross_talk"] > 0.02
     shift = dict(zip(result["noll"], result["reference_shift_nm"], strict=True))
@@ -411,13 +402,12 @@ def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop)
 )
 def test_an_option_without_effect_is_refused(loop: InProcessLoop, words: str, why: str) -> None:
     before = {path.name for path in Path().iterdir()}
-    with pytest.raises(ConfigurationError, match=why):
-        CliRunner().invoke(calibrate_app, words.split(), catch_exceptions=False)
+    assert re.search(why, refusal("calibrate", *words.split(), kind=ConfigurationError))
     assert {path.name for path in Path().iterdir()} == before
 
 
 def test_fewer_cycles_than_their_scatter_needs_are_refused() -> None:
-    assert "--cycles" in CliRunner().invoke(calibrate_app, ["--cycles", "3"]).stderr
+    assert "--cycles" in lowfc("calibrate", "--cycles", "3").stderr
 
 
 def test_a_comparison_of_different_sensors_and_a_missing_directory_are_refused(loop: InProcessLoop) -> None:
@@ -432,10 +422,10 @@ def test_a_comparison_of_different_sensors_and_a_missing_directory_are_refused(l
         actuators_to_modes=three_modes.actuators_to_modes[:2],
     )
     calibration_file.save(identified(two_modes), Path("other.fits"))
-    with pytest.raises(CalibrationError, match="cannot be compared"):
-        json_of("--compare", "one.fits", "other.fits")
-    with pytest.raises(DataFileError, match="there is no directory"):
-        json_of("--method", "hadamard", "--out", "nowhere/night.fits")
+    error = refusal("calibrate", "--compare", "one.fits", "other.fits", kind=CalibrationError)
+    assert "cannot be compared" in error
+    error = refusal("calibrate", "--method", "hadamard", "--out", "nowhere/night.fits", kind=DataFileError)
+    assert "there is no directory" in error
 
 
 ZERO_POINT = "4=20,7=-20"
