@@ -123,4 +123,5 @@ def test_a_process_of_a_run_that_does_not_answer_is_not_called_absent() -> None:
     assert _lines([row]) == [
         "bench  starting or not answering; controller, recorder; its recorder is starting or not answering"
     ]
-    assert _lines([row | {"processes": processes[:1]}])[0].endswith("controller; not recording")
+    running = row | {"processes": processes[:1], "mode": "open", "rate_hz": 99.6, "uptime_s": 12.3}
+    assert _lines([running]) == ["bench  open at 100 Hz, up 12 s; controller; not recording"]

@@ -25,6 +25,8 @@ ELSEWHERE = {
     "make test": ".ci/run",
     "make release": "tests/house/test_wheel.py",
     "lowfc console": "tests/console/test_console.py",
+    "lowfc ctl gain 0.3 --modes 2,3": "tests/e2e/test_operator.py",
+    "lowfc runs": "tests/e2e/test_operator.py",
     "lowfc doctor": "tests/commissioning/test_doctor.py",
     "lowfc gateway epics": "tests/interlocks/test_gateway.py",
     "rerun $(ls -t logs/*.mcap | head -1)": "tests/e2e/test_rerun_viewer.py",
@@ -62,7 +64,7 @@ def test_every_command_in_the_documentation_is_tested() -> None:
         if document.parent != tutorials.PAGES or tutorials.NOT_FOLLOWED.search(line)
     ]
     assert len(found) > 15
-    tested = {*ELSEWHERE, LOOP, *LOGS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN, *VIEW_FILES}
+    tested = {*ELSEWHERE, LOOP, *LOGS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN, *VIEW_FILES}
     tested |= {*tutorials.LIVE, tutorials.CHAOS, tutorials.BASLER, RECORD_SELECTED, *UNTIL_INTERRUPTED}
     tested |= {*DOCUMENTED, *OPERATING, *BENCH_DAY, *BESIDE_CACAO, *COMMISSIONING}
     assert set(found) == tested
@@ -96,16 +98,6 @@ DESIGN = (
     "lowfc design sam --steps 200 --merit contrast --out mask.json",
     "lowfc design zwfs --out zwfs.toml",
     "lowfc design clowfs --defocus 2:5 --out clowfs.toml",
-)
-REQUESTS = (
-    "lowfc ctl status",
-    "lowfc ctl gain 0.3 --modes 2,3",
-    "lowfc ctl gain auto",
-    "lowfc ctl open",
-    "lowfc ctl close",
-    "lowfc ctl safe",
-    "lowfc ctl clear",
-    "lowfc runs",
 )
 FILES = (
     "lowfc config show > lowfc.toml",
@@ -147,28 +139,6 @@ LOGS = (
 def test_the_documented_loop_runs_and_writes_one_log(tmp_path: Path) -> None:
     assert "frame to command" in run(tmp_path, LOOP)
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
-
-
-@pytest.mark.exclusive
-@pytest.mark.slow
-def test_the_documented_requests_are_answered(tmp_path: Path, own_runtime: Path) -> None:
-    loop = start(tmp_path, "sim-loop", "--rate", "100", "--no-record")
-    try:
-        status = [sys.executable, "-m", "lowfc", "ctl", "status"]
-        until(
-            lambda: "closed · residual " in subprocess.run(status, capture_output=True, text=True, check=False).stdout
-        )
-        printed = [run(tmp_path, line) for line in REQUESTS]
-    finally:
-        out, stderr = interrupt(loop)
-    assert loop.returncode == 0, stderr
-    assert printed[0].startswith("closed · residual ")
-    assert printed[1].startswith("gain is now 0.3 0.3 0.0"), "only tip and tilt"
-    assert printed[2].startswith("the gain of Z2"), "all modes"
-    replies = [text.split(",")[0] for text in printed[3:7]]
-    assert replies == ["loop open", "loop closed", "loop in safe mode", "loop open"]
-    assert re.match(r"\S+  open at \d+ Hz, up \d+ s; camera, controller, mirror-dm; not recording\n", printed[7])
-    assert "frame to command" in out
 
 
 @pytest.mark.exclusive
