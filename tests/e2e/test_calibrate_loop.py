@@ -10,7 +10,7 @@ import pytest
 from lowfc.adapters.files import calibration_file
 from lowfc.client import Client, running
 from lowfc.control.calibration.response_fit import cross_talk
-from tests.support.loops import interrupt, recorded_bytes, run, start, until
+from tests.support.loops import interrupt, json_of, recorded_bytes, run, start, until
 
 CONFIG = """
 [sensor]
@@ -108,6 +108,4 @@ def test_rejection_of_a_running_loop_and_of_its_log(tmp_path: Path) -> None:
     assert (tmp_path / "live.png").read_bytes().startswith(b"\x89PNG")
 
     (log,) = (tmp_path / "logs").glob("*.mcap")
-    again = run(tmp_path, "acceptance", "rejection", "--json", str(log))
-    assert again.returncode == 0, again.stderr
-    assert json.loads(again.stdout) == live
+    assert json_of("acceptance", "rejection", log) == live

@@ -1,7 +1,5 @@
 """A dark hole is dug while the loop runs: the loop does not undo it, and a replay is identical."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ from lowfc.arrays import Array
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.messages import CALIBRATION, COMMAND, OFFLOAD, STEP, wire
 from lowfc.programs.paper.dark_hole import PLAIN, SHIFTED, STEPS, DarkHoleRun, dark_hole
-from tests.support.loops import payloads, run
+from tests.support.loops import json_of, payloads
 
 pytestmark = pytest.mark.slow
 
@@ -92,9 +90,7 @@ def test_the_mean_command_is_published_once_a_second(logged: dict[str, list[byte
 
 
 def test_the_run_is_replayed_to_the_bit(dark_hole_run: DarkHoleRun) -> None:
-    done = run(dark_hole_run.log.parent, "replay", "--json", str(dark_hole_run.log))
-    assert done.returncode == 0, done.stdout + done.stderr
-    results = json.loads(done.stdout)
+    results = json_of("replay", dark_hole_run.log)
     assert results["identical"]
     assert results["largest_difference_nm"] == 0
     assert results["requests"] > STEPS

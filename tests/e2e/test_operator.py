@@ -29,7 +29,7 @@ from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limits
 from lowfc.programs.cli.ctl import ctl_app
-from tests.support.loops import FIXED, children, interrupt, lowfc, payloads, refusal, run, start, until
+from tests.support.loops import FIXED, children, interrupt, json_of, lowfc, payloads, refusal, start, until
 from tests.support.safety_checks import violations
 
 pytestmark = pytest.mark.exclusive
@@ -277,9 +277,7 @@ def test_every_command_keeps_the_actuator_limits(night: Night) -> None:
 def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
     commands = 0
     for log in night.logs:
-        done = run(night.folder, "replay", "--json", str(log))
-        assert done.returncode == 0, done.stdout + done.stderr
-        results = json.loads(done.stdout)
+        results = json_of("replay", log)
         assert results["identical"]
         assert results["largest_difference_nm"] == 0
         commands += results["commands"]

@@ -1,13 +1,11 @@
 """Replay of what real processes recorded: operators, a restart, dropped frames, rotation."""
 
-import json
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,7 +15,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Client
 from lowfc.contract.messages import CONTROLLER_STATE, EVENT, STEP
-from tests.support.loops import LOWFC, loop, run, until
+from tests.support.loops import LOWFC, json_of, loop, until
 
 pytestmark = [pytest.mark.exclusive, pytest.mark.slow]
 
@@ -39,13 +37,6 @@ def lossy(self, payload, *more):
 ZenohPublisher.put = lossy
 main()
 """
-
-
-def replayed(folder: Path, *logs: Path) -> dict[str, Any]:
-    done = run(folder, "replay", "--json", *map(str, logs))
-    assert done.returncode == 0, done.stdout + done.stderr
-    results: dict[str, Any] = json.loads(done.stdout)
-    return results
 
 
 class Night:
@@ -114,7 +105,7 @@ def test_operators_a_restart_dropped_frames_and_rotation(night: Night, tmp_path:
     for name in ("camera", "controller", "mirror-dm", "recorder"):  # from the source of the data to its end
         night.end(name)
     logs = sorted((tmp_path / "logs").iterdir())
-    results = replayed(tmp_path, *logs)
+    results = json_of("replay", *logs)
     assert (results["identical"], results["different"], results["largest_difference_nm"]) == (True, 0, 0.0)
     assert results["frames"] + results["unchecked"] == steps_of(*logs) > 500
     assert results["unchecked"] < 5, results["unchecked_because"]  # what the kill cut off
@@ -130,7 +121,7 @@ def test_a_minute_at_a_kilohertz_is_lossless_and_identical(tmp_path: Path) -> No
     words = ("--rate", "1000", "--duration", "60", "--disturbance", "reaction-wheel")
     results = loop(tmp_path, *words, timeout_s=200)
     assert results["messages_lost"] == 0
-    again = replayed(tmp_path, results["log"])
+    again = json_of("replay", results["log"])
     assert again["identical"]
     assert again["frames"] == results["frames_processed"]
     assert again["unchecked"] == 0
