@@ -10,7 +10,7 @@ from lowfc.arrays import Pixels
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.control.loop.inputs import Frame, Load, MirrorShape, Outputs, Request, Tick
 from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection
-from lowfc.control.loop.state import Settings, State
+from lowfc.control.loop.state import State
 from tests.support.safety_checks import violations
 from tests.support.toy import (
     DARK_DN,
@@ -29,15 +29,11 @@ from tests.support.toy import (
     frame_sequence,
     loaded,
     names,
+    running,
     settings,
 )
 
 DEFAULTS = settings()
-
-
-def running(setup: Settings = DEFAULTS, frames: int = 5) -> State:
-    """A closed loop with a mirror that is not flat."""
-    return feed(setup, loaded(setup), *(frame(count, SOME) for count in range(1, frames + 1)))[0]
 
 
 def ask(name: str, *values: float, modes: tuple[int, ...] = ()) -> Request:

@@ -6,8 +6,8 @@ import pytest
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.inputs import Command, Frame, MirrorReport, MirrorShape, Request, Tick
 from lowfc.control.loop.safety import LoopMode, Rejection
-from lowfc.control.loop.state import LawRunner, State
-from tests.support.toy import GRID, NOLL, SOME, check_reply, feed, frame, loaded, names, settings
+from lowfc.control.loop.state import LawRunner
+from tests.support.toy import GRID, NOLL, SOME, check_reply, feed, frame, loaded, names, running, settings
 
 DEFAULTS = settings()
 LOST, BACK = MirrorReport(0, "does not answer"), MirrorReport(0, "")
@@ -17,13 +17,9 @@ def frames(*counts: int) -> list[Frame]:
     return [frame(count, SOME) for count in counts]
 
 
-def running(count: int = 5) -> State:
-    return feed(DEFAULTS, loaded(DEFAULTS), *frames(*range(1, count + 1)))[0]
-
-
 def test_a_lost_mirror_moves_the_command_back_to_its_last_shape() -> None:
     """While the mirror does not follow, the error persists: without the move back the integrator would wind up."""
-    last_seen = running(5)
+    last_seen = running()
     wound_up = feed(DEFAULTS, last_seen, *frames(*range(6, 30)))[0]
     assert np.abs(wound_up.loop.history_nm[0] - last_seen.loop.history_nm[0]).max() > 20
     lost = MirrorReport(0, LOST.fault, MirrorShape(0, last_seen.loop.actuators_nm, last_seen.loop.history_nm[0]))
@@ -45,7 +41,7 @@ def test_a_lost_mirror_moves_the_command_back_to_its_last_shape() -> None:
 
 
 def test_moving_back_keeps_the_slew_limit() -> None:
-    state = running(30)
+    state = running(frames=30)
     far = MirrorShape(0, np.full(GRID, -600, np.float32), np.zeros(len(NOLL), np.float32))
     after, (_, outputs) = feed(DEFAULTS, state, MirrorReport(0, LOST.fault, far), *frames(31))
     moved_nm = np.abs(outputs.command.actuators_nm - state.loop.actuators_nm).max()
@@ -82,7 +78,7 @@ def test_a_lost_mirror_ends_the_probe_sequence_and_refuses_others() -> None:
 
 
 def test_safe_flattens_a_lost_mirror() -> None:
-    state, all_outputs = feed(DEFAULTS, running(30), LOST, Request(0, "safe"), *frames(*range(31, 60)))
+    state, all_outputs = feed(DEFAULTS, running(frames=30), LOST, Request(0, "safe"), *frames(*range(31, 60)))
     check_reply(all_outputs[1], True)
     assert not all_outputs[-1].command.actuators_nm.any()
     assert state.mode is LoopMode.SAFE

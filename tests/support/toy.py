@@ -122,6 +122,12 @@ def feed(settings: Settings, state: State, *inputs: Input) -> tuple[State, list[
     return state, all_outputs
 
 
+def running(setup: Settings | None = None, frames: int = 5) -> State:
+    """State of a closed loop after frames of one wavefront; the mirror is not flat."""
+    setup = setup or settings()
+    return feed(setup, loaded(setup), *(frame(count, SOME) for count in range(1, frames + 1)))[0]
+
+
 def names(all_outputs: list[Outputs]) -> list[str]:
     """Names of all events of these outputs."""
     return [event.name for outputs in all_outputs for event in outputs.events]
