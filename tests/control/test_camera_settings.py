@@ -192,11 +192,11 @@ def odd(count: int) -> Frame:
     return frame(count, pixels=ODD)
 
 
-def idle(frames: int = 3, shape_nm: float = 0.0) -> State:
+def idle(shape_nm: float = 0.0) -> State:
     """A controller without a calibration, whose mirror has reported its shape."""
     actuators = np.full(GRID, shape_nm, np.float32)
     state, _ = feed(DEFAULTS, State(), MirrorShape(0, actuators, np.zeros(0, np.float32)))
-    return feed(DEFAULTS, state, *(odd(count) for count in range(1, frames + 1)))[0]
+    return feed(DEFAULTS, state, *(odd(count) for count in range(1, 4)))[0]
 
 
 def play(state: State, table: Single, basis: Single = BASIS) -> State:

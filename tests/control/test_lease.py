@@ -36,11 +36,11 @@ def applied(state: State, request: Request) -> tuple[State, Outputs]:
     return advance(DEFAULTS, state, request)
 
 
-def played(state: State, frames: int = 500, lease_id: int = MINE) -> State:
+def played(state: State, frames: int = 500) -> State:
     """The state with a probe sequence in progress."""
     shape = np.full(GRID, 3, np.float32).reshape(-1)
     table = np.ones((frames, 1), np.float32)
-    request = Request(0, "play", text=MIRROR, actuators_nm=shape, table=table, lease_id=lease_id)
+    request = Request(0, "play", text=MIRROR, actuators_nm=shape, table=table, lease_id=MINE)
     state, outputs = applied(state, request)
     check_reply(outputs, True)
     return state

@@ -43,22 +43,21 @@ def within(limits: Limits, actuators_nm: Single) -> bool:
     return bool(stroke) and neighbour_difference_nm(actuators_nm.astype(np.float64)) <= limits.neighbour_nm
 
 
-def allowed_shapes(limits: Limits = LIMITS) -> st.SearchStrategy[Single]:
-    """Shapes within the limits, many of them exactly at a limit."""
-
-    def bring_in(shape: Single) -> Single:
-        shape = np.clip(shape, -np.float32(limits.stroke_nm), np.float32(limits.stroke_nm))
+def bring_in(shape: Single) -> Single:
+    shape = np.clip(shape, -np.float32(LIMITS.stroke_nm), np.float32(LIMITS.stroke_nm))
+    apart = neighbour_difference_nm(shape.astype(np.float64))
+    while apart > LIMITS.neighbour_nm:
+        shape = (shape * np.float32(LIMITS.neighbour_nm / apart * (1 - 1e-7))).astype(np.float32)
         apart = neighbour_difference_nm(shape.astype(np.float64))
-        while apart > limits.neighbour_nm:
-            shape = (shape * np.float32(limits.neighbour_nm / apart * (1 - 1e-7))).astype(np.float32)
-            apart = neighbour_difference_nm(shape.astype(np.float64))
-        return shape
+    return shape
 
-    return hnp.arrays(np.float32, GRID, elements=finite.map(np.float32)).map(bring_in)
+
+allowed_shapes = hnp.arrays(np.float32, GRID, elements=finite.map(np.float32)).map(bring_in)
+"""Shapes within the limits, many of them exactly at a limit."""
 
 
 @settings(max_examples=400, deadline=None, derandomize=True)
-@given(previous=allowed_shapes(), requested=hnp.arrays(np.float32, GRID, elements=anything.map(np.float32)))
+@given(previous=allowed_shapes, requested=hnp.arrays(np.float32, GRID, elements=anything.map(np.float32)))
 def test_the_limits_hold_for_any_requested_shape(previous: Single, requested: Single) -> None:
     assert within(LIMITS, previous)
     limited = limit(LIMITS, previous, requested)
@@ -85,7 +84,7 @@ def test_the_limits_hold_for_any_limits(stroke: float, slew: float, neighbour: f
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
-@given(previous=allowed_shapes(), fraction=st.floats(0, 1))
+@given(previous=allowed_shapes, fraction=st.floats(0, 1))
 def test_a_move_within_the_limits_is_unchanged(previous: Single, fraction: float) -> None:
     """A move well within all limits is not changed, and no reason is reported."""
     requested = (previous * np.float32(fraction)).astype(np.float32)
@@ -161,7 +160,7 @@ def test_a_shape_outside_the_limits_comes_back(previous: Single, requested: Sing
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
-@given(previous=st.one_of(allowed_shapes(), hnp.arrays(np.float32, GRID, elements=st.floats(-3000, 3000, width=32))))
+@given(previous=st.one_of(allowed_shapes, hnp.arrays(np.float32, GRID, elements=st.floats(-3000, 3000, width=32))))
 def test_relaxing_reaches_flat(previous: Single) -> None:
     shape, steps = previous, 0
     while shape.any():
@@ -173,7 +172,7 @@ def test_relaxing_reaches_flat(previous: Single) -> None:
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
-@given(shape=allowed_shapes(), seed=st.integers(0, 2**32 - 1))
+@given(shape=allowed_shapes, seed=st.integers(0, 2**32 - 1))
 def test_a_mirror_pressed_against_the_neighbour_limit_stays_there(shape: Single, seed: int) -> None:
     """Repeated requests beyond the limit neither move it back towards flat nor make it oscillate."""
     rng = np.random.default_rng(seed)

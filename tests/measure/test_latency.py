@@ -149,14 +149,14 @@ def test_a_histogram_counts_values_beyond_its_edges_in_the_outermost_bins() -> N
     assert len(sparkline([1] * 160)) == 32
 
 
-def repeat(command_us: float, echo_us: float = 100, step_us: float = 50, **changes: Any) -> dict[str, Any]:
+def repeat(command_us: float, echo_us: float = 100, **changes: Any) -> dict[str, Any]:
     """A repeat with constant latencies."""
     names = ("p50", "p90", "p99", "p99_9", "max")
     results = repeat_statistics(frames(command_us=float(command_us)))
     alone = {
         "echo_us": dict.fromkeys(names, echo_us),
-        "step_us": dict.fromkeys(names, step_us),
-        "hot_step_us": dict.fromkeys(names, step_us / 2),
+        "step_us": dict.fromkeys(names, 50.0),
+        "hot_step_us": dict.fromkeys(names, 25.0),
         "timer_us": dict.fromkeys(names, 5.0),
     }
     return (

@@ -164,10 +164,10 @@ def in_background(folder: Path, *lines: str) -> Iterator[list[str]]:
     assert all(process.returncode in (0, -signal.SIGTERM, 130) for process in processes), stderr
 
 
-def interrupt(process: "subprocess.Popen[str]", timeout_s: float = 20) -> tuple[str, str]:
+def interrupt(process: "subprocess.Popen[str]") -> tuple[str, str]:
     """Send Ctrl-C and return standard output and standard error."""
     process.send_signal(signal.SIGINT)
-    return process.communicate(timeout=timeout_s)
+    return process.communicate(timeout=20)
 
 
 def until(

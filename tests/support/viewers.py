@@ -50,9 +50,9 @@ def pixels(png: bytes) -> Pixels:
         return np.asarray(picture.convert("RGB"))
 
 
-def share_of(picture: Pixels, colour: tuple[int, int, int], tolerance: int = 12) -> float:
+def share_of(picture: Pixels, colour: tuple[int, int, int]) -> float:
     """Fraction of an image with a colour, 0 to 1."""
-    return float(np.all(np.abs(picture.astype(int) - colour) <= tolerance, axis=2).mean())
+    return float(np.all(np.abs(picture.astype(int) - colour) <= 12, axis=2).mean())
 
 
 def views(part: rrb.Container | rrb.View) -> list[rrb.View]:

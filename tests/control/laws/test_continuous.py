@@ -38,9 +38,9 @@ def wheel(noise_nm2: float = 1e-6) -> Model:
     return Model(1e-9, np.inf, lines, noise_nm2, RATE_HZ)
 
 
-def simulated_residual(law: LinearLaw, omega: float, timing: Timing, frames: int = 1500) -> float:
+def simulated_residual(law: LinearLaw, omega: float, timing: Timing) -> float:
     """Mean square residual over time of sqrt(2) cos(omega t + 1), simulated in fine steps."""
-    fine = (np.arange(FINE) + 0.5) / FINE
+    frames, fine = 1500, (np.arange(FINE) + 0.5) / FINE
     weights = delay_weights(timing.delay)
     x, c = at_rest(law).astype(float), np.zeros(frames + 8)
     squares = []

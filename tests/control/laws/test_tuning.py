@@ -36,10 +36,10 @@ def wheel(frames: int, seed: int = 1, noise_nm: float = 0.8) -> tuple[TimeSeries
     return TimeSeries((truth + noise,), 0), truth
 
 
-def true_mas(law: LinearLaw, pol: TimeSeries, truth: np.ndarray, delay_frames: float, settled: int = 4000) -> float:
+def true_mas(law: LinearLaw, pol: TimeSeries, truth: np.ndarray, delay_frames: float) -> float:
     errors, _ = run(law, pol.values[0], delay_frames)
     residual = errors - (pol.values[0] - truth)
-    return float(np.sqrt(np.mean(residual[settled:] ** 2)) / NM_PER_MAS)
+    return float(np.sqrt(np.mean(residual[4000:] ** 2)) / NM_PER_MAS)
 
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.5, 2.0, 3.0])

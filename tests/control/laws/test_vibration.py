@@ -21,10 +21,10 @@ RATE_HZ = 1000.0
 NM_PER_MAS = tilt_nm_per_mas(2.0)
 
 
-def preset(name: str, frames: int, seed: int = 1, noise_nm: float = 0.8) -> TimeSeries:
+def preset(name: str, frames: int) -> TimeSeries:
     """Tip of a preset, measured with white noise."""
-    simulated = preset_disturbance(name, (2, 3, 4), seed, NM_PER_MAS, 550.0)
-    noise = noise_nm * np.random.default_rng(seed).standard_normal((frames, 1))
+    simulated = preset_disturbance(name, (2, 3, 4), 1, NM_PER_MAS, 550.0)
+    noise = 0.8 * np.random.default_rng(1).standard_normal((frames, 1))
     return TimeSeries((modes_nm(simulated, 0, frames, RATE_HZ)[:, :1] + noise,), 0)
 
 
