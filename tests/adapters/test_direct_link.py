@@ -122,7 +122,7 @@ class ReaderOnTwoPaths:
         unsubscribed: number of times that it left the bus.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, shared: bool = False) -> None:
         self.delivered: list[int] = []
         self.unsubscribed = 0
         self.reader = direct_link.DirectReader(
@@ -132,6 +132,7 @@ class ReaderOnTwoPaths:
             self._subscribe,
             time.time_ns,
             pytest.fail,
+            shared=shared,
         )
 
     def _subscribe(self, _: Callable[[Sample], None]) -> Callable[[], None]:
@@ -333,29 +334,13 @@ def test_handed_ns_precedes_the_bus_put_with_a_direct_reader_and_follows_it_with
 
 def test_after_a_stall_with_the_bus_ahead_nothing_is_delivered_twice(tmp_path: Path) -> None:
     """A socket buffers at most a few thousand commands."""
-    delivered_ns: list[int] = []
-    by_bus: list[direct_link.Handler] = []
-
-    def subscribe(handler: direct_link.Handler) -> Callable[[], None]:
-        by_bus.append(handler)
-        return by_bus.clear
-
-    path, commands = tmp_path / "mirror-dm.in", 5000
-    reader = direct_link.DirectReader(
-        path,
-        "k",
-        lambda sample: delivered_ns.append(sample.publish_time_ns),
-        subscribe,
-        lambda: 0,
-        pytest.fail,
-        shared=True,
-    )
+    reader, commands = ReaderOnTwoPaths(tmp_path / "mirror-dm.in", shared=True), 5000
     for count in range(commands):
-        by_bus[0](Sample("k", b"", sequence_of(5, count), count, 0))
+        reader.by_bus(sequence_of(5, count), count)
     for count in range(commands + 1):
-        reader.take(Envelope(sequence_of(5, count), count).encode(), b"", 0)
-    reader.close()
-    assert delivered_ns == list(range(commands + 1))
+        reader.by_socket(sequence_of(5, count), count)
+    reader.reader.close()
+    assert reader.delivered == [sequence_of(5, count) for count in range(commands + 1)]
 
 
 def test_with_a_router_there_is_no_direct_link(ends: Ends) -> None:

@@ -1,6 +1,5 @@
 """The rules of the chaos cases: each holds in a run without a fault, and detects its own kind of fault."""
 
-import json
 import random
 import shutil
 import signal
@@ -11,8 +10,6 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import runtime_base
@@ -27,11 +24,12 @@ from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, T
 from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Outcome, ProcessEnd
 from lowfc.programs.reliability.chaos.case import Case, lacking
 from lowfc.programs.reliability.chaos.cases import CASES
-from lowfc.programs.reliability.chaos.command import _run, chaos, configured
+from lowfc.programs.reliability.chaos.command import _run, configured
 from lowfc.programs.reliability.chaos.evidence import FORGED_S, Entry, Evidence, read
 from lowfc.programs.reliability.chaos.frames import FAULTY_FRAMES, FIRST
 from lowfc.programs.reliability.chaos.rules import FLOOR_NM, MAX_RATIO, Finding, judge, recovered_s, restart_steps_nm
 from sim_camera.faults import Kind
+from tests.support.loops import json_of, lowfc, refusal
 
 START_S = 1_800_000_000
 SECOND_NS = 1_000_000_000
@@ -264,11 +262,8 @@ def test_every_case_has_a_valid_configuration_and_known_events(tmp_path: Path) -
 
 
 def run(*arguments: str, status: int = 0) -> str:
-    app = typer.Typer()
-    app.command("chaos")(chaos)
-    app.command("other")(lambda: None)  # an app with one command has no names of commands
-    done = CliRunner().invoke(app, ["chaos", *arguments], catch_exceptions=False)
-    assert done.exit_code == status
+    done = lowfc("chaos", *arguments)
+    assert done.exit_code == status, done.exception
     return done.stdout
 
 
@@ -305,7 +300,7 @@ def test_a_case_that_the_host_cannot_run_is_skipped_and_not_passed() -> None:
     table = run(*arguments)
     assert table.splitlines()[0].startswith("lacking  skipped: requires a mount (not here) ")
     assert table.endswith("1 passed, 0 failed, 1 skipped, seed 1\n")
-    results = json.loads(run(*arguments, "--json"))
+    results = json_of("chaos", *arguments)
     assert (results["passed"], results["failed"], results["skipped"]) == (1, 0, 1)
     assert [(row["passed"], row["skipped"]) for row in results["cases"]] == [
         (False, "requires a mount (not here)"),
@@ -320,7 +315,7 @@ def test_an_unexpected_error_fails_only_its_case_and_its_traceback_is_kept() -> 
     assert table.endswith("2 passed, 1 failed, seed 1\n")
     assert 'raise KeyError("odd")' in Path("chaos-logs/odd-1/error.txt").read_text()
     assert "    logs: chaos-logs/odd-1\n" in table
-    rows = json.loads(run("--case", "good", "--case", "odd", "--case", "lacking", "--json", status=1))["cases"]
+    rows = json_of("chaos", "--case", "good", "--case", "odd", "--case", "lacking", status=1)["cases"]
     assert [(row["detail"], row["log"]) for row in rows] == [
         ("", None),
         ("error: KeyError: 'odd'", "chaos-logs/odd-1"),
@@ -331,7 +326,7 @@ def test_an_unexpected_error_fails_only_its_case_and_its_traceback_is_kept() -> 
 @pytest.mark.usefixtures("without_loop")
 def test_a_log_that_cannot_be_moved_stays_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.move", Mock(side_effect=OSError("no space left")))
-    good, odd = json.loads(run("--case", "good", "--case", "odd", "--json", status=1))["cases"]
+    good, odd = json_of("chaos", "--case", "good", "--case", "odd", status=1)["cases"]
     assert (good["passed"], good["log"], odd["passed"]) == (True, None, False)
     assert 'raise KeyError("odd")' in Path(odd["log"], "error.txt").read_text()
     shutil.rmtree(odd["log"])
@@ -362,11 +357,10 @@ def test_a_shifted_clock_is_tried_with_the_shift_of_the_case(monkeypatch: pytest
 def test_a_folder_that_cannot_hold_logs_is_refused_before_the_first_case(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for folder in ("file", "file/logs"):
-        with pytest.raises(DataFileError, match="no logs can be kept in file"):
-            run("--case", "stopped", "--keep", folder)
+        error = refusal("chaos", "--case", "stopped", "--keep", folder, kind=DataFileError)
+        assert "no logs can be kept in file" in error
     Path("chaos-logs").touch()
-    with pytest.raises(DataFileError, match="name another with --keep"):
-        run("--case", "stopped")
+    assert "name another with --keep" in refusal("chaos", "--case", "stopped", kind=DataFileError)
 
 
 @pytest.mark.usefixtures("own_runtime")
@@ -380,6 +374,5 @@ def test_an_interrupt_while_a_case_is_prepared_leaves_no_run(tmp_path: Path, mon
 def test_without_a_case_all_are_listed_and_the_error_of_an_unknown_one_suggests_a_name() -> None:
     table = run()
     assert all(name in table for name in CASES)
-    assert [one["name"] for one in json.loads(run("--json"))["cases"]] == list(CASES)
-    with pytest.raises(ConfigurationError, match="frames-dark"):
-        run("--case", "frame-dark")
+    assert [one["name"] for one in json_of("chaos")["cases"]] == list(CASES)
+    assert "frames-dark" in refusal("chaos", "--case", "frame-dark", kind=ConfigurationError)
