@@ -1,22 +1,17 @@
 """A run in one process, in real time: real controller and mirror, toy sensor, a stand-in for the recorder."""
 
-import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 from lowfc.adapters.bus.bus import Query, Sample
 from lowfc.adapters.process.clock import HostClock
-from lowfc.adapters.process.latch import Latch
-from lowfc.adapters.process.service import Service
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, RECORD_KEY, REQUEST, image, wire
-from lowfc.device.driver import CameraSettings, DriverOptions, camera_state
-from lowfc.device.mirror_loop import MirrorLoop
-from lowfc.programs.core.controller import Controller
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from sim_dm.driver import SimulatedMirror
+from lowfc.device.driver import CameraSettings, camera_state
+from tests.support.in_process_loop import ThreadedRun
 from tests.support.loops import until
 from tests.support.toy import GRID, SATURATION_DN, SHAPE, TOY, calibration
 
@@ -39,7 +34,7 @@ CONFIG = load(
 )
 
 
-class LiveRun:
+class LiveRun(ThreadedRun):
     """A run whose controller, mirror and camera are threads of this process.
 
     Attributes:
@@ -48,7 +43,8 @@ class LiveRun:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.hub, self.clock = MemoryHub(), HostClock()
+        self.clock = HostClock()
+        super().__init__(RUN, CONFIG, lambda: self.clock)
         self.requests: list[wire.Request] = []
         self.recorded: list[str] = []
         monitor = self.bus("monitor")
@@ -56,37 +52,20 @@ class LiveRun:
         mirror_states: list[object] = []
         monitor.subscribe(MIRROR_STATE, mirror_states.append)
         self.bus("recorder").queryable(RECORD_KEY.format(name="*"), self._record)
-        self.services = [
-            Service(name, RUN, self.clock, self.bus(name)) for name in ("controller", "mirror-dm", "camera")
-        ]
-        controller, mirror, self.camera = self.services
+        self.camera = self.service("camera")
         self.frames, camera_states = self.camera.publisher(FRAME), self.camera.publisher(CAMERA_STATE)
-        processes = [MirrorLoop(SimulatedMirror(DriverOptions(), CONFIG), mirror, CONFIG)]
-        processes.append(Controller(CONFIG, controller, identified(calibration()), "a test", Latch([folder / "safe"])))
-        self._threads = [threading.Thread(target=process.run, daemon=True) for process in processes]
-        self._threads.append(threading.Thread(target=self._expose, daemon=True))
         state = camera_state(
             replace(CameraSettings.configured(CONFIG, *SHAPE), saturation_dn=SATURATION_DN), self.clock.now_ns()
         )
         camera_states.put(state.SerializeToString())
-        for thread in self._threads:
-            thread.start()
+        camera = SimpleNamespace(run=self._expose)
+        self.start(identified(calibration()), "a test", folder / "safe", (camera, self.camera))
         until(lambda: mirror_states)
 
     def _add_request(self, sample: Sample) -> None:
         request = wire.Request.FromString(sample.payload)
         if request.name != "configuration":
             self.requests.append(request)
-
-    def bus(self, role: str) -> MemoryBus:
-        return MemoryBus(self.hub, role, self.clock)
-
-    def stop(self) -> None:
-        for service in reversed(self.services):
-            service.stop("the test is over")
-        for thread in self._threads:
-            thread.join(10)
-        assert not any(thread.is_alive() for thread in self._threads)
 
     def _expose(self) -> None:
         self.camera.state = "running"

@@ -50,19 +50,15 @@ from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
-from lowfc.device import DriverOptions
 from lowfc.device.driver import CameraSettings, camera_state
-from lowfc.device.mirror_loop import MirrorLoop
 from lowfc.programs.core.controller import Controller
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.driver import scene as configured_scene
 from sim_camera.scene import Scene, Wavefront
-from sim_dm.driver import SimulatedMirror
-from tests.support.in_process_loop import SMALL_MIRROR
+from tests.support.in_process_loop import PATIENCE_S, SMALL_MIRROR, ThreadedRun
 from tests.support.loops import until
 from tools.law_bench import calibrated
 
-PATIENCE_S = 20.0
 START_NS = 1_767_225_600_000_000_000
 
 
@@ -80,11 +76,12 @@ CONFIG, CLOSED = configured(), configured(control__start_mode="closed")
 GRID = CONFIG.mirror.rows, CONFIG.mirror.columns
 
 
-class Rig:
-    """A run in one process: controller and mirror in threads, and the messages that they published."""
+class Rig(ThreadedRun):
+    """A run in one process, and the messages that its controller and mirror published."""
 
     def __init__(self, config: Configuration, calibration: Calibration, scene: Scene) -> None:
-        self.config, self.calibration, self.scene, self.hub = config, calibration, scene, MemoryHub()
+        super().__init__("test", config, lambda: SimulatedClock(START_NS) if config.lockstep else HostClock())
+        self.calibration, self.scene = calibration, scene
         self.received: dict[str, list[Any]] = {}
         self.offset_nm = np.zeros(GRID, np.float32)
         self._index = 0
@@ -94,21 +91,10 @@ class Rig:
             self.operator.subscribe(topic, self._appender(topic.message, topic.key))
         camera = self.bus("camera")
         self.frames, self.settings = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
-        self.services = [Service(role, "test", self.clock(), self.bus(role)) for role in ("controller", "mirror-dm")]
-        self.mirror = MirrorLoop(SimulatedMirror(DriverOptions(), config), self.services[1], config)
         state = camera_state(CameraSettings.configured(config, *scene.shape), START_NS)
         self.settings.put(state.SerializeToString())
         self.latch = Path(tempfile.mkdtemp()) / "safe"
-        self.controller = Controller(config, self.services[0], calibration, "a test", Latch([self.latch]))
-        self.threads = [threading.Thread(target=process.run) for process in (self.mirror, self.controller)]
-        for thread in self.threads:
-            thread.start()
-
-    def clock(self) -> HostClock | SimulatedClock:
-        return SimulatedClock(START_NS) if self.config.lockstep else HostClock()
-
-    def bus(self, role: str) -> MemoryBus:
-        return MemoryBus(self.hub, role, self.clock())
+        self.start(calibration, "a test", self.latch)
 
     def _appender(self, kind: type[Message], key: str) -> Callable[[Sample], None]:
         def append(sample: Sample) -> None:
@@ -164,11 +150,7 @@ class Rig:
         return [log.message.split()[0] for log in self.received.get(EVENT.key, []) if isinstance(log, Log)]
 
     def stop(self) -> None:
-        for service in self.services:
-            service.stop("the test is over")
-        for thread in self.threads:
-            thread.join(PATIENCE_S)
-        assert not any(thread.is_alive() for thread in self.threads)
+        super().stop()
         assert not any(bus.faults.counts for bus in self.hub.buses)
 
 
@@ -522,7 +504,7 @@ def test_refused_commands_do_not_reset_the_command_timeout(
     with running(configured(lockstep=False, control__command_timeout_ms=50.0), calibration, scene) as rig:
         rig.put(scene.expose(0, rig.offset_nm))
         rig.services[0].stop("the controller has died")
-        rig.threads[1].join(PATIENCE_S)
+        rig.threads[0].join(PATIENCE_S)
         another_publisher = rig.bus("other").publisher(COMMAND, "dm")
         nonsense = wire.MirrorCommand(
             rows=GRID[0], columns=GRID[1], actuators=actuators, frame_sequence=2**63, valid_for_ns=10**9

@@ -7,7 +7,6 @@ released version are never changed.
 
 import shutil
 import sys
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,9 +18,7 @@ import numpy as np
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files import calibration_file, factory, law_file
 from lowfc.adapters.logs.writer import Attachment
-from lowfc.adapters.process.latch import Latch
 from lowfc.adapters.process.provenance import provenance
-from lowfc.adapters.process.service import Service
 from lowfc.client import Client
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.codecs.codec import actuators
@@ -30,21 +27,16 @@ from lowfc.contract.errors import RequestRefusedError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, STEP, TRUTH, image, timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw, integrator_block, law_from_blocks
-from lowfc.device import DriverOptions
 from lowfc.device.driver import CameraSettings, camera_state
-from lowfc.device.mirror_loop import MirrorLoop
-from lowfc.programs.core.controller import Controller
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.testing.clock import FakeClock
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.driver import scene
-from sim_dm.driver import SimulatedMirror
+from tests.support.in_process_loop import ThreadedRun
 from tests.support.loops import until
 from tools.law_bench import calibrated
 
 ROOT = Path(__file__).parents[2]
 START_NS = 1_767_225_600_000_000_000
-PATIENCE_S = 20.0
 CONFIGURATION = {
     "sensor.modes": 2,
     "mirror.rows": 12,
@@ -62,12 +54,12 @@ CONFIGURATION = {
 }
 
 
-class Night:
+class Night(ThreadedRun):
     """A run in one process: a camera that exposes on request; controller, mirror and recorder in their own threads."""
 
     def __init__(self, config: Configuration, calibration: Calibration, folder: Path) -> None:
-        self.config, self.calibration = config, calibration
-        self.hub, self.clock = MemoryHub(), FakeClock(START_NS)
+        self.clock = FakeClock(START_NS)
+        super().__init__("golden", config, lambda: self.clock)
         self.index = self.last_step = 0
         self.shape_nm = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
         self.scene = scene(config)
@@ -85,20 +77,8 @@ class Night:
         recorder = Recorder(
             self.bus("recorder"), self.clock, "golden", folder / "logs", metadata=metadata, attachments=attached
         )
-        services = [Service(role, "golden", self.clock, self.bus(role)) for role in ("controller", "mirror-dm")]
-        latch = Latch([folder / "run" / "safe"])
-        self.processes = [
-            (Controller(config, services[0], calibration, "calibration.fits", latch), services[0]),
-            (MirrorLoop(SimulatedMirror(DriverOptions(), config), services[1], config), services[1]),
-            (recorder, recorder.service),
-        ]
-        self.threads = [threading.Thread(target=process.run) for process, _ in self.processes]
-        for thread in self.threads:
-            thread.start()
+        self.start(calibration, "calibration.fits", folder / "run" / "safe", (recorder, recorder.service))
         until(lambda: recorder.service.state == "ready")
-
-    def bus(self, role: str) -> MemoryBus:
-        return MemoryBus(self.hub, role, self.clock)
 
     def start_camera(self, **changes: float) -> None:
         """Start the camera, or restart it with other settings."""
@@ -143,12 +123,6 @@ class Night:
         for _ in range(3):
             self.clock.advance(20_000_000)
             time.sleep(0.05)
-
-    def finish(self) -> None:
-        for thread, (_, service) in zip(self.threads, self.processes, strict=True):
-            service.stop("done")
-            thread.join(PATIENCE_S)
-            assert not thread.is_alive()
 
 
 def expect_refusal(request: Callable[..., object], *arguments: object) -> None:
@@ -243,7 +217,7 @@ def main(folder: Path) -> None:
     expect_refusal(loop.close_loop)
     loop.clear()
     night.expose(1)
-    night.finish()
+    night.stop()
     (log,) = (work / "logs").glob("*.mcap")
     log.rename(folder / "night.mcap")
     shutil.rmtree(work)

@@ -1,10 +1,12 @@
-"""A loop in one process: with the interface of `lowfc.client`, or run for a number of frames."""
+"""A loop in one process: with the interface of `lowfc.client`, in threads, or run for a number of frames."""
 
 import contextlib
+import threading
 import tomllib
 from collections import deque
 from collections.abc import Callable, Iterator
 from functools import lru_cache
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.bus.bus import Publisher
-from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.clock import Clock, HostClock
+from lowfc.adapters.process.latch import Latch
+from lowfc.adapters.process.service import Service
 from lowfc.arrays import Single
 from lowfc.client import Answer, Client, MirrorWatch
 from lowfc.client import Frame as Image
@@ -25,10 +29,14 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.inputs import MirrorShape, Request, Step, Tick
-from lowfc.device import driver
+from lowfc.device import DriverOptions, driver
+from lowfc.device.mirror_loop import MirrorLoop
+from lowfc.programs.core.controller import Controller
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
+from sim_dm.driver import SimulatedMirror
 from tools.law_bench import Bench, calibrated
 
+PATIENCE_S = 20.0
 FIRST = 1 << 32  # sequence of the first frame of a camera
 SMALL_MIRROR = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 10}
 """For tests that do not depend on the number of actuators: a calibration is computed several times as fast."""
@@ -242,3 +250,35 @@ def run_loop(config: Configuration, frames: int, calibration: Calibration | None
     for name in ("disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm"):
         columns[name] = [getattr(truth.sampled, name) for truth in bench.truths]
     return SimpleNamespace(**{name: np.array(rows, np.float64) for name, rows in columns.items()})
+
+
+class ThreadedRun:
+    """Controller and mirror in threads; a subclass adds the camera, and other processes if it needs them."""
+
+    def __init__(self, run_id: str, config: Configuration, new_clock: Callable[[], Clock]) -> None:
+        """Each connection and each service has a clock of `new_clock`."""
+        self.run_id, self.config, self.new_clock, self.hub = run_id, config, new_clock, MemoryHub()
+
+    def bus(self, role: str) -> MemoryBus:
+        return MemoryBus(self.hub, role, self.new_clock())
+
+    def service(self, role: str) -> Service:
+        return Service(role, self.run_id, self.new_clock(), self.bus(role))
+
+    def start(self, calibration: Calibration, source: str, latch: Path, *others: tuple[Any, Service]) -> None:
+        """Start the controller, the mirror, and other processes with their services."""
+        controller, mirror = self.service("controller"), self.service("mirror-dm")
+        self.controller = Controller(self.config, controller, calibration, source, Latch([latch]))
+        self.mirror = MirrorLoop(SimulatedMirror(DriverOptions(), self.config), mirror, self.config)
+        processes = ((self.controller, controller), (self.mirror, mirror), *others)
+        self.services = [service for _, service in processes]
+        self.threads = [threading.Thread(target=process.run, daemon=True) for process, _ in processes]
+        for thread in self.threads:
+            thread.start()
+
+    def stop(self) -> None:
+        """Stop the processes, one after another."""
+        for service, thread in zip(self.services, self.threads, strict=True):
+            service.stop("the test is over")
+            thread.join(PATIENCE_S)
+            assert not thread.is_alive()
