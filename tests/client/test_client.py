@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import json
 import os
 import shutil
 import socket
@@ -56,7 +55,7 @@ from lowfc.programs.cli.modes import noll_of
 from lowfc.programs.cli.status import json_object, text
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.in_process_loop import ReportingBus
-from tests.support.loops import lowfc, until
+from tests.support.loops import json_of, lowfc, until
 from tests.support.recording import Bench, bodies_of, put
 from tests.support.toy import NOLL, calibration
 
@@ -763,7 +762,5 @@ def test_contrast_is_estimated_for_a_real_camera_and_true_for_a_simulated_one() 
 def test_a_configuration_with_values_that_json_lacks_is_printed_as_json(monkeypatch: pytest.MonkeyPatch) -> None:
     loop = SimpleNamespace(run_id="bench", configuration=lambda: "[drivers.own]\nsince = 2026-01-31\nlimit = -inf\n")
     monkeypatch.setattr("lowfc.programs.cli.ctl._client", lambda run: contextlib.nullcontext(loop))
-    done = lowfc("ctl", "configuration", "--json")
-    assert json.loads(done.stdout) == {"drivers": {"own": {"since": "2026-01-31", "limit": "-Infinity"}}}, (
-        done.exception
-    )
+    shown = json_of("ctl", "configuration")
+    assert shown == {"drivers": {"own": {"since": "2026-01-31", "limit": "-Infinity"}}}

@@ -24,7 +24,7 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.messages import FRAME, STEP, Role, Topic
 from lowfc.programs.core.recording.summary import Summary
 from lowfc.programs.launch.watch import topic_count
-from tests.support.loops import lowfc, start, until
+from tests.support.loops import json_of, lowfc, refusal, start, until
 from tests.support.recording import PATIENCE_S, bodies_of
 
 SAFE_S = 0.6
@@ -137,13 +137,12 @@ def test_a_recording_is_stopped_without_a_controller_and_a_second_recorder_is_re
 ) -> None:
     monkeypatch.setattr("lowfc.programs.core.recording.process.set_up_below_loop", lambda *_: NOTHING)
     (config := own_runtime / "other.toml").touch()
-    assert "cannot listen" in str(lowfc("record", "--run", bench.run.run_id, "--config", config).exception)
+    assert "cannot listen" in refusal("record", "--run", bench.run.run_id, "--config", config)
     assert not (bench.run.path / "config.toml").exists()
-    stopped = lowfc("ctl", "record", "stop", "--json")
-    reader = LogReader(Path(json.loads(stopped.stdout)["log"]))
+    reader = LogReader(Path(json_of("ctl", "record", "stop")["log"]))
     assert (len(list(reader)) > 0, reader.complete) == (True, True)
-    refused = lowfc("ctl", "status", "--run", bench.run.run_id)
-    assert f"run '{bench.run.run_id}' has no controller" in str(refused.exception)
+    refused = refusal("ctl", "status", "--run", bench.run.run_id)
+    assert f"run '{bench.run.run_id}' has no controller" in refused
 
 
 @pytest.mark.parametrize(

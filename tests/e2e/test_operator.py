@@ -18,7 +18,6 @@ from subprocess import Popen
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.files import calibration_file, law_file
 from lowfc.client import Client, running
@@ -28,7 +27,6 @@ from lowfc.contract.messages import COMMAND, EVENT, REQUEST, Log, wire
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limits
-from lowfc.programs.cli.ctl import ctl_app
 from tests.support.loops import FIXED, children, interrupt, json_of, lowfc, payloads, refusal, start, until
 from tests.support.safety_checks import violations
 
@@ -52,8 +50,8 @@ class Night:
 
     def ctl(self, command: str) -> str:
         words = [str(self.folder / word) if (self.folder / word).is_file() else word for word in shlex.split(command)]
-        done = CliRunner().invoke(ctl_app, [*words[2:], "--run", self.name], catch_exceptions=False)
-        assert done.exit_code == 0, done.output
+        done = lowfc(*words[1:], "--run", self.name)
+        assert done.exit_code == 0, (done.output, done.exception)
         self.outputs[command] = done.stdout
         return done.stdout
 

@@ -24,7 +24,7 @@ from lowfc.programs.gateway.variables import Kind, variables
 from lowfc.programs.gateway.watch import Watch
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from tests.support.loops import interrupt, lowfc, start, until
+from tests.support.loops import interrupt, refusal, start, until
 
 Process = subprocess.Popen[str]
 IOC = """
@@ -119,10 +119,9 @@ def test_requests_with_numbers_or_a_text_are_variables_with_unique_names() -> No
 
 def test_missing_p4p_is_reported_with_install_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "p4p", None)
-    fault = lowfc("gateway", "epics").exception
-    assert isinstance(fault, ConfigurationError)
-    assert "needs p4p" in str(fault)
-    assert "pip install" in str(fault)
+    fault = refusal("gateway", "epics", kind=ConfigurationError)
+    assert "needs p4p" in fault
+    assert "pip install" in fault
 
 
 class DeafBus(MemoryBus):

@@ -26,7 +26,7 @@ from lowfc.programs.logs.report.results import report_of
 from lowfc.programs.logs.report.source import read_run
 from lowfc.programs.logs.report.verdict import verdict
 from tests.support import report_log
-from tests.support.loops import json_of, lowfc
+from tests.support.loops import json_of, lowfc, refusal
 from tests.support.mutated_logs import flipped
 from tests.support.report_log import READ_NOISE_E, TOY_CALIBRATION, SyntheticLog
 from tests.support.theory import noise_gain, rejection
@@ -555,9 +555,7 @@ def test_missing_packages_are_reported_before_the_log_is_read(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.setattr("lowfc.programs.logs.report.source.read_run", lambda *_: pytest.fail("the log was read"))
-    done = lowfc("report", good)
-    assert isinstance(done.exception, ConfigurationError)
-    assert re.search(r"-m pip install .*'jinja2", str(done.exception))
+    assert re.search(r"-m pip install .*'jinja2", refusal("report", good, kind=ConfigurationError))
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, module, None)
     assert json_of("report", good)["log"]["file"] == "x.mcap", "the results need neither"
@@ -568,7 +566,6 @@ def test_a_report_overwrites_no_log_and_has_the_name_of_a_page(tmp_path: Path, n
     log = uneventful(SyntheticLog(), 3).write(tmp_path / "night.mcap")
     before = log.read_bytes()
     (tmp_path / "link.html").hardlink_to(log)
-    done = lowfc("report", str(log), "--out", str(tmp_path / name))
-    assert isinstance(done.exception, DataFileError)
+    assert refusal("report", log, "--out", tmp_path / name, kind=DataFileError)
     assert log.read_bytes() == before
     assert {path.name for path in tmp_path.iterdir()} == {"night.mcap", "link.html"}
