@@ -128,21 +128,11 @@ def hub() -> MemoryHub:
     return MemoryHub()
 
 
-@pytest.fixture
-def forge(hub: MemoryHub) -> Callable[[], None]:
-    bus = MemoryBus(hub, "operator", FakeClock())
-
-    def flood() -> None:
-        for number in range(FORGED):
-            bus.publisher(HEALTH, f"forged-{number}").put(health(number))
-
-    return flood
-
-
-def test_forged_names_do_not_fill_a_process_and_give_one_event(hub: MemoryHub, forge: Callable[[], None]) -> None:
-    listener = Listener(hub, FakeClock())
+def test_forged_names_do_not_fill_a_process_and_give_one_event(hub: MemoryHub) -> None:
+    bus, listener = MemoryBus(hub, "operator", FakeClock()), Listener(hub, FakeClock())
     camera = listener.service("camera")
-    forge()
+    for number in range(FORGED):
+        bus.publisher(HEALTH, f"forged-{number}").put(health(number))
     listener.service("controller").beat()
     camera.beat()
     assert len(camera.last_health) == MAX_NAMES + 1

@@ -25,7 +25,7 @@ from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.control.calibration.response_fit import cross_talk
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.optics.chain.zernike import zernikes
-from lowfc.optics.twin.twin import Twin, node_radii, reference, response
+from lowfc.optics.twin.twin import node_radii, reference, response
 from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate import align as calibrate_align
 from lowfc.programs.commissioning.calibrate import command, pokes
@@ -437,17 +437,8 @@ def config() -> Configuration:
     return load(None, BRIGHT)
 
 
-@pytest.fixture(scope="module")
-def optics(config: Configuration) -> Twin:
-    return factory.twin(config, None, print)
-
-
-@pytest.fixture(scope="module")
-def at_zero_point(config: Configuration) -> Calibration:
-    return analytic(config, SILENT, zero_point(config, ZERO_POINT)[1])
-
-
-def test_the_response_is_the_derivative_of_the_image(optics: Twin) -> None:
+def test_the_response_is_the_derivative_of_the_image(config: Configuration) -> None:
+    optics = factory.twin(config, None, print)
     modes = zernikes((2, 4, 11), *node_radii(optics))
     state_nm = 15.0 * modes[1] - 10.0 * modes[2]
     H = response(optics, modes, state_nm)
@@ -459,9 +450,9 @@ def test_the_response_is_the_derivative_of_the_image(optics: Twin) -> None:
 
 
 def test_the_option_at_takes_a_mirror_shape_for_the_wavefront_that_it_makes(
-    config: Configuration, at_zero_point: Calibration, tmp_path: Path
+    config: Configuration, tmp_path: Path
 ) -> None:
-    flat = analytic(config, SILENT)
+    flat, at_zero_point = analytic(config, SILENT), analytic(config, SILENT, zero_point(config, ZERO_POINT)[1])
     command_nm = np.zeros(len(flat.noll))
     command_nm[[flat.noll.index(4), flat.noll.index(7)]] = 20.0, -20.0
     np.save(tmp_path / "shape.npy", (flat.modes_to_actuators @ command_nm).reshape(flat.grid))

@@ -46,11 +46,6 @@ def quiet() -> Scene:
     return scene_of(configured(**FINE))
 
 
-@pytest.fixture(scope="module")
-def noisy() -> Scene:
-    return scene_of(configured())
-
-
 def shape_of(calibration: Calibration, modes_nm: np.ndarray) -> np.ndarray:
     return (calibration.modes_to_actuators @ modes_nm.astype(np.float32)).reshape(GRID)
 
@@ -93,7 +88,8 @@ def noisy_frames(scene: Scene, count: int) -> list[np.ndarray]:
     return [scene.expose(index, FLAT) for index in range(count)]
 
 
-def test_noise_depends_on_the_seed_and_flux_matches_the_calibration(noisy: Scene, calibration: Calibration) -> None:
+def test_noise_depends_on_the_seed_and_flux_matches_the_calibration(calibration: Calibration) -> None:
+    noisy = scene_of(configured())
     frames, pixels = noisy_frames(noisy, 20), noisy.shape[0] * noisy.shape[1]
     first = [frame.tobytes() for frame in frames[:3]]
     assert [frame.tobytes() for frame in noisy_frames(scene_of(configured()), 3)] == first
