@@ -1,7 +1,6 @@
 """Control characters in notes and other text of unknown origin are escaped and never sent to a terminal."""
 
 import errno
-import signal
 import sys
 from pathlib import Path
 
@@ -48,6 +47,7 @@ def test_a_process_escapes_its_events(capsys: pytest.CaptureFixture[str]) -> Non
     assert capsys.readouterr().err == f"camera: RECORDING_FAILED recording stopped: {SHOWN}\n"
 
 
+@pytest.mark.usefixtures("restored_signals")
 @pytest.mark.parametrize("fault", [RequestRefusedError(HOSTILE), OSError(errno.ENAMETOOLONG, "too long", HOSTILE)])
 def test_a_command_escapes_its_output_and_errors(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, fault: Exception
@@ -61,13 +61,8 @@ def test_a_command_escapes_its_output_and_errors(
         raise fault
 
     monkeypatch.setattr(sys, "argv", ["lowfc"])
-    before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)}
-    try:
-        with pytest.raises(SystemExit):
-            run_app(failing)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with pytest.raises(SystemExit):
+        run_app(failing)
     check(capsys.readouterr().err)
 
 

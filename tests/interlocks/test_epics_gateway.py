@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -220,16 +220,7 @@ def test_a_port_in_use_is_an_error_with_the_address(pvs: Variables) -> None:
         gateway()
 
 
-@pytest.fixture
-def signals() -> Iterator[None]:
-    """Restore the handlers of signals that a command sets."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-@pytest.mark.usefixtures("signals", "own_runtime")
+@pytest.mark.usefixtures("restored_signals", "own_runtime")
 def test_the_command_serves_a_run_until_it_is_stopped(
     pvs: Variables, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
