@@ -433,10 +433,6 @@ def test_a_log_without_input_numbers_is_refused() -> None:
     assert replay(night.messages).identical
 
 
-def test_one_frame_is_singular() -> None:
-    assert Account(frames=1, commands=1).head()[0].startswith("1 frame, commands identical")
-
-
 def test_a_log_with_nothing_to_check_is_not_identical() -> None:
     assert not replay([]).identical
     night = night_of(frames(5))
