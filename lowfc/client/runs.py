@@ -29,8 +29,7 @@ def the_run(name: str | None) -> str:
     if len(matching) == 1:
         return matching[0]
     if silent := _silent_routers(name) if name or not runs else "":
-        before = "" if name else f"{none_here()}; "
-        raise BusError(f"{before}{silent}: is it running, and can this host reach it?")
+        raise BusError(f"{silent}: is it running, and can this host reach it?" if name else f"{none_here()}; {silent}")
     if not runs:
         raise BusError(none_here() if name is None else f"there is no run {name!r}: {none_here()}")
     if name is None:

@@ -179,6 +179,22 @@ def test_an_unreadable_step_leaves_the_one_before() -> None:
     assert error(watch.update(), {}).tolist() == []
 
 
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        wire.ControllerState(channels=[wire.Channel(name="cut", actuators=b"123")]),
+        wire.ControllerState(interlocks_acting=[wire.ActingInterlock(number=1)]),
+    ],
+)
+def test_an_unusable_state_leaves_the_one_before(damaged: wire.ControllerState) -> None:
+    hub, clock = MemoryHub(), FakeClock()
+    states = MemoryBus(hub, "controller", clock).publisher(CONTROLLER_STATE)
+    watch = Watch(MemoryBus(hub, "operator", clock), clock)
+    for state in (wire.ControllerState(calibration_id="night"), damaged):
+        states.put(state.SerializeToString())
+        assert watch.update().state.calibration_id == "night"
+
+
 @pytest.fixture
 def ioc() -> Iterator[tuple[Process, int]]:
     """A running IOC, and the UDP port of its searches."""

@@ -303,6 +303,10 @@ class Accumulator:
             state = topic.message.FromString(message.payload)
             if isinstance(state, wire.ControllerState):
                 checked_time_ns(state.mode_timestamp)
+                if any(len(channel.actuators) % 4 for channel in state.channels):
+                    raise ValueError("a channel with a part of a number")
+                if any(acting.number >= len(state.settings.interlocks) for acting in state.interlocks_acting):
+                    raise ValueError("an interlock that is not in its settings")
             self._states[topic] = decode_calibration(state) if isinstance(state, wire.Calibration) else state
 
     def _set_data_time(self, data_ns: int, publish_time_ns: int) -> None:
