@@ -140,7 +140,8 @@ def options(driver: Any, configured: dict[str, Any], words: Sequence[str] = ()) 
         except ValidationError as error:
             faults = error.errors()
     if faults:
-        lines = [f"options of {driver.__name__}: {_explained(detail, model)}" for detail in faults]
+        name = getattr(driver, "__name__", "the driver")  # a factory such as `partial` has none
+        lines = [f"options of {name}: {_explained(detail, model)}" for detail in faults]
         raise ConfigurationError("\n".join(lines))
     return validated
 

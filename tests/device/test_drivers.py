@@ -3,6 +3,7 @@
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -240,6 +241,14 @@ def test_doctor_shows_what_a_driver_found_as_text(monkeypatch: pytest.MonkeyPatc
     assert [check.got for check in checks] == ["/dev/mirror", "2", "not found"]
     monkeypatch.setattr(IdleMirror, "needs", lambda options: "a licence", raising=False)
     assert "requirements cannot be checked: TypeError" in [*device_checks(f"{__name__}:IdleMirror", CONFIG)][1].got
+
+
+def test_a_factory_without_a_name_is_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    factory = partial(Ramp)
+    monkeypatch.setattr(plugins, "load", lambda kind, name: factory)
+    assert [check.got for check in device_checks("basler", CONFIG)] == ["functools:partial"]
+    with pytest.raises(ConfigurationError, match="options of the driver: there is no 'x'"):
+        plugins.options(factory, {"x": 1})
 
 
 class FailingSettings(Ramp):

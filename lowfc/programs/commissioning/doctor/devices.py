@@ -26,7 +26,8 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
             advice = f"set it in [{section}] of a configuration, and give that file with --config FILE"
             yield wrong(str(fault), advice)._replace(name=what)
             continue
-        yield ok(f"{driver.__module__}:{driver.__qualname__}")._replace(name=what)
+        found = getattr(driver, "__qualname__", type(driver).__qualname__)  # a factory such as `partial` has none
+        yield ok(f"{driver.__module__}:{found}")._replace(name=what)
         try:
             with opening("its requirements cannot be checked"):
                 needs = getattr(driver, "needs", lambda _: ())(options)
