@@ -76,6 +76,15 @@ def test_each_law_is_tuned_from_a_closed_loop(
     assert all(mode.achieved_nm == mode.noll for mode in result_of(continuous, best, gains, controller).modes)
 
 
+def test_predictions_contain_the_part_of_a_constant_disturbance_that_a_leak_leaves(telemetry: Telemetry) -> None:
+    pol = replace(telemetry.pol, values=tuple(piece + np.array([0, 0, 50]) for piece in telemetry.pol.values))
+    run = replace(telemetry, pol=pol, law=replace(telemetry.law, leak=np.full(len(NOLL), 0.01, np.float32)))
+    best, gains = tuned(run, "integrator")
+    focus = result_of(run, best, gains, "integrator").modes[2]
+    assert focus.predicted_nm == pytest.approx(gains.predicted_nm[2], rel=0.05)
+    assert focus.predicted_now_nm == pytest.approx(50 * 0.01 / (0.01 + 0.2), rel=0.1)
+
+
 def test_the_true_residual_over_all_time_is_read_from_the_log(tmp_path: Path) -> None:
     night = SyntheticLog()
     night.instants = 4

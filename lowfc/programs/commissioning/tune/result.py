@@ -118,7 +118,7 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
     """Predicted residual of a tuned law, with the residual of the run."""
     now = run.driving or integrator(run.law.gain, run.law.leak, run.noll, run.timing.delay, run.rate_hz)
     leak = run.law.leak.astype(np.float64)
-    integrator_nm = tune_integrator(best.models, gains, run.noll, leak, run.timing).predicted_nm
+    integrators = tune_integrator(best.models, gains, run.noll, leak, run.timing)
     now_nm = predicted_nm(now, best.models, run.timing) if margins.margins(now, run.timing.delay).stable else None
     achieved_nm = _achieved_nm(run, gains.noise_nm)
     has_truth = run.true_nm2 is not None or run.continuous_rms_nm is not None
@@ -126,10 +126,17 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
         # The frames give the residual at one instant per frame; theory adds the residual between these instants.
         sampled_nm = predicted_nm(now, best.models, Timing.sampled(run.timing.delay))
         achieved_nm = np.sqrt(np.maximum(achieved_nm**2 + now_nm**2 - sampled_nm**2, 0.0))
+    mean_nm = max(run.pol.values, key=len).mean(axis=0)
+
+    def with_mean(law: LinearLaw, changing_nm: Array) -> Array:
+        """Rms (modes,) with the part of the disturbance's mean that a leak leaves; the models have no mean."""
+        return np.asarray(np.hypot(changing_nm, mean_nm * margins.rejection(law, np.zeros(1))[0]))
+
+    best_nm, integrator_nm = (with_mean(each.law, each.predicted_nm) for each in (best, integrators))
     columns = {
         "achieved_nm": achieved_nm,
-        "predicted_now_nm": now_nm,
-        "predicted_nm": best.predicted_nm,
+        "predicted_now_nm": None if now_nm is None else with_mean(now, now_nm),
+        "predicted_nm": best_nm,
         "integrator_predicted_nm": integrator_nm,
         "gain_now": None if run.driving else run.law.gain.astype(float).round(6),
         "gain_best": gains.gain.round(4),
@@ -151,7 +158,7 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
     rms_nm = {
         "open": np.sqrt(np.mean(run.pol.joined() ** 2, axis=0)),
         "achieved": achieved_nm,
-        "predicted": best.predicted_nm,
+        "predicted": best_nm,
         "integrator_predicted": integrator_nm,
     }
     tilt_mas = {name: _tilt_mas(run, each) for name, each in rms_nm.items()}
@@ -165,7 +172,7 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
         frames=run.pol.frames,
         achieved_from=None if achieved_nm is None else "truth" if has_truth else "error less noise",
         tilt_mas=tilt_mas,
-        added_contrast=_added_contrast(run, best, now, achieved_nm),
+        added_contrast=_added_contrast(run, best, now, achieved_nm, best_nm),
         gain_margin=_finite(float(best.margins.gain_margin.min())),
         phase_margin_deg=best.margins.phase_margin_deg.min(),
         max_rejection=best.margins.peak.max(),
@@ -207,7 +214,9 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
     return png(drawing)
 
 
-def _added_contrast(run: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Array | None) -> dict[str, Any] | None:
+def _added_contrast(
+    run: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Array | None, best_nm: Array
+) -> dict[str, Any] | None:
     """Contrast added to the dark zone: in open loop, in closed loop as measured, and predicted with the tuned law."""
     if run.noise_nm2 is None:
         return None
@@ -222,7 +231,7 @@ def _added_contrast(run: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Arra
         {
             "open": opened.T @ opened / len(opened) - frame_noise_nm2(best.models, run.noise_nm2),
             "closed": closed,
-            "predicted": predicted_nm2(best.law, best.models, run.noise_nm2, run.timing),
+            "predicted": with_variances(predicted_nm2(best.law, best.models, run.noise_nm2, run.timing), best_nm),
         },
     )
 
