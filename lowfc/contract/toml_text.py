@@ -16,7 +16,7 @@ def parsed(content: bytes) -> dict[str, Any]:
     """Tables of a TOML file; ValueError, with a short text, if it is invalid, too large or slow to parse."""
     if len(content) > MAX_BYTES:
         raise ValueError(f"larger than {MAX_BYTES} bytes")
-    text = content.decode()
+    text = content.decode("utf-8-sig")
     for number, line in enumerate(text.split("\n"), 1):
         if line.count(".") > _MAX_DOTS and len(re.findall(r"\.+", _NUMBER.sub("0", line))) > _MAX_DOTS:
             raise ValueError(f"line {number} has more than {_MAX_DOTS} dots")

@@ -256,6 +256,10 @@ def test_a_missing_or_invalid_file_is_named(tmp_path: Path) -> None:
     assert "not a readable TOML file" in error_of(tmp_path)
 
 
+def test_the_byte_order_mark_of_an_editor_is_ignored(tmp_path: Path) -> None:
+    assert load(write(tmp_path, "\ufeffseed = 3")).seed == 3
+
+
 def test_overrides_replace_values_of_the_file(tmp_path: Path) -> None:
     path = write(tmp_path, "seed = 3\n[camera]\nrate_hz = 500")
     config = load(path, {"camera.rate_hz": 250.0})
