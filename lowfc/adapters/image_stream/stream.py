@@ -159,7 +159,7 @@ class Stream:
         return cls(path)
 
     def current(self) -> bool:
-        """Whether its name still refers to this complete file; otherwise the mapping must not be accessed."""
+        """Whether its path still leads to this file at its full size; otherwise the mapping must not be accessed."""
         try:
             return _identity(os.stat(self._file)) == self.identity  # noqa: PTH116  # twice as fast as Path.stat
         except OSError:

@@ -2,7 +2,7 @@
 
 Everything is checked by checksums. In a finished log they cover every byte: chunks and attachments have their own,
 DataEnd has that of the data section, the footer that of the summary. A log rewritten by another tool may lack checksums
-and chunks. In any other log only the checksum of the data section may be missing.
+and chunks; one written by lowfc may lack only the checksum of the data section.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ _CHANGED = "its parts are intact, but some are missing, out of order, or changed
 _BEGIN = MAGIC + bytes([Opcode.HEADER])
 _OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _FIRST_BLOCK_BYTES = 1 << 12
-_TRIES = 4  # limit of bytes read in search of chunks, in file sizes: a malicious file must not occupy the reader
+_TRIES = 4  # most bytes read in search of chunks, per byte of the file: a malicious file must not occupy the reader
 
 
 @dataclass(slots=True)
@@ -182,7 +182,10 @@ class LogFile:
         return None
 
     def _find_summary(self) -> int | None:
-        """First byte of the summary, or of the footer without one; None if a required checksum is wrong or missing."""
+        """First byte of the summary, or of the footer if there is no summary.
+
+        None without an intact footer, or if a required checksum is wrong or missing.
+        """
         footer_at = self.size - _FOOTER_BYTES
         footer = self._read(footer_at, _FOOTER_BYTES) if self.finished and footer_at > 0 else b""
         if not footer or HEAD.unpack_from(footer) != (Opcode.FOOTER, 20):
@@ -219,7 +222,7 @@ class LogFile:
                 opcode, length = HEAD.unpack(head)
                 if opcode in _EXPECTED and end + HEAD.size + length <= self.size:
                     return end
-            self._bytes_to_try -= min(end - at, MAX_BYTES)  # read once, now searched
+            self._bytes_to_try -= min(end - at, MAX_BYTES)  # these bytes have been read once already
         start, block = at + 1, _FIRST_BLOCK_BYTES
         while start < self.size and self._bytes_to_try > 0:
             for match in CHUNK_HERE.finditer(self._read(start, block + 64)):
@@ -271,7 +274,7 @@ class LogFile:
         return None
 
     def _is_by_lowfc(self) -> bool:
-        """Whether, by its header, lowfc wrote this file, and so with all checksums; True if the header is damaged."""
+        """Whether the header names lowfc as the writer, which requires checksums; True if the header is damaged."""
         head = self._read(len(MAGIC), HEAD.size)
         opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
         if opcode != Opcode.HEADER or length > _BLOCK_BYTES:
@@ -289,7 +292,7 @@ class LogFile:
         return not self._by_lowfc or any(not statistics.chunk_count for statistics in records)
 
     def _unchunked_records(self, at: int) -> bytes:
-        """Complete records from `at` on of the kinds that are usually in chunks, up to the one that exceeds 1 MB."""
+        """Complete records from `at` on, of the kinds that are usually in chunks, until they reach 1 MiB in total."""
         end = at
         while end - at < _BLOCK_BYTES and len(head := self._read(end, HEAD.size)) == HEAD.size:
             opcode, length = HEAD.unpack(head)
@@ -299,7 +302,7 @@ class LogFile:
         return self._read(at, end - at)
 
     def _in_summary(self, *opcodes: Opcode) -> Iterator[bytes]:
-        """Records of some kinds in the summary, up to an impossible length; nothing without a valid summary."""
+        """Records of some kinds in the summary, up to one of impossible length; nothing without a valid summary."""
         at, end = self.size if self._summary is None else self._summary, self.size - _FOOTER_BYTES
         while at < end:
             opcode, length = HEAD.unpack(self._read(at, HEAD.size))
