@@ -13,7 +13,7 @@ from lowfc.control.laws.stability import delay_weights
 Signal = Literal["error", "pol"]
 
 _LARGEST_POLE = 0.99
-"""Largest pole of an integrator's prediction of pol during missing frames in an open loop: below 1, for stability."""
+"""Largest pole of an integrator of pol in an open loop while frames are missing: below 1, for stability."""
 MAX_STATES = 512
 """Most states of a law: a step with this number takes about 50 us."""
 SIGNALS: tuple[Signal, ...] = ("error", "pol")
@@ -33,7 +33,7 @@ class LinearLaw:
         command_gain: (states, modes) U.
         predict_only: (states, states) A.
         output: (modes, states) K.
-        name: kind of the law, for people.
+        name: kind of the law, as displayed.
         noll: Noll index of each mode.
         delay_frames: delay for which it was made, as in `lowfc.control.laws.stability.delay_weights`.
         rate_hz: frame rate for which it was made.
@@ -154,8 +154,8 @@ def integrator_block(gain: float, leak: float, signal: Signal, delay_frames: flo
 
     For the latter, e[k] = pol[k] + sum_j w_j c[k-1-j], for which the block stores commands. During missing frames pol
     is predicted to cancel the stored commands, so that the command keeps its value, apart from the leak. Above a gain
-    of 0.99 / w_0 this prediction would be unstable in an open loop, so it is damped: the command then goes back. At
-    gains that keep the margins it goes back by at most a quarter of its last change.
+    of 0.99 / w_0 this prediction would be unstable in an open loop, so it is damped: the command then undoes part of
+    its last change, at most a quarter at gains that keep the margins.
     """
     if signal == "error":
         return Block(np.zeros((1, 1)), np.array([-gain]), np.array([1 - leak]), np.zeros((1, 1)), np.ones(1))

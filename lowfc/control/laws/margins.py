@@ -1,6 +1,6 @@
 """Closed-loop poles, margins, rejection and noise transfer of a linear law, for any true delay.
 
-A frame measures error = disturbance + noise + B command with B(z) = sum_j w_j z^-(1+j), w of the true delay; the law
+A frame measures error = disturbance + noise + B command with B(z) = sum_j w_j z^-(1+j), w from the true delay; the law
 replies with command = -C error. Then L = C B, S = 1 / (1 + L) and T = L S. Coupled modes are evaluated one by one with
 the others closed: L of a mode is 1/S - 1.
 """
@@ -25,7 +25,7 @@ MAX_SETTLING_FRAMES = 4000
 _GRID = 2048  # frequencies of each regular grid
 _AROUND_POLE = np.concatenate([-np.geomspace(1e-2, 1e2, 33)[::-1], [0.0], np.geomspace(1e-2, 1e2, 33)])
 _LOWEST = 1e-6  # rad per frame: an integrator has no value at 0 Hz
-_ROUNDING = 1e-6  # a pole of undriven states may exceed 1 by this, from rounding to single precision
+_ROUNDING = 1e-6  # poles other than those of a driven closed loop may exceed 1 by this, from single precision
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ def check_law(law: LinearLaw, delay_frames: float, rate_hz: float) -> None:
     """Refuse a law that was made for another loop; `rate_hz` is 0 if unknown.
 
     Raises:
-        ValueError: its rate differs, its delay differs (of a law of "pol"), or it is not stable here.
+        ValueError: its rate differs, its delay differs (if its signal is "pol"), or it is not stable here.
     """
     if law.signal == "pol" and abs(law.delay_frames - delay_frames) > 1e-3:
         raise ValueError(
@@ -145,7 +145,7 @@ def noise_transfer(law: LinearLaw, frequency_hz: Array, delay_frames: float | No
 
 
 def noise_gain(law: LinearLaw, delay_frames: float | None = None) -> Array:
-    """Variance (modes,) of the residual per variance of white noise of one frame of the same mode."""
+    """Residual variance (modes,) caused by white measurement noise, per variance of that noise in one frame."""
     gain, weights = np.zeros(len(law.noll)), _weights(law, delay_frames)
     for part in _parts(law):
         if not part.driven:
@@ -173,7 +173,7 @@ def sensitivity(law: LinearLaw, omega: Array, delay_frames: float | None = None)
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """Coupled states and modes of a law, in double precision."""
+    """Coupled states and modes of a `LinearLaw`, with its matrices in double precision."""
 
     modes: Integers
     F: Array
@@ -239,7 +239,7 @@ def _parts(law: LinearLaw) -> list[_Part]:
 
 
 def _first_linked(linked: Mask) -> Integers:
-    """First member (n,) of the connected group of each node, from links (n, n); scipy.sparse takes 0.3 s to import."""
+    """First member (n,) of the connected group of each node, from links (n, n); importing scipy.sparse takes 0.3 s."""
     while True:
         further = linked.astype(np.float32) @ linked.astype(np.float32) > 0
         if (further == linked).all():
@@ -257,7 +257,7 @@ def _poles(matrix: Array) -> Complex:
 
 
 def _frequencies(poles: Complex) -> Array:
-    """Rad per frame from nearly 0 to pi, ascending: evenly, logarithmically towards 0, densely around each pole."""
+    """Frequencies from nearly 0 to pi rad per frame: an even grid, a logarithmic grid, and dense grids around poles."""
     near = poles[np.abs(poles) > 0.5]
     gap = np.maximum(np.abs(1 - np.abs(near)), 1e-9)
     around = np.abs(np.angle(near))[:, None] + gap[:, None] * _AROUND_POLE

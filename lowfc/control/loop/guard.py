@@ -34,7 +34,7 @@ LONG_TERM_S = 10.0
 """Time constant of the long-term mean square of the pseudo-open-loop modes."""
 AMPLIFIED = 2.5
 """Ratio of mean squared error to the long-term mean square of the pseudo-open-loop modes above which the loop
-amplifies, unless the former is below `BETTER` times their current mean square: then the disturbance has grown."""
+amplifies. Exception: if the error is below `BETTER` times their mean square in the block, the disturbance has grown."""
 
 NAMES = ("tip and tilt", "the other modes")  # of the groups
 LAW_RETURNS = "law returns"
@@ -84,8 +84,8 @@ class Group(NamedTuple):
         Args:
             means_nm2: means over the block of the squares of errors, virtual errors and pseudo-open-loop modes.
             spans: durations.
-            void: whether the comparison is invalid. An amplifying loop is detected nevertheless: a wrong delay, for
-                example, falsifies the pseudo-open-loop modes, and with them the comparison.
+            void: whether the comparison with the integrator is invalid. An amplifying loop is detected without it, so
+                also if a wrong delay falsifies the pseudo-open-loop modes, and with them the comparison.
         """
         error_nm2, virtual_nm2, pol_nm2 = means_nm2
         after = self._replace(usual_nm2=self.usual_nm2 + (pol_nm2 - self.usual_nm2) / spans.long_term)
@@ -118,8 +118,8 @@ class LawGuard(NamedTuple):
         frames: frames of the current block.
         sums_nm2: (3, groups) sums of squares: errors, virtual errors, pseudo-open-loop modes.
         void: whether the virtual loop was interrupted during the block.
-        virtual_nm: commands (modes,) of the controller that does not drive a mode, newest first; empty until it
-            starts from the loop's command.
+        virtual_nm: virtual commands (modes,), newest first: for each mode, of the controller that does not drive it;
+            empty until the virtual loop starts from the loop's commands.
         x: (states,) of the law as if it drove the overruled modes too; None while no mode is overruled.
     """
 
@@ -205,10 +205,10 @@ class LawGuard(NamedTuple):
             law: the guarded law.
             x: (states,) its state after this frame, in the real loop.
             integrator: the integrator that it is compared with.
-            weights: which commands an exposure sees.
+            weights: lag and weight of each command that an exposure sees.
             history_nm: the loop's commands (modes,) before this frame's, newest first.
-            error_nm: (modes,) error of this frame.
-            pol_nm: (modes,) pseudo-open-loop modes; both relative to the loop's target.
+            error_nm: (modes,) error of this frame, relative to the loop's target.
+            pol_nm: (modes,) pseudo-open-loop modes, also relative to it.
             limited: whether a limit of the mirror acted on the last command; virtual commands ignore these limits.
         """
         spans, groups = self.spans, self.groups
