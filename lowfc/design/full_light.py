@@ -1,7 +1,7 @@
 """Predicted performance of sensors that use all light from the focal-plane mask (Zernike, CLOWFS), for a search.
 
-The fields on the focal-plane mask depend on neither the spot nor the defocus: they are computed once, and propagated
-from there to the detector for each candidate.
+The fields on the focal-plane mask depend on neither the phase spot nor the defocus: they are computed once, and
+propagated from there to the detector for each candidate.
 """
 
 from collections.abc import Callable
@@ -139,7 +139,7 @@ def _nonlinearity_waves(candidate: FullLight, modes: int) -> float:
 
 
 def sweep(merit_of: Callable[[float], float], low: float, high: float, count: int) -> tuple[Array, float]:
-    """Minimise over a range: evenly spaced values (count,), and the refined value of least merit.
+    """Minimise over a range; return evenly spaced values (count,) of it, and the refined value of least merit.
 
     The refinement searches between the neighbours of the best evenly spaced value.
 

@@ -17,8 +17,8 @@ class Selection:
     """Decides for every key of a log whether it is published.
 
     Attributes:
-        roles: roles to take over, in the order of the topics; with frames also those of all mirrors, unless a live
-            mirror may be moved.
+        roles: roles to take over, in the order of the topics; if frames are selected also those of all mirrors,
+            unless a live mirror may be moved.
         live: roles of live processes.
     """
 
@@ -86,7 +86,7 @@ def role_of(key: str) -> str:
     name = name_in(topic, key)
     if topic is HEALTH:
         return name
-    if topic is BENCH:  # a recorded value would count as that of a device of the live bench
+    if topic is BENCH:  # else a recorded value would count as one of the live bench
         return Role.BENCH
     if len(topic.publishers) > 1:
         return ""

@@ -33,7 +33,7 @@ _POLL_S = 0.02
 _QUIET_FRAMES = 250  # before a fault: one second at the default rate
 _LAST_HEALTH_S = 0.2
 SETTLED_FRAMES = 500
-"""Frames used after a fault: two seconds at the default rate; the last second is judged."""
+"""Closed-loop frames to wait for after a fault: two seconds at the default rate; the last second is judged."""
 PATIENCE_S = 5.0
 """Time that a process may take to exit after the signal to stop."""
 START_S = 240.0
@@ -198,7 +198,7 @@ class ChaosBench:
         process.send_signal(number)
 
     def restart(self, name: str, command: list[str] | None = None, *, ready: bool = True) -> None:
-        """Start a process again that has ended, with the same or another command line; if `ready`, wait until it is."""
+        """Start an ended process again, with the same or another command line; if `ready`, wait until it is ready."""
         stderr = self.folder / f"{name}-{next(self._numbers)}.stderr"
         self._start(Child(name, command or self.children[name].command, stderr), ready=ready)
 
