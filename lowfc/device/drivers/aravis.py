@@ -91,7 +91,7 @@ class AravisCamera:
 
     def _open(self, name: str) -> None:
         self._camera = camera = self._aravis.Camera.new(name or None)
-        self._name, self._lost = name or camera.get_device_id(), False  # before the signal, which may come at once
+        self._name, self._lost = name or camera.get_device_id(), False  # before `connect`: the signal may come at once
         camera.get_device().connect("control-lost", self._lose)
         self._configure(self._options)
         self._stream = camera.create_stream(None, None)
