@@ -1,4 +1,4 @@
-"""Ends of a camera's stream: a program that writes prepared frames, and a driver that records when each was written.
+"""Both ends of a stream: a program that writes prepared frames, and a driver that reads them and records their times.
 
 Example: python -m benchmarks.stream_ends FOLDER STREAM FRAMES, with the folder of a run
 """
@@ -38,7 +38,7 @@ class TimedCamera(IsioCamera):
         self._sequence, self._put_ns, self._written_ns = array("Q"), array("q"), array("q")
 
     def join(self, service: Service) -> None:
-        """Keep the clock and the run's folder, for the times."""
+        """Store the clock and the run's folder, which are needed to record the times."""
         super().join(service)
         self._folder = open_run(service.run_id, ()).path
         self._clock = service.clock
@@ -61,7 +61,7 @@ class TimedCamera(IsioCamera):
         self._written_ns.append(self._newest_ns)
 
     def close(self) -> None:
-        """Save the times; a frame's scheduled time is that of its writing into the stream."""
+        """Save the times; `due_ns` of a frame is the time at which it was written into the stream."""
         super().close()
         np.savez(
             self._folder / SENT_FILE,
@@ -74,7 +74,7 @@ class TimedCamera(IsioCamera):
 def main() -> None:
     """Write every frame at its scheduled time, or at once if late.
 
-    A real camera's program is in C; to be about as fast, this one writes each frame to another stream just before.
+    A real camera's program is in C; to be about as fast, this one first writes each frame to a warm-up stream.
     """
     folder, name, count = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
     config, frames, path = load(folder / "config.toml"), np.load(folder / FRAMES_FILE), stream_path(name)
