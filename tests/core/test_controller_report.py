@@ -78,7 +78,7 @@ def test_the_closed_fraction_is_that_of_the_time_between_first_and_last_frame(
     controller = wire.Health(topics=[received], not_closed_ns=not_closed_s * SECOND)
     camera = wire.Health(mean_rate_hz=100.0)
     assert summary(Watch({"controller": controller, "camera": camera}, []), False)["closed_fraction"] == fraction
-    camera.mean_rate_hz = 30.0  # in lockstep, that of the real time
+    camera.mean_rate_hz = 30.0  # in lockstep: frames per second of real time
     assert summary(Watch({"controller": controller, "camera": camera}, []), False, 100.0)["closed_fraction"] == fraction
 
 
@@ -99,7 +99,7 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
     assert first_line(mode=wire.LOOP_MODE_OPEN, **not_closed) == expected.replace("closed;", "open;")
     assert first_line(mode=wire.LOOP_MODE_SAFE, **not_closed) == expected.replace("closed;", "in safe mode;")
     assert screen(Watch({}, [Log(message="without a level")]), Configuration(), None, 1.0)
-    assert first_line() == "no controller reported", "no time counts before the loop has started"
+    assert first_line() == "no controller reported", "no time is shown before the controller reports a mode"
     state, _ = feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1), replace(CAMERA, bias_dn=DARK_DN + 300))
     message = controller_state(state, SETTINGS, (START + 12) * SECOND)
     mirror = wire.Health(command_refused=wire.REASON_OUT_OF_ORDER)

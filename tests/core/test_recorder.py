@@ -220,7 +220,7 @@ def test_duplicates_neither_count_as_losses_nor_hide_them() -> None:
     account.revert()
     for published, lost in ((7, 1), (8, 1), (9, 2)):
         reconcile(account, published, "stopped")
-        assert account.lost() == {FRAME.key: lost}, "frame 3 was not received; above seven, more was published"
+        assert account.lost() == {FRAME.key: lost}, "frame 3 was lost; of nine published, another message too"
     assert account.recorded() == {FRAME.key: 7}
 
 

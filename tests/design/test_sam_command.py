@@ -318,7 +318,7 @@ def test_missing_packages_are_reported_before_the_search(tmp_path, monkeypatch):
 def test_recorded_command_finds_a_layout_as_good_as_the_packaged_one(tmp_path, name):
     """The merits agree within 1 %.
 
-    The layouts differ: the search that found the packaged ones gave small holes too much light, and took another path.
+    The layouts differ: the search that found the packaged ones overestimated the light through small holes.
     """
     ran = lowfc(*shlex.split(RECORDED[name])[1:], "--jobs", 1, "--out", tmp_path / "mask.json")
     assert ran.exit_code == 0, ran.output

@@ -327,7 +327,7 @@ def test_a_failed_mirror_goes_flat_before_it_follows_commands_again(bad: Any, me
     assert bench.command(50.0).refused == Rejection.NO_MIRROR
     bench.tick()
     bench.tick()
-    assert mirror.heights_nm[4:] == [280.0, 280.0, 130.0, 0.0], "to flat within the slew limit, also from 300 nm"
+    assert mirror.heights_nm[4:] == [280.0, 280.0, 130.0, 0.0], "the last certain shape, then flat in slew steps"
     assert not bench.service.health().command_refused
     assert bench.command(50.0).refused == 0
     assert mirror.heights_nm[-1] == 50.0
@@ -368,7 +368,7 @@ def test_a_hanging_mirror_reports_no_position_and_goes_flat_before_the_next_comm
     assert mirror.heights_nm == [0.0, 100.0, 110.0]
     bench.tick()
     bench.tick()
-    assert mirror.heights_nm[3:] == [100.0, 0.0], "its idle state first"
+    assert mirror.heights_nm[3:] == [100.0, 0.0], "the last certain shape first, then flat"
     assert bench.command(30.0).refused == 0
     assert bench.listener.events() == ["STARTED", "DRIVER_HANGS", "COMMAND_REFUSED", "COMMAND_BACK"]
     assert bench.loop.watch.failures == 1
@@ -424,7 +424,7 @@ def test_a_mirror_starts_from_the_position_that_its_driver_reads() -> None:
     bench.command(180.0)
     for ms in (10, 10, 100, 200):
         bench.tick(ms)
-    assert mirror.heights_nm[-3:] == [50.0] * 3, "within the slew limit of the 200 nm read back, after longer pauses"
+    assert mirror.heights_nm[-3:] == [50.0] * 3, "each retry is within the slew limit of the 200 nm read back"
 
 
 def test_a_driver_is_closed_after_its_last_command_and_called_no_more() -> None:

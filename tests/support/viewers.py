@@ -61,7 +61,7 @@ def views(part: rrb.Container | rrb.View) -> list[rrb.View]:
 
 
 def complaints(viewer: RerunViewer) -> list[str]:
-    """Reports of the viewer's views, and its warnings and errors."""
+    """Faults that the viewer's views report, and the warnings and errors of its log."""
     reports = [report.summary for view in viewer.state().views for report in view.reports]
     logs = ViewerClient.connect(viewer.url).get_logs()
     return reports + [entry.message for entry in logs if entry.level != "INFO"]
@@ -117,15 +117,15 @@ class Page:
 
     def _next(self) -> dict[str, Any]:
         message: dict[str, Any] = json.loads(self._connection.recv(timeout=CALL_S))
-        event, about = message.get("method"), message.get("params", {})
+        event, parameters = message.get("method"), message.get("params", {})
         if event == "Network.requestWillBeSent":
-            self.fetched[about["requestId"]] = about["request"]["url"]
-        elif event == "Network.loadingFailed" and about.get("blockedReason") == "csp":
-            self.fetched.pop(about["requestId"], None)
+            self.fetched[parameters["requestId"]] = parameters["request"]["url"]
+        elif event == "Network.loadingFailed" and parameters.get("blockedReason") == "csp":
+            self.fetched.pop(parameters["requestId"], None)
         elif event in ("Log.entryAdded", "Runtime.consoleAPICalled", "Runtime.exceptionThrown"):
-            level = about.get("entry", {}).get("level") or about.get("type", "error")
+            level = parameters.get("entry", {}).get("level") or parameters.get("type", "error")
             if level in ("warning", "error"):
-                self.complaints.append(json.dumps(about))
+                self.complaints.append(json.dumps(parameters))
         return message
 
 
@@ -157,7 +157,7 @@ def browser(folder: Path, size_px: tuple[int, int], *, webgl: bool = False) -> I
 def browser_screenshot(
     address: str, path: Path, seconds: float, shows: Callable[[Pixels], bool], size_px: tuple[int, int]
 ) -> Page:
-    """Write a PNG of a page in a browser once `shows` is true, or after so many seconds."""
+    """Write a PNG of a page in a browser once `shows` is true, or after `seconds`."""
     folder = path.parent / f"{path.stem}-browser"
     folder.mkdir()
     try:
