@@ -2,7 +2,7 @@
 
 import contextlib
 
-from lowfc.adapters.bus.other_loops import none_here
+from lowfc.adapters.bus.other_loops import no_loop_message
 from lowfc.adapters.bus.run import Run, open_run, run_path, runtime_base
 from lowfc.contract.errors import BusError, DataFileError, nearest
 from lowfc.contract.messages import Role
@@ -29,9 +29,11 @@ def the_run(name: str | None) -> str:
     if len(matching) == 1:
         return matching[0]
     if silent := _silent_routers(name) if name or not runs else "":
-        raise BusError(f"{silent}: is it running, and can this host reach it?" if name else f"{none_here()}; {silent}")
+        raise BusError(
+            f"{silent}: is it running, and can this host reach it?" if name else f"{no_loop_message()}; {silent}"
+        )
     if not runs:
-        raise BusError(none_here() if name is None else f"there is no run {name!r}: {none_here()}")
+        raise BusError(no_loop_message() if name is None else f"there is no run {name!r}: {no_loop_message()}")
     if name is None:
         raise BusError(f"choose a run with --run, the beginning of its name is enough: there are {_listed(runs)}")
     if matching:

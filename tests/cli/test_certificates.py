@@ -214,7 +214,7 @@ def test_errors_name_the_file_or_option_at_fault(tmp_path: Path) -> None:
         make(tmp_path / ("x" * 300), ("camera",), [])
     make(tmp_path / "half", ("camera",), [])
     (tmp_path / "half" / "ca.key").unlink()
-    with pytest.raises(DataFileError, match=r"has no ca\.key: make certificates where the authority's key is"):
+    with pytest.raises(DataFileError, match=r"has no ca\.key: use the folder that has both ca\.pem and ca\.key"):
         make(tmp_path / "half", ("viewer",), [])
     for name in ("one", "other"):
         make(tmp_path / name, ("camera",), [])

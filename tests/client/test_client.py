@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.bus.bus import Query, Sample
-from lowfc.adapters.bus.other_loops import none_here, other_loops
+from lowfc.adapters.bus.other_loops import no_loop_message, other_loops
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
@@ -381,10 +381,10 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
             process.stdout.readline()
             ours = [other for other in other_loops() if f"(process {process.pid})" in other[0] or name in other[0]]
-            message = none_here()
+            message = no_loop_message()
             with monkeypatch.context() as patch:
                 patch.setattr("lowfc.adapters.bus.other_loops._START_S", 0.0)
-                late = none_here()
+                late = no_loop_message()
                 patch.setattr(os, "geteuid", lambda: 4_000_000_000)
                 patch.setenv("XDG_RUNTIME_DIR", runtime_dir)
                 theirs = list(other_loops())

@@ -43,8 +43,10 @@ def make_certificates(
         Files of the new certificates.
 
     Raises:
-        ConfigurationError: an address is missing, invalid, or not in the router's certificate; nothing can be renewed.
-        DataFileError: the folder holds other files, or cannot be written.
+        ConfigurationError: an address is missing, invalid, or not in the router's certificate; `renew` finds no
+            authority.
+        DataFileError: the authority's key or certificate is missing; a file is not the key or certificate that its
+            name says; the folder cannot be written.
     """
     names = [_general_name(address) for address in addresses]
     try:
@@ -86,8 +88,8 @@ def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]
         write_whole(certificate_file, builder.sign(own, SHA256()).public_bytes(Encoding.PEM))
     elif missing:
         raise DataFileError(
-            f"{folder} has no {missing[0]}: make certificates where the authority's key is, or all anew in an empty "
-            "folder"
+            f"{folder} has no {missing[0]}: use the folder that has both {CA} and {CA_KEY}, or make all "
+            "certificates anew in an empty folder"
         )
     try:
         key = load_pem_private_key(key_file.read_bytes(), password=None)
@@ -95,7 +97,9 @@ def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]
     except (ValueError, TypeError) as fault:
         raise DataFileError(f"{key_file} and {certificate_file} are not an authority's key and certificate") from fault
     if not isinstance(key, EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
-        raise DataFileError(f"{key_file} is not the key of {certificate_file}; make all anew in an empty folder")
+        raise DataFileError(
+            f"{key_file} is not the key of {certificate_file}; make all certificates anew in an empty folder"
+        )
     return key, certificate
 
 
@@ -109,7 +113,7 @@ def _router_addresses(folder: Path) -> list[x509.GeneralName]:
 
 
 def _own_key(folder: Path, role: str) -> EllipticCurvePrivateKey:
-    """A role's key, made once, so that every existing certificate belongs to it even after an interruption."""
+    """A role's key; if missing, it is made before the certificate: an interruption leaves no mismatched pair."""
     file = folder / f"{role}.key"
     if not file.exists():
         (folder / f"{role}.pem").unlink(missing_ok=True)  # it belongs to a lost key

@@ -16,10 +16,10 @@ _PROGRAMS = ("controller", "sim-loop")
 _MAX_LISTED = 3
 _MAX_NAME_LENGTH = 48  # characters of a run's name
 _FOLDER = "XDG_RUNTIME_DIR"
-_START_S = 600.0  # the first start computes the optical model
+_START_S = 600.0  # longest start: the first one computes the optical model
 
 
-def none_here() -> str:
+def no_loop_message() -> str:
     """Sentence for an error when no loop is found: the folder that was searched, and other loops on this host."""
     loops = list(other_loops())
     if transient := [text for text, starting in loops if starting]:
@@ -36,7 +36,7 @@ def none_here() -> str:
 def other_loops() -> Iterator[tuple[str, bool]]:
     """Yield, for each simulated loop and each separate controller on this host, of any user, a sentence and a flag.
 
-    The flag is set for a new loop of this user in this runtime directory, which is then starting or ending.
+    The flag is set for a new loop of this user with this runtime directory: not found there, it is starting or ending.
     """
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):  # it has ended, or is not readable

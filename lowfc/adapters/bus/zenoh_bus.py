@@ -72,7 +72,7 @@ class ZenohPublisher:
         self._keeps = topic.queryable
         self._host_ns = bus.clock.host_ns
         self._bus = bus
-        self._sent = bus.sent
+        self._encode = bus.encode
         self._replying = bus.replying
         self._publisher = declare_publisher(session, topic, key, lockstep=bus.clock.lockstep)
         self._direct_link = direct_link
@@ -91,7 +91,7 @@ class ZenohPublisher:
         handed = self._direct_link is not None and self._direct_link.send(envelope.encode(), payload)
         if handed:
             self.handed_ns = self._host_ns()
-        self._publisher.put(payload, attachment=self._sent(envelope))
+        self._publisher.put(payload, attachment=self._encode(envelope))
         if not handed:
             self.handed_ns = self._host_ns()
         return envelope
@@ -105,7 +105,7 @@ class ZenohPublisher:
         with self._replying(query):
             if self.last is not None:
                 payload, envelope = self.last
-                query.reply(self.key, payload, attachment=self._sent(envelope))
+                query.reply(self.key, payload, attachment=self._encode(envelope))
 
 
 class ZenohRing:
@@ -135,7 +135,7 @@ class ZenohRing:
 
 
 class ZenohBus:
-    """One process's zenoh session; see `Bus`. Once closed, its rings, and new publishers and rings, raise BusError.
+    """One process's zenoh session; see `Bus`. After `close`, its rings, `publisher`, `ring` and `get` raise BusError.
 
     Attributes:
         offset: offset of the router's clock, in a run on several hosts. Envelopes on the network have the router's
@@ -154,7 +154,7 @@ class ZenohBus:
             role: role of this process.
             clock: clock of the run.
             monitor: whether this process is a monitor, which polls `Ring`s. It gets `latest_only` topics at display
-                rate, spare receive buffers and a single receive thread: half the cost. Set it in a process's first bus.
+                rate, a pool of receive buffers and one receive thread: half the cost. Set it in a process's first bus.
             beside: bus of another role in this process, already subscribed: the direct link to it is a function call.
 
         Raises:
@@ -306,7 +306,7 @@ class ZenohBus:
         done.wait(timeout_s + 1.0)
         return list(answers)
 
-    def sent(self, envelope: Envelope) -> bytes:
+    def encode(self, envelope: Envelope) -> bytes:
         """Encode an outgoing envelope: across hosts, with the router's time."""
         if self.offset is None:
             return envelope.encode()
@@ -365,7 +365,7 @@ class ZenohBus:
         def reply(body: bytes) -> None:
             with self.replying(query):
                 envelope = Envelope(sequence_of(self.start_s, 0), self.clock.host_ns())
-                query.reply(key, body, attachment=self.sent(envelope))
+                query.reply(key, body, attachment=self.encode(envelope))
 
         return reply
 

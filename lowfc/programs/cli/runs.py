@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from lowfc.adapters.bus.other_loops import none_here
+from lowfc.adapters.bus.other_loops import no_loop_message
 from lowfc.adapters.bus.run import open_run, runtime_path
 from lowfc.adapters.process.terminal import Json
 from lowfc.client import Client
@@ -28,7 +28,7 @@ def runs(as_json: Json = False) -> None:
             not_joined[name] = str(fault)
     results = {"runs": rows, "not_joined": not_joined, "searched": str(runtime_path())}
     lines = [*_lines(rows), *(f"{name}  cannot be joined: {why}" for name, why in not_joined.items())]
-    print_result(results, "\n".join(lines) or none_here(), as_json=as_json)
+    print_result(results, "\n".join(lines) or no_loop_message(), as_json=as_json)
 
 
 def _row(name: str, roles: set[str]) -> dict[str, Any]:
