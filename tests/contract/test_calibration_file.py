@@ -48,9 +48,9 @@ def test_a_saved_calibration_is_loaded_bit_for_bit(tmp_path: Path, flux_dn: floa
 
 
 def test_the_file_is_fits_with_named_extensions_and_units() -> None:
-    with fits.open(io.BytesIO(to_bytes(calibration(2.6589626685784786e-123)))) as units:
-        units.verify("exception")
-        names = {unit.name: unit.header.get("BUNIT") for unit in units[1:]}
+    with fits.open(io.BytesIO(to_bytes(calibration(2.6589626685784786e-123)))) as hdus:
+        hdus.verify("exception")
+        names = {hdu.name: hdu.header.get("BUNIT") for hdu in hdus[1:]}
         assert names == {
             "REFERENCE": "",
             "RESPONSE": "nm-1",
@@ -59,15 +59,15 @@ def test_the_file_is_fits_with_named_extensions_and_units() -> None:
             "DARK": "adu",
             "MODES2ACT": "",
         }
-        assert units[0].header["NOLL"] == "2 3 4"
+        assert hdus[0].header["NOLL"] == "2 3 4"
 
 
 def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "night.fits"
     content = to_bytes(calibration())
     path.write_bytes(content)
-    with fits.open(path, mode="update") as units:
-        units["DARK"].data[3] += 1
+    with fits.open(path, mode="update") as hdus:
+        hdus["DARK"].data[3] += 1
     with pytest.raises(DataFileError, match="damaged: the identity of its content"):
         load(path)
     card = b"ROWS    ="
@@ -110,9 +110,9 @@ def test_actuators_to_modes_are_stored_and_optional(tmp_path: Path) -> None:
     save(with_matrix, path)
     assert np.array_equal(load(path).actuators_to_modes, matrix)
     assert with_matrix.id != without.id
-    with fits.open(path) as units:
-        assert "ACT2MODES" in units
+    with fits.open(path) as hdus:
+        assert "ACT2MODES" in hdus
     save(without, path)
     assert load(path).actuators_to_modes.size == 0
-    with fits.open(path) as units:
-        assert "ACT2MODES" not in units
+    with fits.open(path) as hdus:
+        assert "ACT2MODES" not in hdus

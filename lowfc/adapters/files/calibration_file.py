@@ -20,15 +20,15 @@ _EXTENSIONS = (
     ("MASK", "good", "", "1 where a pixel is used"),
     ("DARK", "dark", "adu", "frame without light"),
     ("MODES2ACT", "modes_to_actuators", "", "nm of surface per nm rms of wavefront"),
-    ("ACT2MODES", "actuators_to_modes", "", "nm rms of wavefront that R makes of a nm of surface"),
+    ("ACT2MODES", "actuators_to_modes", "", "nm rms of wavefront that R measures per nm of surface"),
 )
 _OPTIONAL = "ACT2MODES"
 _CAMERA = (
     ("CAMBIAS", "bias_dn", "[adu] bias of the camera when this was made"),
-    ("CAMFULL", "saturation_dn", "[adu] its highest value of a pixel"),
-    ("CAMGAIN", "gain_e_per_dn", "[e-/adu] its conversion gain"),
-    ("CAMEM", "em_gain", "its electron-multiplying gain"),
-    ("CAMNOISE", "read_noise_e", "[e-] its read noise"),
+    ("CAMFULL", "saturation_dn", "[adu] highest pixel value of the camera"),
+    ("CAMGAIN", "gain_e_per_dn", "[e-/adu] conversion gain of the camera"),
+    ("CAMEM", "em_gain", "electron-multiplying gain of the camera"),
+    ("CAMNOISE", "read_noise_e", "[e-] read noise of the camera"),
 )
 
 
@@ -69,7 +69,7 @@ def save(calibration: Calibration, path: Path) -> None:
 
 
 def load(path: Path, content: bytes | None = None) -> Calibration:
-    """Read a FITS file, or its `content` that `path` names in errors, and check its identity.
+    """Read a FITS file, or its `content` if given (`path` is then only named in errors), and check its identity.
 
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
