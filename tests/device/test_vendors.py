@@ -67,7 +67,7 @@ def test_the_reason_of_a_refusing_basler_camera_is_reported(place: str, monkeypa
     stub = SimpleNamespace(DeviceInfo=refuse, GenericException=RuntimeError)
     for module in ("pylon", "genicam"):
         monkeypatch.setitem(sys.modules, f"pypylon.{module}", stub)
-    with pytest.raises(ConfigurationError, match=r"^Basler camera the first found: Cannot set 'Gain'\.$"):
+    with pytest.raises(ConfigurationError, match=r"^Basler camera \(the first found\): Cannot set 'Gain'\.$"):
         BaslerCamera(GenicamOptions(rows=8, columns=8), CONFIG)
 
 
@@ -81,7 +81,7 @@ def test_settings_default_to_the_configuration() -> None:
 class Buffers:
     """Stand-in for a stream of aravis: buffers of 2 x 3 pixels with the given frame numbers; 0 for a failed buffer.
 
-    The last `later` of them are not yet in the queue.
+    At first all but the last `later` are in the queue; by default each arrives when the driver waits for it.
     """
 
     def __init__(self, *numbers: int, later: int = 99) -> None:
@@ -151,7 +151,7 @@ def emulated(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.basler
-def test_an_untriggered_basler_camera_is_silent_and_invalid_settings_are_refused(emulated: None) -> None:
+def test_a_basler_camera_that_gets_no_trigger_is_silent_and_invalid_settings_are_refused(emulated: None) -> None:
     driver = BaslerCamera(GenicamOptions(**OPTIONS, camera="0815-0001", trigger="Line1"), CONFIG)
     driver.start()
     assert driver.expose() is None
@@ -329,7 +329,7 @@ def test_a_closed_loop_counts_every_failed_buffer(emulated: None, tmp_path: Path
 
 
 @pytest.mark.basler
-def test_an_untriggered_camera_reports_the_wait_and_ends_at_ctrl_c(
+def test_a_camera_that_gets_no_trigger_reports_the_wait_and_ends_at_ctrl_c(
     emulated: None, tmp_path: Path, own_runtime: Path
 ) -> None:
     options = "--rows 60 --columns 80 --trigger Line1 --camera 0815-0001"

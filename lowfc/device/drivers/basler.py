@@ -35,7 +35,7 @@ class BaslerCamera:
         try:
             self._open(options.camera)
         except importlib.import_module("pypylon.genicam").GenericException as fault:
-            which = options.camera or "the first found"
+            which = options.camera or "(the first found)"
             why = re.split(r" : \w+ thrown", str(fault))[0]  # without the place in the library
             raise ConfigurationError(f"Basler camera {which}: {why}") from None
 
