@@ -21,20 +21,20 @@ STEP_E = 1 / 64
 _ENTRIES_BITS = 10
 _ENTRIES = 1 << _ENTRIES_BITS
 _FRACTION_BITS = 16  # resolution of the probability of rounding up
-_MAX_TABULATED_E = 64  # tabulated electrons, from 0; at a mean of 24 e- a pixel has as many once in 1e11 frames
+_MAX_TABULATED_E = 64  # electrons, exclusive; a pixel with a mean of 24 e- reaches 64 once in 1e11 frames
 _TAIL = 8.0  # tabulated range of the read noise, standard deviations
 _WIDEST = 256  # largest range of digital numbers that is tabulated
-_MIN_NOISE_DN = 0.05  # with less read noise the table does not resolve the rounding
+_MIN_NOISE_DN = 0.05  # the table divides by the read noise, which may be 0
 _REMAINDER = 65535  # never a tabulated digital number, since those are below saturation
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseTable:
-    """Distributions of the digital number at the means 0, STEP_E, ... FAINT_E (means).
+    """Distributions of the digital number, one for each of the means 0, STEP_E, ... FAINT_E.
 
     Attributes:
         entries: (means, entries) digital numbers, all equally likely; `_REMAINDER` where `remainder` decides.
-        remainder: (means, numbers) cumulative distribution of the probability that is not a multiple of 1/1024.
+        remainder: (means, numbers) cumulative distribution of the rest of each probability, less than 1/1024.
         first_dn: Digital number of the first column of `remainder`.
     """
 
@@ -89,7 +89,7 @@ def draw(table: NoiseTable, mean_e: Single, rng: np.random.Generator) -> Pixels:
     index += words.view(np.int32) & ((1 << _FRACTION_BITS) - 1)
     index >>= _FRACTION_BITS - _ENTRIES_BITS
     words >>= 32 - _ENTRIES_BITS
-    index ^= words.view(np.int32)  # the low bits depend on the rounding above: XOR with fresh bits
+    index ^= words.view(np.int32)  # the low bits depend on how the mean was rounded: XOR with unused bits
     drawn = table.entries.ravel().take(index)
     undecided = np.flatnonzero(drawn == _REMAINDER)
     cumulative = table.remainder.take(index.take(undecided) >> _ENTRIES_BITS, axis=0)
