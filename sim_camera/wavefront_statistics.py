@@ -11,7 +11,7 @@ from lowfc.optics.chain.added_contrast import by_group, costliest
 from sim_camera.scene import Truth, Wavefront
 
 BLOCK = 500
-"""Frames summed together at first: the second half is correct to one block."""
+"""Frames per block at first; the second half of the run begins at the border of a block."""
 MAX_BLOCKS = 256
 """Blocks stored; then pairs are merged and blocks are twice as long, so that memory does not grow with the run."""
 
@@ -36,19 +36,22 @@ class WavefrontAccumulator:
             instants: samples of each period in the continuous truth; 0 if it is not computed.
         """
         self._noll, self._instants = noll, instants
-        self._values = 1 + len(noll) + (8 if instants else 4)
+        self._value_count = 1 + len(noll) + (8 if instants else 4)
         self._tilts = slice(0, sum(index in TIP_TILT for index in noll))  # tip and tilt are the first modes
         self._nm_per_mas = nm_per_mas
         self._blocks: list[list[float]] = []
-        self._sums = [0.0] * self._values
+        self._sums = [0.0] * self._value_count
         self._count = self._frames = 0
-        self._block = BLOCK
-        self._recent = np.zeros((recent, self._values))
+        self._block_frames = BLOCK
+        self._recent = np.zeros((recent, self._value_count))
 
     def add(self, truth: Truth, added_flat: float = 0.0, added: Single | None = None) -> None:
-        """Add a frame's truth, the contrast added by its disturbance with a flat mirror, and by each residual mode.
+        """Add a frame.
 
-        `added` is (modes,).
+        Args:
+            truth: its true wavefront.
+            added_flat: contrast that its disturbance adds with a flat mirror.
+            added: (modes,) contrast that each mode of its residual adds; None for zeros.
         """
         contrasts = [added_flat, *([0.0] * len(self._noll) if added is None else added.tolist())]
         values = (*contrasts, *self._squares(truth.sampled))
@@ -58,13 +61,13 @@ class WavefrontAccumulator:
         self._recent[self._frames % len(self._recent)] = values
         self._frames += 1
         self._count += 1
-        if self._count == self._block:
+        if self._count == self._block_frames:
             self._blocks.append(self._sums)
-            self._sums, self._count = [0.0] * self._values, 0
+            self._sums, self._count = [0.0] * self._value_count, 0
         if len(self._blocks) == MAX_BLOCKS:
             pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
             self._blocks = [[first + second for first, second in zip(*pair, strict=True)] for pair in pairs]
-            self._block *= 2
+            self._block_frames *= 2
 
     def wavefront(self) -> dict[str, Any]:
         """Statistics over the second half of the complete blocks, or over all frames before the first is complete.
@@ -73,7 +76,7 @@ class WavefrontAccumulator:
         """
         if self._blocks:
             half = self._blocks[len(self._blocks) // 2 :]
-            mean = np.sum(half, axis=0) / (self._block * len(half))
+            mean = np.sum(half, axis=0) / (self._block_frames * len(half))
         elif self._count:
             mean = np.array(self._sums) / self._count
         else:
