@@ -1,4 +1,4 @@
-"""The commands `lowfc camera` and `lowfc mirror`: options only."""
+"""The command-line options of `lowfc camera` and `lowfc mirror`; `lowfc.device` runs the drivers."""
 
 from typing import Annotated
 
@@ -27,7 +27,7 @@ def camera(
 ) -> None:
     """Run a camera: publish the frames and settings of its driver to a run.
 
-    The driver's own options are in [drivers.DRIVER] of the configuration; `--name value` here takes precedence.
+    The driver's own options are in [drivers.DRIVER] of the configuration; those given here take precedence.
     `lowfc camera DRIVER --help` lists them.
 
     Example: lowfc camera sim --run bench --config lowfc.toml
@@ -38,9 +38,9 @@ def camera(
 
 @mirror_app.command(cls=driver_command("mirror"), context_settings=PASSED_ON)
 def mirror(context: typer.Context, driver: Driver, run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
-    """Run a mirror: apply the commands of a run by its driver, within the mirror's own limits.
+    """Run a mirror: its driver applies the commands of a run, within the mirror's own limits.
 
-    The driver's own options are in [drivers.DRIVER] of the configuration; `--name value` here takes precedence.
+    The driver's own options are in [drivers.DRIVER] of the configuration; those given here take precedence.
     `lowfc mirror DRIVER --help` lists them.
 
     Example: lowfc mirror sim --run bench --config lowfc.toml

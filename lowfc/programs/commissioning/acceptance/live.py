@@ -54,7 +54,7 @@ class Live:
         try:
             yield self
         finally:
-            self.client.check_lease()  # if another operator ended it, leave the loop to them
+            self.client.check_lease()  # raises if another operator ended it: the loop is left to them
             self.client.stop()
             now = LoopMode(self._state().mode)
             if now in (LoopMode.OPEN, LoopMode.CLOSED) and now is not self._initial_mode:
@@ -97,8 +97,8 @@ class Live:
     ) -> ProbeResponse:
         """Play a table and return the loop's response; without shapes in `basis` the table is added to the offset.
 
-        With a table without columns no probe is added: only the steps are recorded. AcceptanceError if the table is
-        too large for a request, gains or law changed, or the mirror or the camera failed.
+        A table without columns adds no probe: only the steps are recorded. AcceptanceError if the table is too large
+        for a request, gains or law changed, or the mirror or the camera failed.
         """
         modes = len(self.calibration.noll)
         basis = np.zeros((modes, 0), np.float32) if basis is None else basis
@@ -106,7 +106,7 @@ class Live:
         most_frames = (max_bytes("play") - _OTHER_BYTES - basis.nbytes) // (table.itemsize * max(columns, 1))
         if columns and frames > most_frames:
             longest_s = most_frames / self.loop.rate_hz
-            raise AcceptanceError(f"a probe sequence of {columns} columns takes at most {longest_s:.0f} s: shorten it")
+            raise AcceptanceError(f"a probe sequence of {columns} columns is too long: shorten it to {longest_s:.0f} s")
         self.set_mode(mode)
         before = self._state()
         steps, watch = self.client.steps(), self.client.mirror_watch()

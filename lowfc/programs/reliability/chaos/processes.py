@@ -100,7 +100,7 @@ def _stalled_viewer(bench: ChaosBench) -> None:
 
 
 class CommandTimes:
-    """Frame-to-command latencies of a bench that has begun; its outcome has those of each measured phase."""
+    """Frame-to-command latencies of a running bench; those of each measured phase are stored in its `outcome`."""
 
     def __init__(self, bench: ChaosBench) -> None:
         assert bench.bus is not None  # noqa: S101  # the bench has begun
@@ -110,7 +110,7 @@ class CommandTimes:
         bench.outcome.measurements["frame_to_command"] = self.phases
 
     def drain(self) -> dict[str, float]:
-        """Number of frames timed since the last call, their p50 and p99; empty without frames."""
+        """Number of frames timed since the last call, p50 and p99 of their latencies; empty without frames."""
         latencies_ns, self._latencies_ns = self._latencies_ns, []
         if not latencies_ns:
             return {}
@@ -130,7 +130,7 @@ class CommandTimes:
 
 
 def compare(bench: ChaosBench, stall: Callable[[], contextlib.AbstractContextManager[None]]) -> None:
-    """Measure frame to command before, during and after a stall, and the ratios of its p99, for the case's report."""
+    """Measure latencies before, during and after a stall; store them and the ratios of their p99 in the outcome."""
     times = CommandTimes(bench)
     times.measure("before", CALM_S)
     with stall():
