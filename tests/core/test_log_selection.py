@@ -75,7 +75,7 @@ def test_steps_and_commands_are_never_left_out() -> None:
 
 
 def test_every_tenth_frame_is_recorded_and_the_others_do_not_count_as_lost(tmp_path: Path) -> None:
-    """The frame number selects mirror states too; a selected message that is missing counts as lost."""
+    """The frame number selects mirror states too; a message not received counts as lost, selected or not."""
     bench = Bench(tmp_path / "logs")
     frames, commands = bench.camera.publisher(FRAME), bench.controller.publisher(COMMAND, "dm")
     mirror = bench.join("mirror-dm")
@@ -143,7 +143,7 @@ def test_a_smaller_copy_has_all_messages_of_an_unknown_topic(tmp_path: Path, mon
     assert len(on(messages, FRAME)) == 3
 
 
-def test_replay_refuses_a_log_without_all_frames_in_one_line(small: Path) -> None:
+def test_replay_refuses_a_log_without_all_frames_by_an_error_of_one_line(small: Path) -> None:
     for words in (["--jobs", "1"], ["--jobs", "2"]):
         error = refusal("replay", small, *words)
         assert "\n" not in error
@@ -221,7 +221,7 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     assert "1 in 10 frames" in estimate(fewer)
 
 
-def test_record_start_names_the_request() -> None:
+def test_record_with_the_word_start_is_refused_and_names_the_request() -> None:
     assert "`lowfc ctl record start`" in refusal("record", "start", kind=ConfigurationError)
 
 

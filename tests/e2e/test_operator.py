@@ -105,7 +105,7 @@ def _prepare(night: Night) -> None:
 
 
 def _run_program(night: Night, program: str) -> str:
-    """Run a program of the document in this process; return its output. Only the run has another name."""
+    """Run a program of the document in this process, for this run and with this Python's `lowfc`; return its output."""
     printed = io.StringIO()
     words = program.replace('"bench"', repr(night.name)).replace("Client()", f"Client({night.name!r})")
     words = words.replace('"lowfc", "config"', f"{sys.executable!r}, '-m', 'lowfc', 'config'")
@@ -159,7 +159,7 @@ def _make_requests_beyond_the_document(night: Night) -> None:
         loop.record(True)
         until(lambda: loop.processes()["controller"].mode == wire.LOOP_MODE_CLOSED)
         until(lambda: not loop.processes()["recorder"].recording.stopped)
-    for name, arguments in (("beginning", ("ctl", "note", "here", "--run", night.name[:-1])), ("hosts", ("hosts",))):
+    for name, arguments in (("short name", ("ctl", "note", "here", "--run", night.name[:-1])), ("hosts", ("hosts",))):
         night.outputs[name] = lowfc(*arguments).stdout
 
     def recorder_answered() -> bool:
@@ -221,7 +221,7 @@ def test_the_commands_print_what_they_did(night: Night) -> None:
     assert [name for name, _ in processes] == list(names)
     assert all(name in outputs["hosts"] for name in names)
     assert outputs["hosts"].endswith("no clock is compared: the run has no router, or its router reports no clock\n")
-    assert f"run {night.name}" in outputs["beginning"]
+    assert f"run {night.name}" in outputs["short name"]
     assert status["channels"] == []
     assert json.loads(outputs["lowfc ctl note once --json"])["reply"] == "noted"
     assert json.loads(outputs["lowfc ctl configuration --json"])["camera"]["rate_hz"] == 100.0
@@ -285,8 +285,8 @@ def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
 
 
 @pytest.mark.slow
-def test_requests_are_answered_while_a_process_is_stopped_for_longer_than_its_links_last(tmp_path: Path) -> None:
-    """Closing such a link once blocked the controller's receiving thread for ten seconds."""
+def test_requests_are_answered_while_a_process_is_stopped_beyond_the_timeout_of_its_links(tmp_path: Path) -> None:
+    """Closing a link that had timed out once blocked the controller's receiving thread for ten seconds."""
     process = start(tmp_path, "sim-loop", "--run", "stopped", "--rate", "50", "--no-record")
     try:
         until(lambda: "sim_dm" in children(process.pid) and "stopped" in running())

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import settings as effort
+from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from lowfc.adapters.bus.bus import Sample
@@ -187,7 +187,7 @@ def frames(count: int, first: int = 0) -> list[Input]:
     return [frame(first + index, rng.normal(0, 4, len(NOLL))) for index in range(count)]
 
 
-@effort(deadline=None, max_examples=EXAMPLES)
+@hypothesis_settings(deadline=None, max_examples=EXAMPLES)
 @given(*[inputs()] * 2, *map(st.sampled_from, (["hold", "flat"], [1.0, 2.5], ["numpy", "fused"])))
 def test_any_sequence_of_inputs_is_replayed_bit_by_bit(
     before: list[Input], after: list[Input], on_frame_timeout: str, delay_frames: float, kernel: str
@@ -228,7 +228,7 @@ def test_an_overruled_law_is_replayed_bit_by_bit_even_from_the_middle() -> None:
         assert account.frames >= 860 - first - 2 * STATE_EVERY
 
 
-@effort(deadline=None, max_examples=EXAMPLES)
+@hypothesis_settings(deadline=None, max_examples=EXAMPLES)
 @given(inputs(), st.randoms(use_true_random=False), st.integers(1, 6))
 def test_lost_messages_are_never_a_difference_and_every_step_is_accounted_for(
     input_list: list[Input], random: st.DataObject, losses: int
@@ -242,7 +242,7 @@ def test_lost_messages_are_never_a_difference_and_every_step_is_accounted_for(
     assert account.frames + account.unchecked == sum(message.key == STEP.key for message in remaining)
 
 
-@effort(deadline=None, max_examples=EXAMPLES)
+@hypothesis_settings(deadline=None, max_examples=EXAMPLES)
 @given(inputs(), st.randoms(use_true_random=False))
 def test_the_order_between_publishers_does_not_matter(input_list: list[Input], random: st.DataObject) -> None:
     night = night_of([*input_list, *frames(20, 5000)])
@@ -257,7 +257,7 @@ def test_the_order_between_publishers_does_not_matter(input_list: list[Input], r
     assert account.frames == night.steps()
 
 
-@effort(deadline=None, max_examples=EXAMPLES)
+@hypothesis_settings(deadline=None, max_examples=EXAMPLES)
 @given(
     inputs(),
     inputs(),
@@ -274,7 +274,7 @@ def test_segments_together_give_the_account_of_the_whole_log(
     only_states: bool,
     slowdown: int,
 ) -> None:
-    """With single messages or seconds of messages or states missing, at different message rates."""
+    """Messages or states are missing, singly or for seconds, at different message rates."""
     night = night_of([*before, *frames(60, 9000)])
     night.restart()
     for one in after_camera_restart([*after, *frames(60, 9000)]):
@@ -353,7 +353,7 @@ def test_an_input_of_a_former_version_whose_rule_has_changed_is_named_and_replay
         night.apply(one)
     account = replay(night.messages, former=FormerVersion({}))
     assert (account.frames, account.different, account.rules_changed) == (60, 0, {rule: 1})
-    assert replay(night.messages).different  # of this version
+    assert replay(night.messages).different  # as a log of this version
 
 
 def raise_actuator(command: Any, number: int) -> None:
@@ -459,7 +459,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_several_processes_give_the_account_of_one(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    chunk_ends_ns = workers._chunk_ends_ns  # out of order: a large calibration is a chunk, and has its former time
+    chunk_ends_ns = workers._chunk_ends_ns  # unsorted, as with a repeated calibration: it keeps its old time
     monkeypatch.setattr(workers, "_chunk_ends_ns", lambda path: chunk_ends_ns(path)[::-1])
     monkeypatch.setattr(workers, "_WORTH_BYTES", 1)
     by_one, by_two = (workers.replay_files([log], 0.0, jobs, lambda done: None) for jobs in (1, 2))
