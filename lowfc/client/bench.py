@@ -6,7 +6,7 @@ import numpy as np
 
 from lowfc.client.arguments import ARGUMENT_ERRORS
 from lowfc.contract.codecs.bench_codec import encode_bench_value
-from lowfc.contract.errors import BadMessageError, ConfigurationError, raised_as
+from lowfc.contract.errors import BadMessageError, ConfigurationError, brief, raised_as
 from lowfc.contract.sections import BENCH_NAME
 from lowfc.control.loop.interlocks import Value
 
@@ -17,9 +17,9 @@ def bench_message(name: str, value: Value, time_ns: int) -> bytes:
     Raises:
         ConfigurationError: its name or the value is invalid.
     """
-    if not re.fullmatch(BENCH_NAME, name):
+    if not isinstance(name, str) or not re.fullmatch(BENCH_NAME, name):
         raise ConfigurationError(
-            f"a bench value's name begins with a letter and has up to 64 of A-Z, a-z, 0-9, _ and -, got {name[:80]!r}"
+            f"a bench value's name begins with a letter and has up to 64 of A-Z, a-z, 0-9, _ and -, got {brief(name)}"
         )
     with raised_as(ConfigurationError, (BadMessageError, *ARGUMENT_ERRORS), f"bench value {name}"):
         plain = value.item() if isinstance(value, np.generic) else value  # numpy's `True` is true, not 1
