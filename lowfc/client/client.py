@@ -21,7 +21,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.host import by_this_process, program_name
 from lowfc.arrays import Single
 from lowfc.client.answer import Answer
-from lowfc.client.arguments import ARGUMENT_ERRORS, floats, required
+from lowfc.client.arguments import ARGUMENT_ERRORS, floats, real, required
 from lowfc.client.bench import bench_message
 from lowfc.client.lease import Lease, new_identity
 from lowfc.client.mirror_watch import MirrorWatch
@@ -342,7 +342,7 @@ class Client:
             message = wire.Request(
                 name=name,
                 modes=[index(mode) for mode in np.atleast_1d(modes).tolist()] if np.size(modes) else [],
-                values=np.atleast_1d(np.asarray(values, np.float64)).tolist(),
+                values=np.atleast_1d(np.asarray(real(values), np.float64)).tolist(),
                 text=required(name, text, str),
                 actuators=b"" if actuators_nm is None else actuators_nm.tobytes(),
                 table=b"" if table is None else table.tobytes(),
