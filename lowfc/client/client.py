@@ -231,7 +231,11 @@ class Client:
 
     @contextlib.contextmanager
     def held(self, purpose: str, hold_s: float) -> Iterator[None]:
-        """Hold the loop for at most `hold_s` while something on the bench moves; a closed loop then resumes."""
+        """Hold the loop for at most `hold_s` while something on the bench moves; a closed loop then resumes.
+
+        The hold is a reservation of its own: it is refused within `reserved`, where `pause` and `close_loop` take its
+        place, and until its end this client's requests that would change the loop are refused as well.
+        """
         identity = new_identity()
         self.permit(purpose, hold_s, identity)
         try:
