@@ -319,6 +319,10 @@ def test_a_knob_is_chosen_and_shown_whatever_the_number_of_modes(monkeypatch: py
     knobs.turn(1)
     knobs.automatic()
     assert [turn.modes for turn in turned] == [(2, 3), (2, 3)]
+    knobs.discard_pending()
+    update(2, 3, gain=1.8)
+    knobs.turn(1)
+    assert turned[-1].values == [1.8, 1.8], "a gain beyond the bar, entered as a number, is not lowered"
     for gain, automatic in ((np.inf, ()), (np.nan, ()), (0.5, (True,))):  # of another program
         update(2, 3, gain=gain, automatic=automatic)
         assert [line.plain for line in knobs._lines] == ["gains are not known yet"]

@@ -84,7 +84,7 @@ class Gains(Lines):
             self._draw()
 
     def _request(self, number: int, knob: float) -> None:
-        knob = round(min(max(knob, 0.0), HIGHEST), 3)
+        knob = round(min(max(knob, 0.0), max(HIGHEST, self._knob(number))), 3)
         present = self._gain[self._indices(number)]
         gains = np.full(len(present), knob) if not present.any() else present / present.max() * knob
         self._pending[number] = knob, time.monotonic() + _PENDING_S
