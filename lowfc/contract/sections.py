@@ -53,9 +53,10 @@ class Gateway(Section):
     search: WithoutNul = "127.0.0.1"
     """Addresses searched for variables of other servers, separated by spaces."""
     bench: dict[Annotated[str, Field(pattern=BENCH_NAME)], Annotated[str, Field(min_length=1)]] = Field(
-        default_factory=dict
+        default_factory=dict, max_length=64
     )
-    """Variables of other servers that become bench values: name of the value = name of the variable."""
+    """Variables of other servers that become bench values: name of the value = name of the variable. At most 64, as a
+    recorder takes no more names."""
 
 
 class Star(Section):

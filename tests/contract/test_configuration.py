@@ -9,6 +9,7 @@ import pytest
 import tomli_w
 from pydantic import Field, create_model
 
+from lowfc.adapters.bus.names import MAX_NAMES
 from lowfc.adapters.files.factory import detector, mirror, mirror_limits, settings
 from lowfc.contract.configuration import Configuration, keys, load
 from lowfc.contract.errors import ConfigurationError
@@ -145,6 +146,13 @@ def test_an_invalid_value_is_reported_in_one_line_with_key_and_value(key: str, v
     assert message.startswith(key)
     assert f" = {repr(value).strip('[]')}: " in message  # of a list, its only item
     assert "\n" not in message
+
+
+def test_a_gateway_has_no_more_bench_values_than_a_recorder_takes_names() -> None:
+    variables = {f"value-{number}": "PV" for number in range(MAX_NAMES + 1)}
+    assert "at most 64 items" in error_of(None, {"gateway.bench": variables})
+    del variables["value-0"]
+    assert load(None, {"gateway.bench": variables}).gateway.bench == variables
 
 
 def test_each_fault_of_a_value_of_several_types_names_its_key() -> None:
