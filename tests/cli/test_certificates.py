@@ -229,6 +229,13 @@ def test_errors_name_the_file_or_option_at_fault(tmp_path: Path) -> None:
         make(tmp_path / "one", ("viewer",), [])
 
 
+def test_nothing_is_signed_by_an_authority_that_has_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(certificates, "CA_DAYS", 0)
+    with pytest.raises(DataFileError, match=r"ca\.pem ended on .*: make all certificates anew in an empty folder"):
+        make(tmp_path, ("camera",), [])
+    assert not (tmp_path / "camera.pem").exists()
+
+
 @pytest.mark.parametrize("name", ["x" * 51, "../x", "Tip", ""])
 def test_a_name_that_no_mirror_can_have_is_refused(tmp_path: Path, name: str) -> None:
     assert f"mirror.name = {name!r}" in refusal(

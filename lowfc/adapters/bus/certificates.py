@@ -100,6 +100,10 @@ def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]
         raise DataFileError(
             f"{key_file} is not the key of {certificate_file}; make all certificates anew in an empty folder"
         )
+    if (ended := certificate.not_valid_after_utc) <= datetime.datetime.now(datetime.UTC):
+        raise DataFileError(
+            f"{certificate_file} ended on {ended:%Y-%m-%d}: make all certificates anew in an empty folder"
+        )
     return key, certificate
 
 
