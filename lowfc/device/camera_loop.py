@@ -179,7 +179,10 @@ class CameraLoop:
         """Publish the settings when they have changed, and twice a second."""
         settings = self._driver.settings()
         time_ns = self._service.clock.now_ns() if settings.time_ns is None else settings.time_ns
-        if settings != self._settings or time_ns + int(settings.period_ns) // 2 >= self._settings_due_ns:
+        if (
+            settings != self._settings
+            or time_ns + min(int(settings.period_ns), SETTINGS_NS) // 2 >= self._settings_due_ns
+        ):
             self._states.put(camera_state(settings, time_ns).SerializeToString())
             self._settings, self._settings_due_ns = settings, time_ns + SETTINGS_NS
             self._simulated = settings.clock == "run"

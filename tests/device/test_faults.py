@@ -170,6 +170,13 @@ def test_expose_returning_none_is_not_a_failure() -> None:
     assert run_camera_loop(lambda: None, lambda: None, good(), frames=1).events() == ["STARTED", "STOPPED"]
 
 
+def test_settings_are_published_twice_a_second_however_often_expose_returns_none() -> None:
+    bench = CameraBench(settings=replace(SETTINGS, period_ns=2000 * MS))
+    bench.camera.expose = Mock(side_effect=[None] * 100 + [Exposure(GOOD)])  # type: ignore[method-assign]
+    bench.loop.run()
+    assert len(bench.listener.messages(CAMERA_STATE)) == 2, "at the start and with the first exposure"
+
+
 def test_exposure_times_are_converted_from_the_clock_in_the_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     """The host's monotonic clock is 5 s behind the run's clock, its wall clock 2 s."""
     monkeypatch.setattr(FakeClock, "offset_ns", 5 * 10**9)
