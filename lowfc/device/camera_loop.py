@@ -178,6 +178,8 @@ class CameraLoop:
     def _publish_settings(self) -> CameraSettings:
         """Publish the settings when they have changed, and twice a second."""
         settings = self._driver.settings()
+        if not isinstance(settings, CameraSettings):
+            raise TypeError(f"settings() returned {type(settings).__name__}, expected CameraSettings")
         time_ns = self._service.clock.now_ns() if settings.time_ns is None else settings.time_ns
         if (
             settings != self._settings

@@ -166,6 +166,11 @@ def test_settings_that_cannot_be_true_are_named(setting: dict[str, Any], message
         camera_state(replace(SETTINGS, **setting), 0)
 
 
+def test_settings_of_another_type_are_named() -> None:
+    with pytest.raises(TypeError, match=r"settings\(\) returned dict, expected CameraSettings"):
+        CameraBench(settings={"rows": 3})  # type: ignore[arg-type]
+
+
 def test_expose_returning_none_is_not_a_failure() -> None:
     assert run_camera_loop(lambda: None, lambda: None, good(), frames=1).events() == ["STARTED", "STOPPED"]
 
