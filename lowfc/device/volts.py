@@ -49,16 +49,18 @@ class VoltMap:
         if (order % 1).any() or order.max() >= 1 << 16:
             raise ConfigurationError("option order: every value must be a whole number below 65536")
         self._wired = np.flatnonzero(order >= 0)
+        if not self._wired.size:
+            raise ConfigurationError("option order: no actuator has a channel; channel numbers begin with 0")
         self._channel = order[self._wired].astype(int)
-        self.channels = int(self._channel.max(initial=-1)) + 1 if channels is None else channels
-        if len(set(self._channel)) < len(self._channel) or self._channel.max(initial=-1) >= self.channels:
+        self.channels = int(self._channel.max()) + 1 if channels is None else channels
+        if len(set(self._channel)) < len(self._channel) or self._channel.max() >= self.channels:
             raise ConfigurationError(f"option order: each actuator needs its own channel below {self.channels}")
         if not (gain.ravel()[self._wired] > 0).all():
             raise ConfigurationError("option gain_map: the gain of every actuator with a channel must be above 0")
         self._zero = zero.ravel()[self._wired]
         self._nm_per_value = (gain * config.mirror.nm_per_unit).ravel()[self._wired]
         self._range = low, high = options.lowest, options.highest
-        if not (low <= self._zero.min(initial=np.inf) <= self._zero.max(initial=-np.inf) <= high):
+        if not (low <= self._zero.min() <= self._zero.max() <= high):
             raise ConfigurationError(f"options zero, zero_map: flat values must be within {low:g} to {high:g}")
         self._grid = grid
 

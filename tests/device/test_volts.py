@@ -45,6 +45,7 @@ def test_a_surface_is_converted_to_clipped_values_in_channel_order(tmp_path: Pat
         ("order", [[0, 9, 1], [2, 3, 4]], "below 8"),
         ("order", [[0, 1, 2], [3, 4, 5.5]], "whole number"),
         ("order", [[0, 1, 2], [3, 4, 1e30]], "whole number"),
+        ("order", [[-1, -1, -1], [-1, -1, -1]], "no actuator has a channel"),
         ("gain_map", [[0, 1, 1], [1, 1, 1]], "above 0"),
         ("zero_map", [[2, 0, 0], [0, 0, 0]], "flat values"),
         ("zero_map", [[0, 0, 0]], "1 x 3 values"),
