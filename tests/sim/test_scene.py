@@ -17,7 +17,7 @@ from lowfc.control.loop.estimator import Estimator
 from lowfc.optics.chain.sensor import image, pupil_radii
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Evaluator
-from sim_camera.disturbance import BLOCK, Sampler, _sum_of_waves
+from sim_camera.disturbance import BLOCK, Sampler
 from sim_camera.driver import disturbance_of
 from sim_camera.driver import scene as scene_of
 from sim_camera.scene import Scene, exposure_nodes
@@ -130,11 +130,11 @@ def test_image_is_the_mean_over_its_exposure(exposure: float) -> None:
         "camera__exposure_fraction": exposure,
     }
     config = configured(**FINE, **keys)
-    blurred, disturbance = scene_of(config), disturbance_of(config)
+    blurred = scene_of(config)
+    sampler = Sampler(disturbance_of(config), exposure * (np.arange(64) + 0.5) / 64, 1000.0)
     evaluator, worst = Evaluator(blurred._optics), 0.0
     for index in (0, 40, 91, 333):
-        times = index + exposure * (np.arange(64) + 0.5) / 64
-        opds = _sum_of_waves(disturbance, times / 1000).astype(np.float32) @ blurred._basis
+        opds = sampler.at(index) @ blurred._basis
         mean = np.mean([evaluator.image(opd).copy() for opd in opds], axis=0, dtype=np.float64) * blurred._electrons
         found = (blurred.expose(index, FLAT).astype(float) - BIAS_DN) * FINE_E_PER_DN
         worst = max(worst, float(np.abs(found - mean).max() / mean.max()))
@@ -166,15 +166,15 @@ def test_blurred_image_is_as_accurate_as_one_at_rest() -> None:
     """The twin with two nodes against the full optics at 64 times: error at most 10 % above that of a single image."""
     keys = {"disturbance__preset": "reaction-wheel-ideal", "camera__rate_hz": 1000.0}
     config = configured(**FINE, **keys)
-    blurred, disturbance, optics = scene_of(config), disturbance_of(config), sensor(config, print)
+    blurred, optics = scene_of(config), sensor(config, print)
+    sampler = Sampler(disturbance_of(config), config.camera.exposure_fraction * (np.arange(64) + 0.5) / 64, 1000.0)
     evaluator, shapes = Evaluator(blurred._optics), zernikes(config.noll, *pupil_radii(optics))
     at_rest = moving = 0.0
     for index in (0, 91):
-        times = index + config.camera.exposure_fraction * (np.arange(64) + 0.5) / 64
-        images = [image(optics, np.tensordot(one, shapes, 1)) for one in _sum_of_waves(disturbance, times / 1000)]
-        middle = _sum_of_waves(disturbance, times[32:33] / 1000)[0].astype(np.float32)
+        modes = sampler.at(index)
+        images = [image(optics, np.tensordot(one, shapes, 1)) for one in modes]
         electrons = float(blurred._electrons)
-        at_rest = max(at_rest, float(np.abs(evaluator.image(middle @ blurred._basis) - images[32]).max()))
+        at_rest = max(at_rest, float(np.abs(evaluator.image(modes[32] @ blurred._basis) - images[32]).max()))
         found = (blurred.expose(index, FLAT).astype(float) - BIAS_DN) * FINE_E_PER_DN / electrons
         moving = max(moving, float(np.abs(found - np.mean(images, axis=0)).max()))
     rounding = 0.5 * FINE_E_PER_DN / electrons
@@ -184,13 +184,12 @@ def test_blurred_image_is_as_accurate_as_one_at_rest() -> None:
 def test_continuous_truth_is_the_rms_over_the_period_with_a_moving_mirror(calibration: Calibration) -> None:
     """Compared with static scenes with the wavefront of each instant; the mirror moves in mid-period."""
     config = configured(disturbance__preset="bench", camera__rate_hz=20.0, camera__instants=4)
-    scene, disturbance = scene_of(config), disturbance_of(config)
+    scene, sampler = scene_of(config), Sampler(disturbance_of(config), np.array([0.125, 0.375, 0.625, 0.875]), 20.0)
     shapes = [shape_of(calibration, height_nm * np.eye(MODES)[3]) for height_nm in (5.0, -8.0)]
     weights = np.array([[1, 0], [1, 0], [0.25, 0.75], [0, 1]], np.float32)
     found = scene.truth(7, shapes[0], (shapes, weights))
     squares, pupil = [], []
-    for instant, weight in zip((0.125, 0.375, 0.625, 0.875), weights, strict=True):
-        modes = _sum_of_waves(disturbance, np.array([(7 + instant) / 20]))[0]
+    for modes, weight in zip(sampler.at(7), weights, strict=True):
         static = scene_of(
             configured(disturbance__static_nm={str(n): v for n, v in zip(config.noll, modes, strict=True)})
         )
@@ -207,7 +206,7 @@ def test_with_one_instant_image_and_truth_are_at_the_start_of_the_exposure() -> 
     keys = {"camera__noise": False, "disturbance__preset": "reaction-wheel-ideal"}
     config = configured(**keys, camera__instants=1)
     scene = scene_of(config)
-    modes = _sum_of_waves(disturbance_of(config), np.array([3 / config.camera.rate_hz]))[0]
+    modes = Sampler(disturbance_of(config), np.zeros(1), config.camera.rate_hz).at(3)[0]
     static_nm = {str(n): float(v) for n, v in zip(config.noll, modes, strict=True)}
     static = scene_of(configured(camera__noise=False, disturbance__static_nm=static_nm))
     assert (scene.expose(3, FLAT) == static.expose(0, FLAT)).all()
