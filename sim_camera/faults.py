@@ -47,6 +47,8 @@ class Fault:
     def __post_init__(self) -> None:
         if self.first < 1 or self.frames < 1:
             raise ValueError(f"a fault begins at frame 1 or later and has frames, got {self.first} and {self.frames}")
+        if not isinstance(self.seed, int) or self.seed < 0:
+            raise ValueError(f"a fault's seed is a whole number of 0 or more, got {self.seed!r}")
 
     def kind_at(self, index: int) -> Kind | None:
         """Kind of the fault in the frame with this index; None if it is good."""

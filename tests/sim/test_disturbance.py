@@ -328,6 +328,8 @@ def test_faulty_publisher_sends_the_configured_frames(kind: Kind) -> None:
         '{"kind": "lost"}',
         '{"kind": "bent", "first": 1, "frames": 1}',
         '{"kind": "lost", "first": 0, "frames": 1}',
+        '{"kind": "lost", "first": 1, "frames": 1, "seed": -1}',
+        '{"kind": "lost", "first": 1, "frames": 1, "seed": 1.5}',
     ],
 )
 def test_invalid_fault_file_is_refused(tmp_path: Path, content: str) -> None:
