@@ -173,6 +173,8 @@ def _choice(model: type[DriverOptions], key: str, value: Any) -> Any:
 
 def _explained(fault: Any, model: type[DriverOptions]) -> str:
     if fault["type"] == "extra_forbidden":
+        if fault["loc"][0] in KINDS and isinstance(fault["input"], dict):
+            return f"a section has options, or the parts {' and '.join(KINDS)} with options, not both"
         return f"there is no {brief(fault['loc'][0])}; there are {', '.join(model.model_fields) or 'none'}"
     if fault["type"] == "missing":
         key = str(fault["loc"][0])

@@ -117,6 +117,7 @@ def test_options_come_from_configuration_and_command_line() -> None:
         assert plugins.table(load(None, {"drivers.basler": serial}), kind, "basler") == serial
     for table, words, why in [
         ({"levle": 1}, (), "there is no 'levle'; there are level, ports, binning"),
+        ({"level": 7, "camera": {"level": 1}}, (), "has options, or the parts camera and mirror"),
         ({"level": "7"}, (), "level = '7'"),
         ({}, ("--level", "x"), "level = 'x'"),
         ({}, ("level",), "--name value"),
