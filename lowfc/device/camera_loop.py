@@ -106,7 +106,7 @@ class CameraLoop:
                 raise ValueError(f"pixels are {pixels.dtype} of shape {pixels.shape}, {expected}")
             end_ns = self._end_ns(exposure, settings)
             self._follow_numbers(exposure, settings)
-        except Exception as fault:
+        except (Exception, SystemExit) as fault:
             watch.failed(fault)
             return None
         watch.worked()

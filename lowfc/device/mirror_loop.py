@@ -221,7 +221,7 @@ class MirrorLoop:
                     raise ValueError("it returned positions that are NaN or infinite, expected nm of surface")
             if self.watch.returned():
                 return shape_nm
-        except Exception as fault:
+        except (Exception, SystemExit) as fault:  # of `sys.exit`, which would end only the receive thread
             self.watch.failed(fault)
         self._known, self._returning, self._driven_nm = False, True, None
         self._status = self._status._replace(following=False, channels={}, command_nm=_NONE)

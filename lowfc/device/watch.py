@@ -24,7 +24,7 @@ _HERE = Path(__file__).parent
 _PROGRAMS = _HERE.parent / "programs"
 
 
-def described(fault: Exception) -> str:
+def described(fault: Exception | SystemExit) -> str:
     """Describe an exception of a driver, with the line of the driver that raised it."""
     frames = [
         frame
@@ -139,14 +139,14 @@ class DriverWatch:
             self.call(fill, self._fields)
         health.MergeFrom(self._fields)
 
-    def failed(self, fault: Exception) -> None:
+    def failed(self, fault: Exception | SystemExit) -> None:
         """Note that a call raised or returned an invalid result; a `LowfcError`, for the user, is raised again."""
         self.returned()
         self._report(fault)
         self.retry_ns = self._service.clock.host_ns() + PAUSES_NS[min(self._consecutive, len(PAUSES_NS) - 1)]
         self._consecutive += 1
 
-    def _report(self, fault: Exception) -> None:
+    def _report(self, fault: Exception | SystemExit) -> None:
         if isinstance(fault, LowfcError):
             raise fault
         self._count()

@@ -1,5 +1,6 @@
 """Drivers in their loops; those that fail, hang or return invalid data are reported, counted and retried."""
 
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -83,6 +84,7 @@ def run_camera_loop(*exposures: Callable[[], Any], frames: int, settings: Camera
     ("bad", "message"),
     [
         (Mock(side_effect=OSError("the cable")), "OSError: the cable"),
+        (Mock(side_effect=SystemExit("no licence")), "SystemExit: no licence"),
         (Mock(side_effect=UnprintableError), "UnprintableError: (its __str__ fails)"),
         (good(pixels=GOOD[1:]), "shape (2, 4)"),
         (good(pixels=np.full((3, 4), np.nan)), "float64"),
@@ -94,7 +96,7 @@ def run_camera_loop(*exposures: Callable[[], Any], frames: int, settings: Camera
         (lambda: "nothing", "expose() returned str"),
         (good(pixels=GOOD.tolist()), "pixels of Exposure are list"),
     ],
-    ids=["raises", "text", "shape", "NaN", "future", "past", "NaN time", "negative loss", "huge loss", "str", "list"],
+    ids=["raises", "exits", "text", "shape", "NaN", "future", "past", "NaN time", "loss", "huge loss", "str", "list"],
 )
 def test_camera_failures_are_reported_once_counted_and_retried(bad: Callable[[], Any], message: str) -> None:
     recovered = [good()] * 251  # more than 1 s at 250 Hz
@@ -314,10 +316,11 @@ def test_the_mirror_refuses_a_command_whose_sender_started_in_the_future_and_fol
     ("bad", "message"),
     [
         (lambda _: 1 / 0, "ZeroDivisionError"),
+        (lambda _: sys.exit("no licence"), "SystemExit: no licence"),
         (lambda shape: shape[1:], "(3, 5)"),
         (lambda shape: shape * np.float32(np.nan), "NaN or infinite"),
     ],
-    ids=["raises", "shape", "NaN"],
+    ids=["raises", "exits", "shape", "NaN"],
 )
 def test_a_failed_mirror_goes_flat_before_it_follows_commands_again(bad: Any, message: str) -> None:
     mirror = Mirror()
