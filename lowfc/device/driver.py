@@ -124,7 +124,7 @@ def camera_state(settings: CameraSettings, time_ns: int) -> wire.CameraState:
         if not isinstance(value := getattr(settings, name), Integral) or value < lowest:
             raise ValueError(f"{name} of the settings is {value!r}, expected a whole number of {lowest} or more")
     if settings.saturation_dn is None:
-        settings = replace(settings, saturation_dn=2**settings.bit_depth - 1)
+        settings = replace(settings, saturation_dn=2 ** int(settings.bit_depth) - 1)
     for name in ("gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "em_gain"):
         if not isinstance(number := getattr(settings, name), Real) or not isfinite(number):
             raise ValueError(f"{name} of the settings is {number}, expected a finite number")

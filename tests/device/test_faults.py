@@ -218,6 +218,7 @@ def test_whole_numbers_of_the_settings_may_be_numpy_integers(kind: Any) -> None:
     settings = replace(SETTINGS, period_ns=kind(SETTINGS.period_ns), number_wrap=kind(SETTINGS.number_wrap))
     bench = CameraBench(*[good(number=number) for number in (65_535, 1, 30_000, 0)], settings=settings)
     assert None not in [bench.loop._next_frame() for _ in range(4)], bench.listener.event_texts("DRIVER_FAILED")
+    assert camera_state(replace(SETTINGS, bit_depth=np.uint8(12)), 0).saturation_dn == 4095
 
 
 def test_lost_frames_without_numbers_are_counted() -> None:
