@@ -10,7 +10,7 @@ from lowfc.arrays import Array, Mask
 _SIGMAS = 8.0
 """Robust standard deviations above the median beyond which a pixel is bad; none of 6400 good pixels is that far."""
 _ROUNDING_DN = 0.6
-"""Largest noise that a pixel may have, or lack, because its values are rounded to whole DN; with a margin."""
+"""Largest noise that a pixel may have, or lack, in many frames, because its values are rounded to whole DN."""
 _MAX_LIGHT = 0.02
 """Largest fraction of the star's light in dark frames."""
 _TO_SIGMA = 1.4826
@@ -64,14 +64,15 @@ def measure_dark(frames: npt.NDArray[np.number]) -> Dark:
     level, typical = float(np.median(mean)), float(np.median(noise))
     mean_spread = max(_spread(mean), typical / np.sqrt(count), 1e-3)
     noise_spread = max(_spread(noise), typical / np.sqrt(2 * count), 1e-3)
-    hot = mean > level + max(_SIGMAS * mean_spread, _SIGMAS * typical / 4, _ROUNDING_DN)
+    rounding_dn = _ROUNDING_DN * (1 + 4 / np.sqrt(count))  # in few frames, a good pixel may keep one value
+    hot = mean > level + max(_SIGMAS * mean_spread, _SIGMAS * typical / 4, rounding_dn)
     if hot.mean() > 0.05:
         raise ValueError(
             f"{hot.mean():.0%} of the pixels are much brighter than the median of {level:.1f} DN: these frames are not "
             "dark; block the star, or switch it off"
         )
-    noisy = noise > max(typical + _SIGMAS * noise_spread, float(np.hypot(typical, _ROUNDING_DN)))
-    return Dark(mean, noise, hot, noisy, (noise < 0.05 * typical) & (typical > _ROUNDING_DN / 2))
+    noisy = noise > max(typical + _SIGMAS * noise_spread, float(np.hypot(typical, rounding_dn)))
+    return Dark(mean, noise, hot, noisy, (noise < 0.05 * typical) & (typical > rounding_dn / 2))
 
 
 def check_dark(dark_dn: Array, reference: Array, flux_dn: float) -> None:

@@ -302,12 +302,13 @@ def test_bad_pixels_are_found() -> None:
         measure_dark(frames)
 
 
-@pytest.mark.parametrize("noise_dn", [0.0, 0.1, 0.15, 0.17, 0.25, 0.5])
+@pytest.mark.parametrize("frames", [16, 400])
+@pytest.mark.parametrize("noise_dn", [0.0, 0.1, 0.15, 0.17, 0.2, 0.25, 0.35, 0.5])
 @pytest.mark.parametrize("pattern_dn", [0.0, 0.5])
-def test_pixels_whose_noise_is_lost_in_rounding_are_not_bad(noise_dn: float, pattern_dn: float) -> None:
+def test_pixels_whose_noise_is_lost_in_rounding_are_not_bad(noise_dn: float, pattern_dn: float, frames: int) -> None:
     rng = np.random.default_rng(1)
     level_dn = 100 + pattern_dn * rng.uniform(-1, 1, 1600)
-    dark = measure_dark(np.rint(level_dn + noise_dn * rng.standard_normal((400, 1600))))
+    dark = measure_dark(np.rint(level_dn + noise_dn * rng.standard_normal((frames, 1600))))
     assert np.count_nonzero(dark.good == 0) == 0
 
 
