@@ -326,6 +326,8 @@ def test_a_knob_is_chosen_and_shown_whatever_the_number_of_modes(monkeypatch: py
     for gain, automatic in ((np.inf, ()), (np.nan, ()), (0.5, (True,))):  # of another program
         update(2, 3, gain=gain, automatic=automatic)
         assert [line.plain for line in knobs._lines] == ["gains are not known yet"]
+    update(2, gain=-1e30)
+    assert " ●━━━━━━━━ -1e+30" in knobs._lines[0].plain
     monkeypatch.setattr(Gains, "size", Size(60, 5))
     update(*range(2, 37))
     for _ in range(8):
@@ -516,6 +518,7 @@ def test_verdict_and_tiles_have_the_text_of_the_view() -> None:
 def test_pictures_and_sparklines_have_a_fixed_size() -> None:
     assert sparkline([1.0, float("nan"), 0.5, 0.0], 3) == " █▁"
     assert sparkline([], 3) == ""
+    assert sparkline([1.0, float("inf")], 3) == "▁█"
     assert sparkline([-0.01, -0.02], 3) == "▁▁"  # light of a blocked star, less the dark
     for shape in ((6, 7), (34, 34), (1, 300)):
         small = reduced(np.full(shape, 4.0))

@@ -102,7 +102,7 @@ class Gains(Lines):
         lines = []
         for number, (name, _) in enumerate(groups(self._noll)):
             knob, indices = self._knob(number), self._indices(number)
-            at = min(round(knob / HIGHEST * _BAR), _BAR)
+            at = round(min(max(knob / HIGHEST, 0.0), 1.0) * _BAR)
             lowest = float(self._gain[indices].min())
             range_start = "" if lowest >= 0.99 * knob else f"{lowest:.2g}-"
             chosen = number == self._chosen

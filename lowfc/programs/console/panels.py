@@ -127,7 +127,7 @@ def sparks(reading: Reading) -> list[Text]:
 
 def sparkline(values: Sequence[float], width: int) -> str:
     """The last values as bars from zero to the largest; a negative value has the lowest bar, NaN a space."""
-    last = np.array(values[-width:])
+    last = np.minimum(values[-width:], np.finfo(float).max)  # the share of infinity would be NaN
     largest = max(np.nanmax(last, initial=0.0), 1e-9) if last.size else 1.0
     return "".join(" " if np.isnan(one) else _SPARKS[min(int(max(one, 0.0) / largest * 8), 7)] for one in last)
 
