@@ -58,7 +58,9 @@ def bridge_isio(
     if beside in names:
         raise ConfigurationError(f"{beside} is the loop's own channel (--beside): leave out --external {beside}")
     for total in (name for name in names if sum_name(f"{name}00") == name):
-        raise ConfigurationError(f"--external {total} is the sum, with the loop's own channel: name single channels")
+        raise ConfigurationError(
+            f"--external {total} is a sum, which may contain the loop's own channel: name single channels"
+        )
     lower_priority()
     run_id, clock = the_known_run(run), HostClock()
     with contextlib.suppress(KeyboardInterrupt):
