@@ -319,7 +319,9 @@ def test_a_frame_timeout_ends_the_probe_sequence() -> None:
     state, all_outputs = feed(DEFAULTS, state, odd(4), Tick(0, DEFAULTS.frame_timeout_ns + 1))
     assert "PLAY_ENDED" in names(all_outputs)
     state = play(state, np.ones((5, 1), np.float32))
-    assert names(feed(DEFAULTS, state, Tick(0, DEFAULTS.frame_timeout_ns + 2))[1]) == ["PLAY_ENDED"]
+    tick = Tick(0, DEFAULTS.frame_timeout_ns + 2)
+    assert names(feed(replace(DEFAULTS, on_frame_timeout="flat"), state, tick)[1]) == ["PLAY_ENDED"]
+    assert names(feed(replace(DEFAULTS, on_frame_timeout="hold"), state, tick)[1]) == []
 
 
 @pytest.mark.parametrize(("rows", "request_", "events"), [(5, "status", 1), (5, "stop", 0), (1, "status", 0)])

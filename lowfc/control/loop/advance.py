@@ -265,11 +265,12 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
         return state, Outputs(events=tuple(events), changed=lease_ended)
     flatten = silent and settings.on_frame_timeout == "flat"
     counts = state.counts
-    if silent and not state.frame_timeout:
+    begins = silent and not state.frame_timeout
+    if begins:
         action = "relaxing the mirror to flat" if flatten else "holding the command"
         events.append(PendingEvent("NO_FRAMES", {"silent_ms": tick.silent_ns / 1e6, "action": action}))
         counts = _counted(counts, (Rejection.NO_FRAME,))
-    if silent:
+    if begins or flatten:  # a sequence requested during the timeout waits for the next frame, unless the mirror relaxes
         loop = end_probe(loop, state.frame_sequence, f"no frame for {tick.silent_ns / 1e6:.0f} ms", events)
     if flatten or safe:
         loop = step_to_flat(settings, loop)
