@@ -145,7 +145,7 @@ def hole_fields(optics: Optics, hole: Hole) -> SingleComplex:
     n = optics.groups[0].relay.shape[1]
     u = pupil_axis(n)
     rows, columns = _covered(n, y, diameter), _covered(n, x, diameter)
-    radius = np.sqrt(diameter**2 / 4.0 - 1.0 / (12.0 * n**2))  # a soft rim adds this much to the area
+    radius = np.sqrt(max(diameter**2 / 4.0 - 1.0 / (12.0 * n**2), 0.0))  # a soft rim adds this much to the area
     open_part = np.clip((radius - np.hypot(u[rows, None] - y, u[columns] - x)) * n + 0.5, 0.0, 1.0)
     open_part = open_part.astype(np.float32)
     parts = []

@@ -128,6 +128,10 @@ def test_light_through_small_holes_agrees_with_the_full_chain(pupil, optics, dia
     assert throughput(SamCandidate(optics, fields).central("disk")) == pytest.approx(I0.sum(), rel=allowed)
 
 
+def test_the_light_through_the_smallest_hole_is_finite(optics):
+    assert np.isfinite(hole_fields(optics, (0.0, 0.0, 1e-3))).all()
+
+
 def test_merits_agree_with_their_definitions(optics, fields):
     mask = SamCandidate(optics, fields)
     predicted = predictions(mask)
