@@ -504,10 +504,11 @@ def test_an_unknown_position_names_the_failure_of_the_driver() -> None:
     [
         (lambda shape: np.where(np.arange(42).reshape(6, 7) % 7 < 5, shape, 0), 12, "exclude those without a channel"),
         (lambda shape: 16 * np.round(shape / 16), 42, "step is above 7.49 nm, set mirror.driver_bits"),
+        (lambda shape: shape / 1000, 42, "with the right orientation, times 0.001: report nm, not um"),
     ],
-    ids=["a round mirror", "a coarse step"],
+    ids=["a round mirror", "a coarse step", "um, below one step"],
 )
-def test_actuators_that_do_not_move_are_no_error_of_scale_or_order(reported: Any, count: int, advice: str) -> None:
+def test_the_advice_on_actuators_that_hardly_move_names_the_cause(reported: Any, count: int, advice: str) -> None:
     checks = mirror_checks(Dialogue(Mirror(state=shaped(reported)), Expected(CONFIG)), 0.2, lambda _: None)
     (applied,) = (check for check in checks if check.name == "applied")
     assert (applied.status, applied.got.partition(" off")[0]) == (WRONG, f"{count} of 42 actuators")

@@ -178,17 +178,16 @@ def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wir
     if away.size <= off_nm.size // 10:
         return warning(got, f"are they dead? Exclude them in the map mirror.active: {', '.join(map(str, away[:8]))}")
     moved = (np.abs(where_nm - base_nm) > expected.tolerance_nm) & expected.moving
-    if not moved.flat[away].any():
-        advice = "they do not move, the others do: exclude those without a channel in the map mirror.active"
-        if not moved.any():
-            step = f"step is above {np.abs(commanded_nm - base_nm).max():.3g} nm, set mirror.driver_bits"
-            advice = f"none moves: does the driver send the values? If its {step}"
-        return wrong(got, advice)
-    return wrong(got, _difference(base_nm, commanded_nm, where_nm))
+    if moved.any() and not moved.flat[away].any():
+        return wrong(got, "they do not move, the others do: exclude those without a channel in the map mirror.active")
+    return wrong(got, _difference(base_nm, commanded_nm, where_nm, moved=bool(moved.any())))
 
 
-def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single) -> str:
-    """Advice: the error that transforms the commanded shape into the reported one."""
+def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single, *, moved: bool) -> str:
+    """Advice: the error that transforms the commanded shape into the reported one.
+
+    `moved`: whether an actuator moved by more than a step of the driver.
+    """
     commanded, got = commanded_nm.astype(np.float64) - base_nm, where_nm.astype(np.float64) - base_nm
     turns = {
         "with the right orientation": got,
@@ -204,6 +203,9 @@ def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single) -> str:
     }
     how = max(similarity, key=lambda name: abs(similarity[name]))
     if abs(similarity[how]) < 0.9:
+        if not moved:
+            step = f"step is above {np.abs(commanded).max():.3g} nm, set mirror.driver_bits"
+            return f"none moves: does the driver send the values? If its {step}"
         return "the reported and the commanded shape are unrelated: check the driver's order of the actuators"
     scale = float((commanded * turns[how]).sum() / (commanded**2).sum())
     advice = f"the reported shape is the commanded one {how}, times {scale:.3g}"
