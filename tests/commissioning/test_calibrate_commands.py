@@ -325,8 +325,10 @@ def test_pokes_resolve_a_reflection_that_does_not_change_the_image(geometry: Geo
     image = computed.reference.astype(float).reshape(80, 80)
     alignment = align(onto(image, geometry, (80, 80)), image)
     H = onto(computed.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
+    alignment = replace(alignment, residual=0.1, other_parity=0.2)  # of the better parity, which may be the wrong one
     found, calibration, correlation = oriented(config, computed, alignment, 1e5, computed, lambda mode: H[:, mode])
     assert found.geometry.parity == geometry.parity
+    assert found.residual == (0.1 if alignment.geometry.parity == geometry.parity else 0.2)
     assert correlation > 0.99
     assert np.abs(cross_talk(calibration.reconstructor, H)).max() < 0.01
 

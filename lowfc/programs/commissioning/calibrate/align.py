@@ -125,7 +125,10 @@ def oriented(
     responses = [poke(mode) for mode in modes]
     scores = [np.mean([correlation(responses[k], each.response[:, k]) for k in modes]) for each in candidates]
     best = int(np.argmax(scores))
-    return replace(alignment, geometry=alignment.orientations[best]), candidates[best], float(scores[best])
+    geometry, residuals = alignment.orientations[best], (alignment.residual, alignment.other_parity)
+    residual, other = residuals if geometry.parity == alignment.geometry.parity else residuals[::-1]
+    found = replace(alignment, geometry=geometry, residual=residual, other_parity=other)
+    return found, candidates[best], float(scores[best])
 
 
 def computed_scale(config: Configuration) -> float:
