@@ -23,6 +23,7 @@ from lowfc.contract.messages import BENCH, CALIBRATION, CONTROLLER_STATE, FRAME,
 from lowfc.programs.logs.report.results import report_of
 from lowfc.programs.logs.report.source import read_run
 from tests.support.loops import json_of, lowfc, refusal
+from tests.support.mutated_logs import flipped
 from tests.support.report_log import METADATA, SyntheticLog
 from tests.support.toy import START
 
@@ -178,10 +179,13 @@ def test_a_command_gives_the_same_results_for_ten_files_as_for_one(
 
 def test_a_report_says_that_a_file_between_two_others_is_missing(folder: Path, samples: list[Sample]) -> None:
     files = recorded(folder, samples, 4)
-    for named, text in ((files[2:], "complete, no message lost"), (files[::2], "a file between the first and")):
+    missing = "1 file missing between the first and the last"
+    for named, text in ((files[2:], "complete, no message lost"), (files[::2], missing)):
         report = report_of(read_run(named)).results
-        assert report["verdict"]["checks"][0]["text"].startswith(text)
+        assert report["verdict"]["checks"][0]["text"] == text
         assert report["log"]["complete"] == (named == files[2:])
+    damaged = report_of(read_run((files[0], flipped(files[2], -100)))).results
+    assert damaged["verdict"]["checks"][0]["text"] == f"1 damaged part left out; {missing}"
 
 
 def test_acceptance_reads_several_files(folder: Path, samples: list[Sample]) -> None:

@@ -62,6 +62,7 @@ def report_of(run: Run) -> Report:
 
 def _log(run: Run) -> Results:
     log = run.history.log
+    missing = missing_between(log.paths)
     account = log.metadata.get("recording", {})
     lost = {name.removeprefix("lost "): _number(text) for name, text in account.items() if name.startswith("lost ")}
     return {
@@ -70,7 +71,8 @@ def _log(run: Run) -> Results:
         "selection": log.selection.description,
         "bytes": log.size,
         "finished": log.finished,
-        "complete": log.complete and not log.damage and not missing_between(log.paths),
+        "complete": log.complete and not log.damage and not missing,
+        "missing_files": missing,
         "stopped": account.get("stopped") or None,
         "recovery": recovery_in_words(log.metadata) or None,
         "damage": [{"byte": damage.position, "bytes": damage.length, "why": damage.why} for damage in log.damage],

@@ -41,8 +41,8 @@ def _record(results: Results) -> Results:
         faults.append(f"{counted(len(log['damage']), 'damaged part')} left out")
     if not log["finished"]:
         faults.append("truncated: the recorder did not finish it")
-    if not (log["complete"] or log["damage"]) and log["finished"]:
-        faults.append("a file between the first and the last is missing")
+    if log["missing_files"]:
+        faults.append(f"{counted(log['missing_files'], 'file')} missing between the first and the last")
     if log["recovery"]:
         faults.append(log["recovery"])
     if log["messages_lost"]:
