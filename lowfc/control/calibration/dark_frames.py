@@ -57,10 +57,10 @@ def measure_dark(frames: npt.NDArray[np.number]) -> Dark:
     if count < 16:
         raise ValueError(f"a dark takes at least 16 frames, got {count}")
     values = frames.astype(np.float64)
-    mean, noise = values.mean(axis=0), values.std(axis=0, ddof=1)
-    if bad := int(np.count_nonzero(~np.isfinite(mean))):
+    if bad := int(np.count_nonzero(~np.isfinite(values).all(axis=0))):
         which = "1 pixel of the dark frames has" if bad == 1 else f"{bad} pixels of the dark frames have"
         raise ValueError(f"{which} values that are not finite: replace them by numbers")
+    mean, noise = values.mean(axis=0), values.std(axis=0, ddof=1)
     level, typical = float(np.median(mean)), float(np.median(noise))
     mean_spread = max(_spread(mean), typical / np.sqrt(count), 1e-3)
     noise_spread = max(_spread(noise), typical / np.sqrt(2 * count), 1e-3)
