@@ -12,18 +12,21 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files import calibration_file
+from lowfc.arrays import single
 from lowfc.contract.codecs.calibration_codec import camera_settings, identified
 from lowfc.contract.configuration import Configuration, Control
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
 from lowfc.contract.sections import Camera, Disturbance, SensorSection
+from lowfc.control.calibration.alignment import Geometry, onto
+from lowfc.control.calibration.delay_fit import Delay
 from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.programs.commissioning.calibrate import pokes
 from lowfc.programs.commissioning.calibrate.run import partial_of
 from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.commission import commissioning
 from lowfc.programs.commissioning.commission.commissioning import Commissioning, CommissionOptions, provisional_path
-from lowfc.programs.commissioning.commission.first_calibration import linear_nm
+from lowfc.programs.commissioning.commission.first_calibration import aligned, linear_nm
 from lowfc.programs.commissioning.commission.first_light import Sensor, calibration_with_reference
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, Agreement, agreement_checks
 from tests.support.in_process_loop import InProcessLoop, computed
@@ -214,6 +217,22 @@ def test_a_given_number_of_cycles_changes_only_the_default_signal_to_noise_ratio
     bench, _ = commissioned
     request = bench.steps(snr=snr, cycles=cycles)._request()
     assert (request.snr, request.cycles) == (required, cycles)
+
+
+@pytest.mark.parametrize(("noise", "poked"), [(0.0, [1]), (0.3, [])], ids=["the configured sensor", "another"])
+def test_tilt_is_poked_for_a_reflection_if_the_sensor_is_the_configured_one(noise: float, poked: list[int]) -> None:
+    config = Configuration.model_validate({**tomllib.loads(TOML), "sensor": {"kind": "clowfs", "modes": 3}})
+    first, geometry = computed(config.to_toml()), Geometry(1.0, 40.2, 39.5, 12.0, -1)
+    H = onto(first.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
+    image = onto(first.reference.astype(float).reshape(80, 80), geometry, (80, 80)).reshape(-1)
+    image *= 1 + noise * np.random.default_rng(1).standard_normal(image.size)
+    first_poke = Mock(side_effect=lambda mode, plan: Delay(1.0, 0.1, np.ones(1), H[:, mode], 9.0))
+    before = replace(first, reference=single(image))
+    player: Any = SimpleNamespace(before=before, report=lambda text: None, first_poke=first_poke)
+    results: dict[str, Any] = {}
+    aligned(player, config, first, Delay(1.0, 0.1, np.ones(1), H[:, 0], 9.0), results)
+    assert [call.args[0] for call in first_poke.call_args_list] == poked
+    assert results.get("parity") == (-1 if poked else None)
 
 
 @pytest.mark.slow

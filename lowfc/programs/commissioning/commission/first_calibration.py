@@ -14,6 +14,7 @@ from lowfc.control.calibration import poke_plan
 from lowfc.control.calibration.alignment import align
 from lowfc.control.calibration.calibration import FIRST, Calibration
 from lowfc.control.calibration.delay_fit import Delay
+from lowfc.control.calibration.response_fit import correlation
 from lowfc.programs.commissioning.calibrate.align import computed_scale, in_words, on_sensor, oriented
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, first_poke_plan, largest_nm
 from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError
@@ -65,12 +66,14 @@ def aligned(
     model = computed.reference.astype(np.float64).reshape(computed.shape)
     try:
         alignment = align(image, model)
-        on_sensor(config, computed, alignment.geometry, before.flux_dn, before)
+        calibration = on_sensor(config, computed, alignment.geometry, before.flux_dn, before)
     except (ValueError, CalibrationError) as error:
         report(f"the image cannot be compared with the computed one: {error}")
         return None
-    responses = partial(_poke_response, player, config, poke)
-    alignment, calibration, poke_correlation = oriented(config, computed, alignment, before.flux_dn, before, responses)
+    poke_correlation = abs(correlation(poke.response, calibration.response[:, 0]))
+    if alignment.residual <= MAX_MISFIT:  # otherwise a poke of tilt is of no use
+        pokes = partial(_poke_response, player, config, poke)
+        alignment, calibration, poke_correlation = oriented(config, computed, alignment, before.flux_dn, before, pokes)
     scale = alignment.geometry.scale * computed_scale(config)
     report(
         f"{in_words(alignment, scale)}; correlation of the poke's image with the computed one: {poke_correlation:.2f}"
