@@ -481,7 +481,8 @@ def test_a_mirror_that_does_not_span_the_pupil_causes_a_warning() -> None:
     analytic(load(None, {"mirror.rows": 8, "mirror.columns": 8, "sensor.modes": 6}), Console(file=printed, width=400))
     assert "8 x 8 actuators at 31 pitches per pupil make at most" in printed.getvalue()
     printed = StringIO()
-    analytic(load(None, SMALL_MIRROR), Console(file=printed))
+    for limits in ({}, {"control.limit_nm": 1e5, "control.tilt_limit_nm": 1e5}):  # the latter are no limits
+        analytic(load(None, SMALL_MIRROR | limits), Console(file=printed))
     assert not printed.getvalue()
 
 

@@ -18,7 +18,7 @@ from lowfc.optics.twin.twin_mirror import TwinMirror
 _FRAMES = 100  # simulated frames, whose flux in DN is compared with that of the light on the detector
 
 _MIN_REACH = 0.1
-"""Fraction of a modal limit that the mirror's stroke allows, below which mirror and modes do not fit together."""
+"""Least amplitude that the stroke must allow, as a fraction of the modal limit, or of the stroke if that is smaller."""
 
 WavefrontFunction = Callable[[Twin, TwinMirror], Array]
 """Computes the wavefront at the used nodes, nm, from a twin and the mirror on its nodes."""
@@ -49,8 +49,9 @@ def analytic(config: Configuration, console: Console, at: WavefrontFunction | No
             f"limit of {limit_nm[worst]:g} nm: the star is too faint, or the mask cannot distinguish so many modes"
         )
     mirror, reach_nm = config.mirror, config.safety.stroke_nm / np.abs(calibration.modes_to_actuators).max(axis=0)
-    worst = int(np.argmin(reach_nm / limit_nm))
-    if reach_nm[worst] < _MIN_REACH * limit_nm[worst]:
+    fraction = reach_nm / np.minimum(limit_nm, config.safety.stroke_nm)
+    worst = int(np.argmin(fraction))
+    if fraction[worst] < _MIN_REACH:
         warn(
             f"{mirror.rows} x {mirror.columns} actuators at {mirror.pitches_per_pupil:g} pitches per "
             f"pupil make at most {reach_nm[worst]:.2g} nm rms of Z{calibration.noll[worst]} within safety.stroke_nm: "
