@@ -33,7 +33,7 @@ def test_an_identified_law_is_nearly_optimal() -> None:
 @pytest.mark.parametrize("width", lines.WIDTHS)
 def test_laws_are_nearly_optimal_within_the_margins(width: float, magnitude: float, delay: float) -> None:
     residuals = lines.case(width, magnitude, delay)
-    assert max(residuals["identified_mas"]) < 1.05 * residuals["best_within_margins_mas"]
+    assert max(residuals["identified_mas"]) < 1.06 * residuals["best_within_margins_mas"]
     assert residuals["optimum_mas"] <= 1.001 * residuals["best_within_margins_mas"]
 
 
