@@ -78,9 +78,13 @@ ADVICE: dict[str, Advice] = {
         "the mirror had a shape outside the modes, as after a restart of the controller.",
         "keep it if it is a dark hole; else `lowfc ctl channel adopted --zero`.",
     ),
+    "FLAT_NOT_IN_FORCE": Advice(
+        "the mirror reported late, and with the channels set before, the map of `mirror.flat` exceeds a limit.",
+        "change those channels, then `lowfc ctl channel flat FILE`.",
+    ),
     "LAW_NOT_IN_FORCE": Advice(
-        "the law of `control.law` was refused: no calibration is loaded, or the camera's settings do not fit it.",
-        "load a calibration for the camera's settings, or restore them; then `lowfc ctl law FILE`.",
+        "the law of `control.law` was refused: no calibration of its modes is loaded, or the camera does not fit it.",
+        "load a calibration of these modes for the camera's settings, or restore them; then `lowfc ctl law FILE`.",
     ),
     "LAW_OVERRULED": Advice(
         "the guard found that the law's residual exceeds the integrator's, or that the loop amplifies.",

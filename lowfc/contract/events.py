@@ -81,6 +81,7 @@ EVENTS: dict[str, Event] = {
             "the mirror had {rms_nm:.1f} nm rms of surface outside the modes: kept as the channel 'adopted'; "
             "`lowfc ctl channel adopted --zero` removes it",
         ),
+        Event("FLAT_NOT_IN_FORCE", Level.WARNING, "the flat map of the configuration is not in force: {why}"),
         Event("LAW_NOT_IN_FORCE", Level.WARNING, "the law of the configuration is not in force: {why}"),
         Event(
             "LAW_OVERRULED",

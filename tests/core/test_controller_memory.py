@@ -415,6 +415,23 @@ def test_without_a_calibration_the_configured_law_is_not_in_force(tmp_path: Path
     until(lambda: any(b"LAW_NOT_IN_FORCE" in event for event in events))
 
 
+def test_what_clients_changed_before_a_late_mirror_does_not_end_the_controller(
+    calibration: Calibration, tmp_path: Path
+) -> None:
+    shape, noll = np.full(GRID, 500, np.float32), (2, 3)
+    np.save(tmp_path / "flat.npy", shape)
+    law_file.save(integrator([0.3] * 2, [0.0] * 2, noll, 1.0, CONFIG.camera.rate_hz), tmp_path / "law")
+    config = configured(lockstep=False, mirror__flat=str(tmp_path / "flat.npy"), control__law=str(tmp_path / "law"))
+    hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), config)
+    events: list[bytes] = []
+    MemoryBus(hub, "operator", HostClock()).subscribe(EVENT, lambda sample: events.append(sample.payload))
+    controller._mirror_adopted = True  # it has not reported within `MIRROR_PATIENCE_S`
+    controller._carry_out_internal(Request(0, "channel", text="dig", actuators_nm=shape.reshape(-1)))
+    controller._send_start_requests()
+    for name in (b"LAW_NOT_IN_FORCE", b"FLAT_NOT_IN_FORCE"):
+        until(lambda name=name: any(name in event for event in events))
+
+
 def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: Calibration, tmp_path: Path) -> None:
     hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     mirror, shape = MemoryBus(hub, "mirror-dm", HostClock()), wire.MirrorState(rows=1, columns=1, actuators=bytes(4))

@@ -37,6 +37,7 @@ from lowfc.control.cache_warmup import CacheWarmup
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.durations import Durations
 from lowfc.control.loop.advance import advance
+from lowfc.control.loop.command_channels import ADOPTED
 from lowfc.control.loop.inputs import Input, Load, MirrorReport, Outputs, Reply, Report, Request, Tick
 from lowfc.control.loop.loading import holding_cause, misfit, safe_pending, uncalibrated
 from lowfc.control.loop.requests import CONFIGURATION, MAX_REPLY_LENGTH, prepared
@@ -349,8 +350,10 @@ class Controller:
         self._start_pending = False
         for request in self._start_up.requests(self._state, self._service.clock.now_ns()):
             reply = self._carry_out_internal(request, lock=contextlib.nullcontext())
-            if not reply.accepted and request.name == "law" and (misfit(self._state) or uncalibrated(self._state)):
-                self._service.event("LAW_NOT_IN_FORCE", why=reply.text)  # the loop stays open or idle
+            law, late = request.name == "law", self._mirror_adopted  # if late, clients may have changed the loop before
+            unfit = law and (misfit(self._state) or uncalibrated(self._state))  # the loop stays open or idle
+            if not reply.accepted and (unfit or (late and request.text != ADOPTED)):
+                self._service.event("LAW_NOT_IN_FORCE" if law else "FLAT_NOT_IN_FORCE", why=reply.text)
             elif not reply.accepted:
                 self._start_up.handle_refusal(request, reply.text)
                 break
