@@ -13,6 +13,7 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings, changes
 from lowfc.control.loop.command_channels import MIRROR
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorReport, MirrorShape, Outputs, Reply, Request, Tick
+from lowfc.control.loop.loading import LATCHED
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.control.loop.state import State
 from lowfc.control.loop.wording import CAMERA_MISFIT
@@ -268,7 +269,10 @@ def test_safe_mode_from_before_the_start_remains() -> None:
     _, all_outputs = feed(safe, state, odd(1))
     assert not surfaces(all_outputs).any()
     for load in (Load(0, calibration(), "a file"), Request(0, "load", calibration=calibration())):
-        assert sorted(names(feed(safe, State(), load)[1])) == ["CALIBRATION_LOADED", "MODE_CHANGED", "SAFED"]
+        state, (outputs,) = feed(safe, State(), load)
+        assert sorted(names([outputs])) == ["CALIBRATION_LOADED", "MODE_CHANGED", "SAFED"]
+        causes = {event.details["why"] for event in outputs.events if "why" in event.details}
+        assert causes == {state.conditions.mode_cause} == {LATCHED}
 
 
 @pytest.mark.parametrize("begin", [idle, other_size])

@@ -41,7 +41,7 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
         events += lease_events
         text += "".join(f"; this ended the reservation for {event.details['holder']}" for event in lease_events)
     if after.mode is not state.mode:
-        why = asked_by(lease_before, request)
+        why = after.conditions.mode_cause
         events.append(mode_event(state.mode, after.mode, why))
         if after.mode is LoopMode.SAFE:
             events.append(PendingEvent("SAFED", {"why": why}))
