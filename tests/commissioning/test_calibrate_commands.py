@@ -254,6 +254,11 @@ def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:
     assert "reserved for somebody" in refusal(*words, kind=RequestRefusedError)
 
 
+def test_a_saturated_image_is_no_reference(loop: InProcessLoop) -> None:
+    loop.load(identified(replace(loop.calibration(), saturation_dn=float(loop.calibration().dark.max() + 10))))
+    assert "good pixels at full well" in refusal("calibrate", "reference", "--frames", "16", kind=CalibrationError)
+
+
 def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
     loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:

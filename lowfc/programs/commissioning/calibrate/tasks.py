@@ -23,6 +23,7 @@ from lowfc.control.calibration.adapted import with_dark, with_reference
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.dark_frames import check_dark, measure_dark
 from lowfc.control.calibration.response_fit import normalised
+from lowfc.control.loop.estimator import saturated_pixels
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Twin, node_radii
@@ -172,7 +173,12 @@ def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> Re
         cube = next_frames(loop, frames)
         loop.check_lease()  # another shape of the mirror is another zero point
         check_size(cube.shape[1:], before)
-        pixels = cube.reshape(frames, -1)
+        pixels, allowed = cube.reshape(frames, -1), configuration_of(loop).control.max_saturated_pixels
+        if (saturated := max(saturated_pixels(before, frame) for frame in pixels)) > allowed:
+            raise CalibrationError(
+                f"a frame has {counted(saturated, 'good pixel')} at full well, {before.saturation_dn:g} DN; the loop "
+                f"uses frames with at most {allowed}: shorten the exposure, or dim the star"
+            )
         light, flux = normalised(pixels, before.dark.astype(np.float64), before.good.astype(np.float64))
         image = light.mean(axis=0)
         calibration = write(with_reference(before, image, float(flux.mean()), *noise), out, loop if load else None)
