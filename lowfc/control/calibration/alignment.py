@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.optimize import least_squares
 
-from lowfc.arrays import Array, Complex
+from lowfc.arrays import Array, Complex, Mask
 
 _ANGLES = 72
 """Number of initial rotations, spread over 180 degrees."""
@@ -80,20 +80,21 @@ def onto(image: Array, geometry: Geometry, shape: tuple[int, int]) -> Array:
     return _sample(spline_filter(np.asarray(image, np.float64)), geometry, shape)
 
 
-def align(real: Array, computed: Array) -> Alignment:
+def align(real: Array, computed: Array, good: Mask | None = None) -> Alignment:
     """Fit the geometry of a real reference image to the computed one.
 
     Args:
         real: (rows, columns) real image, dark subtracted, any unit.
         computed: (rows, columns) I0.
+        good: (rows, columns) whether each pixel is used; None for all.
 
     Raises:
         ValueError: the image has no light, or does not resemble the computed one.
     """
-    real = np.asarray(real, np.float64)
+    real, used = np.asarray(real, np.float64), np.ones(real.shape, np.bool_) if good is None else good
     spline = spline_filter(np.asarray(computed, np.float64))
     background = float(np.median(np.concatenate([real[0], real[-1], real[:, 0], real[:, -1]])))
-    light = real - background
+    light = np.where(used, real - background, 0.0)
     if not light.sum() > 0:
         raise ValueError("the reference image has no light above its edge")
     # Scale 1 is tried as well: a detector region may cut off the image's wings, and so reduce its size.
@@ -104,9 +105,9 @@ def align(real: Array, computed: Array) -> Alignment:
         guesses = []
         for scale, angle in product(scales, np.arange(_ANGLES) * 180.0 / _ANGLES):
             guess = _placed(spline, Geometry(scale, 0.0, 0.0, float(angle), parity), light.shape, spectrum)
-            guesses.append((_residual(_sample(spline, guess, real.shape), real)[0], guess))
+            guesses.append((_residual(_sample(spline, guess, real.shape)[used], real[used])[0], guess))
         guesses.sort(key=lambda each: each[0])
-        fits.append(min((_refine(spline, guess, real) for _, guess in guesses[:3]), key=lambda each: each[0]))
+        fits.append(min((_refine(spline, guess, real, used) for _, guess in guesses[:3]), key=lambda each: each[0]))
     fits.sort(key=lambda each: each[0])
     (residual, best), (other, reflected) = fits
     if residual > 0.5:
@@ -114,7 +115,7 @@ def align(real: Array, computed: Array) -> Alignment:
             f"the image does not resemble the computed reference: {residual:.0%} of it remains after the best fit; is "
             "this the sensor and the mask of the configuration?"
         )
-    _, flux, background = _residual(_sample(spline, best, real.shape), real)
+    _, flux, background = _residual(_sample(spline, best, real.shape)[used], real[used])
     possible = [best, reflected] if other < max(_ALIKE * residual, _EXACT) else [best]
     possible = [replace(each, rotation_deg=(each.rotation_deg + 90) % 180 - 90) for each in possible]
     orientations = [orientation for each in possible for orientation in (each, each.rotated_180())]
@@ -164,7 +165,7 @@ def _residual(model: Array, real: Array) -> tuple[float, float, float]:
     return float(np.sqrt(np.mean(residual**2)) / real.std()), flux, float(real.mean() - flux * model.mean())
 
 
-def _refine(spline: Array, guess: Geometry, real: Array) -> tuple[float, Geometry]:
+def _refine(spline: Array, guess: Geometry, real: Array, used: Mask) -> tuple[float, Geometry]:
     """Relative residual and geometry of the least-squares fit that starts at a guess."""
 
     def geometry(values: Array) -> Geometry:
@@ -172,9 +173,9 @@ def _refine(spline: Array, guess: Geometry, real: Array) -> tuple[float, Geometr
         return Geometry(scale * guess.scale, row, column, rotation_deg, guess.parity)
 
     def residuals(values: Array) -> Array:
-        model = _sample(spline, geometry(values), real.shape)
-        _, flux, background = _residual(model, real)
-        return np.asarray(((real - flux * model - background) / real.std()).ravel())
+        model, image = _sample(spline, geometry(values), real.shape)[used], real[used]
+        _, flux, background = _residual(model, image)
+        return np.asarray((image - flux * model - background) / image.std())
 
     start = np.array([1.0, guess.row, guess.column, guess.rotation_deg])
     fit = least_squares(residuals, start, x_scale=np.array([0.01, 0.3, 0.3, 1.0]), diff_step=[1e-5])

@@ -57,7 +57,8 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
         flux_dn = float(light_dn.reshape(-1) @ before.good)
         computed = analytic(config, console)
         with raised_as(CalibrationError, ValueError):
-            alignment = align(light_dn, computed.reference.astype(np.float64).reshape(computed.shape))
+            model = computed.reference.astype(np.float64).reshape(computed.shape)
+            alignment = align(light_dn, model, before.good.reshape(before.shape) > 0)
         player = Player(loop, on_sensor(config, computed, alignment.geometry, flux_dn, before), reporter(console))
 
         def poke(mode: int) -> Array:

@@ -65,7 +65,7 @@ def aligned(
     image = (before.reference * before.flux_dn).reshape(before.shape).astype(np.float64)
     model = computed.reference.astype(np.float64).reshape(computed.shape)
     try:
-        alignment = align(image, model)
+        alignment = align(image, model, before.good.reshape(before.shape) > 0)
         calibration = on_sensor(config, computed, alignment.geometry, before.flux_dn, before)
     except (ValueError, CalibrationError) as error:
         report(f"the image cannot be compared with the computed one: {error}")
