@@ -1,5 +1,6 @@
 """`lowfc tune`: results, files and errors, on a log made by the live loop's own `advance`; and law files."""
 
+import json
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -32,7 +33,7 @@ from lowfc.programs.commissioning.tune.command import apply_gains
 from lowfc.programs.commissioning.tune.data import Telemetry, telemetry_from_log, telemetry_from_run
 from lowfc.programs.commissioning.tune.result import result_of, tuned
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
-from tests.support.loops import json_of, refusal
+from tests.support.loops import json_of, lowfc, refusal
 from tests.support.report_log import SyntheticLog
 from tests.support.theory import LAWS
 from tests.support.toy import NOLL, PERIOD_NS, frame_sequence
@@ -103,6 +104,14 @@ def test_the_command_writes_the_law_and_draws_it(
     assert result["files"] == [str(out), str(plot)]
     assert plot.read_bytes()[:4] == b"\x89PNG"
     assert law_file.load(out).id == tuned_as("lqg")[0].law.id
+
+
+def test_the_result_is_printed_although_the_loop_refuses_it(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lowfc.client.the_run", lambda _: "bench")
+    monkeypatch.setattr("lowfc.client.Client", Mock(side_effect=RequestRefusedError("another delay")))
+    done = lowfc("tune", log, "--controller", "lqg", "--apply", "--json")
+    assert str(done.exception) == "another delay"
+    assert json.loads(done.stdout)["applied"] is None
 
 
 def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path) -> None:

@@ -70,12 +70,14 @@ def tune(
         save(best.law, out)
     if plot is not None:
         write_whole(plot, picture(telemetry, best))
-    if apply:
-        with Client(run) as loop:
-            integrator = controller == "integrator"
-            answer = apply_gains(loop, gains.gain.tolist(), telemetry.noll) if integrator else loop.law(best.law)
-        result.applied = answer.sentence
-    print_result(result, as_json=as_json)
+    try:
+        if apply:
+            with Client(run) as loop:
+                integrator = controller == "integrator"
+                answer = apply_gains(loop, gains.gain.tolist(), telemetry.noll) if integrator else loop.law(best.law)
+            result.applied = answer.sentence
+    finally:  # also if the loop refuses it: a warning may say why
+        print_result(result, as_json=as_json)
 
 
 def apply_gains(loop: "Client", gains: list[float], noll: tuple[int, ...]) -> "Answer":
