@@ -74,6 +74,7 @@ def test_contrast_is_summed_by_group_and_large_tilt_is_beyond_quadratic(shaped: 
     assert costliest({"coma": 3.0, "focus": 1.0, "tilt": -9.0}) == ("coma", 0.75)
     assert not modal.is_beyond_quadratic(0.3**2 * np.eye(len(NOLL)))
     assert modal.is_beyond_quadratic(20**2 * np.diag(np.eye(len(NOLL))[tilt]))
+    assert not modal.is_beyond_quadratic(0.5**2 * np.diag(np.eye(len(NOLL))[tilt])), "the images differ by rounding"
 
 
 def test_added_contrast_of_a_run_is_that_of_its_second_half(shaped: Coronagraph, by_image: ByImage) -> None:

@@ -17,8 +17,8 @@ from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.science_camera import ScienceCamera
 from lowfc.optics.chain.zernike import mode_group, zernikes
 
-BEYOND_QUADRATIC = 0.1
-"""Relative difference between quadratic form and full images above which it is reported."""
+_BEYOND_QUADRATIC = 0.1
+_IMAGE_ROUNDING = 1e-13  # contrast; the images, of single precision, are exact to some 1e-14 behind a shaped pupil
 _SAMPLES_PER = 2  # samples per lambda / D: the intensity's band is 1 D to either side
 _DRAWS = 24  # random wavefronts compared, each with both signs
 
@@ -54,7 +54,12 @@ class ModalContrast:
         flat = self.by_image(np.zeros(len(values)))
         image = float(np.mean([self.by_image(wavefront_nm) - flat for wavefront_nm in both_signs_nm]))
         form = float(np.einsum("nj,jl,nl->", modes_nm, self.form, modes_nm)) / _DRAWS
-        return abs(form - image) > BEYOND_QUADRATIC * abs(image)
+        return beyond_quadratic(form, image)
+
+
+def beyond_quadratic(form: float, image: float) -> bool:
+    """Whether the contrast added in full images differs from the quadratic form's by over 10 %, rounding aside."""
+    return abs(form - image) > max(_BEYOND_QUADRATIC * abs(image), _IMAGE_ROUNDING)
 
 
 def by_group(noll: Sequence[int], by_mode: Array) -> dict[str, float]:

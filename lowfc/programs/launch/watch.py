@@ -7,7 +7,7 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.names import Names
 from lowfc.contract.messages import FRAME, Log, Role, wire
 from lowfc.control.loop.safety import mode_name as name_of_mode
-from lowfc.optics.chain.added_contrast import BEYOND_QUADRATIC
+from lowfc.optics.chain.added_contrast import beyond_quadratic
 
 
 @dataclass(slots=True)
@@ -104,8 +104,7 @@ def wavefront(known: wire.WavefrontFigures) -> dict[str, Any]:
         "costliest_modes": {"modes": known.costliest_modes, "share": round(known.costliest_share, 3)}
         if known.costliest_modes
         else None,
-        "beyond_quadratic": abs(known.quadratic_added_contrast - known.added_contrast)
-        > BEYOND_QUADRATIC * abs(known.added_contrast)
+        "beyond_quadratic": beyond_quadratic(known.quadratic_added_contrast, known.added_contrast)
         if known.science_images
         else None,
         "dark_zone_contrast": known.dark_zone_contrast or None,
