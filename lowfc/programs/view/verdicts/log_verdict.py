@@ -98,14 +98,16 @@ class LogVerdict:
         worst_nm = float(np.nanmax(self._closed.wavefront()[1][:, 0]))
         factor = flat_nm / residual_nm if residual_nm else 1.0
         compared = f"{factor:.1f} x better" if factor >= 1 else "worse"
+        on_purpose = self._closed.true and self._shaped
+        shapes = " with offset and channels," if on_purpose else ""
         detail = (
-            f"while closed, {compared} than {rounded(flat_nm)} nm with a flat mirror; worst "
+            f"while closed,{shapes} {compared} than {rounded(flat_nm)} nm with a flat mirror; worst "
             f"{_span(self._closed)}: {rounded(worst_nm)} nm; {'true' if self._closed.true else 'measured, with noise'}"
         )
-        harmful = factor < 1 / WORSE and not (self._closed.true and self._shaped)
+        harmful = factor < 1 / WORSE and not on_purpose
         level = Level.WARNING if harmful else Level.GOOD if factor >= GOOD_FACTOR else Level.NEUTRAL
         value = f"{rounded(residual_nm)} nm rms"
-        advice = f"residual {value}, {'worse than ' if harmful else ''}{rounded(flat_nm)} nm with a flat mirror"
+        advice = f"residual {value},{shapes} {'worse than ' if harmful else ''}{rounded(flat_nm)} nm with a flat mirror"
         return Tile("WAVEFRONT", value, detail, level, advice)
 
     def _star(self) -> Tile:
