@@ -166,6 +166,12 @@ def test_spectra_are_compared_with_theory(eventful: dict[str, Any]) -> None:
     assert tip["frequency_hz"][loudest] == pytest.approx(7, abs=eventful["spectra"]["resolution_hz"])
 
 
+def test_the_bands_of_a_slow_loop_end_at_half_its_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report_log, "PERIOD_NS", 200_000_000)
+    slow = report_of(read_run((SyntheticLog().frames(600).write(tmp_path / "slow.mcap"),)))
+    assert "<td>1</td><td>2.5</td>" in page(slow)
+
+
 def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
     verdict = eventful["verdict"]
     levels = {check["name"]: check["level"] for check in verdict["checks"]}
