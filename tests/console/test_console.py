@@ -509,6 +509,8 @@ def test_verdict_and_tiles_have_the_text_of_the_view() -> None:
     assert panels.verdict(reading, RUN) == (verdict.level, f"CHECK  {verdict.headline}")
     for line, tile in zip(panels.tiles(reading), verdict.tiles, strict=True):
         assert all(word in line.plain for word in (tile.title, tile.value, tile.detail))
+    slow = reading._replace(state=replace(reading.state, rate_hz=0.4))
+    assert panels.peers(slow, RUN).plain.endswith(" 0.4 Hz")
     silent = reading._replace(silent_s=3.0)
     assert panels.verdict(silent, RUN)[0] is Level.BAD
     ended = replace(silent.state, controller=silent.state.controller._replace(life=Liveness.STOPPED))

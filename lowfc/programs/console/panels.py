@@ -19,7 +19,7 @@ from lowfc.programs.console.feed import TREND_S, Reading
 from lowfc.programs.console.phrases import phrased
 from lowfc.programs.view.draw.colours import GREY, ORANGE, RED, YELLOW, Colour, Rgb, diverging, sequential
 from lowfc.programs.view.verdicts.run_state import Liveness
-from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, duration, numbers, rounded
+from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, duration, hertz, numbers, rounded
 from lowfc.programs.view.verdicts.watcher import SILENT_S
 
 _PIXELS = 12
@@ -185,7 +185,7 @@ def peers(reading: Reading, run: str) -> Text:
             line.append(f" {name} {'stopped' if stopped else 'alive'} ", DIM if stopped else style())
     rate_hz, camera = reading.state.rate_hz, reading.state.camera.life
     if rate_hz is not None and camera is Liveness.RUNNING and reading.connected:
-        line.append(f" {rate_hz:.0f} Hz", BOLD)
+        line.append(f" {hertz(rate_hz)}", BOLD)
     return line
 
 
