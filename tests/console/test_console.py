@@ -532,6 +532,15 @@ def test_pictures_and_sparklines_have_a_fixed_size() -> None:
         assert _mode(2, command_nm, limit_nm, 12).plain == f"Z2  {bar}"
 
 
+@pytest.mark.parametrize("count", range(1, 36))
+def test_the_bars_and_limits_of_all_modes_fit_their_columns(count: int) -> None:
+    snapshot = SimpleNamespace(controller=wire.ControllerState(limit_nm=[50.0] * count), noll=range(2, 2 + count))
+    reading = SimpleNamespace(state=SimpleNamespace(snapshot=snapshot), command_nm=np.full(count, -50.0))
+    lines = panels.modes(reading, application._LEFT)
+    assert max(line.cell_len for line in lines) <= application._LEFT
+    assert sum(line.plain.count("│") for line in lines) == count
+
+
 def test_a_configuration_that_was_not_received_is_queried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     queries: list[object] = []
     monkeypatch.setattr(feed.Feed, "_query", lambda self: queries.append(self))

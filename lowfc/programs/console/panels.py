@@ -140,7 +140,7 @@ def modes(reading: Reading, width: int) -> list[Text]:
     columns = -(-len(noll) // _MODE_LINES)
     cell_width = width // columns
     cells = [
-        _mode(mode, float(command), float(limit), cell_width - 1)
+        _mode(mode, float(command), float(limit), cell_width - 2)  # without the middle of the bar and a space
         for mode, command, limit in zip(noll, reading.command_nm, state.limit_nm, strict=False)
     ]
     lines = []
