@@ -184,12 +184,16 @@ def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame
     whole = wire.WavefrontFigures(residual_rms_nm=27.0, disturbance_rms_nm=31.0)
     recent = wire.WavefrontFigures(residual_rms_nm=2.2, disturbance_rms_nm=30.0)
     watch.health["camera"] = wire.Health(process="camera", rate_hz=250, wavefront=whole, recent_wavefront=recent)
+    watch.health["camera"].mean_rate_hz = 250
     assert "closed     250 Hz  residual 2.20 of 30.00 nm rms" in status_line(watch, 10.0)
     received = wire.TopicCount(topic=FRAME.key, received=900)
     begun = wire.Health(mode=wire.LOOP_MODE_CLOSED, topics=[received], not_closed_ns=2 * SECOND)
     early = Watch(watch.health | {"controller": begun}, [])
     assert "closed for 1.6 s     250 Hz" in status_line(early, 5.0), "the residual includes open-loop frames"
     assert "closed for 2.0 s     250 Hz" in status_line(early, 5.0, 225.0), "simulated time in lockstep"
+    begun.topics[0].received, begun.not_closed_ns = 250 * 3601, 3600 * SECOND
+    early.health["camera"].rate_hz = 250.4  # of the last half second
+    assert "closed for 1.0 s     250 Hz" in status_line(early, 5.0)
     with Console(width=120, file=io.StringIO(), record=True) as console:
         console.print(screen(watch, Configuration(), None, 10.0))
     assert "residual 2.20 of 30.00 nm rms" in console.export_text()

@@ -60,7 +60,7 @@ def status_line(watch: Watch, elapsed_s: float, lockstep_hz: float | None = None
     frames, recent = topic_count(controller, FRAME.key), wavefront(camera.recent_wavefront)
     added = recent["added_contrast"]
     contrast = "" if added is None else f"contrast {added['closed']:+.1e} of {added['open']:+.1e}  "
-    just_closed = _closed_for(controller, lockstep_hz or camera.rate_hz)
+    just_closed = _closed_for(controller, lockstep_hz or camera.mean_rate_hz)
     return (
         f"{elapsed_s:5.0f} s  {mode(controller)}{just_closed}  {camera.rate_hz:6.0f} Hz  "
         f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms  {contrast}"
