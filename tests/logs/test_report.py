@@ -162,6 +162,7 @@ def test_spectra_are_compared_with_theory(eventful: dict[str, Any]) -> None:
     assert tip["measured_over_theory"]["median"] == pytest.approx(1, abs=0.02)
     assert tip["true_over_theory"]["median"] == pytest.approx(1, abs=0.15)
     assert sum(band["disturbance_rms_nm"] ** 2 for band in tip["bands"]) == pytest.approx(72, rel=0.1)
+    assert tip["bands"][0]["from_hz"] == eventful["spectra"]["resolution_hz"], "slower drift is not in the spectrum"
     loudest = int(np.argmax(tip["power_nm2_hz"]["disturbance"]))
     assert tip["frequency_hz"][loudest] == pytest.approx(7, abs=eventful["spectra"]["resolution_hz"])
 

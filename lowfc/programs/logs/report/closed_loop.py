@@ -204,7 +204,8 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
     if "residual_predicted" in binned:
         over["true_over_theory"] = _amplitude_ratio(binned["residual"], binned["residual_predicted"])
     highest_hz = float(frequency_hz[-1])
-    edges_hz = [0.0, *(edge for edge in BANDS_HZ if frequency_hz[1] < edge < highest_hz), highest_hz]
+    lowest_hz = float(frequency_hz[1])  # of each segment, the mean is subtracted, and most of a slower drift with it
+    edges_hz = [lowest_hz, *(edge for edge in BANDS_HZ if lowest_hz < edge < highest_hz), highest_hz]
     bands = [
         {"from_hz": low, "to_hz": high}
         | {f"{key}_rms_nm": _band_rms(frequency_hz, column, low, high) for key, column in columns.items()}
