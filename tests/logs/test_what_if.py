@@ -387,6 +387,18 @@ def test_an_offset_is_not_reported_as_a_missing_command() -> None:
     np.testing.assert_array_equal(run.seen_nm, 0)
 
 
+def test_a_probe_sequence_of_the_target_is_not_reported_as_a_missing_command() -> None:
+    """With 3 nm added to the target in 10 frames the error is smaller by as much; the frames are compared."""
+    error_nm = np.full((40, 3), 4, np.float32)
+    error_nm[20:30] -= 3
+    play = wire.Request(name="play", accepted=True, text="offset", columns=3, frame_sequence=toy.frame_sequence(20))
+    play.table = np.full((10, 3), 3, "<f4").tobytes()
+    run = LoggedRun(replace(history(error_nm=error_nm), requests=[play]))
+    assert not run.command_lost.any()
+    np.testing.assert_array_equal(run.seen_nm, 0)
+    assert rows_compared(run) == list(range(10, 40))
+
+
 def test_a_frame_ahead_and_a_clear_for_a_lower_start_do_not_cut_the_run() -> None:
     sequence, reasons = history().steps.sequence, np.zeros(40, np.int64)
     sequence[10], reasons[10] = toy.frame_sequence(0, 2 * toy.START), 1 << Rejection.AHEAD

@@ -151,11 +151,11 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
     measured = delay_from_times(steps.sequence, steps.time_ns - config.exposure_ns, applied, applied_ns)
     if config.lockstep or (measured is not None and measured < assumed):
         measured = None  # time is simulated, or a delay after the mirror's report is not in these times
-    seen = SeenCommands.of(steps, missing_before(steps.sequence), states, assumed, measured)
     played = np.zeros(steps.sequence.shape, np.bool_)
     for state in states:
         if state.HasField("play"):
             played |= during_probe(steps.sequence, state.play.first_sequence, state.play.frames)
+    seen = SeenCommands.of(steps, missing_before(steps.sequence), states, assumed, measured, played)
     steps, usable = _without_probes(steps, seen, assumed, played)
     timing = Timing.of(seen.delay_frames, config.camera.exposure_fraction)
     lost = [f"{counted(stream.lost, 'step')} lost between the controller and this program"] if stream.lost else []

@@ -60,12 +60,17 @@ class SeenCommands(NamedTuple):
         states: Sequence[wire.ControllerState],
         controller_delay: float,
         measured_delay: float | None,
+        played: Mask,
     ) -> "SeenCommands":
-        """Commands seen by these steps; the first one's frame was used. The states give the loop's target."""
+        """Commands seen by these steps; the first one's frame was used. The states give the loop's target.
+
+        A probe sequence (`played`) may change the target, too: there the steps' commands are those seen.
+        """
         weights = delay_weights(controller_delay).astype(np.float32)
         target_nm = _target_nm(states, steps.sequence, steps.error_nm.shape[1])
         assumed_nm = steps.error_nm + target_nm - steps.pol_nm
         computed_nm = seen_nm(weights, steps.command_nm, missing, assumed_nm[0])
+        assumed_nm[played] = computed_nm[played]
         command_lost: Mask = np.abs(computed_nm - assumed_nm).max(axis=1) > _COMMAND_LOST_NM
         if measured_delay is None or abs(measured_delay - controller_delay) <= DELAY_DIFFERS:
             return cls(controller_delay, weights, assumed_nm, command_lost)
@@ -89,7 +94,7 @@ class LoggedRun:
         law: last law of the run.
         controller_delay: delay assumed by the controller, frames; `measured_delay`, from `measured_from`, is None if
             it cannot be measured; the comparison uses `delay_frames`, with `weights`.
-        played: (steps,) True during a probe sequence, which moves the mirror in addition to the commands.
+        played: (steps,) True during a probe sequence, which moves the mirror or the loop's target.
         seen: commands seen by the exposures; `delay_frames`, `weights`, `seen_nm` and `command_lost` are those of
             `seen`.
     """
@@ -115,7 +120,7 @@ class LoggedRun:
 
         self.measured_delay, self.measured_from = self._measured_delay()
         self.seen = SeenCommands.of(
-            self.steps, self.missing, history.controllers, self.controller_delay, self.measured_delay
+            self.steps, self.missing, history.controllers, self.controller_delay, self.measured_delay, self.played
         )
         self.delay_frames, self.weights, self.seen_nm, self.command_lost = self.seen
 
