@@ -387,6 +387,16 @@ def test_an_offset_is_not_reported_as_a_missing_command() -> None:
     np.testing.assert_array_equal(run.seen_nm, 0)
 
 
+def test_a_command_from_before_the_log_is_not_reported_as_a_missing_one() -> None:
+    """With a delay of 2 frames the second frame saw the last command before the log; the log has all later ones."""
+    command_nm = np.repeat(np.arange(40, dtype=np.float32)[:, None], 3, axis=1)
+    logged = history(command_nm=command_nm, pol_nm=4 - (command_nm - 2))
+    logged.controllers[0].delay_frames = 2
+    run = LoggedRun(logged)
+    assert not run.command_lost.any()
+    np.testing.assert_array_equal(run.seen_nm, command_nm - 2)
+
+
 def test_a_probe_sequence_of_the_target_is_not_reported_as_a_missing_command() -> None:
     """With 3 nm added to the target in 10 frames the error is smaller by as much; the frames are compared."""
     error_nm = np.full((40, 3), 4, np.float32)

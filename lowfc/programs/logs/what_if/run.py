@@ -72,6 +72,7 @@ class SeenCommands(NamedTuple):
         computed_nm = seen_nm(weights, steps.command_nm, missing, assumed_nm[0])
         assumed_nm[played] = computed_nm[played]
         command_lost: Mask = np.abs(computed_nm - assumed_nm).max(axis=1) > _COMMAND_LOST_NM
+        command_lost[: len(weights)] = False  # these may have seen commands from before the log
         if measured_delay is None or abs(measured_delay - controller_delay) <= DELAY_DIFFERS:
             return cls(controller_delay, weights, assumed_nm, command_lost)
         rounded = round(measured_delay)
