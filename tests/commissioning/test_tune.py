@@ -276,6 +276,12 @@ def test_probe_sequences_on_a_running_loop_are_excluded(gain: float, settling: i
     assert run.law.gain == pytest.approx(gain), "the law is the last one"
 
 
+def test_a_closed_loop_with_few_frames_after_half_a_second_is_not_called_open() -> None:
+    disturbance_nm = np.random.default_rng(5).standard_normal((2300, 3)).astype(np.float32)
+    run = telemetry_from_run(SteppedLoop(closed_loop(disturbance_nm, 1)), 60.0)
+    assert (run.closed, run.pol.frames) == (True, 2048)
+
+
 def test_a_too_short_live_time_is_refused_at_once() -> None:
     with pytest.raises(DataFileError, match=r"2048 consecutive frames, 2.05 s at 1000 Hz, but got 2 s: use --live 3"):
         telemetry_from_run(StreamedLoop(CONFIG), 2.0)

@@ -35,7 +35,7 @@ from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.what_if.run import LoggedRun, SeenCommands, during_probe
 
-_SETTLING_S = 0.5  # least time excluded after the loop was closed
+_SETTLING_S = 0.5  # least time excluded after the loop was closed, if enough frames are left
 _POLL_FRAMES = 100  # between two requests for the state of a running loop
 
 
@@ -232,8 +232,8 @@ def _telemetry(
     settling, frames_closed = settling_frames(laws[0].gain, laws[0].leak), index - last_not_closed
     if laws[1] is not None:
         settling = SETTLING_FRAMES + FADING_FRAMES + margins.settling_frames(laws[1], timing.delay)
-    settling = min(settling, int(frames_closed.max()) - FEWEST)  # leave enough frames
-    closed, rows = True, usable & was_closed & (frames_closed > max(settling, _SETTLING_S * rate_hz))
+    settling = min(max(settling, _SETTLING_S * rate_hz), int(frames_closed.max()) - FEWEST)  # leave enough frames
+    closed, rows = True, usable & was_closed & (frames_closed > settling)
     pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if pol.longest < FEWEST:
         closed, rows = False, usable
