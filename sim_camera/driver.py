@@ -237,11 +237,14 @@ class SimulatedCamera:
                 raise BusError(self._no_progress())
             self._drain()
 
-    def close(self) -> None:
-        """Publish the last truth and compute the contrast of the run."""
+    def finish(self) -> None:
+        """Publish the last truth and compute the contrast of the run, for the last Health."""
         self._drain()
         self._publish_truth()
         self._measured = self._contrast.measure() if self._contrast is not None else {}
+
+    def close(self) -> None:
+        """Do nothing: there is no hardware."""
 
     def fill(self, health: wire.Health) -> None:
         """Add late commands, latency and wavefront to a Health."""

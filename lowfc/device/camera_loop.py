@@ -62,7 +62,8 @@ class CameraLoop:
         """
         service = self._service
         step = getattr(self._driver, "step", _NO_EXTRAS.step) if service.clock.lockstep else _NO_EXTRAS.step
-        with self.watch.over(self._driver.close, self._fill_extra):
+        finish = getattr(self._driver, "finish", _NO_EXTRAS.finish)
+        with self.watch.over(self._driver.close, self._fill_extra, finish):
             service.require(wait_for, WAIT_S, "the camera does not start")
             service.awaited = lambda: "" if service.work else "the camera's first frame"
             service.state = "running"

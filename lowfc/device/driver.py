@@ -198,6 +198,9 @@ class CameraExtras:
     def fill(self, health: wire.Health) -> None:
         """Add fields to the Health message, twice a second."""
 
+    def finish(self) -> None:
+        """Called once after the last frame, before the last `fill` and `close`."""
+
 
 @dataclass(frozen=True, slots=True)
 class Geometry:

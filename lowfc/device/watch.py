@@ -88,8 +88,10 @@ class DriverWatch:
         self._ending = threading.Lock()  # a call does not end while it is being reported as hanging
 
     @contextmanager
-    def over(self, close: Callable[[], None], fill: Callable[[wire.Health], None]) -> Iterator[None]:
-        """Watch on a separate thread; at the end of the block, call `fill` for the last Health and close the driver."""
+    def over(
+        self, close: Callable[[], None], fill: Callable[[wire.Health], None], finish: Callable[[], None] = lambda: None
+    ) -> Iterator[None]:
+        """Watch on a separate thread; at the end call `finish`, `fill` (for the last Health) and `close`."""
         threading.Thread(target=self._run_checks, name="driver's watch", daemon=True).start()
         try:
             yield
@@ -97,6 +99,8 @@ class DriverWatch:
             self.timeout_s = max(self.timeout_s, CLOSE_S)
             self.begin()
             try:
+                with suppress(LowfcError):
+                    self.call(finish)
                 with suppress(LowfcError):
                     self.fill(fill, wire.Health())
                 close()

@@ -311,6 +311,16 @@ def test_a_camera_that_cannot_be_started_gives_one_sentence_and_is_closed() -> N
     assert camera.closed
 
 
+def test_a_camera_finishes_before_its_last_health_and_is_closed_after_it() -> None:
+    camera, calls = Ramp(Ramp.Options(), CONFIG), list[str]()
+    for name in ("finish", "close"):
+        setattr(camera, name, partial(calls.append, name))
+    camera.fill = lambda _: calls.append("fill")  # type: ignore[attr-defined]
+    CameraLoop(camera, Listener(MemoryHub(), FakeClock()).service("camera"), frames=3).run()
+    assert calls[-3:] == ["finish", "fill", "close"]
+    assert calls.count("finish") == 1
+
+
 def test_a_fault_in_an_optional_method_is_counted_and_reported_and_stops_nothing() -> None:
     camera, listener = Ramp(Ramp.Options(), CONFIG), Listener(MemoryHub(), FakeClock(), FRAME)
     camera.sent = lambda _: 1 / 0  # type: ignore[attr-defined]

@@ -123,9 +123,10 @@ def main() -> None:
         if word in ("stop", ""):
             break
     comb.running = False
-    driver.close()
+    driver.finish()
     health = wire.Health()
     driver.fill(health)
+    driver.close()
     print(json.dumps({"frames": count, "residual_rms_nm": health.wavefront.continuous_residual_rms_nm}))
 
 
