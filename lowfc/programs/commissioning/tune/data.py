@@ -232,7 +232,7 @@ def _telemetry(
     settling, frames_closed = settling_frames(laws[0].gain, laws[0].leak), index - last_not_closed
     if laws[1] is not None:
         settling = SETTLING_FRAMES + FADING_FRAMES + margins.settling_frames(laws[1], timing.delay)
-    settling = min(max(settling, _SETTLING_S * rate_hz), int(frames_closed.max()) - FEWEST)  # leave enough frames
+    settling = min(max(settling, round(_SETTLING_S * rate_hz)), int(frames_closed.max()) - FEWEST)  # leaves enough
     closed, rows = True, usable & was_closed & (frames_closed > settling)
     pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if pol.longest < FEWEST:
