@@ -27,7 +27,7 @@ from lowfc.programs.core.start_up import settings_under
 from tests.support import toy
 
 RATE_HZ = 1000.0
-SAME_NM = 1e-4
+SAME_NM = 2e-4  # the order of sums depends on the processor: 1.5e-4 nm with AVX-512, in a million frames
 ROUNDINGS = 10
 """Allowed float32 roundings of a step's largest number: without full well a bright spot causes errors of 500 nm."""
 COMMAND_ARRAYS = 2
