@@ -6,10 +6,11 @@ raises, and the loop counts the fault, reports it in an event and tries again. A
 `ConfigurationError`, is a fault that a user has to correct: the process ends with its message.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from math import isfinite
 from numbers import Integral, Real
-from typing import Literal, NamedTuple, Protocol, get_args
+from typing import Any, Literal, NamedTuple, Protocol, get_args
 
 from lowfc.adapters.bus.bus import Publisher
 from lowfc.adapters.files.factory import detector, mirror_limits
@@ -256,7 +257,7 @@ class Mirror(Protocol):
 
 
 class MirrorExtras:
-    """Optional methods of a mirror, independent of each other; the defaults do nothing."""
+    """Optional methods of a mirror, independent of each other; those that a driver does not define have no effect."""
 
     def join(self, service: Service) -> None:
         """Called when the process has joined its run; `service` has its clock, publishers, bus and events."""
@@ -283,3 +284,9 @@ class MirrorExtras:
 
     def fill(self, health: wire.Health) -> None:
         """Add fields to the Health message, twice a second; called on another thread, also while `apply` runs."""
+
+
+def own_method(driver: object, name: str, default: Callable[..., object]) -> Callable[..., Any] | None:
+    """A driver's optional method; None if it has none, or only the `default` of `CameraExtras` or `MirrorExtras`."""
+    method: Callable[..., Any] | None = getattr(driver, name, None)
+    return None if getattr(method, "__func__", None) is default else method

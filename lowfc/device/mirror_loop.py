@@ -30,7 +30,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.loop.safety import Limits, Reason, Rejection, finite
-from lowfc.device.driver import Mirror, MirrorExtras, geometry
+from lowfc.device.driver import Mirror, MirrorExtras, geometry, own_method
 from lowfc.device.mirror_protection import Command, MirrorProtection, Status, apply_command, tick
 from lowfc.device.watch import CLOSE_S, DriverWatch
 from lowfc.optics.chain.grid import pupil_axis
@@ -89,8 +89,7 @@ class MirrorLoop:
         self._driver = driver
         self._service = service
         self._protection = protection_of(driver, config)
-        settle = getattr(driver, "settle", None)
-        self._settle = None if getattr(settle, "__func__", None) is MirrorExtras.settle else settle
+        self._settle = own_method(driver, "settle", MirrorExtras.settle)
         self._beside = getattr(driver, "beside", None)
         getattr(driver, "join", _NO_EXTRAS.join)(service)
         self._fill_extra = getattr(driver, "fill", _NO_EXTRAS.fill)

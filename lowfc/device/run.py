@@ -15,7 +15,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import Role
 from lowfc.device.camera_loop import CameraLoop
-from lowfc.device.driver import Camera, CameraExtras, Mirror
+from lowfc.device.driver import Camera, CameraExtras, Mirror, own_method
 from lowfc.device.mirror_loop import MirrorLoop
 from lowfc.device.plugins import Kind, load, options_help
 from lowfc.device.watch import closed_on_fault, opening
@@ -69,7 +69,7 @@ def run_camera(
         LowfcError: the driver cannot be started, or reported a fault that a user has to correct.
     """
     with closed_on_fault(driver.close):
-        if config.lockstep and getattr(type(driver), "step", CameraExtras.step) is CameraExtras.step:
+        if config.lockstep and own_method(driver, "step", CameraExtras.step) is None:
             raise ConfigurationError(
                 "in lockstep a camera waits for the mirror after each frame, and this driver has no method `step` that "
                 "does; leave out lockstep"
