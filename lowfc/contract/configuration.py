@@ -175,7 +175,7 @@ class Realtime(Section):
     recorder_priority: int = Field(10, ge=0, le=98)
     """SCHED_FIFO priority of the recorder, below `priority`; normal scheduling if either is 0."""
     lock_memory: bool = True
-    """Lock the memory of camera, controller and mirror."""
+    """Lock the memory of camera, controller and mirror, and move it to huge pages once they are ready (Linux 6.1)."""
     disable_cpu_idle: bool = True
     """Keep processors out of deep idle states while the loop runs: lower latency, more power."""
     cache_warmup: bool = True

@@ -129,7 +129,7 @@ import gc, json, os, sys
 import numpy
 from threadpoolctl import threadpool_info
 {limits}
-from lowfc.adapters.process.realtime import set_up, set_up_below_loop
+from lowfc.adapters.process.realtime import set_up, set_up_below_loop, use_huge_pages
 granted = {call}
 print(json.dumps({{
     "granted": granted.granted, "refused": granted.refused,
@@ -138,6 +138,7 @@ print(json.dumps({{
     "blas": [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"],
     "locked_kb": [int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmLck")][0],
     "resident_kb": [int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmRSS")][0],
+    "huge_kb": [int(line.split()[1]) for line in open("/proc/self/smaps_rollup") if line.startswith("AnonHuge")][0],
     "open": [os.readlink(f"/proc/self/fd/{{number}}") for number in os.listdir("/proc/self/fd")[:-1]],
 }}))
 """
@@ -202,6 +203,26 @@ def test_locking_memory_does_not_allocate_reserved_memory() -> None:
         pytest.skip(str(reported["refused"]))
     assert reported["locked_kb"] > 1 << 18
     assert reported["resident_kb"] < 150_000
+
+
+def test_memory_is_moved_to_huge_pages() -> None:
+    used = "memory = bytearray(b'1' * (16 << 20))"
+    reported = report("use_huge_pages()", used)
+    if reported["refused"]:
+        pytest.skip(str(reported["refused"]))
+    assert reported["granted"] == ["huge pages"]
+    assert reported["huge_kb"] >= 14 << 10
+
+
+def test_a_host_without_huge_pages_refuses_them() -> None:
+    disabled = "import ctypes; assert ctypes.CDLL(None).prctl(41, 1, 0, 0, 0) == 0  # PR_SET_THP_DISABLE"
+    reported = report("use_huge_pages()", disabled)
+    ((measure, cost),) = reported["refused"]
+    assert measure == "huge pages (Invalid argument)"
+    assert "Linux 6.1" in cost
+    assert (reported["granted"], reported["huge_kb"]) == ([], 0)
+    absent = "import lowfc.adapters.process.realtime as it; it._HUGE_PAGE_BYTES = '/no/such/file'"
+    assert report("use_huge_pages()", absent)["refused"][0][0] == "huge pages (not in this kernel)"
 
 
 def fifo_permitted() -> bool:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import termios
 import threading
+from unittest.mock import Mock
 
 import pytest
 
@@ -85,6 +86,18 @@ def test_health_has_the_counts_of_a_mailbox(hub: MemoryHub, clock: FakeClock) ->
     box.take(0.0)
     (count,) = (count for count in controller.health().topics if count.topic == FRAME.key)
     assert (count.received, count.skipped, count.missing, count.last_sequence) == (3, 2, 1, last)
+
+
+def test_measures_are_requested_once_when_the_process_is_ready(hub: MemoryHub, clock: FakeClock) -> None:
+    listener = Listener(hub, clock, HEALTH)
+    at_ready = Mock(return_value=Granted(("huge pages",), (("big caches", "slow"),)))
+    camera = service(hub, clock, "camera", granted=Granted(("one BLAS thread",), ()), at_ready=at_ready)
+    for state in ("ready", "running", "ready"):
+        camera.state = state
+    assert [health.realtime_granted for health in listener.messages(HEALTH)] == [["one BLAS thread", "huge pages"]] * 3
+    assert listener.messages(HEALTH)[0].realtime_refused == ["big caches: slow"]
+    assert [log.message.split()[0] for log in listener.messages(EVENT)] == ["STARTED", "REALTIME_REFUSED"]
+    at_ready.assert_called_once_with()
 
 
 def test_events_are_published_and_warnings_printed(

@@ -94,6 +94,7 @@ NOTHING_REQUESTED = load(None, {"realtime.priority": 0, "realtime.recorder_prior
 REFUSED = {
     "priority": ("SCHED_FIFO priority 50 (no)", "frames come late"),
     "lock_memory": ("locked", "stalls"),
+    "huge_pages": ("huge pages (no)", "frames take longer"),
     "disable_cpu_idle": ("processors awake (no)", "it wakes late"),
 }
 DEEP = {f"{CPUS}/cpu0/cpuidle/state2/disable": "0\n"}
@@ -195,6 +196,7 @@ def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
         ("scheduling class", "note", "realtime.priority = 0", {"config": NOTHING_REQUESTED}),
         ("scheduling class", "warning", "LimitRTPRIO=50 frames come late", {"trial": trial(REFUSED)}),
         ("locked memory", "warning", "stalls", {"trial": trial(REFUSED)}),
+        ("huge pages", "warning", "frames take longer", {"trial": trial(REFUSED)}),
         ("swap", "warning", "memory is not locked", {"trial": trial(REFUSED), "swap": (1 << 31, 0)}),
         ("idle states", "ok", "133 us to wake; kept awake", DEEP | {"config": load(None, NAMED)}),
         ("idle states", "warning", "it wakes late", DEEP | {"config": load(None, NAMED), "trial": trial(REFUSED)}),

@@ -4,7 +4,7 @@ from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.bus.zenoh_session import receive_in_one_thread
 from lowfc.adapters.process.clock import Clock, HostClock, SimulatedClock
-from lowfc.adapters.process.realtime import Granted, set_up
+from lowfc.adapters.process.realtime import Granted, set_up, use_huge_pages
 from lowfc.adapters.process.service import Service
 from lowfc.adapters.process.supervision import Supervisor
 from lowfc.contract.configuration import Configuration
@@ -38,7 +38,9 @@ def join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Serv
         receive_in_one_thread()
     run = open_run(run_id, (config.mirror.name,), network=config.network)
     clock = clock_of(config)
-    return Service(role, run_id, clock, ZenohBus(run.links, role, clock), granted=granted, announces=True)
+    at_ready = use_huge_pages if config.realtime.lock_memory else None
+    bus = ZenohBus(run.links, role, clock)
+    return Service(role, run_id, clock, bus, granted=granted, at_ready=at_ready, announces=True)
 
 
 def join_beside(config: Configuration, service: Service, role: str) -> Service:

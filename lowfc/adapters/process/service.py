@@ -61,11 +61,24 @@ class Service:
         bus: Bus,
         *,
         granted: Granted = NOTHING,
+        at_ready: Callable[[], Granted] | None = None,
         fill: Callable[[wire.Health], None] | None = None,
         announces: bool = False,
         supervisor: Supervisor | None = None,
     ) -> None:
-        """Join the run; `fill` adds the role's own fields to each Health, `supervisor` defaults to the host's."""
+        """Join the run.
+
+        Args:
+            name: name of the process.
+            run_id: identifier of the run.
+            clock: clock of the run.
+            bus: bus of the process.
+            granted: real-time measures requested before.
+            at_ready: requests further ones once the process is ready.
+            fill: adds the role's own fields to each Health.
+            announces: see the attribute.
+            supervisor: the host's by default.
+        """
         self.name = name
         self.clock = clock
         self.bus = bus
@@ -76,7 +89,8 @@ class Service:
         self.publishers: list[Publisher] = []
         self.arrivals: list[Arrivals] = []
         self.run_id = run_id
-        self._granted = granted
+        self._granted = NOTHING
+        self._at_ready = at_ready
         self._host = platform.node()
         self.fill = fill
         self.announces = announces
@@ -101,8 +115,7 @@ class Service:
         self.event("STARTED", process=name, version=__version__)
         if abs(ahead_ns := clock.ahead_ns()) > WALL_TOLERANCE_NS:
             self.event("CLOCK_OFF", ahead_ms=ahead_ns / 1e6)
-        for measure, cost in granted.refused:
-            self.event("REALTIME_REFUSED", measure=measure, cost=cost)
+        self._report(granted)
 
     def publisher(self, topic: Topic, name: str = "") -> Publisher:
         """Publisher of a topic, counted in Health."""
@@ -185,6 +198,8 @@ class Service:
 
     @state.setter
     def state(self, state: ProcessState) -> None:
+        if state == "ready" and self._state == "starting" and self._at_ready is not None:
+            self._report(self._at_ready())
         self._state = state
         self._send_health(self.clock.host_ns())
         if state in ("ready", "running"):
@@ -239,6 +254,12 @@ class Service:
                 self._print(log.message)
             elif count == PRINTED:
                 self._print(f"{event} recurs: more within {PRINTED_NS // 10**9} s are in the log only")
+
+    def _report(self, measures: Granted) -> None:
+        """Report real-time measures in Health, and each refused one in an event."""
+        self._granted = Granted(self._granted.granted + measures.granted, self._granted.refused + measures.refused)
+        for measure, cost in measures.refused:
+            self.event("REALTIME_REFUSED", measure=measure, cost=cost)
 
     def _announce(self, what: str) -> None:
         if self.announces:

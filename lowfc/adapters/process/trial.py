@@ -10,7 +10,7 @@ from multiprocessing import get_context
 from typing import NamedTuple
 
 from lowfc.adapters.process.child import interrupt_blocked
-from lowfc.adapters.process.realtime import leave_real_time, set_up
+from lowfc.adapters.process.realtime import leave_real_time, set_up, use_huge_pages
 from lowfc.contract.configuration import Realtime
 
 RATE_HZ = 1000
@@ -22,7 +22,7 @@ class Trial(NamedTuple):
     """Result of a trial.
 
     Attributes:
-        refused: refused ones among `priority`, `lock_memory` and `disable_cpu_idle`, each with its cost.
+        refused: refused ones among `priority`, `lock_memory`, `huge_pages` and `disable_cpu_idle`, each with its cost.
         cpus: processors that the process may use, also beyond the caller's.
         normal_ns: lateness of each wake-up in the normal scheduling class, ns.
         fifo_ns: lateness of each wake-up under SCHED_FIFO, ns; empty if not requested or refused.
@@ -79,6 +79,8 @@ def _try(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
             refused[name] = refusals[0]
 
     request("lock_memory", lock_memory=requested.lock_memory)
+    if requested.lock_memory and (refusals := use_huge_pages().refused):
+        refused["huge_pages"] = refusals[0]
     request("disable_cpu_idle", disable_cpu_idle=requested.disable_cpu_idle)
     normal_ns = lateness_ns(wake_ups)
     request("priority", requested.priority or None)
