@@ -214,15 +214,17 @@ def test_memory_is_moved_to_huge_pages() -> None:
     assert reported["huge_kb"] >= 14 << 10
 
 
-def test_a_host_without_huge_pages_refuses_them() -> None:
+def test_a_host_without_huge_pages_refuses_them(tmp_path: Path) -> None:
     disabled = "import ctypes; assert ctypes.CDLL(None).prctl(41, 1, 0, 0, 0) == 0  # PR_SET_THP_DISABLE"
     reported = report("use_huge_pages()", disabled)
     ((measure, cost),) = reported["refused"]
     assert measure == "huge pages (Invalid argument)"
     assert "Linux 6.1" in cost
     assert (reported["granted"], reported["huge_kb"]) == ([], 0)
-    absent = "import lowfc.adapters.process.realtime as it; it._HUGE_PAGE_BYTES = '/no/such/file'"
-    assert report("use_huge_pages()", absent)["refused"][0][0] == "huge pages (not in this kernel)"
+    (tmp_path / "bytes").write_text(str(1 << 40))  # larger than any memory here
+    for file, why in (("bytes", "no memory fills one"), ("none", "not in this kernel")):
+        other = f"import lowfc.adapters.process.realtime as it; it._HUGE_PAGE_BYTES = {str(tmp_path / file)!r}"
+        assert report("use_huge_pages()", other)["refused"][0][0] == f"huge pages ({why})"
 
 
 def fifo_permitted() -> bool:

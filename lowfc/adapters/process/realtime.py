@@ -209,15 +209,18 @@ def _collapse_memory() -> None:
         size = int(Path(_HUGE_PAGE_BYTES).read_text())
     except FileNotFoundError as fault:
         raise _RefusedError("not in this kernel") from fault
-    libc, collapsed = ctypes.CDLL(None, use_errno=True), 0
+    libc, collapsed, why = ctypes.CDLL(None, use_errno=True), False, "no memory fills one"
     for line in Path("/proc/self/maps").read_text().splitlines():
         pages, rights, _, _, inode, *name = line.split(maxsplit=5)
         if rights == "rw-p" and inode == "0" and name in ([], ["[heap]"]):
             begin, end = (int(address, 16) for address in pages.split("-"))
             for page in range(-(-begin // size) * size, end - size + 1, size):
-                collapsed += libc.madvise(ctypes.c_void_p(page), ctypes.c_size_t(size), _MADV_COLLAPSE) == 0
+                if libc.madvise(ctypes.c_void_p(page), ctypes.c_size_t(size), _MADV_COLLAPSE) == 0:
+                    collapsed = True
+                else:
+                    why = os.strerror(ctypes.get_errno())
     if not collapsed:
-        raise _RefusedError(os.strerror(ctypes.get_errno()))
+        raise _RefusedError(why)
 
 
 def _capabilities() -> int:
