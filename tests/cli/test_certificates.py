@@ -12,7 +12,7 @@ import pytest
 
 from lowfc.adapters.bus.access import ROUTER
 from lowfc.adapters.bus.own_certificate import WARN_DAYS, read_certificate
-from lowfc.adapters.bus.routed import ending_certificates, router_trouble
+from lowfc.adapters.bus.routed import certificate_warnings, router_trouble
 from lowfc.contract.configuration import Network
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from tests.support.loops import lowfc, refusal
@@ -180,21 +180,21 @@ def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
     network = Network(router="tls/localhost:7447", certificates=str(tmp_path))
     make(tmp_path, (ROUTER, "camera"), ["localhost"], 100)
     make(tmp_path, ("viewer",), [], CA_DAYS + 100)
-    assert ending_certificates(network, now + (99 - WARN_DAYS) * day) == []
+    assert certificate_warnings(network, now + (99 - WARN_DAYS) * day) == []
     date = now + 100 * day
-    assert ending_certificates(network, now + (100.5 - WARN_DAYS) * day) == [
+    assert certificate_warnings(network, now + (100.5 - WARN_DAYS) * day) == [
         f"{role}'s certificate ends in {WARN_DAYS - 1} days, on {date:%Y-%m-%d}: lowfc certs --renew"
         for role in ("camera", "router")
     ]
-    warnings = ending_certificates(network, now + (CA_DAYS - WARN_DAYS + 1) * day)
+    warnings = certificate_warnings(network, now + (CA_DAYS - WARN_DAYS + 1) * day)
     assert len(warnings) == 3, "the authority ends first"
     assert warnings[2].endswith("with its authority's ca.pem: make all anew in an empty folder (lowfc certs)")
     (tmp_path / "viewer.key").chmod(0o644)
-    (warning,) = ending_certificates(network, now)
+    (warning,) = certificate_warnings(network, now)
     assert "viewer.key can be read by every user" in warning
     (tmp_path / "viewer.key").chmod(0o640)
     (tmp_path / "camera.key").write_bytes((tmp_path / "viewer.key").read_bytes())
-    (warning,) = ending_certificates(network, now)
+    (warning,) = certificate_warnings(network, now)
     assert "camera.pem is not a valid certificate" in warning
 
 

@@ -206,7 +206,7 @@ def require_certificate(network: Network, role: str) -> None:
         )
 
 
-def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
+def certificate_warnings(network: Network, now: datetime.datetime) -> list[str]:
     """Warnings on this host's certificates: absent, invalid, ending within `WARN_DAYS`, or a key that all can read."""
     folder = user_path(network.certificates)
     roles = sorted(key.stem for key in folder.glob("*.key") if key.name != CA_KEY)

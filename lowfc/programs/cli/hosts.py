@@ -130,7 +130,7 @@ def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) 
 
     Example: lowfc hosts --config lowfc.toml --run bench
     """
-    from lowfc.adapters.bus.routed import ending_certificates
+    from lowfc.adapters.bus.routed import certificate_warnings
     from lowfc.adapters.bus.run import open_run, run_path
     from lowfc.adapters.bus.zenoh_bus import ZenohBus
     from lowfc.adapters.process.clock import HostClock
@@ -157,7 +157,7 @@ def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) 
     if links.network.router:
         if name == run:
             open_run(run, mirrors, network=settings.network)  # ctl and view now find it without the configuration
-        for warning in ending_certificates(links.network, datetime.datetime.now(datetime.UTC)):
+        for warning in certificate_warnings(links.network, datetime.datetime.now(datetime.UTC)):
             sys.stderr.write(f"warning: {warning}\n")
     rows = [_host_process(health) for _, health in sorted(processes.items())]
     print_result(HostsResult(run=name, processes=rows), as_json=as_json)

@@ -6,7 +6,7 @@ import numpy as np
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from lowfc.adapters.bus.own_certificate import WARN_DAYS
-from lowfc.adapters.bus.routed import ending_certificates
+from lowfc.adapters.bus.routed import certificate_warnings
 from lowfc.adapters.process import compiled
 from lowfc.contract.codecs.input_file import user_path
 from lowfc.control.kernel.tables import FUSED
@@ -25,7 +25,7 @@ _MEMLOCK_ADVICE = "`lowfc doctor --setup` (memlock unlimited in limits.d), or th
 
 @CHECKS.check("locked memory")
 def _locked_memory(facts: Facts) -> Check:
-    """Locking a process's memory, requested as by the loop."""
+    """Locking a process's memory, as the loop requests it."""
     if not facts.config.realtime.lock_memory:
         return note("not requested by the configuration: realtime.lock_memory = false")
     if refused := facts.completed_trial.refused.get("lock_memory"):
@@ -56,7 +56,7 @@ def _swap(facts: Facts) -> Check:
     cost="a page fault may clear or gather 2 MB in the middle of a frame",
 )
 def _huge_pages(facts: Facts) -> Check:
-    """Moving memory to huge pages, as the loop does, and when the kernel does so: `transparent_hugepage/enabled`."""
+    """Moving memory to huge pages, as the loop does, and when the kernel uses them: `transparent_hugepage/enabled`."""
     if refused := facts.completed_trial.refused.get("huge_pages"):
         what, cost = refused
         return warning(f"refused: {what}", "a kernel of version 6.1 or newer, with transparent huge pages", cost)
@@ -156,10 +156,10 @@ def _certificates(facts: Facts) -> Check:
     network = facts.config.network
     if not network.router:
         return ok("none needed: the configuration names no router")
-    ending = ending_certificates(network, datetime.datetime.now(datetime.UTC))
-    if not ending:
+    warnings = certificate_warnings(network, datetime.datetime.now(datetime.UTC))
+    if not warnings:
         return ok(f"all in {network.certificates} are valid for more than {WARN_DAYS} days")
-    return warning("; ".join(ending))
+    return warning("; ".join(warnings))
 
 
 def _blas_threads() -> dict[str, int]:
