@@ -32,8 +32,8 @@ HEAD = struct.Struct("<BQ")
 
 _FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
 _BLOCK_BYTES = 1 << 20
-_EXPECTED = {Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END}
-_CHANGED = "its parts are intact, but some are missing, out of order, or changed in between"
+_MAY_FOLLOW = {Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END}
+_CHANGED = "its parts are intact, but some are missing or out of order, or bytes between them changed"
 _BEGIN = MAGIC + bytes([Opcode.HEADER])
 _OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _FIRST_BLOCK_BYTES = 1 << 12
@@ -220,7 +220,7 @@ class LogFile:
             head = self._read(end, HEAD.size)
             if len(head) == HEAD.size:
                 opcode, length = HEAD.unpack(head)
-                if opcode in _EXPECTED and end + HEAD.size + length <= self.size:
+                if opcode in _MAY_FOLLOW and end + HEAD.size + length <= self.size:
                     return end
             self._bytes_to_try -= min(end - at, MAX_BYTES)  # these bytes have been read once already
         start, block = at + 1, _FIRST_BLOCK_BYTES
