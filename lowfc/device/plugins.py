@@ -28,7 +28,7 @@ def installed(kind: Kind) -> dict[str, EntryPoint]:
 
 
 def load(kind: Kind, name: str) -> Any:
-    """Import a driver's class or factory; ConfigurationError if there is none, or import or methods are wrong."""
+    """Import a driver's class or factory; ConfigurationError if it is absent, fails to import or lacks a method."""
     module, colon, attribute = name.rpartition(":")
     with opening(f"the driver {name!r} cannot be loaded"):
         if colon:
@@ -37,8 +37,8 @@ def load(kind: Kind, name: str) -> Any:
             names = [section(name)] if module.endswith(".py") else module.split(".")
             if not all(part.isidentifier() for part in (*names, *attribute.split("."))):
                 raise ConfigurationError(
-                    f"the driver {name!r} cannot be loaded: file and class have names of letters, digits and _, as in "
-                    "folder/my_camera.py:MyCamera: rename the file or the class"
+                    f"the driver {name!r} cannot be loaded: file and class must have names of letters, digits and _, "
+                    "as in folder/my_camera.py:MyCamera: rename the file or the class"
                 )
             # `python -P` excludes the current folder
             sys.path.insert(0, str(Path(module).resolve().parent if module.endswith(".py") else Path.cwd()))
@@ -84,7 +84,7 @@ def faults(config: Configuration, folder: Path) -> list[str]:
         kinds = [kind for kind in KINDS if name in installed(kind)]
         module = name.partition(".")[0]
         importable = module in sys.modules or importlib.util.find_spec(module) is not None
-        # an unknown name may be that of a file in any other folder
+        # An unknown name is a fault only if it is like a driver's or no identifier: a file elsewhere may have it.
         similar = nearest(name, {*installed("camera"), *installed("mirror")})
         if not kinds and name not in files and not importable and (similar or not module.isidentifier()):
             sentences.append(
@@ -164,7 +164,7 @@ def options_help(driver: Any) -> list[tuple[str, str]]:
 
 
 def _choice(model: type[DriverOptions], key: str, value: Any) -> Any:
-    """The choice of a Literal that a word of the command line stands for, such as the number 2; else the word."""
+    """The choice of a Literal option whose text is `value`, such as the number 2 for "2"; `value` if there is none."""
     annotation = model.model_fields[key].annotation if key in model.model_fields else None
     parts = annotation, *get_args(annotation)
     choices = {str(choice): choice for part in parts if get_origin(part) is Literal for choice in get_args(part)}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.device import CameraSettings, Configuration, ConfigurationError, Exposure, Need
-from lowfc.device.drivers.genicam import QUEUED, WAIT_MS, GenicamOptions
+from lowfc.device.drivers.genicam import MAX_QUEUED, WAIT_MS, GenicamOptions
 
 ADVICE = (
     "Debian: apt install gir1.2-aravis-0.8 python3-gi; then make the package gi visible to this Python, with an "
@@ -71,7 +71,7 @@ class AravisCamera:
         buffer = self._stream.timeout_pop_buffer(WAIT_MS * 1000)
         if buffer is None:
             return None
-        while self._stream.get_n_buffers()[1] >= QUEUED:
+        while self._stream.get_n_buffers()[1] >= MAX_QUEUED:
             self._stream.push_buffer(buffer)
             buffer = self._stream.timeout_pop_buffer(0)
         try:

@@ -9,7 +9,7 @@ import numpy as np
 
 from lowfc.adapters.process.extras import install_advice, package_required
 from lowfc.device import CameraSettings, Configuration, ConfigurationError, Exposure, Need
-from lowfc.device.drivers.genicam import QUEUED, WAIT_MS, GenicamOptions
+from lowfc.device.drivers.genicam import MAX_QUEUED, WAIT_MS, GenicamOptions
 
 _EXPOSURES = "ExposureTime", "ExposureTimeAbs"
 """Node names of newer and older cameras; the emulation has both, and the older one takes effect."""
@@ -105,7 +105,7 @@ class BaslerCamera:
             camera.AcquisitionFrameRateEnable.Value = True
             self._write(_RATES, 1e9 / period_ns)
             period_ns = round(1e9 / min(self._read(_RESULTS + _RATES)))
-        camera.MaxNumBuffer.Value, camera.OutputQueueSize.Value = _BUFFERS, QUEUED
+        camera.MaxNumBuffer.Value, camera.OutputQueueSize.Value = _BUFFERS, MAX_QUEUED
         exposure_ns = round(self._read(_EXPOSURES)[0] * 1e3)
         self._settings = replace(settings, exposure_ns=exposure_ns, period_ns=period_ns)
 

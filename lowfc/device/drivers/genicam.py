@@ -9,12 +9,12 @@ from lowfc.contract.configuration import Configuration
 from lowfc.device import CameraSettings, DriverOptions
 
 FRAME_ID_WRAP = 65535
-"""GigE Vision counts frames from 1 to 65535, then from 1 again; 64-bit numbers are reduced modulo 65535."""
+"""GigE Vision counts frames from 1 to 65535, then from 1 again: numbers are compared modulo 65535, 64-bit ones too."""
 WAIT_MS = 500
 """Longest wait for a frame."""
-QUEUED = 2
-"""Number of frames, the newest, that are read after the process stood still; older ones are dropped and counted as
-lost: all of them saw the same mirror shape."""
+MAX_QUEUED = 2
+"""Number of frames that may wait, the newest ones. Older ones are dropped and count as lost: those that came while the
+process was stopped all saw the same mirror shape."""
 
 
 class GenicamOptions(DriverOptions):
@@ -39,7 +39,7 @@ class GenicamOptions(DriverOptions):
     gain: float | None = None
     """Gain, in the camera's unit, mostly dB; by default the camera keeps its gain."""
     trigger: str = ""
-    """Camera's name of the line that triggers each frame (`Line1`); empty: free-running."""
+    """Line that triggers each frame, by the camera's name for it (`Line1`); empty: free-running."""
 
     def settings(self, config: Configuration) -> CameraSettings:
         """Settings requested by the options; the bit depth follows from the pixel format."""
