@@ -191,7 +191,7 @@ def interlocks(known: dict[str, Any]) -> str:
     return f"none of {count} acts" if count else "none"
 
 
-def shaped(state: wire.ControllerState | None) -> bool:
+def holds_shape(state: wire.ControllerState | None) -> bool:
     """Whether the loop holds a shape on purpose, so that the true wavefront is not its residual."""
     return state is not None and (any(state.offset_nm) or any(one.name != FLAT for one in state.channels))
 

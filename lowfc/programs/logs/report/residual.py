@@ -10,7 +10,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.contrast import added_contrast, with_variances
-from lowfc.programs.cli.status import shaped
+from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.logs.report.closed_loop import Stretch, noise_of
 from lowfc.programs.logs.report.source import Results, Run
 
@@ -64,7 +64,7 @@ def residual_results(run: Run, stretch: Stretch | None) -> Results:
         },
         "open_pupil": open_pupil,
         "truth": "none" if history.true is None else "continuous" if true.continuous else "sampled only",
-        "shaped": any(map(shaped, history.controllers)),
+        "shaped": any(map(holds_shape, history.controllers)),
         "steps_open": int(opened.size),
         "steps_closed": int(closed.size),
     }

@@ -11,7 +11,7 @@ from lowfc.adapters.logs.columns import Steps
 from lowfc.control.durations import Durations
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted
-from lowfc.programs.cli.status import shaped
+from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.view.snapshot import LogEnd, Snapshot
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
 from lowfc.programs.view.verdicts.facts import facts
@@ -47,7 +47,7 @@ class LogVerdict:
             self._closed.add_wavefronts(wavefronts.at(closed), true=self._means.true)
         for duration_ns in snapshot.timings["frame_to_command"].tolist():
             self._latency.add(duration_ns)
-        self._shaped |= shaped(snapshot.controller)
+        self._shaped |= holds_shape(snapshot.controller)
 
     def verdict(self, state: RunState, ended: LogEnd) -> Verdict:
         """Tiles of the whole log, and a headline, with the advice of the worst tile if it needs attention."""

@@ -25,7 +25,7 @@ FILL: dict[Level, Colour] = {
     Level.WARNING: (240, 200, 40),
     Level.BAD: (222, 80, 10),
 }
-"""They also differ in lightness: dark grey, green, orange red, bright yellow."""
+"""They also differ in lightness, from dark to bright: grey, green, orange red (bad), yellow (warning)."""
 INK: dict[Level, Colour] = {
     Level.NEUTRAL: (235, 235, 240),
     Level.GOOD: (235, 245, 240),
@@ -38,7 +38,7 @@ WORD: dict[Level, str] = {Level.NEUTRAL: "", Level.GOOD: "ok", Level.WARNING: "C
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """One tile of the annunciator: a word or number, its explanation, and the advice for the headline."""
+    """One tile of a verdict: a word or number, its explanation, and the advice for the headline."""
 
     title: str
     value: str
@@ -58,7 +58,7 @@ class Verdict:
 
 
 def worst_of(tiles: Sequence[Tile]) -> Tile:
-    """The first tile of the highest level: causes precede their consequences."""
+    """The first tile of the highest level; `tiles` are in an order in which causes precede their consequences."""
     return max(tiles, key=lambda tile: tile.level)
 
 

@@ -5,7 +5,7 @@ from math import hypot, sqrt
 
 from lowfc.contract.messages import wire
 from lowfc.contract.printable import printable
-from lowfc.programs.cli.status import shaped
+from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.steady import ResidualComparison
 from lowfc.programs.view.verdicts.tile import Level, Tile, rounded, short
@@ -40,7 +40,7 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
         return tile(f"last: {residual} nm", f"of {flat}; {remarks}")
     if loop.level is not Level.GOOD:
         return tile(value, f"{'not corrected;' if loop.value in UNCORRECTED else 'of'} {flat}; {remarks}")
-    if state.true and shaped(state.snapshot.controller):
+    if state.true and holds_shape(state.snapshot.controller):
         why = f"The wavefront is {value}, including the shapes of offset and channels; {flat}."
         return tile(value, f"with offset and channels; {flat}; {remarks}", advice=why)
     raw, latest = rms.open_nm / rms.residual_nm if rms.residual_nm else 1.0, state.latest
