@@ -18,8 +18,8 @@ COMMANDS = {
         Row("camera", "cli.devices:camera_app", "Run a camera: publish the frames of its driver."),
         Row("mirror", "cli.devices:mirror_app", "Run a mirror: apply a run's commands by its driver."),
         Row("record", "cli.processes:record", "Record the messages of a run."),
-        Row("bridge", "", "Run a bridge to another control system."),
-        Row("gateway", "", "Connect a run to a control system."),
+        Row("bridge", "", "Share a mirror with CACAO or another control system."),
+        Row("gateway", "", "Serve a run to an observatory's control system (EPICS)."),
         Row("config", "", "Show and check the configuration."),
         Row("certs", "cli.hosts:certs", "Make the certificates of a run on several hosts."),
         Row("router", "cli.hosts:router", "Run the router of a run on several hosts."),
@@ -50,7 +50,7 @@ COMMANDS = {
         Row("latency", "measure.latency.command:latency", "Measure the latency from frame to command on this host."),
         Row("bench", "", "Measure the speed of the optical model, and recording."),
     ),
-    "Trust": (
+    "Verify": (
         Row("validate", "paper.commands:validate", "Reproduce the tables and figures of the paper."),
         Row("chaos", "reliability.chaos.command:chaos", "Inject faults into a simulated loop and check its log."),
         Row("soak", "reliability.soak.command:soak", "Run the simulated loop for hours and watch its resources."),
@@ -59,7 +59,7 @@ COMMANDS = {
 }
 """By purpose, in the order of `lowfc --help`; a row without a module is a group with its commands in `PARTS`."""
 PARTS = (
-    Row("bridge isio", "bridge.isio:bridge_isio", "Write modes to ImageStreamIO streams, read channels from them."),
+    Row("bridge isio", "bridge.isio:bridge_isio", "Write steps to ImageStreamIO streams, report other channels."),
     Row("config show", "cli.config:config_show", "Print every key with its value and description, as TOML."),
     Row("config check", "cli.config:config_check", "Check a configuration file and the files it names."),
     Row("config zenoh", "cli.config:config_zenoh", "Print the zenoh configuration for your own program."),
