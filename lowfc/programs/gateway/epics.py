@@ -1,4 +1,4 @@
-"""EPICS PV Access: variables as PVs of a server, other servers' PVs as bench values; by default on loopback only."""
+"""EPICS PV Access: serve the variables as PVs, and read other servers' PVs as bench values; by default on loopback."""
 
 import threading
 import time
@@ -17,7 +17,7 @@ _CODES = {Kind.BOOLEAN: "?", Kind.NUMBER: "d", Kind.TEXT: "s", Kind.NUMBERS: "ad
 _EMPTY: dict[Kind, Any] = {Kind.BOOLEAN: False, Kind.NUMBER: 0.0, Kind.TEXT: "", Kind.NUMBERS: []}
 _INVALID = 3
 """Alarm severity of an invalid value."""
-Ask = Callable[[Put, Any], object]
+CarryOut = Callable[[Put, Any], object]
 """Function that carries out a put; LowfcError if it is refused."""
 
 
@@ -35,7 +35,7 @@ def protocol() -> Any:
 class EpicsGateway:
     """Server of the variables, and PV monitors whose valid values are in `bench`; each update sets `changed`."""
 
-    def __init__(self, config: Gateway, variables: Sequence[Variable], ask: Ask) -> None:
+    def __init__(self, config: Gateway, variables: Sequence[Variable], carry_out: CarryOut) -> None:
         """Serve; BusError if it cannot listen."""
         p4p = protocol()
         self.variables, self.bench, self.changed = variables, dict[str, Value](), threading.Event()
@@ -52,7 +52,7 @@ class EpicsGateway:
             handler: dict[str, Any] = {}
             if one.put is not None:  # a thread for each PV: by default p4p has four for all, and `safe` would wait
                 handler["queue"] = p4p.util.ThreadedWorkQueue(maxsize=0, daemon=True).start()
-                handler["handler"] = _PutHandler(one.kind, one.put, ask)
+                handler["handler"] = _PutHandler(one.kind, one.put, carry_out)
             self._pvs[one.name] = p4p.server.thread.SharedPV(nt=nt, initial=described, **handler)
         address, port = config.listen, config.port
         served = {
@@ -65,7 +65,7 @@ class EpicsGateway:
         provided = {f"{config.prefix}{name}": pv for name, pv in self._pvs.items()}
         with raised_as(BusError, RuntimeError, f"cannot serve PV Access on {address}:{port}"):
             self._server = p4p.server.Server(providers=[provided], conf=served, useenv=False)
-        if self.port != port:  # the library would serve on another port
+        if self.port != port:  # the port is in use: the library chose another one
             self._server.stop()
             raise BusError(f"cannot serve PV Access on {address}:{port}: it is in use; set another gateway.port")
         searched = {"EPICS_PVA_ADDR_LIST": config.search, "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
@@ -81,7 +81,7 @@ class EpicsGateway:
         return int(self._server.conf()["EPICS_PVAS_SERVER_PORT"])
 
     def update(self, values: dict[str, Any], fault: str) -> None:
-        """Post a new image, and the variables that have changed; these are invalid with a fault, or if NaN."""
+        """Post a new image and each changed variable; a variable is invalid if there is a `fault`, or if it is NaN."""
         for one in self.variables:
             value = values.get(one.name, _EMPTY.get(one.kind))
             if value is None:
@@ -118,15 +118,15 @@ class EpicsGateway:
 class _PutHandler:
     """Carries out puts to a variable; a refused put fails with the controller's message."""
 
-    def __init__(self, kind: Kind, put: Put, ask: Ask) -> None:
-        self._kind, self._put, self._ask = kind, put, ask
+    def __init__(self, kind: Kind, put: Put, carry_out: CarryOut) -> None:
+        self._kind, self._put, self._carry_out = kind, put, carry_out
 
     def put(self, pv: Any, operation: Any) -> None:
         """Carry out one put, on the variable's own thread."""
         try:
             value = operation.value()
             if self._kind is not Kind.BOOLEAN or value:  # a display writes 0 to reset a button
-                self._ask(self._put, value.tolist() if isinstance(value, np.ndarray) else value)
+                self._carry_out(self._put, value.tolist() if isinstance(value, np.ndarray) else value)
         except LowfcError as fault:
             operation.done(error=str(fault))
         else:
@@ -144,7 +144,7 @@ def _value_of(value: Any) -> Value | None:
             plain = str(choices[index]) if 0 <= index < len(choices) else None
         else:
             plain = value["value"]
-    except (AttributeError, LookupError, TypeError, ValueError):  # an Exception, a structure, or not UTF-8
+    except (AttributeError, LookupError, TypeError, ValueError):  # disconnected, a structure, or not UTF-8
         return None
     if isinstance(plain, bool):
         return plain
