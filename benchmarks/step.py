@@ -1,8 +1,8 @@
 """Time of each stage of the control step, and of one matrix-vector product of the same size in the same run.
 
 The step is the loop's own, from a frame's bytes to a command's, with a random calibration of 6400 pixels, 20 modes and
-1156 actuators. The step and the product R x are timed back to back, and paced at the frame rate as in the loop. Then
-the step is timed stage by stage, which takes a little longer.
+1156 actuators. The step and the product R x are timed separately, each call directly after the last (back to back), and
+once per frame period as in the loop (paced). Then the step is timed stage by stage, which takes a little longer.
 
 Example:
     python -m benchmarks step --seconds 5
@@ -120,7 +120,7 @@ def about(found: Result) -> str:
 def _timed(
     step: ControlStep, payloads: Payloads, product: Callable[[bytes], object], seconds: float, period_ns: int | None
 ) -> dict[str, Long]:
-    """Durations of the step, of the product and of each stage, ns, a third of the time for each."""
+    """Durations, ns, of the step, of the product, and of the stages of a step; `seconds` / 3 for each of the three."""
 
     def alone(work: Callable[[bytes], object]) -> Long:
         return time_alone(work, payloads, HostClock(), seconds / 3, period_ns)[1]

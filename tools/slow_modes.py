@@ -45,7 +45,7 @@ def case(config: Configuration) -> Results:
     calibration = calibrated(config)
     bench = Bench(config, calibration)
     frames = round(WINDOW_S * RATE_HZ)
-    residual_nm, drift_nm, mirror_nm = (np.zeros((WINDOWS, len(config.noll))) for _ in range(3))
+    residual_nm, drift_nm, mirror_error_nm = (np.zeros((WINDOWS, len(config.noll))) for _ in range(3))
     bench.run(round(SETTLE_S * RATE_HZ))
     for window in track(range(WINDOWS), f"exposure {config.camera.exposure_fraction:g} of the period"):
         bench.new_record()
@@ -53,7 +53,7 @@ def case(config: Configuration) -> Results:
         residual_nm[window] = bench.residual_nm(continuous=False).mean(axis=0)
         drift_nm[window] = np.mean([truth.sampled.disturbance_nm for truth in bench.truths], axis=0, dtype=np.float64)
         command_nm = np.mean([step.command_nm for step in bench.steps], axis=0, dtype=np.float64)
-        mirror_nm[window] = residual_nm[window] - drift_nm[window] - command_nm
+        mirror_error_nm[window] = residual_nm[window] - drift_nm[window] - command_nm
     light_e = calibration.flux_dn * config.camera.gain_e_per_dn
     H, I0 = (array.astype(np.float64) * (light_e * frames) for array in (calibration.response, calibration.reference))
     bound_nm = np.sqrt(np.diag(cramer_rao(H, variance_e(I0, 0.0))))
@@ -63,7 +63,7 @@ def case(config: Configuration) -> Results:
         "residual_pm": 1e3 * _rms(residual_nm),
         "photon_bound_pm": 1e3 * bound_nm,
         "noise_pm": 1e3 * noise_nm,
-        "mirror_pm": 1e3 * _rms(mirror_nm),
+        "mirror_pm": 1e3 * _rms(mirror_error_nm),
     }
     return {
         "light_e_per_s": light_e * RATE_HZ,
