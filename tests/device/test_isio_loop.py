@@ -53,8 +53,8 @@ MIRROR = "lowfc mirror isio --run bench --config bench.toml"
 CAMERA_DRIVER = "lowfc camera isio --run bench --config bench.toml"
 CONTROLLER = "lowfc controller --run bench --config bench.toml"
 BRIDGE = "lowfc bridge isio --run bench --beside dm00disp03"
-LOOP_OF_TWO, LOOP_OF_ONE = (CAMERA_DRIVER, CONTROLLER), (f"{CONTROLLER} --camera isio",)
-DOCUMENTED = (MIRROR, CAMERA_DRIVER, CONTROLLER, BRIDGE, *LOOP_OF_ONE)
+TWO_PROCESSES, ONE_PROCESS = (CAMERA_DRIVER, CONTROLLER), (f"{CONTROLLER} --camera isio",)
+DOCUMENTED = (MIRROR, CAMERA_DRIVER, CONTROLLER, BRIDGE, *ONE_PROCESS)
 """Commands documented in docs/howto/cacao.md; all are run here."""
 
 
@@ -121,11 +121,11 @@ def folder(tmp_path: Path, own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -
     return tmp_path
 
 
-@pytest.mark.parametrize("loop", [LOOP_OF_TWO, LOOP_OF_ONE], ids=["two processes", "one process"])
-def test_a_loop_runs_on_streams_with_other_mirror_channels(folder: Path, loop: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("commands", [TWO_PROCESSES, ONE_PROCESS], ids=["two processes", "one process"])
+def test_a_loop_runs_on_streams_with_other_mirror_channels(folder: Path, commands: tuple[str, ...]) -> None:
     (folder / "bench.toml").write_text(bench_of(rate_hz=200, preset="quiet", tilt_nm=15))
     with closing(Bench(folder)) as bench, in_background(folder, MIRROR), bench.listening():
-        with in_background(folder, *loop):
+        with in_background(folder, *commands):
             until(bench.converged, 60)
             refused = run(folder, "mirror", "isio", "--run", "other", "--config", "bench.toml")
             assert refused.returncode == 2
@@ -136,10 +136,10 @@ def test_a_loop_runs_on_streams_with_other_mirror_channels(folder: Path, loop: t
         assert other_channel.pixels.any()
 
 
-@pytest.mark.parametrize("loop", [LOOP_OF_TWO, LOOP_OF_ONE], ids=["two processes", "one process"])
-def test_stream_faults_are_reported_and_recovered_from(folder: Path, loop: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("commands", [TWO_PROCESSES, ONE_PROCESS], ids=["two processes", "one process"])
+def test_stream_faults_are_reported_and_recovered_from(folder: Path, commands: tuple[str, ...]) -> None:
     (folder / "bench.toml").write_text(bench_of(rate_hz=200, preset="quiet", tilt_nm=15))
-    with closing(Bench(folder)) as bench, in_background(folder, MIRROR, *loop), bench.listening():
+    with closing(Bench(folder)) as bench, in_background(folder, MIRROR, *commands), bench.listening():
         until(bench.converged, 60)
         _a_stopped_reader_resumes_with_the_newest_image(bench)
         bench.send("renew")
@@ -194,7 +194,7 @@ def _other_channels_are_not_undone(bench: Bench) -> None:
         until(bench.converged)
         correction_nm = calibration.actuators_to_modes @ (bench.stream(CHANNEL).pixels[0] - before).reshape(-1)
         external_nm = calibration.actuators_to_modes @ dark_hole.reshape(-1)
-        assert np.linalg.norm(correction_nm) < 0.3 * np.linalg.norm(external_nm)  # noise; uncompensated it would be 1
+        assert np.linalg.norm(correction_nm) < 0.3 * np.linalg.norm(external_nm)  # noise; 1 if undone
         state = client.status().state
         (external,) = (one for one in state.channels if one.name == "external")
         assert np.allclose(np.frombuffer(external.actuators, "f4"), dark_hole.reshape(-1) * 1000, atol=0.01)

@@ -88,7 +88,7 @@ def noisy_frames(scene: Scene, count: int) -> list[np.ndarray]:
     return [scene.expose(index, FLAT) for index in range(count)]
 
 
-def test_noise_depends_on_the_seed_and_flux_matches_the_calibration(calibration: Calibration) -> None:
+def test_the_seed_determines_the_noise_and_the_flux_matches_the_calibration(calibration: Calibration) -> None:
     noisy = scene_of(configured())
     frames, pixels = noisy_frames(noisy, 20), noisy.shape[0] * noisy.shape[1]
     first = [frame.tobytes() for frame in frames[:3]]
@@ -123,7 +123,7 @@ def test_frames_do_not_depend_on_the_order_of_exposure() -> None:
 
 @pytest.mark.parametrize("exposure", [0.5, 0.9])
 def test_image_is_the_mean_over_its_exposure(exposure: float) -> None:
-    """Two quadrature nodes agree with 64 times while the star moves by 14 mas rms: to 1e-5 of the brightest pixel."""
+    """Two quadrature nodes agree with 64 instants to 1e-5 of the brightest pixel; the star moves by 14 mas rms."""
     keys = {
         "disturbance__preset": "reaction-wheel-ideal",
         "camera__rate_hz": 1000.0,
@@ -147,14 +147,14 @@ def test_image_is_the_mean_over_its_exposure(exposure: float) -> None:
 )
 @pytest.mark.parametrize("rate_hz", [100.0, 20.0])
 def test_vibrations_faster_than_the_exposure_are_averaged(keys: dict[str, object], rate_hz: float) -> None:
-    """The sensed wavefront is the mean over 1000 times, to 0.05 nm; the lines have 1 nm and more."""
+    """The sensed wavefront is the mean over 1000 instants, to 0.05 nm; the lines have 1 nm and more."""
     config = configured(camera__rate_hz=rate_hz, camera__exposure_fraction=1.0, **keys)
     truth = scene_of(config).truth(3, FLAT)
     expected = Sampler(disturbance_of(config), (np.arange(1000) + 0.5) / 1000, rate_hz).at(3).mean(axis=0)
     assert truth.sensed_nm == pytest.approx(expected, abs=0.05)
 
 
-def test_slow_vibrations_need_two_nodes_of_the_exposure() -> None:
+def test_exposure_nodes_average_a_vibration_and_are_two_if_it_is_slow() -> None:
     assert len(exposure_nodes(0.25)[0]) == 2
     for cycles in (0.2, 0.9, 1.2, 3.0, 58.0):
         nodes, weights = exposure_nodes(cycles)
@@ -163,7 +163,7 @@ def test_slow_vibrations_need_two_nodes_of_the_exposure() -> None:
 
 @pytest.mark.slow
 def test_blurred_image_is_as_accurate_as_one_at_rest() -> None:
-    """The twin with two nodes against the full optics at 64 times: error at most 10 % above that of a single image."""
+    """The twin with two nodes against the full optics at 64 instants: error at most 10 % above a single image's."""
     keys = {"disturbance__preset": "reaction-wheel-ideal", "camera__rate_hz": 1000.0}
     config = configured(**FINE, **keys)
     blurred, optics = scene_of(config), sensor(config, print)

@@ -146,7 +146,7 @@ def test_mirror_at_the_neighbour_limit_does_not_oscillate() -> None:
     assert np.array_equal(status.surface_nm, settled)
 
 
-def test_limits_of_the_mirror_are_reported_and_drop_the_modal_command() -> None:
+def test_limits_of_the_mirror_are_reported_and_its_modal_command_is_then_empty() -> None:
     device = mirror()
     status, _ = device.apply_command(device.initial, command(even(100)), START_NS)
     assert status.limits_hit == ()
