@@ -162,6 +162,27 @@ def test_a_lease_ends_after_its_number_of_frames() -> None:
     assert not remaining_rows(state)
 
 
+@pytest.mark.parametrize("period_ns", [250_000, 500_000, 999_999, 2_000_000, 7_300_000])
+@pytest.mark.parametrize("ahead_ns", [0, 3600 * SECOND_NS])
+def test_a_lease_lasts_its_seconds_at_any_frame_rate(period_ns: int, ahead_ns: int) -> None:
+    """The configured rate is 1 kHz, and the camera's clock may be another one."""
+    first, _ = feed(DEFAULTS, loaded(DEFAULTS), frame(1, SOME, time_ns=ahead_ns + period_ns))
+    state, _ = applied(first, Request(0, "lease", values=(1.0,), text=HOLDER, lease_id=MINE))
+    count = 1
+    while not state.conditions.lease.ended:
+        count += 1
+        state, _ = applied(state, frame(count, SOME, time_ns=ahead_ns + count * period_ns))
+    assert abs((count - 1) * period_ns - SECOND_NS) <= period_ns + 1_000_000
+
+
+@pytest.mark.parametrize("time_ns", [0, frame(3).time_ns + 10 * SECOND_NS])
+def test_frames_count_after_a_silence_and_without_times(time_ns: int) -> None:
+    *lasting, last = (frame(count, SOME, time_ns=time_ns) for count in range(4, 1005))
+    state, all_outputs = feed(DEFAULTS, held(1.0), *lasting)
+    assert "LEASE_ENDED" not in names(all_outputs)
+    assert "LEASE_ENDED" in names(feed(DEFAULTS, state, last)[1])
+
+
 def test_without_frames_a_lease_ends_by_the_clock_and_before_the_next_request() -> None:
     state, all_outputs = feed(DEFAULTS, played(held(1.0)), Tick(SECOND_NS, 0), Tick(SECOND_NS + 1, 0))
     assert names(all_outputs) == ["LEASE_ENDED"]

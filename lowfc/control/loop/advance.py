@@ -39,7 +39,7 @@ from lowfc.control.loop.loading import (
     mode_event,
 )
 from lowfc.control.loop.requests import answer
-from lowfc.control.loop.reservation import lease_checked
+from lowfc.control.loop.reservation import counted_to_frame, lease_checked
 from lowfc.control.loop.safety import NOT_NEW, Limit, LoopMode, Reason, Rejection
 from lowfc.control.loop.state import ActiveLoop, Settings, State
 
@@ -71,7 +71,8 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     state, loop = _arrive(state, frame, events)
     lease_ended = False
     if state.conditions.lease is not None:
-        state, lease_events = lease_checked(state._replace(loop=loop), 0, frame.sequence)
+        state = counted_to_frame(settings, state._replace(loop=loop), frame)
+        state, lease_events = lease_checked(state, 0, frame.sequence)
         events, loop, lease_ended = [*events, *lease_events], state.loop, bool(lease_events)
     if loop is None:
         return _refuse(settings, _with_newest_frame(state, loop, frame), frame, Rejection.NO_CALIBRATION, events)
@@ -152,18 +153,11 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
 
 
 def _camera_started(state: State, frame: Frame) -> State:
-    """The state at the first frame after a start of the camera; a lease keeps its remaining frames.
-
-    Camera settings are awaited if the known ones are of another start.
-    """
-    conditions = state.conditions
-    camera, held = conditions.camera, conditions.lease
-    if camera is not None and camera.start_s not in (0, frame.sequence >> COUNT_BITS):
-        conditions = conditions._replace(camera_awaited=True)
-    if held is not None and not held.ended and held.same_start(state.frame_sequence):
-        last_sequence = frame.sequence + held.last_sequence - state.frame_sequence
-        conditions = conditions._replace(lease=held._replace(last_sequence=last_sequence))
-    return state._replace(conditions=conditions)
+    """The state at the first frame after a start of the camera; settings known from another start are awaited."""
+    camera = state.conditions.camera
+    if camera is None or camera.start_s in (0, frame.sequence >> COUNT_BITS):
+        return state
+    return state._replace(conditions=state.conditions._replace(camera_awaited=True))
 
 
 def _with_newest_frame(state: State, loop: ActiveLoop | None, frame: Frame) -> State:

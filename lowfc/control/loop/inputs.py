@@ -16,6 +16,8 @@ from lowfc.control.loop.safety import LoopMode, Reason
 
 COUNT_BITS = 32
 """A frame's sequence is its publisher's start in seconds, shifted by this many bits, plus its count."""
+TICK_NS = 10_000_000
+"""Period at which the held command is repeated while no frame arrives."""
 
 
 class Frame(NamedTuple):

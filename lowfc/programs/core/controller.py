@@ -38,7 +38,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.durations import Durations
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.command_channels import ADOPTED
-from lowfc.control.loop.inputs import Input, Load, MirrorReport, Outputs, Reply, Report, Request, Tick
+from lowfc.control.loop.inputs import TICK_NS, Input, Load, MirrorReport, Outputs, Reply, Report, Request, Tick
 from lowfc.control.loop.loading import holding_cause, misfit, safe_pending, uncalibrated
 from lowfc.control.loop.requests import CONFIGURATION, MAX_REPLY_LENGTH, prepared
 from lowfc.control.loop.safety import LoopMode
@@ -57,8 +57,6 @@ from lowfc.programs.core.gain_watch import GainWatch
 from lowfc.programs.core.mirror_reports import MirrorReports
 from lowfc.programs.core.start_up import StartUp, settings_under
 
-TICK_NS = 10_000_000
-"""Period at which the held command is repeated while no frame arrives."""
 MIRROR_PATIENCE_S = 1.0
 """Longest time that the start waits for the mirror to report its shape."""
 STATE_PERIOD_NS = 1_000_000_000
