@@ -65,6 +65,25 @@ def test_health_is_published_when_due_with_all_fields(hub: MemoryHub, clock: Fak
     }
 
 
+@pytest.mark.parametrize("rate_hz", [0.1, 0.7, 1.6, 5.0, 1000.0])
+def test_the_rate_of_slow_work_is_measured_over_several_units(hub: MemoryHub, clock: FakeClock, rate_hz: float) -> None:
+    """Also with a Health between the usual ones; after a silence the rate is 0."""
+    listener = Listener(hub, clock, HEALTH)
+    camera = service(hub, clock, "camera")
+    for number in range(300):
+        camera.work = int(number * 0.5 * rate_hz)
+        if number % 10 == 3:
+            camera.state = "running"
+        camera.beat()
+        clock.advance(HEALTH_PERIOD_NS)
+    rates = [health.rate_hz for health in listener.messages(HEALTH)]
+    assert all(0.75 * rate_hz < rate < 1.3 * rate_hz for rate in rates[100:])
+    for _ in range(1 + int(8 / rate_hz)):
+        clock.advance(HEALTH_PERIOD_NS)
+        camera.beat()
+    assert listener.messages(HEALTH)[-1].rate_hz == 0
+
+
 @pytest.mark.parametrize(("ahead_ms", "reported"), [(-99, False), (100, False), (101, True), (-250, True)])
 def test_a_wrong_clock_is_reported_at_the_start(
     hub: MemoryHub, clock: FakeClock, monkeypatch: pytest.MonkeyPatch, ahead_ms: int, reported: bool

@@ -387,6 +387,6 @@ def test_the_service_managers_socket_may_have_an_at_sign_in_its_name(tmp_path: P
 
 def test_a_status_is_one_line() -> None:
     health = wire.Health(state="ready", rate_hz=3.2, recording=wire.Recording(failure="disk full\nREADY=1"))
-    assert status_line(health) == "ready, 3 Hz, recording failed: disk full READY=1"
+    assert status_line(health) == "ready, 3.2 Hz, recording failed: disk full READY=1"
     safe = wire.Health(state="running", rate_hz=1000.4, mode=wire.LOOP_MODE_SAFE)
     assert status_line(safe) == "running, in safe mode, 1000 Hz"

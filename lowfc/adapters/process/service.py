@@ -22,6 +22,7 @@ from lowfc.adapters.process.clock import WALL_TOLERANCE_NS, Clock
 from lowfc.adapters.process.host import resident_bytes
 from lowfc.adapters.process.realtime import NOTHING, Granted
 from lowfc.adapters.process.supervision import Supervisor
+from lowfc.adapters.process.work_rate import WorkRate
 from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.events import EVENTS, Level
@@ -106,8 +107,8 @@ class Service:
         self._last_warning: Log | None = None
         self._warned: dict[str, tuple[int, int]] = {}
         self._supervisor = supervisor or Supervisor()
-        self._started_ns = self._last_health_ns = clock.host_ns()
-        self._last_health_work = 0
+        self._started_ns = clock.host_ns()
+        self._work_rate = WorkRate(self._started_ns)
         self._due_ns = 0
         self._events = self.publisher(EVENT)
         self._health = self.publisher(HEALTH, name)
@@ -304,7 +305,6 @@ class Service:
     def health(self) -> wire.Health:
         """Current Health of the process."""
         now_ns = self.clock.host_ns()
-        span_s = max(now_ns - self._last_health_ns, 1) * 1e-9
         message = wire.Health(
             timestamp=timestamp(now_ns),
             process=self.name,
@@ -314,7 +314,7 @@ class Service:
             host=self._host,
             version=__version__,
             memory_bytes=resident_bytes(),
-            rate_hz=(self.work - self._last_health_work) / span_s,
+            rate_hz=self._work_rate.update(now_ns, self.work),
             peers_alive=sorted(self.last_health),
             realtime_granted=self._granted.granted,
             realtime_refused=[f"{measure}: {cost}" for measure, cost in self._granted.refused],
@@ -344,7 +344,6 @@ class Service:
         self._due_ns = now_ns + HEALTH_PERIOD_NS
         self._report_unreadable()
         message = self.health()
-        self._last_health_ns, self._last_health_work = now_ns, self.work
         self._health.put(message.SerializeToString())
         self._supervisor.send_status(message)
 

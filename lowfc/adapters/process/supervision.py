@@ -11,6 +11,7 @@ from collections.abc import Mapping
 
 from lowfc.contract.messages import wire
 from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.wording import hertz
 
 
 class Supervisor:
@@ -69,7 +70,7 @@ def status_line(health: wire.Health) -> str:
     parts = [health.state]
     if health.mode:
         parts.append(LoopMode(health.mode).in_words)
-    parts.append(f"{health.rate_hz:.0f} Hz")
+    parts.append(hertz(health.rate_hz))
     if health.recording.failure:
         parts.append(f"recording failed: {health.recording.failure}")
     return " ".join(", ".join(parts).split())

@@ -21,3 +21,8 @@ def counted(count: float, noun: str, plural: str = "") -> str:
 def mode_word(mode: str) -> str:
     """A loop mode in words."""
     return "in safe mode" if mode == "safe" else mode
+
+
+def hertz(rate_hz: float) -> str:
+    """Text of a frame rate."""
+    return f"{rate_hz:.0f} Hz" if rate_hz >= 10 else f"{rate_hz:.2g} Hz"

@@ -9,7 +9,7 @@ from lowfc.client import Client
 from lowfc.client.runs import live_runs
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import Role
-from lowfc.control.loop.wording import mode_word
+from lowfc.control.loop.wording import hertz, mode_word
 from lowfc.programs.cli.output import print_result
 from lowfc.programs.cli.status import NO_HEALTH, recording_state
 from lowfc.programs.launch.watch import mode_name
@@ -59,7 +59,7 @@ def _lines(rows: list[dict[str, Any]]) -> list[str]:
             mode += " or not answering"
         if row["holding"]:
             mode += f" (command held: {row['holding']})"
-        rate = "" if row["rate_hz"] is None else f" at {row['rate_hz']:.0f} Hz, up {row['uptime_s']:.0f} s"
+        rate = "" if row["rate_hz"] is None else f" at {hertz(row['rate_hz'])}, up {row['uptime_s']:.0f} s"
         starting = {one["process"] for one in row["processes"] if one["state"] == "starting"}
         no_recorder = "its recorder is starting or not answering" if Role.RECORDER in starting else "not recording"
         recordings = {"recording": f"recording {row['log']}", "none": no_recorder}

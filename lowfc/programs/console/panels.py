@@ -15,11 +15,12 @@ from lowfc.contract.envelope import count_of
 from lowfc.contract.events import Level as Severity
 from lowfc.contract.messages import Log, from_timestamp, wire
 from lowfc.contract.printable import printable
+from lowfc.control.loop.wording import hertz
 from lowfc.programs.console.feed import TREND_S, Reading
 from lowfc.programs.console.phrases import phrased
 from lowfc.programs.view.draw.colours import GREY, ORANGE, RED, YELLOW, Colour, Rgb, diverging, sequential
 from lowfc.programs.view.verdicts.run_state import Liveness
-from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, duration, hertz, numbers, rounded
+from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, duration, numbers, rounded
 from lowfc.programs.view.verdicts.watcher import SILENT_S
 
 _PIXELS = 12

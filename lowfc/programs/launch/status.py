@@ -12,7 +12,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, FRAME, Role, wire
 from lowfc.contract.printable import printable
-from lowfc.control.loop.wording import counted, mode_word
+from lowfc.control.loop.wording import counted, hertz, mode_word
 from lowfc.programs.cli.contrast import contrast_cases, contrast_in_words, costliest_modes
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
@@ -34,7 +34,7 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     table.add_column(style="dim", justify="right")
     table.add_column()
     silent = _silence_notice(watch)
-    rate = silent or f"{camera.rate_hz:.0f} Hz of {config.camera.rate_hz:g} Hz"
+    rate = silent or f"{hertz(camera.rate_hz)} of {config.camera.rate_hz:g} Hz"
     table.add_row("loop", Text(f"{mode(controller)}, {rate}"))  # a string would be read as rich's markup
     table.add_row("wavefront", silent or _wavefront_in_words(camera))
     table.add_row("frame to command", latency(controller.frame_to_command))
@@ -62,7 +62,7 @@ def status_line(watch: Watch, elapsed_s: float, lockstep_hz: float | None = None
     contrast = "" if added is None else f"contrast {added['closed']:+.1e} of {added['open']:+.1e}  "
     just_closed = _closed_for(controller, lockstep_hz or camera.mean_rate_hz)
     return (
-        f"{elapsed_s:5.0f} s  {mode(controller)}{just_closed}  {camera.rate_hz:6.0f} Hz  "
+        f"{elapsed_s:5.0f} s  {mode(controller)}{just_closed}  {hertz(camera.rate_hz):>9}  "
         f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms  {contrast}"
         f"frame to command {latency(controller.frame_to_command)}  "
         f"skipped {frames.skipped} missing {frames.missing}  {recording(watch.health_of(Role.RECORDER))}"

@@ -4,9 +4,9 @@ from collections.abc import Iterable
 from functools import partial
 
 from lowfc.control.loop.safety import Reason, Rejection
-from lowfc.control.loop.wording import counted
+from lowfc.control.loop.wording import counted, hertz
 from lowfc.programs.view.verdicts.run_state import RECENT_S, Liveness, RunState
-from lowfc.programs.view.verdicts.tile import Level, Tile, absent, duration, hertz, worst_of
+from lowfc.programs.view.verdicts.tile import Level, Tile, absent, duration, worst_of
 
 SLOW = 0.9
 """Fraction of the camera's nominal rate below which camera or host does not keep up."""

@@ -10,14 +10,14 @@ import numpy as np
 from lowfc.adapters.logs.columns import Steps
 from lowfc.control.durations import Durations
 from lowfc.control.loop.safety import LoopMode
-from lowfc.control.loop.wording import counted
+from lowfc.control.loop.wording import counted, hertz
 from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.view.snapshot import LogEnd, Snapshot
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import PERIODS, RunState
 from lowfc.programs.view.verdicts.span_means import SpanMeans
-from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, hertz, rounded, worst_of
+from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, rounded, worst_of
 from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, stroke
 from lowfc.programs.view.verdicts.watcher import FRAMES_SILENT_S
 from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR, WORSE

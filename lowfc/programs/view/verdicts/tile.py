@@ -67,11 +67,6 @@ def rounded(value: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 
 
-def hertz(rate_hz: float) -> str:
-    """Text of a frame rate."""
-    return f"{rate_hz:.0f} Hz" if rate_hz >= 10 else f"{rate_hz:.2g} Hz"
-
-
 def numbers(values: Sequence[float]) -> str:
     """Text of up to three numbers, or of the range of more."""
     if len(values) < 4:

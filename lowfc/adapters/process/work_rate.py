@@ -1,0 +1,36 @@
+"""The rate of a process's work, as in its Health."""
+
+from collections import deque
+
+WINDOW_NS = 500_000_000
+UNITS = 4
+"""Least work in the time over which a rate is measured."""
+
+
+class WorkRate:
+    """Rate of work from its counts, as often as they are known: over half a second, or over four units if it is slow.
+
+    It is 0 after a silence in which four units were expected.
+    """
+
+    def __init__(self, now_ns: int) -> None:
+        """Work begins now."""
+        self._known: deque[tuple[int, int]] = deque([(now_ns, 0)], maxlen=16)  # times and counts after new work
+        self._last = now_ns, 0
+        self._rate_hz = 0.0
+
+    def update(self, now_ns: int, work: int) -> float:
+        """Rate of the work that has reached this count, Hz."""
+        if work != self._last[1]:
+            begun = [self._known[0]]
+            begun += [it for it in (*self._known, self._last) if work - it[1] >= UNITS and now_ns - it[0] >= WINDOW_NS]
+            since_ns, done = begun[-1]
+            if not self._rate_hz:
+                self._known.clear()
+            self._rate_hz = (work - done) * 1e9 / max(now_ns - since_ns, 1)
+            self._known.append((now_ns, work))
+        elif (silent_ns := now_ns - self._known[-1][0]) >= WINDOW_NS and silent_ns * 1e-9 * self._rate_hz >= UNITS:
+            self._rate_hz = 0.0
+            self._known = deque([self._known[-1]], maxlen=16)
+        self._last = now_ns, work
+        return self._rate_hz
