@@ -66,8 +66,18 @@ def test_every_cause_of_a_loop_that_was_not_closed_is_named() -> None:
         conditions = state.conditions._replace(mode_cause=f"cause {number}")
         account.note(state._replace(mode=LoopMode.OPEN, conditions=conditions), (10 + number) * SECOND)
     cause = account.note(state, 100 * SECOND)[1]
-    assert cause.startswith("operator asked to open (2 times); operator asked to pause (1 time); cause 0 (1 time); ")
+    assert cause.startswith("cause 49 (1 time); operator asked to open (2 times); operator asked to pause (1 time); ")
     assert cause.endswith("; other causes (48 times)")
+
+
+def test_the_causes_that_lasted_longest_are_named() -> None:
+    account, (state, _) = NotClosed(), feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1))
+    causes = ["open", "step", "pause", "step", "one", "two", "three", "open", "safe"]
+    for time_s, cause in enumerate(causes):
+        conditions = state.conditions._replace(mode_cause=cause)
+        account.note(state._replace(mode=LoopMode.OPEN, conditions=conditions), time_s * SECOND)
+    cause = account.note(state, 100 * SECOND)[1]
+    assert cause == "safe (1 time); open (2 times); step (2 times); pause (1 time); other causes (3 times)"
 
 
 @pytest.mark.parametrize(("not_closed_s", "fraction"), [(0, 1.0), (3, 0.7), (10, 0.0)])

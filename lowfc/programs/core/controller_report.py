@@ -19,8 +19,8 @@ from lowfc.programs.core.gain_watch import GainWatch
 TIMING_PERIOD_NS = 100_000_000
 SECOND_NS = 1_000_000_000
 CAUSES_NAMED = 4
-"""Number of causes that are listed with their counts, the most frequent first."""
-MAX_CAUSES = 20
+"""Number of causes that are listed with their counts, the longest in total first."""
+MAX_CAUSES = 200
 """Largest number of different causes counted: a cause may contain values, so that their number has no limit."""
 
 
@@ -167,16 +167,19 @@ class NotClosed:
         self._since_ns: int | None = None
         self._cause = ""
         self._causes: Counter[str] = Counter()
+        self._caused_ns: Counter[str] = Counter()
         self._occurrences = 0
 
     def note(self, state: State, now_ns: int) -> tuple[int, str]:
-        """Note the loop mode; return the time not closed, ns, and the causes, most frequent first."""
+        """Note the loop mode; return the time not closed, ns, and the causes, the longest first."""
         with self._lock:  # called from the main and the receiving thread
             if not state.frame_sequence:
                 return self._total_ns, self._causes_in_words()
             before_ns, self._since_ns = self._since_ns, None
             if before_ns is not None:
                 self._total_ns += max(0, now_ns - before_ns)
+                if self._cause in self._causes:
+                    self._caused_ns[self._cause] += max(0, now_ns - before_ns)
             if state.mode is not LoopMode.CLOSED:
                 cause, self._since_ns = state.conditions.mode_cause, now_ns
                 if cause and (before_ns is None or cause != self._cause):
@@ -189,7 +192,8 @@ class NotClosed:
     def _causes_in_words(self) -> str:
         if len(self._causes) < 2:
             return "".join(self._causes)
-        named = dict(self._causes.most_common(CAUSES_NAMED))
+        longest = sorted(self._causes, key=self._caused_ns.__getitem__, reverse=True)[:CAUSES_NAMED]
+        named = {cause: self._causes[cause] for cause in longest}
         if others := self._occurrences - sum(named.values()):
             named["other causes"] = others
         return "; ".join(f"{cause} ({counted(times, 'time')})" for cause, times in named.items())
