@@ -433,8 +433,22 @@ def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_p
     assert {term["missing"] for term in results["error_budget"]["terms"]} == {True}
     assert results["light"]["refused"] == {"dark": 200}
     assert results["verdict"]["checks"][2]["level"] == "look"  # the true wavefront is uncorrected
-    results = results_of(night.request("offset", (20.0, 0.0, 0.0)).write(tmp_path / "offset.mcap"))
-    assert results["verdict"]["checks"][2]["text"].endswith("(true, with the shapes of offset and channels)")
+
+
+@pytest.mark.parametrize(("frames", "shaped"), [((0, 400, 0), True), ((0, 200, 200), True), ((20, 20, 400), False)])
+def test_a_true_residual_with_an_offset_is_no_measure_of_the_loop(
+    tmp_path: Path, frames: tuple[int, int, int], shaped: bool
+) -> None:
+    before, during, after = frames
+    night = SyntheticLog().frames(before).request("offset", (20.0, 0.0, 0.0)).frames(during)
+    night.request("offset", (0.0, 0.0, 0.0))
+    if not shaped:
+        night.request("gain", (0.2,))  # a new law, and so another stretch
+    results = results_of(night.frames(after).write(tmp_path / "x.mcap"))
+    check, after_nm = results["verdict"]["checks"][2], results["residual"]["open_pupil"]["residual_open_pupil_rms_nm"]
+    assert (check["level"], results["residual"]["shaped"], "(true)" in check["text"]) == ("good", shaped, not shaped)
+    text = f"an offset or channels were in force, and their shapes are in the true residual of {after_nm:.3g} nm"
+    assert (text in check["text"]) is shaped
 
 
 @pytest.mark.parametrize("logged", [True, False])

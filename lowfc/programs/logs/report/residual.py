@@ -1,5 +1,7 @@
 """Residual wavefront: rms of each mode, and of tip and tilt on the sky."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from lowfc.adapters.files.factory import known_contrast
@@ -12,7 +14,7 @@ from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.contrast import added_contrast, with_variances
 from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.logs.report.closed_loop import Stretch, noise_of
-from lowfc.programs.logs.report.source import Results, Run
+from lowfc.programs.logs.report.source import Results, Run, row_after
 
 
 def residual_results(run: Run, stretch: Stretch | None) -> Results:
@@ -64,7 +66,7 @@ def residual_results(run: Run, stretch: Stretch | None) -> Results:
         },
         "open_pupil": open_pupil,
         "truth": "none" if history.true is None else "continuous" if true.continuous else "sampled only",
-        "shaped": any(map(holds_shape, history.controllers)),
+        "shaped": _shaped_in(run, stretch.rows if stretch is not None else slice(0, steps.sequence.size)),
         "steps_open": int(opened.size),
         "steps_closed": int(closed.size),
     }
@@ -91,6 +93,18 @@ def binned_rms(run: Run, max_bins: int = 300) -> dict[str, Array]:
 def bin_starts(rows: int, max_bins: int) -> Integers:
     """First row of each bin: at most `max_bins` bins of equal numbers of rows, only the last may have fewer."""
     return np.arange(0, rows, max(1, -(-rows // max_bins)))
+
+
+def _shaped_in(run: Run, rows: slice) -> bool:
+    """Whether an offset or a channel had a shape in some of these steps."""
+    states = run.history.controllers
+    changes = [k for k, state in enumerate(states) if not k or holds_shape(state) != holds_shape(states[k - 1])]
+    firsts = [row_after(run.history, states[k].frame_sequence, states[k].timestamp) for k in changes]
+    spans = pairwise([*firsts, rows.stop])
+    return any(
+        holds_shape(states[k]) and first < rows.stop and rows.start < end
+        for k, (first, end) in zip(changes, spans, strict=True)
+    )
 
 
 def _contrast(true: Truths, rows: Integers, config: Configuration | None) -> Results | None:
