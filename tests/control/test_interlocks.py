@@ -222,6 +222,9 @@ def test_a_permit_is_granted_while_the_loop_is_not_closed() -> None:
             check_reply(outputs, True, f"the loop is {state.mode.in_words}")
         _, outputs = applied(setup, after, "close" if name == "open" else "clear")
         check_reply(outputs, False, "reserved for moving the mask")
+    check_reply(outputs, False, "in safe mode `lowfc ctl safe`, ends that")  # `open` is refused there
+    state, _ = applied(setup, after, "safe")
+    check_reply(applied(setup, state, "clear")[1], True)
 
 
 def test_a_permit_is_refused_during_a_lease_or_a_probe_sequence() -> None:

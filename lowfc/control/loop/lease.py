@@ -80,7 +80,7 @@ def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
     if lease is not None and not lease.ended:
         if lease_id == lease.id:
             return ""
-        return f"{lease.reserved_message(time_ns)}; `lowfc ctl open` or `lowfc ctl safe` ends that"
+        return f"{lease.reserved_message(time_ns)}; `lowfc ctl open`, or in safe mode `lowfc ctl safe`, ends that"
     if not lease_id:
         return ""
     if lease is None or lease.id != lease_id:
