@@ -432,6 +432,15 @@ def test_what_clients_changed_before_a_late_mirror_does_not_end_the_controller(
         until(lambda name=name: any(name in event for event in events))
 
 
+def test_a_gain_request_of_a_camera_with_another_clock_ends_no_reservation(
+    calibration: Calibration, tmp_path: Path
+) -> None:
+    _, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
+    assert controller._carry_out_internal(Request(0, "lease", (), (5.0,), "somebody", lease_id=1)).accepted
+    reply = controller._carry_out_internal(Request(2**62, "gain", (), (0.1,), "auto"))  # the time of its frame
+    assert (reply.accepted, "the loop is reserved for somebody" in reply.text) == (False, True)
+
+
 def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: Calibration, tmp_path: Path) -> None:
     hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     mirror, shape = MemoryBus(hub, "mirror-dm", HostClock()), wire.MirrorState(rows=1, columns=1, actuators=bytes(4))

@@ -4,6 +4,7 @@ import contextlib
 import threading
 from collections import deque
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import partial
 
 from lowfc.adapters.bus.bus import ALL, Query, Sample
@@ -292,8 +293,8 @@ class Controller:
                 self._camera.wake()
 
     def _carry_out_internal(self, request: Request, lock: AbstractContextManager[object] | None = None) -> Reply:
-        """Carry out an internal request and publish it like an operator's."""
-        request = prepared(self._settings, request)
+        """Carry out an internal request, at the controller's time, and publish it like an operator's."""
+        request = prepared(self._settings, replace(request, time_ns=self._service.clock.now_ns()))
         reply, _, number = self._carry_out(request, lock)
         with self._requests_lock:
             self._requests.put(codec.encode_request(request, reply, number, None))
