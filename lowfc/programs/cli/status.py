@@ -210,9 +210,11 @@ def _in_short(known: dict[str, Any]) -> str:
     measured = ["no frame used in the last second"]
     if known["frames_used_last_second"]:
         true_nm = known["true_residual_rms_nm"]
+        on_purpose = any(known["offset_nm"]) or any(channel["name"] != FLAT for channel in known["channels"])
+        shapes = ", with offset and channels" if on_purpose else ""
         measured = [
             f"residual {known['residual_rms_nm']:.2f} nm rms, noise included"
-            + ("" if true_nm is None else f" (true {true_nm:.2f})"),
+            + ("" if true_nm is None else f" (true {true_nm:.2f}{shapes})"),
             f"light {100 * known['flux_fraction']:.0f} %",
         ]
     recording = {"recording": f"recording {known['log']}", "none": "not recording"}
