@@ -162,7 +162,7 @@ def test_a_lease_ends_after_its_number_of_frames() -> None:
     assert not remaining_rows(state)
 
 
-@pytest.mark.parametrize("period_ns", [250_000, 500_000, 999_999, 2_000_000, 7_300_000])
+@pytest.mark.parametrize("period_ns", [250_000, 500_000, 999_999, 2_000_000, 15_000_000])
 @pytest.mark.parametrize("ahead_ns", [0, 3600 * SECOND_NS])
 def test_a_lease_lasts_its_seconds_at_any_frame_rate(period_ns: int, ahead_ns: int) -> None:
     """The configured rate is 1 kHz, and the camera's clock may be another one."""

@@ -48,7 +48,7 @@ def counted_to_frame(settings: Settings, state: State, frame: Frame) -> State:
     """The state with the end of its lease counted to a new frame: in periods of the configured rate, by frames' times.
 
     Only their differences count, because the camera may have another clock. Frames count if their times do not
-    increase, and after a silence, in which ticks have the time. When the camera starts, all periods remain.
+    increase, and after a silence, in which a tick surely has the time. When the camera starts, all periods remain.
     """
     held, frames = state.conditions.lease, frame.sequence - state.frame_sequence
     if held is None or held.ended or not (settings.rate_hz and held.same_start(state.frame_sequence)):
@@ -57,7 +57,7 @@ def counted_to_frame(settings: Settings, state: State, frame: Frame) -> State:
     if held.same_start(frame.sequence):
         period_ns, elapsed_ns = max(1, round(1e9 / settings.rate_hz)), frame.time_ns - state.frame_time_ns
         periods = frame.time_ns // period_ns - state.frame_time_ns // period_ns
-        if elapsed_ns <= 0 or (periods > frames and elapsed_ns > TICK_NS):
+        if elapsed_ns <= 0 or (periods > frames and elapsed_ns > 2 * TICK_NS):
             return state
     last_sequence = max(held.last_sequence + frames - periods, frame.sequence - 1)
     return _with(state, held._replace(last_sequence=last_sequence))
