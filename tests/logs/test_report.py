@@ -449,6 +449,9 @@ def test_a_true_residual_with_an_offset_is_no_measure_of_the_loop(
     assert (check["level"], results["residual"]["shaped"], "(true)" in check["text"]) == ("good", shaped, not shaped)
     text = f"an offset or channels were in force, and their shapes are in the true residual of {after_nm:.3g} nm"
     assert (text in check["text"]) is shaped
+    terms = {term["name"]: term for term in results["error_budget"]["terms"]}
+    assert (terms["cross-talk and aliasing"]["missing"], terms["lag"]["missing"]) == (shaped, False)
+    assert (results["error_budget"]["true_residual"]["rms_nm"]["all modes"] is None) is shaped
 
 
 @pytest.mark.parametrize("logged", [True, False])

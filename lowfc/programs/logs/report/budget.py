@@ -18,14 +18,20 @@ _THROUGH = "times the loop's noise transfer"
 _NO_CAMERA = "a calibration, light, and the camera's gain"
 _NO_TRUTH = "the true wavefront, known only in simulation"
 _TOO_SHORT = "a longer stretch with the loop closed"
+_SHAPED = "a stretch without offset and channels, whose shapes are in the true residual"
 
 
-def budget_results(run: Run, stretch: Stretch | None, spectra: Spectra | None, masks: Masks) -> Results:
-    """Terms, their sum and the values to compare it with, in nm rms over each group of modes."""
+def budget_results(
+    run: Run, stretch: Stretch | None, spectra: Spectra | None, masks: Masks, *, shaped: bool
+) -> Results:
+    """Terms, their sum and the values to compare it with, in nm rms over each group of modes.
+
+    If the true residual is `shaped` by offset or channels, it measures nothing, and is left out.
+    """
     if stretch is None:
         return {"why_not": why_none(run)}
     noise = noise_of(run.history, stretch.rows)
-    terms = _terms(stretch, spectra, noise)
+    terms = _terms(stretch, spectra, noise, shaped=shaped)
     rows = [
         {"name": name, "how": how} | _columns(term, masks) | {"missing": term is None}
         for name, (term, how) in terms.items()
@@ -33,7 +39,9 @@ def budget_results(run: Run, stretch: Stretch | None, spectra: Spectra | None, m
     known = [term for term, _ in terms.values() if term is not None]
     total = Term(np.sum([np.maximum(term.variance_nm2, 0) for term in known], axis=0)) if known else None
     missing = [name for name, (term, _) in terms.items() if term is None]
-    true = Term(stretch.residual_ms_nm2) if stretch.residual_ms_nm2 is not None and stretch.frames.values else None
+    true = None
+    if stretch.residual_ms_nm2 is not None and stretch.frames.values and not shaped:
+        true = Term(stretch.residual_ms_nm2)
     measured = Term(np.mean(stretch.signal(ERROR).joined() ** 2, axis=0)) if stretch.frames.values else None
     return {
         "terms": rows,
@@ -52,7 +60,7 @@ def budget_results(run: Run, stretch: Stretch | None, spectra: Spectra | None, m
     }
 
 
-def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None) -> dict[str, Entry]:
+def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None, *, shaped: bool) -> dict[str, Entry]:
     """Each term and its source, or None and what would be required."""
     law, timing = stretch.law, stretch.timing
     entries: dict[str, Entry] = {}
@@ -75,16 +83,18 @@ def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None)
         mean_nm = stretch.signal(POL).joined().mean(axis=0)
         how = "pseudo-open-loop spectrum minus its noise floor, times the rejection"
         entries["lag"] = (lag_under_noise(law, spectra[POL], mean_nm, timing), how)
-    crosstalk, nonlinearity = _measurement_terms(stretch, noise)
+    crosstalk, nonlinearity = _measurement_terms(stretch, noise, shaped=shaped)
     entries["cross-talk and aliasing"] = crosstalk
     entries["nonlinearity"] = nonlinearity
     return entries
 
 
-def _measurement_terms(stretch: Stretch, noise: SensorNoise | None) -> tuple[Entry, Entry]:
+def _measurement_terms(stretch: Stretch, noise: SensorNoise | None, *, shaped: bool) -> tuple[Entry, Entry]:
     split, missing = None, _TOO_SHORT
     if not stretch.true:
         missing = _NO_TRUTH
+    elif shaped:
+        missing = _SHAPED
     elif noise is None:
         missing = _NO_CAMERA
     else:

@@ -195,7 +195,7 @@ def _budget(figure: "Figure", report: Report) -> bool:
         return False
     rows = [(term["name"], term["rms_nm"], term["upper_limit"]) for term in budget["terms"] if not term["missing"]]
     rows.append(("sum of the terms", budget["sum"]["rms_nm"], []))
-    if report.results["closed_stretch"]["true"]:
+    if report.results["closed_stretch"]["true"] and not report.results["residual"]["shaped"]:
         rows.append(("true residual", budget["true_residual"]["rms_nm"], []))
     groups = [name for name in budget["sum"]["rms_nm"] if name != "all modes"]
     panels = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]

@@ -41,6 +41,7 @@ def report_of(run: Run) -> Report:
     spectra = spectra_of(stretch)
     noll = history.calibration.noll if history.calibration is not None else ()
     masks = groups_of(noll) | {"all modes": np.ones(len(noll), bool)}
+    residual = residual_results(run, stretch)
     results: Results = {
         "log": _log(run),
         "run": _run(run),
@@ -49,9 +50,9 @@ def report_of(run: Run) -> Report:
         "laws": course.laws(run),
         "closed_stretch": stretch_results(run, stretch),
         "timing": timing_results(run),
-        "residual": residual_results(run, stretch),
+        "residual": residual,
         "spectra": spectra_results(run, stretch, spectra),
-        "error_budget": budget_results(run, stretch, spectra, masks),
+        "error_budget": budget_results(run, stretch, spectra, masks, shaped=residual["shaped"]),
         "light": course.light_results(history),
         "mirror": course.mirror_results(history),
         "events": course.events(run),
