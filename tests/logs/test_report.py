@@ -436,6 +436,7 @@ def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_p
 
 
 @pytest.mark.parametrize(("frames", "shaped"), [((0, 400, 0), True), ((0, 200, 200), True), ((20, 20, 400), False)])
+@pytest.mark.usefixtures("without_drawings")
 def test_a_true_residual_with_an_offset_is_no_measure_of_the_loop(
     tmp_path: Path, frames: tuple[int, int, int], shaped: bool
 ) -> None:
@@ -444,7 +445,9 @@ def test_a_true_residual_with_an_offset_is_no_measure_of_the_loop(
     night.request("offset", (0.0, 0.0, 0.0))
     if not shaped:
         night.request("gain", (0.2,))  # a new law, and so another stretch
-    results = results_of(night.frames(after).write(tmp_path / "x.mcap"))
+    report = report_of(read_run(night.frames(after).write(tmp_path / "x.mcap")))
+    results = report.results
+    assert ("The true residual includes the shapes of offset or channels." in page(report)) is shaped
     check, after_nm = results["verdict"]["checks"][2], results["residual"]["open_pupil"]["residual_open_pupil_rms_nm"]
     assert (check["level"], results["residual"]["shaped"], "(true)" in check["text"]) == ("good", shaped, not shaped)
     text = f"an offset or channels were in force, and their shapes are in the true residual of {after_nm:.3g} nm"
