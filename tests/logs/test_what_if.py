@@ -468,6 +468,7 @@ def test_warnings_name_what_makes_the_results_doubtful() -> None:
     logged = replace(history(reasons=reasons, pol_nm=pol), requests=[wire.Request(name="gain", accepted=True)])
     logged.mirror.limits = np.array([0, 1, 1])
     logged.controllers[0].law.name = "lqg"
+    logged.controllers[0].channels.add(name="dark-hole")
     logged.log.finished = False
     logged.log.damage.append(Damage(77, 5, "the checksum of a chunk is wrong"))
     warnings = "\n".join(what_if(LoggedRun(logged), WhatIf())["warnings"])
@@ -480,6 +481,7 @@ def test_warnings_name_what_makes_the_results_doubtful() -> None:
         "the log has no end",
         "lacks some commands: 1 frame exposed with a missing",
         "a linear law (lqg) was in use",
+        "an offset or channels were in force",
     ):
         assert words in warnings
 
