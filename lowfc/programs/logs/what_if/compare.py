@@ -23,7 +23,7 @@ from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words, with_variances
 from lowfc.programs.cli.result import table
-from lowfc.programs.cli.status import shaped
+from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.logs.what_if.options import LAW_KEYS, WhatIf, law, logged_gains
 from lowfc.programs.logs.what_if.run import LoggedRun
 
@@ -257,7 +257,7 @@ def _log_warnings(run: LoggedRun) -> list[str]:
             f"the mirror's own limits acted on {counted(int(count), 'command')}{recorded}: pseudo-open-loop modes are "
             "wrong there"
         )
-    if any(map(shaped, run.history.controllers)):
+    if any(map(holds_shape, run.history.controllers)):
         true = "" if run.true_nm is None else ", and true values include the shapes of both"
         found.append(f"an offset or channels were in force: the open loop is relative to the offset{true}")
     if changes := sum(one.accepted and one.name in LAW_KEYS for one in run.history.requests):
