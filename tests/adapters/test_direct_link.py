@@ -44,10 +44,10 @@ class Ends:
         self.threads.append(threading.current_thread().name)
         self.sizes.append(len(sample.payload))
 
-    def publish(self, publisher: ZenohPublisher, messages: int, pause_s: float = 0.001) -> None:
+    def publish(self, publisher: ZenohPublisher, messages: int) -> None:
         for _ in range(messages):
             publisher.put(bytes(1000))
-            time.sleep(pause_s)
+            time.sleep(0.001)
 
     def until_direct_only(self, publisher: ZenohPublisher) -> None:
         """Publish until messages arrive over the direct link only."""

@@ -52,14 +52,14 @@ Action = Callable[[Any], object]
 
 
 def calibrator_of(
-    loop: InProcessLoop, method: str, cycles: int = 4, *, report: Callable[[str], None] = ignore, **options: Any
+    loop: InProcessLoop, method: str, *, report: Callable[[str], None] = ignore, **options: Any
 ) -> Calibrator:
-    request = CalibrationRequest(method, **{"out": OUT, "snr": 50.0, "cycles": cycles, **options})
+    request = CalibrationRequest(method, **{"out": OUT, "snr": 50.0, "cycles": 4, **options})
     return Calibrator(loop, request, report, ignore)
 
 
-def measure(loop: InProcessLoop, method: str, cycles: int = 4, **options: Any) -> tuple[Calibrator, CalibrationData]:
-    calibrator = calibrator_of(loop, method, cycles, **options)
+def measure(loop: InProcessLoop, method: str, **options: Any) -> tuple[Calibrator, CalibrationData]:
+    calibrator = calibrator_of(loop, method, **options)
     with calibrator.required_mode():
         return calibrator, calibrator.run()
 
@@ -69,8 +69,8 @@ def mode_of(loop: InProcessLoop) -> int:
     return state.mode
 
 
-def calibrated(loop: InProcessLoop, method: str, cycles: int) -> tuple[Calibration, CalibrationData]:
-    calibrator, data = measure(loop, method, cycles)
+def calibrated(loop: InProcessLoop, method: str) -> tuple[Calibration, CalibrationData]:
+    calibrator, data = measure(loop, method)
     request = CalibrationRequest(method, OUT, 50.0)
     return measured_calibration(loop.config, calibrator.before, data.measured, request)[0], data
 
@@ -92,7 +92,7 @@ def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, 
         loop.close_loop()
         loop.run(30)
     before = loop.calibration()
-    calibration, data = calibrated(loop, method, 4)
+    calibration, data = calibrated(loop, method)
     assert abs(data.delay.delay_frames - delay) < 0.05
     assert data.measured.error.max() < 0.02
     talk = np.abs(cross_talk(calibration.reconstructor, before.response))
@@ -125,7 +125,7 @@ def closed_residual_nm(
 
 def test_measured_and_computed_calibrations_give_residuals_within_5_percent() -> None:
     loop = InProcessLoop(configured(**FEW))
-    calibration, _ = calibrated(loop, "hadamard", 4)
+    calibration, _ = calibrated(loop, "hadamard")
     disturbed = configured(**FEW, disturbance__preset="bench")
     residuals = (closed_residual_nm(disturbed, each, 300, disturbed) for each in (loop.calibration(), calibration))
     computed_rms, measured_rms = (np.sqrt((each**2).sum(axis=1).mean()) for each in residuals)
@@ -140,8 +140,8 @@ def test_a_mirror_with_dead_actuators_and_misregistration_is_calibrated_and_clos
     config = configured(**NOISELESS, mirror__active="active.npy")
     true = {"mirror__dead": dead, "mirror__magnification": 1.01, "mirror__shift_pitches": 0.1}
     loop = InProcessLoop(config, world=configured(**NOISELESS, **true))
-    calibration, data = calibrated(loop, "hadamard", 4)
-    assert calibrator_of(loop, "hadamard", 4).pokes.amplitude_nm <= 3
+    calibration, data = calibrated(loop, "hadamard")
+    assert calibrator_of(loop, "hadamard").pokes.amplitude_nm <= 3
     assert not calibration.modes_to_actuators[dead].any()
     assert not calibration.actuators_to_modes[:, dead].any()
     computed_talk = cross_talk(loop.calibration().reconstructor, data.measured.response)
@@ -155,7 +155,7 @@ def test_the_loop_holds_a_zero_point_that_is_not_flat() -> None:
     state = {"3": -10.0, "4": 15.0}
     config = configured(**NOISELESS)
     loop = InProcessLoop(config, world=configured(**NOISELESS, disturbance__static_nm=state))
-    calibration, _ = calibrated(loop, "hadamard", 4)
+    calibration, _ = calibrated(loop, "hadamard")
     zero = loop.residual_nm(0, 1)[0]
     moved_by_20_nm = configured(**NOISELESS, disturbance__static_nm={"2": 20.0, "3": -10.0, "4": 35.0})  # from `state`
     difference = closed_residual_nm(config, calibration, 200, moved_by_20_nm).mean(axis=0) - zero
@@ -165,9 +165,9 @@ def test_the_loop_holds_a_zero_point_that_is_not_flat() -> None:
 def test_a_closed_loop_is_opened_for_pokes_and_closed_afterwards() -> None:
     loop = InProcessLoop(configured(**FEW))
     with pytest.raises(CalibrationError, match="the loop is open: `lowfc ctl close` first"):
-        measure(loop, "in-loop", 4)
+        measure(loop, "in-loop")
     loop.close_loop()
-    calibrator = calibrator_of(loop, "poke", 4)
+    calibrator = calibrator_of(loop, "poke")
     with calibrator.required_mode():
         assert mode_of(loop) == wire.LOOP_MODE_OPEN
     assert mode_of(loop) == wire.LOOP_MODE_CLOSED
@@ -176,7 +176,7 @@ def test_a_closed_loop_is_opened_for_pokes_and_closed_afterwards() -> None:
     assert mode_of(loop) == wire.LOOP_MODE_CLOSED
     loop.limit(0.1)
     with pytest.raises(CalibrationError, match=r"a limit acted on the pokes \(MODAL_LIMIT\)"):
-        measure(loop, "in-loop", 4)
+        measure(loop, "in-loop")
     loop.ask("safe")
     with pytest.raises(CalibrationError, match="must be open or closed"), calibrator.required_mode():
         pass
@@ -199,15 +199,15 @@ def test_errors_name_why_a_calibration_is_impossible(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(recording, "ATTEMPTS", 2)
     dead_mirror = InProcessLoop(configured(**FEW), world=configured(**FEW, mirror__dead=list(range(12 * 12))))
     with pytest.raises(CalibrationError, match="pokes are not seen"):
-        measure(dead_mirror, "hadamard", 4)
+        measure(dead_mirror, "hadamard")
     loop = InProcessLoop(configured(**FEW))
     with pytest.raises(CalibrationError, match="at most 3 nm of each"):
-        calibrator_of(loop, "hadamard", 4, amplitude_nm=5.0)
+        calibrator_of(loop, "hadamard", amplitude_nm=5.0)
     with pytest.raises(CalibrationError, match="slew limit; at most"):
-        calibrator_of(loop, "poke", 4, amplitude_nm=500.0)
+        calibrator_of(loop, "poke", amplitude_nm=500.0)
     lossy = InProcessLoop(configured(**FEW), lose=lambda index: index % 50 == 49)
     with pytest.raises(CalibrationError, match="in 2 attempts there were no 240 consecutive frames"):
-        measure(lossy, "hadamard", 4)
+        measure(lossy, "hadamard")
 
 
 class FaultyLoop(InProcessLoop):
@@ -294,20 +294,20 @@ def test_ctrl_c_restores_the_mirror_and_keeps_the_completed_cycles() -> None:
     before_nm = loop.surfaces_nm[-1]
     assert np.abs(before_nm).max() > 1
     with pytest.raises(KeyboardInterrupt):
-        measure(loop, "hadamard", 4)
+        measure(loop, "hadamard")
     assert np.abs(loop.surfaces_nm[-1] - before_nm).max() > 1
     loop.run(5)
     assert np.array_equal(loop.surfaces_nm[-1], before_nm)
     assert loop.stops == 1
     kept = resumed(partial_of(OUT), {"method": "hadamard"})
     assert kept.cycles == 1
-    _, data = measure(loop, "hadamard", 4, resume=True)
+    _, data = measure(loop, "hadamard", resume=True)
     assert data.measured.cycles == 4
     assert np.array_equal(loop.surfaces_nm[-1], before_nm)
     with pytest.raises(DataFileError, match="method is hadamard in the file, now poke"):
-        measure(loop, "poke", 4, resume=True)
+        measure(loop, "poke", resume=True)
     with pytest.raises(DataFileError, match="nothing to resume"):
-        measure(loop, "poke", 4, out=Path("other.fits"), resume=True)
+        measure(loop, "poke", out=Path("other.fits"), resume=True)
 
 
 @pytest.mark.parametrize(

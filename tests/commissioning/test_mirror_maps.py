@@ -186,12 +186,12 @@ def started(config: Configuration, calibration: Calibration, shape: MirrorShape 
     return state, requests
 
 
-def commands(config: Configuration, state: State, frames: int) -> tuple[list[Single], list[str]]:
-    """Commands over some frames of uniform light in open loop, and the names of the channels at their end."""
+def commands(config: Configuration, state: State) -> tuple[list[Single], list[str]]:
+    """Commands over ten frames of uniform light in open loop, and the names of the channels at their end."""
     settings = replace(factory.settings(config), min_flux_fraction=0.0, max_identical_frames=0)
     calibration, sent = state.loop.calibration, []
     pixels = np.rint(calibration.dark + 100).reshape(calibration.shape).astype(np.uint16)
-    for index in range(frames):
+    for index in range(10):
         state, outputs = advance(settings, state, Frame(1 + index, index, 0, pixels))
         sent.append(outputs.command.actuators_nm)
     return sent, [channel.name for channel in state.loop.channels_or_empty().channels]
@@ -201,7 +201,7 @@ def test_the_flat_map_is_applied_at_the_start(tmp_path: Path, calibration: Calib
     config = load(None, {"mirror.flat": saved(tmp_path, "flat.fits", wavy(120.0))})
     state, requests = started(config, calibration, None)
     assert [(request.name, request.text) for request in requests] == [("channel", FLAT)]
-    sent, names = commands(config, state, 10)
+    sent, names = commands(config, state)
     assert names == [FLAT]
     np.testing.assert_allclose(sent[-1], wavy(120.0), atol=1e-3)
     steps = np.abs(np.diff([np.zeros(GRID), *sent], axis=0)).max(axis=(1, 2))
@@ -233,7 +233,7 @@ def test_a_restarted_controller_does_not_apply_the_flat_map_twice(
     reported_nm = modal_nm if command_reported else np.zeros(0, np.float32)
     state, requests = started(config, calibration, MirrorShape(0, mirror_nm, reported_nm))
     assert [request.text for request in requests] == [ADOPTED, FLAT]
-    sent, names = commands(config, state, 10)
+    sent, names = commands(config, state)
     for shape in sent:
         np.testing.assert_allclose(shape, mirror_nm, atol=2e-3)
     # Without a report, the adopted modal command includes the flat map's modes, and the channel ADOPTED cancels them.

@@ -51,9 +51,9 @@ def known_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -
     return lqg(models, config.noll, timing_of(config)), np.array(gains)
 
 
-def law_with_gains(*gain: float, leak: tuple[float, ...] = (0.0, 0.0, 0.0)) -> LinearLaw:
+def law_with_gains(*gain: float) -> LinearLaw:
     """An integrator as a linear law, with these gains of tip, tilt and focus."""
-    return integrator(gain, leak, NOLL, 1.0, RATE_HZ)
+    return integrator(gain, (0.0, 0.0, 0.0), NOLL, 1.0, RATE_HZ)
 
 
 GOOD, BAD_TILT, BAD_FOCUS = (law_with_gains(*gain) for gain in ((0.6, 0.6, 0.4), (0.05, 0.05, 0.3), (0.5, 0.5, 0.05)))

@@ -29,10 +29,10 @@ def mask(value: Value | None, age_ns: int = 0) -> BenchReport:
     return BenchReport(5, "mask", value, age_ns)
 
 
-def running(setup: Settings, frames: int = 5) -> State:
+def running(setup: Settings) -> State:
     """A closed loop without an acting interlock."""
     quiet = next(value for value in (False, 0.0, "still") if type(value) is type(setup.interlocks[0].value))
-    return feed(setup, loaded(setup), mask(quiet), *(frame(count, SOME) for count in range(1, frames + 1)))[0]
+    return feed(setup, loaded(setup), mask(quiet), *(frame(count, SOME) for count in range(1, 6)))[0]
 
 
 def applied(setup: Settings, state: State, name: str, **fields: object) -> tuple[State, Outputs]:

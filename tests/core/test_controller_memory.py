@@ -137,8 +137,8 @@ class Rig(ThreadedRun):
         shape = self.calibration.modes_to_actuators @ np.asarray(modes_nm, np.float32)
         self.offset_nm = shape.reshape(GRID)
 
-    def ask(self, name: str, *values: float, modes: tuple[int, ...] = ()) -> wire.Request:
-        payload = wire.Request(modes=modes, values=values).SerializeToString()
+    def ask(self, name: str, *values: float) -> wire.Request:
+        payload = wire.Request(values=values).SerializeToString()
         (answer,) = self.operator.get(f"lowfc/request/{name}", payload, PATIENCE_S)
         return wire.Request.FromString(answer.payload)
 

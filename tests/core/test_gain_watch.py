@@ -50,10 +50,10 @@ def bench(magnitude: float, preset: str = "bench", sensor: str = "sam", **change
     return Bench(configuration(magnitude, preset, sensor, **changed), calibration(magnitude, sensor))
 
 
-def modal_bench(magnitude: float) -> ModalBench:
+def modal_bench() -> ModalBench:
     """A loop with the noise of the images, but without images, for tests of requests."""
-    config = configuration(magnitude)
-    return ModalBench(config, factory.frame_noise_nm2(config, calibration(magnitude, "sam")))
+    config = configuration(2.0)
+    return ModalBench(config, factory.frame_noise_nm2(config, calibration(2.0, "sam")))
 
 
 def named(loop: Bench, name: str) -> list[dict[str, object]]:
@@ -174,7 +174,7 @@ def test_the_gain_bank_receives_the_response_of_the_reweighted_reconstructor(
 
 def test_the_command_of_a_mode_with_automatic_gain_zero_relaxes_to_zero() -> None:
     """With a manual gain of 0, the command stays."""
-    loop = modal_bench(2.0)
+    loop = modal_bench()
     loop.run(560)
     loop.ask("gain", modes=(4,), values=(0.0,))
     gain = gains(loop).copy()
@@ -323,7 +323,7 @@ def test_the_integrator_takes_over_from_a_harmful_law_once_the_loop_is_not_reser
 
 @pytest.mark.parametrize("request_name", ["open", "pause"])
 def test_a_loop_opened_by_an_operator_while_gains_are_measured_stays_open(request_name: str) -> None:
-    loop = modal_bench(2.0)
+    loop = modal_bench()
     loop.run(100)
     loop.ask(request_name)
     loop.run(500)
@@ -332,7 +332,7 @@ def test_a_loop_opened_by_an_operator_while_gains_are_measured_stays_open(reques
 
 
 def test_a_mode_can_have_a_manual_gain_and_return_to_automatic() -> None:
-    loop = modal_bench(2.0)
+    loop = modal_bench()
     loop.run(510)
     loop.ask("gain", values=(0.3,), modes=(4,))
     loop.run(300)

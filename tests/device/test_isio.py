@@ -229,12 +229,12 @@ def test_a_recreated_channel_that_cannot_be_used_fails_commands_until_it_can(fol
 class Sum(threading.Thread):
     """Stand-in for the process that sums the channels: clips the sum, then subtracts its mean."""
 
-    def __init__(self, folder: Path, limit: float, delay_s: float = 0.0) -> None:
+    def __init__(self, folder: Path, delay_s: float = 0.0) -> None:
         super().__init__(daemon=True)
         self.delay_s = delay_s
         self.total = channel(folder, "dm00disp", make=True)
         self.others = channel(folder, "dm00disp00", make=True)
-        self.own, self.limit, self.running = channel(folder), limit, True
+        self.own, self.running = channel(folder), True
         self.own.take(4)  # its semaphore
         self.start()
 
@@ -242,7 +242,7 @@ class Sum(threading.Thread):
         while self.running:
             if self.own.wait(4, 0.01):
                 time.sleep(self.delay_s)
-                total = np.clip(self.own.pixels[0] + self.others.pixels[0], -self.limit, self.limit)
+                total = np.clip(self.own.pixels[0] + self.others.pixels[0], -0.5, 0.5)
                 self.total.write(total - total.mean())
 
 
@@ -250,7 +250,7 @@ def test_the_reached_position_comes_from_the_sum_of_channels(folder: Path, monke
     monkeypatch.setattr(mirror_module, "SUM_WAIT_S", 2.0)
     monkeypatch.setattr(mirror_module, "_SEARCH_S", 0.0)
     channel(folder, make=True)
-    summing = Sum(folder, 0.5)
+    summing = Sum(folder)
     driver, _ = mirror()
     summing.others.write(shape_nm(3) / 1000 + 0.1)
     assert driver.apply(shape_nm(1)) is None  # as written, except for piston
@@ -274,7 +274,7 @@ def test_the_reached_position_comes_from_the_sum_of_channels(folder: Path, monke
 def test_a_sum_that_is_always_late_follows(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mirror_module, "SUM_SILENT_S", 0.1)
     channel(folder, make=True)
-    summing = Sum(folder, 0.5, delay_s=0.01)
+    summing = Sum(folder, delay_s=0.01)
     driver, _ = mirror()
     for seed in range(5):
         assert driver.apply(shape_nm(seed)) is None
@@ -305,7 +305,7 @@ def test_a_sum_that_is_absent_although_expected_counts_as_not_following(
         assert driver.apply(shape_nm(1)) is None
     monkeypatch.setattr(mirror_module, "SUM_WAIT_S", 2.0)
     driver, _ = mirror()
-    summing = Sum(folder, 0.5)
+    summing = Sum(folder)
     assert driver.apply(shape_nm(1)) is None
     (folder / "dm00disp.im.shm").unlink()
     absent_for_a_while(driver, "dm00disp")

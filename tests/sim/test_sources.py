@@ -27,8 +27,8 @@ def quiet(**changed: Any) -> Configuration:
     return load(None, keys | {key.replace("__", "."): value for key, value in changed.items()})
 
 
-def wheel(course: str, change: float, start_hz: float = 30.0) -> Wheel:
-    return wheels(3, (start_hz,), np.array([2.0, 3.0]), course, change)[0]
+def wheel(course: str, change: float) -> Wheel:
+    return wheels(3, (30.0,), np.array([2.0, 3.0]), course, change)[0]
 
 
 @pytest.mark.parametrize(

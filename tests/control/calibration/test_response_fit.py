@@ -143,15 +143,12 @@ def initial_of_sensor(seed: int = 1) -> Initial:
     return Initial(reconstructor(*truth(seed), GOOD, FLUX_E, 0.0), "weighted")
 
 
-def measured(patterns: np.ndarray, cycles: int, drift: float = 0.0) -> Measured:
+def measured(patterns: np.ndarray, cycles: int) -> Measured:
     """H and its error from cycles of simulated frames."""
     sums = Sums.none(initial_of_sensor())
     for number in range(cycles):
         plan = cycle(patterns, hold=4, settle=1, rest=16, backwards=number % 2 == 1)
-        time = np.arange(len(plan))[:, None] / len(plan)
-        wander = drift * (time - 0.7 * time**2) * np.arange(1, MODES + 1)
-        frames = exposed(plan.table + wander, 100 + number)
-        fractions, flux = fractions_of(frames)
+        fractions, flux = fractions_of(exposed(plan.table, 100 + number))
         sums = sums.plus(cycle_response(fractions, flux, plan.table, plan.table, plan.used.astype(float)))
     return fit_response(sums)
 

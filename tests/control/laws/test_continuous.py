@@ -33,9 +33,9 @@ def integrator_of_tip(gain: float, delay: float) -> LinearLaw:
     return integrator([gain], [0.0], (2,), delay, RATE_HZ)
 
 
-def wheel(noise_nm2: float = 1e-6) -> Model:
+def wheel() -> Model:
     lines = tuple(Line(hz, 1e-6, mas**2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
-    return Model(1e-9, np.inf, lines, noise_nm2, RATE_HZ)
+    return Model(1e-9, np.inf, lines, 1e-6, RATE_HZ)
 
 
 def simulated_residual(law: LinearLaw, omega: float, timing: Timing) -> float:

@@ -49,10 +49,7 @@ def columns(steps: list[Step]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
     return error, pol, np.array([step.command_nm for step in steps]), missing_before(sequence)
 
 
-def walk(frames: int) -> np.ndarray:
-    return np.array([15.0, -9.0, 6.0]) + np.cumsum(np.random.default_rng(4).normal(size=(frames, 3)), axis=0)
-
-
+WALK = np.array([15.0, -9.0, 6.0]) + np.cumsum(np.random.default_rng(4).normal(size=(160, 3)), axis=0)
 MISSING = (30, 31, 32, 33, 34, 35, 60, 90, 91)
 DARK = (45, 46, 100, 101, 102, 103)
 
@@ -61,7 +58,7 @@ DARK = (45, 46, 100, 101, 102, 103)
 def test_the_logged_gains_reproduce_the_logged_run(delay: float) -> None:
     """Up to float32 rounding in pol = error - seen, with missing and refused frames and acting modal limits."""
     setup = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0), limit_nm=(12.0, 50.0))
-    error, pol, command, missing = columns(live_steps(setup, walk(160)))
+    error, pol, command, missing = columns(live_steps(setup, WALK))
     assert missing.sum() == 9
     assert np.isnan(error).any(axis=1).sum() == len(DARK)
     assert (np.abs(command[:, 0]) == 12.0).any()
@@ -76,9 +73,8 @@ def test_other_gains_reproduce_a_run_with_these_gains(delay: float) -> None:
     """For a sensor that is linear up to the rounding to DN, here 0.01 nm."""
     before = settings(delay_frames=delay, gain=(0.3, 0.1), **WIDE)
     after = settings(delay_frames=delay, gain=(0.1, 0.25), leak=(0.02, 0.01), **WIDE)
-    disturbance = walk(160)
-    _, pol, _, missing = columns(live_steps(before, disturbance))
-    error, _, command, _ = columns(live_steps(after, disturbance))
+    _, pol, _, missing = columns(live_steps(before, WALK))
+    error, _, command, _ = columns(live_steps(after, WALK))
     law = limited_integrator(after.integrator((2, 3, 4)))
     other_error, other_command = counterfactual(law, weights(delay), pol, missing)
     np.testing.assert_allclose(other_error, error, atol=0.05)

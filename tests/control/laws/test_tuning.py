@@ -29,10 +29,10 @@ NM_PER_MAS = tilt_nm_per_mas(2.0)
 NO_LEAK = np.zeros(2)
 
 
-def wheel(frames: int, seed: int = 1, noise_nm: float = 0.8) -> tuple[TimeSeries, np.ndarray]:
+def wheel(frames: int) -> tuple[TimeSeries, np.ndarray]:
     """Pseudo-open-loop tilts of the reaction wheel, and the true tilts."""
-    truth = modes_nm(preset_disturbance("reaction-wheel", NOLL, seed, NM_PER_MAS, 550.0), 0, frames, RATE_HZ)
-    noise = noise_nm * np.random.default_rng(seed).standard_normal(truth.shape)
+    truth = modes_nm(preset_disturbance("reaction-wheel", NOLL, 1, NM_PER_MAS, 550.0), 0, frames, RATE_HZ)
+    noise = 0.8 * np.random.default_rng(1).standard_normal(truth.shape)
     return TimeSeries((truth + noise,), 0), truth
 
 

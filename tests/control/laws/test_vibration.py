@@ -21,15 +21,15 @@ RATE_HZ = 1000.0
 NM_PER_MAS = tilt_nm_per_mas(2.0)
 
 
-def preset(name: str, frames: int) -> TimeSeries:
-    """Tip of a preset, measured with white noise."""
-    simulated = preset_disturbance(name, (2, 3, 4), 1, NM_PER_MAS, 550.0)
-    noise = 0.8 * np.random.default_rng(1).standard_normal((frames, 1))
-    return TimeSeries((modes_nm(simulated, 0, frames, RATE_HZ)[:, :1] + noise,), 0)
+def ideal_wheel() -> TimeSeries:
+    """Tip of the ideal reaction wheel, measured with white noise."""
+    simulated = preset_disturbance("reaction-wheel-ideal", (2, 3, 4), 1, NM_PER_MAS, 550.0)
+    noise = 0.8 * np.random.default_rng(1).standard_normal((12_000, 1))
+    return TimeSeries((modes_nm(simulated, 0, 12_000, RATE_HZ)[:, :1] + noise,), 0)
 
 
 def test_the_lines_of_the_reaction_wheel_are_identified() -> None:
-    model = identify(preset("reaction-wheel-ideal", 12_000), RATE_HZ)
+    model = identify(ideal_wheel(), RATE_HZ)
     assert [line.frequency_hz for line in model.lines] == pytest.approx(LINES_HZ, abs=0.02)
     rms_mas = [np.sqrt(line.variance_nm2) / NM_PER_MAS for line in model.lines]
     assert rms_mas == pytest.approx([9.0, 8.3, 5.0, 3.0, 2.0], rel=0.06)
@@ -73,7 +73,7 @@ def test_the_spectrum_of_a_model_agrees_with_its_states() -> None:
 
 
 def test_pieces_are_identified_like_one_run_and_short_ones_are_not() -> None:
-    whole = preset("reaction-wheel-ideal", 12_000).values[0]
+    whole = ideal_wheel().values[0]
     model = identify(TimeSeries((whole[:6000], whole[6000:]), 0), RATE_HZ)
     assert [round(line.frequency_hz) for line in model.lines] == [6, 18, 37, 71, 117]
     assert identify(TimeSeries((whole[: FEWEST - 1],), 0), RATE_HZ) is None
