@@ -1,6 +1,7 @@
 """The acceptance tests on a loop in one process: verdicts, results and messages."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from lowfc.adapters.files.drawing import figure_class, png
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.contract.codecs.calibration_codec import identified
-from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
+from lowfc.contract.configuration import FIXED_GAINS
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import wire
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
@@ -26,25 +27,20 @@ from lowfc.programs.commissioning.acceptance.probe import (
     logged_responses,
     selected_modes,
 )
-from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
+from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop, configuration
 from tests.support.loops import refusal
 from tests.support.report_log import TOY_CALIBRATION, SyntheticLog
 
 MULTISINE = {"duration_s": 3.0, "rms_nm": 3.0, "lines_per_mode": 8, "modes": (), "seed": 1}
-
-
-def configured(**changes: object) -> Configuration:
-    defaults = {
-        "disturbance.preset": "quiet",
-        "camera.instants": 1,  # sufficient without a disturbance
-        "sensor.modes": 3,
-        "star.magnitude": -1.0,
-        "control.gain": 0.3,
-        "acceptance.lowest_hz": 2.0,
-    }
-    return load(
-        None, FIXED_GAINS | SMALL_MIRROR | defaults | {key.replace("__", "."): value for key, value in changes.items()}
-    )
+THREE_MODES = {
+    "disturbance.preset": "quiet",
+    "camera.instants": 1,  # sufficient without a disturbance
+    "sensor.modes": 3,
+    "star.magnitude": -1.0,
+    "control.gain": 0.3,
+    "acceptance.lowest_hz": 2.0,
+}
+configured = partial(configuration, FIXED_GAINS | SMALL_MIRROR | THREE_MODES)
 
 
 def responses_of(loop: InProcessLoop, test: Any, **options: Any) -> list[ProbeResponse]:

@@ -4,6 +4,7 @@ import contextlib
 import io
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -13,7 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from lowfc.client import Answer, mirror_watch
-from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, wire
@@ -23,15 +24,10 @@ from lowfc.programs.commissioning.calibrate import pokes, recording
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
 from lowfc.programs.commissioning.calibrate.result import measured_calibration
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator, partial_of, resumed, store
-from tests.support.in_process_loop import BRIGHT, InProcessLoop
+from tests.support.in_process_loop import BRIGHT, InProcessLoop, configuration
 
 OUT = Path("night.fits")
-
-
-def configured(**changes: object) -> Configuration:
-    return load(None, BRIGHT | {key.replace("__", "."): value for key, value in changes.items()})
-
-
+configured = partial(configuration, BRIGHT)
 FEW = {"sensor.modes": 3}
 """Few modes give short cycles, for tests that do not depend on the number of modes."""
 NOISELESS = FEW | {"camera.noise": False}

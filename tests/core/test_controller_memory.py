@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -21,7 +22,7 @@ from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.codecs.law_codec import wire_law
-from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
+from lowfc.contract.configuration import FIXED_GAINS, Configuration
 from lowfc.contract.errors import CalibrationError
 from lowfc.contract.messages import (
     CALIBRATION,
@@ -55,20 +56,13 @@ from lowfc.programs.core.controller import Controller
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.driver import scene as configured_scene
 from sim_camera.scene import Scene, Wavefront
-from tests.support.in_process_loop import PATIENCE_S, SMALL_MIRROR, ThreadedRun
+from tests.support.in_process_loop import PATIENCE_S, SMALL_MIRROR, ThreadedRun, configuration
 from tests.support.loops import until
 from tools.law_bench import calibrated
 
 START_NS = 1_767_225_600_000_000_000
-
-
-def configured(**overrides: object) -> Configuration:
-    bright = {"disturbance.preset": "quiet", "star.magnitude": -2.0, "lockstep": True, "mirror.settling_us": 0.0}
-    return load(
-        None, FIXED_GAINS | SMALL_MIRROR | bright | {key.replace("__", "."): value for key, value in overrides.items()}
-    )
-
-
+BRIGHT = {"disturbance.preset": "quiet", "star.magnitude": -2.0, "lockstep": True, "mirror.settling_us": 0.0}
+configured = partial(configuration, FIXED_GAINS | SMALL_MIRROR | BRIGHT)
 CHANGED_CAMERA = wire.CameraState(
     timestamp=timestamp(START_NS), rows=5, columns=5, bias_dn=100, saturation_dn=65535
 ).SerializeToString()

@@ -1,13 +1,14 @@
 """The loop with diffraction images, in one process: stability and convergence."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
-from lowfc.contract.configuration import Configuration, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from tests.support.in_process_loop import SMALL_MIRROR, run_loop
+from tests.support.in_process_loop import SMALL_MIRROR, configuration, run_loop
 from tools.law_bench import calibrated
 
 QUIET = SMALL_MIRROR | {
@@ -21,10 +22,7 @@ QUIET = SMALL_MIRROR | {
     "camera.gain_e_per_dn": 0.0008,  # small enough that rounding changes a mode by less than a picometre
     "camera.full_well_e": 52.0,
 }
-
-
-def configured(**overrides: object) -> Configuration:
-    return load(None, QUIET | {key.replace("__", "."): value for key, value in overrides.items()})
+configured = partial(configuration, QUIET)
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, render, what_if
 from lowfc.programs.logs.what_if.options import WhatIf, requested, user_controller
 from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support import toy
-from tests.support.in_process_loop import SMALL_MIRROR, run_loop
+from tests.support.in_process_loop import SMALL_MIRROR, configuration, run_loop
 from tests.support.report_log import SyntheticLog
 from tools.law_bench import calibrated
 
@@ -57,7 +57,7 @@ def configured(gains: Gains, delay: float, **overrides: object) -> Configuration
         "control.tilt_leak": leak,
         "control.leak": leak,
     }
-    return load(None, SMALL_MIRROR | keys | {key.replace("__", "."): value for key, value in overrides.items()})
+    return configuration(SMALL_MIRROR | keys, **overrides)
 
 
 def settled_rms(values: np.ndarray) -> np.ndarray:
@@ -155,7 +155,7 @@ def test_added_contrast_of_shaped_pupil_and_lyot_coronagraph() -> None:
     spherical = np.diag(0.01 * np.eye(14)[9])
 
     def found(**keys: object) -> dict[str, Any] | None:
-        config = load(None, {key.replace("__", "."): one for key, one in keys.items()})
+        config = configuration({}, **keys)
         return added_contrast(factory.contrast_of(config), {"was": 0 * spherical, "what if": spherical, "other": None})
 
     assert factory.known_contrast(load(None, {"sensor.pupil": "elsewhere.npz"})) is None

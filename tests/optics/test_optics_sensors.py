@@ -7,7 +7,6 @@ import pytest
 
 from lowfc.adapters.files import factory
 from lowfc.adapters.files.sensors import sensor_from, sensor_named
-from lowfc.contract.configuration import load
 from lowfc.contract.errors import CalibrationError
 from lowfc.contract.sections import SENSORS, SensorSection
 from lowfc.optics.chain.band import Band, gauss_legendre, monochromatic, uniform
@@ -16,6 +15,7 @@ from lowfc.optics.chain.grid import image_axis
 from lowfc.optics.chain.relay import ApertureMask, Defocus, PupilImage, direct_kernel, fresnel_distance
 from lowfc.optics.chain.sensor import Sensor, field, image, light_budget, reference, response, shear_response
 from lowfc.optics.detector.detector import Detector, expose
+from tests.support.in_process_loop import configuration
 
 
 def relative_l2(ours, truth):
@@ -322,7 +322,7 @@ def test_behind_an_aperture_mask_modes_are_odd_and_shear_and_flux_even(name, mod
 def calibrated(**changed):
     """A calibration with a small mirror, and its noise, from configuration keys."""
     keys = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 11.0}
-    config = load(None, keys | {key.replace("__", "."): value for key, value in changed.items()})
+    config = configuration(keys, **changed)
     optics = factory.twin(config, None, pytest.fail)
     calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, pytest.fail))
     return calibration, factory.frame_noise_nm(config, calibration)

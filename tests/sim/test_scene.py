@@ -1,6 +1,7 @@
 """The simulated scene: the reported true wavefront equals the injected modes, and frames match the calibration."""
 
 import importlib.util
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -8,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lowfc.adapters.files.factory import analytic_calibration, mirror_on_twin, sensor, twin
-from lowfc.contract.configuration import Configuration, load
+from lowfc.adapters.files.factory import sensor
+from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
@@ -21,6 +22,8 @@ from sim_camera.disturbance import BLOCK, Sampler
 from sim_camera.driver import disturbance_of
 from sim_camera.driver import scene as scene_of
 from sim_camera.scene import Scene, exposure_nodes
+from tests.support.in_process_loop import configuration
+from tools.law_bench import calibrated
 
 GRID, MODES = (34, 34), 14
 FLAT = np.zeros(GRID, np.float32)
@@ -28,17 +31,12 @@ BIAS_DN, FINE_E_PER_DN = 100.0, 0.01
 FINE = {"camera__noise": False, "camera__gain_e_per_dn": FINE_E_PER_DN, "camera__full_well_e": 600.0}
 """No noise, and little rounding."""
 
-
-def configured(**overrides: object) -> Configuration:
-    quiet = {"disturbance.preset": "quiet"}
-    return load(None, quiet | {key.replace("__", "."): value for key, value in overrides.items()})
+configured = partial(configuration, {"disturbance.preset": "quiet"})
 
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    config = configured(**FINE)
-    optics = twin(config, None, print)
-    return analytic_calibration(config, optics, mirror_on_twin(config, optics, print))
+    return calibrated(configured(**FINE))
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +104,7 @@ def test_the_seed_determines_the_noise_and_the_flux_matches_the_calibration(cali
 def test_frames_without_noise_have_the_flux_and_dark_of_the_calibration() -> None:
     keys = {"camera__em_gain": 100.0, "camera__dark_current_e_s": 20.0, "camera__clock_induced_charge_e": 0.02}
     config = configured(camera__noise=False, camera__full_well_e=600_000.0, camera__gain_e_per_dn=10.0, **keys)
-    optics = twin(config, None, print)
-    calibration = analytic_calibration(config, optics, mirror_on_twin(config, optics, print))
+    calibration = calibrated(config)
     light_dn = scene_of(config).expose(0, FLAT).reshape(-1) - calibration.dark
     assert light_dn.sum() == pytest.approx(calibration.flux_dn, rel=0.01)
 

@@ -1,6 +1,7 @@
 """Reaction wheels, drift, jitter and shear of the simulated camera, against simple models."""
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -9,22 +10,18 @@ import pytest
 from scipy.integrate import cumulative_trapezoid
 
 from lowfc.adapters.files.factory import shear_slopes, twin
-from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.optics.twin.twin import reference
 from sim_camera.disturbance import shear_at, variances_nm2
 from sim_camera.driver import disturbance_of, scene
 from sim_camera.wheel import HEIGHTS, ORDERS, SOFT_HZ, Wheel, walk, wheels
+from tests.support.in_process_loop import configuration
 from tests.support.theory import modes_nm
 
 FLAT = np.zeros((34, 34), np.float32)
 TIME_S = np.arange(0, 20, 1e-4)
 NM_PER_MAS = 2.424
-
-
-def quiet(**changed: Any) -> Configuration:
-    keys = {"disturbance.preset": "quiet", "camera.rate_hz": 1000.0}
-    return load(None, keys | {key.replace("__", "."): value for key, value in changed.items()})
+quiet = partial(configuration, {"disturbance.preset": "quiet", "camera.rate_hz": 1000.0})
 
 
 def wheel(course: str, change: float) -> Wheel:

@@ -21,7 +21,7 @@ from lowfc.arrays import Single
 from lowfc.client import Answer, Client, MirrorWatch
 from lowfc.client import Frame as Image
 from lowfc.contract.codecs.state_codec import controller_state
-from lowfc.contract.configuration import FIXED_GAINS, Configuration
+from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.errors import CalibrationError, RequestRefusedError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, MIRROR_STATE, Topic, wire
@@ -52,6 +52,11 @@ BRIGHT = (
     }
 )
 """For calibrations: a bright star without a disturbance."""
+
+
+def configuration(keys: dict[str, Any], **changes: Any) -> Configuration:
+    """The configuration with these keys; `camera__noise=False` changes the key `camera.noise`."""
+    return load(None, keys | {key.replace("__", "."): value for key, value in changes.items()})
 
 
 @lru_cache(maxsize=4)
