@@ -19,9 +19,9 @@ class Listener:
         for topic, received in self.samples.items():
             bus.subscribe(topic, received.append)
 
-    def service(self, role: str) -> Service:
-        """Make a process on the same hub with the same clock."""
-        return Service(role, "test", self._clock, MemoryBus(self._hub, role, self._clock))
+    def service(self, role: str, **options: Any) -> Service:
+        """Make a process on the same hub with the same clock, with these options of `Service`."""
+        return Service(role, "test", self._clock, MemoryBus(self._hub, role, self._clock), **options)
 
     def messages(self, topic: Topic) -> list[Any]:
         """Messages of a topic, in order."""

@@ -12,7 +12,7 @@ import pytest
 
 from lowfc import __version__
 from lowfc.adapters.process.realtime import Granted
-from lowfc.adapters.process.service import HEALTH_PERIOD_NS, PRINTED, PRINTED_NS, WAITING_NS, Service
+from lowfc.adapters.process.service import HEALTH_PERIOD_NS, PRINTED, PRINTED_NS, WAITING_NS
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, from_timestamp, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
@@ -31,17 +31,16 @@ def clock() -> FakeClock:
     return FakeClock()
 
 
-def service(hub: MemoryHub, clock: FakeClock, name: str, **options: object) -> Service:
-    return Service(name, "night", clock, MemoryBus(hub, name, clock), **options)
+@pytest.fixture
+def listener(hub: MemoryHub, clock: FakeClock) -> Listener:
+    return Listener(hub, clock, HEALTH)
 
 
-def test_health_is_published_when_due_with_all_fields(hub: MemoryHub, clock: FakeClock) -> None:
-    listener = Listener(hub, clock, HEALTH)
-
+def test_health_is_published_when_due_with_all_fields(listener: Listener, clock: FakeClock) -> None:
     def fill(health: wire.Health) -> None:
         health.commands_late = 3
 
-    camera = service(hub, clock, "camera", granted=Granted(("one BLAS thread",), ()), fill=fill)
+    camera = listener.service("camera", granted=Granted(("one BLAS thread",), ()), fill=fill)
     frames = camera.publisher(FRAME)
     camera.beat()
     camera.beat()
@@ -53,7 +52,7 @@ def test_health_is_published_when_due_with_all_fields(hub: MemoryHub, clock: Fak
     camera.beat()
     first, second = listener.messages(HEALTH)
     assert (first.state, first.rate_hz, second.rate_hz) == ("starting", 0.0, 10.0)
-    assert (second.process, second.run_id, second.pid, second.version) == ("camera", "night", os.getpid(), __version__)
+    assert (second.process, second.run_id, second.pid, second.version) == ("camera", "test", os.getpid(), __version__)
     assert (second.commands_late, second.uptime_ns) == (3, HEALTH_PERIOD_NS)
     assert second.realtime_granted == ["one BLAS thread"]
     assert from_timestamp(second.timestamp) == clock.now_ns()
@@ -86,17 +85,16 @@ def test_the_rate_of_slow_work_is_measured_over_several_units(hub: MemoryHub, cl
 
 @pytest.mark.parametrize(("ahead_ms", "reported"), [(-99, False), (100, False), (101, True), (-250, True)])
 def test_a_wrong_clock_is_reported_at_the_start(
-    hub: MemoryHub, clock: FakeClock, monkeypatch: pytest.MonkeyPatch, ahead_ms: int, reported: bool
+    listener: Listener, clock: FakeClock, monkeypatch: pytest.MonkeyPatch, ahead_ms: int, reported: bool
 ) -> None:
-    listener = Listener(hub, clock, HEALTH)
     monkeypatch.setattr(clock, "ahead_ns", lambda: ahead_ms * 1_000_000)
-    service(hub, clock, "camera")
+    listener.service("camera")
     events = listener.event_texts(f"CLOCK_OFF this boot's clock is {ahead_ms:+d} ms from the wall clock")
     assert len(events) == len(listener.event_texts("CLOCK_OFF")) == reported
 
 
-def test_health_has_the_counts_of_a_mailbox(hub: MemoryHub, clock: FakeClock) -> None:
-    camera, controller = service(hub, clock, "camera"), service(hub, clock, "controller")
+def test_health_has_the_counts_of_a_mailbox(listener: Listener, hub: MemoryHub) -> None:
+    camera, controller = listener.service("camera"), listener.service("controller")
     box = controller.mailbox(FRAME)
     frames = camera.publisher(FRAME)
     hub.lose = lambda role, key, envelope: key == FRAME.key and envelope.sequence & 0xFFFFFFFF == 1
@@ -107,10 +105,9 @@ def test_health_has_the_counts_of_a_mailbox(hub: MemoryHub, clock: FakeClock) ->
     assert (count.received, count.skipped, count.missing, count.last_sequence) == (3, 2, 1, last)
 
 
-def test_measures_are_requested_once_when_the_process_is_ready(hub: MemoryHub, clock: FakeClock) -> None:
-    listener = Listener(hub, clock, HEALTH)
+def test_measures_are_requested_once_when_the_process_is_ready(listener: Listener) -> None:
     at_ready = Mock(return_value=Granted(("huge pages",), (("big caches", "slow"),)))
-    camera = service(hub, clock, "camera", granted=Granted(("one BLAS thread",), ()), at_ready=at_ready)
+    camera = listener.service("camera", granted=Granted(("one BLAS thread",), ()), at_ready=at_ready)
     for state in ("ready", "running", "ready"):
         camera.state = state
     assert [health.realtime_granted for health in listener.messages(HEALTH)] == [["one BLAS thread", "huge pages"]] * 3
@@ -120,10 +117,9 @@ def test_measures_are_requested_once_when_the_process_is_ready(hub: MemoryHub, c
 
 
 def test_events_are_published_and_warnings_printed(
-    hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
+    listener: Listener, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    listener = Listener(hub, clock, HEALTH)
-    controller = service(hub, clock, "controller", granted=Granted((), (("SCHED_FIFO", "a longer tail"),)))
+    controller = listener.service("controller", granted=Granted((), (("SCHED_FIFO", "a longer tail"),)))
     controller.event("FRAMES_BACK", silent_ms=12.4)
     assert [(log.name, log.message.split()[0], log.level) for log in listener.messages(EVENT)] == [
         ("controller", "STARTED", 2),
@@ -143,10 +139,9 @@ def test_events_are_published_and_warnings_printed(
 
 
 def test_a_flood_of_warnings_is_in_the_log_whole_and_on_the_terminal_in_part(
-    hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
+    listener: Listener, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    listener = Listener(hub, clock, HEALTH)
-    controller = service(hub, clock, "controller")
+    controller = listener.service("controller")
     for number in range(2 * PRINTED):
         controller.event("FRAMES_MISSING", count=1, number=number)
     controller.event("CLOCK_OFF", ahead_ms=200)
@@ -159,8 +154,8 @@ def test_a_flood_of_warnings_is_in_the_log_whole_and_on_the_terminal_in_part(
     assert "before frame 99" in printed[-1]
 
 
-def test_processes_are_connected_when_each_has_received_the_others_health(hub: MemoryHub, clock: FakeClock) -> None:
-    camera, controller = service(hub, clock, "camera"), service(hub, clock, "controller")
+def test_processes_are_connected_when_each_has_received_the_others_health(listener: Listener) -> None:
+    camera, controller = listener.service("camera"), listener.service("controller")
     assert camera.wait_for(["controller", "mirror-dm"], 0.0) == ("controller", "mirror-dm")
     camera.state = controller.state = "ready"  # controller received camera's Health before publishing its own
     assert camera.wait_for(["controller"], 0.0) == ()
@@ -168,27 +163,26 @@ def test_processes_are_connected_when_each_has_received_the_others_health(hub: M
     assert controller.wait_for(["camera"], 0.0) == ("camera",)
     camera.beat()
     assert controller.wait_for(["camera"], 0.0) == ()
-    mirror = service(hub, clock, "mirror-dm")
+    mirror = listener.service("mirror-dm")
     mirror.beat()  # running, but not ready
     assert camera.wait_for(["mirror-dm"], 0.0) == ("mirror-dm",)
     assert camera.last_health["mirror-dm"].state == "starting"
 
 
-def test_a_newcomer_gets_a_health_before_the_next_is_due(hub: MemoryHub, clock: FakeClock) -> None:
-    camera = service(hub, clock, "camera")
+def test_a_newcomer_gets_a_health_before_the_next_is_due(listener: Listener, hub: MemoryHub, clock: FakeClock) -> None:
+    camera = listener.service("camera")
     camera.beat()
-    listener = Listener(hub, clock, HEALTH)
     camera.beat()
-    assert listener.messages(HEALTH) == []
-    controller = service(hub, clock, "controller")
+    assert len(listener.messages(HEALTH)) == 1
+    controller = listener.service("controller")
     controller.beat()
     camera.beat()
     assert list(listener.messages(HEALTH)[-1].peers_alive) == ["controller"]
     controller.state = "ready"  # its second Health: not a newcomer
     camera.beat()
-    assert [health.process for health in listener.messages(HEALTH)] == ["controller", "camera", "controller"]
+    assert [health.process for health in listener.messages(HEALTH)] == ["camera", "controller", "camera", "controller"]
     assert [camera.has_newcomers(), camera.has_newcomers()] == [True, False]
-    service(hub, clock, "controller").beat()  # restarted; in a container, with its former process id
+    listener.service("controller").beat()  # restarted; in a container, with its former process id
     assert camera.has_newcomers()
     before = len(listener.messages(HEALTH))
     for number in (1, 2, 1):  # two views, in turns
@@ -197,11 +191,8 @@ def test_a_newcomer_gets_a_health_before_the_next_is_due(hub: MemoryHub, clock: 
     assert [health.process for health in listener.messages(HEALTH)[before:]] == ["", "camera", "", ""]  # "": a view
 
 
-def test_a_flood_of_bad_messages_gives_one_event_and_the_last_health_has_all_counts(
-    hub: MemoryHub, clock: FakeClock
-) -> None:
-    listener = Listener(hub, clock, HEALTH)
-    mirror = service(hub, clock, "mirror-dm")
+def test_a_flood_of_bad_messages_gives_one_event_and_the_last_health_has_all_counts(listener: Listener) -> None:
+    mirror = listener.service("mirror-dm")
     for number in range(500):
         mirror.unreadable("lowfc/mirror/dm/command", f"reason {number}")
     mirror.beat()
@@ -223,10 +214,9 @@ def test_a_flood_of_bad_messages_gives_one_event_and_the_last_health_has_all_cou
 
 
 def test_an_unreadable_message_gives_an_event_without_traceback_or_stop(
-    hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
+    listener: Listener, hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    listener = Listener(hub, clock, HEALTH)
-    mirror = service(hub, clock, "mirror-dm")
+    mirror = listener.service("mirror-dm")
     read: list[int] = []
     decode = wire.MirrorCommand.FromString
     mirror.dispatch(COMMAND, lambda sample: read.append(len(decode(sample.payload).actuators)), "dm", period_ns=10**6)
@@ -242,8 +232,8 @@ def test_an_unreadable_message_gives_an_event_without_traceback_or_stop(
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_stop_wakes_the_loop(hub: MemoryHub, clock: FakeClock) -> None:
-    camera = service(hub, clock, "camera")
+def test_stop_wakes_the_loop(listener: Listener) -> None:
+    camera = listener.service("camera")
     box = camera.mailbox(FRAME)
     timer = threading.Timer(0.01, camera.stop, ["stopped by test"])
     timer.start()
@@ -255,12 +245,10 @@ def test_stop_wakes_the_loop(hub: MemoryHub, clock: FakeClock) -> None:
 LOOP = """
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from lowfc.adapters.process.service import Service
+from lowfc.testing.memory_bus import MemoryHub
 from lowfc.contract.messages import FRAME
 
-clock = FakeClock()
-service = Service("camera", "night", clock, MemoryBus(MemoryHub(), "camera", clock))
+service = Listener(MemoryHub(), FakeClock()).service("camera")
 box = service.mailbox(FRAME)
 service.catch_signals()
 print("up", flush=True)
@@ -286,12 +274,12 @@ def test_a_signal_ends_the_loop_and_a_second_interrupt_the_process(number: str, 
 
 
 def test_a_process_prints_once_that_it_is_ready_and_once_what_it_waits_for(
-    hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
+    listener: Listener, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    camera = service(hub, clock, "camera", announces=True)
-    controller = service(hub, clock, "controller", announces=True)
+    camera = listener.service("camera", announces=True)
+    controller = listener.service("controller", announces=True)
     controller.awaited = lambda: "a camera"
-    quiet = service(hub, clock, "mirror-dm")
+    quiet = listener.service("mirror-dm")
     camera.wait_for(["controller", "recorder"], 0.0)
     for process in (camera, controller, quiet):
         process.state = "ready"
@@ -301,13 +289,13 @@ def test_a_process_prints_once_that_it_is_ready_and_once_what_it_waits_for(
             process.state = "running"
             process.beat()
     printed = capsys.readouterr().err.splitlines()
-    assert printed[:2] == ["camera: ready (run night)", "controller: ready (run night)"]
-    assert printed[2:] == ["camera: waiting for recorder (run night)", "controller: waiting for a camera (run night)"]
+    assert printed[:2] == ["camera: ready (run test)", "controller: ready (run test)"]
+    assert printed[2:] == ["camera: waiting for recorder (run test)", "controller: waiting for a camera (run test)"]
     camera.work = 1
     controller.stop("SIGINT")
     for process in (camera, controller, quiet):
         process.finish()
     assert capsys.readouterr().err.splitlines() == [
-        "camera: stopped after 1 frame: finished (run night)",
-        "controller: stopped after 0 frames: SIGINT (run night)",
+        "camera: stopped after 1 frame: finished (run test)",
+        "controller: stopped after 0 frames: SIGINT (run test)",
     ]
