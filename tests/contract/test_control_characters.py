@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from lowfc.adapters.process.service import Service
 from lowfc.adapters.process.terminal import new_app, run_app
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError, RequestRefusedError
@@ -17,7 +16,8 @@ from lowfc.programs.view.panels.loop import LOG
 from lowfc.programs.view.recorded import draw_logs
 from lowfc.programs.view.renderer import Renderer
 from lowfc.testing.clock import FakeClock
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from lowfc.testing.listener import Listener
+from lowfc.testing.memory_bus import MemoryHub
 from tests.support import report_log
 from tests.support.loops import lowfc
 from tests.support.report_log import SyntheticLog
@@ -42,8 +42,7 @@ def test_only_control_characters_are_escaped() -> None:
 
 
 def test_a_process_escapes_its_events(capsys: pytest.CaptureFixture[str]) -> None:
-    clock = FakeClock()
-    Service("camera", "night", clock, MemoryBus(MemoryHub(), "camera", clock)).event("RECORDING_FAILED", why=HOSTILE)
+    Listener(MemoryHub(), FakeClock()).service("camera").event("RECORDING_FAILED", why=HOSTILE)
     assert capsys.readouterr().err == f"camera: RECORDING_FAILED recording stopped: {SHOWN}\n"
 
 

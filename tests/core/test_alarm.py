@@ -5,12 +5,11 @@ import time
 from pathlib import Path
 
 from lowfc.adapters.process.clock import HostClock
-from lowfc.adapters.process.service import Service
 from lowfc.contract.events import Level
-from lowfc.contract.messages import EVENT, Log
 from lowfc.programs.core.recording import alarm as alarms
 from lowfc.programs.core.recording.alarm import Alarm
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from lowfc.testing.listener import Listener
+from lowfc.testing.memory_bus import MemoryHub
 from tests.support.loops import until
 
 # Shell command that appends a line about the event to the file `notes`.
@@ -21,16 +20,12 @@ class Alarmed:
     """A camera that publishes events, and a recorder with an alarm."""
 
     def __init__(self, command: str, min_interval_s: float = 0.0) -> None:
-        hub, clock = MemoryHub(), HostClock()
-        self.camera, self.recorder = (
-            Service(name, "bench", clock, MemoryBus(hub, name, clock)) for name in ("camera", "recorder")
-        )
-        self.events: list[str] = []
-        self.camera.bus.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload).message))
-        self.alarm = Alarm(self.recorder, command, Level.WARNING, min_interval_s)
+        self.listener = Listener(MemoryHub(), HostClock())
+        self.camera = self.listener.service("camera")
+        self.alarm = Alarm(self.listener.service("recorder"), command, Level.WARNING, min_interval_s)
 
     def failures(self) -> list[str]:
-        return [event for event in self.events if event.startswith("ON_EVENT_FAILED")]
+        return self.listener.event_texts("ON_EVENT_FAILED")
 
 
 def test_events_during_the_command_run_it_once_more_for_the_worst(tmp_path: Path, monkeypatch) -> None:
@@ -46,9 +41,9 @@ def test_events_during_the_command_run_it_once_more_for_the_worst(tmp_path: Path
     Path("go").touch()
     until(lambda: notes.read_text().count("\n") == 2)
     first, second = notes.read_text().splitlines()
-    assert first.startswith("bench|warning|camera|MIRROR_REFUSED|the mirror's shape is not adopted: it is")
+    assert first.startswith("test|warning|camera|MIRROR_REFUSED|the mirror's shape is not adopted: it is")
     assert first.endswith("`touch harm`|0")
-    assert second.startswith("bench|error|camera|MIRROR_LOST|the mirror is silent")
+    assert second.startswith("test|error|camera|MIRROR_LOST|the mirror is silent")
     assert second.endswith("|2")
     assert {path.name for path in tmp_path.iterdir()} == {"notes", "go"}, "text of an event is not run by the shell"
     assert not run.failures()

@@ -53,7 +53,8 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.programs.core.controller import Controller
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from lowfc.testing.listener import Listener
+from lowfc.testing.memory_bus import MemoryHub
 from sim_camera.driver import scene as configured_scene
 from sim_camera.scene import Scene, Wavefront
 from tests.support.in_process_loop import PATIENCE_S, SMALL_MIRROR, ThreadedRun, configuration
@@ -148,13 +149,11 @@ class Rig(ThreadedRun):
         assert not any(bus.faults.counts for bus in self.hub.buses)
 
 
-def alone(
-    calibration: Calibration | None, latch: Latch, config: Configuration
-) -> tuple[MemoryHub, Service, Controller]:
+def alone(calibration: Calibration | None, latch: Latch, config: Configuration) -> tuple[Listener, Service, Controller]:
     """A controller without camera and mirror."""
-    hub, clock = MemoryHub(), SimulatedClock(START_NS) if config.lockstep else HostClock()
-    service = Service("controller", "test", clock, MemoryBus(hub, "controller", clock))
-    return hub, service, Controller(config, service, calibration, "a test", latch)
+    listener = Listener(MemoryHub(), SimulatedClock(START_NS) if config.lockstep else HostClock())
+    service = listener.service("controller")
+    return listener, service, Controller(config, service, calibration, "a test", latch)
 
 
 def mode_of(controller: Controller) -> LoopMode:
@@ -368,9 +367,9 @@ def test_safe_mode_outlives_the_controller(calibration: Calibration, tmp_path: P
 
 
 def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration: Calibration, tmp_path: Path) -> None:
-    hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
+    listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     small = wire.MirrorState(rows=20, columns=20, actuators=np.zeros(400, np.float32).tobytes())
-    MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(small.SerializeToString())
+    listener.service("mirror-dm").publisher(MIRROR_STATE, "dm").put(small.SerializeToString())
     with pytest.raises(CalibrationError, match="20, 20"):
         controller.run()
 
@@ -379,12 +378,12 @@ def test_start_requests_wait_for_the_mirror_and_the_cameras_settings(calibration
     np.save(tmp_path / "flat.npy", np.ones(GRID, np.float32))
     flat = configured(lockstep=False, mirror__flat=str(tmp_path / "flat.npy"))
     for first in (None, calibration):
-        hub, _, controller = alone(first, Latch([tmp_path / "safe"]), flat)
+        listener, _, controller = alone(first, Latch([tmp_path / "safe"]), flat)
         controller._report_mirror()
         controller._send_start_requests()
         assert controller._start_pending
         shape = wire.MirrorState(rows=GRID[0], columns=GRID[1], actuators=bytes(4 * GRID[0] * GRID[1]))
-        MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
+        listener.service("mirror-dm").publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
         controller._report_mirror()
         for awaited in (True, False):
             conditions = controller._state.conditions._replace(camera_awaited=awaited)
@@ -399,14 +398,12 @@ def test_without_a_calibration_the_configured_law_is_not_in_force(tmp_path: Path
     noll = CONFIG.noll
     law_file.save(integrator([0.3] * len(noll), [0.0] * len(noll), noll, 1.0, CONFIG.camera.rate_hz), tmp_path / "law")
     config = configured(lockstep=False, control__law=str(tmp_path / "law"))
-    hub, _, controller = alone(None, Latch([tmp_path / "safe"]), config)
-    events: list[bytes] = []
-    MemoryBus(hub, "operator", HostClock()).subscribe(EVENT, lambda sample: events.append(sample.payload))
+    listener, _, controller = alone(None, Latch([tmp_path / "safe"]), config)
     shape = wire.MirrorState(rows=GRID[0], columns=GRID[1], actuators=bytes(4 * GRID[0] * GRID[1]))
-    MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
+    listener.service("mirror-dm").publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
     controller._report_mirror()
     controller._between_frames(None)
-    until(lambda: any(b"LAW_NOT_IN_FORCE" in event for event in events))
+    until(lambda: "LAW_NOT_IN_FORCE" in listener.events())
 
 
 def test_what_clients_changed_before_a_late_mirror_does_not_end_the_controller(
@@ -416,14 +413,11 @@ def test_what_clients_changed_before_a_late_mirror_does_not_end_the_controller(
     np.save(tmp_path / "flat.npy", shape)
     law_file.save(integrator([0.3] * 2, [0.0] * 2, noll, 1.0, CONFIG.camera.rate_hz), tmp_path / "law")
     config = configured(lockstep=False, mirror__flat=str(tmp_path / "flat.npy"), control__law=str(tmp_path / "law"))
-    hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), config)
-    events: list[bytes] = []
-    MemoryBus(hub, "operator", HostClock()).subscribe(EVENT, lambda sample: events.append(sample.payload))
+    listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), config)
     controller._mirror_adopted = True  # it has not reported within `MIRROR_PATIENCE_S`
     controller._carry_out_internal(Request(0, "channel", text="dig", actuators_nm=shape.reshape(-1)))
     controller._send_start_requests()
-    for name in (b"LAW_NOT_IN_FORCE", b"FLAT_NOT_IN_FORCE"):
-        until(lambda name=name: any(name in event for event in events))
+    until(lambda: {"LAW_NOT_IN_FORCE", "FLAT_NOT_IN_FORCE"} <= set(listener.events()))
 
 
 def test_a_gain_request_of_a_camera_with_another_clock_ends_no_reservation(
@@ -436,8 +430,8 @@ def test_a_gain_request_of_a_camera_with_another_clock_ends_no_reservation(
 
 
 def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: Calibration, tmp_path: Path) -> None:
-    hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
-    mirror, shape = MemoryBus(hub, "mirror-dm", HostClock()), wire.MirrorState(rows=1, columns=1, actuators=bytes(4))
+    listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
+    mirror, shape = listener.service("mirror-dm").bus, wire.MirrorState(rows=1, columns=1, actuators=bytes(4))
     mirror.publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
     assert controller._mirror.first() is not None
     healths = mirror.publisher(HEALTH, "mirror-dm")
@@ -481,9 +475,9 @@ def test_an_exception_in_frame_processing_ends_the_controller(
 ) -> None:
     """If the bus's thread only counted it, the loop would stop silently."""
     monkeypatch.setattr("lowfc.programs.core.controller.MIRROR_PATIENCE_S", 0.01)
-    hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
+    listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     monkeypatch.setattr(controller, "_frame", Mock(side_effect=ArithmeticError("one and one is three")))
-    frames = MemoryBus(hub, "camera", HostClock()).publisher(FRAME)
+    frames = listener.service("camera").publisher(FRAME)
     late = threading.Timer(0.2, frames.put, [b""])
     late.start()
     with pytest.raises(ArithmeticError, match="three"):
