@@ -14,14 +14,14 @@ class Listener:
 
     def __init__(self, hub: MemoryHub, clock: Clock, *topics: Topic) -> None:
         self.samples: dict[Topic, list[Sample]] = {topic: [] for topic in (*topics, EVENT)}
-        self._hub, self._clock = hub, clock
+        self.hub, self.clock = hub, clock
         bus = MemoryBus(hub, "operator", clock)
         for topic, received in self.samples.items():
             bus.subscribe(topic, received.append)
 
     def service(self, role: str, **options: Any) -> Service:
         """Make a process on the same hub with the same clock, with these options of `Service`."""
-        return Service(role, "test", self._clock, MemoryBus(self._hub, role, self._clock), **options)
+        return Service(role, "test", self.clock, MemoryBus(self.hub, role, self.clock), **options)
 
     def messages(self, topic: Topic) -> list[Any]:
         """Messages of a topic, in order."""

@@ -78,7 +78,7 @@ def test_every_tenth_frame_is_recorded_and_the_others_do_not_count_as_lost(tmp_p
     """The frame number selects mirror states too; a message not received counts as lost, selected or not."""
     bench = Bench(tmp_path / "logs")
     frames, commands = bench.camera.publisher(FRAME), bench.controller.publisher(COMMAND, "dm")
-    mirror = bench.join("mirror-dm")
+    mirror = bench.service("mirror-dm")
     states, surfaces = mirror.publisher(MIRROR_STATE, "dm"), mirror.publisher(SURFACE, "dm")
     bench.hub.lose = lambda role, key, envelope: (
         role == "recorder" and key == FRAME.key and count_of(envelope.sequence) in (55, 60)
@@ -228,7 +228,7 @@ def test_record_with_the_word_start_is_refused_and_names_the_request() -> None:
 def test_the_answer_to_record_start_contains_the_estimate_of_disk_space(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "logs")
     bench.start(bytes_per_s=1e6)
-    operator = bench.join("operator")
+    operator = bench.service("operator")
     answers = []
     for name in ("stop", "start"):
         (sample,) = operator.bus.get(f"lowfc/record/{name}", b"", 20.0)

@@ -53,10 +53,6 @@ def put_until(frames: Publisher, happened: Callable[[], bool]) -> None:
     put(frames, 10)
 
 
-def event_published(bench: Bench, event: str) -> bool:
-    return any(message.startswith(event) for message in bench.events)
-
-
 def check_account(bench: Bench, summary: Summary, frames: Publisher) -> int:
     """Check that summary, last Health and events count every frame missing from the logs; return the number lost."""
     messages = logged(summary)
@@ -100,12 +96,10 @@ def test_a_disk_error_ends_the_recording_but_not_the_process(
     log, frames = bench.recorder._series._log, bench.camera.publisher(FRAME)
     put_until(frames, lambda: log.messages_written > 20)
     fault(bench)
-    put_until(frames, lambda: event_published(bench, "RECORDING_FAILED"))
+    put_until(frames, lambda: "RECORDING_FAILED" in bench.events())
     time.sleep(0.6)  # longer than two flushes
     assert bench.thread.is_alive()
-    assert not event_published(bench, "MESSAGES_LOST"), (
-        "otherwise each flush reports every topic until the recorder ends"
-    )
+    assert "MESSAGES_LOST" not in bench.events(), "otherwise each flush reports every topic until the recorder ends"
     summary = bench.stop()
     assert why in summary.failure
     if not bench.folder.exists():
@@ -119,7 +113,7 @@ def test_a_nearly_full_disk_leaves_a_complete_log(bench: Bench, small_disk: Path
     bench.folder = small_disk / "logs"
     bench.start(limits=LogLimits(min_free_bytes=1_500_000))
     frames = bench.camera.publisher(FRAME)
-    put_until(frames, lambda: event_published(bench, "RECORDING_FAILED"))
+    put_until(frames, lambda: "RECORDING_FAILED" in bench.events())
     assert bench.thread.is_alive()
     summary = bench.stop()
     assert "free some space" in summary.failure
@@ -152,7 +146,7 @@ def test_messages_lost_while_the_disk_stalls_are_counted(bench: Bench, monkeypat
     put_until(frames, lambda: len(bench.recorder._backlog) >= 100)
     time.sleep(0.1)
     resume.set()
-    put_until(frames, lambda: event_published(bench, "DISK_SLOW"))
+    put_until(frames, lambda: "DISK_SLOW" in bench.events())
     until(lambda: len(bench.recorder._backlog) == 0)
     put(frames, 10)
     summary = bench.stop()
@@ -272,7 +266,7 @@ def test_a_frozen_process_does_not_block_the_recorder(bench: Bench, monkeypatch:
         return []
 
     monkeypatch.setattr(bench.recorder._bus, "get", get)
-    bench.join("camera-2").beat()  # a new process: the recorder queries it
+    bench.service("camera-2").beat()  # a new process: the recorder queries it
     frames = bench.camera.publisher(FRAME)
     put_until(frames, queried.is_set)
     sent = frames.published
@@ -303,7 +297,7 @@ def test_each_log_of_a_run_can_be_read_alone(bench: Bench) -> None:
         reader = LogReader(path)
         messages = list(reader)
         assert reader.complete
-        assert (reader.attachments, reader.metadata["lowfc"]) == ({"a.toml": b"[a]"}, {"run": "night"})
+        assert (reader.attachments, reader.metadata["lowfc"]) == ({"a.toml": b"[a]"}, {"run": "test"})
         assert messages[0].key == CALIBRATION.key
         # The second calibration was lost, and queried when the second log was begun.
         assert (second in bodies_of(messages, CALIBRATION)) == (number > 0)
@@ -343,7 +337,7 @@ def test_forged_names_and_starts_do_not_fill_the_recorder_or_a_log(
         body = wire.Health(process=f"forged-{number}").SerializeToString()
         forger.publisher(HEALTH, f"forged-{number}").put(body)
         forger.publisher(COMMAND, f"forged-{number}").put(b"")
-    until(lambda: event_published(bench, "BAD_MESSAGE"))
+    until(lambda: "BAD_MESSAGE" in bench.events())
     first = bench.recorder.service.health().recording.file
     for start_s in range(1, 200):
         forger.publisher(FRAME).put(b"", sequence=sequence_of(start_s, 0))

@@ -7,33 +7,26 @@ from pathlib import Path
 from lowfc.adapters.bus.bus import Publisher, Sample
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
-from lowfc.adapters.process.service import Service
-from lowfc.contract.messages import EVENT, Log, Topic, wire
+from lowfc.contract.messages import Topic, wire
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
+from lowfc.testing.listener import Listener
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.loops import until
 
 PATIENCE_S = 20.0
 
 
-class Bench:
+class Bench(Listener):
     """A recorder in its own thread, two services that publish, and the events on their bus."""
 
     def __init__(self, folder: Path) -> None:
-        self.hub = MemoryHub()
-        self.clock = HostClock()
+        super().__init__(MemoryHub(), HostClock())
         self.folder = folder
         self.summary: Summary | None = None
         self.thread = threading.Thread(target=self._record, daemon=True)
-        self.events: list[str] = []
         self.cameras: list[wire.CameraState | None] = []  # known to the recorder before its first log
-        self.camera = self.join("camera")
-        self.camera.bus.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload).message))
-        self.controller = self.join("controller")
-
-    def join(self, name: str) -> Service:
-        return Service(name, "night", self.clock, MemoryBus(self.hub, name, self.clock))
+        self.camera, self.controller = self.service("camera"), self.service("controller")
 
     def start(self, bytes_per_s: float = 0.0, **more: object) -> None:
         def expected(camera: wire.CameraState | None) -> float:
@@ -41,9 +34,9 @@ class Bench:
             return bytes_per_s
 
         bus = MemoryBus(self.hub, "recorder", self.clock)
-        metadata = {"lowfc": {"run": "night"}}
+        metadata = {"lowfc": {"run": "test"}}
         self.recorder = Recorder(
-            bus, self.clock, "night", self.folder, metadata=metadata, expected_bytes_per_s=expected, **more
+            bus, self.clock, "test", self.folder, metadata=metadata, expected_bytes_per_s=expected, **more
         )
         self.thread.start()
         for service in (self.camera, self.controller):
@@ -61,10 +54,9 @@ class Bench:
     def losses(self) -> Counter[str]:
         """Messages reported as lost by events, by topic."""
         counts: Counter[str] = Counter()
-        for event in self.events:
-            if event.startswith("MESSAGES_LOST"):
-                _, count, *_, topic = event.split()
-                counts[topic] += int(count)
+        for event in self.event_texts("MESSAGES_LOST"):
+            _, count, *_, topic = event.split()
+            counts[topic] += int(count)
         return counts
 
     def _record(self) -> None:
