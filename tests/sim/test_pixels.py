@@ -1,28 +1,26 @@
 """Pixel errors of the simulated detector, against simple models."""
 
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pytest
 import scipy
 
 from lowfc.adapters.files.factory import detector
-from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.configuration import load
 from lowfc.optics.detector.detector import Detector, expose, saturation_dn
 from sim_camera.driver import scene
 from sim_camera.pixels import pixel_errors, response
+from tests.support.in_process_loop import configuration
 
 FLAT = np.zeros((34, 34), np.float32)
 DETECTOR = Detector(full_well_e=40_000.0, bias_dn=100.0)
-
-
-def quiet(**changed: Any) -> Configuration:
-    return load(None, {"disturbance.preset": "quiet", "star.magnitude": 20.0} | changed)
+quiet = partial(configuration, {"disturbance.preset": "quiet", "star.magnitude": 20.0})
 
 
 def test_dark_current_is_poisson_of_the_exposure_time() -> None:
     """400 electrons per second in 2 ms: digital numbers have a Poisson distribution with mean 0.8."""
-    config = quiet(**{"camera.dark_current_e_s": 400.0, "camera.read_noise_e": 0.0})
+    config = quiet(camera__dark_current_e_s=400.0, camera__read_noise_e=0.0)
     assert config.dark_e == pytest.approx(0.8)
     frame = expose(detector(config), np.zeros((400, 500)), np.random.default_rng(1))
     counted = np.bincount((frame - 100).ravel(), minlength=8)
@@ -34,7 +32,7 @@ def test_dark_current_is_poisson_of_the_exposure_time() -> None:
 
 
 def test_dark_current_raises_the_mean_of_frames() -> None:
-    frames = [scene(quiet(**{"camera.dark_current_e_s": rate})).expose(0, FLAT) for rate in (0.0, 5000.0)]
+    frames = [scene(quiet(camera__dark_current_e_s=rate)).expose(0, FLAT) for rate in (0.0, 5000.0)]
     assert frames[1].mean() - frames[0].mean() == pytest.approx(10, abs=0.2)
 
 
