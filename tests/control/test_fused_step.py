@@ -1,7 +1,7 @@
 """The fused step against the reference: random frames and states, each step from the same state."""
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -13,7 +13,7 @@ from lowfc.adapters.process import compiled
 from lowfc.adapters.process.latch import Latch
 from lowfc.arrays import Pixels, Single
 from lowfc.contract.configuration import load
-from lowfc.control.calibration.calibration import Calibration, normalise_flux, reconstructor
+from lowfc.control.calibration.calibration import normalise_flux, reconstructor
 from lowfc.control.kernel import functions, stepping
 from lowfc.control.kernel.tables import FUSED, Tables
 from lowfc.control.laws.linear_law import LinearLaw, integrator
@@ -58,7 +58,8 @@ class Bench:
         self.dark = rng.uniform(90, 110, pixels)
         shapes = rng.normal(0, 1, (grid[0] * grid[1], modes)) / modes**0.5
         single = {"reference": I0, "response": self.H, "reconstructor": R, "good": good, "dark": self.dark}
-        self.calibration = Calibration(
+        self.calibration = replace(
+            toy.calibration(),
             noll=self.noll,
             **{name: array.astype(np.float32) for name, array in single.items()},
             modes_to_actuators=shapes.astype(np.float32),
@@ -66,10 +67,6 @@ class Bench:
             grid=grid,
             flux_dn=self.flux_dn,
             saturation_dn=float(rng.choice([60_000, np.inf])),
-            estimator="weighted",
-            wavelength_nm=550.0,
-            operator_hash="",
-            id="random",
         )
         tight = rng.random() < 0.5
         self.settings = toy.settings(
