@@ -71,7 +71,7 @@ def test_a_channel_is_applied_within_the_slew_limit_and_not_undone() -> None:
     loop, shape = ToyLoop(), dark_hole(60.0)
     loop.run(40)
     before = loop.surfaces[-1]
-    assert loop.ask("channel", text="dark-hole", actuators_nm=shape.reshape(-1)).accepted
+    assert loop.ask("channel", text="dark-hole", actuators_nm=shape).accepted
     loop.run(60)
     moves = np.abs(np.diff(loop.surfaces, axis=0)).max(axis=(1, 2))
     frames = int(np.ceil(np.abs(shape).max() / STEP_NM))
@@ -92,7 +92,7 @@ def test_the_shift_of_the_zero_point_is_delayed_like_the_mirror(delay_frames: fl
     setup = replace(DEFAULTS, delay_frames=delay_frames)
     loop = ToyLoop(setup, LoopMode.OPEN)
     weights = {1.0: (1.0,), 1.5: (0.5, 0.5), 2.0: (0.0, 1.0)}[delay_frames]
-    loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(60.0).reshape(-1))
+    loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(60.0))
     for _ in range(30):
         shapes = [loop.surfaces[max(-1 - lag, -len(loop.surfaces))] for lag in range(len(weights))]
         seen = sum(weight * shape for weight, shape in zip(weights, shapes, strict=True))
@@ -109,7 +109,7 @@ def test_an_external_shape_is_neither_undone_nor_commanded() -> None:
     external += unseen - (TOY.modes_to_actuators @ (loop.to_modes @ unseen.reshape(-1))).reshape(GRID)
     loop.run(40)
     before = loop.surfaces[-1]
-    assert loop.ask("channel", text=EXTERNAL, actuators_nm=external.reshape(-1)).accepted
+    assert loop.ask("channel", text=EXTERNAL, actuators_nm=external).accepted
     seen_nm = DISTURBED + loop.to_modes @ external.reshape(-1)
     loop.run(20, seen_nm)
     assert np.allclose(loop.surfaces[-1], before, atol=0.02)
@@ -117,7 +117,7 @@ def test_an_external_shape_is_neither_undone_nor_commanded() -> None:
     loop.ask("safe")
     loop.run(40, seen_nm)
     assert not loop.surfaces[-1].any()
-    assert loop.ask("channel", text=EXTERNAL, actuators_nm=2 * external.reshape(-1)).accepted
+    assert loop.ask("channel", text=EXTERNAL, actuators_nm=2 * external).accepted
     loop.ask("clear")
     loop.ask("close")
     loop.run(60, seen_nm + loop.to_modes @ external.reshape(-1))
@@ -131,7 +131,7 @@ def test_an_external_shape_is_neither_undone_nor_commanded() -> None:
 def test_the_flat_map_does_not_shift_the_zero_point() -> None:
     loop = ToyLoop()
     loop.run(30)
-    loop.ask("channel", text=FLAT, actuators_nm=dark_hole(20.0).reshape(-1))
+    loop.ask("channel", text=FLAT, actuators_nm=dark_hole(20.0))
     loop.run(60)
     assert np.abs(loop.wavefronts[-1]).max() < 0.05  # the loop has corrected its modes
 
@@ -144,9 +144,9 @@ def test_a_probe_sequence_plays_one_row_per_frame_and_ends(mode: LoopMode) -> No
     held = loop.surfaces[-1]
     table = np.array([[1, 0], [0, 2], [-1, 1]], np.float32)
     basis = np.stack([dark_hole(5.0, 1), dark_hole(5.0, 2)]).reshape(2, -1)
-    reply = loop.ask("play", text=MIRROR, table=table, actuators_nm=basis.reshape(-1))
+    reply = loop.ask("play", text=MIRROR, table=table, actuators_nm=basis)
     assert (reply.accepted, reply.frame_sequence) == (True, frame_sequence(4))
-    assert not loop.ask("play", text=MIRROR, table=table, actuators_nm=basis.reshape(-1)).accepted
+    assert not loop.ask("play", text=MIRROR, table=table, actuators_nm=basis).accepted
     loop.run(2)
     loop.count += 1  # a frame is lost: the table advances with frames, not commands
     loop.run(2)
@@ -255,7 +255,7 @@ def test_an_inconsistent_probe_sequence_is_refused(fields: dict[str, object], wh
 )
 def test_an_invalid_channel_is_refused(text: str, shape_nm: Array, why: str) -> None:
     loop = ToyLoop()
-    reply = loop.ask("channel", text=text, actuators_nm=shape_nm.astype(np.float32).reshape(-1))
+    reply = loop.ask("channel", text=text, actuators_nm=shape_nm.astype(np.float32))
     assert not reply.accepted
     assert why in reply.text
 
@@ -271,13 +271,13 @@ def test_the_number_of_channels_is_limited() -> None:
 
 def test_safe_mode_removes_all_channels_but_the_flat_map_which_returns_after_clear() -> None:
     loop, flat = ToyLoop(), dark_hole(10.0, 3)
-    loop.ask("channel", text=FLAT, actuators_nm=flat.reshape(-1))
-    loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(30.0).reshape(-1))
+    loop.ask("channel", text=FLAT, actuators_nm=flat)
+    loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(30.0))
     loop.run(30, np.zeros(3))
     loop.ask("safe")
     loop.run(10, np.zeros(3))
     assert not loop.surfaces[-1].any()
-    assert not loop.ask("channel", text="dark-hole", actuators_nm=flat.reshape(-1)).accepted
+    assert not loop.ask("channel", text="dark-hole", actuators_nm=flat).accepted
     loop.ask("clear")
     loop.run(10, np.zeros(3))
     assert np.allclose(loop.surfaces[-1], flat, atol=1e-3)
@@ -303,7 +303,7 @@ def test_reset_removes_the_modal_command_within_the_slew_limit(mode: LoopMode) -
     loop = ToyLoop(setup)
     loop.run(100, 3 * DISTURBED)
     channel = dark_hole(10.0)
-    loop.ask("channel", text="dark-hole", actuators_nm=channel.reshape(-1))
+    loop.ask("channel", text="dark-hole", actuators_nm=channel)
     loop.run(100, 3 * DISTURBED)
     if mode is LoopMode.OPEN:
         loop.ask("open")
@@ -370,7 +370,7 @@ def test_in_safe_mode_no_shape_of_the_mirror_is_adopted() -> None:
 
 def test_safe_mode_of_a_mirror_that_reports_late_removes_the_channels() -> None:
     loop = ToyLoop()
-    assert loop.ask("channel", text="dark-hole", actuators_nm=dark_hole().reshape(-1)).accepted
+    assert loop.ask("channel", text="dark-hole", actuators_nm=dark_hole()).accepted
     loop.process_input(MirrorShape(0, np.zeros(GRID, np.float32), np.zeros(0, np.float32), safe=True))
     assert loop.state.mode is LoopMode.SAFE
     loop.run(10, np.zeros(3))
@@ -382,7 +382,7 @@ def test_safe_mode_of_a_mirror_that_reports_late_removes_the_channels() -> None:
 
 def test_a_calibration_loaded_in_safe_mode_leaves_nothing_on_the_mirror() -> None:
     loop = ToyLoop(replace(DEFAULTS, limits=Limits(700.0, 10.0, 400.0)))
-    assert loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(60.0).reshape(-1)).accepted
+    assert loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(60.0)).accepted
     loop.run(60)
     assert loop.ask("safe").accepted
     assert loop.process_input(LOAD_OTHER).reply.accepted
@@ -425,7 +425,7 @@ def test_a_law_for_another_loop_is_refused() -> None:
 
 def test_loading_another_calibration_moves_nothing() -> None:
     loop = ToyLoop()
-    loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(20.0).reshape(-1))
+    loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(20.0))
     loop.run(60)
     refused = loop.process_input(LOAD_OTHER).reply
     assert not refused.accepted  # while the loop is closed
@@ -442,14 +442,14 @@ def test_loading_another_calibration_moves_nothing() -> None:
     loop.ask("open")
     before = loop.surfaces[-1]
     loop.process_input(Load(0, calibration((2, 3)), "test"))  # the part outside these modes becomes a channel
-    loop.ask("channel", text="other", actuators_nm=dark_hole(1.0).reshape(-1))
+    loop.ask("channel", text="other", actuators_nm=dark_hole(1.0))
     loop.run(10)
     assert np.allclose(loop.surfaces[-1], before + dark_hole(1.0), atol=1.1)
 
 
 def test_another_weighting_of_r_changes_the_shift_of_a_settled_channel_at_once() -> None:
     loop = ToyLoop()
-    loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(20.0).reshape(-1))
+    loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(20.0))
     loop.run(60)
     active_loop = loop.state.loop._replace(camera=CAMERA)
     channels = active_loop.with_weighting(Weighting(np.float32([0, 0, 100]), 2e3)).command_channels
