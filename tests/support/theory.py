@@ -18,6 +18,7 @@ from lowfc.control.laws.linear_law import (
     respond,
 )
 from lowfc.control.laws.pi_notch import Notch, pi_notch
+from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import delay_weights, open_loop
 from lowfc.control.laws.vibration import Model
 from sim_camera.disturbance import Disturbance, Sampler
@@ -35,6 +36,11 @@ def linear(
 ) -> LinearLaw:
     """An integrator as a linear law."""
     return integrator(law.gain, law.leak, noll, delay_frames, rate_hz)
+
+
+def one_piece(values: Array) -> TimeSeries:
+    """A time series (frames, modes) without gaps."""
+    return TimeSeries((values,), 0)
 
 
 def rejection(frequency_hz: Array, rate_hz: float, gain: float, leak: float, delay_frames: float) -> Array:

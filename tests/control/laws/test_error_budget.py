@@ -13,7 +13,7 @@ from lowfc.control.laws.error_budget import Term, lag, lag_under_noise, measurem
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import TimeSeries, spectrum
 from tests.support.in_process_loop import SMALL_MIRROR, run_loop
-from tests.support.theory import rejection
+from tests.support.theory import one_piece, rejection
 from tools.law_bench import calibrated
 
 RATE_HZ = 1000.0
@@ -23,10 +23,6 @@ SAMPLED = Timing.sampled(1.0)
 
 def law_of_two_modes(gain: tuple[float, ...] = (0.5, 0.1), leak: tuple[float, ...] = (0.0, 0.0)) -> LinearLaw:
     return integrator(gain, leak, (2, 3), 1.0, RATE_HZ)
-
-
-def one_piece(values: np.ndarray) -> TimeSeries:
-    return TimeSeries((values,), 0)
 
 
 def test_the_noise_of_a_loop_with_one_frame_of_delay_has_a_closed_form() -> None:

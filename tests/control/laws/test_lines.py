@@ -9,11 +9,11 @@ from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.kalman import lqg_block
 from lowfc.control.laws.linear_law import LinearLaw, law_from_blocks
 from lowfc.control.laws.margins import margins
-from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG
 from lowfc.control.laws.tuning import within_margins
 from lowfc.control.laws.vibration import Line, Model
 from sim_camera.disturbance import LINES_HZ, LINES_MAS
+from tests.support.theory import one_piece
 from tools import laws, lines
 from tools.law_bench import RATE_HZ, Bench, calibrated, configured, tuned
 
@@ -74,7 +74,7 @@ def test_modal_simulation_agrees_with_images() -> None:
     bench.run(lines.FRAMES)
     noise_nm = frame_noise_nm(config, calibration)[:2]
     tuned_laws = []
-    for pol in (TimeSeries((bench.pol().values[0][:, :2],), 0), lines.tilts_of(config, noise_nm, lines.FRAMES)):
+    for pol in (one_piece(bench.pol().values[0][:, :2]), lines.tilts_of(config, noise_nm, lines.FRAMES)):
         frequency_hz, density = scipy.signal.welch(pol.values[0], RATE_HZ, nperseg=2000, axis=0)
         level_nm = np.sqrt(density[(frequency_hz > 400) & (frequency_hz < 490)].mean(axis=0) * RATE_HZ / 2)
         np.testing.assert_allclose(level_nm, noise_nm, rtol=0.1)

@@ -1,6 +1,5 @@
 """Spectra and measured transfer functions of known signals: noise, sines, gaps, and loops with known theory."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ from lowfc.control.calibration.excitation import FEWEST_CYCLES, build_staircase,
 from lowfc.control.calibration.linearity import captured, gains, levels
 from lowfc.control.laws import margins
 from lowfc.control.laws.integrator import Integrator
-from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.spectra import (
     LONGEST,
     MAX_INTERPOLATED_FRAMES,
@@ -28,14 +26,10 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import Settings, State
-from tests.support.theory import linear
+from tests.support.theory import linear, one_piece
 from tests.support.toy import NOLL, calibration, frame, loaded, run_toy, settings
 
 RATE_HZ = 500.0
-
-
-def one_piece(values: np.ndarray) -> TimeSeries:
-    return TimeSeries((values,), 0)
 
 
 def sequences(count: int, start: int = 1_700_000_000) -> np.ndarray:
@@ -130,19 +124,15 @@ def law(gain: tuple[float, float] = GAIN) -> Integrator:
     return settings(gain=gain).integrator(NOLL)
 
 
-def linear_law(law: Integrator, delay_frames: float) -> LinearLaw:
-    return linear(law, NOLL, delay_frames, 1.0)
-
-
-def through(setup: Settings, requests: Iterable[Request], frames: int) -> tuple[Array, Array, State]:
-    """Errors and commands (frames, modes) of the toy's loop after requests, and its state afterwards.
+def through(setup: Settings, request: Request) -> tuple[Array, Array, State]:
+    """Errors and commands (frames, modes) of the toy's loop during a probe sequence, and its state afterwards.
 
     The disturbance is white noise and a slow sine that is not a line of the multisine.
     """
     state, _ = advance(setup, loaded(setup), frame(1))
-    for request in requests:
-        state, outputs = advance(setup, state, request)
-        assert outputs.reply.accepted, outputs.reply.text
+    state, outputs = advance(setup, state, request)
+    assert outputs.reply.accepted, outputs.reply.text
+    frames = len(request.table)
     slow = 3 * np.sin(2e-4 * np.arange(frames))[:, None]
     noise = 0.3 * np.random.default_rng(3).standard_normal((frames, len(NOLL)))
     steps, _, state = run_toy(setup, slow + noise, state=state, first=2)
@@ -161,7 +151,7 @@ def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: fl
     table = with_lead_in(period, lead)
     shapes = np.zeros(0) if target == "offset" else calibration().modes_to_actuators.T.reshape(-1)
     request = Request(0, "play", text=target, table=table, actuators_nm=shapes.astype(np.float32))
-    error_nm, _, _ = through(setup, [request], len(table))
+    error_nm, _, _ = through(setup, request)
     weights = delay_weights(delay_frames)
     added = -period.astype(float) if target == "offset" else seen_of_mirror(period.astype(float), weights)
     measured = measure_lines(error_nm[lead:], added)
@@ -169,7 +159,7 @@ def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: fl
     assert [np.sort(np.round(measured.frequency[measured.mode == mode] * PERIOD)).tolist() for mode in range(3)] == [
         lines_of_mode.tolist() for lines_of_mode in places
     ]
-    theory, rows = linear_law(law(), delay_frames), np.arange(measured.mode.size)
+    theory, rows = linear(law(), NOLL, delay_frames, 1.0), np.arange(measured.mode.size)
     S, T = (of(theory, measured.frequency)[rows, measured.mode] for of in (margins.rejection, margins.noise_transfer))
     of_s = departure(measured.rejection, S, measured.error, TOLERANCE_DB)
     of_t = departure(measured.noise_transfer, T, measured.error, TOLERANCE_DB)
@@ -181,7 +171,7 @@ def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: fl
         assert 0.6 < np.sqrt(np.mean((compared.db[judged] / compared.error_db[judged]) ** 2)) < 1.6
     assert (np.abs(of_s.db[of_s.judged & (measured.frequency > 0.02)]) < 0.5).all()
 
-    other_theory = linear_law(law((0.6, 0.15)), delay_frames)
+    other_theory = linear(law((0.6, 0.15)), NOLL, delay_frames, 1.0)
     S = margins.rejection(other_theory, measured.frequency)[rows, measured.mode]
     of_other_gain = departure(measured.rejection, S, measured.error, TOLERANCE_DB)
     assert not of_other_gain.within[of_other_gain.judged].all()
@@ -282,7 +272,7 @@ def test_a_step_is_captured_if_the_loop_corrects_it(gain: tuple[float, float], e
     stairs, starts = build_staircase([0.0, 30.0], 40, 20.0)
     table = stairs.astype(np.float32)[:, None]
     request = Request(0, "play", text="mirror", table=table, actuators_nm=shape.reshape(-1))
-    error_nm, command_nm, state = through(setup, [request], len(table))
+    error_nm, command_nm, state = through(setup, request)
     assert state.mode is LoopMode.CLOSED
     before, after = slice(20, 40), slice(int(starts[1]) + 30, int(starts[1]) + 40)
     assert captured(error_nm, command_nm, 1, 30.0, before, after) is expected

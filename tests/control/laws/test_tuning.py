@@ -20,7 +20,7 @@ from lowfc.control.laws.vibration import Model
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import preset_disturbance
 from sim_camera.driver import disturbance_of
-from tests.support.theory import integrators, modes_nm, noise_transfer, realised, rejection, run
+from tests.support.theory import integrators, modes_nm, noise_transfer, one_piece, realised, rejection, run
 from tools import laws
 from tools.law_bench import Bench, calibrated, configured, tuned, with_lines_moved
 
@@ -33,7 +33,7 @@ def wheel(frames: int) -> tuple[TimeSeries, np.ndarray]:
     """Pseudo-open-loop tilts of the reaction wheel, and the true tilts."""
     truth = modes_nm(preset_disturbance("reaction-wheel", NOLL, 1, NM_PER_MAS, 550.0), 0, frames, RATE_HZ)
     noise = 0.8 * np.random.default_rng(1).standard_normal(truth.shape)
-    return TimeSeries((truth + noise,), 0), truth
+    return one_piece(truth + noise), truth
 
 
 def true_mas(law: LinearLaw, pol: TimeSeries, truth: np.ndarray, delay_frames: float) -> float:
@@ -54,7 +54,7 @@ def test_the_highest_gain_has_exactly_the_least_allowed_margins(delay_frames: fl
 def test_the_best_gain_agrees_with_theory() -> None:
     """A random walk with noise: the minimum of drift |S|^2 + noise |T|^2 over the gains, by a search."""
     model = Model(0.02, np.inf, (), 1.0, RATE_HZ)
-    pol = TimeSeries((np.hstack([realised(model, 40_000, seed) for seed in (1, 2)]),), 0)
+    pol = one_piece(np.hstack([realised(model, 40_000, seed) for seed in (1, 2)]))
     best = best_gains(pol, RATE_HZ, Timing.sampled(1.0), NO_LEAK)
     omega = np.geomspace(1e-4, np.pi, 20_000)
     hz = omega * RATE_HZ / (2 * np.pi)
@@ -74,7 +74,7 @@ def test_the_best_gain_agrees_with_theory() -> None:
 def test_the_residual_of_a_leaky_integrator_follows_from_the_log(leak: float) -> None:
     """A leak leaves a part of slow disturbances; those below the log's lowest frequency must not be extrapolated."""
     model = Model(1e-3, np.inf, (), 0.5, RATE_HZ)
-    pol = TimeSeries((10 + np.hstack([realised(model, 6000, seed) for seed in (1, 2)]),), 0)
+    pol = one_piece(10 + np.hstack([realised(model, 6000, seed) for seed in (1, 2)]))
     leaks = np.full(2, leak)
     gains = best_gains(pol, RATE_HZ, Timing.sampled(1.0), leaks)
     best = tune_integrator(identify_modes(pol, RATE_HZ), gains, NOLL, leaks, Timing.sampled(1.0))
@@ -95,7 +95,7 @@ def test_laws_on_the_reaction_wheel_leave_the_predicted_residual(
 ) -> None:
     """LQG leaves less than a notch filter, which leaves less than the integrator."""
     pol, truth = wheel(10_000)
-    later = TimeSeries((truth + 0.8 * np.random.default_rng(99).standard_normal(truth.shape),), 0)
+    later = one_piece(truth + 0.8 * np.random.default_rng(99).standard_normal(truth.shape))
     models = identify_modes(pol, RATE_HZ)
     timing = Timing.sampled(delay)
     gains = best_gains(pol, RATE_HZ, timing, NO_LEAK)
@@ -119,7 +119,7 @@ def test_laws_on_the_reaction_wheel_leave_the_predicted_residual(
 def test_white_noise_gets_a_law_with_a_small_residual() -> None:
     """White noise cannot be predicted: any choice between LQG and integrator leaves a small residual."""
     noise = np.random.default_rng(5).standard_normal((4096, 2))
-    pol = TimeSeries((noise,), 0)
+    pol = one_piece(noise)
     gains = best_gains(pol, RATE_HZ, Timing.sampled(1.0), NO_LEAK)
     best = tune_lqg(pol, identify_modes(pol, RATE_HZ), gains, NOLL, NO_LEAK, Timing.sampled(1.0))
     assert set(best.kinds) <= {"integrator", "lqg"}
@@ -129,7 +129,7 @@ def test_white_noise_gets_a_law_with_a_small_residual() -> None:
 
 
 def test_too_few_frames_are_refused() -> None:
-    pol = TimeSeries((np.zeros((500, 2)),), 0)
+    pol = one_piece(np.zeros((500, 2)))
     with pytest.raises(ValueError, match="at least 2048 frames in a row, the longest run has 500"):
         best_gains(pol, RATE_HZ, Timing.sampled(1.0), NO_LEAK)
     with pytest.raises(ValueError, match="at least 2048 frames in a row"):

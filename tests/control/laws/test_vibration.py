@@ -15,7 +15,7 @@ from lowfc.control.laws.tuning import predicted_nm
 from lowfc.control.laws.vibration import FEWEST, Line, Model, identify, resolution_hz
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import LINES_HZ, preset_disturbance
-from tests.support.theory import modes_nm, realised, run
+from tests.support.theory import modes_nm, one_piece, realised, run
 
 RATE_HZ = 1000.0
 NM_PER_MAS = tilt_nm_per_mas(2.0)
@@ -25,7 +25,7 @@ def ideal_wheel() -> TimeSeries:
     """Tip of the ideal reaction wheel, measured with white noise."""
     simulated = preset_disturbance("reaction-wheel-ideal", (2, 3, 4), 1, NM_PER_MAS, 550.0)
     noise = 0.8 * np.random.default_rng(1).standard_normal((12_000, 1))
-    return TimeSeries((modes_nm(simulated, 0, 12_000, RATE_HZ)[:, :1] + noise,), 0)
+    return one_piece(modes_nm(simulated, 0, 12_000, RATE_HZ)[:, :1] + noise)
 
 
 def test_the_lines_of_the_reaction_wheel_are_identified() -> None:
@@ -39,7 +39,7 @@ def test_the_lines_of_the_reaction_wheel_are_identified() -> None:
 
 def test_width_and_power_of_damped_lines_are_identified() -> None:
     truth = Model(1e-4, np.inf, (Line(20, 0.8, 25.0), Line(60, 2.5, 9.0)), 0.5, RATE_HZ)
-    model = identify(TimeSeries((realised(truth, 40_000),), 0), RATE_HZ)
+    model = identify(one_piece(realised(truth, 40_000)), RATE_HZ)
     assert [line.frequency_hz for line in model.lines] == pytest.approx([20, 60], rel=0.01)
     assert [line.width_hz for line in model.lines] == pytest.approx([0.8, 2.5], rel=0.35)
     assert [line.variance_nm2 for line in model.lines] == pytest.approx([25, 9], rel=0.35)
@@ -48,14 +48,14 @@ def test_width_and_power_of_damped_lines_are_identified() -> None:
 
 def test_a_wide_line_stays_below_half_of_the_frame_rate() -> None:
     truth = Model(1e-8, np.inf, (Line(485, 120, 25.0),), 0.09, RATE_HZ)
-    (line,) = identify(TimeSeries((realised(truth, 4096, 13),), 0), RATE_HZ).lines
+    (line,) = identify(one_piece(realised(truth, 4096, 13)), RATE_HZ).lines
     assert 450 < line.frequency_hz < RATE_HZ / 2
 
 
 def test_no_line_is_identified_in_noise() -> None:
     for seed in range(5):
         noise = np.random.default_rng(seed).standard_normal((4096, 1))
-        model = identify(TimeSeries((noise,), 0), RATE_HZ)
+        model = identify(one_piece(noise), RATE_HZ)
         assert model.lines == ()
         assert model.noise_nm2 == pytest.approx(1, rel=0.1)
 
@@ -76,15 +76,15 @@ def test_pieces_are_identified_like_one_run_and_short_ones_are_not() -> None:
     whole = ideal_wheel().values[0]
     model = identify(TimeSeries((whole[:6000], whole[6000:]), 0), RATE_HZ)
     assert [round(line.frequency_hz) for line in model.lines] == [6, 18, 37, 71, 117]
-    assert identify(TimeSeries((whole[: FEWEST - 1],), 0), RATE_HZ) is None
-    assert resolution_hz(TimeSeries((whole,), 0), RATE_HZ) == RATE_HZ / 12_000
+    assert identify(one_piece(whole[: FEWEST - 1]), RATE_HZ) is None
+    assert resolution_hz(one_piece(whole), RATE_HZ) == RATE_HZ / 12_000
     assert resolution_hz(TimeSeries((), 0), RATE_HZ) == 0
 
 
 def test_a_slow_mode_is_identified_as_drift() -> None:
     simulated = preset_disturbance("thermal", (4,), 3, NM_PER_MAS, 550.0)
     run = modes_nm(simulated, 0, 20_000, RATE_HZ) + 0.5 * np.random.default_rng(3).standard_normal((20_000, 1))
-    model = identify(TimeSeries((run,), 0), RATE_HZ)
+    model = identify(one_piece(run), RATE_HZ)
     assert all(line.frequency_hz < 1 for line in model.lines)
     assert model.drift_nm2 > 0
     assert model.noise_nm2 == pytest.approx(0.25, rel=0.05)
@@ -93,7 +93,7 @@ def test_a_slow_mode_is_identified_as_drift() -> None:
 @pytest.mark.parametrize(("lines", "seed"), [((), 1), (LINES_HZ, 3)])
 def test_a_model_without_noise_still_gives_a_stable_filter(lines: tuple[float, ...], seed: int) -> None:
     truth = Model(1.0, 50.0, tuple(Line(hz, 1e-3, 100.0) for hz in lines), 1e-12, RATE_HZ)
-    model = identify(TimeSeries((realised(truth, 4096, seed),), 0), RATE_HZ)
+    model = identify(one_piece(realised(truth, 4096, seed)), RATE_HZ)
     assert model.noise_nm2 > 1e-8
     check_stable(lqg([model], (2,), SAMPLED), 1.0)
 
