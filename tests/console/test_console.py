@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import os
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from textual.events import Key
 from textual.geometry import Size
+from textual.pilot import Pilot
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files import calibration_file, law_file
@@ -68,47 +69,55 @@ def _no_wait_for_idle(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lowfc.programs.console.feed.DISCONNECTED_S", 0.4)
 
 
-@contextlib.asynccontextmanager
-async def console(run: LiveRun) -> AsyncIterator["Screen"]:
-    bus = run.bus("operator")
-    app = Console(bus, RUN, run.clock)
-    async with app.run_test(size=(100, 30)) as pilot:
-        screen = Screen(app, pilot)
-        await screen.until(lambda: screen.text("verdict") and "NOT CONNECTED" not in screen.text("verdict"))
-        await screen.until(lambda: "light" in screen.text("sparks"))
-        yield screen
-    bus.close()
-
-
 class Screen:
-    """A console without a terminal, and the pilot that presses its keys."""
+    """A console without a terminal: its keys, mouse and texts; it runs only during `press`, `click` and `until`."""
 
-    def __init__(self, app, pilot) -> None:
-        self.app, self.pilot = app, pilot
+    def __init__(self, app: Console, pilot: Pilot, runner: asyncio.Runner) -> None:
+        self.app, self._pilot, self._runner = app, pilot, runner
 
     def text(self, name: str) -> str:
         return str(self.app.screen_stack[0].query_one(f"#{name}").render())
 
-    async def until(self, condition: Callable[[], object]) -> None:
+    def form_is_open(self) -> bool:
+        """Whether there is a form, a question or the help."""
+        return len(self.app.screen_stack) == 2
+
+    def press(self, *keys: str) -> None:
+        self._runner.run(self._pilot.press(*keys))
+
+    def click(self, selector: str, offset: tuple[int, int] = (0, 0)) -> None:
+        self._runner.run(self._pilot.click(selector, offset=offset))
+
+    def until(self, condition: Callable[[], object]) -> None:
         for _ in range(round(TIMEOUT_S / 0.01)):
             if condition():
                 return
-            await self.pilot.pause(0.01)
+            self._runner.run(self._pilot.pause(0.01))
         raise AssertionError(f"condition not met in {TIMEOUT_S:g} s; the console shows {self.text('answer')!r}")
 
-    async def fill(self, *values: str) -> None:
-        await self.until(lambda: len(self.app.screen_stack) == 2 and self.app.focused is not None)
+    def fill(self, *values: str) -> None:
+        self.until(lambda: self.form_is_open() and self.app.focused is not None)
         for field, value in zip(self.app.screen.query("Input"), values, strict=True):
             field.value = value
-        await self.pilot.press("enter")
+        self.press("enter")
 
 
-def operate(run: LiveRun, scenario: Callable[[Screen], Awaitable[None]]) -> None:
-    async def with_console() -> None:
-        async with console(run) as screen:
-            await scenario(screen)
+@contextlib.contextmanager
+def console(run: LiveRun) -> Iterator[Screen]:
+    with asyncio.Runner() as runner, contextlib.closing(run.bus("operator")) as bus:
+        app = Console(bus, RUN, run.clock)
+        running = app.run_test(size=(100, 30))
+        screen = Screen(app, runner.run(running.__aenter__()), runner)
+        screen.until(lambda: screen.text("verdict") and "NOT CONNECTED" not in screen.text("verdict"))
+        screen.until(lambda: "light" in screen.text("sparks"))
+        yield screen
+        runner.run(running.__aexit__(None, None, None))
 
-    asyncio.run(with_console())
+
+@pytest.fixture
+def screen(run: LiveRun) -> Iterator[Screen]:
+    with console(run) as screen:
+        yield screen
 
 
 BUTTONS: dict[str, tuple[tuple[str, ...], dict[str, object]]] = {
@@ -143,71 +152,64 @@ TASKS = {
 
 
 def test_the_key_of_every_button_sends_its_request(
-    run: LiveRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    screen: Screen, run: LiveRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert {*BUTTONS, *TASKS} == set(ALL_ACTIONS)
     monkeypatch.setenv("HOME", str(tmp_path))
     np.save(tmp_path / "shape.npy", np.full(GRID, 3.0))
     law_file.save(LAW, tmp_path / "law.fits")
     calibration_file.save(identified(calibration()), tmp_path / "calibration.fits")
-
-    async def scenario(screen: Screen) -> None:
-        for name in ORDER:
-            typed, expected = BUTTONS[name]
-            before = len(run.requests)
-            await screen.pilot.press(ALL_ACTIONS[name].key)
-            if typed:
-                await screen.fill(*typed)
-            elif ALL_ACTIONS[name].confirm:
-                await screen.until(lambda: len(screen.app.screen_stack) == 2)
-                assert len(run.requests) == before, "no request before the question is answered"
-                await screen.pilot.press("enter")
-            await screen.until(
-                lambda name=name: (
-                    screen.text("answer").startswith(f"{name}: ") and not screen.text("answer").endswith(": requested")
-                )
+    for name in ORDER:
+        typed, expected = BUTTONS[name]
+        before = len(run.requests)
+        screen.press(ALL_ACTIONS[name].key)
+        if typed:
+            screen.fill(*typed)
+        elif ALL_ACTIONS[name].confirm:
+            screen.until(screen.form_is_open)
+            assert len(run.requests) == before, "no request before the question is answered"
+            screen.press("enter")
+        screen.until(
+            lambda name=name: (
+                screen.text("answer").startswith(f"{name}: ") and not screen.text("answer").endswith(": requested")
             )
-            if expected:
-                request = run.requests[-1]
-                assert request.accepted, request.reply
-                assert {field: getattr(request, field) for field in expected} == expected
-                assert request.requester.endswith(f"(process {os.getpid()})")
-            assert len(screen.app.screen_stack) == 1, "a form closes when its request is accepted"
-        laws = [request for request in run.requests if request.name == "law"]
-        assert [law.HasField("law") for law in laws] == [True, False]
-        assert run.recorded == ["stop", "start", "stop"]
-        await screen.until(lambda: "pause (" in screen.text("log"))
-        line = next(line for line in screen.text("log").splitlines() if "pause (" in line)
-        assert f"(process {os.getpid()}))" in line
-        assert "loop paused" in line
-        await screen.pilot.press("c")
-        await screen.until(lambda: "CLOSED" in screen.text("tiles"))
+        )
+        if expected:
+            request = run.requests[-1]
+            assert request.accepted, request.reply
+            assert {field: getattr(request, field) for field in expected} == expected
+            assert request.requester.endswith(f"(process {os.getpid()})")
+        assert not screen.form_is_open(), "a form closes when its request is accepted"
+    laws = [request for request in run.requests if request.name == "law"]
+    assert [law.HasField("law") for law in laws] == [True, False]
+    assert run.recorded == ["stop", "start", "stop"]
+    screen.until(lambda: "pause (" in screen.text("log"))
+    line = next(line for line in screen.text("log").splitlines() if "pause (" in line)
+    assert f"(process {os.getpid()}))" in line
+    assert "loop paused" in line
+    screen.press("c")
+    screen.until(lambda: "CLOSED" in screen.text("tiles"))
 
-    operate(run, scenario)
 
-
-def test_a_refused_request_shows_its_reason_and_turns_its_button_red(run: LiveRun) -> None:
-    async def scenario(screen: Screen) -> None:
-        await screen.pilot.press("g")
-        await screen.fill("much", "2")
-        await screen.until(lambda: "write numbers" in str(screen.app.screen.query_one("#refusal").render()))
-        await screen.fill("9", "2")
-        await screen.until(lambda: "becomes unstable" in str(screen.app.screen.query_one("#refusal").render()))
-        assert not run.requests[-1].accepted
-        assert "becomes unstable" in screen.text("answer")
-        await screen.pilot.press("escape")
-        await screen.until(lambda: len(screen.app.screen_stack) == 1)
-        button = screen.app.screen.query_one("#gain")
-        assert button.has_class("refused")
-        await screen.pilot.press("g")
-        await screen.fill("0.1", "")
-        await screen.until(lambda: not button.has_class("refused"))
-
-    operate(run, scenario)
+def test_a_refused_request_shows_its_reason_and_turns_its_button_red(screen: Screen, run: LiveRun) -> None:
+    screen.press("g")
+    screen.fill("much", "2")
+    screen.until(lambda: "write numbers" in str(screen.app.screen.query_one("#refusal").render()))
+    screen.fill("9", "2")
+    screen.until(lambda: "becomes unstable" in str(screen.app.screen.query_one("#refusal").render()))
+    assert not run.requests[-1].accepted
+    assert "becomes unstable" in screen.text("answer")
+    screen.press("escape")
+    screen.until(lambda: not screen.form_is_open())
+    button = screen.app.screen.query_one("#gain")
+    assert button.has_class("refused")
+    screen.press("g")
+    screen.fill("0.1", "")
+    screen.until(lambda: not button.has_class("refused"))
 
 
 def test_a_form_stays_open_at_the_answer_to_an_earlier_request_of_its_button(
-    run: LiveRun, monkeypatch: pytest.MonkeyPatch
+    screen: Screen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answered = threading.Event()
 
@@ -216,91 +218,80 @@ def test_a_form_stays_open_at_the_answer_to_an_earlier_request_of_its_button(
         return Answer(True, "noted", 0)
 
     monkeypatch.setitem(ALL_ACTIONS, "note", ALL_ACTIONS["note"]._replace(ask=slow))
-
-    async def scenario(screen: Screen) -> None:
-        await screen.pilot.press("n")
-        await screen.fill("the first")
-        await screen.pilot.press("escape")
-        await screen.until(lambda: len(screen.app.screen_stack) == 1)
-        await screen.pilot.press("n")
-        await screen.until(lambda: len(screen.app.screen_stack) == 2)
-        answered.set()
-        await screen.until(lambda: screen.text("answer") == "note: noted")
-        assert len(screen.app.screen_stack) == 2
-        await screen.fill("the second")
-        await screen.until(lambda: len(screen.app.screen_stack) == 1)
-
-    operate(run, scenario)
+    screen.press("n")
+    screen.fill("the first")
+    screen.press("escape")
+    screen.until(lambda: not screen.form_is_open())
+    screen.press("n")
+    screen.until(screen.form_is_open)
+    answered.set()
+    screen.until(lambda: screen.text("answer") == "note: noted")
+    assert screen.form_is_open()
+    screen.fill("the second")
+    screen.until(lambda: not screen.form_is_open())
 
 
-def test_auto_is_for_gains_only(run: LiveRun) -> None:
-    async def scenario(screen: Screen) -> None:
+def test_auto_is_for_gains_only(screen: Screen, run: LiveRun) -> None:
+    before = len(run.requests)
+    for key, values in (("l", ("auto", "")), ("t", ("auto",))):
+        screen.press(key)
+        screen.fill(*values)
+        screen.until(lambda: "'auto': write numbers" in str(screen.app.screen.query_one("#refusal").render()))
+        screen.press("escape")
+        screen.until(lambda: not screen.form_is_open())
+    assert len(run.requests) == before
+
+
+def test_safe_is_requested_by_s_by_its_button_by_f12_in_a_form_and_by_s_in_the_help(
+    screen: Screen, run: LiveRun
+) -> None:
+    for press in (lambda: screen.press("S"), lambda: screen.click("#safe")):
         before = len(run.requests)
-        for key, values in (("l", ("auto", "")), ("t", ("auto",))):
-            await screen.pilot.press(key)
-            await screen.fill(*values)
-            await screen.until(lambda: "'auto': write numbers" in str(screen.app.screen.query_one("#refusal").render()))
-            await screen.pilot.press("escape")
-            await screen.until(lambda: len(screen.app.screen_stack) == 1)
-        assert len(run.requests) == before
-
-    operate(run, scenario)
-
-
-def test_safe_is_requested_by_s_by_its_button_by_f12_in_a_form_and_by_s_in_the_help(run: LiveRun) -> None:
-    async def scenario(screen: Screen) -> None:
-        for press in (lambda: screen.pilot.press("S"), lambda: screen.pilot.click("#safe")):
-            before = len(run.requests)
-            await press()
-            await screen.until(lambda before=before: [request.name for request in run.requests[before:]] == ["safe"])
-        before = len(run.requests)
-        await screen.pilot.press("question_mark", "s")
-        await screen.until(lambda: [request.name for request in run.requests[before:]] == ["safe"])
-        await screen.until(lambda: len(screen.app.screen_stack) == 1)
-        await screen.pilot.press("n")
-        await screen.until(lambda: len(screen.app.screen_stack) == 2)
-        before = len(run.requests)
-        await screen.pilot.press("s", "f12")
-        await screen.until(lambda: [request.name for request in run.requests[before:]] == ["safe"])
-        await screen.until(lambda: screen.app.screen.query_one("Input").value == "s")
-        await screen.pilot.press("escape", "k", "enter")
-        await screen.until(lambda: run.requests[-1].name == "clear" and len(screen.app.screen_stack) == 1)
-        await screen.pilot.click("#close")
-        await screen.until(lambda: run.requests[-1].name == "close")
-
-    operate(run, scenario)
+        press()
+        screen.until(lambda before=before: [request.name for request in run.requests[before:]] == ["safe"])
+    before = len(run.requests)
+    screen.press("question_mark", "s")
+    screen.until(lambda: [request.name for request in run.requests[before:]] == ["safe"])
+    screen.until(lambda: not screen.form_is_open())
+    screen.press("n")
+    screen.until(screen.form_is_open)
+    before = len(run.requests)
+    screen.press("s", "f12")
+    screen.until(lambda: [request.name for request in run.requests[before:]] == ["safe"])
+    screen.until(lambda: screen.app.screen.query_one("Input").value == "s")
+    screen.press("escape", "k", "enter")
+    screen.until(lambda: run.requests[-1].name == "clear" and not screen.form_is_open())
+    screen.click("#close")
+    screen.until(lambda: run.requests[-1].name == "close")
 
 
-def test_a_gain_knob_scales_the_gains_of_all_modes_or_of_one_radial_order(run: LiveRun) -> None:
+def test_a_gain_knob_scales_the_gains_of_all_modes_or_of_one_radial_order(screen: Screen, run: LiveRun) -> None:
     def gain() -> list[float]:
         return list(run.requests[-1].values) if run.requests and run.requests[-1].name == "gain" else []
 
-    async def scenario(screen: Screen) -> None:
-        await screen.pilot.press("g")
-        await screen.fill("0.5 0.5 0.05", "2-4")
-        await screen.until(lambda: gain() == pytest.approx([0.5, 0.5, 0.05]) and "0.05-0.5" in screen.text("gains"))
-        before = len(run.requests)
-        await screen.pilot.press(*["right"] * 4)
-        await screen.until(lambda: gain() == pytest.approx([0.7, 0.7, 0.07]))
-        tip_gains = [request.values[0] for request in run.requests[before:]]
-        assert tip_gains == sorted(tip_gains), "requested in the order of the keys"
-        await screen.until(lambda: "0.07-0.7" in screen.text("gains"))
-        await screen.pilot.press("down", "left")
-        await screen.until(lambda: gain() == pytest.approx([0.65, 0.65]))
-        assert list(run.requests[-1].modes) == [2, 3]
-        await screen.pilot.press("down", "left")
-        await screen.until(lambda: gain() == pytest.approx([0.06]))
-        await screen.until(lambda: "0.06-0.65" in screen.text("gains"))
-        await screen.pilot.click("#gains", offset=(11 + 8, 0))  # the right end of the knob's bar
-        await screen.until(lambda: gain() == pytest.approx([1.5, 1.5, 0.1385]))
-        await screen.pilot.press("u")
-        await screen.until(lambda: any(request.text == "auto" and request.accepted for request in run.requests))
-        await screen.until(lambda: "auto" in screen.text("gains"))
-        await screen.pilot.press("g")  # automatic gains would send requests during the next tests
-        await screen.fill("0.5 0.5 0.05", "2-4")
-        await screen.until(lambda: "auto" not in screen.text("gains"))
-
-    operate(run, scenario)
+    screen.press("g")
+    screen.fill("0.5 0.5 0.05", "2-4")
+    screen.until(lambda: gain() == pytest.approx([0.5, 0.5, 0.05]) and "0.05-0.5" in screen.text("gains"))
+    before = len(run.requests)
+    screen.press(*["right"] * 4)
+    screen.until(lambda: gain() == pytest.approx([0.7, 0.7, 0.07]))
+    tip_gains = [request.values[0] for request in run.requests[before:]]
+    assert tip_gains == sorted(tip_gains), "requested in the order of the keys"
+    screen.until(lambda: "0.07-0.7" in screen.text("gains"))
+    screen.press("down", "left")
+    screen.until(lambda: gain() == pytest.approx([0.65, 0.65]))
+    assert list(run.requests[-1].modes) == [2, 3]
+    screen.press("down", "left")
+    screen.until(lambda: gain() == pytest.approx([0.06]))
+    screen.until(lambda: "0.06-0.65" in screen.text("gains"))
+    screen.click("#gains", offset=(11 + 8, 0))  # the right end of the knob's bar
+    screen.until(lambda: gain() == pytest.approx([1.5, 1.5, 0.1385]))
+    screen.press("u")
+    screen.until(lambda: any(request.text == "auto" and request.accepted for request in run.requests))
+    screen.until(lambda: "auto" in screen.text("gains"))
+    screen.press("g")  # automatic gains would send requests during the next tests
+    screen.fill("0.5 0.5 0.05", "2-4")
+    screen.until(lambda: "auto" not in screen.text("gains"))
 
 
 def test_a_knob_is_chosen_and_shown_whatever_the_number_of_modes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -335,16 +326,13 @@ def test_a_knob_is_chosen_and_shown_whatever_the_number_of_modes(monkeypatch: py
         assert any(line.plain.startswith("▸") for line in knobs._lines[:5]), "scrolled to the chosen knob"
 
 
-def test_keys_typed_while_a_form_opens_are_entered_in_it(run: LiveRun) -> None:
-    async def scenario(screen: Screen) -> None:
-        before = len(run.requests)
-        for key in ("n", "o", "s", "escape", "g", "0", ".", "2", "tab", "2", "tab", "shift+tab", "enter"):
-            screen.app.post_message(Key(key, key if len(key) == 1 else None))
-        await screen.until(lambda: len(run.requests) > before)
-        (gain,) = run.requests[before:]
-        assert (gain.name, list(gain.values), list(gain.modes)) == ("gain", [pytest.approx(0.2)], [2])
-
-    operate(run, scenario)
+def test_keys_typed_while_a_form_opens_are_entered_in_it(screen: Screen, run: LiveRun) -> None:
+    before = len(run.requests)
+    for key in ("n", "o", "s", "escape", "g", "0", ".", "2", "tab", "2", "tab", "shift+tab", "enter"):
+        screen.app.post_message(Key(key, key if len(key) == 1 else None))
+    screen.until(lambda: len(run.requests) > before)
+    (gain,) = run.requests[before:]
+    assert (gain.name, list(gain.values), list(gain.modes)) == ("gain", [pytest.approx(0.2)], [2])
 
 
 def test_a_repeated_event_has_one_line_with_its_count() -> None:
@@ -370,21 +358,17 @@ def test_the_console_replaces_commands_by_keys_and_long_lists_by_ranges() -> Non
     assert panels.event_line(EVENTS["NOTE"].log("controller", 0, text="1 2 3 4")).plain.endswith("NOTE 1 2 3 4")
 
 
-def test_tasks_are_commands_with_the_options_of_their_form(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tasks_are_commands_with_the_options_of_their_form(screen: Screen, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[list[str]] = []
     monkeypatch.setattr(application, "Task", lambda name, words: started.append(words) or FinishedTask(name))
-
-    async def scenario(screen: Screen) -> None:
-        for name, words in TASKS.items():
-            await screen.pilot.press(ALL_ACTIONS[name].key)
-            await screen.until(lambda: len(screen.app.screen_stack) == 2)
-            await screen.pilot.press("enter")
-            await screen.until(lambda name=name: screen.text("answer") == f"{name}: done")
-            command = " ".join(started[-1])
-            assert command.startswith(f"{words} calibration-")
-            assert command.endswith(f".fits --load --run {RUN}")
-
-    operate(run, scenario)
+    for name, words in TASKS.items():
+        screen.press(ALL_ACTIONS[name].key)
+        screen.until(screen.form_is_open)
+        screen.press("enter")
+        screen.until(lambda name=name: screen.text("answer") == f"{name}: done")
+        command = " ".join(started[-1])
+        assert command.startswith(f"{words} calibration-")
+        assert command.endswith(f".fits --load --run {RUN}")
 
 
 def test_a_task_expands_a_tilde_and_its_load_field_takes_yes_or_no() -> None:
@@ -438,50 +422,42 @@ def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatc
 
 
 def test_a_request_is_in_the_log_of_every_console(run: LiveRun) -> None:
-    async def both() -> None:
-        async with console(run) as first, console(run) as second:
-            await first.pilot.press("n")
-            await first.fill("from the first")
-            for screen in (first, second):
-                await screen.until(lambda screen=screen: "note from the first (" in screen.text("log"))
-
-    asyncio.run(both())
+    with console(run) as first, console(run) as second:
+        first.press("n")
+        first.fill("from the first")
+        for screen in (first, second):
+            screen.until(lambda screen=screen: "note from the first (" in screen.text("log"))
 
 
-def test_errors_ring_the_bell_until_it_is_muted(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_ring_the_bell_until_it_is_muted(screen: Screen, run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
     bells: list[str] = []
+    monkeypatch.setattr(screen.app, "bell", lambda: bells.append("bell"))
+    events = run.bus("recorder").publisher(EVENT)
 
-    async def scenario(screen: Screen) -> None:
-        monkeypatch.setattr(screen.app, "bell", lambda: bells.append("bell"))
-        events = run.bus("recorder").publisher(EVENT)
+    def publish(name: str, **details: object) -> None:
+        events.put(EVENTS[name].log("recorder", run.clock.now_ns(), **details).SerializeToString())
+        screen.until(lambda: name in screen.text("log"))
 
-        async def publish(name: str, **details: object) -> None:
-            events.put(EVENTS[name].log("recorder", run.clock.now_ns(), **details).SerializeToString())
-            await screen.until(lambda: name in screen.text("log"))
-
-        await publish("DISK_SLOW", stall_s=2.0, waiting=3)
-        assert bells == []
-        await publish("RECORDING_FAILED", why="no space")
-        assert bells == ["bell"]
-        await screen.pilot.press("m")
-        await publish("MESSAGES_LOST", count=3, topic="lowfc/event")
-        assert bells == ["bell"]
-
-    operate(run, scenario)
+    publish("DISK_SLOW", stall_s=2.0, waiting=3)
+    assert bells == []
+    publish("RECORDING_FAILED", why="no space")
+    assert bells == ["bell"]
+    screen.press("m")
+    publish("MESSAGES_LOST", count=3, topic="lowfc/event")
+    assert bells == ["bell"]
 
 
-def test_a_disconnected_console_reports_it_and_hides_the_values(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def scenario(screen: Screen) -> None:
-        with monkeypatch.context() as disconnected:
-            disconnected.setattr(run.hub, "lose", lambda role, key, envelope: role == "operator")
-            await screen.until(lambda: screen.text("verdict").startswith("NOT CONNECTED"))
-            await screen.until(lambda: not screen.app.screen.query_one("#tiles").visible)
-            await screen.until(lambda: not screen.app.screen.query_one("#gains").visible)
-        await screen.until(lambda: not screen.text("verdict").startswith("NOT CONNECTED"))
-        # seven tiles, CONTRAST and VIEW, once they are laid out again
-        await screen.until(lambda: screen.app.screen.query_one("#tiles").size.height == 9)
-
-    operate(run, scenario)
+def test_a_disconnected_console_reports_it_and_hides_the_values(
+    screen: Screen, run: LiveRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as disconnected:
+        disconnected.setattr(run.hub, "lose", lambda role, key, envelope: role == "operator")
+        screen.until(lambda: screen.text("verdict").startswith("NOT CONNECTED"))
+        screen.until(lambda: not screen.app.screen.query_one("#tiles").visible)
+        screen.until(lambda: not screen.app.screen.query_one("#gains").visible)
+    screen.until(lambda: not screen.text("verdict").startswith("NOT CONNECTED"))
+    # seven tiles, CONTRAST and VIEW, once they are laid out again
+    screen.until(lambda: screen.app.screen.query_one("#tiles").size.height == 9)
 
 
 def test_a_console_without_its_terminal_ends() -> None:
