@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -81,16 +82,10 @@ def gain_bank_responses() -> list[Array | Single]:
 
 @pytest.fixture(scope="module")
 def faint(gain_bank_responses: list[Array | Single]) -> Bench:
-    use_reconstructor = GainBank.use_reconstructor
-
-    def spied(self: GainBank, response: Array | Single) -> None:
-        gain_bank_responses.append(response)
-        use_reconstructor(self, response)
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(GainBank, "use_reconstructor", spied)
+    with patch.object(GainBank, "use_reconstructor", autospec=True, side_effect=GainBank.use_reconstructor) as used:
         loop = bench(6.5)
         loop.run(1200)
+    gain_bank_responses += [call.args[1] for call in used.call_args_list]
     return loop
 
 
