@@ -10,14 +10,17 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 
 class Listener:
-    """Keeps all messages of some topics and all events: `samples` has them by topic, with their envelopes."""
+    """Keeps all messages of some topics and all events: `samples` has them by topic, with their envelopes.
+
+    `bus` is its connection, as an operator's program.
+    """
 
     def __init__(self, hub: MemoryHub, clock: Clock, *topics: Topic) -> None:
         self.samples: dict[Topic, list[Sample]] = {topic: [] for topic in (*topics, EVENT)}
         self.hub, self.clock = hub, clock
-        bus = MemoryBus(hub, "operator", clock)
+        self.bus = MemoryBus(hub, "operator", clock)
         for topic, received in self.samples.items():
-            bus.subscribe(topic, received.append)
+            self.bus.subscribe(topic, received.append)
 
     def service(self, role: str, **options: Any) -> Service:
         """Make a process on the same hub with the same clock, with these options of `Service`."""

@@ -124,15 +124,14 @@ def test_a_very_long_key_is_not_cached() -> None:
 
 
 @pytest.fixture
-def hub() -> MemoryHub:
-    return MemoryHub()
+def listener() -> Listener:
+    return Listener(MemoryHub(), FakeClock())
 
 
-def test_forged_names_do_not_fill_a_process_and_give_one_event(hub: MemoryHub) -> None:
-    bus, listener = MemoryBus(hub, "operator", FakeClock()), Listener(hub, FakeClock())
+def test_forged_names_do_not_fill_a_process_and_give_one_event(listener: Listener) -> None:
     camera = listener.service("camera")
     for number in range(FORGED):
-        bus.publisher(HEALTH, f"forged-{number}").put(health(number))
+        listener.bus.publisher(HEALTH, f"forged-{number}").put(health(number))
     listener.service("controller").beat()
     camera.beat()
     assert len(camera.last_health) == MAX_NAMES + 1
@@ -141,21 +140,19 @@ def test_forged_names_do_not_fill_a_process_and_give_one_event(hub: MemoryHub) -
     assert event.startswith(f"BAD_MESSAGE {FORGED - MAX_NAMES} messages on lowfc/health/* could not be read")
 
 
-def test_a_process_with_many_starts_is_stored_once(hub: MemoryHub) -> None:
-    camera = Listener(hub, FakeClock()).service("camera")
-    bus = MemoryBus(hub, "operator", FakeClock())
-    stranger = bus.publisher(HEALTH, "stranger")
+def test_a_process_with_many_starts_is_stored_once(listener: Listener) -> None:
+    camera, stranger = listener.service("camera"), listener.bus.publisher(HEALTH, "stranger")
     for number in range(FORGED):
-        bus.restart()
+        listener.bus.restart()
         stranger.put(health(number))
         assert camera.has_newcomers()
     assert not camera.has_newcomers()
     assert len(camera._known_starts) == 1
 
 
-def test_forged_names_do_not_fill_launcher_and_viewer(hub: MemoryHub) -> None:
+def test_forged_names_do_not_fill_launcher_and_viewer() -> None:
     watch, view = Watch({}, []), Accumulator()
-    launcher = MemoryBus(hub, "launcher", FakeClock())
+    launcher = MemoryBus(MemoryHub(), "launcher", FakeClock())
     launcher.subscribe(HEALTH, watch.add_health)
     for number in range(FORGED):
         view.add(Sample(HEALTH.at(f"forged-{number}"), health(number), 1, 1, 1))

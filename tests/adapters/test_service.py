@@ -220,7 +220,7 @@ def test_an_unreadable_message_gives_an_event_without_traceback_or_stop(
     read: list[int] = []
     decode = wire.MirrorCommand.FromString
     mirror.dispatch(COMMAND, lambda sample: read.append(len(decode(sample.payload).actuators)), "dm", period_ns=10**6)
-    MemoryBus(hub, "operator", clock).publisher(HEALTH, "stranger").put(b"\xff")
+    listener.bus.publisher(HEALTH, "stranger").put(b"\xff")
     commands = MemoryBus(hub, "controller", clock).publisher(COMMAND, "dm")
     commands.put(b"\xff")
     commands.put(wire.MirrorCommand(actuators=b"1234").SerializeToString())

@@ -686,7 +686,7 @@ def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
         role == "recorder" and key == FRAME.key and envelope.sequence & 0xFFFF in (5, 95)
     )
     bench.start()
-    operator = Client(bus=MemoryBus(bench.hub, "operator", bench.clock))
+    operator = Client(bus=bench.bus)
     first = put(frames, 50)
     stopped = Path(operator.record(False).text)
     assert stopped.is_absolute()
@@ -707,7 +707,7 @@ def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
     second = put(frames, 30)
     operator.record(False)
     put(frames, 10)
-    (answer,) = MemoryBus(bench.hub, "operator", bench.clock).get("lowfc/record/dance", timeout_s=10)
+    (answer,) = bench.bus.get("lowfc/record/dance", timeout_s=10)
     assert not wire.Request.FromString(answer.payload).accepted
     summary = bench.stop()
     assert [path.absolute() for path in summary.files] == [stopped, Path(started.text)]
@@ -728,7 +728,7 @@ def test_a_log_that_cannot_be_created_is_refused_and_can_be_requested_again(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.start(bytes_per_s=1e6)
-    operator = Client(bus=MemoryBus(bench.hub, "operator", bench.clock))
+    operator = Client(bus=bench.bus)
     first = operator.record(False).text
     with monkeypatch.context() as patch:
         patch.setattr("shutil.disk_usage", lambda folder: Path(os.devnull, "x").stat())

@@ -228,10 +228,9 @@ def test_record_with_the_word_start_is_refused_and_names_the_request() -> None:
 def test_the_answer_to_record_start_contains_the_estimate_of_disk_space(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "logs")
     bench.start(bytes_per_s=1e6)
-    operator = bench.service("operator")
     answers = []
     for name in ("stop", "start"):
-        (sample,) = operator.bus.get(f"lowfc/record/{name}", b"", 20.0)
+        (sample,) = bench.bus.get(f"lowfc/record/{name}", b"", 20.0)
         answers.append(wire.Request.FromString(sample.payload))
     bench.stop()
     assert [answer.accepted for answer in answers] == [True, True]

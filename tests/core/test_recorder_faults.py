@@ -22,7 +22,6 @@ from lowfc.contract.envelope import count_of, sequence_of
 from lowfc.contract.messages import CALIBRATION, COMMAND, EVENT, FRAME, HEALTH, RECORD_KEY, STEP, Topic, wire
 from lowfc.programs.core.recording import recorder as recorder_module
 from lowfc.programs.core.recording.summary import Summary
-from lowfc.testing.memory_bus import MemoryBus
 from tests.support.loops import mount, until
 from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put
 
@@ -185,14 +184,13 @@ def test_the_recorder_stays_responsive_while_a_stopped_log_is_written(
     put(bench.camera.publisher(FRAME), 10)
     reached, release = slow_disk(monkeypatch, refuses=refused)
     answers: list[Sample] = []
-    operator = MemoryBus(bench.hub, "operator", bench.clock)
     asking = threading.Thread(
-        target=lambda: answers.extend(operator.get(RECORD_KEY.format(name="stop"), timeout_s=PATIENCE_S))
+        target=lambda: answers.extend(bench.bus.get(RECORD_KEY.format(name="stop"), timeout_s=PATIENCE_S))
     )
     asking.start()
     assert reached.wait(PATIENCE_S)
     beats: list[int] = []
-    operator.subscribe(HEALTH, lambda sample: beats.append(sample.sequence), "recorder")
+    bench.bus.subscribe(HEALTH, lambda sample: beats.append(sample.sequence), "recorder")
     until(lambda: len(beats) >= 2)
     put(bench.camera.publisher(STEP), 5)  # not recorded while stopped, and not lost
     assert not answers
@@ -217,8 +215,7 @@ def test_a_recorder_stopped_while_a_log_is_finished_completes_the_log(
 ) -> None:
     bench.start()
     reached, release = slow_disk(monkeypatch, refuses=False)
-    operator = MemoryBus(bench.hub, "operator", bench.clock)
-    operator.get(RECORD_KEY.format(name="stop"), timeout_s=0)
+    bench.bus.get(RECORD_KEY.format(name="stop"), timeout_s=0)
     assert reached.wait(PATIENCE_S)
     bench.recorder.service.stop("end of the test")
     until(lambda: bench.recorder.service.state == "stopping")
@@ -332,15 +329,14 @@ def test_forged_names_and_starts_do_not_fill_the_recorder_or_a_log(
 ) -> None:
     monkeypatch.setattr("lowfc.programs.core.recording.recorder.MAX_CHANNELS", 100)
     bench.start()
-    forger = MemoryBus(bench.hub, "operator", bench.clock)
     for number in range(1000):
         body = wire.Health(process=f"forged-{number}").SerializeToString()
-        forger.publisher(HEALTH, f"forged-{number}").put(body)
-        forger.publisher(COMMAND, f"forged-{number}").put(b"")
+        bench.bus.publisher(HEALTH, f"forged-{number}").put(body)
+        bench.bus.publisher(COMMAND, f"forged-{number}").put(b"")
     until(lambda: "BAD_MESSAGE" in bench.events())
     first = bench.recorder.service.health().recording.file
     for start_s in range(1, 200):
-        forger.publisher(FRAME).put(b"", sequence=sequence_of(start_s, 0))
+        bench.bus.publisher(FRAME).put(b"", sequence=sequence_of(start_s, 0))
     until(lambda: bench.recorder.service.health().recording.file != first)
     summary = bench.stop()
     keys = {message.key for log in summary.files for message in LogReader(log)}
