@@ -267,13 +267,11 @@ class CommandedMirror:
     """A mirror that records its commands, with a controller and an operator that both publish commands."""
 
     def __init__(self, ends: Ends) -> None:
-        self.ends = ends
         self.received: list[Sample] = []
         self.threads: list[str] = []
         ends.bus("mirror-dm").subscribe(COMMAND, self.receive, "dm")
         controller, operator = ends.bus("controller"), ends.bus("operator")
         self.controller, self.operator = controller.publisher(COMMAND, "dm"), operator.publisher(COMMAND, "dm")
-        self.links = controller, operator
 
     def receive(self, sample: Sample) -> None:
         self.received.append(sample)
