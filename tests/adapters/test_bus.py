@@ -45,10 +45,10 @@ def _runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture
-def join() -> Iterator[Join]:
+def join(run: Run) -> Iterator[Join]:
     buses: list[ZenohBus] = []
 
-    def new_bus(run: Run, role: str, **options: bool) -> ZenohBus:
+    def new_bus(role: str, **options: bool) -> ZenohBus:
         buses.append(ZenohBus(run.links, role, HostClock(), **options))
         return buses[-1]
 
@@ -58,12 +58,12 @@ def join() -> Iterator[Join]:
 
 
 @pytest.fixture(params=["memory", "zenoh"])
-def pair(request: pytest.FixtureRequest, run: Run, join: Join) -> tuple[Bus, Bus]:
+def pair(request: pytest.FixtureRequest, join: Join) -> tuple[Bus, Bus]:
     """Buses of a controller and an operator, linked."""
     if request.param == "memory":
         hub, clock = MemoryHub(), FakeClock()
         return MemoryBus(hub, "controller", clock), MemoryBus(hub, "operator", clock)
-    buses = join(run, "controller"), join(run, "operator")
+    buses = join("controller"), join("operator")
     until(lambda: all(bus.peers() for bus in buses))
     return buses
 
@@ -81,8 +81,8 @@ def test_a_put_reaches_every_subscriber_of_its_key(pair: tuple[Bus, Bus]) -> Non
     assert not frames
 
 
-def test_closing_a_link_does_not_block_its_process(run: Run, join: Join) -> None:
-    buses = [join(run, role) for role in ("controller", "camera")]
+def test_closing_a_link_does_not_block_its_process(join: Join) -> None:
+    buses = [join(role) for role in ("controller", "camera")]
     until(lambda: all(bus.peers() for bus in buses))
     until(lambda: not any(socket_options(socket.SOL_SOCKET, socket.SO_LINGER)))
 
@@ -141,10 +141,10 @@ def test_a_failing_handler_affects_no_other_and_is_printed_once(
     assert capfd.readouterr().err.count("RuntimeError: handler broke") == 2
 
 
-def test_sequences_count_from_zero_and_never_repeat(run: Run, join: Join) -> None:
+def test_sequences_count_from_zero_and_never_repeat(join: Join) -> None:
     starts = []
     for _ in range(3):  # restarted within one second
-        bus = join(run, "camera")
+        bus = join("camera")
         publisher = bus.publisher(FRAME)
         sequences = [publisher.put(b"").sequence for _ in range(3)]
         assert [count_of(sequence) for sequence in sequences] == [0, 1, 2]
@@ -164,7 +164,7 @@ def test_sequences_of_the_memory_bus_never_repeat() -> None:
 
 
 def test_sessions_without_the_password_receive_and_send_nothing(run: Run, join: Join, tmp_path: Path) -> None:
-    camera = join(run, "camera")
+    camera = join("camera")
     configs = [session_config(run.links, "operator")]
     del configs[0]["transport"]["auth"]
     for user in ("lowfc", "intruder"):
@@ -178,7 +178,7 @@ def test_sessions_without_the_password_receive_and_send_nothing(run: Run, join: 
         intruders = [stack.enter_context(session) for session in sessions]
         for intruder in intruders:
             intruder.declare_subscriber(FRAME.key, overheard.append)
-        join(run, "viewer").subscribe(FRAME, received.put)  # after the intruders, with the right password
+        join("viewer").subscribe(FRAME, received.put)  # after the intruders, with the right password
 
         def exchange() -> None:
             frames.put(b"frame")
@@ -192,7 +192,7 @@ def test_sessions_without_the_password_receive_and_send_nothing(run: Run, join: 
 def test_messages_without_a_valid_envelope_are_counted_without_traceback(
     run: Run, join: Join, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    controller = join(run, "controller")
+    controller = join("controller")
     box = Mailbox()
     controller.subscribe(FRAME, box.put)
     ring = controller.ring(HEALTH, 10)
@@ -212,8 +212,8 @@ def test_messages_without_a_valid_envelope_are_counted_without_traceback(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_a_closed_ring_has_no_subscriber(run: Run, join: Join) -> None:
-    operator, camera = join(run, "operator"), join(run, "camera")
+def test_a_closed_ring_has_no_subscriber(join: Join) -> None:
+    operator, camera = join("operator"), join("camera")
     frames = camera.publisher(FRAME)
     ring = operator.ring(FRAME, 4)
     until(lambda: frames._publisher.matching_status.matching)
@@ -223,11 +223,11 @@ def test_a_closed_ring_has_no_subscriber(run: Run, join: Join) -> None:
 
 
 def test_a_listening_role_runs_only_once(run: Run, join: Join) -> None:
-    join(run, "camera")
+    join("camera")
     with pytest.raises(BusError, match=rf"camera of run '{run.run_id}' .* 127.0.0.1:{run.links.ports['camera']}"):
-        join(run, "camera")
-    join(run, "operator")
-    join(run, "operator")  # a role that does not listen may run twice
+        join("camera")
+    join("operator")
+    join("operator")  # a role that does not listen may run twice
 
 
 def test_each_role_listens_on_its_port_and_socket_and_connects_to_all_others(run: Run) -> None:
@@ -256,8 +256,8 @@ def test_monitors_connect_by_port_if_the_socket_path_is_too_long(tmp_path: Path)
 
 
 @pytest.mark.exclusive
-def test_a_monitor_receives_every_row_and_images_at_display_rate(run: Run, join: Join) -> None:
-    camera, viewer, recorder = join(run, "camera"), join(run, "viewer", monitor=True), join(run, "recorder")
+def test_a_monitor_receives_every_row_and_images_at_display_rate(join: Join) -> None:
+    camera, viewer, recorder = join("camera"), join("viewer", monitor=True), join("recorder")
     frames, truths = camera.publisher(FRAME), camera.publisher(TRUTH)
     images, rows, recorded = viewer.ring(FRAME, 5000), viewer.ring(TRUTH, 5000), Mailbox()
     recorder.subscribe(FRAME, recorded.put)
@@ -327,16 +327,16 @@ class Reader:
 
 @pytest.fixture
 def reader(run: Run, join: Join) -> Iterator[Reader]:
-    recorder = Reader(run, join(run, "camera"))
+    recorder = Reader(run, join("camera"))
     until(lambda: recorder.drain()[0] > 0, each=recorder.put)
     yield recorder
     recorder.process.kill()
     recorder.process.communicate()
 
 
-def test_a_stopped_subscriber_does_not_delay_the_others(reader: Reader, run: Run, join: Join) -> None:
+def test_a_stopped_subscriber_does_not_delay_the_others(reader: Reader, join: Join) -> None:
     box = Mailbox()
-    join(run, "controller").subscribe(FRAME, box.put)
+    join("controller").subscribe(FRAME, box.put)
     until(lambda: box.take(0.01), each=reader.put)
     reader.process.send_signal(signal.SIGSTOP)
     for _ in range(1500):  # 19 MB, more than the link buffers; a blocking put would close it
@@ -360,11 +360,11 @@ def test_closing_a_session_leaves_a_slow_reader_only_complete_messages(reader: R
     assert complete > 15  # content of queue and socket
 
 
-def test_a_session_ends_although_a_handler_never_returns(run: Run, join: Join, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_ends_although_a_handler_never_returns(join: Join, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lowfc.adapters.bus.zenoh_bus.CLOSE_S", 0.1)
     free = threading.Event()
     handler = Mock(side_effect=lambda _: free.wait())
-    mirror, frames = join(run, "mirror-dm"), join(run, "camera").publisher(FRAME)
+    mirror, frames = join("mirror-dm"), join("camera").publisher(FRAME)
     mirror.subscribe(FRAME, handler)
     until(lambda: handler.called, each=lambda: frames.put(b"frame"))
     freed = threading.Timer(PATIENCE_S, free.set)
