@@ -1,6 +1,7 @@
 """A loop in one process: with the interface of `lowfc.client`, in threads, or run for a number of frames."""
 
 import contextlib
+import itertools
 import threading
 import tomllib
 from collections import deque
@@ -229,12 +230,10 @@ class InProcessLoop(Client):
         self._listeners.append(listener)
 
         def each() -> Iterator[Any]:
-            left = count
             try:
-                while left is None or left > 0:
+                for _ in itertools.islice(itertools.count(), count):
                     while not waiting:
                         self.expose()
-                    left = None if left is None else left - 1
                     yield waiting.popleft()
             finally:
                 self._listeners = [one for one in self._listeners if one is not listener]
