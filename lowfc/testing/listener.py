@@ -12,13 +12,13 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 class Listener:
     """Keeps all messages of some topics and all events: `samples` has them by topic, with their envelopes.
 
-    `bus` is its connection, as an operator's program.
+    `hub` is its bus, and `bus` its connection, as an operator's program.
     """
 
-    def __init__(self, hub: MemoryHub, clock: Clock, *topics: Topic) -> None:
+    def __init__(self, clock: Clock, *topics: Topic) -> None:
         self.samples: dict[Topic, list[Sample]] = {topic: [] for topic in (*topics, EVENT)}
-        self.hub, self.clock = hub, clock
-        self.bus = MemoryBus(hub, "operator", clock)
+        self.hub, self.clock = MemoryHub(), clock
+        self.bus = MemoryBus(self.hub, "operator", clock)
         for topic, received in self.samples.items():
             self.bus.subscribe(topic, received.append)
 

@@ -125,7 +125,7 @@ def test_a_very_long_key_is_not_cached() -> None:
 
 @pytest.fixture
 def listener() -> Listener:
-    return Listener(MemoryHub(), FakeClock())
+    return Listener(FakeClock())
 
 
 def test_forged_names_do_not_fill_a_process_and_give_one_event(listener: Listener) -> None:

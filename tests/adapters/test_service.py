@@ -16,14 +16,8 @@ from lowfc.adapters.process.service import HEALTH_PERIOD_NS, PRINTED, PRINTED_NS
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, from_timestamp, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 PATIENCE_S = 30.0
-
-
-@pytest.fixture
-def hub() -> MemoryHub:
-    return MemoryHub()
 
 
 @pytest.fixture
@@ -32,8 +26,8 @@ def clock() -> FakeClock:
 
 
 @pytest.fixture
-def listener(hub: MemoryHub, clock: FakeClock) -> Listener:
-    return Listener(hub, clock, HEALTH)
+def listener(clock: FakeClock) -> Listener:
+    return Listener(clock, HEALTH)
 
 
 def test_health_is_published_when_due_with_all_fields(listener: Listener, clock: FakeClock) -> None:
@@ -93,11 +87,11 @@ def test_a_wrong_clock_is_reported_at_the_start(
     assert len(events) == len(listener.event_texts("CLOCK_OFF")) == reported
 
 
-def test_health_has_the_counts_of_a_mailbox(listener: Listener, hub: MemoryHub) -> None:
+def test_health_has_the_counts_of_a_mailbox(listener: Listener) -> None:
     camera, controller = listener.service("camera"), listener.service("controller")
     box = controller.mailbox(FRAME)
     frames = camera.publisher(FRAME)
-    hub.lose = lambda role, key, envelope: key == FRAME.key and envelope.sequence & 0xFFFFFFFF == 1
+    listener.hub.lose = lambda role, key, envelope: key == FRAME.key and envelope.sequence & 0xFFFFFFFF == 1
     for _ in range(4):
         last = frames.put(b"").sequence
     box.take(0.0)
@@ -169,7 +163,7 @@ def test_processes_are_connected_when_each_has_received_the_others_health(listen
     assert camera.last_health["mirror-dm"].state == "starting"
 
 
-def test_a_newcomer_gets_a_health_before_the_next_is_due(listener: Listener, hub: MemoryHub, clock: FakeClock) -> None:
+def test_a_newcomer_gets_a_health_before_the_next_is_due(listener: Listener) -> None:
     camera = listener.service("camera")
     camera.beat()
     camera.beat()
@@ -186,7 +180,7 @@ def test_a_newcomer_gets_a_health_before_the_next_is_due(listener: Listener, hub
     assert camera.has_newcomers()
     before = len(listener.messages(HEALTH))
     for number in (1, 2, 1):  # two views, in turns
-        MemoryBus(hub, "viewer", clock).publisher(HEALTH, "viewer").put(wire.Health(pid=number).SerializeToString())
+        listener.bus.publisher(HEALTH, "viewer").put(wire.Health(pid=number).SerializeToString())
         camera.beat()
     assert [health.process for health in listener.messages(HEALTH)[before:]] == ["", "camera", "", ""]  # "": a view
 
@@ -214,14 +208,14 @@ def test_a_flood_of_bad_messages_gives_one_event_and_the_last_health_has_all_cou
 
 
 def test_an_unreadable_message_gives_an_event_without_traceback_or_stop(
-    listener: Listener, hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
+    listener: Listener, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mirror = listener.service("mirror-dm")
     read: list[int] = []
     decode = wire.MirrorCommand.FromString
     mirror.dispatch(COMMAND, lambda sample: read.append(len(decode(sample.payload).actuators)), "dm", period_ns=10**6)
     listener.bus.publisher(HEALTH, "stranger").put(b"\xff")
-    commands = MemoryBus(hub, "controller", clock).publisher(COMMAND, "dm")
+    commands = listener.bus.publisher(COMMAND, "dm")
     commands.put(b"\xff")
     commands.put(wire.MirrorCommand(actuators=b"1234").SerializeToString())
     mirror.beat()
@@ -245,10 +239,9 @@ def test_stop_wakes_the_loop(listener: Listener) -> None:
 LOOP = """
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryHub
 from lowfc.contract.messages import FRAME
 
-service = Listener(MemoryHub(), FakeClock()).service("camera")
+service = Listener(FakeClock()).service("camera")
 box = service.mailbox(FRAME)
 service.catch_signals()
 print("up", flush=True)

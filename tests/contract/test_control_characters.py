@@ -17,7 +17,6 @@ from lowfc.programs.view.recorded import draw_logs
 from lowfc.programs.view.renderer import Renderer
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryHub
 from tests.support import report_log
 from tests.support.loops import lowfc
 from tests.support.report_log import SyntheticLog
@@ -42,7 +41,7 @@ def test_only_control_characters_are_escaped() -> None:
 
 
 def test_a_process_escapes_its_events(capsys: pytest.CaptureFixture[str]) -> None:
-    Listener(MemoryHub(), FakeClock()).service("camera").event("RECORDING_FAILED", why=HOSTILE)
+    Listener(FakeClock()).service("camera").event("RECORDING_FAILED", why=HOSTILE)
     assert capsys.readouterr().err == f"camera: RECORDING_FAILED recording stopped: {SHOWN}\n"
 
 

@@ -9,7 +9,6 @@ from lowfc.contract.events import Level
 from lowfc.programs.core.recording import alarm as alarms
 from lowfc.programs.core.recording.alarm import Alarm
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryHub
 from tests.support.loops import until
 
 # Shell command that appends a line about the event to the file `notes`.
@@ -20,7 +19,7 @@ class Alarmed:
     """A camera that publishes events, and a recorder with an alarm."""
 
     def __init__(self, command: str, min_interval_s: float = 0.0) -> None:
-        self.listener = Listener(MemoryHub(), HostClock())
+        self.listener = Listener(HostClock())
         self.camera = self.listener.service("camera")
         self.alarm = Alarm(self.listener.service("recorder"), command, Level.WARNING, min_interval_s)
 

@@ -54,7 +54,6 @@ from lowfc.control.loop.state import State
 from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.programs.core.controller import Controller
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryHub
 from sim_camera.driver import scene as configured_scene
 from sim_camera.scene import Scene, Wavefront
 from tests.support.in_process_loop import PATIENCE_S, SMALL_MIRROR, ThreadedRun, configuration
@@ -151,7 +150,7 @@ class Rig(ThreadedRun):
 
 def alone(calibration: Calibration | None, latch: Latch, config: Configuration) -> tuple[Listener, Service, Controller]:
     """A controller without camera and mirror."""
-    listener = Listener(MemoryHub(), SimulatedClock(START_NS) if config.lockstep else HostClock())
+    listener = Listener(SimulatedClock(START_NS) if config.lockstep else HostClock())
     service = listener.service("controller")
     return listener, service, Controller(config, service, calibration, "a test", latch)
 

@@ -32,7 +32,6 @@ from lowfc.device.run import camera_beside
 from lowfc.programs.commissioning.doctor.devices import device_checks
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryHub
 from tests.support.loops import lowfc
 
 GRID = (4, 5)
@@ -76,8 +75,8 @@ class IdleMirror:
 
 
 def test_a_camera_publishes_what_its_driver_returns() -> None:
-    hub, clock = MemoryHub(), FakeClock()
-    listener = Listener(hub, clock, FRAME, CAMERA_STATE)
+    clock = FakeClock()
+    listener = Listener(clock, FRAME, CAMERA_STATE)
     driver = Ramp(Ramp.Options(), CONFIG)
     CameraLoop(driver, listener.service("camera"), frames=3).run()
     frames = listener.messages(FRAME)
@@ -305,7 +304,7 @@ def test_a_fault_in_the_first_settings_gives_one_sentence() -> None:
 def test_a_camera_that_cannot_be_started_gives_one_sentence_and_is_closed() -> None:
     camera = Ramp(Ramp.Options(), CONFIG)
     camera.start = lambda: 1 / 0  # type: ignore[attr-defined]
-    loop = CameraLoop(camera, Listener(MemoryHub(), FakeClock()).service("camera"))
+    loop = CameraLoop(camera, Listener(FakeClock()).service("camera"))
     with pytest.raises(ConfigurationError, match=r"cannot be started: ZeroDivisionError: .* \(test_drivers.py, line"):
         loop.run()
     assert camera.closed
@@ -316,13 +315,13 @@ def test_a_camera_finishes_before_its_last_health_and_is_closed_after_it() -> No
     for name in ("finish", "close"):
         setattr(camera, name, partial(calls.append, name))
     camera.fill = lambda _: calls.append("fill")  # type: ignore[attr-defined]
-    CameraLoop(camera, Listener(MemoryHub(), FakeClock()).service("camera"), frames=3).run()
+    CameraLoop(camera, Listener(FakeClock()).service("camera"), frames=3).run()
     assert calls[-3:] == ["finish", "fill", "close"]
     assert calls.count("finish") == 1
 
 
 def test_a_fault_in_an_optional_method_is_counted_and_reported_and_stops_nothing() -> None:
-    camera, listener = Ramp(Ramp.Options(), CONFIG), Listener(MemoryHub(), FakeClock(), FRAME)
+    camera, listener = Ramp(Ramp.Options(), CONFIG), Listener(FakeClock(), FRAME)
     camera.sent = lambda _: 1 / 0  # type: ignore[attr-defined]
     camera.fill = lambda _: {}["temperature"]  # type: ignore[attr-defined]
     loop = CameraLoop(camera, listener.service("camera"), frames=3)
@@ -334,7 +333,7 @@ def test_a_fault_in_an_optional_method_is_counted_and_reported_and_stops_nothing
 
 
 def test_lockstep_refuses_a_camera_in_the_controllers_process() -> None:
-    controller = Listener(MemoryHub(), FakeClock()).service("controller")
+    controller = Listener(FakeClock()).service("controller")
     beside = camera_beside(Ramp(Ramp.Options(), CONFIG), load(None, {"lockstep": True}), controller)
     with pytest.raises(ConfigurationError, match="leave out --camera, or lockstep"), beside:
         pass

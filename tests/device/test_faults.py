@@ -27,7 +27,6 @@ from lowfc.device.mirror_loop import MirrorLoop
 from lowfc.device.watch import DriverWatch
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 CONFIG = load(None, {"mirror.rows": 4, "mirror.columns": 5})
 SETTINGS = CameraSettings(3, 4, exposure_ns=2_000_000, period_ns=4_000_000, number_wrap=1 << 16)
@@ -67,7 +66,7 @@ class CameraBench:
 
     def __init__(self, *exposures: Callable[[], Any], frames: int = 1, settings: CameraSettings = SETTINGS) -> None:
         self.clock = FakeClock()
-        self.listener = Listener(MemoryHub(), self.clock, FRAME, CAMERA_STATE, HEALTH)
+        self.listener = Listener(self.clock, FRAME, CAMERA_STATE, HEALTH)
         self.camera = Camera(self.clock, *exposures, settings=settings)
         self.loop = CameraLoop(self.camera, self.listener.service("camera"), frames)
 
@@ -118,7 +117,7 @@ def test_a_failing_camera_is_retried_after_increasing_pauses() -> None:
 
 def test_a_failing_camera_does_not_advance_simulated_time(tmp_path: Path) -> None:
     clock, camera = SimulatedClock(base=tmp_path), Camera(Mock(), *[Mock(side_effect=OSError)] * 2, good())
-    begun_ns, service = clock.now_ns(), Listener(MemoryHub(), clock).service("camera")
+    begun_ns, service = clock.now_ns(), Listener(clock).service("camera")
     CameraLoop(camera, service, 1).run()
     assert (service.work, clock.now_ns()) == (1, begun_ns)
 
@@ -264,11 +263,11 @@ class MirrorBench:
     """A mirror in its loop, a sender of commands, and the mirror's reported states."""
 
     def __init__(self, mirror: Mirror) -> None:
-        hub, self.clock = MemoryHub(), FakeClock()
-        self.listener = Listener(hub, self.clock, MIRROR_STATE)
+        self.clock = FakeClock()
+        self.listener = Listener(self.clock, MIRROR_STATE)
         self.service = self.listener.service("mirror-dm")
         self.loop = MirrorLoop(mirror, self.service, CONFIG)
-        self._commands = MemoryBus(hub, "controller", self.clock).publisher(COMMAND, "dm")
+        self._commands = self.listener.bus.publisher(COMMAND, "dm")
         self._numbers: Iterator[int] = count(1)
 
     def command(self, height_nm: float, grid: tuple[int, int] = (4, 5), start_s: int = 0) -> wire.MirrorState:

@@ -43,7 +43,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def joined(driver: Any) -> tuple[Any, Listener]:
     """A driver in a run, and the listener to its events."""
-    listener = Listener(MemoryHub(), FakeClock())
+    listener = Listener(FakeClock())
     driver.join(listener.service("driver"))
     return driver, listener
 
@@ -373,13 +373,13 @@ def test_the_mirror_writes_zeros_over_a_channel_that_is_not_finite(folder: Path)
         return stream
 
     channel(folder, make=True)
-    stream, hub, clock = poisoned(), MemoryHub(), FakeClock()
-    listener = Listener(hub, clock, MIRROR_STATE)
+    stream, clock = poisoned(), FakeClock()
+    listener = Listener(clock, MIRROR_STATE)
     loop = MirrorLoop(mirror()[0], listener.service("mirror-dm"), CONFIG)
     assert not stream.pixels.any(), "at the start"
     command = wire.MirrorCommand(frame_sequence=1, rows=GRID[0], columns=GRID[1], valid_for_ns=10**9)
     command.actuators = shape_nm(1).tobytes()
-    commands = MemoryBus(hub, "controller", clock).publisher(COMMAND, "dm")
+    commands = listener.bus.publisher(COMMAND, "dm")
     commands.put(command.SerializeToString())
     assert stream.pixels.any()
     poisoned()

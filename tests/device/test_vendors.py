@@ -30,7 +30,6 @@ from lowfc.device.drivers.aravis import AravisCamera
 from lowfc.device.drivers.basler import BaslerCamera
 from lowfc.device.drivers.genicam import GenicamOptions
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryHub
 from tests.support.loops import command, in_background, interrupt, start, until
 
 CONFIG = load(None, {"camera.rate_hz": 200.0})
@@ -39,8 +38,7 @@ OPTIONS = {"rows": 60, "columns": 80, "region_row": 16, "region_column": 32, "ra
 
 def run(driver: Any, frames: int) -> tuple[Listener, list[int]]:
     """Run a driver's loop for a number of frames; return the listener and the frame counts."""
-    hub = MemoryHub()
-    listener = Listener(hub, HostClock(), FRAME, CAMERA_STATE)
+    listener = Listener(HostClock(), FRAME, CAMERA_STATE)
     CameraLoop(driver, listener.service("camera"), frames).run()
     counts = [sample.sequence & 0xFFFFFFFF for sample in listener.samples[FRAME]]
     return listener, counts

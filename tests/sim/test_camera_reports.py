@@ -11,7 +11,6 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.driver import SimulatedCamera
 from sim_camera.lateness import WINDOW, Lateness
 from sim_camera.scene import Scene, Truth, Wavefront
@@ -93,12 +92,12 @@ def test_occasional_late_commands_are_not_habitual() -> None:
 
 
 def test_camera_reports_each_change_of_habitual_lateness() -> None:
-    hub, clock, config = MemoryHub(), FakeClock(), Configuration()
-    listener = Listener(hub, clock)
+    clock, config = FakeClock(), Configuration()
+    listener = Listener(clock)
     scene = cast("Scene", SimpleNamespace(shape=(80, 80), instants=()))
     camera = SimulatedCamera(SimulatedCamera.Options(), config, scene)
     camera.join(listener.service("camera"))
-    states = MemoryBus(hub, "mirror-dm", clock).publisher(MIRROR_STATE, config.mirror.name)
+    states = listener.bus.publisher(MIRROR_STATE, config.mirror.name)
     shape = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
 
     def put(sequence: int) -> None:
@@ -128,7 +127,7 @@ def test_camera_reports_each_change_of_habitual_lateness() -> None:
 def test_a_call_of_a_slow_camera_waits_half_a_second_at_most() -> None:
     scene = cast("Scene", SimpleNamespace(shape=(80, 80), instants=(), expose=lambda index, shape: np.zeros((80, 80))))
     camera = SimulatedCamera(SimulatedCamera.Options(), load(None, {"camera.rate_hz": 0.5}), scene)
-    camera.join(Listener(MemoryHub(), FakeClock()).service("camera"))
+    camera.join(Listener(FakeClock()).service("camera"))
     camera.start()
     assert [camera.expose() is None for _ in range(5)] == [False, True, True, True, False]
 
@@ -141,7 +140,7 @@ def test_region_is_read_at_the_centre_of_the_sensor() -> None:
     settings = camera.settings()
     region = settings.region_row, settings.rows, settings.region_column, settings.columns
     assert region == (8, 64, 15, 50)
-    camera.join(Listener(MemoryHub(), clock).service("camera"))
+    camera.join(Listener(clock).service("camera"))
     camera.start()
     exposure = camera.expose()
     assert exposure is not None

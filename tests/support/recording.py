@@ -11,7 +11,7 @@ from lowfc.contract.messages import Topic, wire
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from lowfc.testing.memory_bus import MemoryBus
 from tests.support.loops import until
 
 PATIENCE_S = 20.0
@@ -21,7 +21,7 @@ class Bench(Listener):
     """A recorder in its own thread, two services that publish, and the events on their bus."""
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(MemoryHub(), HostClock())
+        super().__init__(HostClock())
         self.folder = folder
         self.summary: Summary | None = None
         self.thread = threading.Thread(target=self._record, daemon=True)

@@ -22,7 +22,7 @@ from lowfc.programs.view.panels import wavefront
 from lowfc.programs.view.renderer import RenderThread
 from lowfc.programs.view.snapshot import Snapshot
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from lowfc.testing.memory_bus import MemoryBus
 from tests.support.loops import until
 from tests.support.report_log import SyntheticLog
 from tests.support.stage import Tape
@@ -65,7 +65,7 @@ class ViewBench(Listener):
     memory_mb = 100.0
 
     def __init__(self, show: Show | None = Show.WEB, stuck: int = 0) -> None:
-        super().__init__(MemoryHub(), HostClock())
+        super().__init__(HostClock())
         self.night = SyntheticLog().frames(50)
         source = MemoryBus(self.hub, "controller", self.clock)
         self.publishers = {
