@@ -1,5 +1,6 @@
 """The bench of a chaos case with processes that only sleep, and a console in its own terminal."""
 
+import contextlib
 import json
 import os
 import random
@@ -7,7 +8,7 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -141,15 +142,11 @@ def test_every_killed_or_stopped_process_continues_in_the_random_case() -> None:
     def recorded(action: str) -> Callable[[str], None]:
         return lambda name: done.append((action, name))
 
-    class Stopped:
-        def __init__(self, name: str) -> None:
-            self.name = name
-
-        def __enter__(self) -> None:
-            done.append(("stop", self.name))
-
-        def __exit__(self, *_: object) -> None:
-            done.append(("continue", self.name))
+    @contextlib.contextmanager
+    def stopped(name: str) -> Iterator[None]:
+        done.append(("stop", name))
+        yield
+        done.append(("continue", name))
 
     stub: Any = SimpleNamespace(
         rng=random.Random(3),  # noqa: S311
@@ -157,7 +154,7 @@ def test_every_killed_or_stopped_process_continues_in_the_random_case() -> None:
         pause=lambda *_: None,
         kill=recorded("kill"),
         restart=recorded("restart"),
-        stopped=Stopped,
+        stopped=stopped,
     )
     CASES["random"].act(stub)
     begun, ended = done[::2], done[1::2]
@@ -176,16 +173,15 @@ def test_a_stall_is_compared_with_the_time_before_and_after(monkeypatch: pytest.
         latency = latency_us["now"] if seconds > 1 else 9_000
         timings.put(wire.ControlTiming(frame_to_command_ns=[1000 * latency] * 3).SerializeToString())
 
-    class Stall:
-        def __enter__(self) -> None:
-            latency_us["now"] = 300
-
-        def __exit__(self, *_: object) -> None:
-            latency_us["now"] = 200
+    @contextlib.contextmanager
+    def stall(_: str) -> Iterator[None]:
+        latency_us["now"] = 300
+        yield
+        latency_us["now"] = 200
 
     monkeypatch.setattr(processes, "time", SimpleNamespace(sleep=pass_time))
     latency_us["now"] = 100
-    stub: Any = SimpleNamespace(bus=bus, outcome=SimpleNamespace(measurements=measurements), stopped=lambda _: Stall())
+    stub: Any = SimpleNamespace(bus=bus, outcome=SimpleNamespace(measurements=measurements), stopped=stall)
     CASES["stall-recorder"].act(stub)
     each = {name: {"frames": 3, "p50_us": us, "p99_us": us} for name, us in (("before", 100.0), ("during", 300.0))}
     each["after"] = {"frames": 3, "p50_us": 200.0, "p99_us": 200.0}
