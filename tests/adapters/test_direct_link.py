@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -318,13 +319,9 @@ def test_handed_ns_precedes_the_bus_put_with_a_direct_reader_and_follows_it_with
     mirror = CommandedMirror(ends)
     mirror.until_both_paths()
     put_ns: list[int] = []
-
-    class Timed:
-        def put(self, payload: bytes, attachment: bytes) -> None:
-            put_ns.append(ends.clock.host_ns())
-
+    timed = SimpleNamespace(put=lambda payload, attachment: put_ns.append(ends.clock.host_ns()))
     for publisher, has_reader in ((mirror.controller, True), (mirror.operator, False)):
-        publisher._publisher = Timed()  # type: ignore[assignment]
+        publisher._publisher = timed
         envelope = publisher.put(b"")
         assert envelope.publish_time_ns <= publisher.handed_ns
         assert (publisher.handed_ns <= put_ns[-1]) is has_reader

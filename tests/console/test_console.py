@@ -359,14 +359,14 @@ def test_the_console_replaces_commands_by_keys_and_long_lists_by_ranges() -> Non
 
 
 def test_tasks_are_commands_with_the_options_of_their_form(screen: Screen, monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[list[str]] = []
-    monkeypatch.setattr(application, "Task", lambda name, words: started.append(words) or FinishedTask(name))
+    task = Mock(side_effect=lambda name, _: SimpleNamespace(status=0, status_line=f"{name}: done"))
+    monkeypatch.setattr(application, "Task", task)
     for name, words in TASKS.items():
         screen.press(ALL_ACTIONS[name].key)
         screen.until(screen.form_is_open)
         screen.press("enter")
         screen.until(lambda name=name: screen.text("answer") == f"{name}: done")
-        command = " ".join(started[-1])
+        command = " ".join(task.call_args.args[1])
         assert command.startswith(f"{words} calibration-")
         assert command.endswith(f".fits --load --run {RUN}")
 
@@ -379,13 +379,6 @@ def test_a_task_expands_a_tilde_and_its_load_field_takes_yes_or_no() -> None:
         assert dark.command({"load": answer}, RUN) == [*dark.task, *expected, "--run", RUN]
     with pytest.raises(ConfigurationError, match="load is yes or no, got 'yep': write yes, y, no or n"):
         dark.command({"load": "yep"}, RUN)
-
-
-class FinishedTask:
-    status = 0
-
-    def __init__(self, name: str) -> None:
-        self.status_line = f"{name}: done"
 
 
 def test_a_task_runs_in_its_own_session_and_reports_its_end() -> None:
