@@ -384,3 +384,18 @@ def test_a_session_ends_soon_beside_a_process_that_is_stopped(run: Run) -> None:
     assert time.monotonic() - begun_s < 6.0
     with pytest.raises(BusError, match="lowfc/request/safe cannot be used: session closed"):
         operator.get(REQUEST_KEY.format(name="safe"))
+
+
+def test_each_use_of_a_key_on_a_closed_bus_raises_a_bus_error(run: Run) -> None:
+    bus = ZenohBus(run.links, "controller", HostClock())
+    bus.close()
+    for use in (
+        lambda: bus.publisher(COMMAND, "dm"),
+        lambda: bus.subscribe(FRAME, Mailbox().put),  # over a direct link, too
+        lambda: bus.subscribe(HEALTH, Mailbox().put),
+        lambda: bus.ring(HEALTH, 1),
+        lambda: bus.queryable(REQUEST_KEY.format(name="*"), Mailbox().put),
+        lambda: bus.get(FRAME.key),
+    ):
+        with pytest.raises(BusError, match="cannot be used: session closed"):
+            use()

@@ -135,7 +135,7 @@ class ZenohRing:
 
 
 class ZenohBus:
-    """One process's zenoh session; see `Bus`. After `close`, its rings, `publisher`, `ring` and `get` raise BusError.
+    """One process's zenoh session; see `Bus`. After `close`, rings and methods with a topic or key raise BusError.
 
     Attributes:
         offset: offset of the router's clock, in a run on several hosts. Envelopes on the network have the router's
@@ -253,8 +253,8 @@ class ZenohBus:
             except Exception as fault:  # zenoh would only print it; count it here
                 faults.add(f"{self.role}: handler of", key, fault)
 
-        subscriber = self._session.declare_subscriber(key, Callback(received, indirect=False))
-        return subscriber.undeclare
+        with usable(key):
+            return self._session.declare_subscriber(key, Callback(received, indirect=False)).undeclare
 
     def ring(self, topic: Topic, capacity: int) -> "ZenohRing":
         """See `Bus.ring`; zenoh's threads keep the messages without waking Python."""
@@ -267,14 +267,14 @@ class ZenohBus:
         def queried(query: zenoh.Query) -> None:
             key = str(query.key_expr)
             try:
-                handler(
-                    Query(key, b"" if query.payload is None else query.payload.to_bytes(), self._replier(query, key))
-                )
+                payload = b"" if query.payload is None else query.payload.to_bytes()
+                handler(Query(key, payload, self._replier(query, key)))
             except Exception as fault:
                 query.drop()  # type: ignore[no-untyped-call]
                 self.faults.add(f"{self.role}: queryable of", key, fault)
 
-        self._session.declare_queryable(key_expression, Callback(queried, indirect=False))
+        with usable(key_expression):
+            self._session.declare_queryable(key_expression, Callback(queried, indirect=False))
 
     def get(
         self, key: str, payload: bytes = b"", timeout_s: float = 1.0, priority: zenoh.Priority = zenoh.Priority.DATA
