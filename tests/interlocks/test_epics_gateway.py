@@ -43,11 +43,13 @@ class Variables(dict[str, "Variables.Shared"]):
     """
 
     class Shared:
-        def __init__(self, nt: Any, initial: Any, handler: Any = None, queue: Any = None) -> None:
+        def __init__(self, nt: Any, initial: Any, handler: Any = None, queue: Any = None, **alarm: Any) -> None:
             self.nt, self.initial, self.handler, self.queue = nt, initial, handler, queue
+            if nt == "image":  # an array: its alarm is set by keywords
+                self.initial = {f"alarm.{key}": value for key, value in alarm.items()}
             self.posts: list[tuple[Any, int, str]] = []
 
-        def post(self, value: Any, timestamp: float, severity: int = 0, message: str = "") -> None:
+        def post(self, value: Any, timestamp: float, severity: int, message: str) -> None:  # without them, they stay
             self.posts.append((np.asarray(value).tolist(), severity, message))
 
     def __init__(self) -> None:
@@ -139,8 +141,8 @@ def test_a_variable_is_posted_when_it_changes_and_is_invalid_with_a_fault(pvs: V
         "night:close": "?",
         "night:frame": "image",
     }
-    severities = {pv.initial["alarm.severity"] for pv in pvs.values() if pv.nt != "image"}
-    assert severities == {3}, "a value is invalid before the first update"
+    alarms = {(pv.initial["alarm.severity"], pv.initial["alarm.message"]) for pv in pvs.values()}
+    assert alarms == {(3, "not read yet")}, "a value is invalid before the first update"
     values = {"mode": "closed", "rate": 1000.0, "error": np.array([1.0, 2.0])}
     served.update(values, "")
     served.update(values | {"rate": 999.0, "frame": np.ones((1, 2))}, "")

@@ -17,6 +17,7 @@ _CODES = {Kind.BOOLEAN: "?", Kind.NUMBER: "d", Kind.TEXT: "s", Kind.NUMBERS: "ad
 _EMPTY: dict[Kind, Any] = {Kind.BOOLEAN: False, Kind.NUMBER: 0.0, Kind.TEXT: "", Kind.NUMBERS: []}
 _INVALID = 3
 """Alarm severity of an invalid value."""
+_NOT_READ = "not read yet"
 CarryOut = Callable[[Put, Any], object]
 """Function that carries out a put; LowfcError if it is refused."""
 
@@ -44,11 +45,13 @@ class EpicsGateway:
         for one in variables:
             if one.kind is Kind.IMAGE:
                 initial: Any = np.zeros((1, 1), np.uint16)
-                self._pvs[one.name] = p4p.server.thread.SharedPV(nt=p4p.nt.NTNDArray(), initial=initial)
+                self._pvs[one.name] = p4p.server.thread.SharedPV(
+                    nt=p4p.nt.NTNDArray(), initial=initial, severity=_INVALID, message=_NOT_READ
+                )
                 continue
             nt = p4p.nt.NTScalar(_CODES[one.kind], display=True)
             described = {"value": _EMPTY[one.kind], "display.description": one.description, "display.units": one.unit}
-            described |= {"alarm.severity": _INVALID, "alarm.message": "not read yet"}
+            described |= {"alarm.severity": _INVALID, "alarm.message": _NOT_READ}
             handler: dict[str, Any] = {}
             if one.put is not None:  # a thread for each PV: by default p4p has four for all, and `safe` would wait
                 handler["queue"] = p4p.util.ThreadedWorkQueue(maxsize=0, daemon=True).start()
@@ -88,7 +91,7 @@ class EpicsGateway:
                 continue
             pv = self._pvs[one.name]
             if one.kind is Kind.IMAGE:
-                pv.post(value, timestamp=time.time())
+                pv.post(value, severity=0, message="", timestamp=time.time())
                 continue
             why = fault or ("not measured now" if one.kind is Kind.NUMBER and np.isnan(value) else "")
             update = str(np.asarray(value).tolist()), why  # as text, since NaN differs from itself
