@@ -50,6 +50,7 @@ _SHOULD = re.compile("^(?:Input|String|List|Tuple) should")
 Milliseconds = Annotated[float, Field(ge=0, le=1e9)]
 Cpus = list[Annotated[int, Field(ge=0, lt=8192)]]  # the kernel's largest number of processors
 Gain = Annotated[float, Field(ge=0, le=4)]
+Amplitude = Annotated[float, Field(ge=1e-6, le=1e5)]  # a staircase to a far larger one fills the memory
 ModalLimit = Annotated[float, Field(gt=0, le=MAX_LIMIT_NM)]
 FIXED_GAINS = {"control.tilt_gain": 0.5, "control.gain": 0.05}
 """For runs that must not depend on automatic gains, such as timing measurements."""
@@ -126,15 +127,15 @@ class Acceptance(Section):
     """Lowest frequency at which they are measured."""
     highest_of_rate: float = Field(0.3, gt=0, le=0.5)
     """Frequency up to which they are measured, as a fraction of the frame rate."""
-    linear_nm: Positive = 12.0
+    linear_nm: Amplitude = 12.0
     """Wavefront rms of a mode up to which the sensor must be linear; 12 nm is 5 mas of tilt at 2 m."""
     gain_error: Positive = 0.05
     """Largest deviation from 1 of the ratio of measured to true amplitude of a mode, in this range."""
     crosstalk: Positive = 0.05
     """Largest fraction of a mode that is measured as another mode, in this range."""
-    capture_tilt_nm: Positive = 34.0
+    capture_tilt_nm: Amplitude = 34.0
     """Wavefront rms of tip or tilt from which the loop must close; 34 nm is 14 mas at 2 m."""
-    capture_nm: Positive = 20.0
+    capture_nm: Amplitude = 20.0
     """Wavefront rms of any other mode from which the loop must close."""
     noise_ratio: float = Field(1.2, gt=1)
     """Largest white noise of a mode, relative to its photon and read-out noise."""

@@ -14,7 +14,10 @@ MIRROR_NAME = r"^[a-z][a-z0-9_]{0,49}$"
 BENCH_NAME = r"^[A-Za-z][A-Za-z0-9_-]{0,63}$"
 """Regular expression for the name of a bench value."""
 Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+MAX_VALUE = 1e12
+"""Largest value of a key without a limit of its own; a far larger number overflows in single precision."""
+NotNegative = Annotated[float, Field(ge=0, le=MAX_VALUE)]
+Signed = Annotated[float, Field(ge=-MAX_VALUE, le=MAX_VALUE)]
 
 
 class InterlockSection(Section):
@@ -165,7 +168,7 @@ class Camera(Section):
     """Dark current of every pixel, electrons per second; included in an analytic calibration, as by a dark frame."""
     hot_pixels: float = Field(0.0, ge=0, le=0.5)
     """Simulated camera: fraction of hot pixels, which an analytic calibration does not include."""
-    hot_pixel_e_s: Positive = 20_000.0
+    hot_pixel_e_s: float = Field(20_000.0, gt=0, le=MAX_VALUE)
     """Simulated camera: mean dark current of a hot pixel, electrons per second, exponentially distributed."""
     nonlinearity: float = Field(0.0, ge=0, le=0.5)
     """Simulated camera: relative excess of the gain at low signal over the gain at full well."""
@@ -192,9 +195,9 @@ class Disturbance(Section):
     """Multiplies the preset's amplitude."""
     line_width: float = Field(0.005, ge=0, le=0.05)
     """Width of the reaction wheel's lines between half-power points, as a fraction of their frequency."""
-    static_nm: dict[str, float] = Field(default_factory=dict)
+    static_nm: dict[str, Signed] = Field(default_factory=dict)
     """Constant wavefront added to the preset: Noll index = nm rms."""
-    drift_nm: dict[str, float] = Field(default_factory=dict)
+    drift_nm: dict[str, Signed] = Field(default_factory=dict)
     """Random walk added to the preset, from 1e-4 to 10 Hz: Noll index = nm per root second."""
     drift_slope: float = Field(2.0, ge=0, le=4)
     """Exponent of the drift's spectrum, drift_nm^2 / (2 pi^2 f^slope) per Hz; 2 for a random walk."""
@@ -208,10 +211,10 @@ class Disturbance(Section):
     """Amplitude of the wheel's first harmonic at high speed, mas rms per axis; the others have a half to a seventh."""
     wheel_course: Literal["ramp", "walk", "run-down"] = "ramp"
     """Change of the wheel's speed: linear, random walk, or slowed by friction."""
-    wheel_change: float = 0.0
+    wheel_change: Signed = 0.0
     """Rate of change of the wheel's speed: ramp, Hz per second; walk, Hz per root second; run-down, decrease at time 0
     in Hz per second. 0 for constant speed."""
-    second_wheel_hz: float = 0.0
+    second_wheel_hz: Signed = 0.0
     """Initial excess speed of a second, identical wheel, turns per second, so that the two beat; 0: no second wheel."""
 
     @model_validator(mode="after")
@@ -221,8 +224,8 @@ class Disturbance(Section):
                 if not key.isdecimal() or int(key) < 2:
                     raise ValueError(f"{name}: {key!r} is not a Noll index of 2 or more")
         speeds_hz = self.wheel_hz, self.wheel_hz + self.second_wheel_hz
-        if self.wheel_hz and self.wheel_course == "run-down" and (self.wheel_change < 0 or min(speeds_hz) <= 0):
-            raise ValueError("wheels that run down have speeds above 0 and a wheel_change of 0 or more")
+        if self.wheel_hz and self.wheel_course == "run-down" and (self.wheel_change < 0 or min(speeds_hz) < 1e-6):
+            raise ValueError("wheels that run down have speeds of 1e-6 Hz or more and a wheel_change of 0 or more")
         return self
 
 
@@ -247,7 +250,7 @@ class Mirror(Section):
     """Actuator pitches across the pupil."""
     coupling: float = Field(0.15, gt=0, lt=1)
     """Height of an influence function at the neighbouring actuator, as a fraction of its peak."""
-    stroke_nm: float = Field(1500.0, gt=0)
+    stroke_nm: float = Field(1500.0, gt=0, le=MAX_VALUE)
     """Full range of an actuator, nm of surface."""
     driver_bits: int = Field(16, ge=8, le=24)
     """Bits of the driver over the full range."""
@@ -256,7 +259,7 @@ class Mirror(Section):
     fifth of the period."""
     dead: list[int] = Field(default_factory=list)
     """Actuators that stay flat: row * columns + column."""
-    stuck_nm: dict[str, float] = Field(default_factory=dict)
+    stuck_nm: dict[str, Signed] = Field(default_factory=dict)
     """Actuators stuck at a height: row * columns + column = nm."""
     slew_nm: float = Field(150.0, gt=0.01)
     """The mirror's own limit: largest change of an actuator per command."""

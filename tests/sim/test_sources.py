@@ -83,7 +83,7 @@ def test_drift_has_the_configured_spectrum(slope: float) -> None:
         assert variance_nm2[inside, 2].sum() == pytest.approx(expected, rel=0.3)
 
 
-@pytest.mark.parametrize("wrong", [{"wheel_change": -1.0}, {"second_wheel_hz": -40.0}])
+@pytest.mark.parametrize("wrong", [{"wheel_change": -1.0}, {"second_wheel_hz": -40.0}, {"wheel_hz": 1e-308}])
 def test_a_wheel_that_would_not_run_down_is_refused(wrong: dict[str, float]) -> None:
     keys = {"wheel_hz": 40.0, "wheel_course": "run-down", "wheel_change": 1.0} | wrong
     with pytest.raises(ConfigurationError, match="wheels that run down"):
