@@ -12,14 +12,14 @@ from astropy.io import fits
 from lowfc.adapters.files import factory, law_file
 from lowfc.adapters.files.mirror_maps import active_actuators, flat_nm, read_shape
 from lowfc.arrays import Single
-from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw, Signal, integrator_block, law_from_blocks
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.command_channels import ADOPTED, FLAT
 from lowfc.control.loop.inputs import Frame, Load, MirrorShape, Request
-from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.safety import LoopMode, Rejection
 from lowfc.control.loop.state import State
 from lowfc.programs.core.start_up import StartUp, check_files
 from sim_camera.driver import scene
@@ -220,6 +220,25 @@ def test_the_flat_map_is_applied_during_a_permit_from_before_the_mirror_was_know
     state, _ = advance(settings, state, Request(0, "permit", values=(5.0,), text="moving the mask", lease_id=7))
     (request,) = StartUp(config).requests(state, age_s * 10**9)
     assert advance(settings, state, request)[1].reply.accepted
+
+
+def test_a_permit_holds_the_flat_map_of_a_closed_loop_whose_mirror_reports_late(
+    tmp_path: Path, calibration: Calibration
+) -> None:
+    keys = FIXED_GAINS | {"mirror.flat": saved(tmp_path, "flat.npy", wavy(120.0)), "control.start_mode": "closed"}
+    config, flat = load(None, keys), np.zeros(GRID, np.float32)
+    settings = factory.settings(config)
+    state, _ = advance(settings, State(), Load(0, calibration, "test"))
+    permit = Request(0, "permit", values=(5.0,), text="moving the mask", lease_id=7)
+    for input_ in (permit, MirrorShape(1, flat, np.zeros(0, np.float32))):
+        state, _ = advance(settings, state, input_)
+    for input_ in (*StartUp(config).requests(state, 2), Frame(1, 3, 0, None), Frame(2, 4, 0, None)):
+        state, outputs = advance(settings, state, input_)
+    assert (state.mode, outputs.step.reasons) == (LoopMode.CLOSED, (Rejection.HELD,))
+    np.testing.assert_array_equal(outputs.command.actuators_nm, flat)
+    state, _ = advance(settings, state, Request(5, "release", lease_id=7))
+    moved, names = commands(config, state._replace(frame_sequence=0), 2)
+    assert (names, np.abs(moved[-1]).max() > 40) == ([FLAT], True)
 
 
 @pytest.mark.parametrize("command_reported", [True, False])
