@@ -199,7 +199,7 @@ def test_the_noise_floor_matches_photon_and_read_noise() -> None:
     assert not failed.passed
     assert "FAILED" in failed.text()
     assert drawn(noise, result).startswith(b"\x89PNG")
-    with pytest.raises(AcceptanceError, match="closed-loop recording"):
+    with pytest.raises(AcceptanceError, match="found open; the test was ended, or the log begins or ends within it"):
         noise.judge(responses[:1], config)
 
 
@@ -244,6 +244,15 @@ def test_a_disturbed_test_that_was_repeated_does_not_count(tmp_path: Path) -> No
     night, text = SyntheticLog(), 'acceptance {"test": "noise-floor", "loop": "open", "frames": 50}'
     log = night.frames(20).request("note", text=text).frames(20).request("reset").request("note", text=text).frames(60)
     assert len(logged_responses(read_history(LogReader(log.write(tmp_path / "night.mcap"))), noise.KIND)) == 1
+
+
+def test_a_log_that_ends_within_a_test_is_refused_with_what_is_missing(tmp_path: Path) -> None:
+    night = SyntheticLog().frames(20)
+    night.request("note", text='acceptance {"test": "noise-floor", "loop": "closed", "frames": 50}')
+    log = night.frames(40).write(tmp_path / "night.mcap")
+    cut = r"ends 10 of 50 frames before the end of a measurement \(noise-floor, loop closed\): give all files"
+    with pytest.raises(DataFileError, match=cut):
+        logged_responses(read_history(LogReader(log)), noise.KIND)
 
 
 def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_of_its_time(tmp_path: Path) -> None:

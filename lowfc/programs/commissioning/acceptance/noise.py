@@ -66,7 +66,8 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> N
     by_loop = {response.parameters["loop"]: response for response in responses}
     if set(by_loop) != set(_LOOPS):
         raise AcceptanceError(
-            f"an open-loop and a closed-loop recording are needed, found {', '.join(by_loop) or 'none'}"
+            f"an open-loop and a closed-loop recording are needed, found {', '.join(by_loop) or 'none'}; the test was "
+            "ended, or the log begins or ends within it: give all files of the log, or measure again"
         )
     noise_ratio = configuration.acceptance.noise_ratio
     floors, rms, expected = {}, {}, {}

@@ -195,6 +195,13 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
             event_ns = from_timestamp(event.timestamp) - history.camera_lag_ns(event.name)
             if interrupted and times_ns.size and times_ns[0] <= event_ns <= times_ns[-1]:
                 raise DataFileError(f"{path}: {event.message}, during the measurement")
+        cut = 0 if limited else first + frames - 1 - int(sequence.max(initial=first - 1))
+        if cut > MAX_MISSING * frames:
+            named = [f"{key} {parameters[key]}" for key in ("noll", "level_nm", "loop") if key in parameters]
+            raise DataFileError(
+                f"{path}: ends {cut} of {frames} frames before the end of a measurement ({', '.join([kind, *named])}): "
+                "give all files of the log, or measure again"
+            )
         request_ns = from_timestamp(request.timestamp)  # not its frame: a state after a `clear` has none
         states = [state for state in history.controllers if len(state.gain) == modes]
         before = [state for state in states if from_timestamp(state.timestamp) <= request_ns]
