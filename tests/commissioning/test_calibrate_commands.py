@@ -323,17 +323,20 @@ def test_a_poke_resolves_the_rotation_by_180_degrees(noiseless_loop: InProcessLo
     assert np.abs(cross_talk(calibration.reconstructor, noiseless_loop.calibration().response)).max() < 0.05
 
 
+@pytest.mark.parametrize("pupil", [{}, {"sensor.pupil": "prolate", "sensor.focal_radius": 2.5}])
 @pytest.mark.parametrize("geometry", [Geometry(1.0, 40.2, 39.5, -168.0, parity) for parity in (1, -1)])
-def test_pokes_resolve_a_reflection_that_does_not_change_the_image(geometry: Geometry) -> None:
-    """The image of a flat wavefront through the symmetric pupil is symmetric about both axes without a mask."""
-    config = load(None, SMALL_MIRROR | {"sensor.kind": "clowfs", "sensor.modes": 3})
+def test_pokes_resolve_a_reflection_or_rotation_that_does_not_change_the_image(
+    geometry: Geometry, pupil: dict[str, Any]
+) -> None:
+    """Without a mask, the image is symmetric about both axes through the symmetric pupil, circular through a circle."""
+    config = load(None, SMALL_MIRROR | {"sensor.kind": "clowfs", "sensor.modes": 3} | pupil)
     computed = analytic(config, SILENT)
     image = computed.reference.astype(float).reshape(80, 80)
     alignment = align(onto(image, geometry, (80, 80)), image)
     H = onto(computed.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
     alignment = replace(alignment, residual=0.1, other_parity=0.2)  # of the better parity, which may be the wrong one
     found, calibration, correlation = oriented(config, computed, alignment, 1e5, computed, lambda mode: H[:, mode])
-    assert found.geometry.parity == geometry.parity
+    assert (found.geometry.rotation_deg, found.geometry.parity) == (pytest.approx(-168, abs=0.1), geometry.parity)
     assert found.residual == (0.1 if alignment.geometry.parity == geometry.parity else 0.2)
     assert correlation > 0.99
     assert np.abs(cross_talk(calibration.reconstructor, H)).max() < 0.01

@@ -3,7 +3,8 @@
 The image of a flat wavefront through a pupil that is symmetric or without phase is unchanged by a rotation of 180
 degrees, so the reference image alone leaves this ambiguity. In the wrong orientation tip, tilt and other odd modes have
 the opposite sign, and without phase in the pupil all modes: a poke of an odd mode resolves it. If a reflection does not
-change the image either, as without a mask in the relay pupil, it takes pokes of tip and tilt.
+change the image either, as without a mask in the relay pupil, it takes pokes of tip and tilt. A circular image leaves
+the whole rotation to these pokes.
 """
 
 from dataclasses import dataclass, replace
@@ -19,6 +20,8 @@ _ANGLES = 72
 """Number of initial rotations, spread over 180 degrees."""
 _ALIKE, _EXACT = 2.0, 0.01
 """Ratio to the better parity's residual, and residual, below either of which the other parity is possible, too."""
+_CIRCULAR = 0.05
+"""Relative change by a rotation below which an image counts as circular; the samples of a circle change it by 0.01."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +42,9 @@ class Geometry:
     rotation_deg: float
     parity: int
 
-    def rotated_180(self) -> "Geometry":
-        """The geometry rotated by 180 degrees, which the reference image cannot distinguish."""
-        return replace(self, rotation_deg=self.rotation_deg - 180 if self.rotation_deg > 0 else self.rotation_deg + 180)
+    def rotated(self, angle_deg: float) -> "Geometry":
+        """The geometry rotated further by an angle; its rotation is between -180 and 180 degrees."""
+        return replace(self, rotation_deg=(self.rotation_deg + angle_deg + 180) % 360 - 180)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +58,7 @@ class Alignment:
         residual: Rms of real minus fitted image, relative to the rms of the real image.
         other_parity: The same residual for the other parity.
         orientations: Geometries that the image does not distinguish.
+        circular: Whether the image is the same at all rotations, so that those of `orientations` are arbitrary.
     """
 
     geometry: Geometry
@@ -63,6 +67,7 @@ class Alignment:
     residual: float
     other_parity: float
     orientations: list[Geometry]
+    circular: bool
 
 
 def onto(image: Array, geometry: Geometry, shape: tuple[int, int]) -> Array:
@@ -116,10 +121,21 @@ def align(real: Array, computed: Array, good: Mask | None = None) -> Alignment:
             "this the sensor and the mask of the configuration?"
         )
     _, flux, background = _residual(_sample(spline, best, real.shape)[used], real[used])
-    possible = [best, reflected] if other < max(_ALIKE * residual, _EXACT) else [best]
+    circular = _circular(spline, computed)
+    possible = [best, reflected] if circular or other < max(_ALIKE * residual, _EXACT) else [best]
     possible = [replace(each, rotation_deg=(each.rotation_deg + 90) % 180 - 90) for each in possible]
-    orientations = [orientation for each in possible for orientation in (each, each.rotated_180())]
-    return Alignment(possible[0], flux, background, residual, other, orientations)
+    orientations = [orientation for each in possible for orientation in (each, each.rotated(180))]
+    return Alignment(possible[0], flux, background, residual, other, orientations, circular)
+
+
+def _circular(spline: Array, computed: Array) -> bool:
+    """Whether a computed image (rows, columns) is the same at all rotations, within the circle that fits into it."""
+    rows, columns = computed.shape
+    centre = Geometry(1.0, (rows - 1) / 2, (columns - 1) / 2, 0.0, 1)
+    down, across = np.ogrid[:rows, :columns]
+    inside = np.hypot(down - centre.row, across - centre.column) < min(rows, columns) / 2 - 1
+    turned = (_sample(spline, replace(centre, rotation_deg=angle), computed.shape) for angle in (15.0, 40.0))
+    return all(_residual(image[inside], computed[inside])[0] < _CIRCULAR for image in turned)
 
 
 def _doubled(shape: tuple[int, ...]) -> tuple[int, int]:

@@ -239,8 +239,8 @@ def test_the_geometry_is_recovered(geometry: Geometry) -> None:
 def test_a_rotation_by_180_degrees_keeps_the_image_and_inverts_the_response() -> None:
     geometry = Geometry(1.1, 30.0, 40.0, 20.0, -1)
     image = computed_image()
-    other = geometry.rotated_180()
-    assert other.rotated_180() == geometry
+    other = geometry.rotated(180)
+    assert other.rotated(180) == geometry
     assert np.allclose(onto(image, geometry, (70, 80)), onto(image, other, (70, 80)), atol=1e-9)
     slope = image - np.roll(image, 1, axis=0)
     slope = slope - slope[::-1, ::-1]

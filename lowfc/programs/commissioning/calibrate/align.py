@@ -121,15 +121,25 @@ def oriented(
 
     The third value is the mean correlation of these responses with the computed ones; the others as for `on_sensor`.
     """
-    candidates = [on_sensor(config, computed, each, flux_dn, before) for each in alignment.orientations]
-    modes = range(min(len(candidates) // 2, len(computed.noll)))
+    orientations = alignment.orientations
+    modes = range(min(len(orientations) // 2, len(computed.noll)))
     responses = [poke(mode) for mode in modes]
-    scores = [np.mean([correlation(responses[k], each.response[:, k]) for k in modes]) for each in candidates]
+
+    def scored(geometry: Geometry) -> tuple[float, Calibration]:
+        calibration = on_sensor(config, computed, geometry, flux_dn, before)
+        return float(np.mean([correlation(responses[k], calibration.response[:, k]) for k in modes])), calibration
+
+    if alignment.circular:  # the correlation with the responses to tip and tilt is a cosine of the rotation
+        orientations = [
+            each.rotated(float(np.degrees(np.arctan2(scored(each.rotated(90))[0], scored(each)[0]))))
+            for each in orientations[::2]
+        ]
+    scores, candidates = zip(*map(scored, orientations), strict=True)
     best = int(np.argmax(scores))
-    geometry, residuals = alignment.orientations[best], (alignment.residual, alignment.other_parity)
+    geometry, residuals = orientations[best], (alignment.residual, alignment.other_parity)
     residual, other = residuals if geometry.parity == alignment.geometry.parity else residuals[::-1]
     found = replace(alignment, geometry=geometry, residual=residual, other_parity=other)
-    return found, candidates[best], float(scores[best])
+    return found, candidates[best], scores[best]
 
 
 def computed_scale(config: Configuration) -> float:
