@@ -53,6 +53,8 @@ def tilt_mas(summary: str) -> float:
 def test_the_first_loop_tutorial_runs_as_written(tmp_path: Path, shorter: bool, request: pytest.FixtureRequest) -> None:
     if shorter:
         request.getfixturevalue("without_drawings")
+    page = (PAGES / "first_loop.md").read_text()
+    assert page.index("install -e '.[plots]'") < page.index("lowfc report last"), "the extra comes before its use"
     first, info, report, replay, what_if, digest = followed(tmp_path, "first_loop", shorter=shorter).values()
     assert "frame to command" in first
     assert "lowfc/camera/frame" in info
