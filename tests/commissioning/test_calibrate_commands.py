@@ -323,6 +323,19 @@ def test_a_poke_resolves_the_rotation_by_180_degrees(noiseless_loop: InProcessLo
     assert np.abs(cross_talk(calibration.reconstructor, noiseless_loop.calibration().response)).max() < 0.05
 
 
+def test_no_calibration_is_aligned_to_a_turned_mirror(loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A poke of tip is one of tilt, whose image has no correlation with the computed one: its sign says nothing."""
+    play = loop.play
+
+    def turned(basis_nm: Any, table: Any) -> Any:
+        return play(np.rot90(basis_nm.reshape(-1, 12, 12), axes=(1, 2)).reshape(basis_nm.shape), table)
+
+    monkeypatch.setattr(loop, "play", turned)
+    error = refusal("calibrate", "align", "--out", "aligned.fits", "--frames", "200", kind=CalibrationError)
+    assert "their correlation is 0.0" in error
+    assert not Path("aligned.fits").exists()
+
+
 @pytest.mark.parametrize("pupil", [{}, {"sensor.pupil": "prolate", "sensor.focal_radius": 2.5}])
 @pytest.mark.parametrize("geometry", [Geometry(1.0, 40.2, 39.5, -168.0, parity) for parity in (1, -1)])
 def test_pokes_resolve_a_reflection_or_rotation_that_does_not_change_the_image(

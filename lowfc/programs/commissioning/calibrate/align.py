@@ -24,6 +24,9 @@ from lowfc.programs.commissioning.calibrate.recording import Player, check_size,
 from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 from lowfc.programs.commissioning.calibrate.tasks import reporter, write
 
+MIN_CORRELATION = 0.5
+"""Smallest correlation of a poke's image with the computed one; below it the sensor is not the configured one."""
+
 
 class AlignResult(Result):
     """Geometry of the sensor relative to the computed image."""
@@ -65,7 +68,13 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
             amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_nm(config, player.before)[mode]))
             return player.first_poke(mode, first_poke_plan(amplitude_nm)).response
 
-        alignment, calibration, _ = oriented(config, computed, alignment, flux_dn, before, poke)
+        alignment, calibration, likeness = oriented(config, computed, alignment, flux_dn, before, poke)
+        if likeness < MIN_CORRELATION:
+            raise CalibrationError(
+                f"the images of pokes do not resemble the computed ones: their correlation is {likeness:.2f}, expected "
+                f"{MIN_CORRELATION:g} or more; is the mirror turned or reflected relative to the pupil? Correct that "
+                "in its driver, or measure the response with `lowfc commission`"
+            )
         write(calibration, out, loop if load else None)
     return AlignResult(
         **asdict(alignment.geometry),

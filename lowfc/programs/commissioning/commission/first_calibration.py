@@ -15,7 +15,7 @@ from lowfc.control.calibration.alignment import align
 from lowfc.control.calibration.calibration import FIRST, Calibration
 from lowfc.control.calibration.delay_fit import Delay
 from lowfc.control.calibration.response_fit import correlation
-from lowfc.programs.commissioning.calibrate.align import computed_scale, in_words, on_sensor, oriented
+from lowfc.programs.commissioning.calibrate.align import MIN_CORRELATION, computed_scale, in_words, on_sensor, oriented
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, first_poke_plan, largest_nm
 from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError
 from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
@@ -25,8 +25,6 @@ MAX_FIRST_NM = 32.0
 """Largest amplitude of the first pokes, which is doubled until they are detected, nm rms of wavefront."""
 MAX_MISFIT = 0.35
 """Largest rms of the image minus the fitted computed one, relative to that of the image; else it is another sensor."""
-MIN_CORRELATION = 0.5
-"""Smallest correlation of a poke's image with the computed one; below it the sensor is not the configured one."""
 CYCLES = 12  # cycles of pokes that measure the response without an optical model
 MAX_NONLINEARITY = 0.1
 """Largest relative difference of the gains at full and half amplitude, beyond `_STANDARD_ERRORS` standard errors."""
