@@ -542,6 +542,8 @@ def test_an_invalid_wavefront_for_at_is_an_error(config: Configuration, tmp_path
         "1=5": "not a Noll index of 2 or more",
         "4=1,4=2": "named once",
         "4=nan": "its amplitude in nm",
+        "4=-1e300": r"at most 100000\)",
+        "999999999=5": r"\(at most 1000\)",
         str(tmp_path / "none.fits"): "--at: .*there is no such file",
     }.items():
         with pytest.raises(ConfigurationError, match=why):

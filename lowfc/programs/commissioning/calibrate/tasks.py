@@ -28,6 +28,7 @@ from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Twin, node_radii
 from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
+from lowfc.programs.cli.modes import HIGHEST
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.analytic import WavefrontFunction, analytic
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
@@ -39,6 +40,8 @@ from lowfc.programs.commissioning.calibrate.result import (
     result_of,
 )
 from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of
+
+_LARGEST_NM = 1e5  # amplitude of a mode in --at
 
 
 class DarkResult(Result):
@@ -140,9 +143,10 @@ def _modes(text: str) -> dict[int, float]:
             mode, amplitude_nm = int(index), float(value)
         except ValueError:
             raise ConfigurationError(f"--at must be modes in nm, as in 4=15,7=-10, or a file; got {part!r}") from None
-        if mode < 2 or mode in modes_nm or not np.isfinite(amplitude_nm):
+        if not 2 <= mode <= HIGHEST or mode in modes_nm or not abs(amplitude_nm) <= _LARGEST_NM:
             raise ConfigurationError(
-                f"--at: {part!r} is not a Noll index of 2 or more, named once, and its amplitude in nm"
+                f"--at: {part!r} is not a Noll index of 2 or more (at most {HIGHEST}), named once, and its amplitude "
+                f"in nm (at most {_LARGEST_NM:g})"
             )
         modes_nm[mode] = amplitude_nm
     return modes_nm
