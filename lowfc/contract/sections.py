@@ -271,7 +271,7 @@ class Mirror(Section):
     """Flat map (FITS or .npy), nm of surface, applied from the start; empty for none."""
     active: str = ""
     """Map of the active actuators (FITS or .npy), 0 or 1: modes and flat map exclude the others; empty for all."""
-    nm_per_unit: Positive = 1.0
+    nm_per_unit: float = Field(1.0, ge=1e-9, le=1e9)
     """For the mirror's driver: nm of surface per unit written to the hardware."""
     shift_pitches: float = Field(0.0, ge=-2, le=2)
     """Simulated mirror: misregistration of its actuators along x and along y, pitches."""

@@ -124,6 +124,7 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(
         *((f"disturbance.{key}", 1e13) for key in ("scale", "jitter_mas", "wheel_hz", "wheel_mas")),
         *((f"acceptance.{key}", 1e6) for key in ("linear_nm", "capture_nm", "capture_tilt_nm")),
         ("acceptance.linear_nm", 1e-8),
+        ("mirror.nm_per_unit", 1e-46),
         *((f"mirror.{key}", 1e13) for key in ("stroke_nm", "settling_us", "stuck_nm.3")),
         ("control.frame_timeout_ms", 1e10),
         ("control.command_timeout_ms", 1e10),

@@ -101,6 +101,8 @@ def test_frames_are_timed_at_the_end_of_the_exposure(folder: Path, atime: str, e
 def test_the_stream_name_comes_from_command_line_or_configuration() -> None:
     assert options(IsioCamera, {}, ("--stream", "camnsv", "--exposure-us", "500")).exposure_us == 500  # type: ignore[attr-defined]
     assert options(IsioMirror, {"stream": "dm00disp03"}).stream == "dm00disp03"  # type: ignore[attr-defined]
+    with pytest.raises(ConfigurationError, match="nm_per_unit = 1e-46"):  # the stream would get infinite values
+        options(IsioMirror, {"stream": "dm00disp03", "nm_per_unit": 1e-46})
     for table, words in (({}, ()), ({}, ("--atime", "end"))):
         with pytest.raises(ConfigurationError, match="stream"):
             options(IsioCamera, table, words)

@@ -40,7 +40,7 @@ class IsioMirror:
 
         stream: str
         """Name of the channel's stream."""
-        nm_per_unit: float = Field(default=1000.0, gt=0)
+        nm_per_unit: float = Field(default=1000.0, ge=1e-9, le=1e9)
         """Surface per unit of the stream, nm; CACAO's unit is the micrometre."""
         total: str | None = None
         """Stream with the sum of all channels; default: dm00disp for dm00disp03, read once it exists; empty: none."""
