@@ -59,10 +59,11 @@ def test_health_is_published_when_due_with_all_fields(listener: Listener, clock:
 
 
 @pytest.mark.parametrize("rate_hz", [0.1, 0.7, 1.6, 5.0, 1000.0])
-def test_the_rate_of_slow_work_is_measured_over_several_units(hub: MemoryHub, clock: FakeClock, rate_hz: float) -> None:
+def test_the_rate_of_slow_work_is_measured_over_several_units(
+    listener: Listener, clock: FakeClock, rate_hz: float
+) -> None:
     """Also with a Health between the usual ones; after a silence the rate is 0."""
-    listener = Listener(hub, clock, HEALTH)
-    camera = service(hub, clock, "camera")
+    camera = listener.service("camera")
     for number in range(300):
         camera.work = int(number * 0.5 * rate_hz)
         if number % 10 == 3:

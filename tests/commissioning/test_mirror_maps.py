@@ -186,12 +186,12 @@ def started(config: Configuration, calibration: Calibration, shape: MirrorShape 
     return state, requests
 
 
-def commands(config: Configuration, state: State) -> tuple[list[Single], list[str]]:
-    """Commands over ten frames of uniform light in open loop, and the names of the channels at their end."""
+def commands(config: Configuration, state: State, frames: int = 10) -> tuple[list[Single], list[str]]:
+    """Commands over some frames of uniform light in open loop, and the names of the channels at their end."""
     settings = replace(factory.settings(config), min_flux_fraction=0.0, max_identical_frames=0)
     calibration, sent = state.loop.calibration, []
     pixels = np.rint(calibration.dark + 100).reshape(calibration.shape).astype(np.uint16)
-    for index in range(10):
+    for index in range(frames):
         state, outputs = advance(settings, state, Frame(1 + index, index, 0, pixels))
         sent.append(outputs.command.actuators_nm)
     return sent, [channel.name for channel in state.loop.channels_or_empty().channels]
