@@ -114,6 +114,17 @@ def test_the_result_is_printed_although_the_loop_refuses_it(log: Path, monkeypat
     assert json.loads(done.stdout)["applied"] is None
 
 
+@pytest.mark.parametrize(("frames", "warned"), [(3000, False), (1000, True)])
+def test_the_residual_achieved_is_that_of_the_last_gains(tmp_path: Path, frames: int, warned: bool) -> None:
+    """The pseudo-open-loop modes of earlier gains are used, but their errors do not belong to the last law's theory."""
+    night = SyntheticLog().request("close").frames(3600).request("gain", (0.1,) * 3).frames(frames)
+    result = json_of("tune", night.write(tmp_path / "night.mcap"))
+    tip = result["modes"][0]
+    assert (tip["achieved_nm"] == pytest.approx(tip["predicted_now_nm"], rel=0.1)) is not warned
+    assert result["frames"] == 3600 - 500 + frames
+    assert ["changed late in these frames" in warning for warning in result["warnings"]] == [True] * warned
+
+
 def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path) -> None:
     """During a probe sequence on the mirror, the true wavefront does not follow the loop's commands alone."""
     night = SyntheticLog().request("close").frames(100)

@@ -13,7 +13,7 @@ from lowfc.adapters.logs.history import measured_timing, read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask, Single
 from lowfc.client import Client, MirrorWatch, configuration_of
-from lowfc.contract.codecs.law_codec import driving, integrator_of
+from lowfc.contract.codecs.law_codec import driving, integrator_of, overruled
 from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, DataFileError
@@ -50,7 +50,8 @@ class Telemetry:
         law: the integrator's gains at the end; `driving` is the linear law in force instead, if any.
         closed: whether the loop was closed in these frames.
         pol: pseudo-open-loop modes (frames, modes), in pieces without gaps.
-        error: modal error of the same frames (frames, modes).
+        error: modal error (frames, modes); like the true residual, of the frames after the last change of law or gains,
+            unless those are fewer than `FEWEST`.
         true_nm2: mean products of the true residual at the start of each exposure (modes, modes); None if unknown.
         continuous_rms_nm: rms of the true residual over all time (modes,); None if unknown.
         nm_per_mas: wavefront rms of a tilt of 1 mas; None if the telescope's diameter is unknown.
@@ -96,6 +97,7 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
         history.rate_hz,
         run.timing,
         (run.law, driving(history.controller, history.published.laws)),
+        _last_change(history.controllers, len(run.law.gain)),
         steps,
         usable & run.under_calibration,
         (None if run.true_nm is None else run.true_nm[1], run.continuous_rms_nm),
@@ -164,6 +166,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
         rate_hz,
         measured_timing(timing, steps, applied, applied_ns, rate_hz),
         (integrator_of(states[-1]), driving(states[-1], loop.laws())),
+        _last_change(states, len(calibration.noll)),
         steps,
         usable,
         (None, None),
@@ -209,11 +212,24 @@ def _delay_warnings(assumed: float, seen: SeenCommands, measured: float | None, 
     ]
 
 
+def _last_change(states: Sequence[wire.ControllerState], modes: int) -> int:
+    """Sequence of the frame after which the last law and gains were in force; 0 if they never changed."""
+    newest, changed, before = 0, 0, None
+    for state in states:
+        newest = max(newest, state.frame_sequence)  # that of a `clear` is 0
+        gains = [] if state.HasField("law") and not overruled(state) else [*state.gain, *state.leak]
+        law = state.law.id, overruled(state), gains
+        if len(state.gain) == modes:
+            changed, before = changed if before in (None, law) else newest, law
+    return changed
+
+
 def _telemetry(
     source: str,
     rate_hz: float,
     timing: Timing,
     laws: tuple[Integrator, LinearLaw | None],
+    changed: int,
     steps: Steps,
     usable: Mask,
     true_residual: tuple[Single | None, Single | None],
@@ -224,7 +240,7 @@ def _telemetry(
     """The usable steps after the loop has settled in closed loop, or all usable ones if those are too few.
 
     `laws` are the integrator and the linear law in force, if any. `true_residual` has the residual at the start of each
-    exposure and its rms over all time (steps, modes).
+    exposure and its rms over all time (steps, modes). The laws are in force since the frame `changed`.
     """
     was_closed, index = steps.mode == LoopMode.CLOSED, np.arange(len(steps.mode))
     not_closed = np.flatnonzero(~was_closed)
@@ -245,8 +261,13 @@ def _telemetry(
         )
     if Limit.LAW_OVERRULED in count_reasons(steps.reasons[rows]):
         warnings = [*warnings, "in some of these frames the integrator drove in place of a law (LAW_OVERRULED)"]
+    under_law = rows & (steps.sequence > changed + settling)
+    if np.count_nonzero(under_law) < FEWEST:
+        under_law = rows
+        if closed and (steps.sequence[rows] <= changed).any():
+            warnings = [*warnings, "law or gains changed late in these frames: achieved is of all, theory of the last"]
     contrast = known_contrast(config) if config is not None and config.noll == calibration.noll else None
-    known = [None if each is None else each[rows & np.isfinite(each).all(axis=1)] for each in true_residual]
+    known = [None if each is None else each[under_law & np.isfinite(each).all(axis=1)] for each in true_residual]
     true_nm, rms_nm = (each if each is not None and len(each) else None for each in known)
     return Telemetry(
         source=source,
@@ -257,7 +278,7 @@ def _telemetry(
         driving=laws[1],
         closed=closed,
         pol=pol,
-        error=time_series(steps.sequence[rows], steps.error_nm[rows]),
+        error=time_series(steps.sequence[under_law], steps.error_nm[under_law]),
         true_nm2=None if true_nm is None else true_nm.T.astype(float) @ true_nm / len(true_nm),
         continuous_rms_nm=None if rms_nm is None else np.sqrt(np.mean(rms_nm.astype(float) ** 2, axis=0)),
         nm_per_mas=tilt_nm_per_mas(config.star.diameter_m) if config is not None else None,
