@@ -204,7 +204,7 @@ def test_tuning_uses_the_steps_of_a_running_loop() -> None:
     added = values["added_contrast"]
     assert 0 < added["predicted"] < added["open"]
     assert set(added["by_group"]["predicted"]) == {"tilt", "focus"}
-    assert f"closed {added['closed']:+.1e}, predicted {added['predicted']:+.1e}; focus contributes most (" in text
+    assert f"closed {added['closed']:+.1e}, predicted {added['predicted']:+.1e}; tilt contributes most (" in text
 
 
 class ReportingLoop(StreamedLoop):

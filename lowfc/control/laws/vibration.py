@@ -110,17 +110,8 @@ def identify(run: TimeSeries, rate_hz: float) -> Model | None:
     whittle = _Whittle.of(run, rate_hz)
     if whittle is None:
         return None
-    model = whittle.fit_floor(Model(0.0, np.inf, (), 1.0, rate_hz), robust=True)
-    while len(model.lines) < _MAX_LINES:
-        line = whittle.another_line(model)
-        if line is None:
-            break
-        model = whittle.fit_floor(replace(model, lines=(*model.lines, line)), robust=False)
-    lines = tuple(sorted(model.lines, key=lambda line: line.frequency_hz))
-    model = whittle.fit_all(replace(model, lines=lines))
-    needed = whittle.needed(model)
-    model = model if needed == model.lines else whittle.fit_all(replace(model, lines=needed))
-    return replace(model, lowest_hz=rate_hz / run.longest)
+    found = [whittle.fit(robust) for robust in (True, False)]  # a floor without the lowest frequencies may be far off
+    return replace(min(found, key=whittle.cost), lowest_hz=rate_hz / run.longest)
 
 
 def resolution_hz(run: TimeSeries, rate_hz: float) -> float:
@@ -161,6 +152,24 @@ class _Whittle:
     @property
     def spacing_hz(self) -> float:
         return float((self.omega[1] - self.omega[0]) * self.rate_hz / (2 * np.pi))
+
+    def fit(self, robust: bool) -> Model:
+        """Fit a floor, then lines one by one, then all; for a `robust` floor unknown lines matter little."""
+        model = self.fit_floor(Model(0.0, np.inf, (), 1.0, self.rate_hz), robust)
+        while len(model.lines) < _MAX_LINES:
+            line = self.another_line(model)
+            if line is None:
+                break
+            model = self.fit_floor(replace(model, lines=(*model.lines, line)), robust=False)
+        lines = tuple(sorted(model.lines, key=lambda line: line.frequency_hz))
+        model = self.fit_all(replace(model, lines=lines))
+        needed = self.needed(model)
+        return model if needed == model.lines else self.fit_all(replace(model, lines=needed))
+
+    def cost(self, model: Model) -> float:
+        """Negative log-likelihood with the penalty of each line, up to a constant."""
+        whole = self.misfit(self.power, model.spectrum_nm2(self.omega) + model.noise_nm2, 1.0)
+        return whole + float(_PENALTY * np.log(self.omega.size)) * len(model.lines)
 
     def misfit(self, power: Array, spectrum: Array, counts: Array | float) -> float:
         """Negative log-likelihood, up to a constant."""
@@ -261,17 +270,15 @@ class _Whittle:
 
     def needed(self, model: Model) -> tuple[Line, ...]:
         """The lines that raise the likelihood significantly: one found early may have represented several."""
-        lines, whole = model.lines, self.misfit(self.power, model.spectrum_nm2(self.omega) + model.noise_nm2, 1.0)
-        for line in sorted(lines, key=lambda line: line.variance_nm2):
-            fewer = tuple(other for other in lines if other is not line)
-            without = replace(model, lines=fewer).spectrum_nm2(self.omega) + model.noise_nm2
-            lost = self.misfit(self.power, without, 1.0) - whole
-            if lost < _PENALTY * np.log(self.omega.size):
-                lines, whole = fewer, whole + lost
-        return lines
+        for line in sorted(model.lines, key=lambda line: line.variance_nm2):
+            fewer = replace(model, lines=tuple(other for other in model.lines if other is not line))
+            if self.cost(fewer) < self.cost(model):
+                model = fewer
+        return model.lines
 
     def fit_all(self, model: Model) -> Model:
-        """Fit all parameters together, starting from a nearly right model."""
+        """Fit all parameters together, starting from nearly right lines."""
+        model = self.fit_floor(model, robust=False)  # its range around the start is limited
         omega, power, counts = self.grouped(model.lines, robust=False)
         spacing, corner = self.spacing_hz, np.isfinite(model.cutoff_hz)
         allowed_hz = spacing, self.rate_hz / 2 - spacing

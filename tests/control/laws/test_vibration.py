@@ -90,6 +90,25 @@ def test_a_slow_mode_is_identified_as_drift() -> None:
     assert model.noise_nm2 == pytest.approx(0.25, rel=0.05)
 
 
+@pytest.mark.parametrize(("drift_nm2", "cutoff_hz", "frames"), [(1e-4, np.inf, 2048), (1.0, 0.5, 20_000)])
+def test_the_drift_is_identified_down_to_the_lowest_frequencies(
+    drift_nm2: float, cutoff_hz: float, frames: int
+) -> None:
+    truth, omega = Model(drift_nm2, cutoff_hz, (), 1.0, 250.0), 2 * np.pi * np.array([4, 8, 16]) / frames
+    models = [identify(TimeSeries((realised(truth, frames, seed),), 0), 250.0) for seed in range(4)]
+    ratio = [(model.spectrum_nm2(omega) + model.noise_nm2) / (truth.spectrum_nm2(omega) + 1) for model in models]
+    assert np.exp(np.mean(np.log(ratio), axis=0)) == pytest.approx(1, rel=0.35)
+
+
+def test_drift_is_not_identified_as_a_line() -> None:
+    """A bright star: above its band of up to 1 Hz, the drift hardly exceeds the noise."""
+    simulated = preset_disturbance("thermal", tuple(range(2, 16)), 1, NM_PER_MAS, 550.0)
+    drift = modes_nm(simulated, 0, 15_000, 250.0)
+    noise = 0.2 * np.random.default_rng(1).standard_normal(drift.shape)
+    model = identify(TimeSeries(((drift + noise)[:, :1],), 0), 250.0)
+    assert model.spectrum_nm2(np.array([2 * np.pi * 2 / 250])) < model.noise_nm2
+
+
 @pytest.mark.parametrize(("lines", "seed"), [((), 1), (LINES_HZ, 3)])
 def test_a_model_without_noise_still_gives_a_stable_filter(lines: tuple[float, ...], seed: int) -> None:
     truth = Model(1.0, 50.0, tuple(Line(hz, 1e-3, 100.0) for hz in lines), 1e-12, RATE_HZ)
