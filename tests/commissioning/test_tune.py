@@ -31,7 +31,7 @@ from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.commissioning.tune.command import apply_gains
 from lowfc.programs.commissioning.tune.data import Telemetry, telemetry_from_log, telemetry_from_run
-from lowfc.programs.commissioning.tune.result import result_of, tuned
+from lowfc.programs.commissioning.tune.result import picture, result_of, tuned
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
 from tests.support.loops import json_of, lowfc, refusal
 from tests.support.report_log import SyntheticLog
@@ -104,6 +104,19 @@ def test_the_command_writes_the_law_and_draws_it(
     assert result["files"] == [str(out), str(plot)]
     assert plot.read_bytes()[:4] == b"\x89PNG"
     assert law_file.load(out).id == tuned_as("lqg")[0].law.id
+
+
+def test_the_picture_has_the_words_of_the_page_and_the_line_of_the_model(
+    telemetry: Telemetry, tuned_as: Callable[[str], tuple[Tuned, Gains]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr("lowfc.adapters.files.drawing.png", drawn.append)
+    picture(telemetry, tuned_as("lqg")[0])
+    page = " ".join((Path(__file__).parents[2] / "docs/howto/tuning.md").read_text().split())
+    curves = {line.get_label().split(" (")[0]: line.get_ydata() for line in drawn[0].axes[0].lines}
+    assert [label for label in curves if f"the {label}" not in page] == []
+    line = curves["model of the pseudo-open-loop"].sum() / curves["pseudo-open-loop"].sum()
+    assert line == pytest.approx(1, rel=0.2)  # of a width far below the distance of the frequencies
 
 
 def test_the_result_is_printed_although_the_loop_refuses_it(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:

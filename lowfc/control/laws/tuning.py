@@ -209,7 +209,7 @@ def predicted_nm(law: LinearLaw, models: Sequence[Model], timing: Timing) -> Arr
     """Rms (modes,) over all time of the true residual of modes with these models."""
     variance_nm2 = np.zeros(len(models))
     for mode, model in enumerate(models):
-        omega = _fine_frequencies(model)
+        omega = fine_frequencies(model)
         measured = model.spectrum_nm2(omega)[:, None] + model.noise_nm2
         noise_nm2 = np.full(len(models), model.noise_nm2)
         power = residual_spectrum(law, omega, measured, noise_nm2, timing)[:, mode]
@@ -313,7 +313,7 @@ def _sufficient(found: margins.Margins) -> bool:
     )
 
 
-def _fine_frequencies(model: Model) -> Array:
+def fine_frequencies(model: Model) -> Array:
     """Rad per frame from nearly 0 to pi, ascending, densely around each line."""
     apart = np.geomspace(1e-3, 1e4, 120)
     grids = [np.linspace(0, np.pi, 2048), np.geomspace(1e-7, np.pi, 512)]

@@ -15,6 +15,7 @@ from lowfc.control.laws.tuning import (
     Gains,
     Tuned,
     best_gains,
+    fine_frequencies,
     frame_noise_nm2,
     identify_modes,
     predicted_nm,
@@ -189,29 +190,39 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
     pol_spectrum = spectrum(run.pol, run.rate_hz)
     assert pol_spectrum is not None  # noqa: S101  # tuning needs more frames than a spectrum
     largest = np.argsort(-pol_spectrum.variance_nm2())[:2]
+    shown_hz = pol_spectrum.frequency_hz[1:]
+    edges = np.append(shown_hz - pol_spectrum.spacing_hz / 2, shown_hz[-1]) * 2 * np.pi / run.rate_hz
     for axes, mode in zip(drawing.subplots(2, 1, sharex=True), largest.tolist(), strict=False):
         model = best.models[mode]
-        omega = 2 * np.pi * pol_spectrum.frequency_hz[1:] / run.rate_hz
-        one_sided = 2 / run.rate_hz
-        modelled = one_sided * (model.spectrum_nm2(omega) + model.noise_nm2)
+        omega, one_sided = fine_frequencies(model), 2 / run.rate_hz
+        modelled = model.spectrum_nm2(omega) + model.noise_nm2
         noise_nm2 = np.array([each.noise_nm2 for each in best.models])
-        measured = np.repeat((model.spectrum_nm2(omega) + model.noise_nm2)[:, None], len(noise_nm2), axis=1)
-        residual = one_sided * residual_spectrum(best.law, omega, measured, noise_nm2, run.timing)[:, mode]
-        axes.loglog(
-            pol_spectrum.frequency_hz[1:], pol_spectrum.power_nm2_hz[1:, mode], color="0.6", label="pseudo-open-loop"
-        )
+        measured = np.repeat(modelled[:, None], len(noise_nm2), axis=1)
+        residual = residual_spectrum(best.law, omega, measured, noise_nm2, run.timing)[:, mode]
+        axes.loglog(shown_hz, pol_spectrum.power_nm2_hz[1:, mode], color="0.6", label="pseudo-open-loop")
         closed = spectrum(run.error, run.rate_hz) if run.closed else None
         if closed is not None:
             binned_hz, (power,) = in_bins(closed.frequency_hz, [closed.power_nm2_hz[:, mode]])
-            axes.loglog(binned_hz, power, color="tab:orange", label="error, measured")
-        axes.loglog(pol_spectrum.frequency_hz[1:], modelled, color="tab:blue", lw=1, label="model")
+            axes.loglog(binned_hz, power, color="tab:orange", label="error")
         axes.loglog(
-            pol_spectrum.frequency_hz[1:], residual, color="tab:green", label=f"residual, {best.kinds[mode]}, theory"
+            shown_hz,
+            one_sided * _means(modelled, omega, edges),
+            color="tab:blue",
+            lw=1,
+            label="model of the pseudo-open-loop",
         )
+        label = f"predicted residual with the tuned law ({best.kinds[mode]})"
+        axes.loglog(shown_hz, one_sided * _means(residual, omega, edges), color="tab:green", label=label)
         axes.set(ylabel=f"Z{run.noll[mode]} {mode_name(run.noll[mode])}, nm$^2$/Hz")
         axes.legend()
     axes.set(xlabel="Hz")
     return png(drawing)
+
+
+def _means(power: Array, omega: Array, edges: Array) -> Array:
+    """Mean power between neighbouring edges, from values at omega, all in rad per frame: narrow lines are kept."""
+    total = np.append(0, np.cumsum((power[1:] + power[:-1]) / 2 * np.diff(omega)))
+    return np.asarray(np.diff(np.interp(edges, omega, total)) / np.diff(edges))
 
 
 def _added_contrast(
