@@ -9,7 +9,7 @@ from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.virtual import VirtualIntegrators, Weights
 
 MIN_GAIN = 1e-3
-"""Lower limit of a bank's gains: the highest gain within the margins, halved repeatedly. Row 0 has a gain of 0."""
+"""Lower limit of a bank's gains: the highest of its modes' margins, halved repeatedly. Row 0 has a gain of 0."""
 BLOCKS = 10
 """Blocks of a window, for the standard errors of its means."""
 CONFIDENCE = 2.0
@@ -85,15 +85,15 @@ class GainBank:
             delay_frames: The loop's delay.
             windows: Frames of the first window, and of each later one before it grows.
         """
-        highest = min(highest_gain(delay_frames, mode_leak) for mode_leak in np.unique(leak).tolist())
-        rows = highest * 0.5 ** np.arange(int(np.log2(highest / MIN_GAIN)), -1.0, -1)
-        self.rows = np.concatenate([[0], rows]).astype(np.float32)
-        gain = np.repeat(self.rows[:, None], leak.size, axis=1)
-        self._at_rest = VirtualIntegrators.at_rest(gain, 1 - leak, limit_nm, weights)
+        highest = np.array([highest_gain(delay_frames, mode_leak) for mode_leak in leak.tolist()])
+        rows = highest.max() * 0.5 ** np.arange(int(np.log2(highest.max() / MIN_GAIN)), -1.0, -1)
+        self.rows = np.minimum(np.append(0, rows)[:, None], highest).astype(np.float32)  # (rows, modes)
+        self._distinct = np.diff(self.rows, axis=0, prepend=-1) > 0
+        self._at_rest = VirtualIntegrators.at_rest(self.rows, 1 - leak, limit_nm, weights)
         self._windows = windows
         self._closed = self._throughout = False
         self._waiting = 0  # frames in the arrays below that have not been summed
-        self._errors_nm = np.zeros((TOGETHER, *gain.shape), np.float32)
+        self._errors_nm = np.zeros((TOGETHER, *self.rows.shape), np.float32)
         self._loop_nm = np.zeros((TOGETHER, leak.size), np.float32)
         self._tilts_nm = np.zeros((TOGETHER, 2), np.float32)
         self.use_reconstructor(np.eye(leak.size))
@@ -175,7 +175,7 @@ class GainBank:
         proven_mean = np.where(proven, mean, np.inf)
         changed = (now <= 1) & proven.any(axis=0)
         only_cross_talk = (cross_talk_nm != 0) & (own[-EARLY:] > 0).all(axis=0)
-        gain = np.where(changed, self.rows[np.argmin(proven_mean, axis=0)], gain)
+        gain = np.where(changed, self.rows[np.argmin(proven_mean, axis=0), np.arange(now.size)], gain)
         return np.where(only_cross_talk, 0, gain).astype(np.float32)
 
     def held(self, frames: int) -> None:
@@ -202,7 +202,7 @@ class GainBank:
             little = injected(self.rows[1]) * noise_nm2 < MAX_INJECTED * certain_power
             chosen = np.where((chosen == 0) & little & (suspected_nm == 0), 1, chosen)
         verdict = Verdict(
-            self.rows[chosen],
+            self.rows[chosen, modes],
             power,
             noise_nm2,
             mean[now, modes],
@@ -244,7 +244,7 @@ class GainBank:
     def _chosen(self, blocks: Array, now: Integers) -> Integers:
         """Best row (modes,) of each mode whose current row is `now`."""
         own, modes = blocks[:, :-1], np.arange(now.size)
-        rows, helps = own + self._median_of_modes(own), own.mean(axis=0) < 0
+        rows, helps = own + self._median_of_modes(own), (own.mean(axis=0) < 0) & self._distinct
         if self.first:
             beyond_open = rows.mean(axis=0)
             better = helps & self._beyond_noise(beyond_open)
@@ -275,7 +275,7 @@ class GainBank:
 
     def _row_of(self, gain: Single) -> Integers:
         """Row (modes,) nearest to each gain."""
-        nearest = np.argmin(np.abs(np.log(np.maximum(gain, 1e-9)) - np.log(self.rows[1:, None])), axis=0) + 1
+        nearest = np.argmin(np.abs(np.log(np.maximum(gain, 1e-9)) - np.log(self.rows[1:])), axis=0) + 1
         return np.where(gain < self.rows[1] / 2, 0, nearest)
 
     def _add_up(self) -> None:
@@ -309,8 +309,8 @@ class GainBank:
 
     def _begin_block(self) -> None:
         self._frames = self._changes_counted = self._waiting = 0
-        self._sums = np.zeros((self.rows.size + 1, self._at_rest.kept.size))
-        self._spread = np.zeros((self.rows.size, self._at_rest.kept.size))
+        self._sums = np.zeros((len(self.rows) + 1, self._at_rest.kept.size))
+        self._spread = np.zeros((len(self.rows), self._at_rest.kept.size))
         self._power, self._changes, self._mean = np.zeros((3, self._at_rest.kept.size))
         self._tilt = np.zeros(_REGRESSORS)
 
