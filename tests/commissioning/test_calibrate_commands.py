@@ -16,10 +16,12 @@ from rich.console import Console
 
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.progress import counting_bar, progress_lines
+from lowfc.arrays import single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
+from lowfc.control.calibration.adapted import with_dark
 from lowfc.control.calibration.alignment import Geometry, align, onto
 from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.control.calibration.response_fit import cross_talk
@@ -31,8 +33,10 @@ from lowfc.programs.commissioning.calibrate import align as calibrate_align
 from lowfc.programs.commissioning.calibrate import command, pokes
 from lowfc.programs.commissioning.calibrate import tasks as calibrate_commands
 from lowfc.programs.commissioning.calibrate.align import on_sensor, oriented
+from lowfc.programs.commissioning.calibrate.result import comparison
 from lowfc.programs.commissioning.calibrate.run import Calibrator
 from lowfc.programs.commissioning.calibrate.tasks import zero_point
+from tests.support import toy
 from tests.support.in_process_loop import BRIGHT, SMALL_MIRROR, InProcessLoop
 from tests.support.loops import json_of, lowfc, refusal
 
@@ -450,6 +454,21 @@ def test_a_comparison_of_different_sensors_and_a_missing_directory_are_refused(l
     assert "cannot be compared" in error
     error = refusal("calibrate", "--method", "hadamard", "--out", "nowhere/night.fits", kind=DataFileError)
     assert "there is no directory" in error
+
+
+def test_two_calibrations_are_compared_on_the_pixels_that_are_good_in_both() -> None:
+    """A star on the same sensor, with dead pixels in one of the calibrations."""
+    first = toy.calibration()
+    good = np.ones(first.good.size)
+    good[np.argsort(-first.reference)[[2, 7, 11, 20, 33]]] = 0
+    second = with_dark(first, first.dark, good, 1.0, 1.0)
+    for found in (comparison(first, second), comparison(second, first)):
+        assert found.cross_talk < 1e-4
+        assert found.reference_shift_nm == pytest.approx([0] * 3, abs=1e-3)
+        assert found.flux_ratio == pytest.approx(1)
+        assert sorted(found.bad_pixels) == [0, 5]
+    with pytest.raises(CalibrationError, match="good in both: the reference image has no light"):
+        comparison(second, replace(first, good=single(1 - good)))
 
 
 ZERO_POINT = "4=20,7=-20"

@@ -15,9 +15,20 @@ _MIN_RESPONSE = 1e-3
 def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_e: float, gain_e: float) -> Calibration:
     """The calibration with another dark (pixels,), DN, and only the pixels (pixels,) that are 1 in `good`.
 
-    Pixels that were bad stay bad. I0 and H are normalised to the flux on the remaining pixels. A plain R is recomputed
-    from them, for this read noise of a pixel and electrons per DN; any other keeps its response to the modes.
-    `operator_hash` and `id` of the result are empty.
+    As `on_pixels`, but a plain R is recomputed from I0 and H, for this read noise of a pixel and electrons per DN.
+
+    Raises:
+        ValueError: the remaining pixels have no light, or do not tell the modes apart.
+    """
+    changed = replace(on_pixels(calibration, good), dark=single(dark_dn))
+    return _reconstructed(changed, read_noise_e, gain_e) if _is_plain(calibration) else changed
+
+
+def on_pixels(calibration: Calibration, good: Array) -> Calibration:
+    """The calibration with only the pixels (pixels,) that are 1 in `good`; its R H, without unit, stays.
+
+    Pixels that were bad stay bad. I0 and H are normalised to the flux on the remaining pixels. `operator_hash` and `id`
+    of the result are empty.
 
     Raises:
         ValueError: the remaining pixels have no light, or do not tell the modes apart.
@@ -31,11 +42,8 @@ def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_
         reference=single(I0),
         response=single(H),
         good=single(kept),
-        dark=single(dark_dn),
         flux_dn=calibration.flux_dn * share,
     )
-    if _is_plain(calibration):
-        return _reconstructed(changed, read_noise_e, gain_e)
     return replace(changed, reconstructor=single(_same_response(calibration, changed)), operator_hash="", id="")
 
 

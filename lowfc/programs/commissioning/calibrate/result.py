@@ -12,6 +12,7 @@ from lowfc.arrays import Array, single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, raised_as
+from lowfc.control.calibration.adapted import on_pixels
 from lowfc.control.calibration.calibration import FIRST, Calibration, comparable
 from lowfc.control.calibration.regularised import Reconstruction, advice, reconstruct
 from lowfc.control.calibration.response_fit import MAX_ELEMENT, MAX_ELEMENT_RMS, Check, Measured, cross_talk
@@ -259,17 +260,20 @@ def judge(
 
 
 def comparison(first: Calibration, second: Calibration) -> Comparison:
-    """Differences of two calibrations: I0 and H of the second, as measured with R of the first."""
+    """Differences on the common good pixels: I0 and H of the second calibration, as measured with R of the first."""
     if not comparable(first, second):
         raise CalibrationError(
             "calibrations with different sensors or modes cannot be compared: the first has "
             f"{first.shape[0]} x {first.shape[1]} pixels and modes {_span(first)}, the second {second.shape[0]} x "
             f"{second.shape[1]} pixels and modes {_span(second)}"
         )
-    good_in_both = (first.good * second.good).astype(np.float64)
+    bad_pixels = [int(np.count_nonzero(each.good == 0)) for each in (first, second)]
+    with raised_as(CalibrationError, ValueError, "on the pixels that are good in both"):
+        good = (first.good * second.good).astype(np.float64)
+        first, second = on_pixels(first, good), on_pixels(second, good)
     R = first.reconstructor.astype(np.float64)
     talk = cross_talk(R, second.response)
-    shift = R @ ((second.reference - first.reference) * good_in_both)
+    shift = R @ (second.reference - first.reference)
     commands = first.modes_to_actuators, second.modes_to_actuators
     return Comparison(
         modes=len(first.noll),
@@ -280,7 +284,7 @@ def comparison(first: Calibration, second: Calibration) -> Comparison:
         reference_shift_nm=shift.tolist(),
         flux_ratio=second.flux_dn / first.flux_dn,
         dark_shift_dn=float(np.median(second.dark - first.dark)),
-        bad_pixels=[int(np.count_nonzero(each.good == 0)) for each in (first, second)],
+        bad_pixels=bad_pixels,
         same_commands=bool(commands[0].shape == commands[1].shape and np.array_equal(*commands)),
     )
 
