@@ -138,6 +138,14 @@ def test_the_residual_achieved_is_that_of_the_last_gains(tmp_path: Path, frames:
     assert ["changed late in these frames" in warning for warning in result["warnings"]] == [True] * warned
 
 
+def test_an_offset_does_not_belong_to_the_disturbance_at_a_measured_delay(tmp_path: Path) -> None:
+    """Without truth, this log's mirror reports each command a frame later than the controller assumes."""
+    night = SyntheticLog(truth=False).request("close").frames(1500).request("offset", (0.0, 0.0, 20.0)).frames(1500)
+    run = telemetry_from_log(LogReader(night.write(tmp_path / "night.mcap")))
+    assert run.timing.delay == 2
+    assert np.ptp(run.pol.joined()[:, 2]) < 10
+
+
 def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path) -> None:
     """During a probe sequence on the mirror, the true wavefront does not follow the loop's commands alone."""
     night = SyntheticLog().request("close").frames(100)

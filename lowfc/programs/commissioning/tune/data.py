@@ -198,7 +198,7 @@ def _without_probes(steps: Steps, seen: SeenCommands, assumed: float, played: Ma
     Steps with a probe sequence (`played`) get mode 0, as if the loop were not closed, so that the time to settle after
     the sequence is excluded, too.
     """
-    pol_nm = steps.pol_nm if seen.delay_frames == assumed else steps.error_nm - seen.seen_nm
+    pol_nm = steps.pol_nm if seen.delay_frames == assumed else steps.error_nm + seen.target_nm - seen.seen_nm
     usable = np.isfinite(pol_nm).all(axis=1) & ~seen.command_lost & ~played & (steps.saturated_pixels == 0)
     return replace(steps, pol_nm=pol_nm, mode=np.where(played, np.uint8(0), steps.mode)), usable
 

@@ -45,12 +45,14 @@ class SeenCommands(NamedTuple):
             otherwise the controller's. `weights` are its `delay_weights`.
         seen_nm: (steps, modes); NaN where a frame was not used and the delay is the controller's.
         command_lost: (steps,) True where the command seen is not one of the steps': the log lacks it.
+        target_nm: (steps, modes) of the loop, which the steps' errors exclude.
     """
 
     delay_frames: float
     weights: Single
     seen_nm: Single
     command_lost: Mask
+    target_nm: Single
 
     @classmethod
     def of(
@@ -74,12 +76,12 @@ class SeenCommands(NamedTuple):
         command_lost: Mask = np.abs(computed_nm - assumed_nm).max(axis=1) > _COMMAND_LOST_NM
         command_lost[: len(weights)] = False  # these may have seen commands from before the log
         if measured_delay is None or abs(measured_delay - controller_delay) <= DELAY_DIFFERS:
-            return cls(controller_delay, weights, assumed_nm, command_lost)
+            return cls(controller_delay, weights, assumed_nm, command_lost, target_nm)
         rounded = round(measured_delay)
         delay_frames = float(rounded) if abs(measured_delay - rounded) <= DELAY_DIFFERS else measured_delay
         weights = delay_weights(delay_frames).astype(np.float32)
         seen = seen_nm(weights, steps.command_nm, missing, assumed_nm[0])
-        return cls(delay_frames, weights, seen, command_lost)
+        return cls(delay_frames, weights, seen, command_lost, target_nm)
 
 
 class LoggedRun:
@@ -123,7 +125,7 @@ class LoggedRun:
         self.seen = SeenCommands.of(
             self.steps, self.missing, history.controllers, self.controller_delay, self.measured_delay, self.played
         )
-        self.delay_frames, self.weights, self.seen_nm, self.command_lost = self.seen
+        self.delay_frames, self.weights, self.seen_nm, self.command_lost, _ = self.seen
 
     @property
     def uncorrected(self) -> Mask:
