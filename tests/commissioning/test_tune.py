@@ -389,6 +389,13 @@ def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
     assert "tuning requires at least 2048 consecutive frames, 2 s; the longest sequence of good" in error
 
 
+def test_a_log_that_lacks_its_law_is_refused(tmp_path: Path) -> None:
+    night = SyntheticLog().request("close").frames(10)
+    night.law(0.3, logged=False)
+    error = refusal("tune", night.frames(20).write(tmp_path / "night.mcap"), kind=DataFileError)
+    assert re.search(r"night.mcap: the law \w+ is missing", error)
+
+
 def test_tune_never_overwrites_a_log(log: Path) -> None:
     assert "is a log, which is never overwritten" in refusal("tune", log, "--out", log, kind=DataFileError)
 

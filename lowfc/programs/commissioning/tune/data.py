@@ -16,7 +16,7 @@ from lowfc.client import Client, MirrorWatch, configuration_of
 from lowfc.contract.codecs.law_codec import driving, integrator_of, overruled
 from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import BusError, DataFileError
+from lowfc.contract.errors import BusError, DataFileError, raised_as
 from lowfc.contract.messages import Role, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws import margins
@@ -85,6 +85,8 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
     history = read_history(log)
     run = LoggedRun(history)
     steps, usable = _without_probes(run.steps, run.seen, run.controller_delay, run.played)
+    with raised_as(DataFileError, ValueError, log.path):
+        laws = run.law, driving(history.controller, history.published.laws)
     warnings = [
         *history.remarks,
         *_delay_warnings(run.controller_delay, run.seen, run.measured_delay, run.measured_from),
@@ -96,7 +98,7 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
         str(log.path),
         history.rate_hz,
         run.timing,
-        (run.law, driving(history.controller, history.published.laws)),
+        laws,
         _last_change(history.controllers, len(run.law.gain)),
         steps,
         usable & run.under_calibration,
