@@ -146,6 +146,13 @@ def test_an_offset_does_not_belong_to_the_disturbance_at_a_measured_delay(tmp_pa
     assert np.ptp(run.pol.joined()[:, 2]) < 10
 
 
+def test_an_offset_in_the_true_residual_is_reported(tmp_path: Path) -> None:
+    night = SyntheticLog().request("close").frames(100).request("offset", (0.0, 0.0, 20.0)).frames(2700)
+    result = json_of("tune", night.write(tmp_path / "night.mcap"))
+    assert result["modes"][2]["achieved_nm"] > 19
+    assert ["an offset, up to 20 nm" in warning for warning in result["warnings"]] == [True]
+
+
 def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path) -> None:
     """During a probe sequence on the mirror, the true wavefront does not follow the loop's commands alone."""
     night = SyntheticLog().request("close").frames(100)

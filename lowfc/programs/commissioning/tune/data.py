@@ -91,6 +91,8 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
         *history.remarks,
         *_delay_warnings(run.controller_delay, run.seen, run.measured_delay, run.measured_from),
     ]
+    if run.true_nm is not None and (offset_nm := np.abs(run.seen.target_nm).max()) > 0:
+        warnings.append(f"the loop had an offset, up to {offset_nm:.3g} nm: achieved contains it, theory does not")
     if log.damage:
         warnings.append("the log is damaged; unreadable parts are left out")
     config = history.configuration
