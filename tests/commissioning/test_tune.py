@@ -22,7 +22,7 @@ from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.codecs.law_codec import driving
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
-from lowfc.contract.messages import TRUTH, wire
+from lowfc.contract.messages import CONTROLLER_STATE, TRUTH, wire
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.margins import check_stable
@@ -151,6 +151,14 @@ def test_an_offset_in_the_true_residual_is_reported(tmp_path: Path) -> None:
     result = json_of("tune", night.write(tmp_path / "night.mcap"))
     assert result["modes"][2]["achieved_nm"] > 19
     assert ["an offset, up to 20 nm" in warning for warning in result["warnings"]] == [True]
+
+
+def test_a_weighted_reconstructor_is_reported(tmp_path: Path) -> None:
+    """Gains for the modes that it does not correct would make it another one, with more noise."""
+    night = SyntheticLog().request("close").frames(2700)
+    night.change(CONTROLLER_STATE, -1, lambda state: state.prior_nm2.extend([0, 0, 4]))
+    warnings = json_of("tune", night.write(tmp_path / "night.mcap"))["warnings"]
+    assert ["modes that they do not correct (Z4)" in warning for warning in warnings] == [True]
 
 
 def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path) -> None:

@@ -90,6 +90,7 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
     warnings = [
         *history.remarks,
         *_delay_warnings(run.controller_delay, run.seen, run.measured_delay, run.measured_from),
+        *_weighting_warnings(history.controller, run.calibration),
     ]
     if run.true_nm is not None and (offset_nm := np.abs(run.seen.target_nm).max()) > 0:
         warnings.append(f"the loop had an offset, up to {offset_nm:.3g} nm: achieved contains it, theory does not")
@@ -176,7 +177,11 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
         (None, None),
         config,
         calibration_in_use(states[-1], calibration),
-        [*_delay_warnings(assumed, seen, measured, "the times of frames and mirror"), *lost],
+        [
+            *_delay_warnings(assumed, seen, measured, "the times of frames and mirror"),
+            *_weighting_warnings(states[-1], calibration),
+            *lost,
+        ],
     )
 
 
@@ -213,6 +218,17 @@ def _delay_warnings(assumed: float, seen: SeenCommands, measured: float | None, 
     return [
         f"the controller assumed a delay of {counted(assumed, 'frame')}, but measured from {source} it is "
         f"{measured:.2f}: the law is made for {counted(seen.delay_frames, 'frame')}; set control.delay_frames"
+    ]
+
+
+def _weighting_warnings(state: wire.ControllerState | None, calibration: Calibration) -> list[str]:
+    prior_nm2 = [] if state is None else state.prior_nm2
+    names = ", ".join(f"Z{index}" for index, power in zip(calibration.noll, prior_nm2, strict=False) if power > 0)
+    if not names:
+        return []
+    return [
+        f"automatic gains weighted the reconstructor for modes that they do not correct ({names}): gains for these "
+        "raise the noise of the others above the predicted"
     ]
 
 
