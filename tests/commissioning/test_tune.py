@@ -146,11 +146,16 @@ def test_an_offset_does_not_belong_to_the_disturbance_at_a_measured_delay(tmp_pa
     assert np.ptp(run.pol.joined()[:, 2]) < 10
 
 
-def test_an_offset_in_the_true_residual_is_reported(tmp_path: Path) -> None:
+def test_an_offset_or_a_channel_in_the_true_residual_is_reported(tmp_path: Path) -> None:
+    shaped = "an offset or channels were in force: achieved contains their shapes, theory does not"
     night = SyntheticLog().request("close").frames(100).request("offset", (0.0, 0.0, 20.0)).frames(2700)
     result = json_of("tune", night.write(tmp_path / "night.mcap"))
     assert result["modes"][2]["achieved_nm"] > 19
-    assert ["an offset, up to 20 nm" in warning for warning in result["warnings"]] == [True]
+    assert result["warnings"] == [shaped]
+    night = SyntheticLog().request("close").frames(2700)
+    for name, warnings in (("flat", []), ("dark-hole", [shaped])):
+        night.change(CONTROLLER_STATE, -1, lambda state, name=name: state.channels.add(name=name))
+        assert json_of("tune", night.write(tmp_path / f"{name}.mcap"))["warnings"] == warnings
 
 
 def test_a_weighted_reconstructor_is_reported(tmp_path: Path) -> None:

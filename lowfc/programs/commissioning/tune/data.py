@@ -33,6 +33,7 @@ from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.logs.what_if.run import LoggedRun, SeenCommands, during_probe
 
 _SETTLING_S = 0.5  # least time excluded after the loop was closed, if enough frames are left
@@ -92,8 +93,8 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
         *_delay_warnings(run.controller_delay, run.seen, run.measured_delay, run.measured_from),
         *_weighting_warnings(history.controller, run.calibration),
     ]
-    if run.true_nm is not None and (offset_nm := np.abs(run.seen.target_nm).max()) > 0:
-        warnings.append(f"the loop had an offset, up to {offset_nm:.3g} nm: achieved contains it, theory does not")
+    if run.true_nm is not None and any(map(holds_shape, history.controllers)):
+        warnings.append("an offset or channels were in force: achieved contains their shapes, theory does not")
     if log.damage:
         warnings.append("the log is damaged; unreadable parts are left out")
     config = history.configuration
