@@ -8,9 +8,9 @@ UNITS = 4
 
 
 class WorkRate:
-    """Rate of work from its counts, as often as they are known: over half a second, or over four units if it is slow.
+    """Rate of work over the last half second or, if the work is slow, over its last four units or a few more.
 
-    It is 0 after a silence in which four units were expected.
+    The rate is 0 after a silence in which four units were expected.
     """
 
     def __init__(self, now_ns: int) -> None:
@@ -20,7 +20,7 @@ class WorkRate:
         self._rate_hz = 0.0
 
     def update(self, now_ns: int, work: int) -> float:
-        """Rate of the work that has reached this count, Hz."""
+        """Rate, Hz, of the work that has reached this count now; call it repeatedly."""
         if work != self._last[1]:
             begun = [self._known[0]]
             begun += [it for it in (*self._known, self._last) if work - it[1] >= UNITS and now_ns - it[0] >= WINDOW_NS]

@@ -47,8 +47,9 @@ def release(settings: Settings, state: State, request: Request) -> tuple[State, 
 def counted_to_frame(settings: Settings, state: State, frame: Frame) -> State:
     """The state with the end of its lease counted to a new frame: in periods of the configured rate, by frames' times.
 
-    Only their differences count, because the camera may have another clock. Frames count if their times do not
-    increase, and after a silence, in which a tick surely has the time. When the camera starts, all periods remain.
+    Only differences of their times are used, because the camera may have another clock. If the times do not increase,
+    or after a silence, during which a tick compares the clock, the frames are counted instead. At a start of the
+    camera the lease keeps its remaining periods.
     """
     held, frames = state.conditions.lease, frame.sequence - state.frame_sequence
     if held is None or held.ended or not (settings.rate_hz and held.same_start(state.frame_sequence)):
