@@ -457,6 +457,14 @@ def test_a_true_residual_with_an_offset_is_no_measure_of_the_loop(
     assert (results["error_budget"]["true_residual"]["rms_nm"]["all modes"] is None) is shaped
 
 
+@pytest.mark.usefixtures("without_drawings")
+def test_without_truth_no_true_residual_includes_an_offset(tmp_path: Path) -> None:
+    night = SyntheticLog(truth=False).request("offset", (20.0, 0.0, 0.0)).frames(400)
+    report = report_of(read_run(night.write(tmp_path / "x.mcap")))
+    assert not report.results["residual"]["shaped"]
+    assert "shapes of offset or channels" not in page(report)
+
+
 @pytest.mark.parametrize("logged", [True, False])
 def test_theory_is_that_of_the_linear_law_in_use(tmp_path: Path, logged: bool) -> None:
     night = SyntheticLog().frames(300)

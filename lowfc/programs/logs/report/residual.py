@@ -66,7 +66,8 @@ def residual_results(run: Run, stretch: Stretch | None) -> Results:
         },
         "open_pupil": open_pupil,
         "truth": "none" if history.true is None else "continuous" if true.continuous else "sampled only",
-        "shaped": _shaped_in(run, stretch.rows if stretch is not None else slice(0, steps.sequence.size)),
+        "shaped": history.true is not None
+        and _shaped_in(run, stretch.rows if stretch is not None else slice(0, steps.sequence.size)),
         "steps_open": int(opened.size),
         "steps_closed": int(closed.size),
     }
