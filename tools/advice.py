@@ -25,8 +25,8 @@ ADVICE: dict[str, Advice] = {
         "let a time server set the clock before the first run; `lowfc doctor` shows how to correct it later.",
     ),
     "REALTIME_REFUSED": Advice(
-        "the host refuses a real-time measure (SCHED_FIFO, locked memory, huge pages, disabled CPU idle states).",
-        "run `lowfc doctor`, which names what is missing; until then latencies are longer, or have a longer tail.",
+        "the host does not grant a real-time measure (SCHED_FIFO, locked memory, disabled CPU idle states).",
+        "run `lowfc doctor`, which names the missing permission; until then latencies have a longer tail.",
     ),
     "KERNEL": Advice("`realtime.kernel` selects this implementation of the control step.", _NOTHING),
     "KERNEL_MISSING": Advice(

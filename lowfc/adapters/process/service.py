@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from types import FrameType
 from typing import Literal
 
@@ -75,7 +76,7 @@ class Service:
             clock: clock of the run.
             bus: bus of the process.
             granted: real-time measures requested before.
-            at_ready: requests further ones once the process is ready.
+            at_ready: requests further ones once the process is ready; a refusal is no event, as older kernels lack them.
             fill: adds the role's own fields to each Health.
             announces: see the attribute.
             supervisor: the host's by default.
@@ -90,7 +91,7 @@ class Service:
         self.publishers: list[Publisher] = []
         self.arrivals: list[Arrivals] = []
         self.run_id = run_id
-        self._granted = NOTHING
+        self._granted = granted
         self._at_ready = at_ready
         self._host = platform.node()
         self.fill = fill
@@ -116,7 +117,8 @@ class Service:
         self.event("STARTED", process=name, version=__version__)
         if abs(ahead_ns := clock.ahead_ns()) > WALL_TOLERANCE_NS:
             self.event("CLOCK_OFF", ahead_ms=ahead_ns / 1e6)
-        self._report(granted)
+        for measure, cost in granted.refused:
+            self.event("REALTIME_REFUSED", measure=measure, cost=cost)
 
     def publisher(self, topic: Topic, name: str = "") -> Publisher:
         """Publisher of a topic, counted in Health."""
@@ -200,7 +202,7 @@ class Service:
     @state.setter
     def state(self, state: ProcessState) -> None:
         if state == "ready" and self._state == "starting" and self._at_ready is not None:
-            self._report(self._at_ready())
+            self._granted = replace(self._granted, granted=self._granted.granted + self._at_ready().granted)
         self._state = state
         self._send_health(self.clock.host_ns())
         if state in ("ready", "running"):
@@ -255,12 +257,6 @@ class Service:
                 self._print(log.message)
             elif count == PRINTED:
                 self._print(f"{event} recurs: more within {PRINTED_NS // 10**9} s are in the log only")
-
-    def _report(self, measures: Granted) -> None:
-        """Report real-time measures in Health, and each refused one in an event."""
-        self._granted = Granted(self._granted.granted + measures.granted, self._granted.refused + measures.refused)
-        for measure, cost in measures.refused:
-            self.event("REALTIME_REFUSED", measure=measure, cost=cost)
 
     def _announce(self, what: str) -> None:
         if self.announces:
