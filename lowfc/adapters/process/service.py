@@ -76,7 +76,7 @@ class Service:
             clock: clock of the run.
             bus: bus of the process.
             granted: real-time measures requested before.
-            at_ready: requests further ones once the process is ready; a refusal is no event, as older kernels lack them.
+            at_ready: requests further ones once the process is ready; no event tells of a refusal, as on older kernels.
             fill: adds the role's own fields to each Health.
             announces: see the attribute.
             supervisor: the host's by default.
