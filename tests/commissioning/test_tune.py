@@ -158,6 +158,16 @@ def test_an_offset_or_a_channel_in_the_true_residual_is_reported(tmp_path: Path)
         assert json_of("tune", night.write(tmp_path / f"{name}.mcap"))["warnings"] == warnings
 
 
+def test_a_loop_that_was_closed_for_too_few_frames_is_not_simply_called_open(tmp_path: Path) -> None:
+    """Then no residual achieved is given: an offset is not in it."""
+    night = SyntheticLog().request("open").frames(400).request("close").frames(100)
+    night.request("offset", (0.0, 0.0, 20.0)).frames(1900)
+    result = json_of("tune", night.write(tmp_path / "night.mcap"))
+    assert not result["closed"]
+    (warning,) = result["warnings"]
+    assert "in closed loop at most 2000 good frames are consecutive, fewer than 2048" in warning
+
+
 def test_a_weighted_reconstructor_is_reported(tmp_path: Path) -> None:
     """Gains for the modes that it does not correct would make it another one, with more noise."""
     night = SyntheticLog().request("close").frames(2700)

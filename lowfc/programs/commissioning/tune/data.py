@@ -93,12 +93,10 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
         *_delay_warnings(run.controller_delay, run.seen, run.measured_delay, run.measured_from),
         *_weighting_warnings(history.controller, run.calibration),
     ]
-    if run.true_nm is not None and any(map(holds_shape, history.controllers)):
-        warnings.append("an offset or channels were in force: achieved contains their shapes, theory does not")
     if log.damage:
         warnings.append("the log is damaged; unreadable parts are left out")
     config = history.configuration
-    return _telemetry(
+    found = _telemetry(
         str(log.path),
         history.rate_hz,
         run.timing,
@@ -111,6 +109,10 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
         run.calibration if history.controller is None else calibration_in_use(history.controller, run.calibration),
         warnings,
     )
+    if found.closed and found.true_nm2 is not None and any(map(holds_shape, history.controllers)):
+        shapes = "an offset or channels were in force: achieved contains their shapes, theory does not"
+        return replace(found, warnings=(*found.warnings, shapes))
+    return found
 
 
 def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
@@ -273,6 +275,12 @@ def _telemetry(
     closed, rows = True, usable & was_closed & (frames_closed > settling)
     pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if pol.longest < FEWEST:
+        if was_closed[usable].any():
+            warnings = [
+                *warnings,
+                f"in closed loop at most {counted(pol.longest, 'good frame')} are consecutive, fewer than {FEWEST}: "
+                "those of the open loop are used, too, and the residual achieved is unknown",
+            ]
         closed, rows = False, usable
         pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if pol.longest < FEWEST:
