@@ -394,6 +394,17 @@ def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
     assert results["closed_stretch"]["frames"] + results["closed_stretch"]["steps_settling"] == 250
 
 
+def test_gains_of_the_page_are_rounded_and_one_for_each_mode(tmp_path: Path) -> None:
+    night = SyntheticLog(gain=(1 / 0.9, 1 / 57.6)).frames(50).request("gain", (0.2,)).frames(50)
+    text = page(report_of(read_run(night.write(tmp_path / "x.mcap"))))
+    assert re.findall(r'<td class="text">([\d., ]+(?: for all)?)</td>', text)[:4] == [
+        "1.111, 1.111, 0.01736",
+        "0 for all",
+        "0.2 for all",
+        "0 for all",
+    ]
+
+
 def test_a_camera_ahead_and_a_clear_for_a_lower_start_move_no_law_and_no_request(tmp_path: Path) -> None:
     night = SyntheticLog()
     step = wire.ControlStep(frame_sequence=2 * report_log.START << 32, command_nm=[0] * 3, reasons=[wire.REASON_AHEAD])

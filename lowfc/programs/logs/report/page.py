@@ -1,6 +1,6 @@
 """The report's self-contained HTML page, made from results and drawings."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from typing import Any
 
@@ -56,10 +56,16 @@ def fixed(value: float | str, decimals: int = 3) -> str:
     return f"< {least:.{decimals}f}" if 0 < value < least / 2 else f"{value:.{decimals}f}"
 
 
+def per_mode(values: Sequence[float]) -> str:
+    """The value of each mode with four significant digits, or a single one if they are equal."""
+    shown = [f"{value:.4g}" for value in values]
+    return f"{shown[0]} for all" if len(set(shown)) == 1 else ", ".join(shown)
+
+
 def _environment() -> Any:
     with package_required("the HTML page, unlike --json, requires jinja2", "plots"):
         from jinja2 import Environment, StrictUndefined
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.finalize = lambda value: printable(value, keep=LINES) if type(value) is str else value  # not Markup
-    environment.filters |= {"n": number, "fixed": fixed}
+    environment.filters |= {"n": number, "fixed": fixed, "per_mode": per_mode}
     return environment
