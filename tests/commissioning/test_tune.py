@@ -117,6 +117,9 @@ def test_the_picture_has_the_words_of_the_page_and_the_line_of_the_model(
     assert [label for label in curves if f"the {label}" not in page] == []
     line = curves["model of the pseudo-open-loop"].sum() / curves["pseudo-open-loop"].sum()
     assert line == pytest.approx(1, rel=0.2)  # of a width far below the distance of the frequencies
+    drawn[0].draw_without_rendering()
+    for axes in drawn[0].axes:
+        assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1  # it covers no line
 
 
 def test_the_result_is_printed_although_the_loop_refuses_it(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:

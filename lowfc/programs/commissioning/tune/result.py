@@ -214,8 +214,8 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
         label = f"predicted residual with the tuned law ({best.kinds[mode]})"
         axes.loglog(shown_hz, one_sided * _means(residual, omega, edges), color="tab:green", label=label)
         axes.set(ylabel=f"Z{run.noll[mode]} {mode_name(run.noll[mode])}, nm$^2$/Hz")
-        axes.legend()
-    axes.set(xlabel="Hz")
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2, frameon=False)  # covers no line
+    axes.set(xlabel="frequency, Hz")
     return png(drawing)
 
 
