@@ -365,3 +365,5 @@ def test_saturating_star_and_no_light_are_refused():
         calibrated(camera__dark_current_e_s=3e7)
     with pytest.raises(CalibrationError, match="no light reaches the sensor"):
         calibrated(camera__exposure_fraction=1e-9)
+    with pytest.raises(CalibrationError, match=r"no light reaches the sensor.*star\.diameter_m"):
+        calibrated(star__diameter_m=1e-200)

@@ -206,7 +206,10 @@ def analytic_calibration(
     good = np.ones(I0.size)
     flux_e = electrons_per_exposure(config) * float(I0.sum())
     if not flux_e > 0:
-        raise CalibrationError("no light reaches the sensor in an exposure: raise camera.exposure_fraction")
+        raise CalibrationError(
+            "no light reaches the sensor in an exposure: raise camera.exposure_fraction or quantum_efficiency, or "
+            "star.diameter_m, bandwidth or throughput"
+        )
     light = I0.reshape(-1)
     I0, H = normalise_flux(light, H, good)
     nuisance = _nuisance(config, light, good)
