@@ -25,7 +25,7 @@ def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_
 
 
 def on_pixels(calibration: Calibration, good: Array) -> Calibration:
-    """The calibration with only the pixels (pixels,) that are 1 in `good`, and with an R that leaves R H unchanged.
+    """The calibration with only the pixels (pixels,) that are 1 in `good`, and with an R that keeps R H, without unit.
 
     Pixels that were bad stay bad. I0 and H are normalised to the flux on the remaining pixels. `operator_hash` and `id`
     of the result are empty.
