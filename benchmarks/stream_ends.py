@@ -17,6 +17,7 @@ from lowfc.adapters.process.join import prepare
 from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.envelope import Envelope
+from lowfc.contract.messages import Role
 from lowfc.device import Exposure
 from lowfc.device.drivers.isio.camera import IsioCamera
 from lowfc.programs.measure.frame_source import FRAMES_FILE, SENT_FILE
@@ -79,7 +80,7 @@ def main() -> None:
     folder, name, count = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
     config, frames, path = load(folder / "config.toml"), np.load(folder / FRAMES_FILE), stream_path(name)
     stream, warm_up = Stream(path), Stream.create(path.with_stem(f"{path.stem}_"), frames.shape[1:], frames.dtype)
-    prepare(config, config.realtime.camera_cpus)
+    prepare(config, Role.CAMERA, config.realtime.camera_cpus)
     clock = HostClock()
     while not (folder / GO_FILE).exists():
         time.sleep(_POLL_S)

@@ -1,10 +1,12 @@
 """Set-up of a process of the loop: real-time measures, then clock, bus and service."""
 
+from functools import partial
+
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.bus.zenoh_session import receive_in_one_thread
 from lowfc.adapters.process.clock import Clock, HostClock, SimulatedClock
-from lowfc.adapters.process.realtime import Granted, set_up, use_huge_pages
+from lowfc.adapters.process.realtime import NOTHING, Granted, set_up, use_huge_pages
 from lowfc.adapters.process.service import Service
 from lowfc.adapters.process.supervision import Supervisor
 from lowfc.contract.configuration import Configuration
@@ -16,12 +18,14 @@ def clock_of(config: Configuration) -> Clock:
     return SimulatedClock() if config.lockstep else HostClock()
 
 
-def prepare(config: Configuration, cpus: list[int]) -> Granted:
+def prepare(config: Configuration, role: str, cpus: list[int]) -> Granted:
     """Set this process up for the loop, before its first zenoh session, whose threads inherit the scheduling.
 
     All processes have the same priority: if mirror and controller share a processor, the controller yields after its
     put, so that a command is applied before the controller publishes its step.
     """
+    if role != Role.CAMERA:  # a simulated camera computes while messages arrive
+        receive_in_one_thread()
     realtime = config.realtime
     return set_up(
         realtime.priority or None,
@@ -31,16 +35,18 @@ def prepare(config: Configuration, cpus: list[int]) -> Granted:
     )
 
 
+def prepare_ready(config: Configuration) -> Granted:
+    """Request the measures for a process that is ready."""
+    return use_huge_pages() if config.realtime.lock_memory else NOTHING
+
+
 def join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Service:
     """Set this process up for the loop and join a run."""
-    granted = prepare(config, cpus)
-    if role != Role.CAMERA:  # a simulated camera computes while messages arrive
-        receive_in_one_thread()
+    granted = prepare(config, role, cpus)
     run = open_run(run_id, (config.mirror.name,), network=config.network)
     clock = clock_of(config)
-    at_ready = use_huge_pages if config.realtime.lock_memory else None
     bus = ZenohBus(run.links, role, clock)
-    return Service(role, run_id, clock, bus, granted=granted, at_ready=at_ready, announces=True)
+    return Service(role, run_id, clock, bus, granted=granted, at_ready=partial(prepare_ready, config), announces=True)
 
 
 def join_beside(config: Configuration, service: Service, role: str) -> Service:

@@ -58,7 +58,7 @@ def bare_loop(
     cpus = settings.realtime.controller_cpus if role is Role.CONTROLLER else settings.realtime.camera_cpus
     priority = settings.realtime.priority
     above = settings.realtime.model_copy(update={"priority": min(priority + 1, _HIGHEST_PRIORITY) if priority else 0})
-    prepare(settings.model_copy(update={"realtime": above}), cpus)
+    prepare(settings.model_copy(update={"realtime": above}), role, cpus)
     folder = open_run(run, (settings.mirror.name,)).path
     pid = json.loads(_wait_and_read(folder / PROCESSES_FILE))[role]
     begin_ns = int(_wait_and_read(folder / BEGIN_FILE))

@@ -17,11 +17,11 @@ from zenoh.handlers import Callback
 
 from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.bus.zenoh_bus import declare_publisher
-from lowfc.adapters.bus.zenoh_session import keep_thread_state, receive_in_one_thread, session_config
+from lowfc.adapters.bus.zenoh_session import keep_thread_state, session_config
 from lowfc.adapters.files.whole_file import being_written
 from lowfc.adapters.process.clock import HostClock
-from lowfc.adapters.process.join import prepare
-from lowfc.adapters.process.realtime import let_send, use_huge_pages
+from lowfc.adapters.process.join import prepare, prepare_ready
+from lowfc.adapters.process.realtime import let_send
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.arrays import Long
 from lowfc.contract.configuration import Configuration
@@ -94,7 +94,7 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) ->
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(run.links, Role.CAMERA))))
     try:
         publisher = declare_publisher(session, FRAME, FRAME.key)
-        _become_ready(config)
+        prepare_ready(config)
         subscriber = session.declare_subscriber(COMMAND.at(config.mirror.name), Callback(received, indirect=False))
         deadline_s = time.monotonic() + _READY_S
         while not publisher.matching_status.matching:  # type: ignore[attr-defined]  # not a bool
@@ -134,7 +134,7 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
         else:
             ended.set()
 
-    _become_ready(config)
+    prepare_ready(config)
     subscriber = session.declare_subscriber(FRAME.key, Callback(received, indirect=False))
     ended.wait()
     subscriber.undeclare()  # type: ignore[no-untyped-call]
@@ -143,17 +143,10 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
 
 def _join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Run:
     """Set this process up like the loop's process with this role; return the run with only the two processes' links."""
-    prepare(config, cpus)
-    if role != Role.CAMERA:
-        receive_in_one_thread()
+    prepare(config, role, cpus)
     run = open_run(run_id, (config.mirror.name,))
     ports = {str(role): run.links.ports[role] for role in (Role.CAMERA, Role.CONTROLLER)}
     return dataclasses.replace(run, links=dataclasses.replace(run.links, ports=ports))
-
-
-def _become_ready(config: Configuration) -> None:
-    if config.realtime.lock_memory:
-        use_huge_pages()
 
 
 if __name__ == "__main__":
