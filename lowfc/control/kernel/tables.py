@@ -5,7 +5,7 @@ from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from lowfc.arrays import Pixels, Sequences, Single, single
+from lowfc.arrays import Pixels, Sequences, Single, aligned, single
 from lowfc.control.calibration.calibration import Calibration
 
 KernelName = Literal["numpy", "fused"]
@@ -75,9 +75,9 @@ class Tables(NamedTuple):
             kernel.measure,
             kernel.respond,
             np.where(calibration.good > 0, 0xFFFF, 0).astype(np.uint16),
-            single(calibration.dark),
-            single(padded.reshape(-1, blocks, block).swapaxes(0, 1)).reshape(-1, block),
-            np.empty(block, np.float32),
+            aligned(calibration.dark),
+            aligned(padded.reshape(-1, blocks, block).swapaxes(0, 1)).reshape(-1, block),
+            aligned(np.empty(block, np.float32)),
             np.empty((blocks, len(padded)), np.float32),
             np.empty((blocks, 2), np.uint64),
             reference_nm,

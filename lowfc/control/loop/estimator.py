@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lowfc.arrays import Pixels, Single
+from lowfc.arrays import Pixels, Single, aligned
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.kernel.tables import NUMPY, Kernel, Tables
 
@@ -48,8 +48,8 @@ class Estimator(NamedTuple):
         R, I0 = calibration.reconstructor, calibration.reference
         reference_nm = (R.astype(np.float64) @ I0).astype(np.float32)
         tables = Tables.of(kernel, calibration, reference_nm)
-        rows, scratch = np.vstack([R, calibration.good]), np.empty_like(calibration.dark)
-        return cls(rows, reference_nm, calibration.dark, scratch, kernel, tables)
+        rows, dark = aligned(np.vstack([R, calibration.good])), aligned(calibration.dark)
+        return cls(rows, reference_nm, dark, aligned(dark), kernel, tables)
 
     def estimate_fused(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
         """Estimate of a frame (pixels,) by the fused step; None if the frame needs the reference step."""
