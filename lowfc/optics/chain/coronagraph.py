@@ -35,7 +35,7 @@ class Wedge:
 
     @property
     def is_sampled(self) -> bool:
-        """Whether a mean of contrast, at two samples per lambda / D, has a sample in the wedge."""
+        """Whether the wedge holds a sample of an image with two samples per lambda / D."""
         side = 4 * int(np.ceil(self.outer))
         return bool(wedge_samples(self, side, side, 2).any())
 
@@ -62,7 +62,7 @@ class LyotStop:
         return np.asarray(self.stop * (field - self._blocked(field)))
 
     def transposed(self, field: Complex) -> Complex:
-        """The transpose of `behind`: from after the stop to before the mask."""
+        """The transpose of `behind`, from after the stop to before the mask; `_blocked` is self-adjoint."""
         stopped = self.stop * field
         return np.asarray(stopped - self._blocked(stopped.conj()).conj())
 
@@ -104,7 +104,7 @@ def contrast(
     rows: int | None = None,
     samples_per: int = 4,
 ) -> Array:
-    """Contrast (rows, columns) at the centre of the science focal plane, sampled on `image_axis` in both directions.
+    """Contrast (rows, columns) around the star, sampled on `image_axis` in both directions.
 
     Args:
         coronagraph: The optics.

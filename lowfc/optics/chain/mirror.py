@@ -92,7 +92,7 @@ def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None
     inside = (np.hypot(u[:, None], u) <= 0.5).astype(np.float64)
     y_factors = influence_factors(mirror, u, mirror.rows)
     x_factors = influence_factors(mirror, u, mirror.columns)
-    # Sums over the circle of products of two influence functions: for each row of points, along x and then along y.
+    # Sums over the circle of products of two influence functions: along x for each row of points, then along y.
     along_x = inside @ _products(x_factors)
     sums = (_products(y_factors).T @ along_x).reshape(mirror.rows, mirror.rows, mirror.columns, mirror.columns)
     actuators = mirror.rows * mirror.columns

@@ -61,14 +61,14 @@ class ScienceCamera:
         self.samples = 2 * half_width * samples_per
         self.samples_per = samples_per
         self.wavelength_nm = wavelength_nm
-        exact = kernel(self.samples, samples_per, len(pupil), 1.0)
+        of_samples = kernel(self.samples, samples_per, len(pupil), 1.0)
         square = (2 if _in_squares(pupil) else 1) if lyot is None else _LYOT_SQUARE
         cells = _averaged(pupil, square)
         used = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
-        summed = exact.reshape(self.samples, len(cells), square).sum(axis=2)
+        of_cells = of_samples.reshape(self.samples, len(cells), square).sum(axis=2)
         self._lyot = None if lyot is None else _Lyot.of(lyot, square, used)
-        self._in_y = (summed[:, used[0]] / coronagraph.peak).astype(np.complex64)
-        self._in_x = summed[:, used[1]].T.astype(np.complex64)
+        self._in_y = (of_cells[:, used[0]] / coronagraph.peak).astype(np.complex64)
+        self._in_x = of_cells[:, used[1]].T.astype(np.complex64)
         cells = cells[np.ix_(*used)]
         rows, columns = np.nonzero(cells)
         radii = 2 * pupil_axis(len(pupil) // square)
@@ -88,9 +88,9 @@ class ScienceCamera:
         if modes_nm.shape != (modes,):
             raise ValueError(f"a wavefront must have {modes} modes, got shape {modes_nm.shape}")
         phase = modes_nm.astype(np.float32) @ self._phase_per_nm
-        flat = self._field.reshape(-1)
-        flat.real[self._open] = self._amplitude * np.cos(phase)
-        flat.imag[self._open] = self._amplitude * np.sin(phase)
+        flattened = self._field.reshape(-1)
+        flattened.real[self._open] = self._amplitude * np.cos(phase)
+        flattened.imag[self._open] = self._amplitude * np.sin(phase)
         field = self._in_y @ (self._field if self._lyot is None else self._lyot.behind(self._field)) @ self._in_x
         return np.asarray(field.real**2 + field.imag**2)
 

@@ -41,7 +41,7 @@ _NAMES = (
 
 def mode_name(noll: int) -> str:
     """Optical name of a mode, such as "focus"; "Zernike 22" and so on above radial degree 5."""
-    noll_to_orders(noll)
+    noll_to_orders(noll)  # refuses an index below 1
     return _NAMES[noll - 1] if noll <= len(_NAMES) else f"Zernike {noll}"
 
 

@@ -178,7 +178,7 @@ def _field(operator: Operator, nodes: Array | Complex) -> Complex:
 
 
 class Evaluator:
-    """Computes images with a twin in float32, in its own buffers, so that each thread needs its own.
+    """Computes images with a twin in float32; each thread needs its own, as its buffers are overwritten.
 
     Rounding leaves values down to about -1e-7 of the brightest pixel in dark pixels.
     """
