@@ -88,19 +88,19 @@ def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scen
         disturbance,
         camera.rate_hz,
         config.seed,
-        camera.noise,
-        camera.exposure_fraction,
-        camera.instants,
-        pixel_errors(
+        noise=camera.noise,
+        exposure=camera.exposure_fraction,
+        instants=camera.instants,
+        pixels=pixel_errors(
             detector,
-            optics.to_pixels.shape[:1] * 2,
-            config.seed,
-            camera.nonuniformity,
-            camera.nonlinearity,
-            camera.hot_pixels,
-            camera.hot_pixel_e_s * config.exposure_ns * 1e-9,
+            shape=optics.to_pixels.shape[:1] * 2,
+            seed=config.seed,
+            nonuniformity=camera.nonuniformity,
+            nonlinearity=camera.nonlinearity,
+            hot_pixels=camera.hot_pixels,
+            hot_pixel_e=camera.hot_pixel_e_s * config.exposure_ns * 1e-9,
         ),
-        factory.shear_slopes(config) if disturbance.shear is not None else None,
+        shear_slopes=factory.shear_slopes(config) if disturbance.shear is not None else None,
     )
 
 

@@ -41,7 +41,7 @@ class WavefrontAccumulator:
         self._nm_per_mas = nm_per_mas
         self._blocks: list[list[float]] = []
         self._sums = [0.0] * self._value_count
-        self._count = self._frames = 0
+        self._in_block = self._frames = 0
         self._block_frames = BLOCK
         self._recent = np.zeros((recent, self._value_count))
 
@@ -60,10 +60,10 @@ class WavefrontAccumulator:
         self._sums = [total + value for total, value in zip(self._sums, values, strict=True)]
         self._recent[self._frames % len(self._recent)] = values
         self._frames += 1
-        self._count += 1
-        if self._count == self._block_frames:
+        self._in_block += 1
+        if self._in_block == self._block_frames:
             self._blocks.append(self._sums)
-            self._sums, self._count = [0.0] * self._value_count, 0
+            self._sums, self._in_block = [0.0] * self._value_count, 0
         if len(self._blocks) == MAX_BLOCKS:
             pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
             self._blocks = [[first + second for first, second in zip(*pair, strict=True)] for pair in pairs]
@@ -77,8 +77,8 @@ class WavefrontAccumulator:
         if self._blocks:
             half = self._blocks[len(self._blocks) // 2 :]
             mean = np.sum(half, axis=0) / (self._block_frames * len(half))
-        elif self._count:
-            mean = np.array(self._sums) / self._count
+        elif self._in_block:
+            mean = np.array(self._sums) / self._in_block
         else:
             return {}
         return self._statistics(mean)
