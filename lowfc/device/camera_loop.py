@@ -74,7 +74,7 @@ class CameraLoop:
                 if frame is not None:
                     self._publish(*frame)
                     self.watch.call(step)
-                elif not service.clock.lockstep:  # there, a sleep would advance the simulated time
+                elif not service.clock.lockstep:  # in lockstep a sleep would advance the simulated time
                     left_ns = self.watch.retry_ns - service.clock.host_ns()
                     service.clock.sleep_until_ns(service.clock.now_ns() + min(left_ns, REST_NS))
                 self._report_lost()

@@ -239,7 +239,7 @@ class MirrorLoop:
         if self._driven_nm is None:
             if (held_nm := self._read_shape()) is not None:
                 self._status = self._status._replace(driven_nm=held_nm)
-            else:  # the failed call may have moved the mirror: only the last shape is certainly within the slew limit
+            else:  # the failed call may have moved the mirror: only its last shape is surely within the slew limit
                 protection = replace(protection, flatten=False)
         self._status = tick(protection, self._status, self._service.clock.now_ns(), self._drive)
         self._known = True
@@ -273,7 +273,7 @@ class MirrorLoop:
             self._picture_due_ns = now_ns + int(1e9 / float(SURFACE.rate))
 
     def _fill(self, health: wire.Health) -> None:
-        """Add the mirror's part of an operator's `status` to each Health."""
+        """Add to a Health what an operator's `status` shows of the mirror."""
         status = self._status
         health.command_refused = self._refused.value if self._refused is not None else 0  # type: ignore[assignment]
         health.command_expired = bool(status.received_ns) and not status.following

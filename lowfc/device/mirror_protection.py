@@ -148,7 +148,7 @@ def apply_command(
 
 
 def _limited(protection: MirrorProtection, previous_nm: Single, target_nm: Single, others_nm: Single | None) -> Limited:
-    """Limit the command so that its sum with other programs' shape is within the stroke, or exceeds it no further."""
+    """Limit the command so that its sum with other programs' shape exceeds the stroke no more than theirs alone."""
     if others_nm is None or not others_nm.any() or not finite(target_nm):
         return limit(protection.tighter, previous_nm, target_nm)
     stroke_nm = np.float32(protection.tighter.kept_stroke_nm)

@@ -81,7 +81,7 @@ class DriverWatch:
         self.timeout_s = timeout_s
         self._service = service
         self._hanging = hanging
-        self._calls = self._checked_call = self._checks = self._consecutive = self._series = 0
+        self._calls = self._checked_call = self._checks = self._consecutive = self._since_recovery = 0
         self._in_call = False
         self._kind, self._reported_ns, self._fields = "", 0, wire.Health()
         self._closed = threading.Event()
@@ -125,9 +125,9 @@ class DriverWatch:
     def worked(self) -> None:
         """Note that a call has returned a valid result."""
         self._consecutive = 0
-        if self._series and self._service.clock.host_ns() - self.failed_ns >= RECOVERED_NS:
-            self._service.event("DRIVER_BACK", count=self._series)
-            self._series, self._kind = 0, ""
+        if self._since_recovery and self._service.clock.host_ns() - self.failed_ns >= RECOVERED_NS:
+            self._service.event("DRIVER_BACK", count=self._since_recovery)
+            self._since_recovery, self._kind = 0, ""
 
     def call(self, method: Callable[..., None], *arguments: object) -> None:
         """Call an optional method; count and report a fault, raise a `LowfcError` again. No other call is delayed."""
@@ -175,7 +175,7 @@ class DriverWatch:
 
     def _count(self) -> None:
         self.failures += 1
-        self._series += 1
+        self._since_recovery += 1
         self.failed_ns = self._service.clock.host_ns()
 
     def _run_checks(self) -> None:
