@@ -10,6 +10,7 @@ from math import ceil, exp, hypot, inf, log
 import numpy as np
 
 from lowfc.arrays import SingleComplex
+from lowfc.control.loop.wording import counted
 from lowfc.design.goal import Goal, merit
 from lowfc.design.sam_merit import RELAY_SAMPLES, Optics, SamCandidate, hole_fields
 
@@ -92,7 +93,7 @@ def start(bounds: Bounds, seed: int, index: int, steps: int) -> Chain:
         if orbits is not None:
             return Chain(seed, index, steps, 0, orbits, orbits)
     raise ValueError(
-        f"{bounds.count[0]} holes of at least {bounds.diameter[0] / UNIT} pupil diameters with gaps of "
+        f"{counted(bounds.count[0], 'hole')} of at least {bounds.diameter[0] / UNIT} pupil diameters with gaps of "
         f"{bounds.gap / UNIT} could not be placed in {_PACKINGS} attempts; ask for fewer, smaller or closer holes"
     )
 
