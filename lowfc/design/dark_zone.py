@@ -25,12 +25,12 @@ def first_points(zone: Wedge, step: float) -> Array:
 
 def edge_points(zone: Wedge, step: float) -> Array:
     """Points (n, 2), x and y, along the zone's edges: the inner arc, the ray, and the outer arc back."""
-    reach = float(np.deg2rad(zone.half_opening_deg))
-    upward = np.linspace(0.0, reach, int(np.ceil(zone.inner * reach / step)) + 1)
+    opening = float(np.deg2rad(zone.half_opening_deg))
+    upward = np.linspace(0.0, opening, int(np.ceil(zone.inner * opening / step)) + 1)
     ray = np.linspace(zone.inner, zone.outer, int(np.ceil((zone.outer - zone.inner) / step)) + 1)
-    downward = np.linspace(reach, 0.0, int(np.ceil(zone.outer * reach / step)) + 1)
+    downward = np.linspace(opening, 0.0, int(np.ceil(zone.outer * opening / step)) + 1)
     radii = np.concatenate([np.full(upward.size, zone.inner), ray, np.full(downward.size, zone.outer)])
-    angles = np.concatenate([upward, np.full(ray.size, reach), downward])
+    angles = np.concatenate([upward, np.full(ray.size, opening), downward])
     return np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
 
 

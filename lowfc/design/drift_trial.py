@@ -12,7 +12,7 @@ from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, reference, respo
 
 _INSTANTS = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)])  # Gauss-Legendre, in exposure times
 _SAMPLE_TIMES = (np.arange(8) + 0.5) / 8  # times at which the residual is sampled, in periods
-_SETTLING_TIME_CONSTANTS = 8.0  # time constants of the slowest mode that do not count
+_SETTLING_TIME_CONSTANTS = 8.0  # settling, in time constants of the slowest mode
 
 
 @dataclass(frozen=True, eq=False)

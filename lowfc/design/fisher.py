@@ -1,4 +1,4 @@
-"""Noise of an estimate: covariance of a linear estimate, and bounds for any unbiased one.
+"""Noise of a linear estimate: its covariance, and lower bounds of it.
 
 The Cramer-Rao bound holds for a given sensor, the quantum limit for any measurement of the light.
 """

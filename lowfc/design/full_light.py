@@ -16,7 +16,7 @@ from lowfc.control.calibration.calibration import reconstructor
 from lowfc.design.merit import WAVELENGTH_NM, PupilForms, Signal
 from lowfc.design.paper import MODES, TABLE3_INPUT_WAVES
 from lowfc.design.trials import LITERAL_WAVES, bounds_waves, input_rms, random_wavefronts, residual_rms
-from lowfc.optics.chain.band import Band, uniform
+from lowfc.optics.chain.band import Band, monochromatic, uniform
 from lowfc.optics.chain.fourier import to_image
 from lowfc.optics.chain.sensor import Sensor, from_focus, pixel_sums, pupil_radii
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
@@ -98,7 +98,7 @@ class FullLight:
 
     @cached_property
     def _central(self) -> Signal:
-        return self._signal(Band((WAVELENGTH_NM,), (1.0,)))
+        return self._signal(monochromatic(WAVELENGTH_NM))
 
     @cached_property
     def _in_band(self) -> Signal:

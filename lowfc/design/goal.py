@@ -29,10 +29,9 @@ class Goal:
     """The figure of merit to minimise.
 
     Attributes:
-        merit: One of `MERITS`. "paper": the largest ratio of a predicted value to the paper's over the rows of Tables
-            3 and 4, those of Table 3 to the power 2 weight, that of Table 4 to the power 2 (1 - weight). "pareto":
-            table3^(1 - weight) table4^weight. "contrast": contrast added to the dark zone by the noise of 14 modes in
-            one exposure of Table 4's star.
+        merit: One of `MERITS`. "paper": the largest of `paper_ratios`, those of Table 3 to the power 2 x weight, that
+            of Table 4 to the power 2 x (1 - weight). "pareto": table3^(1 - weight) table4^weight.
+            "contrast": contrast added to the dark zone by the noise of 14 modes in one exposure of Table 4's star.
         estimator: "pinv", or "weighted" for the Cramer-Rao bound.
         modes: Number of modes in "table3", "pareto" and "condition".
         weight: As in "pareto" and "paper" above, 0 to 1. None: 1/2 in "paper"; in a "pareto" search each chain

@@ -190,13 +190,12 @@ class SamCandidate:
     def in_band(self) -> Signal:
         """I0 and H in the band with the first focal-plane mask."""
         optics, fields = self.optics, self.fields
-        count, next_start = 1 + optics.band_modes, (1 + len(NOLLS_20)) * len(optics.focal_masks)
+        count = 1 + optics.band_modes
+        other_starts = iter(range((1 + len(NOLLS_20)) * len(optics.focal_masks), len(fields), count))
         I0: Array = np.zeros(fields[0].size)
         H: Array = np.zeros((fields[0].size, optics.band_modes))
         for wavelength_nm, weight in zip(optics.band.wavelengths_nm, optics.band.weights, strict=True):
-            start = 0
-            if wavelength_nm != WAVELENGTH_NM:
-                start, next_start = next_start, next_start + count
+            start = 0 if wavelength_nm == WAVELENGTH_NM else next(other_starts)
             image, response = _image_and_response(fields[start : start + count], wavelength_nm)
             I0, H = I0 + weight * image, H + weight * response
         return Signal(I0, H, _pixels_per_sample(optics), float(I0.max()))
@@ -219,7 +218,7 @@ def _covered(samples: int, centre: float, diameter: float) -> slice:
 
 
 def _image_and_response(fields: SingleComplex, wavelength_nm: float) -> tuple[Array, Array]:
-    """Image (samples,) per pixel, and its derivative (samples, modes) per nm; 2 Im{E0 conj(Ek)}."""
+    """Image (samples,) per pixel, and its derivative (samples, modes) per nm, (4 pi / lambda) Im{E0 conj(Ek)}."""
     flat, modes = fields[0], fields[1:]
     I0 = (flat.real**2 + flat.imag**2).ravel().astype(np.float64)
     slopes = (flat.imag * modes.real - flat.real * modes.imag).reshape(len(modes), -1).astype(np.float64)

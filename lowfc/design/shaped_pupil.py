@@ -45,11 +45,12 @@ class Request:
         inner: Inner radius of the dark zone, in lambda/D.
         outer: Outer radius of the dark zone, in lambda/D.
         half_angle_deg: Half-angle of the dark zone from the x axis, on both sides, in degrees; 90: all around.
-        contrast: Largest intensity in the dark zone, over the star's peak; checked every 0.1 lambda/D and on its edges.
-        limit: Contrast in the linear programs, over the required one: a value below 1 saves rounds.
+        contrast: Largest intensity in the dark zone, relative to the star's peak; checked every 0.1 lambda/D and on its
+            edges.
+        limit: Contrast in the linear programs, as a fraction of the required one; below 1 it saves rounds.
         cells: Cells in half the diameter: 8, 16, 32, 64, 128 or 256.
         step: Spacing of the first grid of points, in lambda/D.
-        symmetry: quarter: about both axes; octant: also about the diagonals, for the zone too; four times faster.
+        symmetry: quarter: about both axes; octant: mask and zone also about the diagonals, four times faster.
         rounds: Largest number of programs for each number of cells.
     """
 
@@ -167,7 +168,7 @@ def exchange(request: Request) -> Iterator[Round]:
             maxima, maxima_signs = _maxima(quarter, request, level * (1 + 1e-6))
             points, signs = np.concatenate([points, maxima]), np.concatenate([signs, maxima_signs])
             multipliers = np.concatenate([multipliers, np.zeros(len(maxima))])
-        if is_open:  # with more cells, the limit on the other sign of the field is hardly ever active at a point
+        if is_open:  # drop each point's limit on the other sign of the field: with more cells it hardly ever acts
             relevant = (signs * _field_at(quarter, points) > 0) | (multipliers > 0)
             points, signs, multipliers = points[relevant], signs[relevant], multipliers[relevant]
 

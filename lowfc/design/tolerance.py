@@ -76,6 +76,7 @@ def tolerated_drift(residual_nm2: float, noise_nm2: float, exposure: float, kind
         exposure: Exposure time, in periods.
         kind: The gain of an integrator is limited to the highest within its margins.
     """
+    # At the best gain the step D solves square D^2 + linear D + residual_nm2^2 = 0.
     square = (exposure - 1.0) ** 2 / 4.0 - exposure / 3.0 + 0.5
     linear = (exposure - 2.0) * residual_nm2 - noise_nm2
     step = 2.0 * residual_nm2**2 / (-linear + np.sqrt(linear**2 - 4.0 * square * residual_nm2**2))

@@ -51,7 +51,7 @@ def sam(
     out: Annotated[Path | None, typer.Option(help="Layout file (.json). Default: the layout's name.")] = None,
     resume: Annotated[Path | None, typer.Option(help="State file of an interrupted search to continue.")] = None,
     front: Annotated[Path | None, typer.Option(help="Write a table of each chain's best layout (CSV).")] = None,
-    plot: Annotated[Path | None, typer.Option(help="Plot each chain's best layout (PNG).")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Plot Tables 3 and 4 of each chain's best layout (PNG).")] = None,
     as_json: Json = False,
 ) -> None:
     """Search for a sparse aperture mask: position, size and number of holes. Ctrl-C writes the best layout found.

@@ -50,21 +50,22 @@ class Sweep(Result):
 def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
     """Evaluate sizes of a sensor, optimise between them, and write the keys of the best as a configuration."""
     if plot is not None:
-        figure_class()
+        figure_class()  # report a missing package before the work, not after
     require_folder(out, plot)
     for end in (sizes.low, sizes.high):
         _section(sizes, end)  # validated here
     key = KEYS[sizes.kind]
 
-    @cache
-    def candidate(value: float) -> FullLight:
-        return FullLight(sensor_from(_section(sizes, value), WAVELENGTH_NM), focal_light)
-
-    def merit_of(value: float) -> float:
-        return merit(candidate(value), goal)
-
     with threadpool_limits(1):
         focal_light = FocalLight.of(sensor_from(_section(sizes, sizes.low), WAVELENGTH_NM))
+
+        @cache
+        def candidate(value: float) -> FullLight:
+            return FullLight(sensor_from(_section(sizes, value), WAVELENGTH_NM), focal_light)
+
+        def merit_of(value: float) -> float:
+            return merit(candidate(value), goal)
+
         values, best = sweep(merit_of, sizes.low, sizes.high, _POINTS)
         predicted = {value: predictions(candidate(value)) for value in sorted({*values.tolist(), best})}
         points = [_point(predicted[value], value, merit_of(value), goal) for value in predicted]

@@ -28,8 +28,8 @@ class _Request(ABC):
         merit: Figure of merit to optimise: paper, table3, table4, condition, throughput, pareto or contrast.
         estimator: pinv, or weighted for the Cramer-Rao bound.
         modes: Modes in Table 3 and the condition number: 14 or 20.
-        weight: Weight of Table 4 in pareto, 0 to 1; in paper, ratios to the paper's Table 3 have the power 2 weight, to
-            Table 4 the power 2 (1 - weight). Default: 0.5.
+        weight: 0 to 1. In pareto, the weight of Table 4. In paper, that of Table 3: its ratios to the paper have the
+            power 2 x weight, that of Table 4 has 2 x (1 - weight). Default: 0.5.
     """
 
     merit: str = "contrast"

@@ -31,6 +31,9 @@ from lowfc.programs.design.sam_request import Search
 
 STATE_PERIOD_S = 10.0
 """Shortest time between two writes of the state file."""
+_PUPIL_SAMPLES = 256
+"""One sample per cell of the package's shaped pupil; predictions agree with 512 samples to 4e-4, contrast to 2 %."""
+_NOTHING = f"no chain had finished its first {BLOCK} steps: nothing was found, nothing is written"
 
 
 def begin(search: Search) -> list[Chain]:
@@ -75,15 +78,16 @@ def design_sam(
 
         try:
             run_chains(search, chains, executor, on_block)
-        except (KeyboardInterrupt, Exception) as error:
-            interrupted = isinstance(error, KeyboardInterrupt)
+        except KeyboardInterrupt:
+            interrupted = True
+            if _store_or_remove(state, search, pupil, chains, out) == _NOTHING:
+                console.print(_NOTHING, highlight=False)
+                raise
+        except Exception as error:
             advice = _store_or_remove(state, search, pupil, chains, out)
             if is_lost(error):
                 raise LowfcError(f"the workers were lost ({error!r}); {advice}") from error
-            if interrupted and advice == _NOTHING:
-                console.print(_NOTHING, highlight=False)
-            if not interrupted or advice == _NOTHING:
-                raise
+            raise
     points = [found_layout(search, chain) for chain in chains if chain.step]
     best = front(points) if search.sweeps else [min(points, key=lambda point: point.merit)]
     command = command_line("lowfc design sam", search)
@@ -105,9 +109,6 @@ def design_sam(
         "merits": [chain.best_merit for chain in chains if chain.step],
         "layouts": [summary(point) for point in best],
     }
-
-
-_NOTHING = f"no chain had finished its first {BLOCK} steps: nothing was found, nothing is written"
 
 
 def _store_or_remove(state: Path, search: Search, pupil: str, chains: list[Chain], out: Path) -> str:
@@ -216,10 +217,6 @@ def _one_thread() -> None:
 def pupil_digest() -> str:
     """Digest of the shaped pupil, on which every result depends."""
     return hashlib.sha256(load_pupil(_PUPIL_SAMPLES).tobytes()).hexdigest()
-
-
-_PUPIL_SAMPLES = 256
-"""One sample per cell of the package's shaped pupil; predictions agree with 512 samples to 4e-4, contrast to 2 %."""
 
 
 @lru_cache(maxsize=4)

@@ -83,7 +83,7 @@ def write_layouts(path: Path, points: Sequence[FoundLayout], search: Search, com
     entries = {point.layout.name: _entry(point, search, command) for point in points}
     content = json.dumps({"units": UNITS, "layouts": entries}, indent=1) + "\n"
     for name, entry in json.loads(content)["layouts"].items():
-        parse_layout(path, name, entry)
+        parse_layout(path, name, entry)  # refused here, not by the loop that reads the file
     write_whole(path, content.encode())
 
 
@@ -100,7 +100,7 @@ def write_front(path: Path, points: Sequence[FoundLayout]) -> None:
 
 
 def write_plot(path: Path, points: Sequence[FoundLayout], search: Search) -> None:
-    """Plot the points and the paper's result (PNG)."""
+    """Plot Table 4 against Table 3 for the points and the paper (PNG)."""
     figure = figure_class()(figsize=(6.4, 4.8), layout="constrained")
     axes = figure.subplots()
     on_front = sorted(front(points), key=lambda point: point.table3_waves)

@@ -74,7 +74,7 @@ def design_spc(request: Request, out: Path, plot: Path | None, console: Console)
         console: Console for progress.
     """
     if plot is not None:
-        figure_class()
+        figure_class()  # report a missing package before the work, not after
     if out.suffix != ".npz":
         raise ConfigurationError(f"--out must end in .npz, the only type read as a pupil file; got {out}")
     if not request.zone.is_sampled:
