@@ -340,8 +340,7 @@ def screen(seed: int, samples: int, spacing: float) -> Array:
     side, finest = 4.0, 12.0  # pupil diameters, cycles per diameter
     count = int(2 * finest * side)
     frequency = np.arange(-count // 2, count // 2 + 1) / side
-    fx, fy = np.meshgrid(frequency, frequency)
-    radius = np.hypot(fx, fy)
+    radius = np.hypot(frequency, frequency[:, None])
     amplitude = np.where((radius > 0) & (radius <= finest), np.maximum(radius, 1 / side) ** (-11 / 6), 0.0)
     spectrum = amplitude * (rng.standard_normal(radius.shape) + 1j * rng.standard_normal(radius.shape))
     position = (np.arange(samples) - (samples - 1) / 2) * spacing

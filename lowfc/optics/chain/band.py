@@ -42,7 +42,8 @@ def gauss_legendre(centre_nm: float, fraction: float = 0.2, count: int = 3) -> B
     3e-4 with four.
     """
     points, weights = np.polynomial.legendre.leggauss(count)
-    return _band(centre_nm * (1.0 + 0.5 * fraction * points), weights / weights.sum())
+    wavelengths_nm = centre_nm * (1.0 + 0.5 * fraction * points)
+    return Band(tuple(wavelengths_nm.tolist()), tuple((weights / weights.sum()).tolist()))
 
 
 def uniform(centre_nm: float, fraction: float = 0.2, count: int = 5) -> Band:
@@ -50,9 +51,5 @@ def uniform(centre_nm: float, fraction: float = 0.2, count: int = 5) -> Band:
 
     Five of these wavelengths have more than ten times the error of three from `gauss_legendre`.
     """
-    wavelengths = centre_nm * (1.0 + 0.5 * fraction * np.linspace(-1.0, 1.0, count))
-    return _band(wavelengths, np.full(count, 1.0 / count))
-
-
-def _band(wavelengths_nm: np.ndarray, weights: np.ndarray) -> Band:
-    return Band(tuple(map(float, wavelengths_nm)), tuple(map(float, weights)))
+    wavelengths_nm = centre_nm * (1.0 + 0.5 * fraction * np.linspace(-1.0, 1.0, count))
+    return Band(tuple(wavelengths_nm.tolist()), (1.0 / count,) * count)
