@@ -1,6 +1,6 @@
 """Estimators of modes from an image: plain and noise-weighted pseudo-inverse (Sect. 2.3), iterated full model."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,33 +20,22 @@ class Fit:
     """A linear estimator for one exposure of one sensor; the total flux is assumed to be known.
 
     Attributes:
-        nolls: Noll index of each mode.
         reference_e: (pixels,) I0 in electrons.
         response_e: (pixels, modes) H in electrons per nm.
         R: (modes, pixels) nm per electron.
         scale_e: Electrons of the open circle's light in the exposure.
     """
 
-    nolls: tuple[int, ...]
     reference_e: Array
     response_e: Array
     R: Array
     scale_e: float
 
 
-def fit(
-    nolls: Sequence[int],
-    I0: Array,
-    H: Array,
-    scale_e: float,
-    read_noise_e: float,
-    kind: str,
-    nuisance: Array | None = None,
-) -> Fit:
+def fit(I0: Array, H: Array, scale_e: float, read_noise_e: float, kind: str, nuisance: Array | None = None) -> Fit:
     """The least-squares solution of eq. (11) for one exposure.
 
     Args:
-        nolls: Noll index of each mode.
         I0: (pixels,) image of a flat wavefront, fractions of the open circle's light.
         H: (pixels, modes) derivative of the image per nm of each mode.
         scale_e: Electrons of the open circle's light in the exposure: the factor from fractions to electrons.
@@ -59,7 +48,7 @@ def fit(
         ValueError: Unknown kind, or modes that this sensor cannot distinguish.
     """
     R = reconstructor(I0, H, np.ones_like(I0), scale_e, read_noise_e, kind, nuisance)
-    return Fit(tuple(nolls), I0 * scale_e, H * scale_e, R / scale_e, scale_e)
+    return Fit(I0 * scale_e, H * scale_e, R / scale_e, scale_e)
 
 
 def estimate(fit: Fit, image_e: Array) -> Array:

@@ -46,12 +46,10 @@ class Drift:
     Attributes:
         step_nm2: D, variance of the drift per frame.
         gain: gain of the integrator.
-        residual_nm2: v, variance of the residual in continuous time.
     """
 
     step_nm2: float
     gain: float
-    residual_nm2: float
 
 
 def drift_residual_nm2(step_nm2: float, noise_nm2: float, exposure: float, gain: float) -> float:
@@ -84,7 +82,7 @@ def tolerated_drift(residual_nm2: float, noise_nm2: float, exposure: float, kind
     if kind == "integrator" and gain > most:
         from_noise_nm2 = drift_residual_nm2(0.0, noise_nm2, exposure, most)
         step, gain = (residual_nm2 - from_noise_nm2) / drift_residual_nm2(1.0, 0.0, exposure, most), most
-    return Drift(float(step), gain, residual_nm2)
+    return Drift(float(step), gain)
 
 
 def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> Callable[[Array], Array]:

@@ -147,7 +147,7 @@ class Prepared:
         else:
             I0, H = self.I0, self.H
         with self._fitting(modes):
-            return fit(NOLLS_20[:modes], I0, H[:, :modes], scale_e, read_noise_e, kind, nuisance)
+            return fit(I0, H[:, :modes], scale_e, read_noise_e, kind, nuisance)
 
     def loop_fit(self, I0: Array, H: Array, light_e: float, read_noise_e: float) -> tuple[Array, Array]:
         """Normalised I0 (pixels,) and weighted R (modes, pixels) of a loop; `light_e` is the open circle's light."""
