@@ -91,11 +91,13 @@ def faults(config: Configuration, folder: Path) -> list[str]:
                 f"drivers.{name}: no installed driver or module has that name{similar}, and there is no file {name}.py "
                 "here; the options of folder/file.py:Class are in drivers.file"
             )
+        parts = " or ".join(f"[drivers.{name}.{kind}]" for kind in kinds)
+        hint = f"; options of the camera or the mirror alone belong in {parts}" if len(kinds) > 1 else ""
         for kind in kinds:
             try:
                 options(load(kind, name), table(config, kind, name))
             except ConfigurationError as fault:
-                sentences.append(f"drivers.{name}: {fault}")
+                sentences.append(f"drivers.{name}: {fault}{hint}")
     return sentences
 
 

@@ -175,6 +175,8 @@ def test_driver_sections_of_a_configuration_are_checked(tmp_path: Path) -> None:
     unknown_option, unknown_driver, _ = plugins.faults(load(None, bad), tmp_path)
     assert "'falt'" in unknown_option
     assert "did you mean 'sim'" in unknown_driver
+    (of_the_camera_only,) = plugins.faults(load(None, {"drivers.sim.rows": 40}), tmp_path)
+    assert "belong in [drivers.sim.camera] or [drivers.sim.mirror]" in of_the_camera_only
 
 
 class RequiredOption(Ramp):
