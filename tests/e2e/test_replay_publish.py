@@ -33,7 +33,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.programs.logs.publish.player import Player, publish, render
-from lowfc.programs.logs.publish.selection import Selection
+from lowfc.programs.logs.publish.selection import PublishedKeys
 from tests.support.loops import FIXED, LOWFC, loop, until
 
 pytestmark = pytest.mark.exclusive
@@ -181,10 +181,10 @@ def test_ctrl_c_prints_the_summary_and_the_mirrors_role_is_taken_until_then(log:
 
 def test_publishing_takes_over_the_roles_of_its_topics_and_with_frames_the_mirrors(run: Run) -> None:
     frames, steps = [FRAME.key], [STEP.key]
-    assert Selection(run.links, frames, ()).roles == ("camera", "mirror-dm")
-    assert Selection(run.links, frames, (), allow_commands=True).roles == ("camera",)
-    assert Selection(run.links, steps, ()).roles == ("controller",)
-    assert set(Selection(run.links, (), ()).roles) == {"camera", "controller", "mirror-dm"}
+    assert PublishedKeys(run.links, frames, ()).roles == ("camera", "mirror-dm")
+    assert PublishedKeys(run.links, frames, (), allow_commands=True).roles == ("camera",)
+    assert PublishedKeys(run.links, steps, ()).roles == ("controller",)
+    assert set(PublishedKeys(run.links, (), ()).roles) == {"camera", "controller", "mirror-dm"}
 
 
 def test_a_log_without_the_selected_topics_is_an_error(log: Path, run: Run) -> None:
@@ -194,9 +194,9 @@ def test_a_log_without_the_selected_topics_is_an_error(log: Path, run: Run) -> N
 
 def test_a_log_with_only_topics_of_a_live_controller_is_an_error_that_says_so(log: Path, run: Run) -> None:
     service = SimpleNamespace(running=True, clock=HostClock(), beat=lambda: None)
-    selection = Selection(run.links, ["lowfc/control/ste*"], {"controller"})
+    selection = PublishedKeys(run.links, ["lowfc/control/ste*"], {"controller"})
     with pytest.raises(DataFileError, match=rf"selected topics; left out: {STEP.key} \(controller is live\)"):
-        Player(service, {}, selection, 1.0).play([log], Console(quiet=True))
+        Player(service, {}, selection, 1.0, Console(quiet=True)).play([log])
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from lowfc.adapters.bus.run import Run
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.messages import STEP
 from lowfc.programs.logs.publish.player import Player, render
-from lowfc.programs.logs.publish.selection import Selection
+from lowfc.programs.logs.publish.selection import PublishedKeys
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.report_log import SyntheticLog
 from tests.support.toy import START
@@ -29,10 +29,9 @@ def published(run: Run, path: Path, last_ns: int) -> tuple[dict[str, Any], str]:
     text, clock = io.StringIO(), HostClock()
     service = SimpleNamespace(running=True, clock=clock)
     service.beat = lambda: setattr(service, "running", "Ctrl-C" not in text.getvalue())
-    player = Player(
-        service, {"controller": MemoryBus(MemoryHub(), "controller", clock)}, Selection(run.links, [STEP.key], ()), 1.0
-    )
-    return player.play([night.write(path)], Console(file=text, width=200)), text.getvalue()
+    buses, console = {"controller": MemoryBus(MemoryHub(), "controller", clock)}, Console(file=text, width=200)
+    player = Player(service, buses, PublishedKeys(run.links, [STEP.key], ()), 1.0, console)
+    return player.play([night.write(path)]), text.getvalue()
 
 
 @pytest.mark.parametrize("last_ns", [1 << 63, (1 << 64) - 1])

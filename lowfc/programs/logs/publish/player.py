@@ -6,8 +6,7 @@ times are new, so that no message counts as late. Deadlines are absolute: timing
 
 import contextlib
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
-from functools import partial
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
 from lowfc.contract.messages import COMMAND, HEALTH, MIRROR_STATE, Role, topic_of
 from lowfc.control.durations import Durations
 from lowfc.control.loop.wording import counted
-from lowfc.programs.logs.publish.selection import Selection, role_of
+from lowfc.programs.logs.publish.selection import PublishedKeys, role_of
 
 BEHIND_NS = 1_000_000
 """Delay after which a message is counted as behind."""
@@ -76,27 +75,29 @@ def publish(
                 f"run {run_id!r} has no role {role!r} to wait for{nearest(role, run.links.ports)}; "
                 f"it has {', '.join(sorted(run.links.ports))}"
             )
-    selection = Selection(run.links, topics, run.links.live() | set(wait_for), allow_commands=allow_commands)
+    keys = PublishedKeys(run.links, topics, run.links.live() | set(wait_for), allow_commands=allow_commands)
     granted = set_up(None, None, lock_memory=False, disable_cpu_idle=False)
-    with _join(run, selection, granted) as (service, buses):
+    with _join(run, keys, granted) as (service, buses):
         console.print(f"publishing in run {run_id!r} as {', '.join(buses)}", highlight=False)
-        player = Player(service, buses, selection, speed)
-        if _wait_for_receivers(service, selection.live, wait_for, console):
+        player = Player(service, buses, keys, speed, console)
+        if _wait_for_receivers(service, keys.live, wait_for, console):
             service.state = "running"
-        results = player.play(logs, console)
-        return {"run": run_id, "logs": [str(path) for path in logs], "speed": speed, **results}
+        return {"run": run_id, "logs": [str(path) for path in logs], "speed": speed, **player.play(logs)}
 
 
 class Player:
     """Publishes the messages of logs, each at its time."""
 
-    def __init__(self, service: Service, buses: dict[str, ZenohBus], selection: Selection, speed: float) -> None:
-        """Publish `selection` as the roles of `buses` until `service` stops."""
+    def __init__(
+        self, service: Service, buses: dict[str, ZenohBus], keys: PublishedKeys, speed: float, console: Console
+    ) -> None:
+        """Publish `keys` as the roles of `buses` until `service` stops; `console` shows the progress."""
         self._service = service
         self._clock = service.clock
         self._buses = buses
-        self._selection = selection
+        self._keys = keys
         self._speed = speed
+        self._console = console
         self._publishers: dict[str, Publisher | None] = {}
         self._excluded: dict[str, str] = {}
         self._timing_errors = Durations()
@@ -104,20 +105,18 @@ class Player:
         self._first_log_ns = self._last_log_ns = 0
         self._begun_ns = self._sent_ns = 0
         self._initial_keys: set[str] = set()
-        self._impossible = 0
-        self._announce: Callable[[str], None] = lambda text: None
+        self._impossible_times = 0
 
-    def play(self, logs: Sequence[Path], console: Console) -> dict[str, Any]:
+    def play(self, logs: Sequence[Path]) -> dict[str, Any]:
         """Publish logs one after the other; return what was published, and the timing errors."""
         log, progress_due_ns = WholeLog(logs, skip_damaged=True), 0
-        self._announce = partial(console.print, highlight=False)
-        with passing_bar(console, TextColumn("{task.description}", markup=False), BarColumn()) as bar:
+        with passing_bar(self._console, TextColumn("{task.description}", markup=False), BarColumn()) as bar:
             task = bar.add_task(titled(log.paths))
             for message in log:
                 if not self._service.running:
                     break
                 if message.receive_time_ns > LAST_NS:
-                    self._impossible += 1
+                    self._impossible_times += 1
                     continue
                 self._play(message)
                 if self._sent_ns >= progress_due_ns:
@@ -133,7 +132,7 @@ class Player:
             "messages": self._timing_errors.count + len(self._initial_keys),
             "published": {key: one.published for key, one in sorted(self._publishers.items()) if one is not None},
             "left_out": dict(sorted(self._excluded.items())),
-            "messages_of_impossible_time": self._impossible,
+            "messages_of_impossible_time": self._impossible_times,
             "span_s": (self._last_log_ns - self._first_log_ns) * 1e-9,
             "took_s": (self._sent_ns - self._begun_ns) * 1e-9,
             "timing_error_us": {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "max": self._timing_errors.max_ns / 1e3},
@@ -167,7 +166,8 @@ class Player:
         due_ns = self._begun_ns + round(min((self._last_log_ns - self._first_log_ns) / self._speed, LAST_NS))
         if (wait_ns := due_ns - self._clock.host_ns()) > LONG_WAIT_NS:
             when = _utc(self._last_log_ns)
-            self._announce(f"the next message, of {when}, follows in {wait_ns / 1e9:.0f} s; Ctrl-C ends it")
+            text = f"the next message, of {when}, follows in {wait_ns / 1e9:.0f} s; Ctrl-C ends it"
+            self._console.print(text, highlight=False)
         self._sleep_until(due_ns)
         if not self._service.running:
             return
@@ -189,9 +189,9 @@ class Player:
         except KeyError:
             self._excluded[key] = "unknown to this version"
             return None
-        if not self._selection.matches(key):
+        if not self._keys.matches(key):
             return None
-        if why := self._selection.exclusion_reason(key):
+        if why := self._keys.exclusion_reason(key):
             self._excluded[key] = why
             return None
         bus = self._buses.get(role_of(key)) or next(iter(self._buses.values()))
@@ -217,12 +217,12 @@ def render(results: dict[str, Any]) -> str:
 
 
 @contextlib.contextmanager
-def _join(run: Run, selection: Selection, granted: Granted) -> Iterator[tuple[Service, dict[str, ZenohBus]]]:
+def _join(run: Run, keys: PublishedKeys, granted: Granted) -> Iterator[tuple[Service, dict[str, ZenohBus]]]:
     """Join the run in the roles of the selected topics, or as `replay` if events are the only topic."""
     with contextlib.ExitStack() as held:
         clock = HostClock()
         buses: dict[str, ZenohBus] = {}
-        for role in selection.roles or (Role.REPLAY,):
+        for role in keys.roles or (Role.REPLAY,):
             buses[role] = ZenohBus(run.links, role, clock)
             held.callback(buses[role].close)
         service = Service(Role.REPLAY, run.run_id, clock, next(iter(buses.values())), granted=granted)

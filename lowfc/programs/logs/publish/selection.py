@@ -1,4 +1,4 @@
-"""Selection of the messages of a log to republish, and of the roles to republish them in.
+"""Choice of the keys of a log to republish, and of the roles to republish them in.
 
 Each topic of a log was published by a role of the loop. `lowfc publish` takes over these roles, including their ports,
 so that each role belongs either to the log or to a live process, never to both.
@@ -13,7 +13,7 @@ from lowfc.contract.errors import BusError, ConfigurationError, nearest
 from lowfc.contract.messages import BENCH, COMMAND, FRAME, HEALTH, TOPICS, Role, topic_of
 
 
-class Selection:
+class PublishedKeys:
     """Decides for every key of a log whether it is published.
 
     Attributes:
@@ -86,7 +86,7 @@ def role_of(key: str) -> str:
     name = name_in(topic, key)
     if topic is HEALTH:
         return name
-    if topic is BENCH:  # else a recorded value would count as one of the live bench
+    if topic is BENCH:  # not published: an interlock would act on a recorded value
         return Role.BENCH
     if len(topic.publishers) > 1:
         return ""
