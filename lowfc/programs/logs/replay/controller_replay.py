@@ -128,7 +128,7 @@ class ControllerReplay:
                 return
             self._first_number = number if self._first_number is None else min(number, self._first_number)
             if self._state is not None and number <= self._state.input_number:
-                self._account_for_late(number, body)
+                self._account_for_past(number, body)
                 return
             entry = self._entries.get(number)
             if entry is None:
@@ -141,7 +141,7 @@ class ControllerReplay:
                 self._context.frames.note_step(body)
         self.proceed(message.receive_time_ns)
 
-    def _account_for_late(self, number: int, body: Message) -> None:
+    def _account_for_past(self, number: int, body: Message) -> None:
         """Account for a message of a past input: from before the adopted state, or a duplicate."""
         if number <= self._start_number:
             if self._counts_earlier:
@@ -210,7 +210,8 @@ class ControllerReplay:
             try:
                 settings, state = self._decoded(message)
             except ValueError as error:
-                self._unchecked_because = self._unchecked_because and f"not replayed: {error}"
+                if self._unchecked_because:
+                    self._unchecked_because = f"not replayed: {error}"
                 continue
             self._states = {later: state for later, state in self._states.items() if later > number}
             self._settings, self._state, self._start_number = settings, state, number

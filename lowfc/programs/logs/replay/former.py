@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Mapping
 from typing import TypeVar
 
-from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorSet
 from google.protobuf.message import DecodeError, Message
 from mcap.records import Schema
 
@@ -17,7 +17,7 @@ CHANNEL_RULE = "only a channel that exists is removed"
 CLOSE_RULE = "the loop is not closed while frames are refused, or on a camera that does not fit the calibration"
 CLEAR_RULE = "clear forgets the newest frame sequence"
 GAIN_RULE = "gain and leak of a mode are checked together, and only controlled modes have automatic gains"
-LOAD_RULE = "a calibration loaded in safe mode adopts nothing, one loaded during a probe sequence none of its shapes"
+LOAD_RULE = "a calibration loaded in safe mode adopts no shape, one loaded during a probe sequence no shape of it"
 
 _REQUEST_RULES = {
     **dict.fromkeys(("close", "step", "law"), CLOSE_RULE),
@@ -50,8 +50,9 @@ class FormerVersion:
 
     def _known(self, name: str) -> set[int] | None:
         """Numbers of the fields of a message; None if the log does not declare it."""
-        unread = set[int]() if name in self._fields else self._schemas.keys() - self._read
-        for number in unread:
+        if name in self._fields:
+            return self._fields[name]
+        for number in self._schemas.keys() - self._read:
             self._read.add(number)
             with contextlib.suppress(DecodeError):
                 for file in FileDescriptorSet.FromString(self._schemas[number].data).file:
@@ -60,8 +61,7 @@ class FormerVersion:
         return self._fields.get(name)
 
     def _declare(self, name: str, message: DescriptorProto) -> None:
-        fields: list[FieldDescriptorProto] = list(message.field)
-        self._fields[name] = {field.number for field in fields}
+        self._fields[name] = {field.number for field in message.field}
         for nested in message.nested_type:
             self._declare(f"{name}.{nested.name}", nested)
 
