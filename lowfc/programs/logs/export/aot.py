@@ -16,8 +16,8 @@ AOT describes a telescope with a Shack-Hartmann or pyramid sensor. A log is mapp
       modal_coefficients  measured modal error, nm rms of wavefront; NaN if the frame was refused
       commands            surface at each actuator as sent, m; NaN if the log has no command for this frame
       modes               Zernike polynomials of the calibration's modes, over the circle
-      measurements_to_modes, modes_to_measurements, modes_to_commands: R (at the end of the log, as automatic gains
-                          weighted it), H and MODES2ACT
+      measurements_to_modes, modes_to_measurements, modes_to_commands: R (as at the end of the log, weighted by
+                          automatic gains), H and MODES2ACT
       time_filter_num, _den: the integrator g / (z - (1 - leak)) of each mode, at the end of the log
       delay               from mid-exposure to the middle of the command's period: delay_frames + (1 - exposure /
                           period) / 2
@@ -220,7 +220,7 @@ class _System:
 def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibration: Calibration) -> None:
     sequence = history.steps.sequence
     shape = (len(sequence), calibration.grid[0] * calibration.grid[1])
-    row_of = {int(one): row for row, one in reversed(list(enumerate(sequence)))}
+    row_of = {int(one): row for row, one in reversed(list(enumerate(sequence)))}  # the first step of each frame
     rows = fits_cube(path, image, shape)
     rows[:] = np.nan
     for message in history.reader(COMMAND):

@@ -96,7 +96,8 @@ def _copy_frames(
                 f"{path}: frame {number} is not a complete image of 16-bit pixels; export without --frames"
             )
         if shape is None:
-            write_header((count, *(shape := frame.pixels.shape)))
+            shape = frame.pixels.shape
+            write_header((count, *shape))
         if frame.pixels.shape != shape:
             raise DataFileError(
                 f"{path}: frame {number} has shape {frame.pixels.shape}, but earlier frames have {shape}; "

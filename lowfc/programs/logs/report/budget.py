@@ -26,7 +26,7 @@ def budget_results(
 ) -> Results:
     """Terms, their sum and the values to compare it with, in nm rms over each group of modes.
 
-    If the true residual is `shaped` by offset or channels, it measures nothing, and is left out.
+    A true residual that is `shaped` by offset or channels is left out: it contains their shapes.
     """
     if stretch is None:
         return {"why_not": why_none(run)}

@@ -68,17 +68,19 @@ ERROR, POL, DISTURBANCE, RESIDUAL, SENSED = range(5)
 def longest_stretch(run: Run) -> Stretch | None:
     """The longest stretch; None if there is none, for the reasons of `why_none`."""
     history, steps = run.history, run.history.steps
-    laws = np.searchsorted([law.first for law in run.laws], np.arange(steps.sequence.size), side="right") - 1
-    known = np.array([*(law.known for law in run.laws), False])  # the last for steps before the first law
-    linear = np.array([*(law.linear is not None for law in run.laws), False])
+    law_of_step = np.searchsorted([law.first for law in run.laws], np.arange(steps.sequence.size), side="right") - 1
+    # Before the first law, the index is -1: the element False at the end.
+    known = np.array([*(law.known for law in run.laws), False])[law_of_step]
+    linear = np.array([*(law.linear is not None for law in run.laws), False])[law_of_step]
     # Until the next state names the overruled groups, only the steps show that there are any.
-    overruled = linear[laws] & (steps.reasons >> Limit.LAW_OVERRULED & 1 == 1)
-    closed = (steps.mode == LoopMode.CLOSED) & known[laws] & ~overruled & history.under_calibration
-    edges = np.flatnonzero(np.diff(np.where(closed, laws, -1), prepend=-1, append=-1))
-    if not (spans := [(first, last) for first, last in pairwise(edges.tolist()) if closed[first]]):
+    overruled = linear & (steps.reasons >> Limit.LAW_OVERRULED & 1 == 1)
+    closed = (steps.mode == LoopMode.CLOSED) & known & ~overruled & history.under_calibration
+    edges = np.flatnonzero(np.diff(np.where(closed, law_of_step, -1), prepend=-1, append=-1))
+    spans = [(first, last) for first, last in pairwise(edges.tolist()) if closed[first]]
+    if not spans:
         return None
     first, last = max(spans, key=lambda span: int(np.isfinite(steps.error_nm[span[0] : span[1], :1]).sum()))
-    in_force = run.laws[laws[first]]
+    in_force = run.laws[law_of_step[first]]
     gain, leak = np.array(in_force.gain, float), np.array(in_force.leak, float)
     if in_force.linear is None:
         settling = settling_frames(gain, leak)
@@ -204,7 +206,7 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
     if "residual_predicted" in binned:
         over["true_over_theory"] = _amplitude_ratio(binned["residual"], binned["residual_predicted"])
     highest_hz = float(frequency_hz[-1])
-    lowest_hz = float(frequency_hz[1])  # of each segment, the mean is subtracted, and most of a slower drift with it
+    lowest_hz = float(frequency_hz[1])  # slower drift is mostly removed with the mean of each segment
     edges_hz = [lowest_hz, *(edge for edge in BANDS_HZ if lowest_hz < edge < highest_hz), highest_hz]
     bands = [
         {"from_hz": low, "to_hz": high}
@@ -252,7 +254,8 @@ def noise_of(history: History, rows: slice) -> SensorNoise | None:
         charge_e = history.configuration.dark_e
     end = history.steps.sequence[rows][-1]
     newest = np.array([state.frame_sequence for state in history.controllers], np.uint64)
-    from_frame = np.maximum.accumulate(newest) + (newest == 0)  # a state after a start or `clear` has no frame
+    # A state without a frame, after a start or `clear`, counts from the next frame.
+    from_frame = np.maximum.accumulate(newest) + (newest == 0)
     count = np.searchsorted(from_frame, end, side="right")
     in_use = calibration_in_use(history.controllers[count - 1], calibration) if count else calibration
     em_gain = max(camera.em_gain, 1.0)

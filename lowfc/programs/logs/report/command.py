@@ -34,7 +34,7 @@ def report(
     from lowfc.adapters.logs.parts import named_logs
 
     named = named_logs(logs, out, as_json=as_json)
-    if out is not None and out.suffix not in _ENDINGS:  # a report replaces an earlier one, and nothing else
+    if out is not None and out.suffix not in _ENDINGS:  # an existing page is replaced without asking
         raise DataFileError(f"a report is an HTML page: use --out FILE.html, not {out}")
     for log in named:
         _report(log, out, as_json)

@@ -52,8 +52,9 @@ def events(run: Run) -> list[Results]:
 
 
 def requests(run: Run) -> list[Results]:
-    """Requests, also the controller's own, and their answers, without those that change nothing and are periodic."""
-    found = [one for one in run.history.requests if one.name not in ("status", "configuration", "renew")]
+    """Requests, also the controller's own, and their answers, without periodic ones that change nothing."""
+    if not run.history.steps.sequence.size:
+        return []
     return [
         {
             "time_s": _request_time_s(run, one),
@@ -63,8 +64,8 @@ def requests(run: Run) -> list[Results]:
             "accepted": one.accepted,
             "reply": one.reply,
         }
-        for one in found
-        if run.history.steps.sequence.size
+        for one in run.history.requests
+        if one.name not in ("status", "configuration", "renew")
     ]
 
 
@@ -102,8 +103,8 @@ def light_results(history: History) -> Results:
 
 def mirror_results(history: History) -> Results:
     """Stroke used, and limits that acted in the controller and in the mirror."""
-    mirror, settings = history.mirror, history.controller.settings if history.controller is not None else None
-    limit_nm = settings.stroke_nm if settings is not None and settings.stroke_nm else None
+    mirror, controller = history.mirror, history.controller
+    limit_nm = (controller.settings.stroke_nm or None) if controller is not None else None
     most_nm = float(mirror.stroke_nm.max()) if mirror.stroke_nm.size else None
     return {
         "stroke_limit_nm": limit_nm,
@@ -116,7 +117,7 @@ def mirror_results(history: History) -> Results:
 
 
 def _limits(reasons: Long) -> dict[str, int]:
-    """Number of times that each limit acted; LAW_OVERRULED is none."""
+    """Number of times that each limit acted; LAW_OVERRULED is not a limit."""
     counts = count_reasons(reasons).items()
     return {
         reason.name.lower(): count

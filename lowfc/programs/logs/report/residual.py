@@ -1,6 +1,6 @@
 """Residual wavefront: rms of each mode, and of tip and tilt on the sky."""
 
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 
@@ -26,7 +26,9 @@ def residual_results(run: Run, stretch: Stretch | None) -> Results:
     history = run.history
     steps = history.steps
     opened = np.flatnonzero((steps.mode == LoopMode.OPEN) & history.under_calibration)
-    closed = np.arange(steps.sequence.size)[stretch.rows] if stretch is not None else opened[:0]
+    rows = stretch.rows if stretch is not None else slice(0, steps.sequence.size)
+    closed = np.arange(steps.sequence.size)[rows] if stretch is not None else opened[:0]
+    either = closed if closed.size else opened
     noll = history.calibration.noll if history.calibration is not None else ()
     true = history.true or TruthRows(0).values()
     values = {
@@ -38,7 +40,7 @@ def residual_results(run: Run, stretch: Stretch | None) -> Results:
         "residual": _rms(true.modes_residual_rms_nm, closed),
         "sampled_residual": _rms(true.residual_nm, closed),
     }
-    noise = noise_of(history, stretch.rows if stretch is not None else slice(None))
+    noise = noise_of(history, rows)
     modes = [
         {
             "noll": index,
@@ -49,25 +51,23 @@ def residual_results(run: Run, stretch: Stretch | None) -> Results:
         for k, index in enumerate(noll)
     ]
     open_pupil = {
-        f"{name}_open_pupil_rms_nm": _at(_rms(column[:, None], rows), 0)
-        for name, column, rows in (
-            ("disturbance", true.disturbance_rms_nm, closed if closed.size else opened),
+        f"{name}_open_pupil_rms_nm": _at(_rms(column[:, None], chosen), 0)
+        for name, column, chosen in (
+            ("disturbance", true.disturbance_rms_nm, either),
             ("residual", true.residual_rms_nm, closed),
             ("sampled_residual", true.sampled_residual_rms_nm, closed),
         )
     }
-    contrast = _contrast(true, opened if not closed.size else closed, history.configuration)
     return {
         "modes": modes,
-        "added_contrast": contrast,
+        "added_contrast": _contrast(true, either, history.configuration),
         "tilt_mas": {signal: _tilt_mas(found, noll, history.configuration) for signal, found in values.items()},
         "total_rms_nm": {
             signal: float(np.sqrt(np.sum(found**2))) if found is not None else None for signal, found in values.items()
         },
         "open_pupil": open_pupil,
         "truth": "none" if history.true is None else "continuous" if true.continuous else "sampled only",
-        "shaped": history.true is not None
-        and _shaped_in(run, stretch.rows if stretch is not None else slice(0, steps.sequence.size)),
+        "shaped": history.true is not None and _shaped_in(run, rows),
         "steps_open": int(opened.size),
         "steps_closed": int(closed.size),
     }
@@ -98,13 +98,11 @@ def bin_starts(rows: int, max_bins: int) -> Integers:
 
 def _shaped_in(run: Run, rows: slice) -> bool:
     """Whether an offset or a channel had a shape in some of these steps."""
-    states = run.history.controllers
-    changes = [k for k, state in enumerate(states) if not k or holds_shape(state) != holds_shape(states[k - 1])]
-    firsts = [row_after(run.history, states[k].frame_sequence, states[k].timestamp) for k in changes]
-    spans = pairwise([*firsts, rows.stop])
+    changes = [next(states) for _, states in groupby(run.history.controllers, holds_shape)]
+    firsts = [row_after(run.history, state.frame_sequence, state.timestamp) for state in changes]
     return any(
-        holds_shape(states[k]) and first < rows.stop and rows.start < end
-        for k, (first, end) in zip(changes, spans, strict=True)
+        holds_shape(state) and first < rows.stop and rows.start < end
+        for state, (first, end) in zip(changes, pairwise([*firsts, rows.stop]), strict=True)
     )
 
 

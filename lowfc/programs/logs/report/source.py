@@ -32,7 +32,7 @@ class InForce:
         first: step from which on it is in force; comparisons ignore it and `linear`.
         law_id, law_name: identity, or "unknown", and name of the linear law; without one, empty and "integrator".
         overruled: groups of modes that the integrator drives instead of the law.
-        linear: the linear law; None for the integrator, if it is not in the log, is overruled or has other modes.
+        linear: the linear law; None without one, or if it is not in the log, is overruled or has other modes.
     """
 
     first: int = field(compare=False)
@@ -65,8 +65,8 @@ class Run:
     def seconds(self, host_ns: npt.ArrayLike) -> Array:
         """Convert host times to frame time, seconds since the first step.
 
-        The frames' publish times are interpolated. In lockstep frame time is simulated; otherwise it differs
-        from host time by an offset. Without frames of steps: host time since the log's beginning.
+        Times between the frames are interpolated. In lockstep frame time is simulated; otherwise it differs from host
+        time by an offset. If the log has no frame of a step: host time since the log's beginning.
         """
         history, host = self.history, np.asarray(host_ns, dtype=np.int64)
         rows = rows_of(history.frame_sequence, history.steps.sequence)

@@ -5,7 +5,7 @@ import numpy as np
 from lowfc.adapters.logs.columns import STAGES, rows_of
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long
-from lowfc.contract.envelope import start_of
+from lowfc.contract.envelope import COUNT_BITS, start_of
 from lowfc.contract.messages import FRAME, TRUTH, Role, wire
 from lowfc.programs.logs.report.source import Results, Run
 
@@ -35,7 +35,7 @@ def intervals_ns(run: Run) -> dict[str, Long]:
     history = run.history
     frames = np.zeros(0, np.int64)
     if history.log.selection.has_every_frame:
-        same_start = np.diff(history.frame_sequence >> np.uint64(32)) == 0
+        same_start = np.diff(history.frame_sequence >> COUNT_BITS) == 0
         frames = np.diff(history.frame_publish_ns)[same_start]
     return {"frames": frames, "commands": np.diff(history.command_publish_ns)}
 
