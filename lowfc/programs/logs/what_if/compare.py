@@ -142,13 +142,11 @@ def render(results: dict[str, Any]) -> str:
     def row(title: str, values: dict[str, Any], key: str, gain: str = "") -> list[str]:
         return [title, *(f"{values[key.format(name)]:.2f}" for name in columns), gain]
 
-    modes = [
-        row(f"{mode['noll']:>3} {mode['name']}", mode, "{}_nm", "{gain_was:.3g} -> {gain:.3g}".format(**mode))
-        if "gain" in mode  # a user's controller has none
-        else row(f"{mode['noll']:>3} {mode['name']}", mode, "{}_nm")
-        for mode in results["modes"]
-    ]
-    rows = [*modes, row("all modes", results, "{}_nm")]
+    rows = []
+    for mode in results["modes"]:
+        gain = f"{mode['gain_was']:.3g} -> {mode['gain']:.3g}" if "gain" in mode else ""  # a user's controller has none
+        rows.append(row(f"{mode['noll']:>3} {mode['name']}", mode, "{}_nm", gain))
+    rows.append(row("all modes", results, "{}_nm"))
     if "tilt_was_mas" in results:
         rows.append(row("tilt per axis, mas", results, "tilt_{}_mas"))
     lines = [

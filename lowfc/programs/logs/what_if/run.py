@@ -44,7 +44,7 @@ class SeenCommands(NamedTuple):
         delay_frames: the measured delay, rounded if it is nearly whole, where it differs from the controller's;
             otherwise the controller's. `weights` are its `delay_weights`.
         seen_nm: (steps, modes); NaN where a frame was not used and the delay is the controller's.
-        command_lost: (steps,) True where the command seen is not one of the steps': the log lacks it.
+        command_lost: (steps,) True where the exposure saw a command that no step has: the log lacks it.
         target_nm: (steps, modes) of the loop, which the steps' errors exclude.
     """
 
@@ -64,9 +64,9 @@ class SeenCommands(NamedTuple):
         measured_delay: float | None,
         played: Mask,
     ) -> "SeenCommands":
-        """Commands seen by these steps; the first one's frame was used. The states give the loop's target.
+        """Commands seen by these steps, of which the first has a used frame; the states give the loop's target.
 
-        A probe sequence (`played`) may change the target, too: there the steps' commands are those seen.
+        A probe sequence (`played`) may change the target, too: there the commands seen are computed from the steps'.
         """
         weights = delay_weights(controller_delay).astype(np.float32)
         target_nm = _target_nm(states, steps.sequence, steps.error_nm.shape[1])
@@ -93,7 +93,7 @@ class LoggedRun:
             any.
         continuous_rms_nm: rms of the true residual (steps, modes) over each period; None if the log does not have it.
         calibration: calibration of the log.
-        used: (steps,) whether the frame was used; `under_calibration`: that of the history.
+        used: (steps,) whether the frame was used; `under_calibration`: see `History`.
         law: last law of the run.
         controller_delay: delay assumed by the controller, frames; `measured_delay`, from `measured_from`, is None if
             it cannot be measured; the comparison uses `delay_frames`, with `weights`.
