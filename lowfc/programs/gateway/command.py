@@ -41,7 +41,8 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
     joined = open_run(the_known_run(run), ())
     run_id, run_config = joined.run_id, joined.path / "config.toml"
     settings = configuration(config) if config is not None or not run_config.exists() else load(run_config)
-    clock, signalled = clock_of(settings), list[int]()  # an Event may lock up in the handler of a second signal
+    clock = clock_of(settings)
+    signalled = list[int]()  # not an Event, whose lock a second signal's handler may wait for forever
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda number, _: signalled.append(number))
     bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)

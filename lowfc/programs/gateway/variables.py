@@ -1,7 +1,7 @@
 """Process variables of a gateway, independent of its protocol: readings, and writable variables that send requests.
 
-A request that changes something and has a `lowfc ctl` command is offered if it takes nothing, numbers or one text. It
-concerns all modes.
+A request that changes something and has a `lowfc ctl` command is offered if it needs no value, numbers or one text. It
+applies to all modes.
 """
 
 from collections.abc import Callable, Iterator
@@ -94,11 +94,8 @@ READINGS = (
 
 def _request(declared: Declaration) -> Variable | None:
     fields, name = {field for field, _ in declared.fields}, declared.name
-    if (
-        not declared.example
-        or not fields <= {"modes", "values", "text", "lease_id"}
-        or name in ("status", "configuration")
-    ):
+    has_command, simple = bool(declared.example), fields <= {"modes", "values", "text", "lease_id"}
+    if not (has_command and simple) or name in ("status", "configuration"):
         return None
     put: Put
     if declared.key.startswith("lowfc/record/"):

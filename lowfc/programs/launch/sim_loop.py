@@ -73,7 +73,7 @@ def sim_loop(
         prepare(config, run, console)
         children += children_of(config, run, duration_s, record)
         if show is not None:
-            children.insert(len(children) - record, _view(run, show, console))  # before the recorder, which ends last
+            children.insert(3, _view(run, show, console))  # after the mirror; the recorder, if any, ends last
         for child in children:
             child.start()
         _supervise(config, children, watch, console, duration_s)
@@ -216,11 +216,12 @@ def _display(console: Console) -> Iterator[Callable[..., None]]:
         with Live(console=console, refresh_per_second=4, transient=True) as live:
             yield lambda *status: live.update(screen(*status))
     else:
-        due_s = [LINE_PERIOD_S]
+        due_s = LINE_PERIOD_S
 
         def line(watch: Watch, config: Configuration, duration_s: float | None, elapsed_s: float) -> None:
-            if elapsed_s >= due_s[0]:
-                due_s[0] += LINE_PERIOD_S
+            nonlocal due_s
+            if elapsed_s >= due_s:
+                due_s += LINE_PERIOD_S
                 lockstep_hz = config.camera.rate_hz if config.lockstep else None
                 sys.stderr.write(status_line(watch, elapsed_s, lockstep_hz) + "\n")
 
