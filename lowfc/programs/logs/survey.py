@@ -178,7 +178,7 @@ def survey(
     reader.progress = progress
     for number, message in enumerate(reader):
         if not number:
-            account = _Account(reader.selection)
+            account = _Account(reader.selection)  # known from the first message on
         topic = _topic(message.key)
         account.enter(topic, message, reader.schema_of(message))
         if digest and topic is not None:

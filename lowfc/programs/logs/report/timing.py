@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lowfc.adapters.logs.columns import STAGES, rows_of
+from lowfc.adapters.logs.columns import rows_of
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long
 from lowfc.contract.envelope import COUNT_BITS, start_of
@@ -45,7 +45,7 @@ def latencies_ns(history: History) -> dict[str, Long]:
     rows = rows_of(history.frame_sequence, history.mirror.sequence)
     applied = rows >= 0
     to_mirror = history.mirror.publish_time_ns[rows[applied]] - history.frame_publish_ns[applied]
-    return {**{stage: history.stages_ns[stage] for stage in STAGES}, FRAME_TO_MIRROR: to_mirror}
+    return history.stages_ns | {FRAME_TO_MIRROR: to_mirror}
 
 
 def percentiles_us(durations_ns: Long) -> Results:

@@ -64,7 +64,7 @@ def _modes(results: Results) -> Results:
         return _check("loop", BAD, _why_no_loop(results["log"]["messages_by_topic"]))
     shares = ", ".join(f"{name} {count / total:.1%}" for name, count in steps.items())
     if steps.get("safe"):
-        return _check("loop", BAD, shares)
+        return _check("loop", BAD, f"the loop was in safe mode ({shares})")
     return _check("loop", GOOD if steps.get("closed") else UNKNOWN, shares)
 
 

@@ -267,8 +267,8 @@ def _log_warnings(run: LoggedRun) -> list[str]:
         )
     if before := np.count_nonzero(~run.history.under_calibration):
         found.append(
-            f"another calibration or camera setting was in use for {counted(int(before), 'step')}: modes and rate are "
-            "those of the others"
+            f"another calibration or camera setting was in use for {counted(int(before), 'step')}; modes and rate are "
+            "those of the other steps"
         )
     if lost := np.count_nonzero(run.command_lost):
         found.append(
