@@ -275,8 +275,7 @@ def _timeline(figure: "Figure", report: Report) -> bool:
 
 
 def _stroke(figure: "Figure", report: Report) -> bool:
-    history = report.run.history
-    mirror = history.mirror
+    mirror = report.run.history.mirror
     if not mirror.sequence.size:
         return False
     plot, image = figure.subplots(1, 2, width_ratios=(2, 1))
@@ -291,7 +290,7 @@ def _stroke(figure: "Figure", report: Report) -> bool:
             plot.axhline(limit_nm, color=COLOURS["error"], linestyle="--")
     plot.set(ylabel="largest |actuator|, nm of surface", xlabel=_SECONDS, title=title)
     plot.set_ylim(bottom=0)
-    extremes = np.maximum(np.abs(history.mirror.highest_nm), np.abs(history.mirror.lowest_nm))  # from flat
+    extremes = np.maximum(np.abs(mirror.highest_nm), np.abs(mirror.lowest_nm))  # from flat
     shown = image.imshow(extremes, cmap="cividis", vmin=0, interpolation="nearest", origin="lower")
     figure.colorbar(shown, ax=image, label="nm of surface")
     share = f",\nat most {results['stroke_most_share']:.1%} of the limit" if limit_nm is not None else ""
