@@ -43,7 +43,7 @@ def driver_command(kind: Kind, name: str | None = None) -> type[TyperCommand]:
     return WithOptions
 
 
-PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": ["-h", "--help"]}
 """Settings of a command that passes unknown words to the driver as its options."""
 Frames = Annotated[int | None, typer.Option(min=1, help="Stop after this many frames; default: at Ctrl-C or SIGTERM.")]
 LEAVE_S = 2.0

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
@@ -32,6 +33,7 @@ from lowfc.device.run import camera_beside
 from lowfc.programs.commissioning.doctor.devices import device_checks
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
+from sim_camera.__main__ import app as sim_camera_app
 from tests.support.loops import lowfc
 
 GRID = (4, 5)
@@ -213,6 +215,7 @@ def test_the_help_lists_the_drivers_options(kind: str, tmp_path: Path, monkeypat
     assert (wait.split(), mode.split()) == (["--wait-s", "<float>"], ["--mode", "<slow|fast>"])
     assert "Options of the driver" not in lowfc(kind, "--help").output
     assert "--rows <int>" in lowfc("camera", "sim", "-h").output
+    assert "--rows <int>" in CliRunner().invoke(sim_camera_app, ["-h"]).output
 
 
 def test_doctor_checks_the_requirements_of_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
