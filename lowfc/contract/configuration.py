@@ -84,8 +84,8 @@ class Control(Section):
     limit_nm: ModalLimit = 50.0
     """Largest modal command of the other modes, wavefront rms."""
     max_frame_age_ms: Milliseconds = 0.0
-    """Age above which a frame is refused; 0: 20 ms or two frame periods, whichever is longer. A frame older than 5 ms
-    and than three periods is refused in any case."""
+    """Age above which a frame is refused; 0: 20 ms or two frame periods, whichever is longer. A frame older than both
+    5 ms and three periods is refused in any case."""
     frame_timeout_ms: Milliseconds = 0.0
     """Time without a frame after which an event is raised; 0: 50 ms or five frame periods, whichever is longer."""
     on_frame_timeout: Literal["hold", "flat"] = "hold"

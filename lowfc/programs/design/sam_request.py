@@ -17,8 +17,9 @@ class Search:
         merit: Figure of merit to optimise: paper, table3, table4, condition, throughput, pareto or contrast.
         estimator: pinv, or weighted for the Cramer-Rao bound. Default: weighted; pinv for the merit paper.
         modes: Modes in Table 3 and the condition number: 14 or 20.
-        weight: 0 to 1. In pareto, the weight of Table 4. In paper, that of Table 3: its ratios to the paper have the
-            power 2 x weight, that of Table 4 has 2 x (1 - weight). Default: 0.5; in pareto, 0 to 1 along a front.
+        weight: Weight w, 0 to 1. pareto minimises table3^(1 - w) table4^w; paper minimises the largest ratio to the
+            paper, those in Table 3 to the power 2 w, that in Table 4 to the power 2 (1 - w). Default: 0.5; in pareto,
+            each chain has its own, from 0 to 1 along a front.
         focal_mask: disk, bowtie or both. Default: disk; both for the merit paper.
         holes: Number of holes, or FEWEST:MOST.
         diameter: Diameter of the holes, or SMALLEST:LARGEST, in pupil diameters.

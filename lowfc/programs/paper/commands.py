@@ -51,7 +51,7 @@ def validate(
     docs: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the pages, their JSON and plots; with all, or with additional tables only.",
+            help="Folder for the pages, their JSON and plots; only with all, or with anchors or tolerance.",
             show_default=False,
         ),
     ] = None,
