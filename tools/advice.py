@@ -90,7 +90,7 @@ ADVICE: dict[str, Advice] = {
         "the guard found that the law's residual exceeds the integrator's, or that the loop amplifies.",
         "tune a law again from a recent log; `lowfc ctl law FILE` or `close` reactivates it.",
     ),
-    "LAW_BACK": Advice("the law's virtual residual was far smaller for some time; the law is active again.", _NOTHING),
+    "LAW_BACK": Advice("the law, simulated on the same frames, had a far smaller residual for some time.", _NOTHING),
     "NOTE": Advice("an operator wrote a note.", _NOTHING),
     "CLOSING_HARMS": Advice(
         "at these gains, closing would increase the residual of some modes: by their noise, or by amplification.",
@@ -144,7 +144,7 @@ ADVICE: dict[str, Advice] = {
     "LIMIT_CLEARED": Advice("the limit no longer acts.", _NOTHING),
     "COMMAND_EXPIRED": Advice(
         "the mirror had no valid command for `control.command_timeout_ms`: the controller died, hangs, or lost its "
-        "link. The mirror relaxes to zero command or holds (`mirror.on_command_timeout`).",
+        "link. The mirror relaxes to flat or holds (`mirror.on_command_timeout`).",
         "restart the controller; it starts from the mirror's shape, in `control.start_mode`.",
     ),
     "COMMAND_BACK": Advice("the mirror follows commands again.", _NOTHING),
@@ -156,7 +156,7 @@ ADVICE: dict[str, Advice] = {
     ),
     "START_AHEAD": Advice(
         "the clock of the sender's host is ahead by more than `control.max_start_ahead_h`.",
-        "set the clocks of both hosts and start the sender again; `lowfc ctl clear` resets a wrong frame number.",
+        "set the clocks of both hosts and start the sender again; `lowfc ctl clear` lets frame numbers restart.",
     ),
     "LATCH_FAILED": Advice(
         "a file that keeps safe mode across restarts cannot be read or written.",
@@ -237,7 +237,7 @@ REASONS: dict[str, Advice] = {
     "NEIGHBOUR": Advice("neighbouring actuators would be too far apart", "smaller channels; look for a stuck actuator"),
     "NOT_FINITE": Advice("a value was not finite; the previous command is kept", "check calibration and law"),
     "WRONG_GRID": Advice("the grid differs from the mirror's", "load the calibration of this mirror"),
-    "CHANNEL": Advice("no usable channel name, or more than sixteen", "remove a channel"),
+    "CHANNEL": Advice("the channel's name is not valid, or it would be the seventeenth", "remove a channel"),
     "LAW_OVERRULED": Advice("the integrator has taken over modes from the law", "as for LAW_OVERRULED"),
 }
 """Cause and remedy of each rejection and limit, by its name on the wire without REASON_."""
