@@ -127,7 +127,7 @@ def _stalls(by_name: dict[str, list[Results]]) -> list[str]:
             if "p99_during_over_calm" in each:  # a case that failed early lacks some of the three spans
                 spans = ", ".join(f"{each['frame_to_command'][span]['p99_us']:.0f}" for span in _STALL)
                 rows.append((name.removeprefix("stall-"), spans, each["p99_during_over_calm"]))
-    head = "stopped for 10 s", "frame to command, p99, us: before, during, after", "during / mean of before and after"
+    head = "stalled", "frame to command, p99, us: before, during, after", "during / mean of before and after"
     return [markdown(head, rows)] if rows else []
 
 
@@ -166,7 +166,7 @@ def render_soak(results: Results) -> str:
         one | {"name": name, "growth": TOO_SHORT if one["memory_mb_per_hour"] is None else GROWTH.format(**one)}
         for name, one in results["processes"].items()
     )
-    ended = "No growth beyond the limits below, no loss." if results["passed"] else f"{verdict(results)}."
+    ended = "No growth beyond these limits, no loss." if results["passed"] else f"{verdict(results)}."
     return (
         f"{ended} {results['hours']:g} h at {results['rate_hz']:.0f} Hz: {results['frames_published']} frames, "
         f"{results['frames_skipped']} skipped, {results['frames_missing']} missing; {results['messages_recorded']} "
