@@ -3,7 +3,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
 VENV := .venv
 BIN := $(VENV)/bin
-# --no-compile: a module is compiled when it is first imported. The newest pip finds the packages in half the time of the one that comes with Python.
+# --no-compile: a module is compiled when it is first imported.
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 export PYTHONDONTWRITEBYTECODE :=  # cleared: without cached bytecode each interpreter that collects the tests needs 5 s more
 .PHONY: help sim-loop test test-all bench lint types format proto node docs release clean
@@ -11,6 +11,7 @@ export PYTHONDONTWRITEBYTECODE :=  # cleared: without cached bytecode each inter
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
+# --upgrade-deps: the newest pip finds the packages in half the time of the one that comes with Python.
 $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "lowfc needs Python 3.11 or newer; none was found. Debian: apt install python3" >&2; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { v=$$($(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])'); \
