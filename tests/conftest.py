@@ -15,8 +15,8 @@ from xdist.scheduler import LoadFileScheduling
 from lowfc.adapters.bus.run import Run, new_run_id, open_run
 
 NO_SKIPS = os.environ.get("LOWFC_NO_SKIPS") == "1"
-ROOT = Path(__file__).parent
-FIRST = frozenset(ROOT / name for name in ("optics", "control", "paper", "design", "contract", "sim"))
+TESTS = Path(__file__).parent
+FIRST = frozenset(TESTS / name for name in ("optics", "control", "paper", "design", "contract", "sim"))
 """Folders whose tests hardly wait for other processes: they run beside the exclusive tests."""
 LONGEST = ("test_lockstep", "test_gain_watch", "test_calibrate", "test_tutorials", "test_commission", "test_what_if")
 """Test files that are started next, so that no worker runs one of them alone at the end."""
@@ -54,7 +54,7 @@ class _Scheduling(LoadFileScheduling):
 
     def _split_scope(self, nodeid: str) -> str:
         file = super()._split_scope(nodeid)
-        return "exclusive" if _exclusive(ROOT.parent / file) else file
+        return "exclusive" if _exclusive(TESTS.parent / file) else file
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -138,6 +138,6 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 @pytest.fixture(scope="session")
 def artefacts() -> Path:
     """Folder in which tests leave images for inspection."""
-    path = Path(__file__).parent / "artefacts"
+    path = TESTS / "artefacts"
     path.mkdir(exist_ok=True)
     return path

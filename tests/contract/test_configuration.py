@@ -151,7 +151,7 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(
 def test_an_invalid_value_is_reported_in_one_line_with_key_and_value(key: str, value: object) -> None:
     message = error_of(None, {key: value})
     assert message.startswith(key)
-    assert f" = {repr(value).strip('[]')}: " in message  # of a list, its only item
+    assert f" = {repr(value).strip('[]')}: " in message  # for a list, its only item
     assert "\n" not in message
 
 
@@ -192,7 +192,7 @@ def test_an_impossible_address_of_the_router_is_refused(key: str, address: str, 
 def test_config_show_sets_only_keys_that_were_set(tmp_path: Path) -> None:
     """Read from a file, the output of `config show` leaves the defaults of a command in force."""
     defaults_file = write(tmp_path, commented(load(None)))
-    assert tomllib.loads(defaults_file.read_text()) == {name: {} for name in tomllib.loads(defaults_file.read_text())}
+    assert all(section == {} for section in tomllib.loads(defaults_file.read_text()).values())
     assert load(defaults_file, None, {"control.start_mode": "closed"}).control.start_mode == "closed"
     assert {line.removeprefix("#").split(" = ")[0] for line in defaults_file.read_text().splitlines()} >= {
         key.rpartition(".")[2] for key in KEYS

@@ -128,9 +128,10 @@ def raised_events() -> Iterator[tuple[str, str, set[str]]]:
     for package in ("lowfc", "sim_camera", "sim_dm"):
         for path in sorted((ROOT / package).rglob("*.py")):
             text = path.read_text(encoding="utf-8")
-            for scope in ast.walk(ast.parse(text)) if ".event(" in text or "PendingEvent(" in text else ():
-                if isinstance(scope, ast.FunctionDef):
-                    yield from _raised_in(scope, path)
+            if ".event(" in text or "PendingEvent(" in text:
+                for scope in ast.walk(ast.parse(text)):
+                    if isinstance(scope, ast.FunctionDef):
+                        yield from _raised_in(scope, path)
 
 
 def _raised_in(scope: ast.FunctionDef, path: Path) -> Iterator[tuple[str, str, set[str]]]:

@@ -393,7 +393,7 @@ def test_start_requests_wait_for_the_mirror_and_the_cameras_settings(calibration
 
 
 def test_without_a_calibration_the_configured_law_is_not_in_force(tmp_path: Path) -> None:
-    """The controller ended, so that a bench could not be commissioned again with its configuration."""
+    """The controller continues, so that a bench can be commissioned again with its configuration."""
     noll = CONFIG.noll
     law_file.save(integrator([0.3] * len(noll), [0.0] * len(noll), noll, 1.0, CONFIG.camera.rate_hz), tmp_path / "law")
     config = configured(lockstep=False, control__law=str(tmp_path / "law"))

@@ -145,7 +145,8 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
         "closed · no frame used in the last second · 0 frames lost ·"
     )
     assert first_line(camera=wire.Health(), recorder=wire.Health()).endswith(" · no warning")
-    before, (state, _) = state, feed(SETTINGS, state, Request((START + 2) * SECOND, "offset", (2,), (20.0,)))
+    before = state
+    state, _ = feed(SETTINGS, state, Request((START + 2) * SECOND, "offset", (2,), (20.0,)))
     assert "residual 2.50 nm rms, noise included (true 2.00, with offset and channels) ·" in first_line()
     state = before
     words = ("paused", "open", "open", "closed", "in safe mode")  # a second `pause` finds the loop open already

@@ -61,13 +61,15 @@ def named(loop: Bench, name: str) -> list[dict[str, object]]:
     return [event.details for _, event in loop.events if event.name == name]
 
 
-def rms_nm(loop: Bench, frames: int) -> tuple[float, float]:
+def mean_squares_nm2(loop: Bench, name: str, frames: int) -> Array:
+    """Mean square (modes,) of the true `residual_nm` or `disturbance_nm` over the last frames."""
+    return np.mean(np.square([getattr(truth.continuous, name) for truth in loop.truths[-frames:]]), axis=0)
+
+
+def rms_nm(loop: Bench, frames: int) -> tuple[float, ...]:
     """True residual and disturbance over the last frames, nm rms."""
-    truths = [truth.continuous for truth in loop.truths[-frames:]]
-    return tuple(
-        float(np.sqrt(np.mean([np.sum(np.square(modes_nm)) for modes_nm in values])))
-        for values in ([truth.residual_nm for truth in truths], [truth.disturbance_nm for truth in truths])
-    )
+    names = ("residual_nm", "disturbance_nm")
+    return tuple(float(np.sqrt(mean_squares_nm2(loop, name, frames).sum())) for name in names)
 
 
 def gains(loop: Bench) -> Single:
@@ -189,10 +191,8 @@ def _contrast_over_open_loop(magnitude: float, seed: int, frames: int) -> float:
     form = np.diag(factory.contrast_of(loop.config).form)
     loop.run(frames - frames // 2, record=False)
     loop.run(frames // 2)
-    truths = [truth.continuous for truth in loop.truths]
     residual, disturbance = (
-        form @ np.mean(np.square(values), axis=0)
-        for values in ([truth.residual_nm for truth in truths], [truth.disturbance_nm for truth in truths])
+        form @ mean_squares_nm2(loop, name, frames // 2) for name in ("residual_nm", "disturbance_nm")
     )
     return float(residual / disturbance)
 
@@ -249,8 +249,7 @@ def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:
     form = np.diag(factory.contrast_of(loop.config).form)
 
     def true(name: str, frames: int) -> float:
-        truths = [getattr(truth.continuous, name) for truth in loop.truths[-frames:]]
-        return float(form @ np.mean(np.square(truths), axis=0))
+        return float(form @ mean_squares_nm2(loop, name, frames))
 
     assert loop.watch.added_contrast() is None
     loop.run(333, record=False)

@@ -123,7 +123,8 @@ def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
     again = thin((small,), small.with_name("again.mcap"), selection(4, ["lowfc/camera/*"]))
     expected = Selection(20, frozenset({MIRROR_STATE, SURFACE, TIMING, TRUTH}))
     assert again["selection"] == expected.description
-    assert Selection.of(survey(path := Path(again["file"]))["metadata"]) == expected
+    path = Path(again["file"])
+    assert Selection.of(survey(path)["metadata"]) == expected
     assert len(on(list(LogReader(path)), FRAME)) == FRAMES // 20
     with pytest.raises(DataFileError, match="already exists"):
         thin((whole,), small, Selection(2))

@@ -277,7 +277,6 @@ def test_a_frozen_process_does_not_block_the_recorder(bench: Bench, monkeypatch:
 def test_each_log_of_a_run_can_be_read_alone(bench: Bench) -> None:
     calibrations, frames = bench.controller.publisher(CALIBRATION), bench.camera.publisher(FRAME)
     put(calibrations, 1)
-
     lost = ("recorder", CALIBRATION.key, 1)
     bench.hub.lose = lambda role, key, envelope: (role, key, count_of(envelope.sequence)) == lost
     bench.start(

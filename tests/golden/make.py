@@ -190,7 +190,7 @@ def main(folder: Path) -> None:
     loop.stop()
     loop.channel("dark-hole")
     loop.offset()
-    night.frames.put(b"", sequence=night.frames.last[1].sequence + 2 if night.frames.last else 1)  # one is missing
+    night.frames.put(b"", sequence=night.frames.last[1].sequence + 2)  # unreadable; the one before it is missing
     night.expose(1, lambda pixels: pixels[:3])  # of the wrong size
     night.expose(1, lambda pixels: np.full_like(pixels, 100))  # dark
     night.expose(1, lambda pixels: np.full_like(pixels, 65_535))  # saturated

@@ -99,13 +99,12 @@ def main() -> int:
         counts = shares(all_targets, options.inputs)
         results = []
         for target in all_targets:
-            results.append(fuzz(target, range(options.first, options.first + counts[target.name])))
-            found = results[-1]
-            line = f"{found['name']:20} {found['inputs']:8} inputs, {found['refused']:8} refused, "
-            line += (
+            found = fuzz(target, range(options.first, options.first + counts[target.name]))
+            results.append(found)
+            sys.stderr.write(
+                f"{found['name']:20} {found['inputs']:8} inputs, {found['refused']:8} refused, "
                 f"{len(found['crashes'])} crashes, {len(found['hangs'])} hangs, {found['grown_bytes'] / 1e6:.0f} MB\n"
             )
-            sys.stderr.write(line)
     if options.json:
         sys.stdout.write(json.dumps({"targets": results, "seconds": round(time.monotonic() - begun_s, 1)}) + "\n")
     for found in results:

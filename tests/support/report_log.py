@@ -58,7 +58,7 @@ class SyntheticLog:
         """Start a loop with `changes` to its settings."""
         self.samples: list[Sample] = []
         self.truth = truth
-        self.instants = 0  # of a period, in each truth; if not 0, its continuous modes are twice the sampled ones
+        self.instants = 0  # of each truth; unless 0, its continuous modes are twice the sampled ones
         self.now_ns = START * 10**9
         self.calibration = calibration
         self.settings = settings(**({"gain": (0.4, 0.2)} | changes))
