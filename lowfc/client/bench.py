@@ -22,5 +22,5 @@ def bench_message(name: str, value: Value, time_ns: int) -> bytes:
             f"a bench value's name begins with a letter and has up to 64 of A-Z, a-z, 0-9, _ and -, got {brief(name)}"
         )
     with raised_as(ConfigurationError, (BadMessageError, *ARGUMENT_ERRORS), f"bench value {name}"):
-        plain = value.item() if isinstance(value, np.generic) else value  # numpy's `True` is true, not 1
+        plain = value.item() if isinstance(value, np.generic) else value  # numpy's True becomes Python's, not 1
         return encode_bench_value(plain, time_ns)

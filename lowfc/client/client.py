@@ -89,8 +89,8 @@ class Client:
     def __init__(self, run: str | None = None, *, bus: Bus | None = None) -> None:
         """Join a run.
 
-        None selects the only run on this host. With a `bus`, which `disconnect` does not close, `run` only names it in
-        messages.
+        None selects the only run on this host. With a `bus`, `run` is only a name in messages, and `disconnect` does
+        not close the bus.
 
         Raises:
             BusError: there is no such run, none at all, or more than one to choose from.
@@ -120,7 +120,7 @@ class Client:
         """Leave the run; the loop continues unchanged."""
         if self._own_bus is not None:
             self._own_bus.close()
-            self._bench.clear()  # zenoh's publishers raise an error of their own
+            self._bench.clear()  # so that `bench` raises BusError: publishers of a closed bus raise zenoh's error
 
     status = _plain("status")
     open_loop = _plain("open")
@@ -233,8 +233,8 @@ class Client:
     def held(self, purpose: str, hold_s: float) -> Iterator[None]:
         """Hold the loop for at most `hold_s` while something on the bench moves; a closed loop then resumes.
 
-        The hold is a reservation of its own: it is refused within `reserved`, where `pause` and `close_loop` take its
-        place, and until its end this client's requests that would change the loop are refused as well.
+        Until the end of the hold, requests that would change the loop are refused, also those of this client. Within
+        `reserved` a hold is refused: use `pause` and `close_loop` there.
         """
         identity = new_identity()
         self.permit(purpose, hold_s, identity)
@@ -270,10 +270,11 @@ class Client:
 
     def calibration(self) -> Calibration:
         """The calibration in use; BusError if there is none, or the answer is not a calibration."""
+        # Without one in use, the last published one may be one that was refused.
         if not self._get_message(CONTROLLER_STATE, wire.ControllerState, Role.CONTROLLER).calibration_id:
             remedy = "`lowfc ctl load FILE` loads one, `lowfc commission` measures one"
             raise BusError(f"no calibration is loaded in run {self.run_id!r}: {remedy}")
-        sample = self._get(CALIBRATION.key, b"", ANSWER_S)  # with none in use it may be one that was refused
+        sample = self._get(CALIBRATION.key, b"", ANSWER_S)
         with raised_as(BusError, (DecodeError, ValueError), f"the answer to {CALIBRATION.key} is not a calibration"):
             return decode_calibration(wire.Calibration.FromString(sample.payload))
 

@@ -23,19 +23,21 @@ def the_run(name: str | None) -> str:
         DataFileError: the run's directory is damaged.
     """
     runs = live_runs(name)
+    if name is None:
+        if not runs:
+            raise BusError("; ".join(filter(None, (no_loop_message(), _silent_routers(None)))))
+        if len(runs) > 1:
+            raise BusError(f"choose a run with --run, the beginning of its name is enough: there are {_listed(runs)}")
+        return next(iter(runs))
     if name in runs:
         return name
-    matching = [] if name and (runtime_base() / name).is_dir() else [run for run in runs if run.startswith(name or "")]
+    matching = [] if name in _stored() else [run for run in runs if run.startswith(name)]
     if len(matching) == 1:
         return matching[0]
-    if silent := _silent_routers(name) if name or not runs else "":
-        raise BusError(
-            f"{silent}: is it running, and can this host reach it?" if name else f"{no_loop_message()}; {silent}"
-        )
+    if silent := _silent_routers(name):
+        raise BusError(f"{silent}: is it running, and can this host reach it?")
     if not runs:
-        raise BusError(no_loop_message() if name is None else f"there is no run {name!r}: {no_loop_message()}")
-    if name is None:
-        raise BusError(f"choose a run with --run, the beginning of its name is enough: there are {_listed(runs)}")
+        raise BusError(f"there is no run {name!r}: {no_loop_message()}")
     if matching:
         raise BusError(f"{name!r} is the beginning of several runs' names: {', '.join(matching)}")
     raise BusError(

@@ -359,6 +359,8 @@ def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., 
         the_run("day")
     with pytest.raises(BusError, match=r"noon \(did you mean 'night'\?\)$"):
         the_run("ngiht")
+    with pytest.raises(BusError, match="there is no run 'nnn"):
+        the_run("n" * 300)  # longer than any file's name
     open_run("noo")  # which is stopped: the request is not for another run
     with pytest.raises(BusError, match="there is no run 'noo'"):
         the_run("noo")
