@@ -1,7 +1,7 @@
 """Interface of the message bus: publish, subscribe, answer, query.
 
 `ZenohBus` carries messages between processes, `MemoryBus` within one process, for tests. Handlers run on receive
-threads: a slow handler delays the next message of the same publisher, and may run for another publisher meanwhile.
+threads: a slow handler delays the next message of the same publisher, and may be called for another one meanwhile.
 """
 
 import sys
@@ -58,8 +58,8 @@ class Publisher(Protocol):
     """Publishes one topic under one key.
 
     Attributes:
-        published: count of the next message: that of the messages so far plus `skipped`.
-        skipped: number of counts for which no message was published, as the camera lost the frame.
+        published: count of the next message: the number of messages so far plus `skipped`.
+        skipped: number of counts without a message, because the camera lost the frame.
         handed_ns: time at which the last message was handed to the direct link, otherwise to the bus, host clock.
     """
 

@@ -95,9 +95,9 @@ class DirectReader:
 
     A copy is recognised by its envelope; the sequence alone is not enough, as two publishers may have started in the
     same second. The reader leaves the bus while the only publisher of a topic uses the socket; messages that arrive
-    over the bus after a newer one from the socket are dropped as late. The socket keeps the publisher's order: a
-    message out of order is forwarded, and so, without the bus, is a repetition of the newest. On a topic with several
-    publishers the reader stays on the bus, and a message that only the bus carried may follow a newer one.
+    over the bus after a newer one from the socket are dropped as late. Those from the socket are in the publisher's
+    order, and forwarded even if their sequences are not; once off the bus, the newest is forwarded again if repeated.
+    On a topic with several publishers the reader stays on the bus, and one that only the bus carried may be late.
     """
 
     def __init__(
@@ -227,21 +227,16 @@ class DirectReader:
                 serving.start()
 
     def _serve(self, connection: socket.socket) -> None:
-        with connection:
-            self._receive(connection)
-        self.writer_gone()
-
-    def _receive(self, connection: socket.socket) -> None:
+        """Receive from a writer until it disconnects."""
         buffer = memoryview(bytearray(2 * _BUFFER_BYTES))
-        while not self._closed:
-            try:
+        with connection, contextlib.suppress(OSError):
+            while not self._closed:
                 size = connection.recv_into(buffer)
-            except OSError:
-                return
-            if not size:
-                return
-            now_ns = self.now_ns()
-            self.take(bytes(buffer[: min(size, _ENVELOPE_BYTES)]), bytes(buffer[_ENVELOPE_BYTES:size]), now_ns)
+                if not size:
+                    break
+                now_ns = self.now_ns()
+                self.take(bytes(buffer[: min(size, _ENVELOPE_BYTES)]), bytes(buffer[_ENVELOPE_BYTES:size]), now_ns)
+        self.writer_gone()
 
 
 def _shut_down(end: socket.socket) -> None:

@@ -18,7 +18,7 @@ class Dispatch(Arrivals):
     """Passes messages to a handler in their order of arrival and identifies superseded ones.
 
     Messages queue while the process stands still. A queued message is superseded if it is at least a period old when
-    dispatched, and any message at 5 ms or three periods, whichever is longer. So that a slow handler cannot fall
+    received, and any message at 5 ms or three periods, whichever is longer. So that a slow handler cannot fall
     further and further behind, messages that still wait after `MAX_IN_A_ROW` back to back are skipped.
     """
 
@@ -52,7 +52,7 @@ class Dispatch(Arrivals):
 
     @property
     def skipped(self) -> int:
-        """Number of skipped messages: superseded, or queued behind too many others."""
+        """Number of skipped messages: superseded ones without a handler, or queued behind too many others."""
         return self._skipped
 
     def put(self, sample: Sample) -> None:

@@ -48,12 +48,11 @@ def read_certificate(authority: Path, certificate: Path, key: Path, *, server: b
             with contextlib.suppress(ssl.SSLWantReadError):
                 side.do_handshake()
         verifying = sides[1] if server else sides[0]
-        own: dict[str, Any] = {**(verifying.getpeercert() or {})}
+        own: Any = verifying.getpeercert() or {}
         name = dict(pair for part in own["subject"] for pair in part)["commonName"]
-        authorities: list[dict[str, Any]] = verifier.get_ca_certs()
-        last_s, authority_last_s = (
-            min(ssl.cert_time_to_seconds(issued["notAfter"]) for issued in each) for each in ([own], authorities)
-        )
+        authorities: Any = verifier.get_ca_certs()
+        last_s = ssl.cert_time_to_seconds(own["notAfter"])
+        authority_last_s = min(ssl.cert_time_to_seconds(each["notAfter"]) for each in authorities)
     except (OSError, KeyError, ValueError) as fault:  # ssl.SSLError is an OSError
         why = getattr(fault, "verify_message", "") or getattr(fault, "reason", "") or getattr(fault, "strerror", "")
         raise DataFileError(

@@ -111,7 +111,7 @@ class Links:
             claimed = max(start_s, int(last) + 1) if last.isdecimal() else start_s
             claimed = claimed if claimed <= _LATEST_START_S else start_s
             file.truncate(0)
-            file.write(str(claimed))  # the file is empty now
+            file.write(str(claimed))
             return claimed
         return start_s
 
@@ -273,7 +273,7 @@ def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], netw
     """Create the directory under another name and rename it; a later process uses the first one's directory."""
     # Monitors connect and do not listen: there may be several, and no other process connects to them.
     roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, *listeners]
-    taken = set[int]()  # by other runs: a killed one would seem to run again, and one not yet started could not listen
+    taken = set[int]()  # by other runs: on their ports a killed one would seem live, and a new one could not listen
     for other in path.parent.glob(f"*/{_LINKS}"):
         with contextlib.suppress(DataFileError):
             taken |= set(_read(other.parent).ports.values())
@@ -313,9 +313,9 @@ def _read(path: Path) -> Links:
 def free_ports(count: int, taken: AbstractSet[int] = frozenset()) -> list[int]:
     """Return free loopback TCP ports below the host's ephemeral range and not in `taken`; BusError if too few are free.
 
-    If that range begins at 15000 or below, the ports are in it. Otherwise it is avoided: an outgoing connection could
-    take an ephemeral port before its role listens, and a connection that is retried to one without a listener could
-    be given the same port on its own side, and connect to itself.
+    An outgoing connection could take an ephemeral port before its role listens; and a connection that is retried to
+    such a port without a listener could get the same port on its own side, and connect to itself. If the ephemeral
+    range begins at 15000 or below, the ports are in it all the same.
     """
     candidates = sorted({*range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))} - taken)
     chooser = random.SystemRandom()

@@ -188,8 +188,8 @@ class ZenohBus:
         except zenoh.ZError as fault:
             what = f"{role} of run {links.run_id!r} cannot join"
             if role in {*links.ports, ROUTER}:
-                address = links.network.listen or links.network.router if role == ROUTER else ""
-                address = address or f"127.0.0.1:{links.ports.get(role)}"
+                own_port = f"127.0.0.1:{links.ports.get(role)}"
+                address = own_port if role != ROUTER else links.network.listen or links.network.router
                 advice = "is one running already? Stop that process, or start another run"
                 what = f"{role} of run {links.run_id!r} cannot listen on {address}; {advice}"
             raise BusError(f"{what} ({plain(fault)})") from None
