@@ -93,7 +93,7 @@ class Child:
 
 @contextlib.contextmanager
 def interrupt_blocked() -> Iterator[None]:
-    """Block Ctrl-C until the end of the context, and for good in the processes started in it, from their first line."""
+    """Block Ctrl-C until the end of the context; processes started in it never receive it."""
     resource_tracker.ensure_running()  # its start unblocks Ctrl-C
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -19,7 +19,7 @@ import psutil
 CPUS = "sys/devices/system/cpu"
 _STA_UNSYNC, _STA_NANO, _TIME_ERROR = 0x40, 0x2000, 5
 _STAT = Path("/proc/stat")
-_MAX_READ_BYTES = 1 << 14  # of a file; of /proc/stat, beyond the beginning of the processor's line
+_MAX_READ_BYTES = 1 << 14  # of a file; of /proc/stat, after the beginning of the processor's line
 
 
 class Synchronisation(NamedTuple):

@@ -3,7 +3,6 @@
 import contextlib
 import time
 from collections.abc import Callable, Iterator
-from math import inf
 
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, ProgressColumn, TaskID, TextColumn, TimeRemainingColumn
@@ -51,7 +50,7 @@ def reading_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
 def progress_lines(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Counted:
     """Progress without a terminal: a line every 10 s with the estimated remaining time; `clock` is in seconds."""
     first = last = -1
-    begun = written = -inf
+    begun = written = 0.0
 
     def count(what: str, done: int, total: int) -> None:
         nonlocal first, last, begun, written

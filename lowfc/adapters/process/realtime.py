@@ -98,7 +98,8 @@ def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int
         cpus: available processors.
         simulated: whether the camera computes its frames.
     """
-    camera, *others = cpus = sorted(cpus)
+    cpus = sorted(cpus)
+    camera, *others = cpus
     if not others:
         return {}
     controller, *others = others
@@ -185,7 +186,7 @@ def _disable_cpu_idle() -> None:
 
 
 def _lock_memory() -> None:
-    """Lock present pages, other pages once touched, and all pages of mapped files now, as reading them is slow.
+    """Lock present pages and all pages of mapped files now, as reading them is slow; other pages once touched.
 
     Locking all reserved memory would allocate it: most of it is buffers and thread stacks that BLAS does not use.
     Under a memory-lock limit nothing is locked, as later allocations would fail.

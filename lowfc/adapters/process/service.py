@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from math import inf
 from types import FrameType
 from typing import Literal
 
@@ -96,8 +97,8 @@ class Service:
         self._host = platform.node()
         self.fill = fill
         self.announces = announces
-        self.awaited: Callable[[], str] = str
-        self._check_waiting_ns: int | None = None
+        self.awaited: Callable[[], str] = lambda: ""
+        self._check_waiting_ns: float = inf
         self._state: ProcessState = "starting"
         self._fault: Exception | None = None
         self._names = Names()
@@ -201,13 +202,14 @@ class Service:
 
     @state.setter
     def state(self, state: ProcessState) -> None:
-        if state == "ready" and self._state == "starting" and self._at_ready is not None:
+        was_starting = self._state == "starting"
+        if state == "ready" and was_starting and self._at_ready is not None:
             self._granted = replace(self._granted, granted=self._granted.granted + self._at_ready().granted)
         self._state = state
         self._send_health(self.clock.host_ns())
         if state in ("ready", "running"):
             self._supervisor.ready()
-            if self._check_waiting_ns is None:
+            if was_starting:
                 self._check_waiting_ns = self.clock.host_ns() + WAITING_NS
                 self._announce("ready")
         elif state in ("stopping", "stopped"):
@@ -221,8 +223,8 @@ class Service:
         now_ns = self.clock.host_ns()
         if alive:
             self._supervisor.alive(now_ns)
-        if self._check_waiting_ns is not None and 0 < self._check_waiting_ns <= now_ns:
-            self._check_waiting_ns = 0
+        if self._check_waiting_ns <= now_ns:
+            self._check_waiting_ns = inf
             if awaited := self.awaited():
                 self._announce(f"waiting for {awaited}")
         if now_ns >= self._due_ns:

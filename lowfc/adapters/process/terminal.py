@@ -106,7 +106,7 @@ def _prepare_process() -> None:
     if os.path.expanduser("~") == "~":  # noqa: PTH111  # Path.home, and astropy with it, would raise RuntimeError
         os.environ["HOME"] = "/"
     for name, flags, mode in (("stdin", os.O_RDONLY, "r"), ("stdout", os.O_RDONLY, "w"), ("stderr", os.O_WRONLY, "w")):
-        if getattr(sys, name) is None:  # closed by the caller: input is empty, and a result cannot be written
+        if getattr(sys, name) is None:  # closed by the caller: input is empty, and writing a result fails
             setattr(sys, name, os.fdopen(os.open(os.devnull, flags), mode))
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # as stderr, for a terminal without UTF-8

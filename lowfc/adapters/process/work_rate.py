@@ -22,10 +22,10 @@ class WorkRate:
     def update(self, now_ns: int, work: int) -> float:
         """Rate, Hz, of the work that has reached this count now; call it repeatedly."""
         if work != self._last[1]:
-            begun = [self._known[0]]
-            begun += [it for it in (*self._known, self._last) if work - it[1] >= UNITS and now_ns - it[0] >= WINDOW_NS]
-            since_ns, done = begun[-1]
-            if not self._rate_hz:
+            past = (*self._known, self._last)
+            usable = [it for it in past if work - it[1] >= UNITS and now_ns - it[0] >= WINDOW_NS]
+            since_ns, done = usable[-1] if usable else self._known[0]
+            if not self._rate_hz:  # after a silence, measure from now on
                 self._known.clear()
             self._rate_hz = (work - done) * 1e9 / max(now_ns - since_ns, 1)
             self._known.append((now_ns, work))

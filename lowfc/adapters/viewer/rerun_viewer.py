@@ -136,7 +136,7 @@ class RerunViewer:
         return self._child.process is not None and self._child.status is None
 
     def answers(self, timeout_s: float = 1.0) -> bool:
-        """Whether its server answers a new connection; a hanging one does not, although the kernel accepts it."""
+        """Whether its server answers on a new connection, which the kernel accepts even for a hanging viewer."""
         try:
             with socket.create_connection((HOST, self.port), timeout_s) as link:
                 link.settimeout(timeout_s)
@@ -232,11 +232,9 @@ class RerunViewer:
     def _draws(self) -> bool:
         """Whether the viewer itself is up: without a graphics driver its server alone runs for a moment."""
         try:
-            return self.answers() and bool(
-                self._ask(lambda client: client.take_screenshot(max_size=16))
-                if self.show is Show.HEADLESS
-                else self.state()
-            )
+            if self.show is Show.HEADLESS:
+                return self.answers() and bool(self._ask(lambda client: client.take_screenshot(max_size=16)))
+            return self.answers() and bool(self.state())
         except ViewerError:
             return False
 
