@@ -37,7 +37,7 @@ from lowfc.optics.twin.twin_mirror import TwinMirror, poke_wavefronts_nm
 Progress = Callable[[int, int], None]
 
 _log = logging.getLogger(__name__)
-_SHARED = ("bias_dn", "gain_e_per_dn", "em_gain", "read_noise_e")
+_SHARED = ("bias_dn", "gain_e_per_dn", "em_gain", "read_noise_e")  # by Detector and CameraSettings
 _TWINS = {spec.nodes: spec for spec in (FAST, ACCURATE)}
 
 
@@ -66,13 +66,13 @@ def twin(config: Configuration, progress: Progress | None, warn: Callable[[str],
 
 
 def contrast_of(config: Configuration) -> ModalContrast:
-    """Contrast that the modes add in the dark zone; takes 0.1 s, 0.5 s with a Lyot stop; cached if no file is read."""
+    """Contrast that the modes add in the dark zone; 0.1 s (Lyot stop: 0.5 s), cached unless the pupil is a file."""
     key = config.sensor, config.noll, config.star.wavelength_nm
     return _contrast_of(*key) if config.sensor.pupil.endswith(".npz") else _cached_contrast_of(*key)  # files change
 
 
 def known_contrast(config: Configuration | None) -> ModalContrast | None:
-    """`contrast_of` a log or another process's loop; None, with a warning, if the file of its pupil is not here."""
+    """`contrast_of` the configuration of a log or running loop; None without one, or with a warning if it fails."""
     try:
         return None if config is None else contrast_of(config)
     except LowfcError as error:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -69,10 +69,10 @@ _CAMERA_SETTINGS = ("period_ns", "exposure_ns", "gain_e_per_dn", "bias_dn", "rea
 _DECODED = {STEP, TRUTH, MIRROR_STATE, TIMING, CALIBRATION, CONTROLLER_STATE, CAMERA_STATE, REQUEST, HEALTH, EVENT}
 
 
-_SEQUENCES, _INTEGERS, _SINGLE = (
-    cast("Callable[[], Any]", partial(np.zeros, 0, kind)) for kind in (np.uint64, np.int64, np.float32)
-)
-_NO_GRID = cast("Callable[[], Any]", partial(np.zeros, (0, 0), np.float32))
+_SEQUENCES: Callable[[], Any] = partial(np.zeros, 0, np.uint64)
+_INTEGERS: Callable[[], Any] = partial(np.zeros, 0, np.int64)
+_SINGLE: Callable[[], Any] = partial(np.zeros, 0, np.float32)
+_NO_GRID: Callable[[], Any] = partial(np.zeros, (0, 0), np.float32)
 
 
 @dataclass(slots=True)
@@ -105,8 +105,9 @@ class History:
         remarks: sentences on parts of the configuration that this version cannot use, and on the calibration if its
             message is lost; each names the log.
         calibration: the last one; if its message is lost, the attached one, if a controller reported to use it.
-        controllers, camera: states of the controllers, in order; state of the camera in most steps under `calibration`,
-            in closed loop if there are any. `under_camera`: whether each step (steps,) has its settings.
+        controllers: states of the controllers, in order.
+        camera: state of the camera in most steps under `calibration`, of those in closed loop if there are any.
+        under_camera: whether each step (steps,) has the settings of `camera`.
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
         command_publish_ns: publish time of every mirror command in the log.
         stepped_sequence: frame sequence of every step in the log, also of those that `steps` leaves out.
@@ -117,8 +118,8 @@ class History:
         requests: operators' requests, with the answers.
         events: (log time in ns, message) of each event.
         health: last Health of each process, by name.
-        commands_late: commands that the camera counted as late from its first Health in the log to its last,
-            restarts included; None with fewer than two.
+        commands_late: commands that the camera counted as late between its first and last Health in the log, restarts
+            included; None if it sent fewer than two.
         counts: number of messages, by topic key.
         published: calibrations, laws and played tables, by identity.
         span_ns: log times of the first message that is not retained, and of the last message; (0, 0) without one.

@@ -30,7 +30,7 @@ class _Tally:
         duplicates: number of those recorded that were duplicates.
         never_sent: frames that a camera lost and never sent, according to its Health, less `lost_before`.
         lost_before: frames that it had lost at its first Health, assumed to precede the first message; None until then.
-        unconfirmed: number lost at the last call of `newly_lost`.
+        last_lost: `lost` at the last call of `newly_lost`.
         flushed: `recorded` and `duplicates` at the last flush.
         reported: number reported as lost by `newly_lost`.
     """
@@ -41,7 +41,7 @@ class _Tally:
     duplicates: int = 0
     never_sent: int = 0
     lost_before: int | None = None
-    unconfirmed: int = 0
+    last_lost: int = 0
     flushed: tuple[int, int] = (0, 0)
     reported: int = 0
 
@@ -55,7 +55,7 @@ class _Tally:
 
         The camera reports frames that it never sent in its next Health, after the gap in their sequences.
         """
-        return min(self.lost, self.unconfirmed) if self.never_sent else self.lost
+        return min(self.lost, self.last_lost) if self.never_sent else self.lost
 
     @property
     def sent(self) -> int:
@@ -141,11 +141,11 @@ class LossAccount:
         return +self._sum(lambda tally: tally.lost)
 
     def newly_lost(self) -> dict[str, int]:
-        """Number of messages lost since the last call, by key; one that arrives after all offsets a later loss."""
+        """Number of messages lost since the last call, by key; one that still arrives offsets a later loss."""
         lost = +self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():
             tally.reported = max(tally.reported, tally.confirmed)
-            tally.unconfirmed = tally.lost
+            tally.last_lost = tally.lost
         return lost
 
     def _tally(self, key: str, author: str, start_s: int, first: int) -> _Tally:

@@ -107,7 +107,7 @@ def selection(interval_frames: int = 1, patterns: Iterable[str] = ()) -> Selecti
         ConfigurationError: a pattern matches no topic.
     """
     chosen: set[Topic] = set()
-    for pattern in (given.removeprefix("/") for given in patterns):
+    for pattern in (text.removeprefix("/") for text in patterns):
         name = (pattern.split("/")[2:3] or [""])[0]  # the place of a mirror's name, as in lowfc/mirror/dm/*
         matching = {topic for topic in TOPICS if topic.matches(pattern) or fnmatchcase(topic.at(name), pattern)}
         if not matching:
