@@ -143,6 +143,14 @@ def test_a_full_disk_or_a_closed_stream_is_one_line(words: str, output: str, sta
     assert (done.returncode, done.stderr) == (status, error)
 
 
+@pytest.mark.parametrize("fault", ["EDQUOT", "EFBIG"])
+def test_a_used_up_quota_is_one_line(fault: str) -> None:
+    raising = f"def app():\n    raise OSError(errno.{fault}, 'no room')\n"
+    code = f"import errno\nfrom lowfc.adapters.process.terminal import run_app\n{raising}run_app(app)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (2, "error: standard output cannot be written: no room\n")
+
+
 @pytest.mark.parametrize("words", ["main config show", "sim_camera --help", "sim_dm --help"])
 def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path, words: str) -> None:
     entry, *options = words.split()
