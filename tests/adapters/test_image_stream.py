@@ -283,7 +283,7 @@ def test_the_first_existing_folder_is_used_and_a_name_that_is_no_file_name_is_re
     assert stream_path("dm00disp03") == tmp_path / "dm00disp03.im.shm"
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path / "none"))
     assert stream_path("dm00disp03").parent in (Path("/milk/shm"), Path("/tmp"))  # noqa: S108
-    for name in ("", "../shm", "a" * 80):
+    for name in ("", "../shm", "a" * 80, "ä" * 40):  # the header has 80 bytes, with a NUL
         with pytest.raises(StreamError, match="a stream's name"):
             stream_path(name)
 

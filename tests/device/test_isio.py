@@ -419,7 +419,7 @@ def test_the_stroke_limit_applies_to_the_sum_of_channels() -> None:
 def test_a_prefix_that_gives_an_invalid_stream_name_is_refused_at_the_start(folder: Path) -> None:
     bus, clock = MemoryBus(MemoryHub(), "operator", FakeClock()), FakeClock()
     for prefix in ("a/b", "x" * 72):
-        with pytest.raises(StreamError, match="a stream's name has 1 to 79 characters without '/'"):
+        with pytest.raises(StreamError, match="a stream's name has 1 to 79 bytes without '/'"):
             bridge.StepStreams(bus, clock, prefix)
     assert list(folder.iterdir()) == []
 

@@ -30,7 +30,7 @@ from lowfc.contract.errors import LowfcError
 SEMAPHORES = 10
 """Number of semaphores of a stream created here; this and the numbers below are those of the C library."""
 TRACES = 10
-_MAX_NAME_LENGTH = 79
+_MAX_NAME_BYTES = 79
 _MODE = 0o666
 _NS = 1_000_000_000
 
@@ -45,8 +45,8 @@ class StreamAbsentError(StreamError):
 
 def stream_path(name: str) -> Path:
     """File of a stream in the first existing of $MILK_SHM_DIR, /milk/shm and /tmp; StreamError for an invalid name."""
-    if not 0 < len(name) <= _MAX_NAME_LENGTH or not name.isprintable() or "/" in name:
-        limit = f"1 to {_MAX_NAME_LENGTH} characters without '/', all printable"
+    if not name.isprintable() or "/" in name or not 0 < len(name.encode()) <= _MAX_NAME_BYTES:
+        limit = f"1 to {_MAX_NAME_BYTES} bytes without '/', all printable"
         raise StreamError(f"a stream's name has {limit}; got {name!r}")
     names = (os.environ.get("MILK_SHM_DIR"), "/milk/shm", "/tmp")  # noqa: S108
     folders = (Path(folder) for folder in names if folder)
