@@ -128,7 +128,7 @@ class Bus(Protocol):
         ...
 
 
-def states(bus: Bus, topics: Iterable[Topic], timeout_s: float = 1.0) -> Iterator[tuple[Topic, Sample]]:
+def last_messages(bus: Bus, topics: Iterable[Topic], timeout_s: float = 1.0) -> Iterator[tuple[Topic, Sample]]:
     """Query the last messages of the queryable `topics` from all publishers, for a process that joins late.
 
     Health is not queried: it is published twice a second.

@@ -81,10 +81,10 @@ class LogReader:
         self._always = always
         self._sparse = sparse
         self._declared: dict[int, Channel] = {}
-        self._delivered: dict[int, tuple[str, int] | None] = {}
-        self._chunks: set[int] = set()
+        self._delivered: dict[int, tuple[str, int] | None] = {}  # key and first sequence of selected channels, by id
+        self._chunks: set[int] = set()  # identities of the intact ones
         self._last_ns: int | None = None
-        self._dated_damage = 0
+        self._dated_damage = 0  # number of `damage` with `before_ns`
         self._has_chunks = False
 
     @property

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from lowfc.adapters.bus.bus import ALL, Bus, Sample, states
+from lowfc.adapters.bus.bus import ALL, Bus, Sample, last_messages
 from lowfc.adapters.bus.names import Names
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
@@ -91,7 +91,7 @@ class FoxgloveBridge:
         self.service.state = "running"
         while self.service.running and not restarted():
             if self.service.has_newcomers():
-                for topic, sample in states(self._bus, SHOWN, _PATIENCE_S):  # published before the connection
+                for topic, sample in last_messages(self._bus, SHOWN, _PATIENCE_S):  # published before the connection
                     last = self.last_states.get(sample.key)
                     if last is None or last.sequence < sample.sequence:
                         try:

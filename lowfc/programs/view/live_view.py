@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from lowfc.adapters.bus.bus import Bus, Sample, states
+from lowfc.adapters.bus.bus import Bus, Sample, last_messages
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.writer import UNFINISHED
 from lowfc.adapters.process.clock import Clock
@@ -142,7 +142,7 @@ class LiveView:
 
         def add() -> None:
             with contextlib.suppress(BusError):  # the view has ended
-                render.add_earlier(sample for _, sample in states(self._bus, SHOWN))
+                render.add_earlier(sample for _, sample in last_messages(self._bus, SHOWN))
             if events_due:
                 render.add_earlier(earlier_events(recorder, self._clock.now_ns()))
 

@@ -3,7 +3,7 @@
 from collections import deque
 from importlib import import_module
 
-from lowfc.adapters.bus.bus import Bus, Sample, states
+from lowfc.adapters.bus.bus import Bus, Sample, last_messages
 from lowfc.adapters.process.clock import Clock
 from lowfc.contract.messages import EVENT, STEP, SURFACE, TRUTH, Role, Topic
 from lowfc.programs.view.snapshot import SHOWN, Accumulator, Snapshot
@@ -67,4 +67,4 @@ class Monitor:
 
     def _query(self) -> None:
         """Query the states published earlier."""
-        self._answers.extend(sample for _, sample in states(self._bus, SHOWN, self._patience_s))
+        self._answers.extend(sample for _, sample in last_messages(self._bus, SHOWN, self._patience_s))

@@ -5,7 +5,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus.bus import Bus, Sample, name_in, states
+from lowfc.adapters.bus.bus import Bus, Sample, last_messages, name_in
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import CAMERA_STATE, HEALTH, TOPICS, wire
 
@@ -77,7 +77,7 @@ class Peers:
         return self._store_new(answers.result())
 
     def _query_all(self) -> list[Sample]:
-        return [sample for _, sample in states(self._bus, TOPICS)]
+        return [sample for _, sample in last_messages(self._bus, TOPICS)]
 
     def _store_new(self, answers: list[Sample]) -> list[Sample]:
         new = [sample for sample in answers if self.store(sample)]
