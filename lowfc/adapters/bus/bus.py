@@ -74,7 +74,6 @@ class Publisher(Protocol):
 
         A caller that sets sequences (a replay sets those of the log) must set them in every call.
         """
-        ...
 
 
 class Ring(Protocol):
@@ -82,11 +81,9 @@ class Ring(Protocol):
 
     def drain(self) -> list[Sample]:
         """Return the messages since the last call, in order; their `receive_time_ns` is the time of this call."""
-        ...
 
     def close(self) -> None:
         """End the subscription; may be called repeatedly."""
-        ...
 
 
 class Bus(Protocol):
@@ -97,35 +94,27 @@ class Bus(Protocol):
 
     def publisher(self, topic: Topic, name: str = "") -> Publisher:
         """Make a publisher of a topic; `get` on the key of a queryable topic returns its last message."""
-        ...
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
         """Call `handler` with every message of a topic, from all or from `name`; the returned function unsubscribes."""
-        ...
 
-    def ring(self, topic: Topic, capacity: int) -> "Ring":
+    def ring(self, topic: Topic, capacity: int) -> Ring:
         """Make a ring buffer of the newest `capacity` messages, for a monitor; it costs no processing until drained."""
-        ...
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
         """Call `handler` with every query of a key expression such as "lowfc/request/*"."""
-        ...
 
     def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
         """Query a key and return the answers, none if no process answers; BusError for an invalid key or closed bus."""
-        ...
 
     def peers(self) -> int:
         """Number of other processes connected to this one."""
-        ...
 
     def restart(self) -> None:
         """Give the messages a new start time; publishers count from 0, as when a camera restarts its frame numbers."""
-        ...
 
     def close(self) -> None:
         """Leave the run."""
-        ...
 
 
 def last_messages(bus: Bus, topics: Iterable[Topic], timeout_s: float = 1.0) -> Iterator[tuple[Topic, Sample]]:
