@@ -145,8 +145,8 @@ def test_a_full_disk_or_a_closed_stream_is_one_line(words: str, output: str, sta
 
 @pytest.mark.parametrize("fault", ["EDQUOT", "EFBIG"])
 def test_a_used_up_quota_is_one_line(fault: str) -> None:
-    raising = f"def app():\n    raise OSError(errno.{fault}, 'no room')\n"
-    code = f"import errno\nfrom lowfc.adapters.process.terminal import run_app\n{raising}run_app(app)"
+    imports = "import errno; from unittest.mock import Mock; from lowfc.adapters.process.terminal import run_app"
+    code = f"{imports}; run_app(Mock(side_effect=OSError(errno.{fault}, 'no room')))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (2, "error: standard output cannot be written: no room\n")
 
