@@ -228,15 +228,11 @@ def _newest(folder: Path) -> list[Path]:
     recording, number = _recording_and_number(newest)
     parts = {number: newest}
     for path in best.values():
-        if number > 1 and _time(path) >= _time(Path(recording[-1])):
+        if number > 1 and path.name >= recording[-1].partition("Z")[0]:  # not older than the recording
             key, other = _recording_and_number(path)
             if key == recording:
                 parts[other] = path
     return [parts[part] for part in sorted(parts)]
-
-
-def _time(path: Path) -> str:
-    return path.name.partition("Z")[0]
 
 
 def _recording_and_number(path: Path) -> tuple[tuple[str, ...], int]:
