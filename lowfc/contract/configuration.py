@@ -194,7 +194,7 @@ class Realtime(Section):
     mirror_cpus: Cpus = Field(default_factory=list)
     """Processors of the mirror; empty for all."""
     recorder_cpus: Cpus = Field(default_factory=list)
-    """Processors of the recorder; empty for all. With three or more, sim-loop keeps it off the controller's."""
+    """Processors of the recorder; empty for all."""
 
 
 class Configuration(Section):
@@ -367,7 +367,7 @@ def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str
 
 
 def _nearest(key: str, known: Sequence[str]) -> str:
-    """Suffix that names the known key most similar to a wrong one, in any section, or the quotes as the fault."""
+    """Suffix of an error about an unknown key: the most similar known one of any section, or a remark on its quotes."""
     if key in known:
         return "; write it without quotes, which make it one name"
     by_name = {dotted.rpartition(".")[2]: dotted for dotted in reversed(known)}

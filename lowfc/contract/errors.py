@@ -53,7 +53,7 @@ def raised_as(
 ) -> Iterator[None]:
     """Raise the exceptions `caught` in the block as errors of this kind; their text follows `about` and a colon.
 
-    The text of an error of the system is its reason alone.
+    The text of an OSError is its reason alone, without number and path.
     """
     try:
         yield

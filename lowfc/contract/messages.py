@@ -58,7 +58,6 @@ class Topic:
         message: class of the payload.
         rate: every frame, on event, or a number of hertz.
         publishers: roles that may publish it; a router drops messages of other roles.
-        description: its description.
         subscribers: roles that receive it.
         deterministic: in lockstep two runs with the same seed write the same payload bytes.
         queryable: a late joiner can query the publisher for the last message.

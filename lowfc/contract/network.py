@@ -41,7 +41,7 @@ def _docstrings(section: type[Section]) -> Iterator[tuple[str, str]]:
         source = inspect.getsource(section)
     except (OSError, TypeError):
         return
-    # Below a condition, the indentation of a class within a class is valid.
+    # The source of a nested class is indented, which is valid below a condition.
     tree = ast.parse(f"if True:\n{source}" if source[0].isspace() else source)
     declared = next(node for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
     for statement, below in pairwise(declared.body):

@@ -24,7 +24,7 @@ class Published:
     plays: dict[str, PlayTable] = field(default_factory=dict)
 
     def store(self, topic: Topic, payload: bytes) -> None:
-        """Store a received message of `TOPICS`; an incomplete one is ignored: decoding what refers to it then fails."""
+        """Store a received message of `TOPICS`. An incomplete one is ignored, and then what refers to it is refused."""
         with contextlib.suppress(DecodeError, ValueError):
             if topic is CALIBRATION:
                 calibration = decode_calibration(wire.Calibration.FromString(payload))

@@ -32,14 +32,13 @@ def recorded(content: bytes) -> tuple[Configuration, list[str]]:
     remarks: list[str] = []
     while faults := _faults(data):
         of_keys = [detail for detail in faults if _is_of_key(data, detail)]
-        for detail in of_keys or faults:
-            consequence = _mend(data, detail) if of_keys else "used as recorded"
-            if len(remarks) < MAX_FAULTS:
-                remarks.append(f"{explain(detail)}; {consequence}")
-        if len(of_keys) > MAX_FAULTS:
-            remarks.append(f"and {len(of_keys) - MAX_FAULTS} more")
         if not of_keys:
+            remarks += [f"{explain(detail)}; used as recorded" for detail in faults]
             return _constructed(data, {str(detail["loc"][0]) for detail in faults if detail["loc"]}), remarks
+        mended = [f"{explain(detail)}; {_mend(data, detail)}" for detail in of_keys]
+        remarks += mended[:MAX_FAULTS]
+        if len(mended) > MAX_FAULTS:
+            remarks.append(f"and {len(mended) - MAX_FAULTS} more")
         if isinstance(interlocks := data.get("interlocks"), list):
             data["interlocks"] = [interlock for interlock in interlocks if interlock is not None]
     return Configuration.model_validate(data), remarks

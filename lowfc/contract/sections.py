@@ -63,7 +63,7 @@ class Gateway(Section):
 
 
 class Star(Section):
-    """The star and the telescope: Sect. 3.3."""
+    """The star and the telescope (Sect. 3.3 of the paper)."""
 
     magnitude: float = Field(2.0, ge=-2, le=20)
     """Apparent V magnitude. The zero point, 1.005e8 photons per s, m^2 and nm, does not change with the wavelength."""
@@ -85,7 +85,7 @@ class SensorSection(Section):
     pupil: str = "shaped"
     """Coronagraph: the shaped pupil; circle for a classical Lyot, prolate for an apodised one; or FILE.npz."""
     focal_mask: Literal["disk", "bowtie"] = "disk"
-    """Reflective focal-plane mask: a disk, or the bowtie of Fig. 3."""
+    """Reflective focal-plane mask: a disk, or the bowtie of the paper's Fig. 3."""
     focal_radius: float = Field(4.0, ge=1, le=10)
     """Radius of the focal-plane mask, lambda/D; at most 7 for a prolate pupil."""
     lyot_stop: float = Field(0.9, gt=0, le=1)

@@ -94,7 +94,7 @@ def command_channels_of(
 ) -> CommandChannels | None:
     """Offset, command channels and probe sequence of a state; None if it has none. `empty` has the same shapes.
 
-    The table of a probe sequence is found in `plays` by its identity; before 0.2 the state held the played rows.
+    The table of a probe sequence is found in `plays` by its identity; states from before 0.2 hold the played rows.
 
     Raises:
         ValueError: the shapes do not match, or the table is missing.
@@ -115,7 +115,7 @@ def command_channels_of(
         if not stored_play.id:
             table = floats(stored_play.table, -1, stored_play.columns or 1)
             basis = floats(stored_play.basis, -1, rows * columns)
-            played = PlayTable(stored_play.target, table, basis, np.zeros(0), 0.0, "")
+            played = PlayTable(stored_play.target, table, basis, largest=np.zeros(0), reach_nm=0.0, id="")
             play = Play(played, stored_play.first_sequence, len(table))
         elif stored_play.id not in plays:
             raise ValueError(f"the table {stored_play.id[:12]} of the probe sequence is missing")
