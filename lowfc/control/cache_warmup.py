@@ -2,7 +2,7 @@
 
 LEAD_NS = 300_000
 """Time from the warm-up to the next frame: short enough to keep the caches warm, with a margin for late wake-ups."""
-LATEST_NS = 80_000
+MIN_LEAD_NS = 80_000
 """Least time from a warm-up to the next frame: a later warm-up would delay that frame."""
 MIN_PERIOD_NS = 500_000
 """Frame period up to which there is no time for a warm-up, and no need: the caches stay warm."""
@@ -41,4 +41,4 @@ class CacheWarmup:
         if not self._pending or now_ns < self._due_ns - LEAD_NS:
             return False
         self._pending = False
-        return now_ns <= self._due_ns - LATEST_NS
+        return now_ns <= self._due_ns - MIN_LEAD_NS

@@ -2,7 +2,7 @@
 
 import pytest
 
-from lowfc.control.cache_warmup import LATEST_NS, LEAD_NS, MIN_PERIOD_NS, CacheWarmup
+from lowfc.control.cache_warmup import LEAD_NS, MIN_LEAD_NS, MIN_PERIOD_NS, CacheWarmup
 
 PERIOD_NS = 1_000_000
 START_NS = 5_000_000_000
@@ -34,7 +34,7 @@ def test_one_warm_up_before_each_frame_after_the_first() -> None:
 
 
 def test_no_warm_up_that_would_delay_the_frame() -> None:
-    late_ns = START_NS + PERIOD_NS - LATEST_NS + 1
+    late_ns = START_NS + PERIOD_NS - MIN_LEAD_NS + 1
     warmup = after(0)
     assert not warmup.due(late_ns)
     assert warmup.wait_ns(late_ns) is None

@@ -2,9 +2,9 @@
 
 The image of a flat wavefront through a pupil that is symmetric or without phase is unchanged by a rotation of 180
 degrees, so the reference image alone leaves this ambiguity. In the wrong orientation tip, tilt and other odd modes have
-the opposite sign, and without phase in the pupil all modes: a poke of an odd mode resolves it. If a reflection does not
-change the image either, as without a mask in the relay pupil, it takes pokes of tip and tilt. A circular image leaves
-the whole rotation to these pokes.
+the opposite sign, and all modes if the pupil has no phase: a poke of an odd mode shows which it is. If a reflection
+does not change the image either, as without a mask in the relay pupil, pokes of both tip and tilt are needed. If the
+image is circular, only these pokes show the rotation.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from lowfc.arrays import Array, Complex, Mask
 _ANGLES = 72
 """Number of initial rotations, spread over 180 degrees."""
 _ALIKE, _EXACT = 2.0, 0.01
-"""Ratio to the better parity's residual, and residual, below either of which the other parity is possible, too."""
+"""The other parity is possible, too, if its residual is below this multiple of the better one's or below this value."""
 _CIRCULAR = 0.05
 """Relative change by a rotation below which an image counts as circular; the samples of a circle change it by 0.01."""
 

@@ -127,7 +127,7 @@ def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Arra
 
 
 def unnormalised(reconstructor: Array, reference: Array, good: Array) -> Array:
-    """R' (modes, pixels) for H in the unit of I0 per nm: R' H = R N, with N the H normalised by `normalise_flux`."""
+    """R' (modes, pixels) with R' H = R N, where H is in the unit of I0 per nm, and N is H after `normalise_flux`."""
     flux = _flux(reference, good)
     return np.asarray((reconstructor - np.outer(reconstructor @ reference / flux, good)) / flux)
 

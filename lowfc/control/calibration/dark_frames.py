@@ -10,7 +10,7 @@ from lowfc.arrays import Array, Mask
 _SIGMAS = 8.0
 """Robust standard deviations above the median beyond which a pixel is bad; none of 6400 good pixels is that far."""
 _ROUNDING_DN = 0.6
-"""Largest noise that a pixel may have, or lack, in many frames, because its values are rounded to whole DN."""
+"""Largest noise that rounding to whole DN may add to a pixel, or remove from it, in many frames."""
 _MAX_LIGHT = 0.02
 """Largest fraction of the star's light in dark frames."""
 _TO_SIGMA = 1.4826

@@ -45,21 +45,19 @@ class Gains:
 
     def within(self, gain_error: float, crosstalk: float) -> list[bool | None]:
         """Whether gain and cross-talk at each amplitude are within these limits; None if too noisy to tell."""
-        limit = np.full(self.gain.shape[1], crosstalk)
-        limit[self.mode] = gain_error
-        departure = self.crosstalk
-        departure[:, self.mode] = self.gain[:, self.mode] - 1
-        beyond = np.abs(departure) > limit + SURE * self.error
+        own = np.arange(self.gain.shape[1]) == self.mode
+        limit = np.where(own, gain_error, crosstalk)
+        beyond = np.abs(self.gain - own) > limit + SURE * self.error
         unsure = self.error > limit / 2
         rows = zip(beyond, unsure, strict=True)
         return [False if far.any() else None if vague.any() else True for far, vague in rows]
 
 
 def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Integers, frames: int) -> Gains:
-    """Gain and cross-talk of a mode that followed the levels (levels,) of `levels`, from open-loop errors.
+    """Gain and cross-talk of a mode, from the open-loop errors (frames, modes) on a staircase of `levels` (levels,).
 
-    Errors are (frames, modes); `starts` (levels,) are the first of the `frames` frames that saw each level. A
-    standard error needs two cycles or more.
+    `starts` (levels,) are the first of the `frames` frames that saw each level. A standard error needs two cycles or
+    more.
     """
     means = np.stack([error_nm[start : start + frames].mean(axis=0) for start in starts])
     per_cycle = (means * np.sign(levels_nm)[:, None]).reshape(-1, len(_SIGNS), error_nm.shape[1]).mean(axis=1)

@@ -108,7 +108,7 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
     row = np.where((frames >= 0) & (frames < len(table)), frames, len(table))  # the padded table ends with zeros
     applied = np.zeros(row.size, np.bool_)
     applied[sequence[commanded] - first] = True
-    applied[: max(int(sequence[0]) - first, 0)] = True  # earlier commands are assumed to have been applied
+    applied[: int(sequence[0]) - first] = True  # earlier commands are assumed to have been applied
     newest = np.maximum.accumulate(np.where(applied, np.arange(row.size), 0))
     padded = np.vstack([table, np.zeros((1, table.shape[1]))])
     in_force = padded[row[newest]]

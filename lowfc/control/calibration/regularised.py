@@ -128,9 +128,8 @@ def advice(reconstruction: Reconstruction, noll: tuple[int, ...], limit_nm: Sing
         )
     worst = np.argsort(-np.abs(reconstruction.combinations[:, bad[-1]]))[:2]
     names = " and ".join(f"Z{noll[mode]}" for mode in worst)
-    # 1 if all are bad: nothing would be left.
     cut = reconstruction.singular_values[bad[0]] / reconstruction.singular_values[0]
-    drop = f", or drop them with --truncate {1.01 * cut:.3g}" if bad[0] else ""
+    drop = f", or drop them with --truncate {1.01 * cut:.3g}" if bad[0] else ""  # nothing would be left if all are bad
     return (
         f"{bad.size} combinations of modes (mostly {names}) are measured with more noise than the "
         f"{limits_nm[bad].min():g} nm of their limit: use fewer modes, lower their gains{drop}"

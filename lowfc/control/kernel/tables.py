@@ -1,4 +1,4 @@
-"""Implementations of the control step, and the arrays of a calibration in the layout of its compiled functions."""
+"""Implementations of the control step, and a calibration's arrays in the layout of the compiled functions."""
 
 from collections.abc import Callable
 from typing import Final, Literal, NamedTuple, get_args
