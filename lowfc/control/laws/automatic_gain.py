@@ -9,7 +9,7 @@ from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.virtual import VirtualIntegrators, Weights
 
 MIN_GAIN = 1e-3
-"""Lower limit of a bank's gains: the highest of its modes' margins, halved repeatedly. Row 0 has a gain of 0."""
+"""Lower limit of a bank's gains: the highest gain that keeps the margins, halved repeatedly. Row 0 has a gain of 0."""
 BLOCKS = 10
 """Blocks of a window, for the standard errors of its means."""
 CONFIDENCE = 2.0
@@ -20,8 +20,8 @@ GRANTED = 3.0
 """Standard errors of white noise by which a gain must beat the open loop in a first window, and for a mode with a gain
 of 0: on a faint star, a single gain granted because of noise may add as much contrast as the dark zone has."""
 EARLY = 5
-"""Blocks of a window after which a mode that is hardly corrected may get another gain before the window ends: a mode
-with a gain of 0 by `GRANTED`, a mode with the least gain after this many blocks in a row in favour of another gain."""
+"""Blocks of a window after which a mode may get another gain before the window ends: from a gain of 0 if the other one
+is better by `GRANTED`, from the least gain if the other one was better in this many blocks in a row."""
 LONGEST = 16
 """Largest factor by which a window grows while it decides nothing."""
 FEW = 3
@@ -109,7 +109,7 @@ class GainBank:
     def use_reconstructor(self, from_own: Array | Single) -> None:
         """Expect modes of another R from now on: `from_own` (modes, modes) times those of the calibration's own R.
 
-        The cross-talk of tilt is fitted in the latter, which do not change: an R for fewer modes mixes it into others.
+        The cross-talk of tilt is fitted in the modes of the calibration's own R: another R mixes it into other modes.
         """
         self._add_up()
         self._from_own, self._to_own = from_own, np.linalg.inv(from_own)
@@ -141,7 +141,7 @@ class GainBank:
                 self._add_up()
             return False
         self._add_up()
-        self._blocks.append(self._sums / self._frames)
+        self._excesses.append(self._excess / self._frames)
         self._powers.append(self._power / self._frames)
         self._changed.append(self._changes / max(self._changes_counted, 1))
         self._means.append(self._mean / self._frames)
@@ -153,7 +153,7 @@ class GainBank:
     @property
     def complete(self) -> bool:
         """Whether the window is complete, so that there is a verdict."""
-        return len(self._blocks) == BLOCKS
+        return len(self._excesses) == BLOCKS
 
     def early(self, gain: Single) -> Single:
         """Gains (modes,) before the window is complete.
@@ -161,7 +161,7 @@ class GainBank:
         A better one for modes with a gain of 0 or the least gain (see `EARLY`), and 0 for modes that prove to be
         cross-talk.
         """
-        if self.first or len(self._blocks) < EARLY:
+        if self.first or len(self._excesses) < EARLY:
             return gain
         now = self._row_of(gain)
         cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts[-EARLY:])
@@ -232,7 +232,7 @@ class GainBank:
         Cross-talk (modes,) is measured but not real: a loop of any gain but 0 puts it on the mirror and then no longer
         measures it.
         """
-        blocks = np.array(self._blocks, float)
+        blocks = np.array(self._excesses, float)
         blocks[:, 1:] += (2 * np.array(self._means, float) * cross_talk_nm)[:, None]
         return blocks
 
@@ -295,21 +295,21 @@ class GainBank:
         self._power += power[:, 0].sum(axis=0)
         self._mean += open_nm.sum(axis=0)
         self._spread += np.square(squares).sum(axis=0)
-        self._sums[:-1] += squares.sum(axis=0)
-        self._sums[-1] += (np.square(self._loop_nm[: self._waiting]) - power[:, 0]).sum(axis=0)
+        self._excess[:-1] += squares.sum(axis=0)
+        self._excess[-1] += (np.square(self._loop_nm[: self._waiting]) - power[:, 0]).sum(axis=0)
         self._waiting = 0
 
     def _clear(self, window: int) -> None:
         self._block = max(window // BLOCKS, 1)
         self._longest = self._block * LONGEST
         self._lists = tuple(list[Array]() for _ in range(6))
-        self._blocks, self._powers, self._changed, self._means, self._tilts, self._spreads = self._lists
+        self._excesses, self._powers, self._changed, self._means, self._tilts, self._spreads = self._lists
         self._throughout = True
         self._begin_block()
 
     def _begin_block(self) -> None:
         self._frames = self._changes_counted = self._waiting = 0
-        self._sums = np.zeros((len(self.rows) + 1, self._at_rest.kept.size))
+        self._excess = np.zeros((len(self.rows) + 1, self._at_rest.kept.size))  # less the open loop's; last: real loop
         self._spread = np.zeros((len(self.rows), self._at_rest.kept.size))
         self._power, self._changes, self._mean = np.zeros((3, self._at_rest.kept.size))
         self._tilt = np.zeros(_REGRESSORS)

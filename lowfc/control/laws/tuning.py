@@ -84,27 +84,28 @@ def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> 
         raise ValueError(f"a law is tuned from at least {FEWEST} frames in a row, the longest run has {run.longest}")
     noise_nm2 = floor_nm2_hz(coarse) * rate_hz / 2
     omega = 2 * np.pi * fine.frequency_hz[1:] / rate_hz  # an integrator without leak has no value at 0 Hz
-    gains, residual_nm2, sensed_nm2 = np.zeros(len(leak)), np.zeros(len(leak)), np.zeros(len(leak))
-    longest_nm = max(run.values, key=len)
-    for mode, mode_leak in enumerate(leak.tolist()):
-        steady_nm2 = float(longest_nm[:, mode].mean()) ** 2  # a leak leaves a fraction of it: |S| at 0 Hz
-        measured = fine.power_nm2_hz[1:, mode : mode + 1] * rate_hz / 2
+    measured, leaks = fine.power_nm2_hz[1:] * rate_hz / 2, leak.tolist()
+    means_nm = [float(max(run.values, key=len)[:, mode].mean()) for mode in range(len(leaks))]
+    gains, residual_nm2, sensed_nm2 = np.zeros((3, len(leaks)))
 
-        def law_of(gain: float, mode_leak: float = mode_leak) -> LinearLaw:
-            return integrator([gain], [mode_leak], (2,), timing.delay, rate_hz)  # the mode does not matter
+    def law_of(gain: float, mode: int) -> LinearLaw:
+        return integrator([gain], [leaks[mode]], (2,), timing.delay, rate_hz)  # its Noll index does not matter
 
-        def steady_residual_nm2(gain: float, mode_leak: float = mode_leak, steady_nm2: float = steady_nm2) -> float:
-            return steady_nm2 * (mode_leak / (mode_leak + gain)) ** 2
+    def steady_nm2(gain: float, mode: int) -> float:
+        """A leak leaves a fraction of the mean: |S| at 0 Hz."""
+        return means_nm[mode] ** 2 * (leaks[mode] / (leaks[mode] + gain)) ** 2
 
-        def residual(gain: float, measured: Array = measured, mode: int = mode, mode_leak: float = mode_leak) -> float:
-            power = residual_spectrum(law_of(gain, mode_leak), omega, measured, noise_nm2[mode : mode + 1], timing)
-            return float(power.sum()) * fine.spacing_hz * 2 / rate_hz + steady_residual_nm2(gain)
+    def residual(gain: float, mode: int) -> float:
+        own = slice(mode, mode + 1)
+        power = residual_spectrum(law_of(gain, mode), omega, measured[:, own], noise_nm2[own], timing)
+        return float(power.sum()) * fine.spacing_hz * 2 / rate_hz + steady_nm2(gain, mode)
 
-        bounds = (LOWEST_GAIN, highest_gain(timing.delay, mode_leak))
-        found = minimize_scalar(residual, bounds=bounds, method="bounded", options={"xatol": 1e-3})
+    for mode in range(len(leaks)):
+        bounds = (LOWEST_GAIN, highest_gain(timing.delay, leaks[mode]))
+        found = minimize_scalar(residual, args=(mode,), bounds=bounds, method="bounded", options={"xatol": 1e-3})
         gains[mode], residual_nm2[mode] = found.x, found.fun
-        error = np.abs(sensitivity(law_of(found.x), omega, timing.delay)) ** 2 * measured
-        sensed_nm2[mode] = error.sum() * fine.spacing_hz * 2 / rate_hz + steady_residual_nm2(found.x) - noise_nm2[mode]
+        error = np.abs(sensitivity(law_of(found.x, mode), omega, timing.delay)) ** 2 * measured[:, mode : mode + 1]
+        sensed_nm2[mode] = error.sum() * fine.spacing_hz * 2 / rate_hz + steady_nm2(found.x, mode) - noise_nm2[mode]
     rms = (np.sqrt(np.maximum(each, 0.0)) for each in (residual_nm2, sensed_nm2, noise_nm2))
     return Gains(gains, *rms)
 
