@@ -145,10 +145,10 @@ class CommandChannels(NamedTuple):
 
     def played_nm(self, sequence: int) -> Single | None:
         """The shape (rows, columns) played for a frame, nm of surface; None if none is."""
-        row = self.play.row(sequence) if self.play is not None and self.play.target == MIRROR else None
-        if row is None or self.play is None:
+        if self.play is None or self.play.target != MIRROR:
             return None
-        return (row @ self.play.table.basis).reshape(self.sum_nm.shape)
+        row = self.play.row(sequence)
+        return None if row is None else (row @ self.play.table.basis).reshape(self.sum_nm.shape)
 
     def moved(self, sequence: int, step_nm: float, to_modes: Single) -> "CommandChannels":
         """A copy for the next command: every channel moves towards its shape, all together by at most `step_nm`."""

@@ -183,7 +183,8 @@ def check_offset(loop: ActiveLoop, largest_nm: npt.NDArray[np.floating[Any]]) ->
     for mode, limit_nm, asked_nm in zip(loop.calibration.noll, loop.integrator.limit_nm, largest_nm, strict=True):
         if asked_nm > limit_nm:
             raise ValueError(f"offset of mode {mode}: at most its limit, {limit_nm:g} nm; asked for {asked_nm:g} nm")
-    if not (own := loop.calibration.actuators_to_modes).size:
+    own = loop.calibration.actuators_to_modes
+    if not own.size:
         return
     departure = np.linalg.norm(own @ loop.to_actuators - np.eye(len(own)), axis=0)
     for mode in np.array(loop.calibration.noll)[(departure > _MAX_DEPARTURE) & (largest_nm > 0)]:

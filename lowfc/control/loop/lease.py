@@ -34,8 +34,8 @@ class Lease(NamedTuple):
         id: identity in the holder's requests; above 0.
         holder: the holder and its purpose, for people.
         until_ns: end by the controller's clock, unless it is renewed.
-        last_sequence: sequence of the last frame for which it is in force, at the configured frame rate from the
-            newest frame on; its duration in frames if it was granted before the first frame; 0 if the rate is unknown.
+        last_sequence: sequence of the last frame for which it is in force, if frames come at the configured rate; its
+            duration in frames if it was granted before the first frame; 0 if the rate is unknown.
         ended: cause of its end; empty while it is in force.
         holds: whether it is a permit: a closed loop holds its command while it is in force.
     """

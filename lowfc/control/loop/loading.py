@@ -68,7 +68,7 @@ def loaded(
     if mode is LoopMode.SAFE:
         cause = LATCHED
     state = state._replace(loop=loop)
-    # A held loop stays closed.
+    # A loop that an interlock holds may stay closed.
     acting = tuple(interlock for interlock in state.conditions.acting if interlock.action is not Action.HOLD)
     if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
         mode, cause = LoopMode.IDLE, wrong
@@ -323,7 +323,8 @@ def _changed(state: State, mode: LoopMode, time_ns: int, cause: str, events: lis
     if mode is state.mode:
         return state
     events.append(mode_event(state.mode, mode, cause))
-    events += [PendingEvent("SAFED", {"why": cause})] if mode is LoopMode.SAFE else []
+    if mode is LoopMode.SAFE:
+        events.append(PendingEvent("SAFED", {"why": cause}))
     return in_mode(state, mode, time_ns, cause)
 
 

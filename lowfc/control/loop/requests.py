@@ -34,7 +34,8 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
     try:
         after, text, *events = _handler(request, lease_before)(settings, now, request)
     except ValueError as error:
-        return state._replace(), Outputs(reply=Reply(False, _short(str(error)), state.frame_sequence + 1))
+        refused = Reply(False, _short(str(error)), state.frame_sequence + 1)
+        return state._replace(), Outputs(reply=refused)  # a copy of the state, so that the request is counted
     by_another = lease_before is not None and lease_before.id != request.lease_id
     if request.name == "safe" or (request.name in ENDED_BY and by_another):
         after, lease_events = lease_ended(after, asked_by(lease_before, request))
@@ -45,11 +46,9 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
         events.append(mode_event(state.mode, after.mode, why))
         if after.mode is LoopMode.SAFE:
             events.append(PendingEvent("SAFED", {"why": why}))
-    changed = after is not state
-    reply = Reply(True, text, state.frame_sequence + 1)
-    return after if changed else state._replace(), Outputs(
-        reply=reply, events=(*expiry_events, *events), changed=changed
-    )
+    changed, reply = after is not state, Reply(True, text, state.frame_sequence + 1)
+    outputs = Outputs(reply=reply, events=(*expiry_events, *events), changed=changed)
+    return (after if changed else state._replace()), outputs
 
 
 def _handler(request: Request, lease_before: Lease | None) -> "Handler":
@@ -185,7 +184,8 @@ def _integrator(settings: Settings, state: State, request: Request) -> Handled:
 
 
 def _offset(settings: Settings, state: State, request: Request) -> Handled:
-    channels = (loop := _calibrated_loop(state)).channels_or_empty()
+    loop = _calibrated_loop(state)
+    channels = loop.channels_or_empty()
     or_zero = request if request.values else replace(request, values=(0.0,))
     values = per_mode(loop.calibration.noll, or_zero, channels.offset_nm)
     check_offset(loop, np.abs(values))

@@ -45,11 +45,11 @@ def release(settings: Settings, state: State, request: Request) -> tuple[State, 
 
 
 def counted_to_frame(settings: Settings, state: State, frame: Frame) -> State:
-    """The state with the end of its lease counted to a new frame: in periods of the configured rate, by frames' times.
+    """The state at a new frame, with its lease moved so that it loses the periods that passed since the last frame.
 
-    Only differences of their times are used, because the camera may have another clock. If the times do not increase,
-    or after a silence, during which a tick compares the clock, the frames are counted instead. At a start of the
-    camera the lease keeps its remaining periods.
+    They follow from the difference of the frames' times, because the camera may have another clock. Instead, each frame
+    counts as one period if the times do not increase, or after a silence, during which ticks compared the clock. At a
+    start of the camera the lease keeps its remaining periods.
     """
     held, frames = state.conditions.lease, frame.sequence - state.frame_sequence
     if held is None or held.ended or not (settings.rate_hz and held.same_start(state.frame_sequence)):

@@ -336,7 +336,7 @@ class State(NamedTuple):
 
     @property
     def may_command(self) -> bool:
-        """Whether commands may be sent: outside safe mode not the first to a mirror with a fault, as it might jump."""
+        """Whether commands may be sent: the first one to a mirror with a fault only in safe mode, as it might jump."""
         return self.commanded or not self.conditions.mirror_fault or self.mode is LoopMode.SAFE
 
     @property
