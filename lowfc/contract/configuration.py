@@ -7,6 +7,7 @@ names a similar known one. `lowfc config show` prints all keys with their descri
 import difflib
 import re
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -275,7 +276,7 @@ class Configuration(Section):
     @property
     def imperfections(self) -> dict[str, Any]:
         """Imperfections of the simulation that are switched on, by key."""
-        values = {key: getattr(getattr(self, key.partition(".")[0]), key.partition(".")[2]) for key in IMPERFECTIONS}
+        values = {key: attrgetter(key)(self) for key in IMPERFECTIONS}
         return {key: value for key, value in values.items() if value}
 
     @property

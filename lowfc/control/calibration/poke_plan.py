@@ -101,14 +101,12 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
     Returns:
         (exposures, columns).
     """
-    lags = len(weights) - 1
-    first = min(int(sequence[0]), 0) - lags
-    last = max(int(sequence[-1]), 0)
-    frames = np.arange(first, last + 1)
+    first = int(sequence[0]) - len(weights)
+    frames = np.arange(first, int(sequence[-1]) + 1)
     row = np.where((frames >= 0) & (frames < len(table)), frames, len(table))  # the padded table ends with zeros
     applied = np.zeros(row.size, np.bool_)
     applied[sequence[commanded] - first] = True
-    applied[: int(sequence[0]) - first] = True  # earlier commands are assumed to have been applied
+    applied[: len(weights)] = True  # earlier commands are assumed to have been applied
     newest = np.maximum.accumulate(np.where(applied, np.arange(row.size), 0))
     padded = np.vstack([table, np.zeros((1, table.shape[1]))])
     in_force = padded[row[newest]]

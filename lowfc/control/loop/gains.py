@@ -32,7 +32,7 @@ def change_integrator(settings: Settings, loop: ActiveLoop, request: Request) ->
         )
     integrator = _new_integrator(loop.integrator, loop.calibration.noll, settings.delay_frames, request)
     if request.name == "gain":  # a gain set by a person is not automatic, and R treats its mode as corrected
-        chosen = _chosen(loop, request)
+        chosen = _chosen(loop.calibration.noll, request)
         weighting = loop.weighting
         loop = loop._replace(automatic=loop.automatic & ~chosen)
         if weighting is not None and (weighting.prior_nm2[chosen] > 0).any():
@@ -45,7 +45,8 @@ def change_integrator(settings: Settings, loop: ActiveLoop, request: Request) ->
 
 def _automatic_gain(settings: Settings, loop: ActiveLoop, request: Request) -> Changed:
     """The loop after a request for automatic gains: without values it switches them on, with values it changes them."""
-    chosen, noll = _chosen(loop, request), loop.calibration.noll
+    noll = loop.calibration.noll
+    chosen = _chosen(noll, request)
     if not request.values:
         loop = loop._replace(automatic=loop.automatic | chosen).with_gains(loop.integrator)
         names = ", ".join(f"Z{index}" for index, is_chosen in zip(noll, chosen, strict=True) if is_chosen)
@@ -66,9 +67,8 @@ def _listed(values: Single) -> str:
     return " ".join(f"{value:.3g}" for value in values.tolist())
 
 
-def _chosen(loop: ActiveLoop, request: Request) -> Mask:
+def _chosen(noll: tuple[int, ...], request: Request) -> Mask:
     """The modes (modes,) of a request; ValueError if one is not controlled."""
-    noll = loop.calibration.noll
     return np.isin(noll, _modes(noll, request))
 
 
@@ -105,7 +105,7 @@ def _new_integrator(integrator: Integrator, noll: tuple[int, ...], delay_frames:
         raise ValueError(f"leak must be between 0 and 1, got {lowest if lowest < 0 else highest:g}")
     if request.name == "limit" and not (lowest >= 0 and highest <= MAX_LIMIT_NM):
         raise ValueError(f"limit must be between 0 and {MAX_LIMIT_NM:g} nm, got {lowest if lowest < 0 else highest:g}")
-    chosen = np.isin(noll, _modes(noll, request))
+    chosen = _chosen(noll, request)
     if request.name == "gain":
         check_gains(values[chosen].tolist(), integrator.leak[chosen].tolist(), delay_frames)
     if request.name == "leak":
@@ -142,7 +142,7 @@ def remark(settings: Settings, loop: ActiveLoop, request: Request) -> str:
     """Remark on the values of a request for gains or limits; usually empty."""
     lowest = min(request.values)
     if request.name == "gain":
-        chosen, integrator = _chosen(loop, request), loop.integrator
+        chosen, integrator = _chosen(loop.calibration.noll, request), loop.integrator
         for gain, leak in zip(integrator.gain[chosen].tolist(), integrator.leak[chosen].tolist(), strict=True):
             recommended = highest_gain(settings.delay_frames, leak)
             if gain > recommended:
