@@ -31,7 +31,7 @@ def recorded(content: bytes) -> tuple[Configuration, list[str]]:
         renamed_keys(data)
     remarks: list[str] = []
     while faults := _faults(data):
-        of_keys = [detail for detail in faults if _is_of_key(data, detail)]
+        of_keys = [detail for detail in faults if _is_of_key(detail)]
         if not of_keys:
             remarks += [f"{explain(detail)}; used as recorded" for detail in faults]
             return _constructed(data, {str(detail["loc"][0]) for detail in faults if detail["loc"]}), remarks
@@ -52,12 +52,9 @@ def _faults(data: dict[str, Any]) -> list[Any]:
     return []
 
 
-def _is_of_key(data: dict[str, Any], detail: Any) -> bool:
-    """Whether one key is at fault, and not a contradiction between several."""
-    if not detail["loc"]:
-        return False
-    section, *path = detail["loc"]
-    return bool(path) or detail["type"] == "extra_forbidden" or not isinstance(data.get(section), dict)
+def _is_of_key(detail: Any) -> bool:
+    """Whether one key is at fault, and not a contradiction between several, which a validator of sections reports."""
+    return len(detail["loc"]) > 1 or detail["type"] != "value_error"
 
 
 def _mend(data: dict[str, Any], detail: Any) -> str:

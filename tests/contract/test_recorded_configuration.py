@@ -48,6 +48,8 @@ def test_known_keys_are_used_and_unknown_or_invalid_ones_are_remarks() -> None:
         ("[mirror]\ndead = [1, 'x']\nrows = 33", {"mirror.rows": 33}, "mirror.dead.1 = 'x': "),
         ("[disturbance]\npreset = 'quake'\nscale = 2.0", {"disturbance.scale": 2.0}, "disturbance.preset = 'quake'"),
         ("[[control]]\ngain = 0.1", {}, "control = [{'gain': 0.1}]"),
+        ("[interlocks]\nname = 'flow'", {}, "interlocks = {'name': 'flow'}: must be a valid list"),
+        ("[seed]\nof = 'noise'", {}, "seed = {'of': 'noise'}: must be a valid integer"),
     ],
 )
 def test_an_invalid_value_is_replaced_by_the_default(toml: str, changed: dict[str, object], remark: str) -> None:
