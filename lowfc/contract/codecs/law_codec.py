@@ -92,7 +92,7 @@ def put_command_channels(message: wire.ControllerState, command_channels: Comman
 def command_channels_of(
     message: wire.ControllerState, empty: CommandChannels, to_modes: Single, plays: Mapping[str, PlayTable]
 ) -> CommandChannels | None:
-    """Offset, command channels and probe sequence of a state; None if it has none. `empty` has the same shapes.
+    """Offset, command channels and probe sequence of a state; None if it has none. `empty` gives the shapes.
 
     The table of a probe sequence is found in `plays` by its identity; states from before 0.2 hold the played rows.
 

@@ -42,7 +42,7 @@ _REGRESSORS = 5
 
 
 class Verdict(NamedTuple):
-    """Result of a window of frames; all (modes,), nm^2 of wavefront.
+    """Result of a window of frames; arrays are (modes,), powers nm^2 of wavefront.
 
     Attributes:
         gain: the gain of each mode from now on.

@@ -84,7 +84,8 @@ def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> 
         raise ValueError(f"a law is tuned from at least {FEWEST} frames in a row, the longest run has {run.longest}")
     noise_nm2 = floor_nm2_hz(coarse) * rate_hz / 2
     omega = 2 * np.pi * fine.frequency_hz[1:] / rate_hz  # an integrator without leak has no value at 0 Hz
-    measured, leaks = fine.power_nm2_hz[1:] * rate_hz / 2, leak.tolist()
+    measured = fine.power_nm2_hz[1:] * rate_hz / 2
+    leaks: list[float] = leak.tolist()
     means_nm = [float(max(run.values, key=len)[:, mode].mean()) for mode in range(len(leaks))]
     gains, residual_nm2, sensed_nm2 = np.zeros((3, len(leaks)))
 

@@ -87,7 +87,7 @@ class Acting(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """The newest value of a name, None if none was received; its age is determined from the clock before the step."""
+    """The newest value of a name, None if none was received; the process computes its age before it calls `advance`."""
 
     time_ns: int
     name: str
