@@ -203,7 +203,7 @@ class _Whittle:
         white = float(np.median(self.power[self.power.size // 2 :])) / (np.log(2) if self.segments == 1 else 1)
         low = slice(0, max(8, omega.size // 20))
         step = float(np.median(np.maximum(power[low] - white - known[low], 1e-3 * white) * omega[low] ** 2))
-        best: tuple[float, Model] | None = None
+        fits: list[tuple[float, Model]] = []
         for cutoff in (np.inf, 0.03, 0.003):  # cycles per frame to begin with
 
             def model_of(parameters: Array, cutoff: float = cutoff) -> Model:
@@ -223,10 +223,9 @@ class _Whittle:
             start = np.log([step, white] + ([cutoff] if np.isfinite(cutoff) else []))
             found = minimize(cost, start, method="Nelder-Mead", options={"maxiter": 300, "xatol": 1e-2, "fatol": 1e-2})
             price = 0.5 * len(start) * np.log(self.omega.size)
-            if best is None or found.fun + price < best[0]:
-                best = found.fun + price, model_of(found.x)
-        assert best is not None  # noqa: S101  # there was a first one
-        return replace(best[1], noise_nm2=max(best[1].noise_nm2, _MIN_NOISE * white))
+            fits.append((found.fun + price, model_of(found.x)))
+        _, best = min(fits, key=lambda fit: fit[0])
+        return replace(best, noise_nm2=max(best.noise_nm2, _MIN_NOISE * white))
 
     def another_line(self, model: Model) -> Line | None:
         """The most significant missing line; None if none is certain."""
