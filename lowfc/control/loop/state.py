@@ -203,11 +203,11 @@ class ActiveLoop(NamedTuple):
             tuple((lag, weight) for lag, weight in enumerate(weights) if weight),
             calibration.camera,
             settings.automatic(calibration.noll),
-            None,
-            None,
-            None,
-            (np.zeros(modes, np.float32),) * len(weights),
-            np.zeros(calibration.grid, np.float32),
+            weighting=None,
+            law_runner=None,
+            command_channels=None,
+            history_nm=(np.zeros(modes, np.float32),) * len(weights),
+            actuators_nm=np.zeros(calibration.grid, np.float32),
         )
         return loop.with_gains(integrator)
 
