@@ -25,7 +25,7 @@ class Action(StrEnum):
 
 IN_WORDS = {
     Action.WARN: "only a warning",
-    Action.REFUSE_CLOSE: "the loop is not closed",
+    Action.REFUSE_CLOSE: "the loop cannot be closed",
     Action.HOLD: "a closed loop holds its command",
     Action.OPEN: "the loop opens",
     Action.SAFE: "the loop goes into safe mode",
