@@ -80,7 +80,7 @@ def residual_power(law: LinearLaw, omega: Array, timing: Timing) -> Array:
 
 
 def _residual(S: Complex, omega: Array, timing: Timing) -> Array:
-    if not timing.held:  # at an instant, as an exposure sees the commands
+    if not timing.held:  # only at the starts of exposures, where S holds
         return np.asarray(np.abs(S) ** 2)
     command = _commanded(S, omega, timing.delay) * mean_over(omega, timing.exposure)[:, None]
     return np.asarray(
