@@ -9,7 +9,7 @@ from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.virtual import VirtualIntegrators, Weights
 
 MIN_GAIN = 1e-3
-"""Lower limit of a bank's gains: the highest gain that keeps the margins, halved repeatedly. Row 0 has a gain of 0."""
+"""Lower limit of a bank's gains: they are the highest gain within the margins, halved repeatedly, and 0 in row 0."""
 BLOCKS = 10
 """Blocks of a window, for the standard errors of its means."""
 CONFIDENCE = 2.0

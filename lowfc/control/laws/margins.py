@@ -121,8 +121,8 @@ def check_stable(law: LinearLaw, delay_frames: float) -> None:
         )
         for state, matrix in matrices:
             radius = float(np.abs(_poles(matrix)).max())
-            driven = part.driven and state == "closed"
-            if radius >= 1 if driven else radius > 1 + _ROUNDING:
+            unstable = radius >= 1 if part.driven and state == "closed" else radius > 1 + _ROUNDING
+            if unstable:
                 modes = ", ".join(f"Z{law.noll[mode]}" for mode in part.modes)
                 true, own = (counted(float(delay), "frame") for delay in (delay_frames, law.delay_frames))
                 raise ValueError(
