@@ -198,29 +198,29 @@ def _mirror_shape(state: wire.MirrorState) -> MirrorShape | None:
     return MirrorShape(from_timestamp(state.timestamp), surface, command_nm, state.safe)
 
 
-MAX_BYTES = 16_000_000
-"""Largest size of any request; the bus loses a far larger one."""
-_SMALL_BYTES = 8_000
 MAX_REQUESTER_LENGTH = 100
 """Largest number of characters kept of a requester."""
+_BYTES_WITHOUT_ARRAYS = 8_000
+_BYTES_WITH_ARRAYS = 16_000_000  # the bus loses a far larger message
 _MAX_BYTES = {
-    "channel": 4 * 128 * 128 + _SMALL_BYTES,
-    "note": 4 * MAX_NOTE_LENGTH + _SMALL_BYTES,
-    "play": MAX_BYTES,
-    "law": MAX_BYTES,
-    "load": MAX_BYTES,
+    "channel": 4 * 128 * 128 + _BYTES_WITHOUT_ARRAYS,
+    "note": 4 * MAX_NOTE_LENGTH + _BYTES_WITHOUT_ARRAYS,
+    "play": _BYTES_WITH_ARRAYS,
+    "law": _BYTES_WITH_ARRAYS,
+    "load": _BYTES_WITH_ARRAYS,
 }
 
 
 def max_bytes(name: str) -> int:
     """Largest size of a request of this name; a larger one is refused before it is decoded."""
-    return _MAX_BYTES.get(name, _SMALL_BYTES)
+    return _MAX_BYTES.get(name, _BYTES_WITHOUT_ARRAYS)
 
 
 def only_requester(payload: bytes) -> bytes:
     """A request with nothing but the requester of this one; empty if it cannot be read."""
     try:
-        return wire.Request(requester=wire.Request.FromString(payload[:_SMALL_BYTES]).requester).SerializeToString()
+        request = wire.Request.FromString(payload[:_BYTES_WITHOUT_ARRAYS])
+        return wire.Request(requester=request.requester).SerializeToString()
     except DecodeError:
         return b""
 

@@ -55,12 +55,12 @@ def _fused(
     channels, law_runner = loop.command_channels, loop.law_runner
     if state.mode is not LoopMode.CLOSED or state.returning_to_zero or (channels is not None and channels.moving):
         return None
-    x, law, from_error = tables.no_states, (tables.no_law, tables.no_law), True
+    x, matrices, from_error = tables.no_states, (tables.no_law, tables.no_law), True
     if law_runner is not None:
         if not law_runner.alone(1):
             return None
-        x, law = law_runner.x, (law_runner.law.joined, law_runner.law.output)
-        from_error = law_runner.law.signal == "error"
+        law, x = law_runner.law, law_runner.x
+        matrices, from_error = (law.joined, law.output), law.signal == "error"
     shift_nm = target_nm = tables.no_modes
     channels_nm = tables.no_channels
     if channels is not None:
@@ -72,7 +72,7 @@ def _fused(
     integrator = loop.integrator.rows
     mirror = tables.shapes, channels_nm, loop.actuators_nm
     limits_nm = limits.kept_stroke_nm, limits.kept_slew_nm, limits.neighbour_nm - limits.margin_nm / 2
-    if not tables.respond(*signals, integrator, x, *law, from_error, *mirror, *limits_nm, results, actuators_nm):
+    if not tables.respond(*signals, integrator, x, *matrices, from_error, *mirror, *limits_nm, results, actuators_nm):
         return None
     error_nm, pol_nm, command_nm = results[:modes], results[modes : 2 * modes], results[2 * modes : 3 * modes]
     return error_nm, pol_nm, command_nm, results[3 * modes :], actuators_nm

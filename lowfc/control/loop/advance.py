@@ -73,7 +73,8 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     if state.conditions.lease is not None:
         state = counted_to_frame(settings, state._replace(loop=loop), frame)
         state, lease_events = lease_checked(state, 0, frame.sequence)
-        events, loop, lease_ended = [*events, *lease_events], state.loop, bool(lease_events)
+        loop, lease_ended = state.loop, bool(lease_events)
+        events += lease_events
     if loop is None:
         return _refuse(settings, _with_newest_frame(state, loop, frame), frame, Rejection.NO_CALIBRATION, events)
     measured = _measure(settings, state, loop, frame)
