@@ -14,7 +14,7 @@ ANSWER_S = 0.2
 
 
 class BenchValues:
-    """The newest value of each name in a slot: even a flood of values costs only one check of each slot per frame."""
+    """The newest value of each name; however many arrive, a frame costs one check of each name."""
 
     def __init__(
         self, service: Service, interlocks: Iterable[Interlock], report: Callable[[BenchReport], None]
@@ -47,7 +47,7 @@ class BenchValues:
 
 
 class _Slot:
-    """The newest value of one name; after `due_ns` it is too old for another of its interlocks."""
+    """The newest value of one name; after `due_ns` it is too old for one more of its interlocks."""
 
     def __init__(self, service: Service, name: str, max_ages_ns: list[int]) -> None:
         self.name = name

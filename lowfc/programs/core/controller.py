@@ -1,9 +1,7 @@
 """The controller's process: applies `advance` to each message; sends the command first, then everything else."""
 
-import contextlib
 import threading
 from collections import deque
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 
@@ -88,7 +86,7 @@ class Controller:
         self._last_sample: Sample | None = None
         self._valid_ns = round(config.control.command_timeout_ms * 1e6)
         self._state = State()
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # reentrant: a step or the start may carry out requests within it
         self._mirror_adopted = False
         self._first_frame: Sample | None = None
         self._unsubscribe_frames = service.dispatch(
@@ -147,9 +145,10 @@ class Controller:
             while self._gain_requests:
                 self._carry_out_internal(self._gain_requests.popleft())
             self._update_latch()
-            for sample in self._camera.query() if self._state.conditions.camera_awaited else ():
-                with self._lock:
-                    self._camera.apply(sample)
+            if self._state.conditions.camera_awaited:
+                for sample in self._camera.query():
+                    with self._lock:
+                        self._camera.apply(sample)
             self._service.beat()
         self._unsubscribe_frames()
         with self._lock:
@@ -261,14 +260,12 @@ class Controller:
         with self._requests_lock:  # in lockstep the receiving thread has requests, too
             self._requests.put(codec.encode_request(request, reply, number, message))
 
-    def _carry_out(
-        self, request: Request, lock: AbstractContextManager[object] | None = None
-    ) -> tuple[Reply, State, int]:
+    def _carry_out(self, request: Request) -> tuple[Reply, State, int]:
         """Carry out a request; return its reply, the state after it, and its input number (0 for `configuration`)."""
         if request.name == CONFIGURATION:
             return Reply(True, self._configuration, self._state.frame_sequence + 1), self._state, 0
         self._arrays.publish(request)
-        with self._lock if lock is None else lock:
+        with self._lock:
             outputs = self._advance(request)
             state = self._state
             self._publish(outputs)
@@ -287,15 +284,15 @@ class Controller:
             self._service.event(event.name, **event.details)
         for request in actions.requests:
             if self._service.clock.lockstep:
-                self._carry_out_internal(request, lock=contextlib.nullcontext())
+                self._carry_out_internal(request)
             else:
                 self._gain_requests.append(request)
                 self._camera.wake()
 
-    def _carry_out_internal(self, request: Request, lock: AbstractContextManager[object] | None = None) -> Reply:
+    def _carry_out_internal(self, request: Request) -> Reply:
         """Carry out an internal request, at the controller's time, and publish it like an operator's."""
         request = prepared(self._settings, replace(request, time_ns=self._service.clock.now_ns()))
-        reply, _, number = self._carry_out(request, lock)
+        reply, _, number = self._carry_out(request)
         with self._requests_lock:
             self._requests.put(codec.encode_request(request, reply, number, None))
         return reply
@@ -348,12 +345,15 @@ class Controller:
             return
         self._start_pending = False
         for request in self._start_up.requests(self._state, self._service.clock.now_ns()):
-            reply = self._carry_out_internal(request, lock=contextlib.nullcontext())
-            law, late = request.name == "law", self._mirror_adopted  # if late, clients may have changed the loop before
+            reply = self._carry_out_internal(request)
+            if reply.accepted:
+                continue
+            law = request.name == "law"
             unfit = law and (misfit(self._state) or uncalibrated(self._state))  # the loop stays open or idle
-            if not reply.accepted and (unfit or (late and request.text != ADOPTED)):
+            # Once the controller runs, clients may have changed the loop.
+            if unfit or (self._mirror_adopted and request.text != ADOPTED):
                 self._service.event("LAW_NOT_IN_FORCE" if law else "FLAT_NOT_IN_FORCE", why=reply.text)
-            elif not reply.accepted:
+            else:
                 self._start_up.handle_refusal(request, reply.text)
                 break
 

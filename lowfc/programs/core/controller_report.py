@@ -91,10 +91,10 @@ class Offload:
 
 
 class LastSecond:
-    """Modal error and flux of the frames used in the last second; at a higher rate than configured, of the newest."""
+    """Modal error and flux of the frames used in the last second; above the configured rate, of the newest only."""
 
     def __init__(self, period_ns: int) -> None:
-        self._rows = np.zeros((max(1, SECOND_NS // period_ns + 1), 3))
+        self._rows = np.zeros((SECOND_NS // period_ns + 1, 3))
         self._count = 0
 
     def add(self, step: Step, now_ns: int) -> None:

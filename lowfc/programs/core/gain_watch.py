@@ -1,4 +1,4 @@
-"""Automatic gains: requests optimal gains from measurements, and reports and reacts to a closed loop that does harm."""
+"""Automatic gains: requests optimal gains from measurements; reports a closed loop that does harm, and reacts to it."""
 
 from typing import NamedTuple
 
@@ -63,7 +63,7 @@ class _Group:
         self.verdict: Verdict | None = None
         self.gain = loop.integrator.gain[mask]
         self.harmful_windows = 0
-        self.unrestricted = window_s == TILT_S
+        self.cautious = window_s == OTHERS_S  # until the first verdict, see CAUTIOUS_GAIN
 
 
 class GainWatch:
@@ -219,10 +219,10 @@ class GainWatch:
             noise = None if noise_nm2 is None else noise_nm2[group.mask]
             group.gain = loop.integrator.gain[group.mask]
             group.verdict = verdict = group.bank.verdict(loop.integrator.gain[group.mask], noise)
-            best = verdict.gain if group.unrestricted else np.minimum(verdict.gain, CAUTIOUS_GAIN)
+            best = np.minimum(verdict.gain, CAUTIOUS_GAIN) if group.cautious else verdict.gain
             gain[group.mask] = np.where(loop.automatic[group.mask], best, gain[group.mask])
-            if not group.unrestricted:
-                group.unrestricted = True
+            if group.cautious:
+                group.cautious = False
                 group.bank.begin_first_window()
             events += self._harm_events(group, verdict, loop)
         requests = []
@@ -241,7 +241,7 @@ class GainWatch:
 
     def _closing_harm(self, gain: Single, loop: ActiveLoop) -> str:
         """Sentence on the wavefront that closing would add, from modes evaluated at their present gains."""
-        noll, added, harm_nm2 = np.array(loop.calibration.noll), "", np.zeros(len(loop.calibration.noll))
+        noll, harm_nm2 = np.array(loop.calibration.noll), np.zeros(len(loop.calibration.noll))
         for group in self._groups:
             verdict = group.verdict
             if verdict is None or not np.array_equal(gain[group.mask], loop.integrator.gain[group.mask]):
@@ -251,6 +251,7 @@ class GainWatch:
         harmful_modes = noll[harm_nm2 > 0].tolist()
         if not harmful_modes:
             return ""
+        added = ""
         if self._contrast is not None and len(self._contrast) == noll.size:
             added = f"{np.diag(self._contrast) @ harm_nm2:.1e} of contrast, "
         names, indices = ", ".join(f"Z{index}" for index in harmful_modes), ",".join(map(str, harmful_modes))

@@ -94,8 +94,8 @@ class StartUp:
         """The requests in the order to send them, once the mirror's shape is known.
 
         If the mirror already has the flat map, from an earlier controller, the flat map is subtracted from the adopted
-        shape and added as a channel of its own, so that nothing moves. A lease, granted before the mirror was known,
-        does not refuse them: they have its identity.
+        shape and added as a channel of its own, so that nothing moves. The requests have the identity of the present
+        lease, which may have been granted before the mirror was known, so that it does not refuse them.
         """
         lease = state.conditions.lease
         lease_id = 0 if lease is None or lease.ended or lease.over(time_ns, 0) else lease.id

@@ -27,7 +27,7 @@ TIMEOUT_S = 60.0
 _MAX_WAITING_EVENTS = 1000
 _END_S = 2.0  # for which a recorder that ends waits for the command; a service manager then kills the command
 _LEVELS: dict[int, str] = {level.value: level.name.lower() for level in Level}
-_OWN = EVENTS["ON_EVENT_FAILED"].name
+_FAILED = EVENTS["ON_EVENT_FAILED"].name
 
 
 class Alarm:
@@ -51,7 +51,7 @@ class Alarm:
 
     def _receive(self, sample: Sample) -> None:
         event = Log.FromString(sample.payload)
-        if event.level >= self._level and not event.message.startswith(_OWN):
+        if event.level >= self._level and not event.message.startswith(_FAILED):
             self._waiting.append(event)
             self._arrived.set()
 
@@ -98,4 +98,4 @@ class Alarm:
             self._fail(f"it cannot be run: {fault.strerror}")
 
     def _fail(self, why: str) -> None:
-        self._service.event(_OWN, why=why)
+        self._service.event(_FAILED, why=why)

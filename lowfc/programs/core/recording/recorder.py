@@ -209,6 +209,7 @@ class Recorder:
         return self._failure
 
     def _resume(self) -> str:
+        """Begin a recording; return the reason of a refusal, or an empty text."""
         if not (self._paused or self._failure) or not self.service.running:
             return "recording is already in progress" if self.service.running else "the recorder is ending"
         try:
@@ -240,10 +241,9 @@ class Recorder:
         except BadMessageError as fault:
             self.service.unreadable(topic.key, fault)
             return
-        queried = self._peers.already_received(sample)
+        written = self._peers.already_received(sample)  # when a query returned it
         unwanted = self._paused or not self._selection.keeps(topic, sample.sequence, sample.payload)
-        # A message that a query returned was written then.
-        recorded = not self._failure if queried else (not unwanted and self._write(sample))
+        recorded = not self._failure if written else not unwanted and self._write(sample)
         self._account.enter(topic, sample, recorded=recorded, unwanted=unwanted)
         if topic is HEALTH:
             self._note_health(topic, sample)
