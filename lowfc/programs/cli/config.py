@@ -68,8 +68,8 @@ def _inline(value: object) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_inline, value))}]"
     if isinstance(value, dict):
-        keys = (tomli_w.dumps({key: 0}).removesuffix(" = 0\n") for key in value)
-        return f"{{{', '.join(f'{key} = {_inline(one)}' for key, one in zip(keys, value.values(), strict=True))}}}"
+        items = (tomli_w.dumps({key: 0}).removesuffix("0\n") + _inline(one) for key, one in value.items())
+        return f"{{{', '.join(items)}}}"
     return tomli_w.dumps({"x": value}).removeprefix("x = ").rstrip("\n")
 
 

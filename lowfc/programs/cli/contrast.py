@@ -42,7 +42,7 @@ def costliest_modes(statistics: Mapping[str, Any]) -> tuple[str, float] | None:
 
 
 def contrast_cases(added: Mapping[str, float]) -> dict[str, float | None]:
-    """Contrast added with a flat mirror and with the present mirror shape, in any loop mode, by their labels."""
+    """Contrast added with a flat mirror and, in any loop mode, with the present mirror shape, by label."""
     return {"flat mirror": added["open"], "residual": added["closed"]}
 
 

@@ -266,7 +266,7 @@ for _measurement in (dark, reference):
 
 @ctl_app.callback()
 def _run_before_request(context: typer.Context, run: AnyRun = None) -> None:
-    """Accept --run also before the request."""
+    """Accept --run also before the request; `start` and `stop` are those of `record`."""
     defaults, group = {"run": run}, context.command
     assert isinstance(group, TyperGroup)  # noqa: S101  # of `ctl_app`
     context.default_map = {name: {**defaults, "start": defaults, "stop": defaults} for name in group.commands}

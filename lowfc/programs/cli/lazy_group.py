@@ -39,10 +39,10 @@ class Commands(Mapping[str, Any]):
             commands = [part._replace(name=part.name.removeprefix(f"{name} ")) for part in parts]
             command = lazy_app(f"{row.description}\n\nExample: lowfc {parts[0].name}", {"Commands": commands})
             command.callback()(lambda: None)
-        app = command if isinstance(command, typer.Typer) else new_app("")
-        if app is not command:  # it is a function
-            app.command(name)(command)
-        click_command = get_command(app)
+        if not isinstance(command, typer.Typer):
+            function, command = command, new_app("")
+            command.command(name)(function)
+        click_command = get_command(command)
         click_command.name = name
         return click_command
 

@@ -48,7 +48,7 @@ COMMANDS = {
     ),
     "Measure": (
         Row("latency", "measure.latency.command:latency", "Measure the latency from frame to command on this host."),
-        Row("bench", "", "Measure the optical model's speed and the cost of recording."),
+        Row("bench", "", "Measure the speed of the optical model and of recording."),
     ),
     "Verify": (
         Row("validate", "paper.commands:validate", "Reproduce the tables and figures of the paper."),

@@ -22,7 +22,8 @@ def noll_of(words: Sequence[str] | None) -> tuple[int, ...]:
         return ()
     found: list[int] = []
     joined = ",".join(words).replace(" ", "")
-    for part in [part for part in joined.split(",") if part] or [joined]:
+    parts = [part for part in joined.split(",") if part]
+    for part in parts or [joined]:  # commas alone are refused
         first, dash, last = part.partition("-")
         last = last if dash else first
         if not (first.isdecimal() and last.isdecimal() and 0 < int(first) <= int(last) <= HIGHEST):

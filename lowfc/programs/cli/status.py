@@ -5,7 +5,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lowfc.contract.codecs.law_codec import overruled
 from lowfc.contract.envelope import count_of
@@ -86,9 +85,9 @@ def json_object(
         "steps_left": state.steps_left,
         "homing": state.returning_to_zero,
         "command_nm": command_nm,
-        "command_rms_nm": _rss(command_nm),
+        "command_rms_nm": float(np.linalg.norm(command_nm)),
         "offset_nm": list(state.offset_nm),
-        "offset_rms_nm": _rss(state.offset_nm),
+        "offset_rms_nm": float(np.linalg.norm(state.offset_nm)),
         "law": law,
         "gain": list(state.gain),
         "gain_automatic": list(state.automatic) or [False] * len(state.gain),
@@ -290,10 +289,6 @@ def _values(values: list[float], unit: str = "") -> str:
         return "none"
     same = len(set(values)) == 1
     return f"{values[0]:g}{unit} for all" if same else " ".join(f"{value:.4g}" for value in values) + unit
-
-
-def _rss(values: npt.ArrayLike) -> float:
-    return float(np.sqrt(np.sum(np.square(np.asarray(values, np.float64)))))
 
 
 def _rms(actuators: bytes) -> float:
