@@ -12,6 +12,7 @@ from lowfc.contract.errors import ConfigurationError, RequestRefusedError
 from lowfc.control.loop.wording import AUTO
 from lowfc.programs.cli.modes import noll_of
 
+LOAD = "load"
 Values = Mapping[str, str]
 """Input of an operator, by field."""
 
@@ -50,7 +51,16 @@ class Action(NamedTuple):
         return [*self.task, *options, *load, "--run", run]
 
 
-LOAD = "load"
+def parse_numbers(text: str) -> list[float]:
+    """Parse numbers separated by spaces or commas; ConfigurationError for anything else."""
+    try:
+        return [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        raise ConfigurationError(f"{text!r}: write numbers, as in 0.3 or 0.3 0.2") from None
+
+
+def _modes(text: str) -> tuple[int, ...]:
+    return noll_of([text] if text else None)
 
 
 def _shape(text: str) -> Any:
@@ -72,8 +82,8 @@ def _calibration(text: str) -> Any:
 
 
 _READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
-    "modes": ("modes", lambda text: noll_of([text] if text else None)),
-    "values": ("values", lambda text: parse_numbers(text)),
+    "modes": ("modes", _modes),
+    "values": ("values", parse_numbers),
     "text": ("text", str),
     "actuators": ("actuators_nm", _shape),
     "law": ("law", _law),
@@ -94,15 +104,6 @@ _LABELS = {
     "note text": "note",
 }
 """Label of each field of a request in a form, by the field or by request and field."""
-_LAST_FIELD = "modes"
-
-
-def parse_numbers(text: str) -> list[float]:
-    """Parse numbers separated by spaces or commas; ConfigurationError for anything else."""
-    try:
-        return [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        raise ConfigurationError(f"{text!r}: write numbers, as in 0.3 or 0.3 0.2") from None
 
 
 def request_action(key: str, name: str, confirm: str = "") -> Action:
@@ -111,13 +112,13 @@ def request_action(key: str, name: str, confirm: str = "") -> Action:
 
     def ask(loop: Client, values: Values) -> Answer:
         if name == "gain" and values["values"] == AUTO:
-            return loop.automatic_gain(_READERS["modes"][1](values["modes"]))
+            return loop.automatic_gain(_modes(values["modes"]))
         arguments = {_READERS[field][0]: _READERS[field][1](text) for field, text in values.items()}
         if name == "channel":  # this method of the client checks the shape against the mirror's grid
             return loop.channel(arguments["text"], arguments["actuators_nm"])
         return loop.ask(name, **arguments)
 
-    names = sorted((field for field, _ in declared.fields), key=lambda field: field == _LAST_FIELD)
+    names = sorted((field for field, _ in declared.fields), key=lambda field: field == "modes")  # modes last
     labels = ((field, _LABELS.get(field) or _LABELS.get(f"{name} {field}")) for field in names)
     fields = tuple(Field(field, label) for field, label in labels if label)
     return Action(key, name, declared.description, fields, ask, confirm=confirm)

@@ -259,7 +259,7 @@ class Console(OrderedKeys):
                 event.form.show_answer(event.text)
 
     def _answer(self, text: str, *, ok: bool) -> None:
-        answer = self.screen_stack[0].query_one("#answer", Static)
+        answer = self._static("answer")
         answer.set_class(not ok, "refused")
         answer.update(text, layout=False)
 
@@ -283,7 +283,7 @@ class Console(OrderedKeys):
 
     def _show(self, reading: Reading) -> None:
         level, headline = panels.verdict(reading, self._run_id)
-        for name in ("#verdict", "#clock"):
+        for name in ("verdict", "clock"):
             styles = self._static(name).styles
             styles.background, styles.color = Color(*FILL[level]), Color(*INK[level])
         self._show_text("verdict", Text(headline))
@@ -303,7 +303,7 @@ class Console(OrderedKeys):
         events = reading.state.snapshot.events
         for event in events:
             self._history.add(event)
-        self._show_text("log", self._history.last(self._static("#log").size.height))
+        self._show_text("log", self._history.last(self._static("log").size.height))
         if not self._mute and any(event.level >= Severity.ERROR for event in events):
             self.bell()
 
@@ -311,19 +311,19 @@ class Console(OrderedKeys):
         for task in [task for task in self._tasks if task.status is not None]:
             self._tasks.remove(task)
             self._answer(task.status_line, ok=not task.status)
-        self._static("#tasks").display = bool(self._tasks)
+        self._static("tasks").display = bool(self._tasks)
         self._show_text("tasks", Text("\n".join(task.status_line for task in self._tasks)))
 
     def _show_text(self, name: str, text: Text) -> None:
         if self._shown.get(name) != text:
             self._shown[name] = text
-            self._static(f"#{name}").update(text, layout=False)
+            self._static(name).update(text, layout=False)
 
     def _lines(self, name: str) -> Lines:
         return self.screen_stack[0].query_one(f"#{name}", Lines)
 
     def _static(self, name: str) -> Static:
-        return self.screen_stack[0].query_one(name, Static)
+        return self.screen_stack[0].query_one(f"#{name}", Static)
 
 
 def _id(action: Action) -> str:

@@ -24,7 +24,7 @@ class History:
     def add(self, entry: wire.Request | Log) -> None:
         """Add an event or request; an event that repeats one of the last lines replaces it."""
         times = 1
-        for line in range(len(self._lines) - 1, max(-1, len(self._lines) - 1 - _SEARCHED), -1):
+        for line in reversed(range(len(self._lines))[-_SEARCHED:]):
             if _repeats(self._lines[line][0], entry):
                 times += self._lines[line][1]
                 del self._lines[line]

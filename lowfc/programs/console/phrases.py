@@ -21,7 +21,8 @@ def phrased(text: str) -> str:
 
 
 def _key(match: re.Match[str]) -> str:
-    name = f"{match[1]} {match[2]}" if f"{match[1]} {match[2]}" in _KEYS else match[1]
+    two_words = f"{match[1]} {match[2]}"
+    name = two_words if two_words in _KEYS else match[1]
     if name not in _KEYS:
         return match[0]
     values = f" {match[2]}, {match[3].removeprefix(' --')}" if match[3] else ""
