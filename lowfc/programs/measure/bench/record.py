@@ -132,10 +132,10 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
         assert recorder.process is not None  # noqa: S101  # it was started
         process = psutil.Process(recorder.process.pid)
         begun_s, first_frame = time.monotonic(), traffic.frames
-        own_s, before = time.process_time(), process.cpu_times()
+        own_begun_s, before = time.process_time(), process.cpu_times()
         traffic.run(seconds)
         elapsed_s = time.monotonic() - begun_s
-        own_s, after = time.process_time() - own_s, process.cpu_times()
+        own_s, after = time.process_time() - own_begun_s, process.cpu_times()
         traffic.finish()
         recorder.stop(_STOP_S)
         if recorder.status:

@@ -57,9 +57,9 @@ def latency(
 ) -> None:
     """Measure the latency of every frame through controller and mirror, and compare it with the host's limits.
 
-    Prepared frames are sent on an absolute schedule and late frames are counted, so that stalls are not hidden. In
-    turns with the loop, a bare zenoh echo of messages of the same sizes, one control step alone and the host's timer
-    are measured. Times are from just before a frame is published to just after its command is published.
+    Prepared frames are sent on an absolute schedule and late frames are counted, so that stalls are not hidden. A bare
+    zenoh echo of messages of the same sizes, one control step alone and the host's timer are measured in turns with
+    the loop. Times are from just before a frame is published to just after its command is published.
 
     Example: lowfc latency --duration 10 --repeats 5 --json > latency.json
     """

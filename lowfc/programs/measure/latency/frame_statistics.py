@@ -159,9 +159,9 @@ def repeat_statistics(frames: FrameOutcomes) -> dict[str, Any]:
     spans = {span: column[counted] for span, column in frames.spans_us.items()}
     count = put_ns.size
     between_ns = np.diff(put_ns)
-    between_ns = between_ns[between_ns <= _PAUSE * np.median(between_ns)] if count > 1 else between_ns
-    period_ns = float(between_ns.mean()) if between_ns.any() else 0.0
-    next_ns = np.append(np.diff(put_ns), np.iinfo(np.int64).max)
+    until_next_ns = np.append(between_ns, np.iinfo(np.int64).max)[:count]
+    usual_ns = between_ns[between_ns <= _PAUSE * np.median(between_ns)] if count > 1 else between_ns
+    period_ns = float(usual_ns.mean()) if usual_ns.any() else 0.0
     latency_us = {span: percentiles(values) for span, values in spans.items()}
     return {
         "latency_us": {span: values for span, values in latency_us.items() if values is not None},
@@ -171,7 +171,7 @@ def repeat_statistics(frames: FrameOutcomes) -> dict[str, Any]:
         "frames": count,
         "warm_up_frames": frames.put_ns.size - count,
         "frames_without_command": int(np.sum(~commanded)),
-        "frames_crowded_out": int(np.sum(~commanded & (next_ns[:count] < _BURST * period_ns))),
+        "frames_crowded_out": int(np.sum(~commanded & (until_next_ns < _BURST * period_ns))),
         "frames_untimed": int(np.sum(commanded & np.isnan(spans["frame_to_command"]))),
         "frames_without_mirror_state": int(np.sum(np.isnan(spans["frame_to_mirror"]))),
         "frames_sent_late": int(np.sum(spans["due_to_frame"] > period_ns / 1e3)) if "due_to_frame" in spans else None,

@@ -16,9 +16,10 @@ _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
 
 
 def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Latency statistics of a log, as of one repeat of a benchmark, and its path, missing parts and host.
+    """Latency statistics of a log, as those of one repeat of `lowfc latency`; and its path, missing parts and host.
 
-    `clock_error_us`: largest error of a latency between two hosts, if there are several. DataFileError without timing.
+    The host's `clock_error_us`, if there are several: largest error of a latency between two of them. DataFileError
+    without timing.
     """
     log = WholeLog(files, skip_damaged=True)
     log.progress = progress

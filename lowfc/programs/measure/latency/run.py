@@ -125,7 +125,8 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
         for sample in frame_ring.drain() if frame_ring is not None else ():
             frames.add(sequence=sample.sequence, publish_ns=sample.publish_time_ns)
 
-    children, traced = _children(options, run) if children is None else children, TRACED if options.trace else ()
+    children = children or _children(options, run)
+    traced = TRACED if options.trace else ()
     for file in (BEGIN_FILE, PROCESSES_FILE):
         (run.path / file).unlink(missing_ok=True)  # left by the previous repeat
     with contextlib.ExitStack() as stack:
@@ -177,14 +178,12 @@ def _children(options: LatencyOptions, run: Run) -> list[Child]:
         arguments = ["-m", "lowfc", "view", "--run", run.run_id, "--web"]
         view = program(str(Role.VIEWER), arguments, run.path / f"{Role.VIEWER}.stderr")
         children.insert(len(children) - options.record, view)  # the recorder ends last
-    awaited = [str(Role.CONTROLLER), mirror_role(config.mirror.name)]
-    awaited += [str(Role.RECORDER)] * options.record + [str(Role.VIEWER)] * options.view
-    waits = [word for name in awaited for word in ("--wait-for", name)]
-    if options.simulated:
-        children[0].command += waits[-2:] if options.view else []  # the simulated camera waits for the others already
-    else:
+    if not options.simulated:
+        waits = [word for child in children[1:] for word in ("--wait-for", child.name)]
         arguments = ["-m", "lowfc.programs.measure.frame_source", *_options(run), "--seconds", str(seconds), *waits]
         children[0] = program(str(Role.CAMERA), arguments, run.path / f"{Role.CAMERA}.stderr")
+    elif options.view:  # it waits for the others already
+        children[0].command += ["--wait-for", str(Role.VIEWER)]
     if options.trace:
         for role in reversed(TRACED):
             arguments = ["-m", bare_loop.__name__, str(role), *_options(run), "--seconds", str(seconds)]

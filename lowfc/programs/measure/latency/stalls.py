@@ -12,7 +12,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Long
 from lowfc.programs.cli.result import Result, result_field
-from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S, FrameOutcomes, percentiles
+from lowfc.programs.measure.latency.frame_statistics import SPANS, STAGES, WARM_UP_S, FrameOutcomes, percentiles
 
 Cause = Literal["host", "loop", "unknown"]
 """Cause of a stall: the loop if one of its processes waited for a processor or pages, and the host is not the cause."""
@@ -21,7 +21,8 @@ _MIN_PERIODS = 0.25
 """Shortest delay that explains a stall, in frame periods."""
 _FAULT_US = 1.0
 """Approximate time to map a page."""
-_SPANS = {"frame_to_receive": "frame to receive", "wakeup": "waking", "compute": "computing", "publish": "publishing"}
+_CONSECUTIVE = ("frame_to_receive", *STAGES)
+"""Spans that make up the time from frame to command."""
 _MAX_SHOWN = 20
 
 
@@ -114,13 +115,13 @@ def signs_of(counted: CountChanges, period_us: float) -> tuple[list[str], list[s
 def stalls_of(frames: FrameOutcomes, period_ns: int, traces: Mapping[str, Trace]) -> Stalls:
     """The stalls among these frames, the warm-up left out; `traces` by the process of each bare loop."""
     command_us = frames.spans_us["frame_to_command"]
-    counted = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
-    slow = counted & (~frames.commanded | (command_us * 1e3 > period_ns))
+    after_warm_up = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
+    slow = after_warm_up & (~frames.commanded | (command_us * 1e3 > period_ns))
     end_ns = _ends_ns(frames, period_ns)
     stalls = [_stall(frames, int(index), float(end_ns[index]), period_ns, traces) for index in np.flatnonzero(slow)]
     causes = [stall.held_up_by for stall in stalls]
     return Stalls(
-        frames=int(counted.sum()),
+        frames=int(after_warm_up.sum()),
         stalled=len(stalls),
         of_host=causes.count("host"),
         of_loop=causes.count("loop"),
@@ -145,15 +146,14 @@ def combine(repeats: Sequence[Stalls]) -> Stalls:
 def _ends_ns(frames: FrameOutcomes, period_ns: int) -> Array:
     """Time of each frame's command, or of the next command if it has none."""
     sent_ns = frames.put_ns + frames.spans_us["frame_to_command"] * 1e3
-    known_ns = np.where(np.isfinite(sent_ns), sent_ns, np.inf)
-    next_ns = np.minimum.accumulate(known_ns[::-1])[::-1]
-    return np.where(np.isfinite(known_ns), known_ns, np.minimum(next_ns, frames.put_ns.max(initial=0) + period_ns))
+    next_ns = np.fmin.accumulate(sent_ns[::-1])[::-1]  # without the NaN of frames that have no command
+    return np.where(np.isfinite(sent_ns), sent_ns, np.fmin(next_ns, frames.put_ns.max(initial=0) + period_ns))
 
 
 def _stall(frames: FrameOutcomes, index: int, end_ns: float, period_ns: int, traces: Mapping[str, Trace]) -> Stall:
     due_to_frame_us = frames.spans_us.get("due_to_frame", np.zeros_like(frames.spans_us["frame_to_command"]))
     begin_ns = int(frames.put_ns[index] - due_to_frame_us[index] * 1e3)
-    spans_us = {name: float(frames.spans_us[span][index]) for span, name in _SPANS.items()}
+    spans_us = {SPANS[span].strip(): float(frames.spans_us[span][index]) for span in _CONSECUTIVE}
     command_us = float(frames.spans_us["frame_to_command"][index])
     timed = bool(np.isfinite(command_us))
     counted = {role: _counted(trace, begin_ns, end_ns) for role, trace in traces.items() if trace.woke_ns.size}
