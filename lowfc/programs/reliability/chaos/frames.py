@@ -11,7 +11,7 @@ FAULTY_FRAMES = 250
 MAX_FRAMES_LATE = 50
 """Largest delay of a frame, in frames."""
 
-# Kind, fault of the frames, event, how many of the faulty frames (the first ones) may be used, whether some are lost.
+# Kind, fault of the frames, event, how many of the first faulty frames may be used, whether losses may be reported.
 _KINDS = (
     ("lost", "10 % of the frames are not sent", "FRAMES_MISSING", FAULTY_FRAMES, True),
     ("duplicated", "each frame is sent twice", "REPEATED", FAULTY_FRAMES, True),

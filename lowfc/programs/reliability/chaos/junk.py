@@ -4,6 +4,7 @@ import itertools
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 
 import numpy as np
 
@@ -28,7 +29,7 @@ _MAY_SUCCEED = ("status", "open", "close", "offset", "play", "law", "channel")
 """Requests that random bytes may encode by chance; these are sent under a name that does not exist."""
 
 
-class Intruder:
+class Intruder(AbstractContextManager["Intruder"]):
     """A hostile connection with the run's secret."""
 
     def __init__(self, bench: ChaosBench) -> None:
@@ -44,10 +45,7 @@ class Intruder:
         while self._bus.peers() < 3 and time.monotonic() < deadline_s:
             time.sleep(_POLL_S)
 
-    def __enter__(self) -> "Intruder":
-        return self
-
-    def __exit__(self, *fault: object) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bus.close()
 
     def send(self, topic: Topic, payload: bytes) -> None:

@@ -73,7 +73,7 @@ def _limits(outcome: Outcome, evidence: Evidence) -> Finding:
         if step_nm > config.safety.slew_nm + ROUNDING_NM
     ]
     count = f"{len(commands)} commands, {len(states)} states"
-    return _finding("limits", wrong if states else [count], count)
+    return _finding("limits", wrong if states else [*wrong, count], count)
 
 
 def _violations(what: str, limits: Limits, shapes: list[Entry], moving: Mask) -> Iterator[str]:

@@ -108,7 +108,8 @@ class _Soak:
         }
         why = [f"growth of the {name}'s {what}" for name, process in processes.items() for what in process["grows"]]
         why += [f"{measured[key]} {text}" for key, text in _MUST_BE_ZERO.items() if measured[key]]
-        why += [f"the recording ended: {recording.failure}"] * bool(recording.failure)
+        if recording.failure:
+            why.append(f"the recording ended: {recording.failure}")
         why += [f"{name} was not finished" for name in unfinished]
         if self.mode != wire.LOOP_MODE_CLOSED:
             mode = wire.LoopMode.Name(self.mode).removeprefix("LOOP_MODE_").lower()
