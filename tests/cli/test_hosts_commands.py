@@ -114,10 +114,13 @@ def test_a_run_whose_router_does_not_answer_is_not_called_absent() -> None:
 
 
 @pytest.mark.usefixtures("toml")
-@pytest.mark.parametrize("words", [("record",), ("config", "zenoh", "--role", "camera"), ("sim-loop",)], ids=" ".join)
-def test_a_name_of_a_run_that_is_too_long_or_empty_is_refused(words: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    "command", ["record", "config zenoh --role camera", "config zenoh --role camera --make", "sim-loop"]
+)
+def test_a_name_of_a_run_that_is_too_long_or_empty_is_refused(command: str) -> None:
     for name in ("x" * 300, ""):
-        fault = refusal(*words, "--run", name, kind=BusError)
+        fault = refusal(*command.split(), "--run", name, kind=BusError)
+        assert "--make" not in fault
         assert len(fault) < 300
         assert "a run's name is up to 48 of" in fault
 
@@ -131,6 +134,7 @@ def test_the_configuration_of_the_router_is_shown_without_creating_its_run(toml:
 
 def test_a_list_of_hosts_without_a_link_to_the_router_creates_no_run(toml: Path) -> None:
     assert "the router accepts no process without it" in refusal("hosts", "--config", toml, "--run", "bench")
+    assert "a run's name is up to 48 of" in refusal("hosts", "--config", toml, "--run", "")
     assert runs() == []
 
 

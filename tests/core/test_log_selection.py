@@ -206,6 +206,7 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     assert 3e6 < growth < 5e6
     assert estimate(config).startswith(f"recording into {tmp_path}: about {growth * 3600 / 1e9:.0f} GB an hour; ")
     assert estimate(config).endswith(" h, at 250 Hz and 80 x 80 pixels, the simulated camera's")
+    assert estimate(load(None, {"recorder.folder": ""})).startswith("recording into .: ")
     camera = wire.CameraState(rows=160, columns=120)
     assert estimate(config, camera).endswith(" h, at 250 Hz and 160 x 120 pixels")
     added_per_s = bytes_per_s(config, configured_selection(config), camera) - growth

@@ -122,13 +122,14 @@ def config_zenoh(
 
     Example: lowfc config zenoh --role camera --run bench
     """
-    created = None
-    if make and not run_path(run or DEFAULT_RUN).is_dir():
+    name = DEFAULT_RUN if run is None else run
+    exists, created = run_path(name).is_dir(), None
+    if make and not exists:
         part, _, mirror = role.partition("-")
         keys = {"mirror.name": mirror} if part == Role.MIRROR and mirror else {}
-        created = open_run(run or DEFAULT_RUN, (load(None, keys).mirror.name,))
+        created = open_run(name, (load(None, keys).mirror.name,))
     try:
-        joined = open_run((run or DEFAULT_RUN) if make else the_known_run(run), ())
+        joined = open_run(name if make else the_known_run(run), ())
     except BusError as fault:
         raise fault if make else BusError(f"{fault}; --make creates a run that does not exist") from None
     links = joined.links

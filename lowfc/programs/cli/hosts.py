@@ -141,7 +141,7 @@ def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) 
     settings = configuration(config)
     if not settings.network.router or (run is None and running()):
         run = the_known_run(run)
-    run = run or DEFAULT_RUN  # with a router, all processes of the run may be on other hosts
+    run = DEFAULT_RUN if run is None else run  # with a router, all processes of the run may be on other hosts
     with ExitStack() as stack:
         exists = run_path(run).is_dir()  # without an answer no run is created
         base = None if exists else Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lowfc-")))

@@ -51,12 +51,12 @@ def configured_selection(config: Configuration) -> Selection:
 def estimate(config: Configuration, camera: wire.CameraState | None = None) -> str:
     """Sentence on the disk space that a recording will use, and on the rate and frame size that this rests on."""
     recorded = configured_selection(config)
-    min_free_bytes = config.recorder.min_free_mb * 1e6
-    growth = growth_in_words(bytes_per_s(config, recorded, camera), user_path(config.recorder.folder), min_free_bytes)
+    folder, min_free_bytes = user_path(config.recorder.folder), config.recorder.min_free_mb * 1e6
+    growth = growth_in_words(bytes_per_s(config, recorded, camera), folder, min_free_bytes)
     rows, columns, source = _frame_size(config, camera)
     selected = f" ({recorded.description})" if recorded.description else ""
     size = f"{rows} x {columns} pixels{source}{selected}"
-    return f"recording into {config.recorder.folder}: {growth}, at {config.camera.rate_hz:g} Hz and {size}"
+    return f"recording into {folder}: {growth}, at {config.camera.rate_hz:g} Hz and {size}"
 
 
 def growth_in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: float) -> str:
