@@ -43,6 +43,11 @@ class Entry(NamedTuple):
         """Start time of its publisher."""
         return start_of(self.sequence)
 
+    @property
+    def frame(self) -> int:
+        """Number of a step's frame since the camera's start."""
+        return count_of(self.message.frame_sequence)
+
 
 @dataclass(slots=True)
 class Evidence:

@@ -1,6 +1,7 @@
 """Chaos cases: faults of the camera's frames, and of the mirror."""
 
 from lowfc.contract.configuration import Control
+from lowfc.contract.envelope import count_of
 from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, case
 
@@ -31,7 +32,7 @@ _KINDS = (
 
 def _wait_for_last(bench: ChaosBench) -> None:
     last = FIRST + FAULTY_FRAMES + MAX_FRAMES_LATE
-    bench.wait(lambda: bench.newest_frame & 0xFFFFFFFF >= last, f"frame {last}")
+    bench.wait(lambda: count_of(bench.newest_frame) >= last, f"frame {last}")
 
 
 for _kind, _description, _reason, _used, _lost in _KINDS:

@@ -11,7 +11,7 @@ from lowfc.adapters.files.factory import mirror_limits, settings
 from lowfc.arrays import Mask
 from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, Role, wire
-from lowfc.control.loop.safety import Limits, Rejection
+from lowfc.control.loop.safety import Limits, Rejection, mode_name
 from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Outcome
 from lowfc.programs.reliability.chaos.case import Case
 from lowfc.programs.reliability.chaos.evidence import Entry, Evidence
@@ -131,11 +131,6 @@ def recovered_s(outcome: Outcome, evidence: Evidence) -> float | None:
     return float((times_ns[good[0]] - begun_ns) * 1e-9) if good.size else None
 
 
-def _frame_number(step: Entry) -> int:
-    """Number of a step's frame since the camera's start."""
-    return int(step.message.frame_sequence & 0xFFFFFFFF)
-
-
 def _bad_frames(case: Case, evidence: Evidence) -> Finding:
     """A refused frame holds the command; bad frames are refused; no frame is used twice or after a newer one."""
     commands, steps = evidence.entries[COMMAND], evidence.entries[STEP]
@@ -148,17 +143,17 @@ def _bad_frames(case: Case, evidence: Evidence) -> Finding:
             before, now = commands[number - 1 : number + 1]
             adjacent = now.sequence == before.sequence + 1  # which implies the same controller
             if adjacent and not np.array_equal(now.actuators_nm, before.actuators_nm):
-                wrong.append(f"a command was made from frame {_frame_number(step)}, which was refused")
+                wrong.append(f"a command was made from frame {step.frame}, which was refused")
     newest: dict[int, int] = {}
     for step in steps:
         if step.message.error_nm:
             last = newest.get(step.start_s, -1)
             if step.message.frame_sequence <= last:
-                wrong.append(f"frame {_frame_number(step)} was used after a newer one, or twice")
+                wrong.append(f"frame {step.frame} was used after a newer one, or twice")
             newest[step.start_s] = max(step.message.frame_sequence, last)
     if case.bad is not None:
-        bad = [step for step in steps if case.bad(_frame_number(step))]
-        wrong += [f"bad frame {_frame_number(step)} was used" for step in bad if step.message.error_nm]
+        bad = [step for step in steps if case.bad(step.frame)]
+        wrong += [f"bad frame {step.frame} was used" for step in bad if step.message.error_nm]
         wrong += [] if bad else ["no bad frame was received"]
     return _finding("bad frames", wrong, f"{len(refused)} refused, {len(steps)} steps")
 
@@ -170,7 +165,7 @@ def _recovery(case: Case, outcome: Outcome, evidence: Evidence) -> Finding:
     after = evidence.residual_nm(end_ns - SPAN_NS, end_ns)
     if np.isnan(after) and outcome.failure and outcome.residuals_nm:  # the recording ended before the loop did
         after = float(np.sqrt(np.mean(np.square(outcome.residuals_nm))))
-    mode = wire.LoopMode.Name(outcome.mode).removeprefix("LOOP_MODE_").lower()
+    mode = mode_name(outcome.mode)
     if outcome.notes:
         return Finding("recovery", False, "; ".join(outcome.notes))
     if not case.safe:

@@ -16,6 +16,7 @@ from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.messages import EVENT, FRAME, Role, topic_of, wire
+from lowfc.control.loop.safety import mode_name
 from lowfc.programs.launch.sim_loop import check, deferred_signals
 from lowfc.programs.launch.watch import topic_count
 from lowfc.programs.reliability.chaos.bench import ChaosBench
@@ -112,8 +113,7 @@ class _Soak:
             why.append(f"the recording ended: {recording.failure}")
         why += [f"{name} was not finished" for name in unfinished]
         if self.mode != wire.LOOP_MODE_CLOSED:
-            mode = wire.LoopMode.Name(self.mode).removeprefix("LOOP_MODE_").lower()
-            why.append(f"the loop should be closed at the end, its mode is {mode}")
+            why.append(f"the loop should be closed at the end, its mode is {mode_name(self.mode)}")
         if recording.messages != self.checker.messages:
             why.append(f"the recorder reports {recording.messages} messages, the logs have {self.checker.messages}")
         unjudged = too_short(processes, measured["latency"])
