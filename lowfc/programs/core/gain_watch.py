@@ -203,9 +203,8 @@ class GainWatch:
         if not loop.automatic.any():
             return Actions(events=events)
         lowered = loop.integrator.gain * np.float32(min(ratio, 0.5))
-        return Actions(
-            (self._gain_request(step, loop, np.where(loop.automatic, lowered, loop.integrator.gain)),), events
-        )
+        request = self._gain_request(step, loop, np.where(loop.automatic, lowered, loop.integrator.gain))
+        return Actions((request,), events)
 
     def _judge(self, judged: list[_Group], step: Step, state: State, loop: ActiveLoop) -> Actions:
         noise_nm2 = self._noise_nm2(loop) if any(group.bank.complete for group in judged) else None

@@ -148,10 +148,7 @@ def _title(results: Mapping[str, Any]) -> str:
         left_out = f", {settings['selection']}" if settings["selection"] else ""
         return f"{Path(settings['log']).name}, {results['rate_hz']:.1f} Hz{left_out}"
     also = "".join(f", with --{name}" for name in ("record", "view", "trace") if settings.get(name))
-    times = (
-        f"{count} repeats of {settings['duration_s']:g} s: medians, largest max"
-        if count > 1
-        else f"{settings['duration_s']:g} s"
-    )
+    duration = f"{settings['duration_s']:g} s"
+    times = f"{count} repeats of {duration}: medians, largest max" if count > 1 else duration
     reached = f" ({results['rate_hz']:.1f} Hz reached)" if results["rate_hz"] else ""  # 0 for a single frame
     return f"{settings['rate_hz']:g} Hz{reached}, {settings['camera']} frames{also}, {times}"
