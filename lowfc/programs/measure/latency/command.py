@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 _RATE_HZ = 1000.0
 _LEAK = 0.01
 
-
 Kernels = Literal["numpy", "fused", "both"]
 Camera = Literal["prepared", "simulated"]
 
