@@ -32,7 +32,6 @@ PROCESSES_FILE = "processes.json"
 TRACED = (Role.CAMERA, Role.CONTROLLER)
 """Processes beside which a bare loop runs."""
 
-_HIGHEST_PRIORITY = 99
 _TIMEOUT_S = 60.0
 _POLL_S = 0.01
 
@@ -57,7 +56,7 @@ def bare_loop(
     settings = configuration(config)
     cpus = settings.realtime.controller_cpus if role is Role.CONTROLLER else settings.realtime.camera_cpus
     priority = settings.realtime.priority
-    above = settings.realtime.model_copy(update={"priority": min(priority + 1, _HIGHEST_PRIORITY) if priority else 0})
+    above = settings.realtime.model_copy(update={"priority": priority + 1 if priority else 0})
     prepare(settings.model_copy(update={"realtime": above}), role, cpus)
     folder = open_run(run, (settings.mirror.name,)).path
     pid = json.loads(_wait_and_read(folder / PROCESSES_FILE))[role]
