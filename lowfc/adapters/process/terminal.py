@@ -23,8 +23,15 @@ if TYPE_CHECKING:
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 _HOST_FAULTS = (
-    *(errno.EACCES, errno.EBADF, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENAMETOOLONG, errno.ENOSPC),
-    *(errno.EPIPE, errno.EROFS),
+    errno.EACCES,
+    errno.EBADF,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EIO,
+    errno.ENAMETOOLONG,
+    errno.ENOSPC,
+    errno.EPIPE,
+    errno.EROFS,
 )
 
 RunId = Annotated[str, typer.Option("--run", help="Name of the run; processes of one run find each other by it.")]
