@@ -13,7 +13,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from lowfc.client import stream
 from lowfc.client.requests import DECLARED as REQUESTS
-from lowfc.contract.codecs.codec import MAX_BYTES
+from lowfc.contract.codecs.codec import max_bytes
 from lowfc.contract.configuration import Acceptance
 from lowfc.contract.events import EVENTS, Event, Level
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, EVENT, FRAME, HEALTH, MIRROR_STATE, SURFACE, Role, Topic
@@ -74,7 +74,7 @@ _ACCEPTANCE = (
 _OPERATING = (
     *_TAKEOVER,
     ("frames or steps queued for a Python program, at most", stream.WAITING),
-    ("size of a request, at most, MB", MAX_BYTES / 1e6),
+    ("size of a request, at most, MB", max_bytes("law") / 1e6),
 )
 
 
