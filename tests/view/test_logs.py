@@ -30,7 +30,7 @@ from lowfc.programs.view.live_view import earlier_events
 from lowfc.programs.view.panels import mirror, pointing, sensor, tiles, trend, wavefront
 from lowfc.programs.view.recorded import Drawn, draw_logs
 from lowfc.programs.view.renderer import Renderer
-from lowfc.programs.view.session import memory_remarks
+from lowfc.programs.view.session import memory_remarks, show_logs
 from lowfc.programs.view.target import Target
 from lowfc.programs.view.verdicts import span_means
 from lowfc.programs.view.verdicts.span_means import SpanMeans
@@ -234,6 +234,16 @@ def test_a_log_larger_than_the_memory_of_the_viewer_gives_a_remark() -> None:
     assert remark.startswith(
         "the log has 1652 MB, the viewer keeps 512 MB (--memory-mb): curves of every frame may begin late"
     )
+
+
+def test_a_file_that_is_not_a_log_is_refused_before_a_viewer_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "notes.txt"
+    file.write_text("nothing recorded")
+    monkeypatch.setattr(Target, "viewer", lambda _: pytest.fail("a viewer was started"))
+    with pytest.raises(DataFileError, match="is not an MCAP file"):
+        show_logs([file], None, Target(web=True))
 
 
 def test_every_view_of_the_layout_has_data_and_the_plots_span_the_whole_log(tmp_path: Path) -> None:

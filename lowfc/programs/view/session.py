@@ -12,7 +12,7 @@ from rich.console import Console
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files.whole_file import being_written, require_folder
-from lowfc.adapters.logs.records import LogFile
+from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.join import clock_of
 from lowfc.adapters.process.progress import reading_bar
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer
@@ -81,8 +81,7 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
     """
     require_folder(target.written)
     for log in logs:
-        with LogFile(log):  # an unreadable log is an error before a viewer starts
-            pass
+        next(iter(LogReader(log, skip_damaged=True)), None)  # an unreadable file is an error before a viewer starts
     drawn = Drawn()
     with contextlib.ExitStack() as stack:
         if target.save is not None:
