@@ -130,7 +130,7 @@ class LiveView:
             self._drawn += self._render.snapshots
             fault, self._render = self._render.fault, None
             if fault is not None and self.viewer is None:
-                self._renew(f"drawing failed: {fault!r}")
+                self._renew(f"drawing failed: {fault!r}")  # raises a ViewError
 
     def _add_earlier(self, render: RenderThread) -> None:
         """Add messages from before this view; in a thread, because a frozen peer answers late."""
@@ -160,7 +160,7 @@ class LiveView:
         viewer_bytes = viewer.resident_bytes() if viewer is not None else 0
         self.peak_bytes = max(self.peak_bytes, own_bytes)
         native = viewer is not None and viewer.show is Show.NATIVE
-        stuck, self._stuck = self._stuck, native and stuck_s > STUCK_S
+        was_stuck, self._stuck = self._stuck, native and stuck_s > STUCK_S
         if viewer is not None and not viewer.alive:
             if native:
                 self.service.stop("the viewer was closed")
@@ -169,7 +169,7 @@ class LiveView:
         elif render.fault is not None:
             self._renew(f"drawing failed: {render.fault!r}")
         elif self._stuck:  # a hung window is reported, not restarted: it belongs to its user
-            if not stuck:
+            if not was_stuck:
                 self.service.event("VIEW_STUCK", stuck_s=stuck_s)
         elif stuck_s > STUCK_S:
             self._renew(f"the viewer read nothing for {stuck_s:.0f} s")
@@ -216,13 +216,11 @@ def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
     found: list[Sample] = []
     missing = []
     for name in reversed(recorder.recording.files):
-        path = Path(recorder.recording.folder, name.removesuffix(UNFINISHED))
-        part = path.with_name(path.name + UNFINISHED)
+        finished = Path(recorder.recording.folder, name.removesuffix(UNFINISHED))
+        unfinished = finished.with_name(finished.name + UNFINISHED)
+        log = unfinished if unfinished.exists() else finished
         try:
-            log = LogReader(
-                path if path.exists() or not part.exists() else part, topics=(EVENT,), skip_damaged=True, sparse=True
-            )
-            found[:0] = log
+            found = [*LogReader(log, topics=(EVENT,), skip_damaged=True, sparse=True), *found]
         except DataFileError as fault:
             missing.append(_line(f"some earlier events are missing: {fault}", now_ns))
         if len(found) >= MAX_EARLIER_EVENTS:

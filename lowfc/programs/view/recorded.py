@@ -82,14 +82,15 @@ def draw_logs(
             if not topic.queryable and message.receive_time_ns < ended_ns - REORDERING_NS:
                 raise DataFileError(f"{log} begins before the previous log ends; name each once, in order of recording")
             if topic is FRAME:
-                sent = message.sequence, message.publish_time_ns
-                same_start = start_of(sent[0]) == start_of(last_frame[0])
-                if same_start and sent[0] <= last_frame[0] and sent[1] > last_frame[1]:
+                sequence, sent_ns = message.sequence, message.publish_time_ns
+                last_sequence, last_sent_ns = last_frame
+                same_start = start_of(sequence) == start_of(last_sequence)
+                if same_start and sequence <= last_sequence and sent_ns > last_sent_ns:
                     raise DataFileError(
                         f"{log} repeats frame numbers of the log before it, as a log of another lockstep run does: "
                         "show one run at a time"
                     )
-                newest_frame = max(newest_frame, sent)
+                newest_frame = max(newest_frame, (sequence, sent_ns))
             if message.receive_time_ns > LAST_NS:
                 accumulator.unreadable += 1
                 continue

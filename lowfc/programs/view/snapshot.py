@@ -33,6 +33,7 @@ from lowfc.contract.messages import (
     RawImage,
     Topic,
     checked_time_ns,
+    floats,
     topic_of,
     wire,
 )
@@ -115,8 +116,8 @@ class Snapshot:
             then. In lockstep it is simulated time.
         host_ns: time of the host clock, as are `sent_ns` (last message of each topic) and `LastHealth`.
         steps, truths, timings, events: new rows and events; timings are the durations of the controller's stages.
-        frame, mirror, surface: newest frame (DN, at `frame_ns`), state and surface over the pupil (nm); None without a
-            new one since the last snapshot, or since the last complete one if this is `complete`. If there is a
+        frame, mirror, surface: newest frame (DN, at `frame_ns`), mirror state, and surface over the pupil (nm); None if
+            none has arrived since the last snapshot or, in a `complete` one, since the last complete one. If there is a
             controller, `frame_ns` is at most `time_ns`, because the camera's clock may be ahead.
         calibration, camera, controller: the latest of each; None before the first. health: the latest by process.
         complete: whether all new data are included; otherwise only the newest pictures, and rows and events wait.
@@ -231,19 +232,20 @@ class Accumulator:
             frame_ns = min(frame_ns, self._time_ns(host_ns))
         elif frame is not None:
             self._set_data_time(frame_ns, self._sent_ns[FRAME])
-        new = StepRows(0), TruthRows(0), TimingRows(), list[Log]()
+        step_rows, truth_rows, timing_rows, events = StepRows(0), TruthRows(0), TimingRows(), list[Log]()
         if complete:
-            new = self._steps, self._truths, self._timings, self._events
-            self._steps, self._truths = StepRows(self._steps.modes), TruthRows(self._truths.modes)
-            self._timings, self._events = TimingRows(), []
-        steps, truths, timings, events = new[0].values(), new[1].values(), *new[2:]
-        self.unreadable += len(new[0]) - len(steps.sequence) + len(new[1]) - len(truths.sequence)
+            step_rows, self._steps = self._steps, StepRows(self._steps.modes)
+            truth_rows, self._truths = self._truths, TruthRows(self._truths.modes)
+            timing_rows, self._timings = self._timings, TimingRows()
+            events, self._events = self._events, []
+        steps, truths = step_rows.values(), truth_rows.values()
+        self.unreadable += len(step_rows) - len(steps.sequence) + len(truth_rows) - len(truths.sequence)
         return Snapshot(
             time_ns=self._time_ns(host_ns),
             host_ns=host_ns,
             steps=steps,
             truths=truths,
-            timings=timings.values()[1],
+            timings=timing_rows.values()[1],
             frame=frame.pixels if frame is not None else None,
             frame_ns=frame_ns,
             mirror=self._newest_of(MIRROR_STATE, wire.MirrorState.FromString, complete=complete),
@@ -345,4 +347,4 @@ def _surface(payload: bytes) -> Single:
     image = RawImage.FromString(payload)
     if image.encoding != FLOAT32:
         raise ValueError(f"a surface is {FLOAT32}, got {image.encoding!r}")
-    return np.frombuffer(image.data, "<f4").reshape(image.height, image.width)
+    return floats(image.data, image.height, image.width)

@@ -19,7 +19,7 @@ _OKABE_ITO: tuple[Colour, ...] = (
     (213, 94, 0),
     (0, 114, 178),
 )
-BLUE, ORANGE, GREEN, YELLOW, PINK, RED, DEEP_BLUE = _OKABE_ITO
+BLUE, ORANGE, GREEN, YELLOW, PINK, RED, _ = _OKABE_ITO
 GREY: Colour = (150, 152, 160)
 WHITE: Colour = (235, 235, 240)
 

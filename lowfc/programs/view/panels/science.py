@@ -25,7 +25,7 @@ _AVERAGED = 5
 """Number of wavefronts averaged in one image, each the newest of a snapshot."""
 _DARKEST, _BRIGHTEST = -10, -4
 """Range of the colour scale, log10 of contrast."""
-_HALF_WIDTH, _SAMPLING = 12, 4  # of an image, lambda / D; samples per lambda / D, fewer for a zone further out
+_HALF_WIDTH, _SAMPLING = 12, 4  # half width of an image, lambda / D; samples per lambda / D, fewer for a larger zone
 _SAMPLES = 2 * _HALF_WIDTH * _SAMPLING
 _GAP, _BAR = 6, 5  # samples between the pictures, and across the colour scale
 _SECOND = _SAMPLES + _GAP  # start of the second picture; `_SCALE`: start of the colour scale

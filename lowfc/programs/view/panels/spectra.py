@@ -7,6 +7,7 @@ import rerun as rr
 
 from lowfc.adapters.logs.columns import frame_rate_hz
 from lowfc.arrays import Array, Mask
+from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import rejection
 from lowfc.control.laws.spectra import Spectrum, in_bins, spectrum, time_series
@@ -21,7 +22,6 @@ from lowfc.programs.view.verdicts.steady import LawInForce, Steady
 TILTS, OTHERS = "spectra/tip_tilt", "spectra/other_modes"
 WIDTH = 150.0
 
-_HIGHEST_TILT = 3
 _SEGMENT = 1024
 _MAX_DECADES = 2
 """Decades by which a scale may exceed the range of the data before it shrinks."""
@@ -55,10 +55,10 @@ class Spectra(Panel):
         rate_hz = frame_rate_hz(snapshot.camera, snapshot.steps)
         series = time_series(*steady.rows())
         spectra = spectrum(series, rate_hz) if rate_hz else None
-        noll = np.array(calibration.noll)
+        tilts = np.isin(calibration.noll, TIP_TILT)
         law = steady.law if steady.mode == LoopMode.CLOSED else None
         at(stream, snapshot.time_ns)
-        for axes, modes in zip(self._axes, (noll <= _HIGHEST_TILT, noll > _HIGHEST_TILT), strict=True):
+        for axes, modes in zip(self._axes, (tilts, ~tilts), strict=True):
             frequency_hz, powers = np.zeros(0), list[Array]()
             state = ": too few frames yet" if modes.any() else ": no such modes"
             if spectra is not None and modes.any():
@@ -92,7 +92,8 @@ def power_curves(spectra: Spectrum, modes: Mask, law: LawInForce | None, rate_hz
     error, pol = spectra.power_nm2_hz[:, : modes.size], spectra.power_nm2_hz[:, modes.size :]
     columns = [pol[:, modes].sum(axis=1), error[:, modes].sum(axis=1)]
     if law is not None and not law.linear:
-        integrating = integrator(law.gain, law.leak, tuple(range(2, 2 + modes.size)), law.delay_frames, rate_hz)
+        any_noll = tuple(range(2, 2 + modes.size))  # the rejection does not depend on it
+        integrating = integrator(law.gain, law.leak, any_noll, law.delay_frames, rate_hz)
         passed = rejection(integrating, spectra.frequency_hz)[:, modes] ** 2
         columns.append((passed * pol[:, modes]).sum(axis=1))
     if not any(column[1:].any() for column in columns):

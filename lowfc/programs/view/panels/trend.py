@@ -22,7 +22,7 @@ WIDTH = 200.0
 _FIRST_SPAN_S, _LONGER = 60.0, 1.4
 """First span of the time axis, and the factor by which it grows when it is full."""
 _TICKS_S = (10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 86_400, 172_800, 604_800, 2_592_000)
-_MAX_TICKS = 6
+_MAX_TICKS, _MAX_TICKS_WITH_SECONDS = 6, 3
 
 
 class Trend(Panel):
@@ -70,7 +70,8 @@ def _nm_ticks(least: float, most: float) -> list[tuple[float, str]]:
 
 def _clock_ticks(begin_ns: int, span_s: float) -> Ticks:
     """Ticks at round times of day, or at midnights for a trend of days, UTC, in seconds since `begin_ns`."""
-    step_s = next((one for one in _TICKS_S if span_s / one <= (_MAX_TICKS if one >= 60 else 3)), _TICKS_S[-1])
+    fitting_s = (one for one in _TICKS_S if span_s / one <= (_MAX_TICKS if one >= 60 else _MAX_TICKS_WITH_SECONDS))
+    step_s = next(fitting_s, _TICKS_S[-1])
     form = "%m-%d" if step_s >= 86_400 else "%H:%M" if step_s >= 60 else "%H:%M:%S"
     first_s = -(-begin_ns // (step_s * 10**9)) * step_s
     times_s = range(first_s, int(begin_ns * 1e-9 + span_s) + 1, step_s)

@@ -73,7 +73,7 @@ class Wavefront(Panel):
         for plot in MODES:
             plot.name(stream, dict(zip(names, distinct(len(noll)), strict=True)))
         kind = "true" if true else "measured"
-        flat = f"with a flat mirror, {kind if true else 'pseudo-open-loop'}"
+        flat = f"with a flat mirror, {'true' if true else 'pseudo-open-loop'}"
         RMS.name(stream, {flat: GREY, f"residual, {kind}": GREEN})
         degrees = np.array([noll_to_orders(index)[0] for index in noll])
         distinct_degrees = sorted(set(degrees.tolist()))

@@ -18,7 +18,7 @@ DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
 """Fractions of the expected light. Below a fifth the controller refuses frames by default; at half the noise is 1.4
 times larger; more than twice is not the calibrated star."""
 HEALTH_OVERDUE_S = 4.0
-"""Time without a frame after which a camera that is not silent is known to run: by then a dead one is silent."""
+"""Time without a frame after which a dead camera would count as silent: one that is not silent by then runs."""
 
 REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.DARK: ("too dark", "the star is gone; check pointing, shutter and clouds"),
@@ -72,8 +72,8 @@ def _rate(state: RunState, nominal_hz: float) -> Tile:
         return tile(value, f"slow: nominal {nominal_hz:.3g} Hz", Level.WARNING, advice)
     unused = {"skipped": state.recent["skipped"], "never arrived": state.recent["missing"]}
     unused["refused"] = sum(state.recent[reason] for reason in REFUSED)
-    few = ", ".join(f"{counted(count, 'frame')} {what}" for what, count in unused.items() if count)
-    detail = f"{few} {state.lately}" if few else "none lost, none refused"
+    named = ", ".join(f"{counted(count, 'frame')} {what}" for what, count in unused.items() if count)
+    detail = f"{named} {state.lately}" if named else "none lost, none refused"
     return tile(value, f"{detail}{', simulated time' if state.simulated else ''}", Level.GOOD)
 
 

@@ -170,7 +170,7 @@ def _mirror(state: RunState, ended: LogEnd) -> Tile:
 
 
 def _log(state: RunState, ended: LogEnd) -> Tile:
-    messages = max(state.totals["lost"], ended.lost)  # the first up to the recorder's last Health
+    messages = max(state.totals["lost"], ended.lost)  # from the recorder's last Health, and from the end of the log
     lost, parts = counted(messages, "message"), counted(ended.damaged, "part")
     detail = f"{ended.name}, {f'{lost} lost' if messages else 'nothing lost'}"
     if ended.damaged:

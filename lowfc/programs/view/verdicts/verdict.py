@@ -12,7 +12,7 @@ import numpy as np
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.contract.printable import printable
-from lowfc.control.loop.safety import REASONS, Limit, LoopMode, Reason
+from lowfc.control.loop.safety import Limit, LoopMode, Reason, reason_name
 from lowfc.control.loop.wording import CAMERA_MISFIT, counted
 from lowfc.programs.view.verdicts.camera_verdict import all_refused, frames, star
 from lowfc.programs.view.verdicts.facts import facts
@@ -87,7 +87,7 @@ def _loop(state: RunState) -> Tile:
     if held := _held(reported):
         advice = f"The loop is closed and holds its command: {held}."
         return tile("HOLDING", f"closed, but {held}: command held", Level.WARNING, advice)
-    if mirror.life is Liveness.SILENT:  # in logs of version 0.1, that is not a mirror fault
+    if mirror.life is Liveness.SILENT:  # normally a mirror fault, above; logs of version 0.1 have none
         return tile("CLOSED", "but the mirror is silent", Level.WARNING)
     if camera.life is Liveness.STOPPED:
         advice = "The camera was stopped: the loop is closed and holds its command."
@@ -143,9 +143,7 @@ def _mirror(state: RunState) -> Tile:
     if reported is None:
         return tile("?", "no state of it is known")
     if reported.refused and reported.status != wire.MIRROR_STATUS_FOLLOWING:
-        why = next(
-            (reason.name for reason in REASONS if reason.value == reported.refused), f"reason {reported.refused}"
-        )
+        why = reason_name(reported.refused)
         advice = f"The mirror refuses the commands ({why}): it holds or relaxes by itself. "
         return tile("REFUSES", f"the commands: {why}", Level.BAD, f"{advice}Check its grid and its clock.")
     if reported.status == wire.MIRROR_STATUS_WAITING:
