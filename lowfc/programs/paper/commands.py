@@ -67,10 +67,10 @@ def validate(
             raise ConfigurationError(f"there is no table {name!r}{nearest(name, known)}; {', '.join(known)}")
     chosen = [name for name in TABLES if name in tables or "all" in tables]
     chosen += [name for name in ADDITIONAL if name in tables]
-    pages = all(name in ADDITIONAL for name in chosen)
-    if docs is not None and (not (pages or tuple(chosen) == TABLES) or sensor or plots is not None):
+    only_additional = all(name in ADDITIONAL for name in chosen)
+    if docs is not None and (not (only_additional or tuple(chosen) == TABLES) or sensor or plots is not None):
         raise ConfigurationError(
-            f"--docs writes complete pages: use it with all, or with {' and '.join(ADDITIONAL)}; without --sensor and "
+            f"--docs writes complete pages: use it with all, or with {' or '.join(ADDITIONAL)}; without --sensor and "
             "--plots"
         )
 
@@ -83,7 +83,7 @@ def validate(
         typer.echo(f"{', '.join(fixed)}: the sensors are fixed, --sensor has no effect there", err=True)
     results = run(chosen, context, plots if docs is None else docs / PICTURES)
     sys.stdout.write((to_json(results) if as_json else "\n\n".join(map(to_text, results))) + "\n")
-    if docs is not None and pages:
+    if docs is not None and only_additional:
         for table in results:
             write_page(docs, table)
     elif docs is not None:

@@ -142,9 +142,9 @@ def apply_steps(loop: Client, step_rms_nm: float, base_nm: Array) -> tuple[dict[
 
 def channel_results(history: History, marks: dict[str, list[int]], channel_modes_nm: Array) -> dict[str, ChannelResult]:
     """Results of the channels, from the history of a simulated run and the values of `apply_steps`."""
-    truths = history.true
+    truths, sequences = history.true, history.steps.sequence
     assert truths is not None  # noqa: S101  # a simulated loop's
-    sequences, command = history.steps.sequence, history.steps.command_nm
+    reaction_nm = history.steps.command_nm + truths.disturbance_nm
     known = np.isfinite(truths.disturbance_nm[:, 0])
 
     def before(end: int, frames: int) -> Mask:
@@ -152,14 +152,12 @@ def channel_results(history: History, marks: dict[str, list[int]], channel_modes
 
     results = {}
     for name, changed_at in marks.items():
-        ends = [before(end, 3 * SETTLE // 4) for end in changed_at]
-        reaction_nm = command + truths.disturbance_nm
-        reaction = np.array([reaction_nm[end].mean(axis=0, dtype=np.float64) for end in ends])
+        settled = [before(end, 3 * SETTLE // 4) for end in changed_at]
+        means_nm = np.array([reaction_nm[rows].mean(axis=0, dtype=np.float64) for rows in settled])
         residual_nm = [
             np.sqrt(truths.residual_nm[before(end, WINDOW)].var(axis=0, dtype=np.float64).sum())
             for end in (changed_at[0], changed_at[-1])
         ]
-        results[name] = ChannelResult(
-            channel_modes_nm[:: STEPS // (len(changed_at) - 1)], reaction, np.array(residual_nm)
-        )
+        stride = STEPS // (len(changed_at) - 1)
+        results[name] = ChannelResult(channel_modes_nm[::stride], means_nm, np.array(residual_nm))
     return results

@@ -100,7 +100,7 @@ def run(names: Sequence[str], context: Context, plots: Path | None = None) -> li
     for name in context.sensors or ():
         prepared(name)  # report an invalid name before the work, not after it
     if plots is not None:
-        figure_class()
+        figure_class()  # report a missing matplotlib before the work, not after it
         with raised_as(DataFileError, OSError, f"the folder {plots} cannot be created"):
             plots.mkdir(parents=True, exist_ok=True)
     with counting_bar(Console(stderr=True), MofNCompleteColumn(), TimeElapsedColumn()) as count, threadpool_limits(1):

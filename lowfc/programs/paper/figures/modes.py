@@ -29,7 +29,8 @@ AMPLITUDES = np.array([0.005 * step for step in range(1, 31)])
 """Amplitudes of the pure modes of Fig. 8(a), waves rms."""
 _MODE_TICKS = [str(noll) for noll in NOLLS_14]
 _PAPER_R2 = {"sam": (0.95, 0.97), "clowfs": (0.79, 0.90)}
-_PAPER_LINEAR = {"sam": ("linear", 0.1), "clowfs": ("linear", 0.1), "zwfs": ("linear to 0.03 waves", None)}
+_PAPER_DEVIATIONS = {"sam": ("linear", 0.1), "clowfs": ("linear", 0.1), "zwfs": ("linear to 0.03 waves", None)}
+"""At lambda/20 and lambda/10."""
 _PAPER_ERROR_WAVES = 0.01
 _DEVIATION = 0.1
 
@@ -212,12 +213,12 @@ def _range_rows(context: Context, name: str) -> Iterator[Row]:
         "lambda/20": int(np.argmin(np.abs(AMPLITUDES - 0.05))),
         "lambda/10": int(np.argmin(np.abs(AMPLITUDES - 0.1))),
     }
-    linear = dict(zip(columns, _PAPER_LINEAR.get(prepared(name).paper_name, (None, None)), strict=True))
+    in_paper = dict(zip(columns, _PAPER_DEVIATIONS.get(prepared(name).paper_name, (None, None)), strict=True))
     for iterations, estimates in zip(ITERATIONS, _pure_modes(context, name), strict=True):
         deviation = deviations(estimates)
         fitted = partial(Row, modes=MODES, estimator=label("pinv", iterations), assumption=assumption)
         for amplitude, j in columns.items():
-            paper = linear[amplitude] if iterations == 0 else None
+            paper = in_paper[amplitude] if iterations == 0 else None
             yield fitted(name, f"mean deviation at {amplitude}", "", float(deviation[:, j].mean()), paper)
             yield fitted(name, f"largest deviation at {amplitude}", "", float(deviation[:, j].max()))
         ranges = np.array([linear_range(mode) for mode in deviation])

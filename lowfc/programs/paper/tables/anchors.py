@@ -92,7 +92,8 @@ def anchors(context: Context) -> list[Row]:
 
 def _with_verdict(row: Row, allowed: float | None = None) -> list[Row]:
     """A row, and its verdict if a value is allowed or published, on `predicted` if known, otherwise on `measured`."""
-    limit, ours = row.paper if allowed is None else allowed, row.measured if row.predicted is None else row.predicted
+    limit = row.paper if allowed is None else allowed
+    ours = row.measured if row.predicted is None else row.predicted
     if limit is None:
         return [row]
     assert isinstance(ours, float)  # noqa: S101  # compared values are numbers
@@ -112,12 +113,11 @@ def _pointing(context: Context, name: str) -> list[Row]:
         (folder / "gains.toml").write_text(f"{GAINS}{sensor}")
         for preset in ("reaction-wheel", "reaction-wheel-ideal"):
             context.progress(f"anchors {name}, {preset}", len(rows), 12)
-            loop = (preset, folder)
-            observed = _history(folder / _sim_loop(*loop, "gains.toml", OBSERVED_S, context.seed)["log"])
+            observed = _history(folder / _sim_loop(preset, folder, "gains.toml", OBSERVED_S, context.seed)["log"])
             law = folder / f"{preset}.fits"
             _lowfc(folder, "tune", str(observed.log.path), "--controller", "lqg", "--out", str(law))
             (folder / "law.toml").write_text(f'{GAINS}law = "{law}"\n{sensor}')
-            run = _sim_loop(*loop, "law.toml", CLOSED_S, context.seed + 1000)
+            run = _sim_loop(preset, folder, "law.toml", CLOSED_S, context.seed + 1000)
             limit = _quantum_pointing_nm(observed, name) / nm_per_mas
             new_lqg_row = partial(new_row, estimator="LQG")
             rows.append(new_row(f"tilt, {preset}, open loop", measured=run["tilt_disturbance_mas"], assumption=LOOP))
@@ -200,7 +200,7 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
         return np.asarray(R @ (image / image.sum() - normalised_I0))
 
     measured = np.array(context.map(f"anchors {name}, 100 s", trial, range(context.trials))).std(axis=0, ddof=1)
-    predicted = np.sqrt(np.diag(tolerance.frame_noise_nm2(name, MAGNITUDE)) / frames)
+    predicted = np.sqrt(tolerance.frame_noise_nm2(name, MAGNITUDE) / frames)
     limit = np.sqrt(tolerance.quantum_noise_nm2(name, MAGNITUDE) / frames)
     for mode, noll in enumerate(NOLLS_14):
         pm = 1e3 * np.array([measured[mode], predicted[mode], limit[mode]])
@@ -220,8 +220,7 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
 
 def added_contrast(name: str, magnitude: float, quantum: bool = False) -> float:
     """Contrast that drift and noise add behind integrators of the best gains."""
-    of_frame = np.diag(tolerance.frame_noise_nm2(name, magnitude))
-    noise = tolerance.quantum_noise_nm2(name, magnitude) if quantum else of_frame
+    noise = (tolerance.quantum_noise_nm2 if quantum else tolerance.frame_noise_nm2)(name, magnitude)
     step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
     residual_nm2 = [
         drift_residual_nm2(step, n, tolerance.EXPOSURE, best_gain(step, n, tolerance.EXPOSURE)) for n in noise.tolist()

@@ -108,11 +108,11 @@ def _signals(sensor: Prepared) -> Iterator[Row]:
 
 
 def _ratios(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
-    own, paper = np.ptp(tilt_signal(clowfs, 0)) / np.ptp(tilt_signal(sam, 0)), PAPER_SIGNAL_RATIO
-    for k, light in enumerate(("own photometry", "paper's electrons")):
-        counts = [float(paper_count_e(each) / each.band_I0.sum()) if k else 1.0 for each in (clowfs, sam)]
-        quantity, ratio = f"P-V of the signal of 1 mas in electrons, {light}", float(own * counts[0] / counts[1])
-        yield Row("clowfs / sam", quantity, "", ratio, paper, assumption="Band in five wavelengths, x tilt.")
+    own = float(np.ptp(tilt_signal(clowfs, 0)) / np.ptp(tilt_signal(sam, 0)))
+    clowfs_e, sam_e = (float(paper_count_e(each) / each.band_I0.sum()) for each in (clowfs, sam))
+    for light, ratio in (("own photometry", own), ("paper's electrons", own * clowfs_e / sam_e)):
+        quantity, band = f"P-V of the signal of 1 mas in electrons, {light}", "Band in five wavelengths, x tilt."
+        yield Row("clowfs / sam", quantity, "", ratio, PAPER_SIGNAL_RATIO, assumption=band)
     predicted = f"Predicted; the ratio in the paper's Table 4 is {TABLE4_MAS['sam'][1] / TABLE4_MAS['clowfs'][1]:.1f}."
     for k, light in enumerate(("paper's electrons", "own photometry")):
         scatter = []

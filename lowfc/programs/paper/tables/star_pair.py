@@ -74,7 +74,7 @@ def pair_rows(name: str) -> Iterator[Row]:
     new_row = partial(Row, name, unit="", assumption=ASSUMPTION)
     gains, residual_nm2 = dict[str, Array](), dict[str, Array]()
     for star, (magnitude, _) in STARS.items():
-        noise = np.diag(tolerance.frame_noise_nm2(name, magnitude)).tolist()
+        noise = tolerance.frame_noise_nm2(name, magnitude).tolist()
         best = [best_gain(step, n, tolerance.EXPOSURE) for n in noise]
         residual = [drift_residual_nm2(step, n, tolerance.EXPOSURE, g) for n, g in zip(noise, best, strict=True)]
         gains[star], residual_nm2[star] = np.array(best), np.array(residual)
@@ -104,5 +104,5 @@ def pair_rows(name: str) -> Iterator[Row]:
     yield new_row(
         f"time for a roll's step of {ROLL_NM:g} nm in every mode to decay to {ROLLED:g}, target",
         unit="s",
-        measured=float((1 + bisect_left(range(1, _LONGEST_FRAMES), True, key=decayed)) / tolerance.RATE_HZ),
+        measured=bisect_left(range(_LONGEST_FRAMES), True, key=decayed) / tolerance.RATE_HZ,
     )

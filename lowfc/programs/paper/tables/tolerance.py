@@ -41,10 +41,10 @@ _LARGEST = 6e-9  # contrast up to which the fourth order is fitted
 ABOUT = """Drift rate of one mode, and amplitude of a line in it, that add a contrast of 1e-9, 1e-10 or 1e-11: theory of
 `lowfc/design/tolerance.py`, from the contrast's Hessian (and its fourth order, which matters for tilt) and the noise of
 a frame. `--json` has every mode, star and contrast; this page has four modes, two stars and 1e-10. Then twelve points
-by simulation, and a pair of stars as a coronagraph observes it: a reference of V = 2 and a target of V = 5 with another
-colour and roll angle, one exposure subtracted from the other. Behind a symmetric pupil and a real mask, a change of
-colour changes the image by an even function of position, and the zero point of an aperture mask stays; the zero points
-of the Zernike sensor and of CLOWFS move, and I0 has to be measured again on the target.
+by simulation, and a pair of stars as a coronagraph observes them: a reference of V = 2 and a target of V = 5 with
+another colour and roll angle, one exposure subtracted from the other. Behind a symmetric pupil and a real mask, a
+change of colour changes the image by an even function of position: the zero point of an aperture mask stays; those of
+the Zernike sensor and of CLOWFS move, and I0 has to be measured again on the target.
 """
 LOOP = (
     f"{RATE_HZ:g} Hz, exposure of half the period, delay of one frame, 1 e- read noise, weighted fit of all 14 modes, "
@@ -111,10 +111,10 @@ def light_e(magnitude: float) -> float:
 
 @lru_cache(maxsize=256)
 def frame_noise_nm2(name: str, magnitude: float) -> Array:
-    """Noise covariance (14, 14) of a loop's modes in a frame, at the central wavelength."""
+    """Noise variance (14,) of each mode of a loop in a frame, at the central wavelength, with all 14 modes fitted."""
     sensor = prepared(name)
     I0, R = sensor.loop_fit(sensor.I0, sensor.H[:, : len(NOLLS_14)], light_e(magnitude), READ_NOISE_E)
-    return noise_nm2(R, I0, light_e(magnitude) * float(sensor.I0.sum()), READ_NOISE_E)
+    return np.asarray(np.diag(noise_nm2(R, I0, light_e(magnitude) * float(sensor.I0.sum()), READ_NOISE_E)))
 
 
 def quantum_noise_nm2(name: str, magnitude: float) -> Array:
@@ -147,12 +147,12 @@ def tolerance(context: Context) -> list[Row]:
 
 def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterator[Row]:
     """Rows of one sensor; `lines` are the results of `tolerated_lines`."""
-    of_contrast = contrasts_of(name)
+    modal = contrasts_of(name)
     for magnitude in MAGNITUDES:
-        noise, quantum = np.diag(frame_noise_nm2(name, magnitude)), quantum_noise_nm2(name, magnitude)
+        noise, quantum = frame_noise_nm2(name, magnitude), quantum_noise_nm2(name, magnitude)
         for mode, noll in enumerate(NOLLS_14):
             for allowed in ALLOWED:
-                residual_nm2 = of_contrast.variance_nm2(mode, allowed)
+                residual_nm2 = modal.variance_nm2(mode, allowed)
                 where = f"Z{noll} {mode_name(noll)}, V = {magnitude:g}, {allowed:g}"
                 new_row = partial(Row, name)
                 for kind in KINDS:
@@ -188,9 +188,9 @@ def _checked(context: Context) -> list[Row]:
 
     def simulated(case: tuple[str, float, int]) -> Row:
         name, magnitude, noll = case
-        mode, of_contrast = NOLLS_14.index(noll), contrasts_of(name)
-        noise = float(np.diag(frame_noise_nm2(name, magnitude))[mode])
-        drift = tolerated_drift(of_contrast.variance_nm2(mode, CHECKED_CONTRAST), noise, EXPOSURE)
+        mode, modal = NOLLS_14.index(noll), contrasts_of(name)
+        noise = float(frame_noise_nm2(name, magnitude)[mode])
+        drift = tolerated_drift(modal.variance_nm2(mode, CHECKED_CONTRAST), noise, EXPOSURE)
         frames = int(np.ceil(_FRAMES_PER_TRIAL * context.trials / drift.gain))
         trial = DriftTrial(twins[name], NOLLS_14, light_e(magnitude), READ_NOISE_E, EXPOSURE)
         only = np.eye(len(NOLLS_14))[mode]
@@ -200,7 +200,7 @@ def _checked(context: Context) -> list[Row]:
             name,
             f"contrast added by Z{noll} {mode_name(noll)} at its tolerance, V = {magnitude:g}",
             "",
-            of_contrast.added(mode, float(residual_nm2[mode])),
+            modal.added(mode, float(residual_nm2[mode])),
             error=CHECKED_CONTRAST * float(np.sqrt(2.0 / (frames * drift.gain))),
             predicted=CHECKED_CONTRAST,
             estimator=ESTIMATORS["integrator"],
@@ -228,7 +228,7 @@ def plot(context: Context, path: Path) -> None:
         residual_nm2 = contrasts_of(name).variance_nm2(mode, SHOWN_CONTRAST)
         pm_per_root_s = []
         for magnitude in magnitudes.tolist():
-            noise = quantum_noise_nm2(name, magnitude) if quantum else np.diag(frame_noise_nm2(name, magnitude))
+            noise = (quantum_noise_nm2 if quantum else frame_noise_nm2)(name, magnitude)
             drift = tolerated_drift(residual_nm2, float(noise[mode]), EXPOSURE, "lqg")
             pm_per_root_s.append(1e3 * np.sqrt(drift.step_nm2 * RATE_HZ))
         return np.array(pm_per_root_s)
