@@ -26,8 +26,8 @@ from lowfc.programs.launch.processes import program
 from lowfc.programs.launch.sim_loop import children_of
 from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S
 from lowfc.programs.measure.latency.run import LatencyOptions, one_loop
+from tools.shared import ROOT
 
-ROOT = Path(__file__).parents[1]
 SIZE = Size()
 DIRECT, CAMERA_PROCESS = "direct link", "ImageStreamIO, camera process"
 IN_CONTROLLER = "ImageStreamIO, read by the controller"

@@ -21,7 +21,7 @@ ADVICE: dict[str, Advice] = {
     "STARTED": Advice("a process has started.", _NOTHING),
     "STOPPED": Advice("a process has ended, for the named reason.", "start it again if nobody meant to stop it."),
     "CLOCK_OFF": Advice(
-        "the wall clock was set after the first run since boot; the times of all runs are off by as much.",
+        "the wall clock was set after the first run since boot; the times of all runs do not include that change.",
         "let a time server set the clock before the first run; `lowfc doctor` shows how to correct it later.",
     ),
     "REALTIME_REFUSED": Advice(

@@ -24,7 +24,7 @@ def measure() -> Results:
         for name, channel in result.channels.items():
             undone, error = channel.undone()
             run[name] = {"undone": undone, "error": error, "left_nm": channel.residual_nm.tolist()}
-            run["seen_nm"] = float(np.linalg.norm(channel.channel_nm[-1]))
+        run["seen_nm"] = float(np.linalg.norm(result.channels[SHIFTED].channel_nm[-1]))
         runs[f"{step_rms_nm:g}"] = run
     return {"runs": runs}
 

@@ -102,9 +102,9 @@ def moved_lines_mas(config: Configuration, calibration: Calibration, law: Linear
 
 
 def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw) -> tuple[float, float]:
-    """Continuous-time residual of the disturbance's known spectrum, and the noise part, mas rms."""
+    """Continuous-time tilt residual of the disturbance's known spectrum, and the noise part, mas rms per axis."""
     frequency_hz, variance_nm2 = variances_nm2(disturbance_of(config))
-    passed = residual_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing_of(config))[:, :2]
+    passed = residual_power(law, 2 * np.pi * frequency_hz / config.camera.rate_hz, timing_of(config))[:, :2]
     waves = np.mean(np.sum(variance_nm2[:, :2] * passed, axis=0))
     noise = np.mean(frame_noise_nm(config, calibration)[:2] ** 2 * noise_gain(law, config.camera.delay_frames)[:2])
     nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)

@@ -38,8 +38,8 @@ def measure() -> Results:
             run = json_of(f"{LOOP} --rate {rate_hz}{option} --config run.toml", folder) | {"log": None, "logs": []}
             # One frame of delay, two if the command was late.
             delay = 1 + run["commands_late"] / run["frames_published"]
-            config = load(file, KEYS | {"camera.rate_hz": float(rate_hz)})
-            runs[name] = run | {"tilt_predicted_mas": round(tilt_residual_mas(config, delay), 4)}
+            config = load(file, KEYS | {"camera.rate_hz": float(rate_hz), "camera.delay_frames": delay})
+            runs[name] = run | {"tilt_predicted_mas": round(tilt_residual_mas(config), 4)}
     return {"runs": runs}
 
 

@@ -100,9 +100,10 @@ class ModalBench(Bench):
         amplitude_nm = self._disturbance.amplitude_nm * np.exp(2j * np.pi * phase_cycles)[:, None]
         self._disturbance = replace(moved, amplitude_nm=amplitude_nm)
         before, self._sampler = self._sampler, self._new_sampler()
-        old, new = vars(before)["_lines"], vars(self._sampler)["_lines"]
-        for name in ("_rng", "_next", "_vector") if new is not None else ():  # damped lines keep their state
-            setattr(new, name, getattr(old, name))
+        old_lines, new_lines = vars(before)["_lines"], vars(self._sampler)["_lines"]
+        if new_lines is not None:  # damped lines keep their state
+            for name in ("_rng", "_next", "_vector"):
+                setattr(new_lines, name, getattr(old_lines, name))
 
     def run(self, frames: int, *, record: bool = True) -> None:
         """Expose, control, move the mirror; events are always recorded."""

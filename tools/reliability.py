@@ -49,14 +49,16 @@ def measure_again(results: Results, seed: int, names: Sequence[str]) -> Results:
         about = host()
         new_cases = _run(" ".join(f"--case {name}" for name in missing), seed)["cases"]
         kept |= {case["name"]: {**case, "host": about} for case in new_cases}
-    return run | counts(cases := list(kept.values())) | {"cases": cases}
+    cases = list(kept.values())
+    return run | counts(cases) | {"cases": cases}
 
 
 def render_chaos(results: Results) -> str:
     """A row for each case, over all seeds; latencies during stalls and with a console."""
     runs = results["runs"]
+    all_cases = [case for run in runs for case in run["cases"]]
     by_name: dict[str, list[Results]] = {}
-    for case in (case for run in runs for case in run["cases"]):
+    for case in all_cases:
         by_name.setdefault(case["name"], []).append(case)
     passed, failed, skipped = (sum(run[name] for run in runs) for name in ("passed", "failed", "skipped"))
     skipped_text = f", {skipped} skipped" if skipped else ""
@@ -74,12 +76,12 @@ def render_chaos(results: Results) -> str:
     ]
     if failures:
         parts.append("\n".join(["What failed:", "", *failures, ""]))
-    if steps_nm := _measurements(by_name, "restart_step_nm"):
+    if steps_nm := _measurements(all_cases, "restart_step_nm"):
         parts.append(
             f"The first command of a restarted controller moved an actuator by at most {max(steps_nm):.1f} nm of "
             f"surface ({len(steps_nm)} restarts).\n"
         )
-    if recovered_s := _measurements({"": by_name.get("kill-controller", [])}, "recovered_s"):
+    if recovered_s := _measurements(by_name.get("kill-controller", []), "recovered_s"):
         parts.append(
             "After a kill and restart in closed loop, the residual (rms over 50 frames) was within the recovery limit "
             f"{1e3 * max(recovered_s):.0f} ms after the controller's first used frame or earlier "
@@ -90,8 +92,9 @@ def render_chaos(results: Results) -> str:
     parts.append(f"Measured again after a change of the case itself: {again}." if again else "")
     hosts: dict[str, dict[str, list[int]]] = {}
     for run in runs:
-        for case in (case for case in run["cases"] if "host" in case):
-            hosts.setdefault(host_in_words(case["host"]), {}).setdefault(case["name"], []).append(run["seed"])
+        for case in run["cases"]:
+            if "host" in case:
+                hosts.setdefault(host_in_words(case["host"]), {}).setdefault(case["name"], []).append(run["seed"])
     for about, found in hosts.items():
         names = (f"`{name}` (seeds {', '.join(map(str, seeds))})" for name, seeds in found.items())
         parts.append(f"Measured {about} by `python -m tools.reliability`: {', '.join(names)}.")
@@ -116,8 +119,8 @@ def _rows(by_name: dict[str, list[Results]]) -> list[Sequence[object]]:
     return rows
 
 
-def _measurements(by_name: dict[str, list[Results]], name: str) -> list[Any]:
-    return [case["figures"][name] for cases in by_name.values() for case in cases if name in case["figures"]]
+def _measurements(cases: Sequence[Results], name: str) -> list[Any]:
+    return [case["figures"][name] for case in cases if name in case["figures"]]
 
 
 def _stalls(by_name: dict[str, list[Results]]) -> list[str]:

@@ -44,8 +44,8 @@ from lowfc.adapters.process.realtime import set_up
 from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S, percentiles
 from lowfc.programs.measure.latency.run import LatencyOptions, one_loop
+from tools.shared import ROOT
 
-ROOT = Path(__file__).parents[2]
 SIZE = Size(SIDE, MODES, MIRROR_SIDE)
 PRIORITY = 50
 
@@ -148,10 +148,10 @@ def one_run(implementation: Implementation, options: argparse.Namespace, priorit
             if source.status != 0:
                 end = "did not end" if source.status is None else f"ended with exit status {source.status}"
                 raise ComparisonError(f"the source of frames {end}: {source.stderr_tail()}")
-            words = "\n".join(child.stderr_tail() for child in children.values())
+            complaints = "\n".join(child.stderr_tail() for child in children.values())
         found = run_statistics(folder, options.warm_up)
         if found["frame_to_command"] is None:
-            raise ComparisonError(f"no command was sent: {words}")
+            raise ComparisonError(f"no command was sent: {complaints}")
         return found
 
 
@@ -283,10 +283,10 @@ def tables(result: Result) -> list[Lines]:
     ]
 
 
-def _cells(name: str, turns: Sequence[Result | None], missing: bool) -> list[str]:
+def _cells(name: str, turns: Sequence[Result | None], is_missing: bool) -> list[str]:
     done = [turn for turn in turns if turn is not None]
     if not done:
-        return [name, "not installed" if missing else "failed", *[""] * (len(HEADINGS) - 2)]
+        return [name, "not installed" if is_missing else "failed", *[""] * (len(HEADINGS) - 2)]
     without, frames = (sum(turn[one] for turn in done) for one in ("without_command", "frames"))
     to_mirror = _spans(done, "frame_to_mirror", ("p50", "p99"))
     return [name, *_spans(done, "frame_to_command", PERCENTILES), f"{without} of {frames}", *to_mirror]

@@ -74,7 +74,7 @@ def test_the_residual_is_the_predicted_one(tmp_path: Path, frames: int) -> None:
     )
     assert results["frames_published"] == results["commands_applied"] == frames
     assert results["tilt_disturbance_mas"] == pytest.approx(5, rel=0.15)
-    predicted_mas = tilt_residual_mas(load(tmp_path / "test.toml"), delay_frames=1.0)
+    predicted_mas = tilt_residual_mas(load(tmp_path / "test.toml"))
     assert results["tilt_residual_mas"] == pytest.approx(predicted_mas, rel=0.1)
 
 
