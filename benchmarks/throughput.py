@@ -13,6 +13,7 @@ Example:
 import argparse
 import math
 import shlex
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 
 from benchmarks.load import run_lowfc
@@ -101,13 +102,12 @@ def grid(lowest_hz: float, highest_hz: float, step: float) -> list[float]:
 
 def search(sustains: Callable[[int], bool], count: int) -> int:
     """Index of the highest of `count` rates sustained in two of three runs, by bisection; -1 for none."""
-    low, high = -1, count
-    while high - low > 1:
-        middle = (low + high) // 2
-        first, second = sustains(middle), sustains(middle)
-        holds = first if first == second else sustains(middle)
-        low, high = (middle, high) if holds else (low, middle)
-    return low
+
+    def fails(index: int) -> bool:
+        first, second = sustains(index), sustains(index)
+        return not (first if first == second else sustains(index))
+
+    return bisect_left(range(count), True, key=fails) - 1
 
 
 def find(words: Sequence[str], rates: Sequence[float], seconds: float, report: Report) -> Result:

@@ -78,15 +78,13 @@ def modal_case(case: tuple[str, str, float]) -> Results:
     For bright stars, the residual with fixed gains too.
     """
     sensor, preset, magnitude = case
-    form, dark_zone_contrast = _contrast(sensor)
     try:
         _noise_nm2(sensor, magnitude)
     except CalibrationError as saturated:
         return {"sensor": sensor, "preset": preset, "magnitude": magnitude, "saturates": str(saturated)}
     residual_nm2 = np.array([_closed_nm2(*case, seed, _AUTO) for seed in SEEDS])
     disturbance_nm2 = np.array([_open_nm2(preset, seed) for seed in SEEDS])
-    open_nm = np.sqrt(disturbance_nm2.sum(axis=1).mean())
-    row = _row(case, (residual_nm2 - disturbance_nm2) @ np.diag(form), dark_zone_contrast, open_nm, residual_nm2)
+    row = _row(case, residual_nm2, disturbance_nm2)
     if magnitude in BRIGHT and preset != "quiet":
         seeds = SEEDS[:2]
         fixed = np.array(
@@ -103,27 +101,23 @@ def modal_case(case: tuple[str, str, float]) -> Results:
 def imaged_case(case: tuple[str, str, float]) -> Results:
     """As `modal_case` without fixed gains, with every image simulated."""
     sensor, preset, magnitude = case
-    form, dark_zone_contrast = _contrast(sensor)
     calibration = calibrated(_configured(sensor, preset, magnitude, 1, _AUTO))
-    changes, residual_nm2, disturbance_nm2 = [], [], []
+    residual_nm2, disturbance_nm2 = list[Array](), list[Array]()
     for seed in SEEDS:
         bench = Bench(_configured(sensor, preset, magnitude, seed, _AUTO), calibration)
         bench.run(2 * _HALF)
         truths = [truth.continuous for truth in bench.truths[-_HALF:]]
-        residual, disturbance = (
-            np.array([getattr(truth, name) for truth in truths], float) for name in ("residual_nm", "disturbance_nm")
-        )
-        residual_nm2.append(np.square(residual).mean(axis=0))
-        disturbance_nm2.append(np.square(disturbance).mean(axis=0))
-        changes.append((residual_nm2[-1] - disturbance_nm2[-1]) @ np.diag(form))
-    open_nm = np.sqrt(np.sum(disturbance_nm2, axis=1).mean())
-    return _row(case, np.array(changes), dark_zone_contrast, open_nm, np.array(residual_nm2)) | {"images": True}
+        for name, means in (("residual_nm", residual_nm2), ("disturbance_nm", disturbance_nm2)):
+            modes_nm = np.array([getattr(truth, name) for truth in truths], float)
+            means.append(np.square(modes_nm).mean(axis=0))
+    return _row(case, np.array(residual_nm2), np.array(disturbance_nm2)) | {"images": True}
 
 
-def _row(
-    case: tuple[str, str, float], change: Array, dark_zone_contrast: float, open_nm: float, residual_nm2: Array
-) -> Results:
+def _row(case: tuple[str, str, float], residual_nm2: Array, disturbance_nm2: Array) -> Results:
+    """Results of a case from mean squares (seeds, modes)."""
     sensor, preset, magnitude = case
+    form, dark_zone_contrast = _contrast(sensor)
+    change = (residual_nm2 - disturbance_nm2) @ np.diag(form)
     error = float(change.std(ddof=1) / np.sqrt(len(change)))
     return {
         "sensor": sensor,
@@ -132,7 +126,7 @@ def _row(
         "change": float(change.mean()),
         "error": error,
         "own": dark_zone_contrast,
-        "open_nm": float(open_nm),
+        "open_nm": float(np.sqrt(disturbance_nm2.sum(axis=1).mean())),
         "closed_nm": float(np.sqrt(residual_nm2.sum(axis=1).mean())),
     }
 

@@ -1,7 +1,6 @@
 """Plots of the figures as PNG files; matplotlib is imported only when something is plotted."""
 
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from math import ceil
 from pathlib import Path
 from textwrap import fill
@@ -76,13 +75,14 @@ def picture(
     """An image (rows, columns) with a colour bar; NaN is grey. `half_width` is in the unit of the axes."""
 
     def panel(figure: "Figure", axes: "Axes") -> None:
-        colours, w = import_module("matplotlib.colors"), half_width
         image = axes.imshow(
             np.maximum(values, bounds[0]) if scale == "log" else values,
             cmap=_MAPS[scale],
-            norm=(colours.LogNorm if scale == "log" else colours.Normalize)(*bounds),
+            norm="log" if scale == "log" else "linear",
+            vmin=bounds[0],
+            vmax=bounds[1],
             origin="lower",
-            extent=(-w, w, -w, w),
+            extent=(-half_width, half_width, -half_width, half_width),
             interpolation="nearest",
         )
         axes.set_facecolor("0.75")

@@ -225,8 +225,9 @@ def _range_rows(context: Context, name: str) -> Iterator[Row]:
         quantity = "amplitude of 10 % deviation"
         yield fitted(name, f"{quantity}, median mode", "waves", _amplitude(float(np.median(ranges))))
         yield fitted(name, f"{quantity}, worst mode", "waves", _amplitude(float(ranges.min())))
-        for noll, each in zip(NOLLS_14, ranges, strict=True) if iterations == 0 else ():
-            yield fitted(f"{name}, Z{noll}", quantity, "waves", _amplitude(each))
+        if iterations == 0:
+            for noll, each in zip(NOLLS_14, ranges, strict=True):
+                yield fitted(f"{name}, Z{noll}", quantity, "waves", _amplitude(each))
 
 
 def _amplitude(waves: float) -> float | str:

@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from math import sqrt
 from pathlib import Path
 from typing import Any
 
@@ -202,16 +203,16 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
     measured = np.array(context.map(f"anchors {name}, 100 s", trial, range(context.trials))).std(axis=0, ddof=1)
     predicted = np.sqrt(tolerance.frame_noise_nm2(name, MAGNITUDE) / frames)
     limit = np.sqrt(tolerance.quantum_noise_nm2(name, MAGNITUDE) / frames)
-    for mode, noll in enumerate(NOLLS_14):
-        pm = 1e3 * np.array([measured[mode], predicted[mode], limit[mode]])
+    modes_pm = 1e3 * np.column_stack([measured, predicted, limit])
+    for noll, (measured_pm, predicted_pm, limit_pm) in zip(NOLLS_14, modes_pm.tolist(), strict=True):
         yield Row(
             name,
             f"Z{noll} {mode_name(noll)} over {AVERAGED_S:g} s",
             "pm",
-            float(pm[0]),
-            error=float(pm[0] / np.sqrt(2 * (context.trials - 1))),
-            predicted=float(pm[1]),
-            limit=float(pm[2]),
+            measured_pm,
+            error=measured_pm / sqrt(2 * (context.trials - 1)),
+            predicted=predicted_pm,
+            limit=limit_pm,
             modes=len(NOLLS_14),
             estimator="weighted",
             assumption=HUNDRED,

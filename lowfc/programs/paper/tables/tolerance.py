@@ -1,8 +1,8 @@
 """Drift and lines that a telescope may have for a given added contrast: theory, checked by simulation."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import lru_cache, partial
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -149,35 +149,18 @@ def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterat
     """Rows of one sensor; `lines` are the results of `tolerated_lines`."""
     modal = contrasts_of(name)
     for magnitude in MAGNITUDES:
-        noise, quantum = frame_noise_nm2(name, magnitude), quantum_noise_nm2(name, magnitude)
-        for mode, noll in enumerate(NOLLS_14):
-            for allowed in ALLOWED:
+        noises_nm2 = np.column_stack([frame_noise_nm2(name, magnitude), quantum_noise_nm2(name, magnitude)])
+        for mode, (noll, noise_and_limit_nm2) in enumerate(zip(NOLLS_14, noises_nm2, strict=True)):
+            for allowed, kind in product(ALLOWED, KINDS):
                 residual_nm2 = modal.variance_nm2(mode, allowed)
+                drifts = [tolerated_drift(residual_nm2, nm2, EXPOSURE, kind) for nm2 in noise_and_limit_nm2]
+                drift_pm = 1e3 * np.sqrt([drift.step_nm2 * RATE_HZ for drift in drifts])
+                line_pm = 1e3 * np.sqrt(lines[kind](residual_nm2 / noise_and_limit_nm2) * noise_and_limit_nm2)
                 where = f"Z{noll} {mode_name(noll)}, V = {magnitude:g}, {allowed:g}"
-                new_row = partial(Row, name)
-                for kind in KINDS:
-                    step, limit = (
-                        tolerated_drift(residual_nm2, n[mode], EXPOSURE, kind).step_nm2 for n in (noise, quantum)
-                    )
-                    pm = [1e3 * float(np.sqrt(each * RATE_HZ)) for each in (step, limit)]
-                    yield new_row(
-                        f"drift of {where}",
-                        "pm/sqrt(s)",
-                        pm[0],
-                        limit=pm[1],
-                        estimator=ESTIMATORS[kind],
-                        assumption=f"{LOOP}\n{DRIFT}",
-                    )
-                    each_noise = np.array([noise[mode], quantum[mode]])
-                    rms = 1e3 * np.sqrt(lines[kind](residual_nm2 / each_noise) * each_noise)
-                    yield new_row(
-                        f"line of {where}",
-                        "pm",
-                        float(rms[0]),
-                        limit=float(rms[1]),
-                        estimator=ESTIMATORS[kind],
-                        assumption=f"{LOOP}\n{LINE}",
-                    )
+                for what, unit, pm, about in (("drift", "pm/sqrt(s)", drift_pm, DRIFT), ("line", "pm", line_pm, LINE)):
+                    measured, limit = pm.tolist()
+                    tolerated = Row(name, f"{what} of {where}", unit, measured, limit=limit)
+                    yield replace(tolerated, estimator=ESTIMATORS[kind], assumption=f"{LOOP}\n{about}")
 
 
 def _checked(context: Context) -> list[Row]:
