@@ -9,7 +9,7 @@ Example:
 
 import argparse
 from collections.abc import Callable
-from itertools import cycle
+from itertools import cycle, product
 from statistics import median
 
 import numpy as np
@@ -46,10 +46,9 @@ def measure(options: argparse.Namespace, report: Report) -> Result:
         for number in range(options.repeats):
             report(f"{size.pixels} pixels, {number + 1} of {options.repeats}")
             turns.append({name: timed(call, options.seconds)["p50"] for name, call in calls.items()})
-        pairs = [(kernel, other) for kernel in KERNELS for other in (PRODUCT, MEMORY)]
-        ratios = {
-            f"{one} over {other}": [turn[one] / turn[other] for turn in turns] for one, other in (*pairs, KERNELS[::-1])
-        }
+        numpy_kernel, fused = KERNELS
+        pairs = (*product(KERNELS, (PRODUCT, MEMORY)), (fused, numpy_kernel))
+        ratios = {f"{one} over {other}": [turn[one] / turn[other] for turn in turns] for one, other in pairs}
         numbers = {"pixels": size.pixels, "modes": size.modes, "actuators": size.actuators}
         sizes.append(numbers | {"turns": turns, "ratios": ratios})
     return {"sizes": sizes}

@@ -62,13 +62,7 @@ def draw_logs(
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
         for number, message in enumerate(reader):
             if renderer is None:
-                known_config, remarks = (config, []) if config else attached_configuration(reader)
-                if known_config is None:
-                    remarks.append(
-                        "the default configuration is used for pupil and telescope, because the log has no readable one"
-                    )
-                drawn.remarks += remarks
-                used_config = known_config or Configuration()
+                used_config = config or _configuration_of(reader, drawn.remarks)
                 renderer = make_renderer(used_config)
                 accumulator = Accumulator(SIMULATED_START_NS if used_config.lockstep else None)
             if number == 0:
@@ -128,3 +122,12 @@ def draw_logs(
         drawn.remarks.append(f"{counted(accumulator.unreadable, 'message')} could not be read")
     drawn.log_s = (last_ns - (first_ns or last_ns)) * 1e-9
     return drawn
+
+
+def _configuration_of(reader: LogReader, remarks: list[str]) -> Configuration:
+    """The configuration in a log, or the default one; the reason is added to the remarks."""
+    known, reasons = attached_configuration(reader)
+    remarks += reasons
+    if known is None:
+        remarks.append("the default configuration is used for pupil and telescope, because the log has no readable one")
+    return known or Configuration()

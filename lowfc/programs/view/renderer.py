@@ -134,7 +134,8 @@ class RenderThread(threading.Thread):
         due_s = began_s = complete_due_s = time.monotonic()
         while not self._abandoned:
             now_s = time.monotonic()
-            behind_s, began_s = max(0.0, now_s - began_s - 1 / PICTURES_HZ), now_s  # waiting messages may be that old
+            behind_s = max(0.0, now_s - began_s - 1 / PICTURES_HZ)  # waiting messages may be that old
+            began_s = now_s
             if complete := now_s >= complete_due_s:
                 complete_due_s = now_s + (PICTURES_PER_COMPLETE - 0.5) / PICTURES_HZ  # before the rings overflow
             arrived = [self._earlier.popleft() for _ in range(len(self._earlier))]

@@ -11,10 +11,9 @@ from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import rejection
 from lowfc.control.laws.spectra import Spectrum, in_bins, spectrum, time_series
-from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.safety import LoopMode, mode_name
 from lowfc.programs.view.draw.colours import GREEN, GREY, YELLOW
 from lowfc.programs.view.draw.plots import BOX_HEIGHT, Axes, at, labels
-from lowfc.programs.view.panels.loop import MODE_NAMES
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
 from lowfc.programs.view.verdicts.steady import LawInForce, Steady
@@ -31,7 +30,6 @@ _LEAST = 1e-12
 """Lowest power drawn, as a fraction of the highest; lower values are drawn there."""
 _NAMES, _COLOURS = ("pseudo-open-loop", "measured error", "rejection² x open"), (GREY, GREEN, YELLOW)
 _WIDTHS = (1.2, 1.8, 0.6)
-_MODES = {mode.value: name for mode, name in MODE_NAMES.items()}
 
 
 class Spectra(Panel):
@@ -67,7 +65,7 @@ class Spectra(Panel):
             if powers:
                 self._fit(stream, axes, rate_hz, np.concatenate(powers))
             axes.draw(stream, np.log10(frequency_hz), [np.log10(power) for power in powers], _COLOURS, _WIDTHS)
-            text = f"loop {_MODES.get(steady.mode, 'unknown')}{state}"
+            text = f"loop {mode_name(steady.mode)}{state}"
             stream.log(f"{axes.path}/state", labels([_STATE_POSITION], [text]))
 
     def _fit(self, stream: rr.RecordingStream, axes: Axes, rate_hz: float, power: Array) -> None:

@@ -43,7 +43,7 @@ def frames(state: RunState) -> Tile:
     """Tile FRAMES: whether frames arrive at the nominal rate and are used."""
     tile, camera, silent_s = partial(Tile, "FRAMES"), state.camera, state.frame_silent_s
     gone = absent("FRAMES", "camera", camera, state.running_s, "the loop holds")
-    if gone is not None and camera.life is not Liveness.SILENT:
+    if gone is not None and camera.life is not Liveness.SILENT:  # a silent camera is reported by its frames, below
         return gone
     if camera.life is Liveness.STARTING:
         return tile("STARTING", "the camera")
