@@ -46,7 +46,7 @@ def join(part: RoleProcess, receive: MessageFunction) -> MessageFunction:
         sent, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.REAL_TIME, express=False
     )
 
-    def put(number: int, payload: bytes, _kept: zenoh.Session = session) -> None:
+    def put(number: int, payload: bytes, _kept: zenoh.Session = session) -> None:  # keeps the session open
         publisher.put(payload, attachment=_NUMBER.pack(number, 0))
 
     return put
