@@ -171,6 +171,12 @@ def test_a_loop_that_was_closed_for_too_few_frames_is_not_simply_called_open(tmp
     assert "in closed loop at most 2000 good frames are consecutive, fewer than 2048" in warning
 
 
+def test_a_loop_that_was_closed_for_just_enough_frames_and_then_opened_is_tuned_as_closed(tmp_path: Path) -> None:
+    night = SyntheticLog().request("close").frames(2100).request("open").frames(400)
+    result = json_of("tune", night.write(tmp_path / "night.mcap"))
+    assert (result["closed"], result["frames"], result["warnings"]) == (True, 2048, [])
+
+
 def test_a_weighted_reconstructor_is_reported(tmp_path: Path) -> None:
     """Gains for the modes that it does not correct would make it another one, with more noise."""
     night = SyntheticLog().request("close").frames(2700)

@@ -65,7 +65,8 @@ def tune(
         with raised_as(DataFileError, ValueError, telemetry.source):
             best, gains = tuned(telemetry, controller)
         result = result_of(telemetry, best, gains, controller)
-    result.files, result.applied = [str(file) for file in (out, plot) if file is not None], None
+    result.files = [str(file) for file in (out, plot) if file is not None]
+    result.applied = None  # set, so that --json has it also without --apply
     if out is not None:
         save(best.law, out)
     if plot is not None:

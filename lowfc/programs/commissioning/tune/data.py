@@ -51,8 +51,8 @@ class Telemetry:
         law: the integrator's gains at the end; `driving` is the linear law in force instead, if any.
         closed: whether the loop was closed in these frames.
         pol: pseudo-open-loop modes (frames, modes), in pieces without gaps.
-        error: modal error (frames, modes); like the true residual, of the frames after the last change of law or gains,
-            unless those are fewer than `FEWEST`.
+        error: modal error (frames, modes). Like the true residual it is from the frames after the last change of law or
+            gains, or from all frames if those are fewer than `FEWEST`.
         true_nm2: mean products of the true residual at the start of each exposure (modes, modes); None if unknown.
         continuous_rms_nm: rms of the true residual over all time (modes,); None if unknown.
         nm_per_mas: wavefront rms of a tilt of 1 mas; None if the telescope's diameter is unknown.
@@ -240,10 +240,13 @@ def _last_change(states: Sequence[wire.ControllerState], modes: int) -> int:
     newest, changed, before = 0, 0, None
     for state in states:
         newest = max(newest, state.frame_sequence)  # that of a `clear` is 0
+        if len(state.gain) != modes:
+            continue
         gains = [] if state.HasField("law") and not overruled(state) else [*state.gain, *state.leak]
         law = state.law.id, overruled(state), gains
-        if len(state.gain) == modes:
-            changed, before = changed if before in (None, law) else newest, law
+        if before not in (None, law):
+            changed = newest
+        before = law
     return changed
 
 
@@ -266,9 +269,8 @@ def _telemetry(
     exposure and its rms over all time (steps, modes). The laws are in force since the frame `changed`.
     """
     was_closed, index = steps.mode == LoopMode.CLOSED, np.arange(len(steps.mode))
-    not_closed = np.flatnonzero(~was_closed)
-    last_not_closed = np.concatenate([[-1], not_closed])[np.searchsorted(not_closed, index)]
-    settling, frames_closed = settling_frames(laws[0].gain, laws[0].leak), index - last_not_closed
+    frames_closed = index - np.maximum.accumulate(np.where(was_closed, -1, index))  # since the loop was last not closed
+    settling = settling_frames(laws[0].gain, laws[0].leak)
     if laws[1] is not None:
         settling = SETTLING_FRAMES + FADING_FRAMES + margins.settling_frames(laws[1], timing.delay)
     settling = min(max(settling, round(_SETTLING_S * rate_hz)), int(frames_closed.max()) - FEWEST)  # leaves enough

@@ -197,7 +197,7 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
         omega, one_sided = fine_frequencies(model), 2 / run.rate_hz
         modelled = model.spectrum_nm2(omega) + model.noise_nm2
         noise_nm2 = np.array([each.noise_nm2 for each in best.models])
-        measured = np.repeat(modelled[:, None], len(noise_nm2), axis=1)
+        measured = np.repeat(modelled[:, None], len(noise_nm2), axis=1)  # only the column of this mode is used
         residual = residual_spectrum(best.law, omega, measured, noise_nm2, run.timing)[:, mode]
         axes.loglog(shown_hz, pol_spectrum.power_nm2_hz[1:, mode], color="0.6", label="pseudo-open-loop")
         closed = spectrum(run.error, run.rate_hz) if run.closed else None
