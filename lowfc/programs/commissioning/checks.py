@@ -92,7 +92,7 @@ class Table(Generic[S]):
         Args:
             name: Name of the check.
             expected: Requirement of the contract.
-            advice: Recommended action, for a warning of the function that gives none.
+            advice: Recommended action, used for a warning without its own.
             cost: Consequence of ignoring this advice.
         """
 

@@ -42,7 +42,7 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
 def _kinds(name: str) -> list[plugins.Kind]:
     """Kinds of driver installed under this name, or implemented by the class of this name; the first kind if none."""
     found = [kind for kind in plugins.KINDS if name in plugins.installed(kind)]
-    return found or [kind for kind in plugins.KINDS if _loads(kind, name)] or [*plugins.KINDS[:1]]
+    return found or [kind for kind in plugins.KINDS if _loads(kind, name)] or list(plugins.KINDS[:1])
 
 
 def _loads(kind: plugins.Kind, name: str) -> bool:

@@ -1,7 +1,7 @@
 """Input of the checks of `lowfc doctor`."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from lowfc.adapters.process.host import Host
 from lowfc.adapters.process.trial import Trial, try_out
@@ -34,12 +34,6 @@ class Facts:
         return self.trial
 
     @property
-    def named_cpus(self) -> set[int]:
-        """Processors that the configuration names for camera, controller, mirror and recorder."""
-        section = self.config.realtime
-        return {*section.camera_cpus, *section.controller_cpus, *section.mirror_cpus, *section.recorder_cpus}
-
-    @property
     def bytes_per_s(self) -> float:
         """Traffic of frames, commands and mirror states, bytes per second; other messages are small."""
         sizes = payload_bytes(self.config)
@@ -48,13 +42,19 @@ class Facts:
 
 def gather(host: Host, config: Configuration, seconds: float) -> Facts:
     """Request the loop's real-time settings, measure wake-ups in each class, and note other busy processes."""
-    facts = Facts(host, config, OSError("not tried"), ())
     host.busy()  # the next call reports the load since this one
+    trial: Trial | OSError
     try:
-        facts = replace(facts, trial=try_out(config.realtime, facts.named_cpus, seconds))
+        trial = try_out(config.realtime, named_cpus(config), seconds)
     except OSError as fault:
-        facts = replace(facts, trial=fault)
-    return replace(facts, busy=tuple(host.busy()))
+        trial = fault
+    return Facts(host, config, trial, tuple(host.busy()))
+
+
+def named_cpus(config: Configuration) -> set[int]:
+    """Processors that a configuration names for camera, controller, mirror and recorder."""
+    section = config.realtime
+    return {*section.camera_cpus, *section.controller_cpus, *section.mirror_cpus, *section.recorder_cpus}
 
 
 def ranges(cpus: Iterable[int]) -> str:

@@ -56,7 +56,7 @@ def _swap(facts: Facts) -> Check:
     cost="a page fault may clear or gather 2 MB in the middle of a frame",
 )
 def _huge_pages(facts: Facts) -> Check:
-    """Moving memory to huge pages, as the loop does, and when the kernel uses them: `transparent_hugepage/enabled`."""
+    """Moving memory to huge pages, as the loop does, and the kernel's setting `transparent_hugepage/enabled`."""
     if refused := facts.completed_trial.refused.get("huge_pages"):
         what, cost = refused
         return warning(f"refused: {what}", "a kernel of version 6.1 or newer, with transparent huge pages", cost)

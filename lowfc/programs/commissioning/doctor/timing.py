@@ -10,7 +10,7 @@ from lowfc.adapters.process.clock import WALL_TOLERANCE_NS, HostClock, boot_file
 from lowfc.adapters.process.host import CPUS
 from lowfc.adapters.process.trial import Trial
 from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
-from lowfc.programs.commissioning.doctor.facts import Facts, ranges
+from lowfc.programs.commissioning.doctor.facts import Facts, named_cpus, ranges
 
 CHECKS: Table[Facts] = Table()
 """The docstring of each check describes its subject; docs/howto/doctor.md also describes its warning."""
@@ -63,7 +63,7 @@ def _processors(facts: Facts) -> Check:
     """Processors available to the loop's processes, and those in the configuration."""
     usable, online = facts.host.usable_cpus(), facts.host.cpus("online")
     detail = f"{len(usable)} usable ({ranges(usable)}) of {len(online)}"
-    named = facts.named_cpus
+    named = named_cpus(facts.config)
     if named and (missing := named - facts.completed_trial.cpus):
         return warning(
             f"{detail}; the configuration names {ranges(missing)}",
