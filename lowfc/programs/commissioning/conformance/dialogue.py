@@ -27,7 +27,7 @@ POLL_S = 0.002
 Show = Callable[[str], None]
 
 _PATTERN_SEED = 5
-_GENTLE = 0.05  # ordinary commands as a fraction of the smallest of stroke, slew and half the neighbour limit
+_ORDINARY = 0.05  # size of ordinary commands as a fraction of the smallest of stroke, slew and half neighbour limit
 _MAX_MOVES = 400  # to a distant shape
 
 
@@ -66,7 +66,7 @@ class Expected:
     @property
     def pattern_nm(self) -> Single:
         """A shape without symmetry, far below every limit."""
-        largest = _GENTLE * min(self.limits.stroke_nm, self.limits.slew_nm, self.limits.neighbour_nm / 2)
+        largest = _ORDINARY * min(self.limits.stroke_nm, self.limits.slew_nm, self.limits.neighbour_nm / 2)
         drawn = np.random.default_rng(_PATTERN_SEED).uniform(-largest, largest, self.grid)
         return np.where(self.moving, drawn, 0).astype(np.float32)
 
@@ -119,7 +119,7 @@ class Dialogue(Collected):
     def begin(self, shape_nm: Single, last_sequence: int) -> None:
         """Start at the mirror's present shape, with the sequence after the last one that it followed.
 
-        The sequences of a running camera are higher, so that the mirror does not refuse a controller that takes over.
+        A running camera's sequences are higher: the mirror will not refuse a controller that takes over afterwards.
         """
         self._commanded_nm, self._next = shape_nm, last_sequence + 1
 

@@ -1,6 +1,6 @@
 """Checks of a camera's frames: format, time, rate and pixels."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -21,7 +21,7 @@ _READOUT_NS = 50_000_000  # longest plausible time from end of exposure to publi
 _FULL = 0.01  # fraction of saturated pixels above which they are reported
 _STOPPED_NS = 300_000_000  # shorter silences, before the first frame and after the last together, do not count
 _VARIED = 8  # with more different values than these, the alignment of bits is judged
-_AGE_NS = 1_000_000  # tolerance of times
+_AGE_NS = 1_000_000  # tolerance of a frame's time
 _OWN_WAIT_NS = 10_000_000  # shorter waits may be caused by this host, not by the camera
 
 ARRIVED: Table[Camera] = Table()
@@ -186,5 +186,5 @@ def _roughness(picture: Pixels) -> float:
     values = picture.astype(np.float64)
     if values.size < 4 or not values.std():
         return 0.0
-    steps: Sequence[float] = [np.abs(np.diff(values, axis=axis)).mean() for axis in (0, 1) if values.shape[axis] > 1]
+    steps = [np.abs(np.diff(values, axis=axis)).mean() for axis in (0, 1) if values.shape[axis] > 1]
     return float(np.mean(steps) / values.std())

@@ -34,8 +34,9 @@ def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool 
     try:
         show("idle")
         found += _idle(mirror)
-        if (last := mirror.last) is not None:
-            base_nm = base_nm if (where_nm := mirror.surface_nm(last)) is None else where_nm
+        last = mirror.last
+        if (where_nm := mirror.surface_nm(last)) is not None:
+            base_nm = where_nm
         if not _bad(found, "grid", "state"):
             mirror.begin(base_nm, 0 if last is None else last.frame_sequence)
             show("ordinary commands")
@@ -74,7 +75,8 @@ def _idle(mirror: Dialogue) -> Iterator[Check]:
     if states and (sequence := states[-1].frame_sequence) >= SEQUENCE_BOUND:
         advice = "report the frame_sequence of the applied command, 0 before the first one"
         yield wrong(f"frame_sequence {sequence}", advice)._replace(name="state", expected="a valid frame_sequence")
-    check, rate_hz = ok(f"{len(states) / IDLE_S:.0f} a second"), len(states) / IDLE_S
+    rate_hz = len(states) / IDLE_S
+    check = ok(f"{rate_hz:.0f} a second")
     if not states:
         advice = "publish it: a controller sends no command before it has received the mirror's shape"
         check = wrong(f"none in {IDLE_S:g} s; received: {mirror.keys}", advice)
@@ -103,7 +105,7 @@ def _grid(mirror: Dialogue, state: wire.MirrorState) -> Check:
 
 
 def _ordinary_commands(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator[Check]:
-    """Send small shapes with alternating sign, one per period, and check the answers; give up after three without."""
+    """Send small shapes of alternating sign, one per period, and check the answers; end if the first 3 have none."""
     connection, period_ns = mirror.connection, mirror.expected.period_ns
     answers: list[wire.MirrorState] = []
     commanded_nm = base_nm
@@ -135,8 +137,8 @@ def _ordinary_commands(mirror: Dialogue, base_nm: Single, seconds: float) -> Ite
     got, advice = names.get(last.status, str(last.status)), "report FOLLOWING while a command is in force"
     yield judged("status", "FOLLOWING", last.status == _FOLLOWING, got, advice)
     different, expected = len(answers) - same_time, "timestamp of the applied command"
-    age_ms = (from_timestamp(last.timestamp) - connection.now_ns()) / 1e6
-    got = f"{different} of {len(answers)} differ, the last {age_ms:.3g} ms from now"
+    age_ms = (connection.now_ns() - from_timestamp(last.timestamp)) / 1e6
+    got = f"{different} of {len(answers)} differ, the last is {age_ms:.3g} ms old"
     advice = "copy the command's timestamp: it joins commands and states in logs"
     yield judged("time", expected, not different, "the same", advice, got, warning)
     got, expected = f"{len(last.command_nm)} values", "command_nm of the applied command"
@@ -204,8 +206,10 @@ def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single, *, move
     how = max(similarity, key=lambda name: abs(similarity[name]))
     if abs(similarity[how]) < 0.9:
         if not moved:
-            step = f"step is above {np.abs(commanded).max():.3g} nm, set mirror.driver_bits"
-            return f"none moves: does the driver send the values? If its {step}"
+            return (
+                f"none moves: does the driver send the values? If its step is above {np.abs(commanded).max():.3g} nm, "
+                "set mirror.driver_bits"
+            )
         return "the reported and the commanded shape are unrelated: check the driver's order of the actuators"
     scale = float((commanded * turns[how]).sum() / (commanded**2).sum())
     advice = f"the reported shape is the commanded one {how}, times {scale:.3g}"
@@ -274,9 +278,9 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
     expired_ns = _expired_ns(mirror, sent_ns)
     expected = f"EXPIRED after valid_for_ns, here {EXPIRES_NS / 1e6:.0f} ms; refused commands do not extend it"
     if expired_ns is None:
-        advice = "time valid_for_ns on the mirror's own clock, from the command's arrival; then hold or relax, and "
+        advice = "time valid_for_ns on the mirror's clock, from a command's arrival; then hold or relax, report EXPIRED"
         late = f"not within {(EXPIRES_NS + SLACK_NS) / 1e6:.0f} ms"
-        yield judged("dead-man", expected, False, late, f"{advice}report EXPIRED")
+        yield judged("dead-man", expected, False, late, advice)
     else:
         held, advice = expired_ns - sent_ns >= 0.8 * EXPIRES_NS, "hold the command while it is valid"
         yield judged("dead-man", expected, held, f"after {(expired_ns - sent_ns) / 1e6:.0f} ms", advice)

@@ -101,10 +101,10 @@ def _health(device: Collected) -> Check:
     if not payloads:
         return warning(f"none of {device.process} in {device.seconds:.1f} s", f"publish it: {cost}")
     try:
-        first, *_, last = [wire.Health.FromString(payload) for payload in (payloads[0], *payloads)]
+        healths = [wire.Health.FromString(payload) for payload in payloads]
     except DecodeError:
         return wrong("it is not a lowfc.v1.Health", "encode the message as declared")
-    rate_hz = len(payloads) / device.seconds
+    first, last, rate_hz = healths[0], healths[-1], len(payloads) / device.seconds
     if last.process != device.process:
         return warning(f"process is {last.process!r}", f"name the process '{device.process}', as its key does")
     if device.seconds >= 2 and not 1 < rate_hz < 10:
