@@ -26,7 +26,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
     probe_response,
 )
 
-_OTHER_BYTES = 1000  # of a request to play, besides its table and shapes
+_OTHER_BYTES = 1000  # bytes of a request to play, without its table and shapes
 _LAW_FIELDS = ("gain", "leak", "limit_nm", "law", "calibration_id")
 
 
@@ -49,10 +49,10 @@ class Live:
         self.loop = loop_of(state, self.calibration, self.configuration.camera.rate_hz, self.client.laws())
 
     @contextmanager
-    def restored(self) -> Iterator["Live"]:
+    def restored(self) -> Iterator[None]:
         """Restore the loop mode at the end, also after an exception; safe mode stays."""
         try:
-            yield self
+            yield
         finally:
             self.client.check_lease()  # raises if another operator ended it: the loop is left to them
             self.client.stop()

@@ -202,7 +202,7 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
                 f"{path}: ends {cut} of {frames} frames before the end of a measurement ({', '.join([kind, *named])}): "
                 "give all files of the log, or measure again"
             )
-        request_ns = from_timestamp(request.timestamp)  # not its frame: a state after a `clear` has none
+        request_ns = from_timestamp(request.timestamp)  # compared by time: a state after a `clear` has no frame
         states = [state for state in history.controllers if len(state.gain) == modes]
         before = [state for state in states if from_timestamp(state.timestamp) <= request_ns]
         if not before:
@@ -218,30 +218,28 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
 
 
 def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[str, Any], wire.Request]]:
-    announced: list[tuple[dict[str, Any], wire.Request]] = []
+    """The measurements of a test: parameters, and the request that started each, of repeated ones the last."""
+    latest: dict[str, tuple[dict[str, Any], wire.Request]] = {}
+    starting = "note" if kind == "noise-floor" else "play"  # noise-floor has no probe sequence
     parameters: dict[str, Any] | None = None
     for request in requests:
         if request.name == "note" and request.accepted and request.text.startswith(ANNOUNCEMENT):
-            try:
-                parameters = json.loads(request.text.removeprefix(ANNOUNCEMENT))
-            except (ValueError, RecursionError):
-                parameters = None  # another note that starts with the same word
-            if (
-                not isinstance(parameters, dict)
-                or parameters.pop("test", None) != kind
-                or not isinstance(parameters.get("frames"), int)
-            ):
-                parameters = None
-            elif kind == "noise-floor":  # it has no probe sequence
-                announced.append((parameters, request))
-                parameters = None
-        elif request.name == "play" and parameters is not None:
+            parameters = _parameters(request.text, kind)
+        if request.name == starting and parameters is not None:
             if request.accepted:
-                announced.append((parameters, request))
+                latest[str([parameters.get(key) for key in ("noll", "level_nm", "loop")])] = parameters, request
             parameters = None
-    # only the last of each counts: an earlier one was stopped and repeated
-    latest = {str([each[0].get(key) for key in ("noll", "level_nm", "loop")]): each for each in announced}
     return list(latest.values())
+
+
+def _parameters(note: str, kind: Kind) -> dict[str, Any] | None:
+    """The parameters that a note announces; None for another test, or another note that starts with the same word."""
+    try:
+        parameters = json.loads(note.removeprefix(ANNOUNCEMENT))
+    except (ValueError, RecursionError):
+        return None
+    of_kind = isinstance(parameters, dict) and parameters.pop("test", None) == kind
+    return parameters if of_kind and isinstance(parameters.get("frames"), int) else None
 
 
 def probe_response(

@@ -13,7 +13,7 @@ from lowfc.control.laws import margins
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.transfer_function import Departure, Lines, departure, measure_lines, seen_of_mirror
-from lowfc.control.loop.command_channels import MIRROR, OFFSET
+from lowfc.control.loop.command_channels import OFFSET
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
@@ -178,7 +178,7 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> R
         law=response.loop.name,
         rate_hz=rate_hz,
         delay_frames=delay_frames,
-        injected=MIRROR if response.target == MIRROR else OFFSET,
+        injected=response.target,
         frames=len(response.table),
         frames_missing=response.missing,
         tolerance_db=tolerance_db,
