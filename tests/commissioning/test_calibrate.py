@@ -51,7 +51,7 @@ def calibrator_of(
     loop: InProcessLoop, method: str, *, report: Callable[[str], None] = ignore, **options: Any
 ) -> Calibrator:
     request = CalibrationRequest(method, **{"out": OUT, "snr": 50.0, "cycles": 4, **options})
-    return Calibrator(loop, request, report, ignore)
+    return Calibrator(loop, request, report, ignore, loop.calibration())
 
 
 def measure(loop: InProcessLoop, method: str, **options: Any) -> tuple[Calibrator, CalibrationData]:

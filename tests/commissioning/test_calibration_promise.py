@@ -132,9 +132,9 @@ def test_pokes_below_the_disturbance_give_an_error(tmp_path: Path) -> None:
 
 
 def test_the_default_calibration_takes_less_than_three_minutes_at_250_hz(tmp_path: Path) -> None:
-    config = load(None, {"camera.rate_hz": 250.0})
+    loop = InProcessLoop(load(None, {"camera.rate_hz": 250.0}))
     request = CalibrationRequest("hadamard", tmp_path / "night.fits", 70.0)
-    plans = Calibrator(InProcessLoop(config), request, lambda _: None, lambda *_: None).pokes
+    plans = Calibrator(loop, request, lambda _: None, lambda *_: None, loop.calibration()).pokes
     assert plans.frames(plans.cycles()) / 250 < 180
 
 

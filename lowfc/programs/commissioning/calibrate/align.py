@@ -126,9 +126,12 @@ def oriented(
     before: Calibration,
     poke: Callable[[int], Array],
 ) -> tuple[Alignment, Calibration, float]:
-    """The possible orientation that fits `poke`, the response to tip, and to tilt if needed, and its calibration.
+    """Choose the orientation that fits pokes of tip, and of tilt if needed, among those that the image allows.
 
-    The third value is the mean correlation of these responses with the computed ones; the others as for `on_sensor`.
+    `poke` measures the response to a mode, by its place; other arguments as for `on_sensor`.
+
+    Returns:
+        The alignment, its calibration, and the mean correlation of the measured responses with the computed ones.
     """
     orientations = alignment.orientations
     modes = range(min(len(orientations) // 2, len(computed.noll)))

@@ -83,7 +83,7 @@ class Pokes:
         self._modes = len(calibration.noll)
         self._basis = calibration.modes_to_actuators.T
         self._largest_nm = largest_nm(config, calibration)
-        self._slew_nm = min(config.safety.slew_nm, config.mirror.slew_nm)
+        self._largest_move_nm = _largest_move_nm(config)
         self.amplitude_nm = self._amplitude()
 
     def cycle(self, number: int) -> poke_plan.Plan:
@@ -102,14 +102,14 @@ class Pokes:
         if request.cycles is not None:
             return request.cycles
         frames = poke_plan.frames_for(request.snr / MARGIN, float(self._noise_nm.max()), self.amplitude_nm)
-        return max(-(-frames // self.cycle(0).per_column), MIN_CYCLES)
+        return max(ceil(frames / self.cycle(0).per_column), MIN_CYCLES)
 
     def more_cycles(self, cycles: int, error: float) -> int:
         """Cycles required, given the error after `cycles`; `cycles` itself if they suffice or too many are required."""
+        if self._request.cycles is not None or error * self._request.snr <= 1:
+            return cycles
         needed = cycles_for(self._request.snr, cycles, error)
-        allowed = max(MAX_CYCLES_RATIO * self.cycles(), ALWAYS_ALLOWED_CYCLES)
-        reachable = self._request.cycles is None and needed <= allowed
-        return needed if reachable and error * self._request.snr > 1 else cycles
+        return needed if needed <= max(MAX_CYCLES_RATIO * self.cycles(), ALWAYS_ALLOWED_CYCLES) else cycles
 
     def frames(self, cycles: int, done: int = 0) -> int:
         """Frames of the remaining cycles and of their check cycles."""
@@ -121,11 +121,10 @@ class Pokes:
             seed = SEED + 1000 * (number + 1)
             return poke_plan.dither(self._modes, amplitude_nm, PIECE, DITHER_HOLD, seed)
         patterns = poke_plan.hadamard_patterns if request.method == "hadamard" else poke_plan.poke_patterns
-        rest_frames = max(16, len(poke_plan.SIGNS) * HOLD)
         shapes = patterns(self._modes, amplitude_nm)
         # a different order in each pair of cycles, so that their scatter shows vibrations
         shapes = np.random.default_rng([SEED, number // 2]).permutation(shapes)
-        return poke_plan.cycle(shapes, HOLD, SETTLE, rest_frames, backwards=number % 2 == 1)
+        return poke_plan.cycle(shapes, HOLD, SETTLE, len(poke_plan.SIGNS) * HOLD, backwards=number % 2 == 1)
 
     def _amplitude(self) -> float:
         """The requested or default amplitude, within the mirror's slew limit."""
@@ -137,7 +136,7 @@ class Pokes:
             )
         shapes = self._cycle(0, 1.0).table @ self._basis
         steepest = float(np.abs(np.diff(shapes, axis=0)).max())
-        largest = _SLEW_FRACTION * self._slew_nm / max(steepest, 1e-9)
+        largest = self._largest_move_nm / max(steepest, 1e-9)
         if requested is None:
             return min(default_nm(method, self._request.snr), largest)
         if requested > largest:
@@ -155,9 +154,13 @@ def first_poke_plan(amplitude_nm: float) -> poke_plan.Plan:
 
 def largest_nm(config: Configuration, calibration: Calibration) -> Array:
     """Largest amplitude (modes,) at which push to pull stays within the slew limit, nm rms of wavefront."""
-    slew_nm = min(config.safety.slew_nm, config.mirror.slew_nm)
     steepest = np.abs(calibration.modes_to_actuators).max(axis=0)
-    return np.asarray(_SLEW_FRACTION * slew_nm / (2 * np.maximum(steepest, 1e-9)), dtype=np.float64)
+    return np.asarray(_largest_move_nm(config) / (2 * np.maximum(steepest, 1e-9)), dtype=np.float64)
+
+
+def _largest_move_nm(config: Configuration) -> float:
+    """Largest move of an actuator from push to pull, nm of surface."""
+    return _SLEW_FRACTION * min(config.safety.slew_nm, config.mirror.slew_nm)
 
 
 def default_nm(method: str, snr: float) -> float:

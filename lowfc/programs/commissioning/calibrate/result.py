@@ -26,7 +26,7 @@ from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrat
 MAX_NOISE_RATIO = 1.5
 """Largest accepted ratio of the noise of the measured R to that of the computed R, at the same flux. A sensor far from
 its zero point exceeds it."""
-_OTHER_SENSOR = 0.5  # error of an element of R H from which a model counts as that of another sensor or orientation
+_OTHER_SENSOR = 0.5  # from this error of an element of R H on, a model is that of another sensor or orientation
 DELAY_TOLERANCE_FRAMES = 0.1
 """Largest difference between measured and configured delay without a warning, frames."""
 
@@ -274,7 +274,6 @@ def comparison(first: Calibration, second: Calibration) -> Comparison:
     R = first.reconstructor.astype(np.float64)
     talk = cross_talk(R, second.response)
     shift = R @ (second.reference - first.reference)
-    commands = first.modes_to_actuators, second.modes_to_actuators
     return Comparison(
         modes=len(first.noll),
         noll=list(first.noll),
@@ -285,12 +284,12 @@ def comparison(first: Calibration, second: Calibration) -> Comparison:
         flux_ratio=second.flux_dn / first.flux_dn,
         dark_shift_dn=float(np.median(second.dark - first.dark)),
         bad_pixels=bad_pixels,
-        same_commands=bool(commands[0].shape == commands[1].shape and np.array_equal(*commands)),
+        same_commands=np.array_equal(first.modes_to_actuators, second.modes_to_actuators),
     )
 
 
 def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array, response: Array) -> Array:
-    """Modes (modes, actuators) that R measures for each actuator: for modal shapes as measured, for others as modelled.
+    """Modes (modes, actuators) that R measures per nm of each actuator: modal shapes as measured, others as modelled.
 
     A common factor between measurement and model, such as that of the mirror's stroke or sign, also applies to other
     shapes. A negative factor is accepted only if focus or spherical is among the modes: a mirror of the opposite sign
@@ -300,10 +299,9 @@ def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Arra
     """
     commands, own = before.modes_to_actuators.astype(np.float64), before.actuators_to_modes.astype(np.float64)
     inverse, product = np.linalg.pinv(commands), matrix @ response  # R H is the identity unless R is regularised
-    known = matrix @ np.linalg.pinv(before.reconstructor.astype(np.float64)) @ own if own.size else product @ inverse
     optics = factory.twin(config, None, lambda _: None)
     twin_image = twin_reference(optics)
-    candidates = [known]
+    candidates = []
     if twin_image.shape == before.shape:
         on_nodes = factory.mirror_on_twin(config, optics, lambda _: None)
         modelled = factory.actuators_to_modes(
@@ -311,7 +309,9 @@ def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Arra
         )
         if own.size:
             modelled[:, ~own.any(axis=0)] = 0  # actuators that are not active
-        candidates.insert(0, modelled)
+        candidates.append(modelled)
+    if own.size:
+        candidates.append(matrix @ np.linalg.pinv(before.reconstructor.astype(np.float64)) @ own)
     symmetric = any(noll_to_orders(index)[1] == 0 for index in before.noll)
     for candidate in candidates:
         modes = candidate @ commands

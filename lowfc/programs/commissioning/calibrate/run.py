@@ -67,7 +67,7 @@ class Calibrator:
         request: CalibrationRequest,
         report: Report,
         progress: Counted,
-        computed: Calibration | None = None,
+        computed: Calibration,
     ) -> None:
         """Get the controller's calibration, and read the completed cycles with --resume.
 
@@ -157,7 +157,7 @@ class Calibrator:
     @property
     def _quietest_mode(self) -> int:
         """Index of the mode with the lowest noise; not tip or tilt, the most disturbed, unless there is no other."""
-        tilt = np.array([index in TIP_TILT for index in self.before.noll])
+        tilt = np.isin(self.before.noll, TIP_TILT)
         return int(np.where(tilt & ~tilt.all(), np.inf, self.noise_nm).argmin())
 
     def delay(self) -> Delay:
@@ -228,7 +228,7 @@ class Calibrator:
     def _initial(self, delay: Delay) -> Initial:
         """The initial R of the fit: the computed one, unless the one in use measures pokes with less noise."""
         before = self.before
-        known = [each for each in (self._computed, before) if each is not None and comparable(each, before)]
+        known = [each for each in (self._computed, before) if comparable(each, before)]
         candidates = [Initial(each.reconstructor.astype(np.float64) * before.good, each.estimator) for each in known]
         full_rank = [each for each in candidates if np.linalg.matrix_rank(each.matrix) == len(before.noll)]
         if not full_rank:

@@ -103,6 +103,7 @@ def compute_calibration(
     config = configuration(file)
     name, wavefront = ("", None) if at is None else zero_point(config, at)
     calibration = analytic(config, Console(stderr=True), wavefront)
+    # with fitted nuisance parameters, R does not follow from I0 and H
     initial = calibration.reconstructor.astype(np.float64) if config.control.nuisance else None
     options = {"truncate": request.truncate, "tikhonov": request.tikhonov}
     quality = compute_reconstructor(config, calibration, initial, estimator=config.control.estimator, **options)
@@ -199,7 +200,7 @@ def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
     camera = factory.detector(configuration_of(loop))
     noise = factory.equivalent_read_noise_e(camera), camera.gain_e_per_dn / camera.em_gain
     before = replace(loop.calibration(), camera=loop.camera())
-    if before.camera is not None:  # also if no frame is used: a file has one size
+    if before.camera is not None:  # also with frames from a file: the calibration is written with this camera
         check_size(before.camera.shape, before)
     with raised_as(CalibrationError, ValueError):
         yield before, noise

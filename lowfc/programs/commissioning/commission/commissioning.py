@@ -94,7 +94,6 @@ class Commissioning:
         self._loop, self._config, self._computed, self._options = loop, config, computed, options
         self._report, self._progress, self._confirm = report, progress, confirm
         self._results: dict[str, Any] = {}
-        self._delay: Delay | None = None
         self._provisional_file: Path | None = None  # file of the provisional calibration, once that is in use
         self._advice = ""  # text after an early end, once the calibration is loaded
 
@@ -150,22 +149,23 @@ class Commissioning:
                 )
             self._report(f"resuming from {first_file} with its dark: --dark, --no-dark and --frames have no effect")
         else:
-            first = self._provisional()
+            first, delay = self._provisional()
             calibration_file.save(first, first_file)
             partial_of(options.out).unlink(missing_ok=True)  # cycles of a former commissioning
         self._provisional_file = first_file
         self._loop.load(first)
         player = Player(self._loop, first, self._report)
-        delay = self._delay if self._delay is not None else first_delay(player, config)
-        resume = resumed and partial_of(options.out).is_file()
-        if resume:
+        if resumed:
+            delay = first_delay(player, config)
+        has_cycles = resumed and partial_of(options.out).is_file()
+        if has_cycles:
             amplitude_nm = float(stored_cycles(partial_of(options.out))[0]["amplitude_nm"])
         else:
             self._announce("poke amplitude")
             default_nm = Pokes(config, first, factory.frame_noise_nm(config, first), self._request()).amplitude_nm
             amplitude_nm = linear_nm(player, config, delay, default_nm)
         self._announce("response")
-        request = self._request(amplitude_nm, resume=resume)
+        request = self._request(amplitude_nm, resume=has_cycles)
         calibrator = Calibrator(self._loop, request, self._report, self._progress, self._computed)
         data = calibrator.run(delay)
         self._announce("verdict")
@@ -213,8 +213,8 @@ class Commissioning:
             raise CalibrationError("the controller did not report its state")
         return state
 
-    def _provisional(self) -> Calibration:
-        """Measure the provisional calibration: dark, reference image, delay, and a first response."""
+    def _provisional(self) -> tuple[Calibration, Delay]:
+        """Measure the provisional calibration (dark, reference image, a first response) and the delay."""
         self._announce("camera")
         frames = list(self._loop.frames(CAMERA_FRAMES))
         camera = checked_camera(self._config, self._loop.camera_state(), frames, self._report)
@@ -235,10 +235,10 @@ class Commissioning:
         )
         self._announce("delay")
         player = Player(self._loop, before, self._report)
-        self._delay = delay = first_delay(player, self._config)
+        delay = first_delay(player, self._config)
         self._announce("orientation and sign")
         first = aligned(player, self._config, self._computed, delay, self._results)
-        return poked(player, self._config, delay) if first is None else first
+        return poked(player, self._config, delay) if first is None else first, delay
 
     def _predict_and_close(self, delay_frames: float) -> str:
         """Predict the residual; if requested, close the loop and compare."""

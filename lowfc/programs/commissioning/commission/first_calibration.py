@@ -1,7 +1,6 @@
 """The provisional calibration: from the image of one poke and the computed response, or from pokes of all modes."""
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,7 +52,7 @@ def first_delay(player: Player, config: Configuration, mode: int = 0) -> Delay:
 
 
 def aligned(
-    player: Player, config: Configuration, computed: Calibration, poke: Delay, results: dict[str, Any]
+    player: Player, config: Configuration, computed: Calibration, first_poke: Delay, results: dict[str, Any]
 ) -> Calibration | None:
     """The computed calibration on the sensor's pixels, with the sign from the poke of the first mode.
 
@@ -68,10 +67,13 @@ def aligned(
     except (ValueError, CalibrationError) as error:
         report(f"the image cannot be compared with the computed one: {error}")
         return None
-    poke_correlation = abs(correlation(poke.response, calibration.response[:, 0]))
+    poke_correlation = abs(correlation(first_poke.response, calibration.response[:, 0]))
     if alignment.residual <= MAX_MISFIT:  # otherwise a poke of tilt is of no use
-        pokes = partial(_poke_response, player, config, poke)
-        alignment, calibration, poke_correlation = oriented(config, computed, alignment, before.flux_dn, before, pokes)
+
+        def poke(mode: int) -> Array:
+            return (first_delay(player, config, mode) if mode else first_poke).response
+
+        alignment, calibration, poke_correlation = oriented(config, computed, alignment, before.flux_dn, before, poke)
     scale = alignment.geometry.scale * computed_scale(config)
     report(
         f"{in_words(alignment, scale)}; correlation of the poke's image with the computed one: {poke_correlation:.2f}"
@@ -90,11 +92,7 @@ def aligned(
     return identified(calibration)
 
 
-def _poke_response(player: Player, config: Configuration, first_poke: Delay, mode: int) -> Array:
-    return (first_delay(player, config, mode) if mode else first_poke).response
-
-
-def poked(player: Player, config: Configuration, poke: Delay) -> Calibration:
+def poked(player: Player, config: Configuration, delay: Delay) -> Calibration:
     """A calibration from pokes of each mode, without an optical model."""
     before, modes = player.before, len(player.before.noll)
     amplitude_nm = min(FIRST_NM, float(largest_nm(config, before).min()))
@@ -102,7 +100,7 @@ def poked(player: Player, config: Configuration, poke: Delay) -> Calibration:
     _report_time(player, config, CYCLES)
     for number in range(CYCLES):
         plan = _poke_cycle(modes, amplitude_nm, number)
-        response += player.cycle(plan, poke.delay_frames).response / CYCLES
+        response += player.cycle(plan, delay.delay_frames).response / CYCLES
     calibration = replace(before, response=single(response), estimator=f"{config.control.estimator}+poke{FIRST}")
     matrix = compute_reconstructor(config, calibration, None).matrix
     player.report(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")

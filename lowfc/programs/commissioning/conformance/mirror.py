@@ -319,16 +319,9 @@ def _limit_checks(mirror: Dialogue) -> Iterator[Check]:
     stroke_nm, slew_nm, apart_nm = limits.stroke_nm, limits.slew_nm, limits.neighbour_nm
     too_far_nm = min(_FAR * slew_nm, _NEAR * stroke_nm)
     fits = _BEYOND * apart_nm / 2 <= _NEAR * stroke_nm and mirror.reachable(_BEYOND * apart_nm)
+    reached = _reaches_stroke(mirror)
     for name, words, reason, limit_nm, commanded_nm, shape, possible in (
-        (
-            "stroke",
-            "no actuator above",
-            wire.REASON_STROKE,
-            stroke_nm,
-            _BEYOND * stroke_nm,
-            uniform,
-            _reaches_stroke(mirror),
-        ),
+        ("stroke", "no actuator above", wire.REASON_STROKE, stroke_nm, _BEYOND * stroke_nm, uniform, reached),
         ("slew", "no move above", wire.REASON_SLEW, slew_nm, too_far_nm, uniform, too_far_nm >= _BEYOND * slew_nm),
         ("neighbours", "no step above", wire.REASON_NEIGHBOUR, apart_nm, _BEYOND * apart_nm, peak, fits),
     ):
