@@ -41,7 +41,7 @@ def bridge_isio(
     beside: Annotated[
         str, typer.Option(help="Channel that the loop writes; the loop does not undo this mirror's other channels.")
     ] = "",
-    external: Annotated[list[str] | None, typer.Option(help="Channel that the loop must not undo; repeat.")] = None,
+    external: Annotated[list[str] | None, typer.Option(help="Channel not undone by the loop; may be repeated.")] = None,
     nm_per_unit: Annotated[float, typer.Option(min=1e-9, max=1e9, help="Surface per unit of a channel, nm.")] = 1000.0,
 ) -> None:
     """Publish modal error, command, residual and flux as ImageStreamIO streams, until Ctrl-C.
@@ -57,10 +57,11 @@ def bridge_isio(
         )
     if beside in names:
         raise ConfigurationError(f"{beside} is the loop's own channel (--beside): leave out --external {beside}")
-    for total in (name for name in names if sum_name(f"{name}00") == name):
-        raise ConfigurationError(
-            f"--external {total} is a sum, which may contain the loop's own channel: name single channels"
-        )
+    for name in names:
+        if sum_name(f"{name}00") == name:
+            raise ConfigurationError(
+                f"--external {name} is a sum, which may contain the loop's own channel: name single channels"
+            )
     lower_priority()
     run_id, clock = the_known_run(run), HostClock()
     with contextlib.suppress(KeyboardInterrupt):
