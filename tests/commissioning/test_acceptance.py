@@ -123,7 +123,7 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, Prob
     assert result.frames_missing == 1
     assert "interpolated" in result.text()
     loop.ask("safe")
-    with pytest.raises(AcceptanceError, match="it must be open or closed to be measured"):
+    with pytest.raises(AcceptanceError, match="it must be open or closed for a test"):
         Live(loop, lambda *_: None)
     silent = InProcessLoop(configured(), lose=lambda index: index == 60 and silent.silence_camera())
     with pytest.raises(AcceptanceError, match="NO_FRAMES no frame for 60 ms"):

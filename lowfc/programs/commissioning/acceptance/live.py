@@ -39,11 +39,9 @@ class Live:
         self.calibration = client.calibration()
         self.configuration = configuration_of(client)
         state = self._state()
-        if LoopMode(state.mode) not in (LoopMode.OPEN, LoopMode.CLOSED):
-            raise AcceptanceError(
-                f"the loop is {LoopMode(state.mode).in_words}: it must be open or closed to be measured"
-            )
         self._initial_mode = LoopMode(state.mode)
+        if self._initial_mode not in (LoopMode.OPEN, LoopMode.CLOSED):
+            raise AcceptanceError(f"the loop is {self._initial_mode.in_words}: it must be open or closed for a test")
         self._progress = progress
         self._done = self._expected = 0
         self.loop = loop_of(state, self.calibration, self.configuration.camera.rate_hz, self.client.laws())
@@ -110,12 +108,13 @@ class Live:
         self.set_mode(mode)
         before = self._state()
         steps, watch = self.client.steps(), self.client.mirror_watch()
-        first = self.client.note(
-            ANNOUNCEMENT + json.dumps({"test": kind, **parameters, "frames": frames})
-        ).frame_sequence
-        if columns:
-            answer = self.client.play(basis, table) if basis.size else self.client.play_offset(table)
-            first = answer.frame_sequence
+        answer = self.client.note(ANNOUNCEMENT + json.dumps({"test": kind, **parameters, "frames": frames}))
+        target = ""
+        if columns and basis.size:
+            target, answer = MIRROR, self.client.play(basis, table)
+        elif columns:
+            target, answer = OFFSET, self.client.play_offset(table)
+        first = answer.frame_sequence
         recorded: list[Step] = []
         for step in steps:
             if step.frame_sequence < first:
@@ -136,7 +135,6 @@ class Live:
         if columns and watch.interruption:
             raise AcceptanceError(f"{watch.interruption} during the measurement: measure again")
         loop = loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws())
-        target = "" if not columns else MIRROR if basis.size else OFFSET
         return probe_response(parameters, loop, target, table, basis, first, steps_as_columns(recorded, modes))
 
     def _state(self) -> wire.ControllerState:

@@ -43,12 +43,8 @@ def camera_checks(camera: Camera) -> Iterator[Check]:
 def _frames(camera: Camera) -> Check:
     count = len(camera.published)
     if not count:
-        advice = (
-            camera.driver_failure
-            or "is the camera in this run, does it use the session file of `lowfc config zenoh --role camera` and this "
-            "key?"
-        )
-        return wrong(f"none in {camera.seconds:g} s; received: {camera.keys}", advice)
+        advice = "does the camera use this run's session file (`lowfc config zenoh --role camera`), and this key?"
+        return wrong(f"none in {camera.seconds:g} s; received: {camera.keys}", camera.driver_failure or advice)
     if camera.unreadable:
         got = f"{camera.unreadable} of {count} payloads are not a foxglove.RawImage"
         return wrong(got, "encode the message as declared in foxglove/RawImage.proto")
@@ -68,10 +64,8 @@ def _frame_time(camera: Camera) -> Check:
     exposure_ns = 0 if camera.settings is None else camera.settings.exposure_ns
     got = f"{age_ns / 1e6:.3g} ms before the publish time"
     if age_ns < -_AGE_NS:
-        return wrong(
-            f"{-age_ns / 1e6:.3g} ms after the publish time",
-            "use the same clock for the timestamp and the publish time",
-        )
+        got = f"{-age_ns / 1e6:.3g} ms after the publish time"
+        return wrong(got, "use the same clock for the timestamp and the publish time")
     if age_ns > _READOUT_NS + exposure_ns:
         return wrong(got, "use the same clock for the timestamp and the publish time, in nanoseconds since the epoch")
     if exposure_ns > _AGE_NS and 0.9 * exposure_ns <= age_ns < 1.5 * exposure_ns:

@@ -58,9 +58,8 @@ def _sequence(device: Collected) -> Check | None:
     if gaps:
         got = f"{sum(gaps)} missing, in {counted(len(gaps), 'gap')} among {len(sequences)} messages"
         if len(gaps) > len(steps) // 10:
-            return wrong(
-                got, "count only the messages of this topic; if FRAMES_LOST reports lost frames, find their cause"
-            )
+            advice = "count only the messages of this topic; if FRAMES_LOST reports lost frames, find their cause"
+            return wrong(got, advice)
         return warning(got, "were they never published, or lost because this host is busy?")
     if len({start_of(sequence) for sequence in sequences}) > 1:
         return warning("the publisher restarted during the check", "repeat the check while it runs")

@@ -90,9 +90,8 @@ def _size(camera: Camera) -> Check | None:
     if camera.shapes == [size]:
         return ok(got)
     swapped = camera.shapes == [size[::-1]]
-    return wrong(
-        got, "exchange rows and columns" if swapped else "publish the size of the region of interest that is sent"
-    )
+    advice = "exchange rows and columns" if swapped else "publish the size of the region of interest that is sent"
+    return wrong(got, advice)
 
 
 @SETTINGS.check("settings' range", "no pixel above saturation_dn or the converter's largest value")
