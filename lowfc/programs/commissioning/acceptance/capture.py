@@ -110,9 +110,8 @@ def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> Capt
         # The last trial of each level.
         of_mode = {trial.parameters["level_nm"]: trial for trial in trials if trial.parameters["noll"] == noll}
         converged = {level_nm: removed(trial) for level_nm, trial in of_mode.items()}
-        sizes = sorted({abs(level_nm) for level_nm in converged})
         lost = [abs(level_nm) for level_nm, success in converged.items() if not success]
-        good = [size for size in sizes if {size, -size} <= set(converged) and size < min([*lost, np.inf])]
+        good = [size for size in converged if 0 < size < min(lost, default=np.inf) and -size in converged]
         required_nm = _required_nm(configuration, noll)
         modes.append(
             CaptureMode(

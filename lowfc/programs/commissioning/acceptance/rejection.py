@@ -210,9 +210,8 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> R
 def draw(result: dict[str, Any], figure: Any) -> None:
     """Draw rejection and noise transfer side by side: measured points and theory."""
     axes = figure.subplots(1, 2, sharex=True)
-    for ax, name, title in zip(
-        axes, ("rejection", "noise_transfer"), ("rejection |S|", "noise transfer |T|"), strict=True
-    ):
+    titles = {"rejection": "rejection |S|", "noise_transfer": "noise transfer |T|"}
+    for ax, (name, title) in zip(axes, titles.items(), strict=True):
         for number, mode in enumerate(result["modes"]):
             points = [point for point in result["points"] if point["noll"] == mode["noll"]]
             hz = [point["frequency_hz"] for point in points]

@@ -192,27 +192,22 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
     largest = np.argsort(-pol_spectrum.variance_nm2())[:2]
     shown_hz = pol_spectrum.frequency_hz[1:]
     edges = np.append(shown_hz - pol_spectrum.spacing_hz / 2, shown_hz[-1]) * 2 * np.pi / run.rate_hz
+    noise_nm2 = np.array([each.noise_nm2 for each in best.models])
+    closed = spectrum(run.error, run.rate_hz) if run.closed else None
     for axes, mode in zip(drawing.subplots(2, 1, sharex=True), largest.tolist(), strict=False):
-        model = best.models[mode]
-        omega, one_sided = fine_frequencies(model), 2 / run.rate_hz
-        modelled = model.spectrum_nm2(omega) + model.noise_nm2
-        noise_nm2 = np.array([each.noise_nm2 for each in best.models])
+        omega = fine_frequencies(best.models[mode])
+        modelled = best.models[mode].spectrum_nm2(omega) + noise_nm2[mode]
         measured = np.repeat(modelled[:, None], len(noise_nm2), axis=1)  # only the column of this mode is used
         residual = residual_spectrum(best.law, omega, measured, noise_nm2, run.timing)[:, mode]
+        model_nm2_hz = 2 / run.rate_hz * _means(modelled, omega, edges)
+        residual_nm2_hz = 2 / run.rate_hz * _means(residual, omega, edges)
         axes.loglog(shown_hz, pol_spectrum.power_nm2_hz[1:, mode], color="0.6", label="pseudo-open-loop")
-        closed = spectrum(run.error, run.rate_hz) if run.closed else None
         if closed is not None:
             binned_hz, (power,) = in_bins(closed.frequency_hz, [closed.power_nm2_hz[:, mode]])
             axes.loglog(binned_hz, power, color="tab:orange", label="error")
-        axes.loglog(
-            shown_hz,
-            one_sided * _means(modelled, omega, edges),
-            color="tab:blue",
-            lw=1,
-            label="model of the pseudo-open-loop",
-        )
+        axes.loglog(shown_hz, model_nm2_hz, color="tab:blue", lw=1, label="model of the pseudo-open-loop")
         label = f"predicted residual with the tuned law ({best.kinds[mode]})"
-        axes.loglog(shown_hz, one_sided * _means(residual, omega, edges), color="tab:green", label=label)
+        axes.loglog(shown_hz, residual_nm2_hz, color="tab:green", label=label)
         axes.set(ylabel=f"Z{run.noll[mode]} {mode_name(run.noll[mode])}, nm$^2$/Hz")
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2, frameon=False)  # covers no line
     axes.set(xlabel="frequency, Hz")
