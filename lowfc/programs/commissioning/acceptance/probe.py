@@ -186,15 +186,7 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
         sequence = history.steps.sequence
         limited = sequence[(sequence >= first) & (history.steps.reasons & _LIMIT_BITS != 0)].tolist()
         end = min([first + frames, *limited[:1]])  # a limit that acts ends the measurement
-        for other in history.requests:
-            if other.accepted and other.name in _DISTURBING and first < other.frame_sequence < end:
-                raise DataFileError(f"{path}: request {other.name!r} disturbed the measurement")
-        times_ns = history.steps.time_ns[(sequence >= first) & (sequence < end)]
-        for _, event in history.events:
-            interrupted = play and event.message.startswith(INTERRUPTIONS)
-            event_ns = from_timestamp(event.timestamp) - history.camera_lag_ns(event.name)
-            if interrupted and times_ns.size and times_ns[0] <= event_ns <= times_ns[-1]:
-                raise DataFileError(f"{path}: {event.message}, during the measurement")
+        _check_undisturbed(history, first, end, play=play)
         cut = 0 if limited else first + frames - 1 - int(sequence.max(initial=first - 1))
         if cut > MAX_MISSING * frames:
             named = [f"{key} {parameters[key]}" for key in ("noll", "level_nm", "loop") if key in parameters]
@@ -215,6 +207,21 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
         target = request.text if play else ""
         responses.append(probe_response(parameters, loop, target, table, basis, first, history.steps))
     return responses
+
+
+def _check_undisturbed(history: History, first: int, end: int, *, play: bool) -> None:
+    """DataFileError if a request disturbed the frames from `first` to before `end`, or an event a probe sequence."""
+    path, sequence = history.log.path, history.steps.sequence
+    for request in history.requests:
+        if request.accepted and request.name in _DISTURBING and first < request.frame_sequence < end:
+            raise DataFileError(f"{path}: request {request.name!r} disturbed the measurement")
+    times_ns = history.steps.time_ns[(sequence >= first) & (sequence < end)]
+    if not (play and times_ns.size):
+        return
+    for _, event in history.events:
+        event_ns = from_timestamp(event.timestamp) - history.camera_lag_ns(event.name)
+        if event.message.startswith(INTERRUPTIONS) and times_ns[0] <= event_ns <= times_ns[-1]:
+            raise DataFileError(f"{path}: {event.message}, during the measurement")
 
 
 def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[str, Any], wire.Request]]:

@@ -62,12 +62,7 @@ class Calibrator:
     """
 
     def __init__(
-        self,
-        loop: Client,
-        request: CalibrationRequest,
-        report: Report,
-        progress: Counted,
-        computed: Calibration,
+        self, loop: Client, request: CalibrationRequest, report: Report, progress: Counted, computed: Calibration
     ) -> None:
         """Get the controller's calibration, and read the completed cycles with --resume.
 
