@@ -57,13 +57,13 @@ class CalibrationProperties(Result):
     singular_values: list[float] = result_field("singular values", form=".3g")
     kept: list[float] = result_field()
     delay_frames: float = result_field("delay", "frames", ".3f")
-    delay_error_frames: float = result_field("standard error of the delay", "frames", ".3f")
+    delay_error_frames: float | None = result_field("standard error of the delay", "frames", ".3f", default=None)
     frame_to_effect_ms: float = result_field("frame to effect", "ms", ".3g")
     noise_gain_nm: list[float] = result_field("noise per frame", "nm", ".3g", column=True)
     computed_noise_nm: list[float] | None = result_field("computed", "nm", ".3g", column=True, default=None)
     bad_pixels: int = result_field("bad pixels")
     flux_dn: float = result_field("light", "DN", ".4g")
-    cycles: int = result_field("cycles")
+    cycles: int | None = result_field("cycles", default=None)
     cross_talk: float | None = result_field("largest cross-talk relative to the computed H", form=".4f", default=None)
     cross_talk_error: float | None = result_field("standard error of this cross-talk", form=".4f", default=None)
     file: str = result_field("written")
@@ -175,9 +175,12 @@ def result_of(
     verdict: Verdict | None = None,
 ) -> CalibrationResult:
     """The result of a measured or computed calibration."""
-    delay_frames, error_frames = (configured_delay(config), 0.0) if data is None else data.delay[:2]
     limit_nm = factory.settings(config).integrator(calibration.noll).limit_nm
+    delay_frames = configured_delay(config)
     optional: dict[str, Any] = {}
+    if data is not None:
+        delay_frames, optional["delay_error_frames"] = data.delay[:2]
+        optional["cycles"] = data.measured.cycles
     noise = None if computed is None else computed_noise_nm(config, calibration, computed)
     if data is not None and computed is not None and noise is not None:
         optional["cross_talk"] = float(np.abs(cross_talk(calibration.reconstructor, computed.response)).max())
@@ -191,12 +194,10 @@ def result_of(
         singular_values=reconstruction.singular_values.tolist(),
         kept=reconstruction.kept.tolist(),
         delay_frames=delay_frames,
-        delay_error_frames=error_frames,
         frame_to_effect_ms=delay_frames * config.period_ns * 1e-6,
         noise_gain_nm=factory.frame_noise_nm(config, calibration).tolist(),
         bad_pixels=int(np.count_nonzero(calibration.good == 0)),
         flux_dn=calibration.flux_dn,
-        cycles=0 if data is None else data.measured.cycles,
         file=str(file),
         advice=[advice(reconstruction, calibration.noll, limit_nm)],
         **optional,
