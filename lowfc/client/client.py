@@ -321,7 +321,7 @@ class Client:
         return Stream(self._bus.ring(STEP, WAITING), step_of, "step", count, patience_s)
 
     def mirror_watch(self) -> MirrorWatch:
-        """Watch the mirror's reports from now on, without blocking; see `MirrorWatch`."""
+        """Watch the mirror's reports from now on; see `MirrorWatch`."""
         return MirrorWatch(self._bus)
 
     def ask(

@@ -18,7 +18,7 @@ from unittest.mock import Mock
 import pytest
 import zenoh
 
-from lowfc.adapters.bus.bus import Bus, Query, Sample
+from lowfc.adapters.bus.bus import Bus, Faults, Query, Sample
 from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.bus.run import Run, new_run_id, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
@@ -399,3 +399,10 @@ def test_each_use_of_a_key_on_a_closed_bus_raises_a_bus_error(run: Run) -> None:
     ):
         with pytest.raises(BusError, match="cannot be used: session closed"):
             use()
+
+
+def test_a_fault_is_counted_also_if_standard_error_cannot_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", Mock(write=Mock(side_effect=OSError("disk full"))))
+    faults = Faults()
+    faults.add("camera: handler of", "lowfc/frame", RuntimeError("broken"))
+    assert faults.counts == {"camera: handler of lowfc/frame": 1}

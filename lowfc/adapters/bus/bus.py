@@ -4,6 +4,7 @@
 threads: a slow handler delays the next message of the same publisher, and may be called for another one meanwhile.
 """
 
+import contextlib
 import sys
 import threading
 import traceback
@@ -159,7 +160,8 @@ class Faults:
             self.counts[where] = before + 1
         if not before:
             text = "".join(traceback.format_exception(fault))
-            sys.stderr.write(f"{where}: {text}(further ones at this place are only counted)\n")
+            with contextlib.suppress(OSError):  # for example a full disk: the receive thread goes on
+                sys.stderr.write(f"{where}: {text}(further ones at this place are only counted)\n")
 
     def add_unreadable(self, key: str, why: object) -> None:
         """Count an unreadable message by its key or key expression."""
