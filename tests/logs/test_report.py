@@ -41,6 +41,11 @@ def results_of(log: Path) -> dict[str, Any]:
     return results
 
 
+def check_of(results: dict[str, Any], name: str) -> dict[str, str]:
+    """A check of the verdict by its name."""
+    return next(check for check in results["verdict"]["checks"] if check["name"] == name)
+
+
 @pytest.fixture(scope="module")
 def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A log with the loop open and closed, frames lost and dark, gains changed, controller and camera restarted.
@@ -101,8 +106,7 @@ def test_frames_are_accounted_for(eventful: dict[str, Any]) -> None:
 def test_commands_of_a_camera_that_does_not_count_late_ones_are_not_called_in_time(tmp_path: Path) -> None:
     results = results_of(uneventful(SyntheticLog(truth=False)).write(tmp_path / "log.mcap"))
     assert results["timing"]["frames"]["commands_late"] is None
-    delay = next(check for check in results["verdict"]["checks"] if check["name"] == "delay")
-    assert delay["level"] == "unknown"
+    assert check_of(results, "delay")["level"] == "unknown"
 
 
 def test_latencies_are_those_of_the_messages(eventful: dict[str, Any]) -> None:
@@ -174,14 +178,14 @@ def test_the_bands_of_a_slow_loop_end_at_half_its_rate(tmp_path: Path, monkeypat
 
 
 def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
-    verdict = eventful["verdict"]
-    levels = {check["name"]: check["level"] for check in verdict["checks"]}
-    assert verdict["level"] == "look"
+    found = eventful["verdict"]
+    levels = {check["name"]: check["level"] for check in found["checks"]}
+    assert found["level"] == "look"
     assert {name for name, level in levels.items() if level == "look"} == {"commands", "light", "events"}
     assert {name for name, level in levels.items() if level == "good"} == {"log", "loop", "residual", "delay", "mirror"}
-    assert verdict["because"] == "6 of 2250 frames (0.27%) led to no command"
+    assert found["because"] == "6 of 2250 frames (0.27%) led to no command"
     before_nm = eventful["residual"]["open_pupil"]["disturbance_open_pupil_rms_nm"]
-    text = verdict["checks"][2]["text"]
+    text = check_of(eventful, "residual")["text"]
     assert text.startswith(f"{before_nm:.3g} nm before")
     assert "nm after over the open pupil;" in text
 
@@ -237,8 +241,8 @@ def test_the_state_of_the_log_is_in_the_verdict(
 ) -> None:
     log = make(good, tmp_path)
     report = report_of(read_run(log))
-    check = report.results["verdict"]["checks"][0]
-    assert (check["name"], check["level"], check["text"].partition(", unreadable")[0]) == ("log", level, text)
+    check = check_of(report.results, "log")
+    assert (check["level"], check["text"].partition(", unreadable")[0]) == (level, text)
     assert (report.results["log"]["complete"], report.results["log"]["finished"]) == (complete, make is not cut_off)
     assert 0 < report.results["run"]["steps"] <= 1500
     assert report.results["verdict"]["level"] == level
@@ -266,8 +270,7 @@ def test_a_limit_of_mirror_and_controller_has_the_larger_count(good: Path) -> No
         "limits_at_mirror": {"stroke": 50, "slew": 2},
         "limits_at_controller": {"stroke": 1, "slew": 3},
     }
-    check = next(check for check in verdict(results)["checks"] if check["name"] == "mirror")
-    assert check["text"] == "limits acted: stroke 50, slew 3"
+    assert check_of({"verdict": verdict(results)}, "mirror")["text"] == "limits acted: stroke 50, slew 3"
 
 
 def test_only_the_end_of_a_very_long_stretch_is_analysed(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -336,7 +339,7 @@ def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(
     assert results["residual"]["total_rms_nm"]["residual"] is None
     assert "true_over_theory" not in results["spectra"]["groups"][0]
     assert results["run"]["simulated"] is False
-    assert "nm after in all modes over the circle;" in results["verdict"]["checks"][2]["text"]
+    assert "nm after in all modes over the circle;" in check_of(results, "residual")["text"]
 
 
 def test_a_log_of_an_open_loop_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
@@ -355,12 +358,11 @@ def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
     night.frames(300)
     results = results_of(night.write(tmp_path / "x.mcap"))
     assert (results["mode_steps"], results["run"]["simulated"]) == ({"idle": 300}, True)
-    check = results["verdict"]["checks"][2]
+    check = check_of(results, "residual")
     assert (check["level"], check["text"]) == ("unknown", "the loop was not closed in this log")
-    check = results["verdict"]["checks"][3]
-    assert (check["name"], check["level"]) == ("commands", "unknown")
+    assert check_of(results, "commands")["level"] == "unknown"
     night.start_controller()
-    log = results_of(night.frames(10).write(tmp_path / "y.mcap"))["verdict"]["checks"][0]
+    log = check_of(results_of(night.frames(10).write(tmp_path / "y.mcap")), "log")
     assert log["text"] == "300 messages without the calibration's modes or with impossible values, left out"
 
 
@@ -433,7 +435,7 @@ def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -
     assert results["mode_steps"] == {"closed": 300}
     why = "the law with which the loop was closed is not in this log, or the integrator took over some of its modes"
     assert results["spectra"] == results["error_budget"] == {"why_not": why}
-    assert results["verdict"]["checks"][2]["text"] == why
+    assert check_of(results, "residual")["text"] == why
 
 
 def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
@@ -443,7 +445,7 @@ def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_p
     assert "has 0 frames" in results["spectra"]["why_not"]
     assert {term["missing"] for term in results["error_budget"]["terms"]} == {True}
     assert results["light"]["refused"] == {"dark": 200}
-    assert results["verdict"]["checks"][2]["level"] == "look"  # the true wavefront is uncorrected
+    assert check_of(results, "residual")["level"] == "look"  # the true wavefront is uncorrected
 
 
 @pytest.mark.parametrize(("frames", "shaped"), [((0, 400, 0), True), ((0, 200, 200), True), ((20, 20, 400), False)])
@@ -459,7 +461,7 @@ def test_a_true_residual_with_an_offset_is_no_measure_of_the_loop(
     report = report_of(read_run(night.frames(after).write(tmp_path / "x.mcap")))
     results = report.results
     assert ("The true residual includes the shapes of offset or channels." in page(report)) is shaped
-    check, after_nm = results["verdict"]["checks"][2], results["residual"]["open_pupil"]["residual_open_pupil_rms_nm"]
+    check, after_nm = check_of(results, "residual"), results["residual"]["open_pupil"]["residual_open_pupil_rms_nm"]
     assert (check["level"], results["residual"]["shaped"], "(true)" in check["text"]) == ("good", shaped, not shaped)
     text = f"an offset or channels were in force, and their shapes are in the true residual of {after_nm:.3g} nm"
     assert (text in check["text"]) is shaped
