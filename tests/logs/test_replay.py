@@ -111,8 +111,9 @@ class Night:
             self._put_state()
         self._last_number = number
 
-    def steps(self) -> int:
-        return sum(message.key == STEP.key for message in self.messages)
+    def places(self, topic: Topic) -> list[int]:
+        """Indices of the messages of a topic."""
+        return [index for index, message in enumerate(self.messages) if topic.matches(message.key)]
 
     def _start(self) -> None:
         self.state, self._last_number = State(), 0
@@ -254,7 +255,7 @@ def test_the_order_between_publishers_does_not_matter(input_list: list[Input], r
     shuffled = sorted(late, key=lambda message: message.receive_time_ns)
     account = replay(shuffled)
     assert account.identical
-    assert account.frames == night.steps()
+    assert account.frames == len(night.places(STEP))
 
 
 @hypothesis_settings(deadline=None, max_examples=EXAMPLES)
@@ -284,20 +285,20 @@ def test_segments_together_give_the_account_of_the_whole_log(
         message._replace(receive_time_ns=begun_ns + slowdown * (message.receive_time_ns - begun_ns))
         for message in night.messages
     ]
-    for place, count in gaps:
-        first = int(place * (len(messages) - 1))
+    for fraction, count in gaps:
+        first = int(fraction * (len(messages) - 1))
         states = [index for index, message in enumerate(messages) if message.key == CONTROLLER_STATE.key]
         gone = [index for index in (states if only_states else range(len(messages))) if index >= first][:count]
         messages = [message for index, message in enumerate(messages) if index not in gone]
     span_ns = messages[-1].receive_time_ns - messages[0].receive_time_ns if messages else 0
-    edges = sorted({begun_ns + 1 + int(cut * span_ns) for cut in edge_fractions})
+    edges = sorted({begun_ns + 1 + int(fraction * span_ns) for fraction in edge_fractions})
     whole = replay(messages)
     parts = [replay(messages, segment=Segment(begin, end)) for begin, end in pairwise([0, *edges, 1 << 63])]
     steps = sum(message.key == STEP.key for message in messages)
     assert sum(part.steps for part in parts) == whole.steps == steps
     assert whole.frames + whole.unchecked == steps
-    for count in ("frames", "commands", "requests", "different", "commands_missing"):
-        assert sum(getattr(part, count) for part in parts) == getattr(whole, count), count
+    for name in ("frames", "commands", "requests", "different", "commands_missing"):
+        assert sum(getattr(part, name) for part in parts) == getattr(whole, name), name
     unchecked = sum(part.unchecked for part in parts)
     assert unchecked >= whole.unchecked  # where states are missing, two segments may count the same step
     if not gaps:
@@ -306,7 +307,7 @@ def test_segments_together_give_the_account_of_the_whole_log(
 
 def test_after_a_gap_the_replay_continues_at_the_next_state_and_reports_unchecked_steps() -> None:
     night = night_of(frames(100))
-    steps = [index for index, message in enumerate(night.messages) if message.key == STEP.key]
+    steps = night.places(STEP)
     account = replay([*night.messages[: steps[30]], *night.messages[steps[40] :]])
     assert account.identical
     assert list(account.unchecked_because) == ["after an input that the log does not have"]
@@ -366,8 +367,7 @@ def raise_actuator(command: Any, number: int) -> None:
 def tampered(night: Night, topic: Topic, number: int, change: str) -> Account:
     """Change one message slightly, and replay."""
     messages = list(night.messages)
-    places = [index for index, message in enumerate(messages) if topic.matches(message.key)]
-    index = places[number]
+    index = night.places(topic)[number]
     body = topic.message.FromString(messages[index].payload)
     if change == "actuators":
         raise_actuator(body, 7)
@@ -399,24 +399,20 @@ def test_the_smallest_difference_is_found_and_reported(topic: Topic, change: str
     assert any(line.startswith(expected) for line in account.first_difference.fields), account.first_difference.fields
     if change == "actuators":
         assert 0 < account.largest_difference_nm < 1e-5
-        assert (account.different, account.first_difference.taken, account.first_difference.frame_sequence & 0xFF) == (
-            1,
-            4,
-            2,
-        )
+        difference = account.first_difference
+        assert (account.different, difference.taken, difference.frame_sequence & 0xFF) == (1, 4, 2)
 
 
 def test_a_second_message_for_one_input_differs() -> None:
     night = night_of(frames(60))
-    place = [index for index, message in enumerate(night.messages) if message.key == STEP.key][20]
-    account = replay([*night.messages, night.messages[place]])
+    account = replay([*night.messages, night.messages[night.places(STEP)[20]]])
     assert account.different == 1
     assert account.first_difference.fields == ["a second message of input 22"]
 
 
 def test_commands_that_are_not_in_the_log_are_counted() -> None:
     night = night_of(frames(60))
-    commands = [index for index, message in enumerate(night.messages) if COMMAND.matches(message.key)]
+    commands = night.places(COMMAND)
     without = [message for index, message in enumerate(night.messages) if index not in commands[10:13]]
     account = replay(without)
     assert (account.identical, account.commands, account.commands_missing) == (True, 57, 3)
