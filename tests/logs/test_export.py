@@ -162,7 +162,6 @@ def test_an_aot_file_describes_the_system_to_aotpy(log: Path, tmp_path: Path) ->
     system = aotpy.AOSystem.read_from_file(path, exception_level=AOTFITSErrorLevel.WARNING)
     (loop,) = system.loops
     sensor, mirror = loop.input_sensor, loop.commanded_corrector
-    calibration, good = CALIBRATED, GOOD
 
     def check(image: aotpy.Image, unit: str | None, expected: npt.ArrayLike) -> None:
         assert image.unit == unit
@@ -173,9 +172,9 @@ def test_an_aot_file_describes_the_system_to_aotpy(log: Path, tmp_path: Path) ->
     assert np.flatnonzero(np.isnan(commands_nm[:, 0])).tolist() == [WITHOUT_COMMAND]
     check(loop.modal_coefficients, "nm", sent(STEP, "error_nm"))
     check(loop.commands, "m", commands_nm * np.float32(1e-9))
-    check(loop.measurements_to_modes, "nm", calibration.reconstructor[:, None, good])
-    check(loop.modes_to_measurements, "nm-1", calibration.response[good][:, None])
-    check(loop.modes_to_commands, "m nm-1", calibration.modes_to_actuators * np.float32(1e-9))
+    check(loop.measurements_to_modes, "nm", CALIBRATED.reconstructor[:, None, GOOD])
+    check(loop.modes_to_measurements, "nm-1", CALIBRATED.response[GOOD][:, None])
+    check(loop.modes_to_commands, "m nm-1", CALIBRATED.modes_to_actuators * np.float32(1e-9))
     check(loop.time_filter_num, None, np.array([[0.4], [0.4], [0.2]], np.float32))
     check(loop.time_filter_den, None, [[-1, 1]] * 3)
     assert loop.modes.data.shape == (MODES, 64, 64)
@@ -188,17 +187,17 @@ def test_an_aot_file_describes_the_system_to_aotpy(log: Path, tmp_path: Path) ->
     assert (loop.closed, loop.framerate, loop.delay) == (True, 1000, 1.25)
 
     check(sensor.detector.pixel_intensities, "adu", FRAMES)
-    check(sensor.detector.dark, "adu", calibration.dark.reshape(toy.SHAPE))
-    check(sensor.ref_measurements, None, calibration.reference[None, good])
-    assert sensor.n_valid_subapertures == good.sum() == (sensor.subaperture_mask.data >= 0).sum()
-    assert sensor.wavelength == pytest.approx(calibration.wavelength_nm * 1e-9)
+    check(sensor.detector.dark, "adu", CALIBRATED.dark.reshape(toy.SHAPE))
+    check(sensor.ref_measurements, None, CALIBRATED.reference[None, GOOD])
+    assert sensor.n_valid_subapertures == GOOD.sum() == (sensor.subaperture_mask.data >= 0).sum()
+    assert sensor.wavelength == pytest.approx(CALIBRATED.wavelength_nm * 1e-9)
     assert mirror.uid == "dm"
     assert mirror.n_valid_actuators == len(mirror.actuator_coordinates) == ACTUATORS
     across = [coordinate.x for coordinate in mirror.actuator_coordinates[: toy.GRID[1]]]
     np.testing.assert_allclose(np.diff(across), 2.0 / 31.0)  # diameter, m, over pitches per pupil
     assert system.main_telescope.enclosing_diameter == 2.0
     metadata = {one.key: one.value for one in system.metadata}
-    assert (metadata["CALID"], metadata["RUN"], metadata["EPERADU"]) == (calibration.id, "night", 1.0)
+    assert (metadata["CALID"], metadata["RUN"], metadata["EPERADU"]) == (CALIBRATED.id, "night", 1.0)
     assert metadata["GAINSETS"] == 1
     assert json.loads(system.config) == Configuration().model_dump()
 
@@ -210,7 +209,8 @@ def test_aot_has_the_weighted_reconstructor_and_no_gains_that_a_linear_law_repla
     state.prior_nm2[:], state.weighting_flux_dn = [0, 0, 16], toy.FLUX_DN
     state.camera_expected.CopyFrom(wire_camera(toy.CAMERA))
     night.put(CONTROLLER_STATE, state)
-    export_log(night.write(tmp_path / "x.mcap"), Format.AOT, path := tmp_path / "x.fits", frames=False, console=QUIET)
+    path = tmp_path / "x.fits"
+    export_log(night.write(tmp_path / "x.mcap"), Format.AOT, path, console=QUIET)
     (loop,) = aotpy.AOSystem.read_from_file(path).loops
     assert (loop.delay, loop.time_filter_num, loop.time_filter_den) == (1.25, None, None)
     weighted = calibration_in_use(state, CALIBRATED).reconstructor[:, None, GOOD]

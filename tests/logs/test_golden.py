@@ -24,7 +24,7 @@ from tests.support.loops import json_of, refusal, run
 
 WIRE = Path(__file__).parents[2] / "lowfc" / "contract" / "wire"
 FOLDER = Path(__file__).parents[1] / "golden" / "0.1"
-FORMER_KEY = next(old for old, new in former_names.KEYS.items() if new.endswith("frame_timeout_ms")).partition(".")[2]
+FORMER_KEY = "hold_ms"
 NIGHT, KILLED = FOLDER / "night.mcap", FOLDER / "killed.mcap"
 NIGHT_RULES = {CAMERA_RULE: 1, CLEAR_RULE: 1}
 CALIBRATION_ID = "88418bc31223bb21a6b588e0b43a360fda6133511792fa03b8c6af46764afa20"

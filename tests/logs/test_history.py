@@ -52,10 +52,10 @@ def history_of(night: SyntheticLog, path: Path) -> History:
 def test_an_invalid_step_is_left_out_of_every_column(tmp_path: Path, change: Callable[[Any], object]) -> None:
     night = SyntheticLog().frames(STEPS)
     night.change(STEP, -10, change)
-    steps = (history := history_of(night, tmp_path / "x.mcap")).steps
+    history = history_of(night, tmp_path / "x.mcap")
     assert history.excluded_messages == 1
-    assert {len(getattr(steps, column)) for column in steps.__slots__} == {STEPS - 1}
-    assert np.isfinite(steps.error_nm).all()
+    assert {len(getattr(history.steps, column)) for column in history.steps.__slots__} == {STEPS - 1}
+    assert np.isfinite(history.steps.error_nm).all()
     assert len(history.truths.sequence) == len(history.mirror.sequence) == len(history.stepped_sequence) == STEPS
 
 

@@ -51,8 +51,7 @@ def recorded(folder: Path, samples: Sequence[Sample], files: int, *, finish: boo
 
 @pytest.fixture(scope="module")
 def samples() -> list[Sample]:
-    night = SyntheticLog().request("close").frames(FRAMES, lost=[100, 101])
-    return night.samples
+    return SyntheticLog().request("close").frames(FRAMES, lost=[100, 101]).samples
 
 
 @pytest.fixture
@@ -201,7 +200,7 @@ ONE_BY_ONE = [["info"], ["report"], ["export", "--to", "csv", "--force"], ["reco
 @pytest.mark.usefixtures("without_drawings")
 @pytest.mark.parametrize("words", ONE_BY_ONE, ids=lambda words: words[0])
 def test_several_logs_are_processed_one_by_one(folder: Path, words: list[str]) -> None:
-    (night := SyntheticLog()).frames(3)
+    night = SyntheticLog().frames(3)
     first, second = (str(night.write(Path(f"{name}.mcap"))) for name in "ab")
     several = lowfc(*words, first, second)
     alone = [lowfc(*words, log).stdout for log in (first, second)]

@@ -113,15 +113,14 @@ def test_parts_left_out_are_reported(tmp_path: Path) -> None:
     done = lowfc("recover", path, "--out", out)
     assert done.exit_code == 0, done.output
     first, last = done.stdout.splitlines()
-    kept = len(list(LogReader(out)))
+    saved = LogReader(out)
+    kept = len(list(saved))
     assert 0 < kept < len(small_samples())
     assert first.startswith("left out at byte ")
     assert "s between the messages around it" in first
     assert last == f"{out}: {kept} messages"
-    account = LogReader(out)
-    list(account)
-    assert account.metadata["recovery"]["source"] == "night.mcap"
-    assert "left out " + account.metadata["recovery"]["left_out 1"] == first
+    assert saved.metadata["recovery"]["source"] == "night.mcap"
+    assert "left out " + saved.metadata["recovery"]["left_out 1"] == first
     damage = json_of("recover", path)["damage"]
     assert len(damage) == 1
     assert damage[0]["position"] < middle < damage[0]["position"] + damage[0]["length"]

@@ -97,7 +97,7 @@ BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}
 def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_those_gains(
     frames: int, pair: tuple[Gains, Gains], delay: float, within_nm: float, overrides: dict[str, Any]
 ) -> None:
-    """In both directions between two laws, each mode is within 10 % of the simulated run; its own law to rounding."""
+    """From each run to the other law, every mode is within 10 %; a run's own law reproduces it to rounding."""
     configs = [configured(gains, delay, **overrides) for gains in pair]
     calibration = calibrated(configs[0])  # independent of the gains
     runs = [run_loop(config, frames, calibration) for config in configs]
@@ -113,7 +113,7 @@ def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_those_gains(
 
 
 FRAMES = 1200
-SETTLING = 599  # frames left out: half of the log, because settling takes longer
+SETTLING = 599  # frames left out at the start: half of the log, the most allowed; settling takes longer
 OTHER = "gain=0.3,tilt_gain=0.2,leak=0.01"
 
 
@@ -331,12 +331,12 @@ def test_a_users_controller_is_run_like_the_integrator(
 ) -> None:
     (tmp_path / "mine.py").write_text(INTEGRATOR)
     where = f"{tmp_path / 'mine.py'}:step"
-    own, ours = results_of(runs["default"], requested(controller=where)), results_of(runs["default"], requested(OTHER))
-    np.testing.assert_allclose(column(own, "what_if"), column(ours, "what_if"), rtol=1e-4)
-    assert own["controller"] == where
-    assert "gain" not in own["modes"][0]
-    assert where in render(own)
-    assert "->" not in render(own)
+    users, integrator = (results_of(runs["default"], one) for one in (requested(controller=where), requested(OTHER)))
+    np.testing.assert_allclose(column(users, "what_if"), column(integrator, "what_if"), rtol=1e-4)
+    assert users["controller"] == where
+    assert "gain" not in users["modes"][0]
+    assert where in render(users)
+    assert "->" not in render(users)
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.startswith("loaded\ncalled\n")
