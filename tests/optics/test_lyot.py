@@ -9,7 +9,7 @@ from lowfc.optics.chain.added_contrast import ModalContrast, contrast_form
 from lowfc.optics.chain.coronagraph import Coronagraph, contrast, mean_contrast
 from lowfc.optics.chain.zernike import NOLLS_14
 
-NM = 550.0
+WAVELENGTH_NM = 550.0
 
 
 @pytest.fixture(scope="module", params=["lyot", "aplc"])
@@ -24,7 +24,7 @@ def waves_nm():
 
 def test_lyot_image_agrees_with_hcipy(hcipy, coronagraph, modes, waves_nm):
     opd_nm, lyot, samples = np.tensordot(waves_nm[0], modes[:14], 1), coronagraph.lyot, 96
-    found = contrast(coronagraph, opd_nm, NM, samples, samples_per=4)
+    found = contrast(coronagraph, opd_nm, WAVELENGTH_NM, samples, samples_per=4)
 
     def focal_grid(count, samples_per):
         step = 1 / samples_per
@@ -34,7 +34,7 @@ def test_lyot_image_agrees_with_hcipy(hcipy, coronagraph, modes, waves_nm):
     passed = hcipy.Field(1.0 - lyot.opaque.ravel(), mask_grid)
     theirs = hcipy.LyotCoronagraph(pupil_grid, passed, hcipy.Field(lyot.stop.ravel(), pupil_grid))
     camera = hcipy.FraunhoferPropagator(pupil_grid, focal_grid(samples, 4))
-    field = (coronagraph.pupil * np.exp(2j * np.pi / NM * opd_nm)).ravel()
+    field = (coronagraph.pupil * np.exp(2j * np.pi / WAVELENGTH_NM * opd_nm)).ravel()
     behind = theirs.forward(hcipy.Wavefront(hcipy.Field(field, pupil_grid)))
     star = hcipy.Wavefront(hcipy.Field((coronagraph.pupil * lyot.stop).ravel() + 0j, pupil_grid))
     peak = np.abs(star.electric_field.sum() / 512**2) ** 2
@@ -43,10 +43,10 @@ def test_lyot_image_agrees_with_hcipy(hcipy, coronagraph, modes, waves_nm):
 
 
 def test_fast_image_and_quadratic_form_agree_with_the_exact_image(coronagraph, modes, waves_nm):
-    modal = ModalContrast(coronagraph, NOLLS_14, NM)
+    modal = ModalContrast(coronagraph, NOLLS_14, WAVELENGTH_NM)
     small_nm = [0.3 * np.random.default_rng(seed).choice([-1.0, 1.0], 14) for seed in range(6)]
     flat, large, *small = (
-        mean_contrast(coronagraph, np.tensordot(one, modes[:14], 1), NM, coronagraph.dark_zone, 2)
+        mean_contrast(coronagraph, np.tensordot(one, modes[:14], 1), WAVELENGTH_NM, coronagraph.dark_zone, 2)
         for one in (0 * waves_nm[0], waves_nm[0], *small_nm)
     )
     assert modal.by_image(waves_nm[0]) - modal.by_image(0 * waves_nm[0]) == pytest.approx(large - flat, rel=0.02)
@@ -56,5 +56,5 @@ def test_fast_image_and_quadratic_form_agree_with_the_exact_image(coronagraph, m
 def test_lyot_coronagraphs_are_far_more_sensitive_to_tilt_than_a_shaped_pupil(coronagraph):
     """Tilt adds 1800 times more contrast with the APLC; with the classical mask it changes a contrast of 1e-5."""
     shaped = coronagraph_from(SensorSection())
-    of_lyot, of_shaped = (contrast_form(one, (2,), NM).item() for one in (coronagraph, shaped))
+    of_lyot, of_shaped = (contrast_form(one, (2,), WAVELENGTH_NM).item() for one in (coronagraph, shaped))
     assert abs(of_lyot) > 1000 * of_shaped > 0

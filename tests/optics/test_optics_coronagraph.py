@@ -22,7 +22,7 @@ from lowfc.optics.chain.screen import kolmogorov
 from lowfc.optics.chain.zernike import NOLLS_14, zernikes
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 
-NM = 550.0
+WAVELENGTH_NM = 550.0
 
 
 @pytest.fixture(scope="module")
@@ -38,25 +38,25 @@ def flat(shaped):
 def test_open_circle_gives_an_airy_pattern():
     x = image_axis(64, 8)
     r = np.pi * np.hypot(x[:, None], x)
-    found = contrast(Coronagraph(circle(512)), np.zeros((512, 512)), NM, 64, samples_per=8)
+    found = contrast(Coronagraph(circle(512)), np.zeros((512, 512)), WAVELENGTH_NM, 64, samples_per=8)
     np.testing.assert_allclose(found, (2 * j1(r) / r) ** 2, atol=2e-4)  # the sampled circle has a staircase edge
 
 
 def test_shaped_pupil_contrast_is_below_1e_9_in_its_dark_zone(shaped, flat):
     dark = wedge_samples(DARK_ZONE, 160, 160)
-    image = contrast(shaped, flat, NM, 160)
+    image = contrast(shaped, flat, WAVELENGTH_NM, 160)
     assert image[dark].max() < 1e-9
     assert image[~dark].max() > 0.9
-    fewer_rows = contrast(shaped, flat, NM, 160, 108)
+    fewer_rows = contrast(shaped, flat, WAVELENGTH_NM, 160, 108)
     np.testing.assert_allclose(fewer_rows, image[26:134], rtol=1e-9, atol=1e-16)  # a smaller image is a part of it
 
 
 def test_a_tilt_moves_the_star(shaped):
-    ramp = NM * (3.0 * pupil_axis(512) + 0.5 * pupil_axis(512)[:, None])  # 3 and 1/2 waves across the pupil
-    image = contrast(shaped, ramp, NM, 64)
+    ramp = WAVELENGTH_NM * (3.0 * pupil_axis(512) + 0.5 * pupil_axis(512)[:, None])  # 3 and 1/2 waves across the pupil
+    image = contrast(shaped, ramp, WAVELENGTH_NM, 64)
     x = image_axis(64, 4)
-    flat = contrast(shaped, np.zeros((512, 512)), NM, 64)
-    np.testing.assert_allclose(image[2:, 12:], flat[:-2, :-12], atol=1e-12)
+    centred = contrast(shaped, np.zeros((512, 512)), WAVELENGTH_NM, 64)
+    np.testing.assert_allclose(image[2:, 12:], centred[:-2, :-12], atol=1e-12)
     row, column = np.unravel_index(image.argmax(), image.shape)
     assert abs(x[column] - 3.0) <= 0.125
     assert abs(x[row] - 0.5) <= 0.125
@@ -64,15 +64,15 @@ def test_a_tilt_moves_the_star(shaped):
 
 def test_mean_contrast_and_curve_agree_with_the_full_image(shaped, flat, modes):
     ring = Wedge(4.5, 5.5)
-    opd_nm = NM / 30 * (modes[2] + modes[5])
-    image = contrast(shaped, opd_nm, NM, 160)
-    mean = mean_contrast(shaped, opd_nm, NM, ring)
+    opd_nm = WAVELENGTH_NM / 30 * (modes[2] + modes[5])
+    image = contrast(shaped, opd_nm, WAVELENGTH_NM, 160)
+    mean = mean_contrast(shaped, opd_nm, WAVELENGTH_NM, ring)
     assert mean == pytest.approx(image[wedge_samples(ring, 160, 160)].mean(), rel=1e-9)
     edges = np.array([3.5, 4.5, 5.5, 6.5])
-    curve = contrast_curve(shaped, opd_nm, NM, edges)
+    curve = contrast_curve(shaped, opd_nm, WAVELENGTH_NM, edges)
     assert curve[1] == pytest.approx(mean, rel=1e-9)
-    assert mean > 30 * mean_contrast(shaped, flat, NM, ring)
-    assert mean_contrast(shaped, opd_nm, NM, ring, samples_per=2) == pytest.approx(mean, rel=0.05)
+    assert mean > 30 * mean_contrast(shaped, flat, WAVELENGTH_NM, ring)
+    assert mean_contrast(shaped, opd_nm, WAVELENGTH_NM, ring, samples_per=2) == pytest.approx(mean, rel=0.05)
 
 
 def test_wedge_has_the_area_of_its_formula():
@@ -87,7 +87,7 @@ def test_wedge_has_the_area_of_its_formula():
 
 def test_wavefront_with_other_sampling_than_the_pupil_is_refused(shaped):
     with pytest.raises(ValueError, match=r"\(512, 512\), got \(64, 64\)"):
-        contrast(shaped, np.zeros((64, 64)), NM, 8)
+        contrast(shaped, np.zeros((64, 64)), WAVELENGTH_NM, 8)
 
 
 def test_screens_have_the_structure_function_of_a_periodic_kolmogorov_screen():
@@ -118,7 +118,7 @@ TILT_NM = 14 * tilt_nm_per_mas(2.0)
 
 @pytest.fixture(scope="module")
 def camera(shaped):
-    return ScienceCamera(shaped, NOLLS_14, NM, HALF_WIDTH, SAMPLES_PER)
+    return ScienceCamera(shaped, NOLLS_14, WAVELENGTH_NM, HALF_WIDTH, SAMPLES_PER)
 
 
 def wavefront(**nm):
@@ -130,7 +130,7 @@ RANDOM = np.random.default_rng(5)
 CASES = {
     "flat": wavefront(),
     "tilt of 14 mas": wavefront(Z2=TILT_NM, Z3=-TILT_NM),
-    "focus and coma": wavefront(Z4=NM / 30, Z7=NM / 30),
+    "focus and coma": wavefront(Z4=WAVELENGTH_NM / 30, Z7=WAVELENGTH_NM / 30),
     "1 nm each": RANDOM.normal(0, 1.0, 14),
     "5 nm each": RANDOM.normal(0, 5.0, 14),
     "20 nm each": RANDOM.normal(0, 20.0, 14),
@@ -141,22 +141,22 @@ CASES = {
 def test_fast_science_image_agrees_with_the_exact_image_to_one_percent(shaped, modes, camera, name):
     """Each sample to 1 % of itself, 0.1 % of the mean and 1 % of the flat wavefront's contrast; the mean to 0.2 %."""
     opd_nm = np.tensordot(CASES[name], modes[:14], 1)
-    exact = contrast(shaped, opd_nm, NM, camera.samples, samples_per=SAMPLES_PER)
+    exact = contrast(shaped, opd_nm, WAVELENGTH_NM, camera.samples, samples_per=SAMPLES_PER)
     found = camera.image(CASES[name])
     dark = wedge_samples(Wedge(4.0, HALF_WIDTH), camera.samples, camera.samples, SAMPLES_PER)
     np.testing.assert_allclose(found[dark], exact[dark], rtol=1e-2, atol=4e-12 + 1e-3 * exact[dark].mean())
-    mean = mean_contrast(shaped, opd_nm, NM, RING, SAMPLES_PER)
+    mean = mean_contrast(shaped, opd_nm, WAVELENGTH_NM, RING, SAMPLES_PER)
     assert camera.mean_contrast(found, RING) == pytest.approx(mean, rel=2e-3)
     assert np.abs(found - exact).max() < 1e-3  # including the star's core
 
 
 def test_pupil_without_equal_squares_is_not_averaged():
-    pupil = Coronagraph(circle(64))
+    plain = Coronagraph(circle(64))
     modes_nm = np.array([20.0, -35.0, 12.0])
     radii = 2 * pupil_axis(64)
     opd_nm = np.tensordot(modes_nm, zernikes((2, 5, 8), radii, radii[:, None]), 1)
-    camera = ScienceCamera(pupil, (2, 5, 8), NM, 6, 4)
-    np.testing.assert_allclose(camera.image(modes_nm), contrast(pupil, opd_nm, NM, 48), rtol=1e-4, atol=1e-7)
+    camera = ScienceCamera(plain, (2, 5, 8), WAVELENGTH_NM, 6, 4)
+    np.testing.assert_allclose(camera.image(modes_nm), contrast(plain, opd_nm, WAVELENGTH_NM, 48), rtol=1e-4, atol=1e-7)
 
 
 def test_science_camera_refuses_inconsistent_inputs(shaped, camera):
@@ -165,10 +165,9 @@ def test_science_camera_refuses_inconsistent_inputs(shaped, camera):
     with pytest.raises(ValueError, match=r"ends 12 lambda/D"):
         camera.mean_contrast(camera.image(np.zeros(14)), Wedge(4.0, 20.0))
     with pytest.raises(ValueError, match="square"):
-        ScienceCamera(Coronagraph(shaped.pupil[:100]), NOLLS_14, NM)
+        ScienceCamera(Coronagraph(shaped.pupil[:100]), NOLLS_14, WAVELENGTH_NM)
     with pytest.raises(ValueError, match="must have modes"):
-        ScienceCamera(shaped, (), NM)
+        ScienceCamera(shaped, (), WAVELENGTH_NM)
+    behind_lyot = Coronagraph(np.ones((126, 126)), lyot=LyotStop(np.ones((8, 8)), np.ones((126, 126))))
     with pytest.raises(ValueError, match="multiple of 4 samples across, got 126"):
-        ScienceCamera(
-            Coronagraph(np.ones((126, 126)), lyot=LyotStop(np.ones((8, 8)), np.ones((126, 126)))), NOLLS_14, NM
-        )
+        ScienceCamera(behind_lyot, NOLLS_14, WAVELENGTH_NM)

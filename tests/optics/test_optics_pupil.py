@@ -101,14 +101,14 @@ def encircled(pupil, radius):
     """Fraction of a pupil's light within a radius in the image plane, and the field there, from fine samples."""
     samples_per = 32
     x = image_axis(2 * int(np.ceil(radius * samples_per)), samples_per)
-    image = to_image(pupil.astype(complex), x.size, samples_per, 1.0) * (np.hypot(x[:, None], x) <= radius)
-    return np.sum(np.abs(image) ** 2) / samples_per**2 / (np.sum(pupil**2) / pupil.size), image
+    field = to_image(pupil.astype(complex), x.size, samples_per, 1.0) * (np.hypot(x[:, None], x) <= radius)
+    return np.sum(np.abs(field) ** 2) / samples_per**2 / (np.sum(pupil**2) / pupil.size), field
 
 
 def test_prolate_pupil_is_an_eigenfunction_of_the_mask(apodised):
     """The eigenvalue of the circular prolate function is the fraction of light on the mask."""
-    encircled_fraction, image = encircled(apodised, 2.5)
-    back = to_pupil(image, 256, 32, 1.0)
+    encircled_fraction, field = encircled(apodised, 2.5)
+    back = to_pupil(field, 256, 32, 1.0)
     inside = circle(256) > 0
     assert np.abs(back[inside] - encircled_fraction * apodised[inside]).max() < 1e-3
 

@@ -267,14 +267,14 @@ def test_rows_that_are_not_finite_are_a_gap() -> None:
 
 def test_a_scale_grows_at_once_and_shrinks_after_two_seconds() -> None:
     scale = Scale(1.0)
-    steps = [(0.1, 0, True, 1.0), (-33.0, 1, True, 50.0), (1.1, 10**9, False, 50.0), (1.1, 3 * 10**9, True, 1.5)]
-    for value, time_ns, changed, limit in steps:
+    fits = [(0.1, 0, True, 1.0), (-33.0, 1, True, 50.0), (1.1, 10**9, False, 50.0), (1.1, 3 * 10**9, True, 1.5)]
+    for value, time_ns, changed, limit in fits:
         assert scale.fit(np.array([value, np.nan]), time_ns) == changed
         assert scale.limit == limit
 
 
 START_NS = 1_795_000_000_000_000_000
-NM = 550.0
+WAVELENGTH_NM = 550.0
 RATE_HZ = 500.0
 CALIBRATION = calibration()
 MODES = len(NOLL)
@@ -301,9 +301,18 @@ def steps(first: int, error_nm: Any, pol_nm: Any, mode: int = LoopMode.CLOSED) -
 def truths(residual_nm: Any, disturbance_nm: Any) -> Truths:
     rows = len(residual_nm)
     disturbance, residual = (np.asarray(one, np.float32) for one in (disturbance_nm, residual_nm))
-    modes = disturbance, residual, residual, np.abs(disturbance), np.abs(residual)  # the third as sensed
-    zero, instants = np.zeros(rows, np.float32), np.zeros(rows, np.int64)
-    return Truths(np.arange(rows, dtype=np.uint64), np.full(rows, START_NS), *modes, *[zero] * 3, instants, zero, zero)
+    rms = ("disturbance_rms_nm", "residual_rms_nm", "sampled_residual_rms_nm")
+    return Truths(
+        sequence=np.arange(rows, dtype=np.uint64),
+        time_ns=np.full(rows, START_NS),
+        disturbance_nm=disturbance,
+        residual_nm=residual,
+        sensed_nm=residual,
+        modes_disturbance_rms_nm=np.abs(disturbance),
+        modes_residual_rms_nm=np.abs(residual),
+        instants=np.zeros(rows, np.int64),
+        **dict.fromkeys((*rms, "added_contrast", "added_contrast_flat"), np.zeros(rows, np.float32)),
+    )
 
 
 def drawn(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:
@@ -317,14 +326,14 @@ def drawn(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:
 def contrast_of(pupil: Any, modes_nm: Any) -> float:
     radii = 2 * pupil_axis(len(pupil))
     opd_nm = np.tensordot(modes_nm, zernikes(NOLL, radii, radii[:, None]), 1)
-    return mean_contrast(Coronagraph(pupil), opd_nm, NM, Wedge(4.0, 6.0))
+    return mean_contrast(Coronagraph(pupil), opd_nm, WAVELENGTH_NM, Wedge(4.0, 6.0))
 
 
 def test_contrast_is_the_mean_over_the_newest_wavefronts() -> None:
     pupil, rng = load_pupil(), np.random.default_rng(3)
     residual_nm, open_nm = rng.normal(0, 30.0, (4, MODES)), rng.normal(0, 80.0, (4, MODES))
     refused = np.full((1, MODES), np.nan)
-    tape, panel = Tape(), science.Science(Coronagraph(pupil), NM)
+    tape, panel = Tape(), science.Science(Coronagraph(pupil), WAVELENGTH_NM)
     panel.begin(tape)
     measured = steps(0, np.vstack([residual_nm[:2], refused]), np.vstack([open_nm[:2], refused]))
     drawn(panel, tape, 0, steps=measured, calibration=None)
@@ -346,7 +355,7 @@ def test_contrast_is_the_mean_over_the_newest_wavefronts() -> None:
 
 
 def test_a_brighter_dark_zone_is_brighter_in_the_picture() -> None:
-    tape, panel = Tape(), science.Science(Coronagraph(load_pupil()), NM)
+    tape, panel = Tape(), science.Science(Coronagraph(load_pupil()), WAVELENGTH_NM)
     open_nm = np.full((1, MODES), 90.0)
     drawn(panel, tape, 0, truths=truths(0 * open_nm, open_nm))
     shown = pixels(tape, f"{science.IMAGE}/contrast").astype(float).sum(axis=2)
@@ -357,7 +366,7 @@ def test_a_brighter_dark_zone_is_brighter_in_the_picture() -> None:
     assert shown[star, star] == shown[star, second + star] == shown.max()  # both stars
     drawn(panel, tape, science.Science.period_ns)  # nothing new, nothing drawn
     assert len(tape.rows[science.CONTRAST.path]) == 1
-    further_out = science.Science(Coronagraph(load_pupil(), Wedge(11.0, 16.0)), NM)
+    further_out = science.Science(Coronagraph(load_pupil(), Wedge(11.0, 16.0)), WAVELENGTH_NM)
     drawn(further_out, tape, 0, truths=truths(0 * open_nm, open_nm))
     assert len(tape.rows[science.CONTRAST.path]) == 2
 
