@@ -214,7 +214,8 @@ def test_the_process_serves_a_real_run(tmp_path: Path, run: Run) -> None:
     frames, steps = map(bus.publisher, (FRAME, STEP))
     try:
         address = process.stderr.readline().split()[4]
-        with connected(int(address.rpartition(":")[2].rstrip(";"))) as client:
+        port = int(address.rpartition(":")[2].rstrip(";"))
+        with connected(port) as client:
             until(lambda: received)
             client.subscribe("/" + FRAME.key, "/" + STEP.key)
             time.sleep(0.2)  # the server takes a moment to subscribe
@@ -233,7 +234,7 @@ def test_the_process_serves_a_real_run(tmp_path: Path, run: Run) -> None:
         run.remove()  # the run starts again
         bus = ZenohBus(open_run(run.run_id).links, Role.CONTROLLER, HostClock())
         calibrations = bus.publisher(CALIBRATION)
-        with connected(int(address.rpartition(":")[2].rstrip(";"))) as client:
+        with connected(port) as client:
             client.subscribe("/" + CALIBRATION.key)
             received.clear()
             bus.subscribe(HEALTH, lambda sample: received.append(sample.key), ALL)

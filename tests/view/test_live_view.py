@@ -37,7 +37,8 @@ class FakeViewer:
         self.show, self.hangs, self.alive, self.memory_bytes = show, hangs, True, 0
         self.stopped, self.blocked = threading.Event(), threading.Event()
         self.tape = Tape()
-        self.tape.log, self._log = self.log, self.tape.log
+        self._log = self.tape.log
+        self.tape.log = self.log
 
     def log(self, path: str, *archetypes: Any, static: bool = False) -> None:
         if self.hangs and not static:
@@ -142,7 +143,7 @@ def failure_of(bench: ViewBench) -> str:
 
 
 def test_a_late_view_requests_the_calibration(benches: ViewBenches) -> None:
-    assert topic_of(CALIBRATION.key).queryable
+    assert CALIBRATION.queryable
     bench = benches()
     step = next(one.payload for one in bench.night.samples if one.key == STEP.key)
     # repeatedly: steps before the calibration are not drawn

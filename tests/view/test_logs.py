@@ -142,8 +142,7 @@ def test_a_log_of_a_loop_that_did_harm_needs_attention(tmp_path: Path, shown: Sh
 def test_the_verdict_on_a_log_says_that_its_residual_includes_a_shape(tmp_path: Path, shown: Shown) -> None:
     log = SyntheticLog().frames(200).request("offset", values=(30.0, 0.0, 0.0)).frames(800)
     drawn(log.write(tmp_path / "shape.mcap"))
-    wavefront = tile(shown[-1], "WAVEFRONT")
-    assert wavefront.detail.startswith("while closed, with offset and channels, worse than ")
+    assert tile(shown[-1], "WAVEFRONT").detail.startswith("while closed, with offset and channels, worse than ")
     assert "with offset and channels" in shown[-1].headline
 
 

@@ -1,13 +1,10 @@
 """The verdict on a run as text, levels and picture: each state by itself, and the conditions for a good loop."""
 
-import io
 from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 import pytest
-from PIL import Image
 
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CAMERA_STATE, CONTROLLER_STATE, EVENT, FRAME, wire
@@ -26,6 +23,7 @@ from lowfc.programs.view.verdicts.wavefront_verdict import factor, merit
 from tests.support.report_log import SyntheticLog
 from tests.support.stage import MAS, Stage, Tape, tile
 from tests.support.toy import START
+from tests.support.viewers import Pixels, pixels
 
 NO_WARNING = {Level.NEUTRAL, Level.GOOD}
 
@@ -416,9 +414,8 @@ NOON_NS = 43_200 * 10**9
 LONG = "neighbouring/actuators/in/a/very/long/path/without/any/blank " + "and more words than a tile has room for " * 3
 
 
-def picture_of(verdict: Verdict, time_ns: int = NOON_NS) -> npt.NDArray[np.uint8]:
-    with Image.open(io.BytesIO(png(picture(verdict, time_ns)))) as shown:
-        return np.asarray(shown.convert("RGB"))
+def picture_of(verdict: Verdict, time_ns: int = NOON_NS) -> Pixels:
+    return pixels(png(picture(verdict, time_ns)))
 
 
 @pytest.mark.parametrize("tiles", [7, 8])
