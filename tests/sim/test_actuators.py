@@ -65,7 +65,7 @@ def test_creep_grows_with_the_logarithm_of_time() -> None:
     assert reached[-1] == pytest.approx(104, abs=0.05)
 
 
-def test_actuator_errors_are_off_by_default() -> None:
+def test_actuator_errors_are_off_by_default_and_reproducible() -> None:
     ideal, real = ({f"mirror.{key}": value for key in ("gain_error", "hysteresis", "creep")} for value in (0.0, 0.05))
     shapes = np.random.default_rng(1).normal(0, 20, (20, 34, 34)).astype(np.float32)
     plain, zero, one, same = (SimulatedMirror(DriverOptions(), load(None, keys)) for keys in ({}, ideal, real, real))

@@ -73,7 +73,7 @@ def test_recent_statistics_cover_only_recent_frames() -> None:
 
 
 @pytest.mark.parametrize("before", [0, 1, WINDOW, 3 * WINDOW + 7])
-def test_late_commands_are_habitual_from_a_quarter_to_an_eighth_of_the_window(before: int) -> None:
+def test_lateness_becomes_habitual_at_a_quarter_of_the_window_and_ends_at_an_eighth(before: int) -> None:
     lateness = Lateness()
     assert not any(lateness.add(False) for _ in range(before))
     changes = [lateness.add(True) for _ in range(WINDOW)]

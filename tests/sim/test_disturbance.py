@@ -83,7 +83,7 @@ def test_damped_lines_do_not_depend_on_order_or_block(first: int, count: int, cu
     check_order_and_block(WHEEL, first, count, cut)
 
 
-@pytest.mark.parametrize("name", ["bench", "thermal", "reaction-wheel"])
+@pytest.mark.parametrize("name", ["bench", "thermal", WHEEL])
 def test_another_seed_gives_another_disturbance_with_the_same_rms(name: str) -> None:
     one, other = preset(name, 1), preset(name, 2)
     assert np.abs(modes_nm(one, 0, 50, RATE_HZ) - modes_nm(other, 0, 50, RATE_HZ)).max() > 0.5
@@ -127,7 +127,7 @@ def test_damped_lines_have_the_configured_power_and_coherence(width: float) -> N
 
 def test_reaction_wheel_and_ideal_preset_have_the_same_power() -> None:
     for per_line in (1, 401):
-        both = [variances_nm2(preset(name), per_line)[1].sum(axis=0) for name in ("reaction-wheel", IDEAL)]
+        both = [variances_nm2(preset(name), per_line)[1].sum(axis=0) for name in (WHEEL, IDEAL)]
         np.testing.assert_allclose(*both)
 
 
@@ -162,7 +162,7 @@ def test_damped_lines_are_finite_at_the_lowest_frame_rate() -> None:
 
 def test_previous_frame_is_available_after_a_new_block(monkeypatch: pytest.MonkeyPatch) -> None:
     """The truth is computed after the next exposure: damped lines must not be drawn again from the first frame on."""
-    sampler = Sampler(preset("reaction-wheel"), np.zeros(1), RATE_HZ)
+    sampler = Sampler(preset(WHEEL), np.zeros(1), RATE_HZ)
     monkeypatch.delattr(_DampedLines, "_restart")
     for index in range(1, 4 * BLOCK):
         before = sampler.at(index - 1)
@@ -225,7 +225,7 @@ def test_unknown_presets_are_refused() -> None:
 
 
 FIRST, FRAMES = 100, 400
-LAST = FIRST + FRAMES + MAX_FRAMES_LATE + 1
+END = FIRST + FRAMES + MAX_FRAMES_LATE + 1
 IMAGE = np.arange(400, dtype=np.uint16).reshape(20, 20)
 DARK, HIGHEST = 100, 60_000
 
@@ -235,7 +235,7 @@ def fault(kind: Kind, seed: int = 5) -> Fault:
 
 
 def published(kind: Kind, seed: int = 5) -> list[int]:
-    return [frame for index in range(LAST) for frame in fault(kind, seed).frames_due(index)]
+    return [frame for index in range(END) for frame in fault(kind, seed).frames_due(index)]
 
 
 def faulty_frame(kind: Kind, index: int) -> np.ndarray:
@@ -244,14 +244,14 @@ def faulty_frame(kind: Kind, index: int) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", Kind)
 def test_fault_changes_no_frame_outside_its_range(kind: Kind) -> None:
-    for index in (1, FIRST - 1, FIRST + FRAMES + MAX_FRAMES_LATE + 1):
+    for index in (1, FIRST - 1, END):
         assert fault(kind).frames_due(index) == (index,)
         assert faulty_frame(kind, index) is IMAGE
         assert fault(kind).payload(index, b"whole", 5) == b"whole"
 
 
 def test_lost_frames_are_a_tenth_chosen_by_the_seed() -> None:
-    lost = set(range(LAST)) - set(published(Kind.LOST))
+    lost = set(range(END)) - set(published(Kind.LOST))
     assert lost <= set(range(FIRST, FIRST + FRAMES))
     assert len(lost) == pytest.approx(LOST_SHARE * FRAMES, rel=0.5)
     assert published(Kind.LOST) == published(Kind.LOST) != published(Kind.LOST, seed=6)
@@ -259,13 +259,13 @@ def test_lost_frames_are_a_tenth_chosen_by_the_seed() -> None:
 
 def test_reordered_frames_are_swapped_in_pairs() -> None:
     found = published(Kind.REORDERED)
-    assert sorted(found) == list(range(LAST))
+    assert sorted(found) == list(range(END))
     assert found[FIRST : FIRST + 4] == [FIRST + 1, FIRST, FIRST + 3, FIRST + 2]
 
 
 def test_late_frames_are_all_published_within_fifty_frames() -> None:
-    when = {frame: index for index in range(LAST) for frame in fault(Kind.LATE).frames_due(index)}
-    assert set(when) == set(range(LAST))
+    when = {frame: index for index in range(END) for frame in fault(Kind.LATE).frames_due(index)}
+    assert set(when) == set(range(END))
     late = [when[frame] - frame for frame in range(FIRST, FIRST + FRAMES)]
     assert (min(late), max(late)) == (1, MAX_FRAMES_LATE)
 

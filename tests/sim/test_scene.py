@@ -1,10 +1,10 @@
 """The simulated scene: the reported true wavefront equals the injected modes, and frames match the calibration."""
 
-import importlib.util
 from functools import partial
 from pathlib import Path
+from runpy import run_path
 from types import SimpleNamespace
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -211,15 +211,12 @@ def test_with_one_instant_image_and_truth_are_at_the_start_of_the_exposure() -> 
 
 
 def test_example_camera_refuses_a_mirror_with_another_grid() -> None:
-    spec = importlib.util.spec_from_file_location("stand_in", Path(__file__).parents[2] / "examples" / "stand_in.py")
-    assert spec is not None
-    assert spec.loader is not None
-    spec.loader.exec_module(stand_in := importlib.util.module_from_spec(spec))
-    handlers: list[Any] = []
-    optics = stand_in.Optics(Configuration())
-    optics.join(SimpleNamespace(bus=SimpleNamespace(subscribe=lambda _, handler, __: handlers.append(handler))))
+    stand_in, service = run_path(str(Path(__file__).parents[2] / "examples" / "stand_in.py")), Mock()
+    optics = stand_in["Optics"](Configuration())
+    optics.join(service)
+    _, on_mirror_state, _ = service.bus.subscribe.call_args.args
     surface = np.zeros((24, 24), np.float32)
     state = wire.MirrorState(rows=24, columns=24, actuators=surface.tobytes())
-    handlers[0](SimpleNamespace(payload=state.SerializeToString()))
+    on_mirror_state(SimpleNamespace(payload=state.SerializeToString()))
     with pytest.raises(ConfigurationError, match=r"\(24, 24\) actuators, .*columns say \(34, 34\)"):
         optics.expose()

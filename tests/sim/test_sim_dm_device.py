@@ -51,9 +51,8 @@ def test_clear_id_resets_the_newest_sequence_of_the_mirror() -> None:
     assert (refused, late) == (Rejection.OUT_OF_ORDER, status)
     status, refused = device.apply_command(status, command(even(9.0), 3, clear_id=77), START_NS)
     assert (refused, status.frame_sequence) == (None, 3)
-    assert device.apply_command(status, command(even(9.0), 2, clear_id=77), START_NS)[1] is Rejection.OUT_OF_ORDER, (
-        "once for each clear"
-    )
+    _, refused = device.apply_command(status, command(even(9.0), 2, clear_id=77), START_NS)
+    assert refused is Rejection.OUT_OF_ORDER, "once for each clear"
     assert device.apply_command(status, command(even(9.0), 2, clear_id=78), START_NS)[1] is None
 
 
@@ -79,7 +78,7 @@ def test_safe_mode_is_stored_by_channel() -> None:
 
 def test_command_with_a_time_in_the_far_future_still_times_out_to_flat() -> None:
     device = mirror(settling_us=50.0)
-    ahead = command(even(100.0))._replace(time_ns=1 << 62)
+    ahead = command(even(100.0), time_ns=1 << 62)
     status, _ = device.apply_command(device.initial, ahead, START_NS)
     for number in range(1, 5):
         status = device.tick(status, START_NS + MAX_VALID_NS + number * 10 * MS)
