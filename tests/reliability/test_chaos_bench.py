@@ -125,9 +125,9 @@ def test_a_recorder_on_a_slow_disk_writes_late_where_it_should(tmp_path: Path, m
 
 
 def test_a_camera_with_another_clock_is_replaced_by_one_with_the_hosts() -> None:
-    bench = Mock(spec=ChaosBench, children={Role.CAMERA: SimpleNamespace(command=["sim-camera"])})
-    CASES["clock-behind"].act(bench)
-    assert bench.method_calls == [
+    started = Mock(spec=ChaosBench, children={Role.CAMERA: SimpleNamespace(command=["sim-camera"])})
+    CASES["clock-behind"].act(started)
+    assert started.method_calls == [
         call.kill(Role.CAMERA),
         call.restart(Role.CAMERA, ["unshare", "--time", "--monotonic", "-3600", "sim-camera"]),
         call.await_steps(WHILE_FRAMES),

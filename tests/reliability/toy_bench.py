@@ -42,7 +42,8 @@ TOY_KEYS: dict[str, Any] = {
 DRIFT_NM, DRIFT_HZ = np.array([20.0, -12.0, 8.0]), 0.3
 """Amplitude and frequency of the disturbance of each mode."""
 TO_MODES = np.linalg.pinv(TOY.modes_to_actuators)
-QUIET_FRAMES = 150
+SETTLED_FRAMES = 150
+"""Closed-loop frames to wait for; fewer than with real processes."""
 CAMERA_PID = 1
 PATIENCE_FRAMES = 3000
 """Number of frames after which a wait for a condition fails."""
@@ -127,14 +128,14 @@ class ToyBench(ChaosBench):
             self.expose()
         raise CaseFailedError(f"waited in vain for {what}")
 
-    def await_settled(self, frames: int = QUIET_FRAMES) -> None:
+    def await_settled(self, frames: int = SETTLED_FRAMES) -> None:
         super().await_settled(frames)
 
     def pause(self, shortest_s: float, longest_s: float) -> None:
         self._sleep(self.rng.uniform(shortest_s, longest_s))
 
     def kill(self, name: str) -> None:
-        self._latch.close()  # its thread has had time to write
+        self._latch.close()  # waits for its thread, which writes in real time
         self._services.pop(name).bus.close()
         self.outcome.ended.append(ProcessEnd(name, -signal.SIGKILL, 0.0, True))
 
