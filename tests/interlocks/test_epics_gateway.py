@@ -49,7 +49,8 @@ class Variables(dict[str, "Variables.Shared"]):
                 self.initial = {f"alarm.{key}": value for key, value in alarm.items()}
             self.posts: list[tuple[Any, int, str]] = []
 
-        def post(self, value: Any, timestamp: float, severity: int, message: str) -> None:  # without them, they stay
+        def post(self, value: Any, timestamp: float, severity: int, message: str) -> None:
+            """All arguments are required: p4p would keep those of the post before."""
             self.posts.append((np.asarray(value).tolist(), severity, message))
 
     def __init__(self) -> None:
@@ -201,7 +202,7 @@ def test_a_put_is_a_request_and_fails_with_its_refusal(pvs: Variables) -> None:
         (received([1, 2]), None),
         (received(2.0, severity=3), None),
         (received({}, "epics:nt/NTTable:1.0"), None),
-        (Mock(get=lambda *_: b"\xb0C".decode()), None),
+        (Mock(get=lambda *_: b"\xb0C".decode()), None),  # not UTF-8
         (TimeoutError("disconnected"), None),
     ],
 )

@@ -99,8 +99,8 @@ def test_requests_with_numbers_or_a_text_are_variables_with_unique_names() -> No
     for request in DECLARED:
         fields = {field for field, _ in request.fields}
         name = request.name if "record" not in request.key else f"record_{request.name}"
-        has_simple_fields = fields <= {"modes", "values", "text", "lease_id"} and request.example
-        writable = bool(has_simple_fields) and name not in ("status", "configuration")
+        is_simple = fields <= {"modes", "values", "text", "lease_id"} and request.example != ""
+        writable = is_simple and name not in ("status", "configuration")
         assert (name in offered and offered[name].put is not None) is writable, name
     loop = Mock()
     for name, value, arguments in (

@@ -19,7 +19,8 @@ FLIPS = 60
 MAX_AGE_S = 1
 FLOOD_HZ = 2000
 FLOOD_S = 1
-S = 1_000_000_000
+SECOND_NS = 1_000_000_000
+RUN = "flipped"
 CONFIG = f"""
 [camera]
 rate_hz = {RATE_HZ}
@@ -38,16 +39,13 @@ when_old = "passes"
 """
 
 
-OPTIONS = ("--config", "night.toml", "--run", "flipped", "--duration", "600")
-
-
 @pytest.mark.exclusive
 def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) -> None:
     """Values act within a period, a flood of values loses no frame, and an old value acts as a missing one."""
     (tmp_path / "night.toml").write_text(CONFIG)
-    process = start(tmp_path, "sim-loop", "--json", *OPTIONS)
+    process = start(tmp_path, "sim-loop", "--json", "--config", "night.toml", "--run", RUN, "--duration", "600")
     try:
-        _publish("flipped")
+        _publish()
     except BaseException:
         process.kill()
         process.communicate()
@@ -65,11 +63,11 @@ def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) ->
     _values_act_at_the_next_frame(log)
 
 
-def _publish(name: str) -> None:
+def _publish() -> None:
     """Publish values at random times, then a flood of them, then none."""
-    until(lambda: name in running(), 60)
+    until(lambda: RUN in running(), 60)
     rng = random.Random(3)  # noqa: S311
-    with Client(name) as loop:
+    with Client(RUN) as loop:
         until(lambda: _has_frames(loop), 60)
         loop.bench("shutter", "open")
         for number in range(FLIPS):  # some values fall between the same two frames
@@ -77,11 +75,11 @@ def _publish(name: str) -> None:
                 time.sleep(rng.uniform(0, 7.5 / RATE_HZ))  # up to seven and a half frames
                 if number % 5:
                     loop.bench("mask", acts)
-                    continue
-                loop.bench("mask", False)
-                loop.bench("shutter", "shut" if acts else "open")
-                if not acts:
-                    until(lambda: _closed(loop))
+                else:
+                    loop.bench("mask", False)
+                    loop.bench("shutter", "shut" if acts else "open")
+                    if not acts:
+                        until(lambda: _closed(loop))
         begun_s = time.monotonic()
         for number in range(FLOOD_HZ * FLOOD_S):
             loop.bench("mask", False)
@@ -124,12 +122,12 @@ def _steps_follow_the_inputs(log: Path) -> None:
             if report.name == "shutter":
                 shut = report.value.text != "open"
             else:
-                mask = report.value.truth or not report.HasField("value") or report.age_ns > MAX_AGE_S * S
+                mask = report.value.truth or not report.HasField("value") or report.age_ns > MAX_AGE_S * SECOND_NS
                 age_ns = report.age_ns
     assert changes >= FLIPS
     assert held
     assert opened
-    assert 0 < age_ns - MAX_AGE_S * S < S // 10
+    assert 0 < age_ns - MAX_AGE_S * SECOND_NS < SECOND_NS // 10
 
 
 def _values_act_at_the_next_frame(log: Path) -> None:
@@ -141,7 +139,7 @@ def _values_act_at_the_next_frame(log: Path) -> None:
     obeyed = []
     for value, after in pairwise(values):
         acts = wire.BenchValue.FromString(value.payload).truth
-        begun_ns = value.publish_time_ns + S // RATE_HZ
+        begun_ns = value.publish_time_ns + SECOND_NS // RATE_HZ
         between = [step for step in steps if begun_ns < frames_ns[step.frame_sequence] < after.publish_time_ns]
         obeyed += [
             (wire.REASON_HELD in step.reasons) is (acts and step.mode == wire.LOOP_MODE_CLOSED) for step in between[:1]
