@@ -194,6 +194,12 @@ def bounds(draw):
     )
 
 
+def moved(orbits, at, orbit):
+    """Orbits without the one at index `at`, and with another one; None: none is removed, or none is added."""
+    kept = [one for index, one in enumerate(orbits) if index != at]
+    return kept if orbit is None else [*kept, orbit]
+
+
 @settings(max_examples=60, deadline=None)
 @given(bounds(), st.integers(0, 1000))
 def test_moves_stay_within_the_bounds(bounds, seed):
@@ -205,7 +211,7 @@ def test_moves_stay_within_the_bounds(bounds, seed):
             if move is None:
                 continue
             at, orbit = move
-            orbits = [*(o for i, o in enumerate(orbits) if i != at), *([orbit] if orbit is not None else [])]
+            orbits = moved(orbits, at, orbit)
         placed = holes(tuple(orbits), bounds.symmetry)
         assert bounds.count[0] <= len(placed) <= bounds.count[1]
         gap = bounds.gap / 1000
@@ -230,7 +236,7 @@ def test_every_kind_of_move_occurs():
             resized = kind == "move" and orbit[2] != orbits[at][2]
             size = len(images(orbit, "y")) if orbit is not None else 0
             kinds.add((kind, size, resized))
-            orbits = [*(o for i, o in enumerate(orbits) if i != at), *([orbit] if orbit is not None else [])]
+            orbits = moved(orbits, at, orbit)
     expected = {("add", size, False) for size in (1, 2)} | {("remove", 0, False)}
     assert kinds == expected | {("move", size, resized) for size in (1, 2) for resized in (False, True)}
 

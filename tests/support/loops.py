@@ -69,7 +69,7 @@ def json_of(*words: object, status: int = 0) -> Any:
     return json.loads(done.stdout)
 
 
-def refusal(*words: object, kind: type[LowfcError] = LowfcError) -> str:
+def refusal(*words: object, kind: type[LowfcError] | tuple[type[LowfcError], ...] = LowfcError) -> str:
     """Text of the error with which `lowfc` refuses these words, run in this process."""
     error = lowfc(*words).exception
     assert isinstance(error, kind), error
