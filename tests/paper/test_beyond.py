@@ -137,8 +137,8 @@ class Loops:
         self.commands = []
 
     def run(self, command, cwd, **_):
-        (*_, lowfc), (name, *words, as_json) = command[:4], command[4:]
-        assert (lowfc, as_json) == ("lowfc", "--json")
+        name, *words, as_json = command[4:]
+        assert (command[3], as_json) == ("lowfc", "--json")
         options = dict(pairwise(words))
         config = load(cwd / options["--config"] if "--config" in options else None)
         assert name == "tune" or config.sensor == section_of(SMALLEST)
