@@ -338,8 +338,8 @@ def test_keys_typed_while_a_form_opens_are_entered_in_it(screen: Screen, run: Li
 def test_a_repeated_event_has_one_line_with_its_count() -> None:
     history = History()
     for number in range(40):
-        name, details = (("LIMIT_HIT", {"reason": "SLEW"}), ("LIMIT_CLEARED", {"reason": "SLEW"}))[number % 2]
-        history.add(EVENTS[name].log("controller", number * 10**7, **details))
+        name = "LIMIT_CLEARED" if number % 2 else "LIMIT_HIT"
+        history.add(EVENTS[name].log("controller", number * 10**7, reason="SLEW"))
     history.add(wire.Request(name="open", accepted=True, reply="loop open"))
     lines = history.last(5).plain.splitlines()
     assert [line.split()[1:4] for line in lines[:2]] == [["20", "x", "controller:"]] * 2
@@ -382,8 +382,7 @@ def test_a_task_expands_a_tilde_and_its_load_field_takes_yes_or_no() -> None:
 
 
 def test_a_task_runs_in_its_own_session_and_reports_its_end() -> None:
-    cases = (["--version"], 0, "t: done; 0."), (["no-such"], 2, "t failed: ")
-    for arguments, status, status_line in cases:
+    for arguments, status, status_line in ((["--version"], 0, "t: done; 0."), (["no-such"], 2, "t failed: ")):
         task = Task("t", arguments)
         assert task.status_line.startswith("t: running for ")
         assert os.getsid(task._process.pid) == task._process.pid, "neither Ctrl-C nor a lost terminal reaches it"
@@ -395,23 +394,21 @@ def test_a_task_runs_in_its_own_session_and_reports_its_end() -> None:
 
 
 def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    configurations: list[object] = []
-    ask = Mock(side_effect=lambda _: configurations[0] if configurations else Mock(side_effect=BusError)())
+    ask = Mock(return_value=CONFIG, side_effect=BusError)
     monkeypatch.setattr(feed, "configuration_of", ask)
     monkeypatch.setattr(monitor, "_QUERY_AGAIN_NS", 100_000_000)
     console_feed = feed.Feed(run.bus("operator"), RUN, run.clock)
     until(
         lambda: len(console_feed.read().state.snapshot.health) == 3 and console_feed.read().state.snapshot.calibration
     )
-    configurations.append(CONFIG)
+    ask.side_effect = None
     until(lambda: console_feed.read() and console_feed._configured)
     assert not console_feed._complete(Mock(controller=None)), "a controller whose state is unknown is queried again"
     asked = ask.call_count
     console_feed._query()  # repeated while there is no calibration
     until(lambda: not any(thread.name == "query" for thread in threading.enumerate()))
-    assert (ask.call_count, console_feed._config) == (asked, CONFIG), (
-        "a known configuration is not requested again: each request is in the log"
-    )
+    assert ask.call_count == asked, "a known configuration is not requested again: each request is in the log"
+    assert console_feed._config == CONFIG
 
 
 def test_a_request_is_in_the_log_of_every_console(run: LiveRun) -> None:

@@ -7,6 +7,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -63,8 +64,8 @@ def test_a_step_retains_no_memory_and_allocates_only_frame_and_actuators(monkeyp
     found = step.allocated(ControlStep(config, calibration, 0), Payloads(frames))
     assert abs(found["kept_bytes"]) < 1
     assert 2 * SMALL.pixels < found["peak_bytes"] < 2 * SMALL.pixels + 5 * 4 * SMALL.actuators + 4096
-    kept, original = [], stepping.integrate  # a step that keeps memory is detected
-    monkeypatch.setattr(stepping, "integrate", lambda *arguments: (kept.append(bytes(100)), original(*arguments))[1])
+    keeping = Mock(wraps=stepping.integrate)  # keeps the arguments of every call
+    monkeypatch.setattr(stepping, "integrate", keeping)
     assert step.allocated(ControlStep(config, calibration, 0), Payloads(frames))["kept_bytes"] > 100
 
 
@@ -349,8 +350,9 @@ def test_the_tables_have_ranges_differences_within_a_turn_and_missing_implementa
 
 
 def test_a_missing_implementation_is_reported_with_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    chain, *_, pyrtcao, _, _ = IMPLEMENTATIONS
-    assert "pyrtcao is not installed in /no" in implementations.missing(pyrtcao, parsed("--pyrtcao", "/no"))
+    named = {one.name: one for one in IMPLEMENTATIONS}
+    chain, fused = named["C chain"], named["pyrtcao, fused"]
+    assert "pyrtcao is not installed in /no" in implementations.missing(fused, parsed("--pyrtcao", "/no"))
     monkeypatch.setattr(implementations.shutil, "which", lambda _: "cc")
     assert f"{tmp_path} has no ImageStreamIO.c: git clone" in implementations.missing(chain, parsed("--isio", tmp_path))
     monkeypatch.setattr(implementations.shutil, "which", lambda _: None)

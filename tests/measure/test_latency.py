@@ -159,9 +159,8 @@ def repeat(command_us: float, echo_us: float = 100, **changes: Any) -> dict[str,
         "hot_step_us": dict.fromkeys(names, 25.0),
         "timer_us": dict.fromkeys(names, 5.0),
     }
-    return (
-        results | alone | {"echo_lost": 1, "frames_skipped": 2, "frames_missing": 0, "reasons": {"LATE": 1}} | changes
-    )
+    counts = {"echo_lost": 1, "frames_skipped": 2, "frames_missing": 0, "reasons": {"LATE": 1}}
+    return results | alone | counts | changes
 
 
 def test_repeats_are_combined_as_medians_with_their_range() -> None:
@@ -183,7 +182,7 @@ def test_repeats_are_combined_as_medians_with_their_range() -> None:
 def trace(
     wakings: int = 1000, late_us: Mapping[int, float] | None = None, steps: Mapping[str, tuple[int, int]] | None = None
 ) -> Trace:
-    """Trace of a bare loop with frames 1 ms apart: lateness by waking, and steps of the counts by (waking, amount)."""
+    """Trace of a bare loop with frames 1 ms apart; some wakings are late, some counts rise by an amount at a waking."""
     due_ns = np.arange(wakings) * MS + MS // 2
     woke_ns = due_ns + 20_000
     for index, late in (late_us or {}).items():
@@ -237,11 +236,9 @@ def test_a_stall_has_only_the_counts_of_its_own_time() -> None:
     command_us[[700, 800, 900, 950]] = 1500, 2000, 1200, 1100
     late_us = np.zeros(1000)
     late_us[900] = 800  # the stall starts when the frame is due, 0.8 ms before it is published
-    beside_camera = trace(late_us={600: 2200})
     steps = {"stolen_ns": (701, 10 * MS), "waited_ns": (801, 1_200_000), "major_faults": (899, 3)}
-    found = stalls_of(
-        frames(command_us=command_us, late_us=late_us), MS, {"camera": beside_camera, "controller": trace(steps=steps)}
-    )
+    traces = {"camera": trace(late_us={600: 2200}), "controller": trace(steps=steps)}
+    found = stalls_of(frames(command_us=command_us, late_us=late_us), MS, traces)
     assert [(stall.second, stall.held_up_by, stall.signs) for stall in found.stalls] == [
         (0.6, "host", "camera: bare loop 2200 us late"),
         (0.601, "host", "camera: bare loop 2200 us late"),
@@ -398,9 +395,8 @@ def test_the_log_of_the_run_gives_the_same_latencies(measured: tuple[dict[str, A
         assert logged["latency_us"][span] == live["latency_us"][span]
     assert "due_to_command" not in logged["latency_us"]
     assert logged["host"]["processor"] == live["host"]["processor"]
-    assert {row["better"] for row in json_of("latency", "--compare", folder / "a.json", folder / "a.json")["rows"]} == {
-        "same"
-    }
+    rows = json_of("latency", "--compare", folder / "a.json", folder / "a.json")["rows"]
+    assert {row["better"] for row in rows} == {"same"}
     (folder / "log.json").write_text(json.dumps(logged))
     done = lowfc("latency", "--compare", folder / "a.json", folder / "log.json")
     assert done.exit_code == 0, done.output
@@ -468,10 +464,8 @@ def test_an_interrupted_or_failed_measurement_removes_its_run(
     victim: str, number: int, status: int, error: str
 ) -> None:
     seconds, before = "2" if "echo" in victim else "30", runs()
-    words: Mapping[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(
-        [sys.executable, "-c", LATENCY_PROGRAM, "--duration", seconds, "--rate", "100"], **words
-    ) as process:
+    command = [sys.executable, "-c", LATENCY_PROGRAM, "--duration", seconds, "--rate", "100"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         until(lambda: child(process.pid, victim or "lowfc controller"))
         os.kill(child(process.pid, victim) if victim else process.pid, number)
         _, stderr = process.communicate(timeout=30)
@@ -496,10 +490,10 @@ def test_the_cost_of_recording_is_measured_at_every_rate(tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == []
     assert [rate["rate_hz"] for rate in results["rates"]] == list(rates_hz)
     for rate in results["rates"]:
-        frames = rate["rate_hz"] * (bench_module._WARM_UP_S + 0.5)
+        count = rate["rate_hz"] * (bench_module._WARM_UP_S + 0.5)
         assert rate["messages_lost"] == 0
-        assert min(rate["messages_published"], rate["messages_recorded"]) >= 5 * frames
-        assert rate["log_bytes"] > 0.5 * frames * results["payload_bytes_per_frame"]
+        assert min(rate["messages_published"], rate["messages_recorded"]) >= 5 * count
+        assert rate["log_bytes"] > 0.5 * count * results["payload_bytes_per_frame"]
         copying = results["copy_us_per_frame"] * rate["offered_hz"] / 1e6
         assert 0 < rate["ratio"] == pytest.approx(rate["cpu_share"] / copying)
         assert rate["longest_unflushed_ms"] >= rate["longest_wait_ms"] > 0
