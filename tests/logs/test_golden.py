@@ -39,7 +39,8 @@ def test_a_replay_is_identical_except_for_rules_that_changed_on_purpose(
     log: Path, lost_bytes: int, frames: int, changed: dict[str, int], tmp_path: Path
 ) -> None:
     """Also without the beginning of the log, which names its version."""
-    (path := tmp_path / "log.mcap").write_bytes(log.read_bytes()[lost_bytes:])
+    path = tmp_path / "log.mcap"
+    path.write_bytes(log.read_bytes()[lost_bytes:])
     # Linear algebra rounds differently on another processor; on the same one there must be no difference.
     results = json_of("replay", path, "--tolerance", 1e-3)
     assert (results["frames"], results["different"], results["unchecked"]) == (frames, 0, 0)

@@ -133,7 +133,8 @@ def test_the_text_has_the_same_numbers(log: Path) -> None:
 def test_truncated_and_damaged_logs_are_reported(log: Path) -> None:
     data = log.read_bytes()
     log.write_bytes(data[:-500])
-    recover(log, recovered := log.with_name("recovered.mcap"))
+    recovered = log.with_name("recovered.mcap")
+    recover(log, recovered)
     text = lowfc("info", recovered).stdout
     assert "recovered from night.mcap, which was incomplete; left out: damaged parts 0" in text
     done = lowfc("info", log)

@@ -107,7 +107,8 @@ def test_an_unfinished_log_is_completed(tmp_path: Path) -> None:
 
 def test_parts_left_out_are_reported(tmp_path: Path) -> None:
     path = small_log(tmp_path / "night.mcap")
-    flipped(path, middle := path.stat().st_size // 2)
+    middle = path.stat().st_size // 2
+    flipped(path, middle)
     out = tmp_path / "else" / "saved.mcap"
     out.parent.mkdir()
     done = lowfc("recover", path, "--out", out)
