@@ -376,7 +376,7 @@ def test_a_session_ends_although_a_handler_never_returns(join: Join, monkeypatch
 
 
 def test_a_session_ends_soon_beside_a_process_that_is_stopped(run: Run) -> None:
-    """As `lowfc ctl safe` while a camera's process is stopped: the host accepts connections in its name."""
+    """As `lowfc ctl safe` while the camera's process is stopped: the host accepts connections for it."""
     with socket.create_server(("127.0.0.1", run.links.ports["camera"])):
         operator = ZenohBus(run.links, "operator", HostClock())
         begun_s = time.monotonic()

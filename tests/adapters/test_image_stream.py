@@ -27,7 +27,7 @@ def path(tmp_path: Path) -> Path:
 
 def new_stream(path: Path, number: int = UINT16, **options: object) -> PlainStream:
     """Create a stream with pixels of the type `number`."""
-    return PlainStream.make(path, COLUMNS, ROWS, number, **options)  # type: ignore[arg-type]
+    return PlainStream.make(path, COLUMNS, ROWS, number, **options)
 
 
 def image(seed: int, number: int = UINT16) -> np.ndarray:
@@ -172,7 +172,6 @@ def test_no_torn_image_is_returned_and_a_dead_writer_is_reported(path: Path) -> 
     stream = PlainStream.make(path, 64, 64, UINT16)
     reader = StreamReader(path)
     with subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE) as writer:
-        assert writer.stdout is not None
         assert writer.stdout.readline()
         numbers = []
         for _ in range(500):

@@ -4,6 +4,7 @@ import ctypes
 import multiprocessing
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -80,22 +81,22 @@ def test_images_of_the_c_library_are_read(path: Path) -> None:
 def test_the_c_library_respects_our_semaphore(path: Path) -> None:
     library = Image(path.name.removesuffix(".im.shm")).create(3)
     reader = StreamReader(path)
-    queue = multiprocessing.get_context("fork").SimpleQueue()
-    ask = lambda: queue.put(LIBRARY.ImageStreamIO_getsemwaitindex(library.memory, 0))  # noqa: E731
-    child = multiprocessing.get_context("fork").Process(target=ask)
+    context = multiprocessing.get_context("fork")
+    queue = context.SimpleQueue()
+    child = context.Process(target=lambda: queue.put(LIBRARY.ImageStreamIO_getsemwaitindex(library.memory, 0)))
     child.start()
     child.join()
     assert queue.get() == 1  # 0 is the reader's
     reader.close()
 
 
-def _receive(name: str, images: int, started: object, queue: object) -> None:
+def _receive(name: str, images: int, started: Any, queue: Any) -> None:
     library = Image(name).open()
     index = LIBRARY.ImageStreamIO_getsemwaitindex(library.memory, 5)
-    started.set()  # type: ignore[attr-defined]
+    started.set()
     for _ in range(images):
         assert not LIBRARY.ImageStreamIO_semwait(library.memory, index)
-        queue.put(library.pixels("f4").copy())  # type: ignore[attr-defined]
+        queue.put(library.pixels("f4").copy())
 
 
 @pytest.mark.parametrize("made_by", ["library", "lowfc"])

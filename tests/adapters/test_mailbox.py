@@ -3,7 +3,6 @@
 import threading
 import time
 from collections.abc import Callable
-from itertools import takewhile
 
 import numpy as np
 from hypothesis import given
@@ -76,22 +75,17 @@ def test_a_message_ends_the_wait_of_another_thread() -> None:
 
 @given(st.lists(st.sampled_from(["put", "take", "lose"]), max_size=40))
 def test_every_message_is_taken_skipped_missing_or_waiting(actions: list[str]) -> None:
-    box, count, taken, sent, started = Mailbox(), 0, 0, 0, False
+    box, taken, published = Mailbox(), 0, ""
     for action in actions:
         if action == "take":
             taken += box.take(0.0) is not None
             continue
         if action == "put":
-            box.put(sample(count))
-            started = True
-        if started:
-            sent += 1
-        count += 1
-    published = [action for action in actions if action != "take"]
-    # Messages lost after the last that arrived are not missing yet: no later one reveals them.
-    lost_last = min(sent, sum(1 for _ in takewhile(lambda action: action == "lose", reversed(published))))
+            box.put(sample(len(published)))
+        published += "x" if action == "put" else " "
     waiting = box.take(0.0) is not None
-    assert sent - lost_last == taken + waiting + box.skipped + box.missing
+    # No message reveals that others were lost before the first or after the last one that arrived.
+    assert len(published.strip()) == taken + waiting + box.skipped + box.missing
 
 
 PERIOD_NS = 1_000_000

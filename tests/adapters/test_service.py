@@ -13,6 +13,7 @@ import pytest
 from lowfc import __version__
 from lowfc.adapters.process.realtime import Granted
 from lowfc.adapters.process.service import HEALTH_PERIOD_NS, PRINTED, PRINTED_NS, WAITING_NS
+from lowfc.contract.envelope import count_of
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, from_timestamp, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
@@ -92,7 +93,7 @@ def test_health_has_the_counts_of_a_mailbox(listener: Listener) -> None:
     camera, controller = listener.service("camera"), listener.service("controller")
     box = controller.mailbox(FRAME)
     frames = camera.publisher(FRAME)
-    listener.hub.lose = lambda role, key, envelope: key == FRAME.key and envelope.sequence & 0xFFFFFFFF == 1
+    listener.hub.lose = lambda role, key, envelope: key == FRAME.key and count_of(envelope.sequence) == 1
     for _ in range(4):
         last = frames.put(b"").sequence
     box.take(0.0)
@@ -100,7 +101,7 @@ def test_health_has_the_counts_of_a_mailbox(listener: Listener) -> None:
     assert (count.received, count.skipped, count.missing, count.last_sequence) == (3, 2, 1, last)
 
 
-def test_measures_are_requested_once_when_the_process_is_ready(listener: Listener) -> None:
+def test_real_time_measures_are_requested_once_when_the_process_is_ready(listener: Listener) -> None:
     at_ready = Mock(return_value=Granted(("huge pages",), (("big caches", "slow"),)))
     camera = listener.service("camera", granted=Granted(("one BLAS thread",), ()), at_ready=at_ready)
     for state in ("ready", "running", "ready"):
