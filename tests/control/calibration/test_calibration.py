@@ -73,16 +73,14 @@ def cramer_rao(flux_e: float, read_noise_e: float) -> np.ndarray:
     image_e = flux_e * TOY.reference / TOY.reference.sum()
     design = np.column_stack([flux_e * RESPONSE / TOY.reference.sum(), image_e])
     information = design.T @ (design / (image_e + read_noise_e**2)[:, None])
-    bound: np.ndarray = np.linalg.inv(information)[:3, :3]
-    return bound
+    return np.linalg.inv(information)[:3, :3]
 
 
 def covariance(estimator: str, flux_e: float, read_noise_e: float) -> np.ndarray:
     """Covariance (modes, modes) of R for frames divided by their own noisy flux."""
     R = reconstructor(I0, H, GOOD, flux_e, read_noise_e, estimator)
     row_weights = R - np.outer(R @ I0, GOOD)  # a frame is divided by its own flux, to which all good pixels contribute
-    result: np.ndarray = row_weights @ np.diag((I0 * flux_e + read_noise_e**2) / flux_e**2) @ row_weights.T
-    return result
+    return row_weights @ np.diag((I0 * flux_e + read_noise_e**2) / flux_e**2) @ row_weights.T
 
 
 @pytest.mark.parametrize(("flux_e", "read_noise_e", "above"), [(1e5, 0.0, 1e-9), (1e4, 5.0, 0.01)])
@@ -211,7 +209,7 @@ def computed_image() -> np.ndarray:
     y, x = np.indices((64, 64)) - 31.5
     speckles = gaussian_filter(rng.standard_normal((64, 64)), 2.5)
     image = np.exp(-(x**2 + y**2) / 180) * (0.05 + (speckles + speckles[::-1, ::-1]) ** 2)
-    return np.asarray(image / image.sum())
+    return image / image.sum()
 
 
 @pytest.mark.parametrize(

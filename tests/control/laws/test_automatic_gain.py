@@ -13,6 +13,7 @@ from lowfc.control.loop.camera import CameraSettings
 
 MODES = 30
 ONES = np.ones(MODES, np.float32)
+ZEROS = 0 * ONES
 
 
 def bank(
@@ -49,12 +50,11 @@ def drift(frames: int, step_nm: float, noise_nm: float, seed: int) -> Array:
 
 
 def test_white_noise_gets_no_gain() -> None:
-    """1200 modes in a first window, with long tails as from few photons; two standard errors would not suffice."""
-    rng, zero_gain = np.random.default_rng(1), np.zeros(MODES, np.float32)
-    granted = 0
+    """40 first windows of 30 modes; the noise has long tails, as from few photons: two standard errors would not do."""
+    rng, granted = np.random.default_rng(1), 0
     for _ in range(40):
         noise = rng.normal(0, 10, (300, MODES)) * (1 + 4 * (rng.random((300, 1)) < 0.02))
-        granted += np.count_nonzero(verdicts(bank(windows=(300, 1000)), noise, zero_gain, 100.0)[0].gain)
+        granted += np.count_nonzero(verdicts(bank(windows=(300, 1000)), noise, ZEROS, 100.0)[0].gain)
     assert granted <= 1
 
 
@@ -64,22 +64,23 @@ def test_the_highest_gain_of_a_bank_keeps_the_margins_with_its_leak(leak: float)
 
 
 def test_the_leak_of_one_mode_limits_its_own_gain_only() -> None:
-    """A mode's stability depends on its own gain and leak; a bank begins with modes of the same large drift."""
-    bank_ = GainBank(
-        np.where(np.arange(MODES) == 4, single(0.9), single(0)), 1e6 * ONES, ((0, single(1)),), 1.0, (500,) * 2
-    )
-    wander = drift(4000, 50.0, 1.0, 7)
-    gain = verdicts(bank_, wander, np.zeros(MODES, np.float32), 1.0)[-1].gain
-    limits = [highest_gain(1.0, 0.9 if mode == 4 else 0.0) for mode in range(MODES)]
+    """All modes have the same large drift, so that each gets the highest gain with which it is stable."""
+    leak = np.where(np.arange(MODES) == 4, single(0.9), single(0))
+    bank_ = GainBank(leak, 1e6 * ONES, ((0, single(1)),), 1.0, (500, 500))
+    gain = verdicts(bank_, drift(4000, 50.0, 1.0, 7), ZEROS, 1.0)[-1].gain
+    limits = [highest_gain(1.0, mode_leak) for mode_leak in leak.tolist()]
     assert limits[4] < limits[0]
     assert gain == pytest.approx(limits)
 
 
 @pytest.mark.parametrize(("step_nm", "delay_frames"), [(0.1, 1.0), (1.0, 1.0), (1.0, 2.0), (20.0, 1.0)])
 def test_a_drift_gets_nearly_the_best_gain(step_nm: float, delay_frames: float) -> None:
-    """For d = 1, the rms of drift, s^2 / (g (2 - g)), plus noise, n^2 g / (2 - g), is within 12 % of the least."""
+    """For a delay of one frame, the residual rms is within 12 % of the least.
+
+    Its square is s^2 / (g (2 - g)) from drift steps of s nm rms, plus n^2 g / (2 - g) from noise of n nm rms.
+    """
     bank_ = bank(delay_frames, (1000, 2500))
-    all_verdicts = verdicts(bank_, drift(8500, step_nm, 10.0, 2), np.zeros(MODES, np.float32), 100.0)
+    all_verdicts = verdicts(bank_, drift(8500, step_nm, 10.0, 2), ZEROS, 100.0)
     assert len(all_verdicts) >= 3
     gains = np.linspace(0.001, highest_gain(delay_frames), 2000)
     if delay_frames == 1.0:
@@ -94,7 +95,7 @@ def test_a_drift_gets_nearly_the_best_gain(step_nm: float, delay_frames: float) 
 def test_modes_with_the_same_disturbance_get_similar_gains() -> None:
     """Gains of 30 modes with the same drift differ less than if each were judged alone, and none stays at 0."""
     wander = drift(1000, 0.2, 10.0, 11)
-    together = verdicts(bank(), wander, np.zeros(MODES, np.float32), 100.0)[0].gain
+    together = verdicts(bank(), wander, ZEROS, 100.0)[0].gain
     alone = np.concatenate(
         [
             verdicts(bank(modes=2), wander[:, [mode, mode + 1]], np.zeros(2, np.float32), 100.0)[0].gain
@@ -108,7 +109,7 @@ def test_modes_with_the_same_disturbance_get_similar_gains() -> None:
 
 def test_a_gain_changes_by_at_most_a_factor_of_two_unless_open_loop_is_better() -> None:
     bank_ = bank()
-    verdicts(bank_, drift(1000, 1.0, 10.0, 3), np.zeros(MODES, np.float32), 100.0)
+    verdicts(bank_, drift(1000, 1.0, 10.0, 3), ZEROS, 100.0)
     low, high = bank_.rows[3], bank_.rows[-1]
     up = verdicts(bank_, drift(500, 5.0, 10.0, 4), low, 100.0)[0]
     assert set(np.unique(up.gain)) <= set(bank_.rows[3:5].ravel())
@@ -119,29 +120,26 @@ def test_a_gain_changes_by_at_most_a_factor_of_two_unless_open_loop_is_better() 
 
 
 def test_a_static_aberration_and_a_jump_across_lost_frames_are_not_noise() -> None:
-    bank_, zero_gain = bank(windows=(500, 500)), np.zeros(MODES, np.float32)
-    verdicts(bank_, 100 + drift(220, 0.0, 1.0, 13), zero_gain, 0.0)
+    bank_ = bank(windows=(500, 500))
+    verdicts(bank_, 100 + drift(220, 0.0, 1.0, 13), ZEROS, 0.0)
     bank_.held(3)
-    [verdict] = verdicts(bank_, 300 + drift(280, 0.0, 1.0, 14), zero_gain, 0.0)
+    [verdict] = verdicts(bank_, 300 + drift(280, 0.0, 1.0, 14), ZEROS, 0.0)
     np.testing.assert_allclose(verdict.noise_nm2, 1, rtol=0.3)
 
 
 def test_a_window_without_a_decision_grows() -> None:
-    bank_, rng = bank(windows=(100, 100)), np.random.default_rng(6)
-    gain = np.zeros(MODES, np.float32)
-    lengths = []
+    bank_, rng, lengths = bank(windows=(100, 100)), np.random.default_rng(6), []
     for _ in range(2000):
         modes_nm = rng.normal(0, 1, MODES).astype(np.float32)
         if bank_.add_frame(modes_nm, modes_nm, closed=True) and bank_.complete:
-            lengths.append(bank_.verdict(gain, None).frames)  # the chosen gains are not applied
+            lengths.append(bank_.verdict(ZEROS, None).frames)  # the chosen gains are not applied
     assert lengths[0] == 100
     assert max(lengths) >= 200
 
 
 def test_a_new_drift_gets_a_gain_before_the_window_ends() -> None:
-    bank_, zero_gain = bank(windows=(500, 5000)), np.zeros(MODES, np.float32)
-    verdicts(bank_, drift(500, 0.0, 1.0, 8), zero_gain, 1.0)
-    early = zero_gain
+    bank_, early = bank(windows=(500, 5000)), ZEROS
+    verdicts(bank_, drift(500, 0.0, 1.0, 8), ZEROS, 1.0)
     for count, modes_nm in enumerate(drift(3000, 0.5, 1.0, 9).astype(np.float32)):
         if bank_.add_frame(modes_nm, modes_nm, closed=False):
             assert not bank_.complete
@@ -164,8 +162,8 @@ def _vibrating(frames: int, seed: int) -> tuple[Array, Array]:
 def test_a_mode_with_only_tilt_cross_talk_gets_no_gain(closed: bool) -> None:
     """Otherwise the loop would put the mean of the cross-talk, 2.7 nm, on the mirror."""
     tilt_nm, modes_nm = _vibrating(1000, 12)
-    assert verdicts(bank(), modes_nm, 0 * ONES, 1.0, tilt_nm, closed=closed)[0].gain[4] == 0
-    assert verdicts(bank(), modes_nm, 0 * ONES, 1.0, closed=closed)[0].gain[4] > 0
+    assert verdicts(bank(), modes_nm, ZEROS, 1.0, tilt_nm, closed=closed)[0].gain[4] == 0
+    assert verdicts(bank(), modes_nm, ZEROS, 1.0, closed=closed)[0].gain[4] > 0
 
 
 def test_the_reported_change_excludes_the_cross_talk_margin() -> None:
@@ -181,7 +179,7 @@ def test_past_tilt_cross_talk_is_forgotten() -> None:
     tilt_nm, modes_nm = _vibrating(200, 20)
     rng = np.random.default_rng(21)
     bank_ = bank(windows=(100, 10))
-    gain = verdicts(bank_, modes_nm, 0 * ONES, 1.0, tilt_nm)[-1].gain
+    gain = verdicts(bank_, modes_nm, ZEROS, 1.0, tilt_nm)[-1].gain
     last_verdict = verdicts(bank_, rng.normal(0, 1, (2000, MODES)), gain, 1.0, rng.normal(0, 1, (2000, 2)))[-1]
     assert last_verdict.power_nm2[4] == pytest.approx(1, abs=0.3)
 
@@ -189,7 +187,7 @@ def test_past_tilt_cross_talk_is_forgotten() -> None:
 def test_a_gain_due_to_tilt_cross_talk_is_removed_before_the_window_ends() -> None:
     tilt_nm, modes_nm = _vibrating(4000, 17)
     bank_ = bank(windows=(100, 5000))
-    gain = verdicts(bank_, drift(100, 1.0, 1.0, 18), np.zeros(MODES, np.float32), 1.0)[0].gain
+    gain = verdicts(bank_, drift(100, 1.0, 1.0, 18), ZEROS, 1.0)[0].gain
     assert gain.all()
     for tilt_of_frame, modes_of_frame in zip(tilt_nm, modes_nm, strict=True):
         if bank_.add_frame(modes_of_frame, modes_of_frame, tilt_of_frame, closed=True):
@@ -201,11 +199,11 @@ def test_tilt_cross_talk_does_not_favour_a_gain() -> None:
     """A true -2.72 nm hides behind 2.7 nm of cross-talk: no loop measures it."""
     tilt_nm, modes_nm = _vibrating(1000, 23)
     modes_nm[:, 4] -= 2.72
-    assert verdicts(bank(), modes_nm, 0 * ONES, 1.0, tilt_nm)[0].gain[4] == 0
+    assert verdicts(bank(), modes_nm, ZEROS, 1.0, tilt_nm)[0].gain[4] == 0
 
 
 def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
-    """R for fewer modes subtracts twice the mode with the squares of tilt from another mode, which had none of them."""
+    """With another R, mode 7 contains minus twice mode 4, and so its cross-talk of tilt; before, it had none."""
     tilt_nm, modes_nm = _vibrating(5200, 22)
     from_own = np.eye(MODES)
     from_own[7, 4] = -2
@@ -213,11 +211,11 @@ def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
     gains = []
     for updated in (True, False):
         bank_ = bank(windows=(200, 1000))
-        verdicts(bank_, modes_nm[:5000], 0 * ONES, 1.0, tilt_nm[:5000], closed=True)
+        verdicts(bank_, modes_nm[:5000], ZEROS, 1.0, tilt_nm[:5000], closed=True)
         bank_.begin_first_window()
         if updated:
             bank_.use_reconstructor(from_own)
-        gains.append(verdicts(bank_, mixed[5000:], 0 * ONES, 1.0, tilt_nm[5000:], closed=True)[0].gain[7])
+        gains.append(verdicts(bank_, mixed[5000:], ZEROS, 1.0, tilt_nm[5000:], closed=True)[0].gain[7])
     assert gains[0] == 0
     assert gains[1] > 0
 
@@ -225,7 +223,7 @@ def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
 def test_a_drift_is_corrected_in_spite_of_tilt_cross_talk() -> None:
     tilt_nm, modes_nm = _vibrating(1000, 13)
     modes_nm += drift(1000, 0.3, 0.0, 14).astype(np.float32)
-    assert (verdicts(bank(), modes_nm, 0 * ONES, 1.0, tilt_nm)[0].gain > 0.01).mean() > 0.9
+    assert (verdicts(bank(), modes_nm, ZEROS, 1.0, tilt_nm)[0].gain > 0.01).mean() > 0.9
 
 
 def test_drifts_and_common_noise_are_not_tilt_cross_talk() -> None:

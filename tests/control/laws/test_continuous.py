@@ -50,12 +50,10 @@ def simulated_residual(law: LinearLaw, omega: float, timing: Timing) -> float:
         measured = wave[k, exposure].mean() if exposure.any() else np.sqrt(2) * np.cos(omega * k + 1)
         seen = sum(weight * c[k - 1 - lag] for lag, weight in enumerate(weights))
         y = measured if law.signal == "pol" else measured + seen
-        x = predict_and_update(law, x, np.array([y]), c[k - 1 : k] if k else np.zeros(1))  # type: ignore[arg-type]
-        c[k] = respond(law, x)[0]  # type: ignore[arg-type]
+        x = predict_and_update(law, x, np.array([y]), c[k - 1 : k] if k else np.zeros(1))
+        c[k] = respond(law, x)[0]
         if k > frames // 2:
-            whole = int(timing.applied)
-            part = timing.applied - whole
-            while_applied = np.sqrt(2) * np.cos(omega * (k + whole + part + fine) + 1)
+            while_applied = np.sqrt(2) * np.cos(omega * (k + timing.applied + fine) + 1)
             squares.append(np.mean((while_applied + c[k]) ** 2))
     return float(np.mean(squares))
 
@@ -83,22 +81,22 @@ def wheel_residual_mas(law: LinearLaw, timing: Timing) -> float:
 
 def test_the_residuals_on_the_ideal_wheel_are_known_and_the_best_law_reaches_the_floor() -> None:
     """Mas per axis, without noise; at one instant of each frame the integrator leaves 2.26 and the best law nothing."""
-    now, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
-    assert wheel_residual_mas(integrator_of_tip(1.11, 1), now) == pytest.approx(3.528, abs=0.002)
+    instant, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
+    assert wheel_residual_mas(integrator_of_tip(1.11, 1), instant) == pytest.approx(3.528, abs=0.002)
     assert wheel_residual_mas(integrator_of_tip(1.11, 1), blurred) == pytest.approx(2.944, abs=0.002)
     assert wheel_residual_mas(integrator_of_tip(0.518, 2), Timing(2, 2, 0.5)) == pytest.approx(6.547, abs=0.002)
     floor = float(np.sqrt(np.square(LINES_MAS) @ hold_floor(OMEGA)))
     assert floor == pytest.approx(0.7215, abs=1e-4)
-    for timing in (now, blurred, Timing(1, 1, 0.9), Timing(2, 2, 0.5), Timing(1, 0.8, 0.5), Timing(1.5, 1.5, 0.5)):
+    for timing in (instant, blurred, Timing(1, 1, 0.9), Timing(2, 2, 0.5), Timing(1, 0.8, 0.5), Timing(1.5, 1.5, 0.5)):
         assert wheel_residual_mas(lqg([wheel()], (2,), timing), timing) == pytest.approx(floor, rel=0.02), timing
 
 
 def test_a_law_that_nulls_another_mean_has_a_larger_residual() -> None:
     instant, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
     at_instant = law_nulling(lambda model: model.mean_over(1.0, 0.0))
-    exposure = law_nulling(lambda model: model.mean_over(1.0, 0.5) @ np.linalg.inv(model.mean_over(0.0, 0.5)))
+    in_exposure = law_nulling(lambda model: model.mean_over(1.0, 0.5) @ np.linalg.inv(model.mean_over(0.0, 0.5)))
     assert wheel_residual_mas(at_instant, instant) == pytest.approx(1.44, abs=0.01)
-    assert wheel_residual_mas(exposure, blurred) == pytest.approx(0.954, abs=0.01)
+    assert wheel_residual_mas(in_exposure, blurred) == pytest.approx(0.954, abs=0.01)
 
 
 def law_nulling(prediction: Callable[[Model], Array]) -> LinearLaw:
@@ -143,7 +141,7 @@ def test_the_continuous_residual_is_recovered_from_instants() -> None:
     assert np.mean((wave + mirror)[500:-100] ** 2) < 0.8 * residual_nm2.mean()
     earlier = continuous_residual_nm2(wave[:, None], mirror[:, None], 0.5)[500:-100].mean()
     assert earlier == pytest.approx(residual_power(law, np.array([omega]), Timing(1, 0.5, 0.0))[0, 0], rel=0.01)
-    assert Timing.measured(1.0, 0.5, 0.6) == Timing.of(1.0, 0.5)  # too late for a delay of one frame
+    assert Timing.measured(1.0, 0.5, 0.6) == Timing.of(1.0, 0.5)  # 1.1 periods are too late for a delay of one
 
 
 def test_the_held_residual_is_recovered_from_noisy_measurements() -> None:

@@ -22,8 +22,9 @@ from tests.support.toy import frame_sequence, run_toy, settings
 
 WIDE = {"limits": Limits(7000.0, 7000.0, 7000.0), "limit_nm": (5000.0, 5000.0)}
 DELAYS = [1.0, 1.4, 2.0, 3.0]
-NOTHING_MISSING = np.zeros(12, np.int64)
-HALF = limited_integrator(law_of(modes=1))
+WALK = np.array([15.0, -9.0, 6.0]) + np.cumsum(np.random.default_rng(4).normal(size=(160, 3)), axis=0)
+MISSING = (30, 31, 32, 33, 34, 35, 60, 90, 91)
+DARK = (45, 46, 100, 101, 102, 103)
 
 
 def single(*values: float) -> np.ndarray:
@@ -35,9 +36,9 @@ def weights(delay_frames: float) -> np.ndarray:
     return delay_weights(delay_frames).astype(np.float32)
 
 
-def live_steps(setup: Settings, disturbance_nm: np.ndarray) -> list[Step]:
-    """Steps of the live loop with missing and dark frames."""
-    return run_toy(setup, disturbance_nm, missing=MISSING, dark=DARK)[0]
+def live_steps(setup: Settings) -> list[Step]:
+    """Steps of the live loop on a random walk, with missing and dark frames."""
+    return run_toy(setup, WALK, missing=MISSING, dark=DARK)[0]
 
 
 def columns(steps: list[Step]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -49,16 +50,11 @@ def columns(steps: list[Step]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
     return error, pol, np.array([step.command_nm for step in steps]), missing_before(sequence)
 
 
-WALK = np.array([15.0, -9.0, 6.0]) + np.cumsum(np.random.default_rng(4).normal(size=(160, 3)), axis=0)
-MISSING = (30, 31, 32, 33, 34, 35, 60, 90, 91)
-DARK = (45, 46, 100, 101, 102, 103)
-
-
 @pytest.mark.parametrize("delay", DELAYS)
 def test_the_logged_gains_reproduce_the_logged_run(delay: float) -> None:
     """Up to float32 rounding in pol = error - seen, with missing and refused frames and acting modal limits."""
     setup = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0), limit_nm=(12.0, 50.0))
-    error, pol, command, missing = columns(live_steps(setup, WALK))
+    error, pol, command, missing = columns(live_steps(setup))
     assert missing.sum() == 9
     assert np.isnan(error).any(axis=1).sum() == len(DARK)
     assert (np.abs(command[:, 0]) == 12.0).any()
@@ -73,8 +69,8 @@ def test_other_gains_reproduce_a_run_with_these_gains(delay: float) -> None:
     """For a sensor that is linear up to the rounding to DN, here 0.01 nm."""
     before = settings(delay_frames=delay, gain=(0.3, 0.1), **WIDE)
     after = settings(delay_frames=delay, gain=(0.1, 0.25), leak=(0.02, 0.01), **WIDE)
-    _, pol, _, missing = columns(live_steps(before, WALK))
-    error, _, command, _ = columns(live_steps(after, WALK))
+    _, pol, _, missing = columns(live_steps(before))
+    error, _, command, _ = columns(live_steps(after))
     law = limited_integrator(after.integrator((2, 3, 4)))
     other_error, other_command = counterfactual(law, weights(delay), pol, missing)
     np.testing.assert_allclose(other_error, error, atol=0.05)
@@ -87,7 +83,7 @@ def test_other_gains_reproduce_a_run_with_these_gains(delay: float) -> None:
 )
 def test_an_integrator_with_gain_one_half_on_a_step(delay: float, errors: list[float]) -> None:
     pol = single(8, 8, 8, 8)
-    error, command = counterfactual(HALF, weights(delay), pol, NOTHING_MISSING[:4])
+    error, command = counterfactual(limited_integrator(law_of(modes=1)), weights(delay), pol, np.zeros(4, np.int64))
     assert error[:, 0].tolist() == errors
     assert command[:, 0].tolist() == np.cumsum([-0.5 * value for value in errors]).tolist()
 
@@ -97,7 +93,7 @@ def test_any_function_of_state_and_error_is_a_controller() -> None:
         count = state or 0
         return count + 1, -error_nm if count % 2 else np.zeros_like(error_nm)
 
-    _, command = counterfactual(every_other, weights(1.0), single(8, 8, np.nan, 8, 8), NOTHING_MISSING[:5])
+    _, command = counterfactual(every_other, weights(1.0), single(8, 8, np.nan, 8, 8), np.zeros(5, np.int64))
     assert command[:, 0].tolist() == [0, -8, -8, 0, -8]
 
 

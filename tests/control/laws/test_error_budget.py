@@ -60,9 +60,9 @@ def test_the_lag_term_of_a_sine_is_its_rejected_power() -> None:
     ]
     expected = np.array([18, 2]) * np.square(passed)
     assert lag(law, power, np.zeros(2), SAMPLED).variance_nm2 == pytest.approx(expected, rel=0.02)
-    omega, whole_time = 2 * np.pi * np.array([31.0, 7.0]) / RATE_HZ, Timing.of(1.0, 0.0)
-    expected = np.array([18, 2]) * residual_power(law, omega, whole_time).diagonal()
-    assert lag(law, power, np.zeros(2), whole_time).variance_nm2 == pytest.approx(expected, rel=0.02)
+    omega, continuous = 2 * np.pi * np.array([31.0, 7.0]) / RATE_HZ, Timing.of(1.0, 0.0)
+    expected = np.array([18, 2]) * residual_power(law, omega, continuous).diagonal()
+    assert lag(law, power, np.zeros(2), continuous).variance_nm2 == pytest.approx(expected, rel=0.02)
     with_mean, without = (lag(law, power, np.full(2, mean), SAMPLED).variance_nm2 for mean in (30.0, 0.0))
     # An integrator without leak removes a mean.
     assert with_mean - without == pytest.approx([0, (30 * 0.02 / 0.12) ** 2], abs=1e-3)

@@ -60,7 +60,7 @@ def test_an_image_of_one_instant_hides_the_residual_between_instants() -> None:
 
 
 def test_the_best_law_nulls_the_mean_over_the_period_of_its_command() -> None:
-    """With a law that nulls the mean over the next exposure, and with the law of `lowfc tune`."""
+    """The law of `lowfc tune` leaves less than a law that nulls the mean over the next exposure."""
     _, bench = wheel()
     bench.run(IDENTIFY)
     run = bench.pol()

@@ -45,9 +45,7 @@ def test_a_filter_keeps_the_margins_at_any_noise(noise_nm: float, width: float, 
     timing = Timing.of(delay, 0.5)
     known = tuple(Line(hz, width * hz, (2.4 * mas) ** 2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
     model = Model(0.02, 2.0, known, noise_nm**2, RATE_HZ)
-    block = within_margins(model, timing)
-    assert block is not None
-    blocks = block, lqg_block(model, timing)
+    blocks = within_margins(model, timing), lqg_block(model, timing)
     law, unconstrained = (law_from_blocks([block], "pol", "lqg", (2,), delay, RATE_HZ) for block in blocks)
 
     def ratio(filter_: LinearLaw) -> float:

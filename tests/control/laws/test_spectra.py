@@ -60,8 +60,8 @@ def test_the_standard_error_equals_the_scatter() -> None:
     rng = np.random.default_rng(2)
     trials = [spectrum(one_piece(rng.standard_normal((2000, 1))), RATE_HZ) for _ in range(300)]
     band = (trials[0].frequency_hz < 50)[:, None]
-    variances = [float(trial.variance_nm2(band)[0]) for trial in trials if trial is not None]
-    errors = [float(trial.error_nm2(band)[0]) for trial in trials if trial is not None]
+    variances = [float(trial.variance_nm2(band)[0]) for trial in trials]
+    errors = [float(trial.error_nm2(band)[0]) for trial in trials]
     assert np.mean(errors) == pytest.approx(np.std(variances), rel=0.2)
 
 
@@ -124,7 +124,7 @@ def law(gain: tuple[float, float] = GAIN) -> Integrator:
     return settings(gain=gain).integrator(NOLL)
 
 
-def through(setup: Settings, request: Request) -> tuple[Array, Array, State]:
+def run_probe(setup: Settings, request: Request) -> tuple[Array, Array, State]:
     """Errors and commands (frames, modes) of the toy's loop during a probe sequence, and its state afterwards.
 
     The disturbance is white noise and a slow sine that is not a line of the multisine.
@@ -151,7 +151,7 @@ def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: fl
     table = with_lead_in(period, lead)
     shapes = np.zeros(0) if target == "offset" else calibration().modes_to_actuators.T.reshape(-1)
     request = Request(0, "play", text=target, table=table, actuators_nm=shapes.astype(np.float32))
-    error_nm, _, _ = through(setup, request)
+    error_nm, _, _ = run_probe(setup, request)
     weights = delay_weights(delay_frames)
     added = -period.astype(float) if target == "offset" else seen_of_mirror(period.astype(float), weights)
     measured = measure_lines(error_nm[lead:], added)
@@ -246,7 +246,7 @@ def test_a_staircase_limits_its_steps_and_holds_its_levels() -> None:
     assert stairs[-1] == 0
     for start, level, previous in zip(starts, levels_nm, np.roll(levels_nm, 1), strict=True):
         assert (stairs[start : start + 6] == level).all()
-        assert start == 0 or level == previous or stairs[start - 1] != level
+        assert start == 0 or level == previous or stairs[start - 1] != level, "it starts when the level is reached"
 
 
 def test_known_gain_and_crosstalk_are_recovered() -> None:
@@ -272,7 +272,7 @@ def test_a_step_is_captured_if_the_loop_corrects_it(gain: tuple[float, float], e
     stairs, starts = build_staircase([0.0, 30.0], 40, 20.0)
     table = stairs.astype(np.float32)[:, None]
     request = Request(0, "play", text="mirror", table=table, actuators_nm=shape.reshape(-1))
-    error_nm, command_nm, state = through(setup, request)
+    error_nm, command_nm, state = run_probe(setup, request)
     assert state.mode is LoopMode.CLOSED
     before, after = slice(20, 40), slice(int(starts[1]) + 30, int(starts[1]) + 40)
     assert captured(error_nm, command_nm, 1, 30.0, before, after) is expected

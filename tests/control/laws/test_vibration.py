@@ -19,6 +19,7 @@ from tests.support.theory import modes_nm, one_piece, realised, run
 
 RATE_HZ = 1000.0
 NM_PER_MAS = tilt_nm_per_mas(2.0)
+SAMPLED = Timing.sampled(1.0)
 
 
 def ideal_wheel() -> TimeSeries:
@@ -117,7 +118,6 @@ def test_a_model_without_noise_still_gives_a_stable_filter(lines: tuple[float, .
     check_stable(lqg([model], (2,), SAMPLED), 1.0)
 
 
-SAMPLED = Timing.sampled(1.0)
 MODEL = Model(0.02, 5.0, (Line(18, 0.3, 60.0), Line(71, 0.5, 20.0)), 0.7, RATE_HZ)
 
 
