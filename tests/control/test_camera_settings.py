@@ -1,5 +1,6 @@
 """A loop with a wrong or restarted camera or without a calibration: when it may close, and what it does meanwhile."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -41,8 +42,7 @@ WRONG = replace(CAMERA, bias_dn=DARK_DN + 60)
 
 
 def ask(state: State, name: str, **fields: object) -> tuple[State, Reply]:
-    state, outputs = advance(DEFAULTS, state, Request(5, name, **fields))  # type: ignore[arg-type]
-    assert outputs.reply is not None
+    state, outputs = advance(DEFAULTS, state, Request(5, name, **fields))
     return state, outputs.reply
 
 
@@ -91,7 +91,7 @@ def test_camera_settings_are_part_of_a_calibrations_identity() -> None:
     plain, measured = identified(calibration()), identified(replace(calibration(), camera=CAMERA))
     assert plain.id != measured.id
     decoded = decode_calibration(wire.Calibration.FromString(encode_calibration(measured, 7)))
-    assert decoded.camera == replace(CAMERA, time_ns=decoded.camera.time_ns if decoded.camera else 0)
+    assert decoded.camera == replace(CAMERA, time_ns=decoded.camera.time_ns)
     assert identified(replace(measured, camera=replace(CAMERA, time_ns=77, start_s=8))).id == measured.id
 
 
@@ -119,7 +119,7 @@ def test_after_a_camera_restart_frames_are_refused_until_its_settings_arrive() -
     restarted = [frame(1, (20, 0, 0), sequence=frame_sequence(count, START + 9)) for count in range(4)]
     before_nm = state.loop.history_nm[0]
     state, all_outputs = feed(DEFAULTS, state, *restarted)
-    assert [outputs.step.reasons for outputs in all_outputs if outputs.step] == [(Rejection.CAMERA_UNKNOWN,)] * 4
+    assert [outputs.step.reasons for outputs in all_outputs] == [(Rejection.CAMERA_UNKNOWN,)] * 4
     assert (state.loop.history_nm[0] == before_nm).all()
     assert not ask(ask(state, "open")[0], "close")[1].accepted
     known = replace(CAMERA, start_s=START + 9)
@@ -134,7 +134,7 @@ def test_settings_received_before_the_first_frame_of_a_restarted_camera_are_acce
 
 
 def test_the_loop_is_not_closed_while_frames_are_refused() -> None:
-    dark = [frame(count, pixels=frame(1).pixels * 0) for count in range(2, 5)]  # type: ignore[operator]
+    dark = [frame(count, pixels=frame(1).pixels * 0) for count in range(2, 5)]
     state = opened(CAMERA, frame(1), *dark[:2])
     assert ask(state, "close")[1].accepted, "two refused frames are ignored"
     state, _ = feed(DEFAULTS, state, dark[2])
@@ -208,9 +208,7 @@ def play(state: State, table: Single, basis: Single = BASIS) -> State:
 
 def surfaces(all_outputs: list[Outputs]) -> Single:
     """Actuators (frames, actuators) of the commands."""
-    return np.array(
-        [outputs.command.actuators_nm.reshape(-1) for outputs in all_outputs if outputs.command is not None]
-    )
+    return np.array([outputs.command.actuators_nm.reshape(-1) for outputs in all_outputs])
 
 
 def other_size() -> State:
@@ -221,8 +219,8 @@ def other_size() -> State:
 
 
 @pytest.mark.parametrize("begin", [idle, other_size])
-def test_a_probe_sequence_plays_without_a_calibration(begin: object) -> None:
-    state = begin()  # type: ignore[operator]
+def test_a_probe_sequence_plays_without_a_calibration(begin: Callable[[], State]) -> None:
+    state = begin()
     assert state.mode is LoopMode.IDLE
     table = np.array([[1], [-2], [3]], np.float32)
     state, all_outputs = feed(DEFAULTS, play(state, table), *(odd(count) for count in range(4, 9)))
@@ -277,15 +275,13 @@ def test_safe_mode_from_before_the_start_remains() -> None:
 
 @pytest.mark.parametrize("begin", [idle, other_size])
 @pytest.mark.parametrize("name", ["close", "step"])
-def test_closing_an_idle_loop_is_refused_with_advice(begin: object, name: str) -> None:
-    _, outputs = advance(DEFAULTS, begin(), Request(0, name, values=(3.0,) if name == "step" else ()))  # type: ignore[operator]
+def test_closing_an_idle_loop_is_refused_with_advice(begin: Callable[[], State], name: str) -> None:
+    _, outputs = advance(DEFAULTS, begin(), Request(0, name, values=(3.0,) if name == "step" else ()))
     check_reply(outputs, False, "lowfc commission")
 
 
 def test_a_calibration_ends_the_idle_mode_and_the_mirror_keeps_its_shape() -> None:
-    state = idle(shape_nm=30.0)
-    request = Request(0, "load", calibration=calibration())
-    state, _ = advance(DEFAULTS, state, request)
+    state, _ = advance(DEFAULTS, idle(shape_nm=30.0), Request(0, "load", calibration=calibration()))
     assert DEFAULTS.start_mode is LoopMode.CLOSED
     assert state.mode is LoopMode.OPEN, "a loaded calibration does not close the loop"
     state, all_outputs = feed(DEFAULTS, state, frame(4, SOME))

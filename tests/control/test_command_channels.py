@@ -22,6 +22,9 @@ DISTURBED = np.array([10.0, -5.0, 3.0])
 ACTUATORS = GRID[0] * GRID[1]
 STEP_NM = DEFAULTS.limits.kept_slew_nm / 2
 """Largest move of a channel in a frame: half the slew limit with its margin."""
+UNIT = np.eye(3, dtype=np.float32)
+SMOOTH = LinearLaw("pol", 0.6 * UNIT, 0.4 * UNIT, 0 * UNIT, UNIT, -UNIT, "smooth", NOLL, 1.0, 1000.0)
+"""A law that removes the smoothed disturbance."""
 LOAD_OTHER = Request(0, "load", calibration=replace(calibration(scale=1.01), id="other"))
 
 
@@ -54,7 +57,7 @@ class ToyLoop:
 
     def ask(self, name: str, **fields: object) -> Reply:
         """Send a request as an operator: encoded and decoded."""
-        request = Request(0, name, **fields)  # type: ignore[arg-type]
+        request = Request(0, name, **fields)
         payload = encode_request(request, Reply(False, "", 0), 0, None)
         return self.process_input(decode_request(payload, name, 0)).reply
 
@@ -98,7 +101,6 @@ def test_the_shift_of_the_zero_point_is_delayed_like_the_mirror(delay_frames: fl
         seen = sum(weight * shape for weight, shape in zip(weights, shapes, strict=True))
         loop.count += 1
         outputs = loop.process_input(frame(loop.count, loop.to_modes @ np.asarray(seen).reshape(-1)))
-        assert outputs.step.error_nm is not None
         assert np.abs(outputs.step.error_nm).max() < 0.05
 
 
@@ -138,8 +140,7 @@ def test_the_flat_map_does_not_shift_the_zero_point() -> None:
 
 @pytest.mark.parametrize("mode", [LoopMode.OPEN, LoopMode.CLOSED])
 def test_a_probe_sequence_plays_one_row_per_frame_and_ends(mode: LoopMode) -> None:
-    setup = replace(DEFAULTS, gain=(0.0, 0.0))
-    loop = ToyLoop(setup, mode)
+    loop = ToyLoop(replace(DEFAULTS, gain=(0.0, 0.0)), mode)
     loop.run(3)
     held = loop.surfaces[-1]
     table = np.array([[1, 0], [0, 2], [-1, 1]], np.float32)
@@ -154,8 +155,7 @@ def test_a_probe_sequence_plays_one_row_per_frame_and_ends(mode: LoopMode) -> No
     expected = [*(row @ basis for row in table[:2]), np.zeros(ACTUATORS), np.zeros(ACTUATORS)]
     for surface, shape in zip(played, expected, strict=True):
         assert np.allclose(surface.reshape(-1), shape, atol=1e-3)
-    step = loop.outputs[-3].step
-    assert np.allclose(step.command_nm, 0)  # the modal command excludes it
+    assert np.allclose(loop.outputs[-3].step.command_nm, 0)  # the modal command excludes it
 
 
 def test_a_probe_sequence_larger_than_the_slew_limit_leaves_no_offset() -> None:
@@ -193,8 +193,7 @@ def test_channels_whose_sum_exceeds_the_stroke_are_refused() -> None:
 
 @pytest.mark.parametrize("end", ["stop", "safe", "close", "limit", "restart", "load"])
 def test_a_probe_sequence_ends_with_a_request_a_limit_a_restart_or_another_calibration(end: str) -> None:
-    setup = replace(DEFAULTS, limits=Limits(700.0, 100.0, 400.0))
-    loop = ToyLoop(setup, LoopMode.OPEN)
+    loop = ToyLoop(mode=LoopMode.OPEN)
     loop.run(2)
     table = np.ones((50, 1), np.float32)
     table[10] = 20 if end == "limit" else 1
@@ -288,7 +287,7 @@ def test_the_loop_opens_after_the_last_step() -> None:
     loop.run(3)
     assert loop.ask("step", values=(4,)).accepted
     loop.run(6)
-    modes = [outputs.step.mode for outputs in loop.outputs[-6:] if outputs.step is not None]
+    modes = [outputs.step.mode for outputs in loop.outputs[-6:]]
     assert modes == [LoopMode.CLOSED] * 4 + [LoopMode.OPEN] * 2
     assert loop.events.count("LOOP_STEPPED") == 1
     assert not np.array_equal(loop.surfaces[-6], loop.surfaces[-7])
@@ -299,8 +298,7 @@ def test_the_loop_opens_after_the_last_step() -> None:
 
 @pytest.mark.parametrize("mode", [LoopMode.OPEN, LoopMode.CLOSED])
 def test_reset_removes_the_modal_command_within_the_slew_limit(mode: LoopMode) -> None:
-    setup = replace(DEFAULTS, limits=Limits(700.0, 2.0, 400.0), gain=(0.5, 0.3))
-    loop = ToyLoop(setup)
+    loop = ToyLoop(replace(DEFAULTS, limits=Limits(700.0, 2.0, 400.0)))
     loop.run(100, 3 * DISTURBED)
     channel = dark_hole(10.0)
     loop.ask("channel", text="dark-hole", actuators_nm=channel)
@@ -315,8 +313,7 @@ def test_reset_removes_the_modal_command_within_the_slew_limit(mode: LoopMode) -
         loop.run(1, 3 * DISTURBED)
     assert len(loop.surfaces) > start + 3  # the slew limit is small
     assert np.allclose(loop.surfaces[-1], channel, atol=0.01)
-    moves = np.abs(np.diff(loop.surfaces, axis=0)).max()
-    assert moves <= 2.0
+    assert np.abs(np.diff(loop.surfaces, axis=0)).max() <= 2.0
     loop.run(5, 3 * DISTURBED)
     assert np.allclose(loop.surfaces[-1], channel, atol=0.01) is (mode is LoopMode.OPEN)
 
@@ -339,12 +336,10 @@ def test_a_foreign_shape_of_the_mirror_is_adopted_as_a_channel() -> None:
 def test_a_law_takes_over_and_returns_control_without_a_jump() -> None:
     """A linear law equal to the integrator: the mirror moves alike under both, within 0.5 nm."""
     loop, plain = ToyLoop(), ToyLoop()
-    law = law_of(0.4)
     for each in (loop, plain):
         each.ask("gain", values=(0.4,))
         each.ask("limit", values=(50.0,))
-    linear_law = linear(law)
-    assert loop.ask("law", law=linear_law).accepted
+    assert loop.ask("law", law=linear(law_of(0.4))).accepted
     assert not loop.ask("gain", values=(0.3,)).accepted
     frames = SETTLING_FRAMES + FADING_FRAMES + 50
     for each in (loop, plain):
@@ -396,10 +391,9 @@ def test_a_calibration_loaded_in_safe_mode_leaves_nothing_on_the_mirror() -> Non
 @pytest.mark.parametrize("signal", [None, "error", "pol"])
 def test_an_offset_moves_the_loop_but_not_the_pseudo_open_loop_modes(signal: Signal | None) -> None:
     """For the integrator, and for laws of the error and of pseudo-open-loop modes."""
-    loop, unit, target = ToyLoop(), np.eye(3, dtype=np.float32), (4.0, 0.0, -2.0)
-    if signal is not None:  # a law equal to the integrator, or one that removes the smoothed disturbance
-        smooth = LinearLaw("pol", 0.6 * unit, 0.4 * unit, 0 * unit, unit, -unit, "smooth", NOLL, 1.0, 1000.0)
-        assert loop.ask("law", law=linear(law_of(0.4)) if signal == "error" else smooth).accepted
+    loop, target = ToyLoop(), (4.0, 0.0, -2.0)
+    if signal is not None:
+        assert loop.ask("law", law=linear(law_of(0.4)) if signal == "error" else SMOOTH).accepted
     for values, expected in ((target, target), ((), (0, 0, 0))):
         assert loop.ask("offset", values=values).accepted
         loop.run(SETTLING_FRAMES + FADING_FRAMES + 50)
@@ -412,10 +406,8 @@ def test_a_law_for_another_loop_is_refused() -> None:
     law = law_of(1.2)
     linear_law = linear(law)
     assert loop.ask("law", law=linear_law).accepted
-    unit = np.eye(3, dtype=np.float32)
     delayed = ToyLoop(replace(DEFAULTS, delay_frames=2.0))
-    one_frame_law = LinearLaw("pol", 0.6 * unit, 0.4 * unit, 0 * unit, unit, -unit, "smooth", NOLL, 1.0, 1000.0)
-    assert "delay" in delayed.ask("law", law=one_frame_law).text
+    assert "delay" in delayed.ask("law", law=SMOOTH).text
     assert not delayed.ask("law", law=linear_law).accepted
     assert not loop.ask("law", law=linear(law, (2, 3, 5))).accepted
     slow = ToyLoop(replace(DEFAULTS, rate_hz=500.0))

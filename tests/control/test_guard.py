@@ -33,8 +33,7 @@ SETUP = settings(guard=True, gain=(0.5, 0.3), rate_hz=RATE_HZ)
 BEFORE = SETTLING_FRAMES + FADING_FRAMES - 1
 """Frames before the first compared one."""
 SPANS = Spans.at(RATE_HZ)
-RNG = np.random.default_rng(1)
-NOISE_NM = 2 * RNG.standard_normal((3_000, len(NOLL)))
+NOISE_NM = 2 * np.random.default_rng(1).standard_normal((3_000, len(NOLL)))
 SWAY_NM = 20 * np.sin(2 * np.pi * 7 / RATE_HZ * np.arange(3_000)[:, None] + [0, 1, 2])
 
 

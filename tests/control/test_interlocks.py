@@ -31,8 +31,8 @@ def mask(value: Value | None, age_ns: int = 0) -> BenchReport:
 
 def running(setup: Settings) -> State:
     """A closed loop without an acting interlock."""
-    quiet = next(value for value in (False, 0.0, "still") if type(value) is type(setup.interlocks[0].value))
-    return feed(setup, loaded(setup), mask(quiet), *(frame(count, SOME) for count in range(1, 6)))[0]
+    quiet = mask(type(setup.interlocks[0].value)())  # False, or 0
+    return feed(setup, loaded(setup), quiet, *(frame(count, SOME) for count in range(1, 6)))[0]
 
 
 def applied(setup: Settings, state: State, name: str, **fields: object) -> tuple[State, Outputs]:
@@ -69,9 +69,8 @@ def test_an_interlock_acts_on_its_condition_and_if_configured_on_a_missing_or_ol
 def test_an_interlock_holds_and_releases_the_command_at_the_next_frame() -> None:
     """At random times; bench reports are encoded as in a log, and the replay of all inputs gives the same steps."""
     setup, rng = under(Action.HOLD), np.random.default_rng(5)
-    state = running(setup)
+    state = replayed_state = running(setup)
     count, acting, flips, logged = 5, False, 0, []
-    start = state
     while flips < 100:
         if rng.random() < 0.3:
             acting, flips, input_ = not acting, flips + 1, mask(not acting)
@@ -87,7 +86,6 @@ def test_an_interlock_holds_and_releases_the_command_at_the_next_frame() -> None
                 np.testing.assert_array_equal(outputs.command.actuators_nm, before.loop.actuators_nm)
         else:
             assert [event.name for event in outputs.events] == ["INTERLOCK_ACTS" if acting else "INTERLOCK_CLEARED"]
-    replayed_state = start
     for input_, outputs in logged:
         if isinstance(input_, BenchReport):
             input_ = codec.decode_input(wire.ControlInput.FromString(codec.encode_input(input_, 3)), {})
@@ -115,7 +113,8 @@ def test_each_action_takes_effect_and_is_not_undone_when_the_interlock_clears(ac
     assert state.mode is mode
     changed = ["MODE_CHANGED"] if mode is not LoopMode.CLOSED else []
     assert names(all_outputs) == ["INTERLOCK_ACTS", *changed, *(["SAFED"] if mode is LoopMode.SAFE else [])]
-    state, _ = applied(setup, state, "open") if mode is LoopMode.CLOSED else (state, None)
+    if mode is LoopMode.CLOSED:
+        state, _ = applied(setup, state, "open")
     refused, clears = action is not Action.WARN, mode is LoopMode.SAFE
     for name, values in (("close", ()), ("step", (3.0,))):
         _, outputs = applied(setup, state, name, values=values)

@@ -26,9 +26,9 @@ SECOND_NS = 1_000_000_000
 def held(seconds: float = 10.0, frames: int = 3) -> State:
     """A closed loop that is reserved from time 0."""
     state, _ = feed(DEFAULTS, loaded(DEFAULTS), *(frame(count, SOME) for count in range(1, frames + 1)))
-    state, reply = applied(state, Request(0, "lease", values=(seconds,), text=HOLDER, lease_id=MINE))
-    assert reply.reply.accepted
-    assert names([reply]) == ["LEASE_TAKEN"]
+    state, outputs = applied(state, Request(0, "lease", values=(seconds,), text=HOLDER, lease_id=MINE))
+    check_reply(outputs, True)
+    assert names([outputs]) == ["LEASE_TAKEN"]
     return state
 
 
@@ -147,7 +147,7 @@ def test_a_lease_has_one_holder_who_alone_can_release_it() -> None:
 )
 def test_an_invalid_lease_is_refused(fields: dict[str, object], why: str) -> None:
     request = Request(0, "lease", values=(5.0,), text=HOLDER, lease_id=MINE)
-    _, outputs = applied(loaded(DEFAULTS), replace(request, **fields))  # type: ignore[arg-type]  # each of its own type
+    _, outputs = applied(loaded(DEFAULTS), replace(request, **fields))
     check_reply(outputs, False, why)
 
 

@@ -201,7 +201,6 @@ def serialised(input_: Input, outputs: Outputs, state: State) -> bytes:
     command = codec.encode_command(outputs.command, 1, "c", state.input_number) if outputs.command else b""
     reply = b""
     if isinstance(input_, Request):
-        assert outputs.reply is not None
         reply = codec.encode_request(input_, outputs.reply, state.input_number, None)
     events = [EVENTS[event.name].log("controller", 0, **event.details).SerializeToString() for event in outputs.events]
     return b"|".join((step, command, reply, *events))
@@ -272,10 +271,10 @@ def inputs_up_to(script: Script, name: str, pause: int, run: Run) -> Iterator[In
         run.counts[name, False] += 1
 
 
-def replayed(setup: Settings, state: State, run: Run, begin: int) -> tuple[State, list[bytes]]:
-    """Replay the rest of a run, with requests as published in the log."""
+def replayed(setup: Settings, state: State, inputs: list[Input]) -> tuple[State, list[bytes]]:
+    """Replay these inputs, with requests as published in the log."""
     sent = []
-    for input_ in run.inputs[begin:]:
+    for input_ in inputs:
         resent = input_
         if isinstance(input_, Request):
             logged = wire.Request.FromString(codec.encode_request(input_, Reply(True, "", 0), 1, None))
@@ -285,19 +284,15 @@ def replayed(setup: Settings, state: State, run: Run, begin: int) -> tuple[State
     return state, sent
 
 
-def check(
-    names: list[str], pauses: list[int], seed: int, delay_frames: float, tight: bool, on_frame_timeout: str
-) -> Run:
+def check(setup: Settings, names: list[str], pauses: list[int], seed: int) -> Run:
     """Run, and replay: from the beginning, and from a decoded state in the middle."""
-    setup = settings(delay_frames=delay_frames, on_frame_timeout=on_frame_timeout, **(TIGHT if tight else {}))
     run = random_run(setup, names, pauses, seed)
     assert sum(run.counts.values()) == len(names), "every request is answered"
     start_state, _ = advance(setup, State(), Load(0, CALIBRATION, "a test"))
     middle = len(run.inputs) // 2
-    first = Run(start_state, run.inputs[:middle], run.outputs[:middle], Counter())
-    state, sent = replayed(setup, start_state, first, 0)
-    assert sent == first.outputs
-    end, sent = replayed(setup, state, run, middle)
+    state, sent = replayed(setup, start_state, run.inputs[:middle])
+    assert sent == run.outputs[:middle]
+    end, sent = replayed(setup, state, run.inputs[middle:])
     assert sent == run.outputs[middle:]
     last = controller_state(run.state, setup, 9).SerializeToString()
     assert controller_state(end, setup, 9).SerializeToString() == last
@@ -309,7 +304,7 @@ def check(
         {request.law.id: request.law for request in requests if request.law is not None},
         {request.played.id: request.played for request in requests if request.played is not None},
     )
-    end, sent = replayed(decoded, resumed, run, middle)
+    end, sent = replayed(decoded, resumed, run.inputs[middle:])
     assert sent == run.outputs[middle:]
     assert controller_state(end, decoded, 9).SerializeToString() == last
     return run
@@ -334,7 +329,9 @@ def test_random_inputs_are_handled_purely_and_within_the_limits(seeds: int) -> N
         requests: list[str] = rng.choice([*NAMES, *NAMES, "safe"], COMMANDS).tolist()
         pauses: list[int] = rng.choice([0, 1, 2, 5, 12], COMMANDS).tolist()
         delay_frames, on_frame_timeout = float(rng.choice([1.0, 1.5, 3.0])), str(rng.choice(["hold", "flat"]))
-        counts += check(requests, pauses, seed, delay_frames, bool(seed % 2), on_frame_timeout).counts
+        tight = TIGHT if seed % 2 else {}
+        setup = settings(delay_frames=delay_frames, on_frame_timeout=on_frame_timeout, **tight)
+        counts += check(setup, requests, pauses, seed).counts
     accepted = {name for name, good in counts if good}
     refused = {name for name, good in counts if not good}
     assert accepted == set(REQUESTS) - {"configuration"}
