@@ -40,11 +40,11 @@ def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pokes, "DELAY_FRAMES", 240)
 
 
+Action = Callable[[Any], object]
+
+
 def ignore(*_: object) -> None:
     pass
-
-
-Action = Callable[[Any], object]
 
 
 def calibrator_of(
@@ -61,8 +61,7 @@ def measure(loop: InProcessLoop, method: str, **options: Any) -> tuple[Calibrato
 
 
 def mode_of(loop: InProcessLoop) -> int:
-    state = loop.status().state
-    return state.mode
+    return loop.status().state.mode
 
 
 def calibrated(loop: InProcessLoop, method: str) -> tuple[Calibration, CalibrationData]:

@@ -30,8 +30,7 @@ from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import node_radii, reference, response
 from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate import align as calibrate_align
-from lowfc.programs.commissioning.calibrate import command, pokes
-from lowfc.programs.commissioning.calibrate import tasks as calibrate_commands
+from lowfc.programs.commissioning.calibrate import command, pokes, tasks
 from lowfc.programs.commissioning.calibrate.align import on_sensor, oriented
 from lowfc.programs.commissioning.calibrate.result import comparison
 from lowfc.programs.commissioning.calibrate.run import Calibrator
@@ -41,7 +40,10 @@ from tests.support.in_process_loop import BRIGHT, SMALL_MIRROR, InProcessLoop
 from tests.support.loops import json_of, lowfc, refusal
 
 CONFIG = BRIGHT | {"sensor.modes": 3}
+STATIC = CONFIG | {"disturbance.static_nm": {"4": 6.0}}
 RATE_HZ, DELAY_FRAMES = 250, 240
+ZERO_POINT = "4=20,7=-20"
+SILENT = Console(quiet=True)
 
 
 @pytest.fixture(autouse=True)
@@ -49,15 +51,10 @@ def _few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pokes, "DELAY_FRAMES", DELAY_FRAMES)
 
 
-STATIC = CONFIG | {"disturbance.static_nm": {"4": 6.0}}
-
-
 @pytest.fixture
 def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
     monkeypatch.chdir(tmp_path)
-    new_loop = InProcessLoop(load(None, CONFIG), world=load(None, STATIC))
-    connect(new_loop, monkeypatch)
-    return new_loop
+    return connected(InProcessLoop(load(None, CONFIG), world=load(None, STATIC)), monkeypatch)
 
 
 @pytest.fixture
@@ -65,14 +62,14 @@ def noiseless_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcess
     """The same without noise, so that a frame takes half the time, and with a slew limit that shrinks the pokes."""
     monkeypatch.chdir(tmp_path)
     config = load(None, CONFIG | {"control.max_identical_frames": 0, "safety.slew_nm": 5.0})
-    new_loop = InProcessLoop(config, world=load(None, STATIC | {"camera.noise": False}))
-    connect(new_loop, monkeypatch)
-    return new_loop
+    return connected(InProcessLoop(config, world=load(None, STATIC | {"camera.noise": False})), monkeypatch)
 
 
-def connect(loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (calibrate_commands, calibrate_align):
+def connected(loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
+    """The loop, to which the commands now connect."""
+    for module in (tasks, calibrate_align):
         monkeypatch.setattr(module, "Client", lambda run: loop)
+    return loop
 
 
 def toml(config: Configuration) -> str:
@@ -91,8 +88,7 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
 ) -> None:
     loop = noiseless_loop
     check = Calibrator.check
-    # For measuring the delay, before the first report of the time to go.
-    delay_measurement_frames = DELAY_FRAMES + 2 * 8
+    delay_measurement_frames = DELAY_FRAMES + 2 * 8  # before the first report of the time to go
     monkeypatch.setattr(Calibrator, "check", Mock(side_effect=KeyboardInterrupt))
     before = loop.calibration()
     words = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]
@@ -149,7 +145,7 @@ def test_a_calibration_in_closed_loop_is_loaded_and_the_loop_closed_again(
 
     result = SimpleNamespace(recommended=True, not_loaded=False)
     monkeypatch.setattr(Calibrator, "run", run)
-    monkeypatch.setattr(calibrate_commands, "finish_calibration", lambda *_: (new_calibration, result))
+    monkeypatch.setattr(tasks, "finish_calibration", lambda *_: (new_calibration, result))
     monkeypatch.setattr(loop, "load", load_calibration)
     monkeypatch.setattr(command, "print_result", lambda *_, **__: None)
     loop.close_loop()
@@ -184,8 +180,7 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
 ) -> None:
     """First with a faint star; then its image also moves before R is checked, which the verdict reports too."""
     monkeypatch.chdir(tmp_path)
-    loop = InProcessLoop(load(None, CONFIG | {"star.magnitude": 3.0}))
-    connect(loop, monkeypatch)
+    loop = connected(InProcessLoop(load(None, CONFIG | {"star.magnitude": 3.0})), monkeypatch)
     before = loop.calibration()
     words = ["--cycles", "4", "--snr", "200", "--out", "night.fits", "--load"]
     done = lowfc("calibrate", *words, "--json")
@@ -285,8 +280,7 @@ def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
     np.save("cube.npy", cube + 0.03 * loop.calibration().flux_dn * loop.calibration().reference.reshape(80, 80))
     error = refusal("calibrate", "dark", "--file", "cube.npy", kind=CalibrationError)
     assert re.search(r"3\.\d% of the star's light is in them", error)
-    dark = InProcessLoop(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
-    connect(dark, monkeypatch)
+    connected(InProcessLoop(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0})), monkeypatch)
     result = json_of("calibrate", "dark", "--star-blocked", "--frames", "50", "--out", "night.fits")
     assert result["dark_dn"] == pytest.approx(100, abs=0.5)
     assert result["hot"] < 5
@@ -328,7 +322,7 @@ def test_a_poke_resolves_the_rotation_by_180_degrees(noiseless_loop: InProcessLo
 
 
 def test_no_calibration_is_aligned_to_a_turned_mirror(loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A poke of tip is one of tilt, whose image has no correlation with the computed one: its sign says nothing."""
+    """A poke of tip is one of tilt: its image has no correlation with the computed one, so the sign says nothing."""
     play = loop.play
 
     def turned(basis_nm: Any, table: Any) -> Any:
@@ -345,13 +339,13 @@ def test_no_calibration_is_aligned_to_a_turned_mirror(loop: InProcessLoop, monke
 def test_pokes_resolve_a_reflection_or_rotation_that_does_not_change_the_image(
     geometry: Geometry, pupil: dict[str, Any]
 ) -> None:
-    """Without a mask, the image is symmetric about both axes through the symmetric pupil, circular through a circle."""
+    """Without a mask, the image of a circular pupil is circular, that of the other pupil symmetric about both axes."""
     config = load(None, SMALL_MIRROR | {"sensor.kind": "clowfs", "sensor.modes": 3} | pupil)
     computed = analytic(config, SILENT)
     image = computed.reference.astype(float).reshape(80, 80)
     alignment = align(onto(image, geometry, (80, 80)), image)
     H = onto(computed.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
-    alignment = replace(alignment, residual=0.1, other_parity=0.2)  # of the better parity, which may be the wrong one
+    alignment = replace(alignment, residual=0.1, other_parity=0.2)  # the better parity may be the wrong one
     found, calibration, correlation = oriented(config, computed, alignment, 1e5, computed, lambda mode: H[:, mode])
     assert (found.geometry.rotation_deg, found.geometry.parity) == (pytest.approx(-168, abs=0.1), geometry.parity)
     assert found.residual == (0.1 if alignment.geometry.parity == geometry.parity else 0.2)
@@ -470,10 +464,6 @@ def test_two_calibrations_are_compared_on_the_pixels_that_are_good_in_both() -> 
         assert sorted(found.bad_pixels) == [0, 5]
     with pytest.raises(CalibrationError, match="good in both: the reference image has no light"):
         comparison(second, replace(first, good=single(1 - good)))
-
-
-ZERO_POINT = "4=20,7=-20"
-SILENT = Console(quiet=True)
 
 
 @pytest.fixture(scope="module")

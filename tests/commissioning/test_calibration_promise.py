@@ -12,6 +12,7 @@ from lowfc.adapters.logs.parts import WholeLog
 from lowfc.client import Client, running
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import load
+from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import CalibrationError
 from lowfc.contract.messages import MIRROR_STATE, wire
 from lowfc.control.calibration.calibration import normalise_flux
@@ -75,9 +76,7 @@ def outcome(method: str, preset: str, seed: int, snr: float, folder: Path, modes
         data = calibrator.run()
         calibration, _ = measured_calibration(config, before, data.measured, request)
         check = calibrator.check(calibration, data)
-    computed = computed_noise_nm(config, calibration, before)
-    assert computed is not None
-    ratio = factory.frame_noise_nm(config, calibration) / computed
+    ratio = factory.frame_noise_nm(config, calibration) / computed_noise_nm(config, calibration, before)
     verdict = judge(snr, data.measured.cycles, data.measured.error, check, ratio, calibration.noll)
     H = true_response(loop, first, closed=method == "in-loop")
     return Outcome(cross_talk(calibration.reconstructor, H), ratio, verdict)
@@ -159,7 +158,7 @@ def test_calibrations_over_the_bus_have_the_requested_accuracy(method: str, pres
     try:
         until(running)
         with Client() as client:
-            until(lambda: client.status().frame_sequence & 0xFFFFFFFF > 200)
+            until(lambda: count_of(client.status().frame_sequence) > 200)
             begun = client.status().frame_sequence
         calibrated = run(tmp_path, "calibrate", "--method", method, "--snr", "30", timeout_s=240)
     finally:

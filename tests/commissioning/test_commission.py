@@ -255,10 +255,10 @@ def test_a_resumed_commissioning_continues_and_reports_an_operator_who_opens_the
             raise KeyboardInterrupt
         return ask(name, **fields)
 
-    bench.loop.ask = interrupted  # type: ignore[method-assign]
+    bench.loop.ask = interrupted
     with pytest.raises(KeyboardInterrupt):
         bench.commission()
-    bench.loop.ask = ask  # type: ignore[method-assign]
+    bench.loop.ask = ask
     bench.loop.ask("release", lease_id=1)
     assert provisional_path(bench.out).exists()
     assert "without a verdict" in bench.shown
@@ -325,7 +325,7 @@ def test_the_operator_is_asked_to_block_and_unblock_the_star(tmp_path: Path) -> 
 
 
 def test_a_hot_pixel_at_full_well_is_not_the_star() -> None:
-    camera, frames = camera_settings(configured(CONFIG)), np.full((16, 80, 80), 200)
+    camera, frames = camera_settings(configured_camera(CONFIG)), np.full((16, 80, 80), 200)
     frames[:, 0, 0] = camera.saturation_dn
     sensor = Sensor(camera, np.full(6400, 100.0), (np.arange(6400) > 0).astype(float), measured=False)
     assert calibration_with_reference(sensor, frames, computed(CONFIG.to_toml()), str).flux_dn == 6399 * 100
@@ -351,12 +351,12 @@ def test_commissioning_is_refused_in_safe_mode(tmp_path: Path) -> None:
         bench.commission()
 
 
-def configured(config: Configuration) -> wire.CameraState:
+def configured_camera(config: Configuration) -> wire.CameraState:
     return camera_state(CameraSettings.configured(config, 80, 80), 1)
 
 
 def changed(**fields: float) -> wire.CameraState:
-    state = configured(Configuration())
+    state = configured_camera(Configuration())
     for name, value in fields.items():
         setattr(state, name, value)
     return state
@@ -372,14 +372,14 @@ def faults(config: Configuration, state: wire.CameraState) -> dict[str, Status]:
 @pytest.mark.parametrize("bits", [12, 16])
 def test_the_simulated_camera_agrees_with_its_configuration(em_gain: float, bits: int) -> None:
     config = Configuration(camera=Camera(em_gain=em_gain, bit_depth=bits, full_well_e=2_000.0))
-    assert faults(config, configured(config)) == {}
+    assert faults(config, configured_camera(config)) == {}
 
 
 @pytest.mark.parametrize("agreement", AGREEMENTS, ids=lambda agreement: agreement.field)
 def test_a_difference_of_camera_and_configuration_is_found(agreement: Agreement) -> None:
-    field, needed = agreement.field, agreement.needed
+    field = agreement.field
     statuses = faults(Configuration(), changed(**{field: getattr(changed(), field) * 2}))
-    assert statuses[field] is (Status.WRONG if needed else Status.WARNING)
+    assert statuses[field] is (Status.WRONG if agreement.needed else Status.WARNING)
 
 
 def test_an_existing_calibration_is_replaced_only_with_force(own_runtime: Path) -> None:
@@ -398,10 +398,10 @@ def test_an_existing_calibration_is_replaced_only_with_force(own_runtime: Path) 
 def test_frame_age_and_timeout_follow_the_rate(rate_hz: float, age_ms: float, timeout_ms: float) -> None:
     config = Configuration(camera=Camera(rate_hz=rate_hz))
     assert (config.max_frame_age_ns, config.frame_timeout_ns) == (age_ms * 1e6, timeout_ms * 1e6)
-    assert "control.frame_timeout_ms" not in faults(config, configured(config))
+    assert "control.frame_timeout_ms" not in faults(config, configured_camera(config))
 
 
 def test_configured_times_apply_and_are_checked() -> None:
     config = Configuration(camera=Camera(rate_hz=20.0), control=Control(max_frame_age_ms=7.0, frame_timeout_ms=50.0))
     assert (config.max_frame_age_ns, config.frame_timeout_ns) == (7_000_000, 50_000_000)
-    assert faults(config, configured(config)) == {"control.frame_timeout_ms": Status.WRONG}
+    assert faults(config, configured_camera(config)) == {"control.frame_timeout_ms": Status.WRONG}

@@ -71,7 +71,7 @@ class Device:
 
     def __init__(self, **changes: Any) -> None:
         self.clock = FakeClock()
-        self.clock.time_ns += 3600 * 1_000_000_000  # some time after the start of the publishers
+        self.clock.advance(3600 * 1_000_000_000)  # some time after the start of the publishers
         self.now_ns = self.clock.now_ns
         self.changes = changes
         self.counts: Counter[str] = Counter()

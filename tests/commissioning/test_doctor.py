@@ -210,7 +210,7 @@ def test_each_property_of_a_host_has_its_status_and_text(
     others = {key: changes[key] for key in ("trial", "config", "busy") if key in changes}
     check = examine(facts(tmp_path, {key: changes[key] for key in changes.keys() - others.keys()}, **others))[name]
     assert (check.status, text in " ".join([check.got, check.advice, check.cost])) == (status, True), check
-    assert (status == "warning") <= bool(check.advice and check.cost)
+    assert status != "warning" or (check.advice and check.cost)
 
 
 def test_unreadable_data_gives_a_note(tmp_path: Path) -> None:
@@ -321,7 +321,6 @@ print(*trial.refused["priority"], *trial.refused["lock_memory"], len(trial.norma
 
 def test_a_trial_ends_after_an_interrupt() -> None:
     with subprocess.Popen([*LOWFC, "doctor"], stderr=subprocess.PIPE, text=True, start_new_session=True) as doctor:
-        assert doctor.stderr is not None
         assert "measuring" in doctor.stderr.readline()
         until(lambda: any(child.cpu_times().user > 0.1 for child in psutil.Process(doctor.pid).children()))
         os.killpg(doctor.pid, signal.SIGINT)  # as a terminal does

@@ -24,10 +24,12 @@ from lowfc.control.loop.state import State
 from lowfc.programs.core.start_up import StartUp, check_files
 from sim_camera.driver import scene
 from tests.support.loops import run
+from tests.support.toy import feed
 from tools.law_bench import calibrated
 
 GRID = (34, 34)
 QUIET = {"disturbance.preset": "quiet", "star.magnitude": -2.0}
+PERMIT = Request(0, "permit", values=(5.0,), text="moving the mask", lease_id=7)
 
 
 @pytest.fixture(scope="module")
@@ -148,8 +150,7 @@ def test_inactive_actuators_get_no_command_and_modes_and_actuators_stay_inverse(
     assert not computed.modes_to_actuators[dead].any()
     assert not computed.actuators_to_modes[:, dead].any()
     assert np.abs(calibration.modes_to_actuators[dead]).max() > 0.01
-    response = computed.actuators_to_modes @ computed.modes_to_actuators
-    assert np.abs(response - np.eye(14)).max() < 1e-4
+    assert np.abs(computed.actuators_to_modes @ computed.modes_to_actuators - np.eye(14)).max() < 1e-4
     without_map = calibration.modes_to_actuators.copy()
     without_map[dead] = 0
     error = np.abs(computed.actuators_to_modes @ without_map - np.eye(14)).max()
@@ -175,9 +176,8 @@ def test_a_registration_error_affects_the_mirror_but_not_the_computed_calibratio
 def started(config: Configuration, calibration: Calibration, shape: MirrorShape | None) -> tuple[State, list[Request]]:
     """Start a controller: load the calibration, report the mirror, carry out the configured requests; all accepted."""
     settings = factory.settings(config)
-    state, _ = advance(settings, State(), Load(0, calibration, "test"))
-    if shape is not None:
-        state, _ = advance(settings, state, shape)
+    reported = () if shape is None else (shape,)
+    state, _ = feed(settings, State(), Load(0, calibration, "test"), *reported)
     requests = StartUp(config).requests(state, 0)
     for request in requests:
         assert request.requester == "the configuration"
@@ -213,11 +213,10 @@ def test_the_flat_map_is_applied_at_the_start(tmp_path: Path, calibration: Calib
 def test_the_flat_map_is_applied_during_a_permit_from_before_the_mirror_was_known(
     tmp_path: Path, calibration: Calibration, age_s: int
 ) -> None:
-    """The controller ended, as the refused request left the loop without the configured flat map."""
+    """If the request were refused, the controller would end: the loop would be without its configured flat map."""
     config = load(None, {"mirror.flat": saved(tmp_path, "flat.npy", wavy(120.0))})
     settings = factory.settings(config)
-    state, _ = advance(settings, State(), Load(0, calibration, "test"))
-    state, _ = advance(settings, state, Request(0, "permit", values=(5.0,), text="moving the mask", lease_id=7))
+    state, _ = feed(settings, State(), Load(0, calibration, "test"), PERMIT)
     (request,) = StartUp(config).requests(state, age_s * 10**9)
     assert advance(settings, state, request)[1].reply.accepted
 
@@ -228,12 +227,10 @@ def test_a_permit_holds_the_flat_map_of_a_closed_loop_whose_mirror_reports_late(
     keys = FIXED_GAINS | {"mirror.flat": saved(tmp_path, "flat.npy", wavy(120.0)), "control.start_mode": "closed"}
     config, flat = load(None, keys), np.zeros(GRID, np.float32)
     settings = factory.settings(config)
-    state, _ = advance(settings, State(), Load(0, calibration, "test"))
-    permit = Request(0, "permit", values=(5.0,), text="moving the mask", lease_id=7)
-    for input_ in (permit, MirrorShape(1, flat, np.zeros(0, np.float32))):
-        state, _ = advance(settings, state, input_)
-    for input_ in (*StartUp(config).requests(state, 2), Frame(1, 3, 0, None), Frame(2, 4, 0, None)):
-        state, outputs = advance(settings, state, input_)
+    shape = MirrorShape(1, flat, np.zeros(0, np.float32))
+    state, _ = feed(settings, State(), Load(0, calibration, "test"), PERMIT, shape)
+    requests = StartUp(config).requests(state, 2)
+    state, (*_, outputs) = feed(settings, state, *requests, Frame(1, 3, 0, None), Frame(2, 4, 0, None))
     assert (state.mode, outputs.step.reasons) == (LoopMode.CLOSED, (Rejection.HELD,))
     np.testing.assert_array_equal(outputs.command.actuators_nm, flat)
     state, _ = advance(settings, state, Request(5, "release", lease_id=7))

@@ -92,7 +92,6 @@ def test_the_true_residual_over_all_time_is_read_from_the_log(tmp_path: Path) ->
     night.request("close").frames(2100)
     del night.samples[night.places(TRUTH)[1200]]  # a lost one
     run = telemetry_from_log(LogReader(night.write(tmp_path / "night.mcap")))
-    assert run.true_nm2 is not None
     np.testing.assert_allclose(run.continuous_rms_nm, 2 * np.sqrt(np.diag(run.true_nm2)), rtol=1e-5)
 
 
@@ -178,7 +177,7 @@ def test_a_loop_that_was_closed_for_just_enough_frames_and_then_opened_is_tuned_
 
 
 def test_a_weighted_reconstructor_is_reported(tmp_path: Path) -> None:
-    """Gains for the modes that it does not correct would make it another one, with more noise."""
+    """A gain for a mode that it does not correct would replace it by one with more noise."""
     night = SyntheticLog().request("close").frames(2700)
     night.change(CONTROLLER_STATE, -1, lambda state: state.prior_nm2.extend([0, 0, 4]))
     warnings = json_of("tune", night.write(tmp_path / "night.mcap"))["warnings"]
@@ -206,7 +205,7 @@ def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
     assert result["modes"][0]["achieved_nm"] is None
     assert result["warnings"] == []
     run = telemetry_from_log(LogReader(path))
-    larger = replace(run, nm_per_mas=run.nm_per_mas / 10)  # type: ignore[operator]
+    larger = replace(run, nm_per_mas=run.nm_per_mas / 10)
     warned = result_of(larger, *tuned(larger, "integrator"), "integrator").text()
     assert "above 10: the optical gain of the sensor is low" in warned
 
