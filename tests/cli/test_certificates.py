@@ -44,7 +44,7 @@ def handshake(server: Path, client: Path, role: str, name: str = "localhost") ->
                 end.do_handshake()
             except ssl.SSLWantReadError:
                 continue
-    assert ends[0].getpeercert()["subject"] == ((("commonName", role),),)  # type: ignore[index]
+    assert ends[0].getpeercert()["subject"] == ((("commonName", role),),)
 
 
 def test_router_and_roles_of_one_authority_accept_each_other(tmp_path: Path) -> None:
