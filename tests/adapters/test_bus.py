@@ -95,7 +95,7 @@ def test_a_query_returns_the_last_message_with_its_envelope(pair: tuple[Bus, Bus
     body = bytes(range(256)) * 12_000  # 3 MB, as a large calibration
     envelope = calibrations.put(body)
     frames.put(b"frame")
-    until(lambda: bool(late.get(CALIBRATION.key)))
+    until(lambda: late.get(CALIBRATION.key))
     (answer,) = late.get(CALIBRATION.key, timeout_s=PATIENCE_S)
     assert (answer.key, answer.payload) == (CALIBRATION.key, body)
     assert (answer.sequence, answer.publish_time_ns) == (envelope.sequence, envelope.publish_time_ns)
@@ -118,7 +118,7 @@ def test_a_query_may_be_answered_later_from_another_thread(pair: tuple[Bus, Bus]
 
     asker = threading.Thread(target=ask)
     asker.start()
-    until(lambda: bool(waiting))
+    until(lambda: waiting)
     assert (waiting[0].name, waiting[0].payload) == ("gain", b"0.5")
     waiting[0].reply(b"done")
     asker.join(PATIENCE_S)

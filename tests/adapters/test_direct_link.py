@@ -126,7 +126,7 @@ class ReaderOnTwoPaths:
     def __init__(self, path: Path, *, shared: bool = False) -> None:
         self.delivered: list[int] = []
         self.unsubscribed = 0
-        self.reader = direct_link.DirectReader(
+        self.direct = direct_link.DirectReader(
             path,
             FRAME.key,
             lambda sample: self.delivered.append(sample.sequence),
@@ -143,23 +143,23 @@ class ReaderOnTwoPaths:
         return leave
 
     def by_socket(self, sequence: int, time_ns: int) -> None:
-        self.reader.take(Envelope(sequence, time_ns).encode(), b"", 1)
+        self.direct.take(Envelope(sequence, time_ns).encode(), b"", 1)
 
     def by_bus(self, sequence: int, time_ns: int) -> None:
-        self.reader._by_bus(Sample(FRAME.key, b"", sequence, time_ns, 1))
+        self.direct._by_bus(Sample(FRAME.key, b"", sequence, time_ns, 1))
 
 
 @pytest.fixture
 def reader(tmp_path: Path) -> Iterator[ReaderOnTwoPaths]:
     on_two_paths = ReaderOnTwoPaths(tmp_path / "socket")
     yield on_two_paths
-    on_two_paths.reader.close()
+    on_two_paths.direct.close()
 
 
 def test_a_message_in_transit_during_the_switch_is_delivered_once(reader: ReaderOnTwoPaths) -> None:
     reader.by_socket(1, 1)
     reader.by_bus(1, 1)
-    reader.reader._leave_bus()
+    reader.direct._leave_bus()
     assert reader.unsubscribed == 1
     reader.by_bus(2, 2)
     reader.by_socket(2, 2)
@@ -167,8 +167,8 @@ def test_a_message_in_transit_during_the_switch_is_delivered_once(reader: Reader
 
 
 def test_a_reader_is_closed_although_a_handler_never_returns(reader: ReaderOnTwoPaths) -> None:
-    reader.reader._turn.acquire()  # as held while a handler runs
-    closing = threading.Thread(target=reader.reader.close, daemon=True)
+    reader.direct._turn.acquire()  # as held while a handler runs
+    closing = threading.Thread(target=reader.direct.close, daemon=True)
     closing.start()
     closing.join(PATIENCE_S)
     assert not closing.is_alive()
@@ -182,7 +182,7 @@ def test_messages_that_a_publisher_repeats_or_reorders_are_delivered_as_they_wer
     reader.by_socket(10, 1)
     if direct_only:
         reader.by_bus(10, 1)
-        reader.reader._leave_bus()
+        reader.direct._leave_bus()
     for time_ns, sequence in enumerate((12, 11, 11, 3), start=2):
         reader.by_socket(sequence, time_ns)
         if not direct_only:
@@ -333,7 +333,7 @@ def test_after_a_stall_with_the_bus_ahead_nothing_is_delivered_twice(tmp_path: P
         reader.by_bus(sequence_of(5, count), count)
     for count in range(commands + 1):
         reader.by_socket(sequence_of(5, count), count)
-    reader.reader.close()
+    reader.direct.close()
     assert reader.delivered == [sequence_of(5, count) for count in range(commands + 1)]
 
 

@@ -242,7 +242,7 @@ def test_a_latch_is_kept_in_one_place_while_the_other_is_missing_and_written_the
     files[0].parent.touch()  # a file where the run's directory was
     latch.set(True)
     until(files[1].exists)
-    until(lambda: bool(reported))
+    until(lambda: reported)
     assert str(files[0]) in reported[0]
     latch.set(False)
     until(lambda: not files[1].exists())

@@ -737,7 +737,7 @@ def test_a_log_that_cannot_be_created_is_refused_and_can_be_requested_again(
     moved.rename(bench.folder)
     assert operator.record(True).text != first
     shutil.rmtree(bench.folder)  # a recording that failed can be followed by another
-    until(lambda: bool(bench.camera.last_health["recorder"].recording.failure))
+    until(lambda: bench.camera.last_health["recorder"].recording.failure)
     third = operator.record(True).text
     summary = bench.stop()
     assert (len(summary.files), str(summary.files[-1].absolute())) == (3, third)

@@ -226,13 +226,21 @@ def test_a_note_announces_the_probe_sequences_of_a_test_in_a_log() -> None:
     assert _announced(requests, "linearity") == []
 
 
+OPEN, CLOSED = (f'acceptance {{"test": "noise-floor", "loop": "{loop}", "frames": 50}}' for loop in ("open", "closed"))
+"""Notes that announce a noise-floor test in a log."""
+
+
+def responses_in(log: Path) -> list[ProbeResponse]:
+    """Responses of the noise-floor tests in a log."""
+    return logged_responses(read_history(LogReader(log)), noise.KIND)
+
+
 @pytest.mark.parametrize("name", ["reset", "stop"])
 def test_a_request_disturbs_a_measurement_unless_a_limit_ended_it_before(name: str, tmp_path: Path) -> None:
     def logged(limit_nm: float) -> list[ProbeResponse]:
         night = SyntheticLog(limit_nm=(limit_nm, limit_nm)).request("close").frames(20)
-        night.request("note", text='acceptance {"test": "noise-floor", "loop": "closed", "frames": 50}')
-        log = night.frames(20).request(name).frames(50).write(tmp_path / f"{limit_nm:g}.mcap")
-        return logged_responses(read_history(LogReader(log)), noise.KIND)
+        night.request("note", text=CLOSED).frames(20).request(name).frames(50)
+        return responses_in(night.write(tmp_path / f"{limit_nm:g}.mcap"))
 
     with pytest.raises(DataFileError, match=f"request '{name}' disturbed the measurement"):
         logged(1e3)
@@ -241,27 +249,23 @@ def test_a_request_disturbs_a_measurement_unless_a_limit_ended_it_before(name: s
 
 
 def test_a_disturbed_test_that_was_repeated_does_not_count(tmp_path: Path) -> None:
-    night, text = SyntheticLog(), 'acceptance {"test": "noise-floor", "loop": "open", "frames": 50}'
-    log = night.frames(20).request("note", text=text).frames(20).request("reset").request("note", text=text).frames(60)
-    assert len(logged_responses(read_history(LogReader(log.write(tmp_path / "night.mcap"))), noise.KIND)) == 1
+    night = SyntheticLog().frames(20).request("note", text=OPEN).frames(20).request("reset")
+    log = night.request("note", text=OPEN).frames(60).write(tmp_path / "night.mcap")
+    assert len(responses_in(log)) == 1
 
 
 def test_a_log_that_ends_within_a_test_is_refused_with_what_is_missing(tmp_path: Path) -> None:
-    night = SyntheticLog().frames(20)
-    night.request("note", text='acceptance {"test": "noise-floor", "loop": "closed", "frames": 50}')
-    log = night.frames(40).write(tmp_path / "night.mcap")
+    log = SyntheticLog().frames(20).request("note", text=CLOSED).frames(40).write(tmp_path / "night.mcap")
     cut = r"ends 10 of 50 frames before the end of a measurement \(noise-floor, loop closed\): give all files"
     with pytest.raises(DataFileError, match=cut):
-        logged_responses(read_history(LogReader(log)), noise.KIND)
+        responses_in(log)
 
 
 def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_of_its_time(tmp_path: Path) -> None:
-    night = SyntheticLog().frames(20)
-    night.request("note", text='acceptance {"test": "noise-floor", "loop": "open", "frames": 50}').frames(60)
-    night.request("gain", (0.1,)).request("safe").request("clear").load(
-        identified(replace(TOY_CALIBRATION, flux_dn=1.0))
-    )
-    (response,) = logged_responses(read_history(LogReader(night.frames(5).write(tmp_path / "night.mcap"))), noise.KIND)
+    night = SyntheticLog().frames(20).request("note", text=OPEN).frames(60)
+    night.request("gain", (0.1,)).request("safe").request("clear")
+    night.load(identified(replace(TOY_CALIBRATION, flux_dn=1.0)))
+    (response,) = responses_in(night.frames(5).write(tmp_path / "night.mcap"))
     assert (response.loop.law.gain[0], response.loop.calibration.id) == (np.float32(0.4), TOY_CALIBRATION.id)
 
 

@@ -429,7 +429,7 @@ def test_an_option_without_effect_is_refused(loop: InProcessLoop, words: str, wh
     assert {path.name for path in Path().iterdir()} == before
 
 
-def test_fewer_cycles_than_their_scatter_needs_are_refused() -> None:
+def test_too_few_cycles_for_their_scatter_are_refused() -> None:
     assert "--cycles" in lowfc("calibrate", "--cycles", "3").stderr
 
 

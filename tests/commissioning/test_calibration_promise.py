@@ -55,7 +55,8 @@ def true_response(loop: InProcessLoop, first: int, *, closed: bool) -> np.ndarra
         [wavefront_nm(mirror, each.reshape(before.grid)) for each in before.modes_to_actuators.T], dtype=np.float64
     )
     good, responses = before.good.astype(np.float64), []
-    for opd_nm in (np.asarray(static_nm + each, dtype=np.float64) for each in moving_nm):
+    for each in moving_nm:
+        opd_nm = np.asarray(static_nm + each, dtype=np.float64)
         light = reference(optics, opd_nm).reshape(-1)
         responses.append(normalise_flux(light, response(optics, shapes, opd_nm), good)[1])
     return np.mean(responses, axis=0)

@@ -27,13 +27,13 @@ from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import Settings, State
 from tests.support.theory import linear, one_piece
-from tests.support.toy import NOLL, calibration, frame, loaded, run_toy, settings
+from tests.support.toy import NOLL, calibration, frame, frame_sequence, loaded, run_toy, settings
 
 RATE_HZ = 500.0
 
 
 def sequences(count: int, start: int = 1_700_000_000) -> np.ndarray:
-    return (np.uint64(start) << np.uint64(32)) + np.arange(count, dtype=np.uint64)
+    return frame_sequence(0, start) + np.arange(count, dtype=np.uint64)
 
 
 def test_the_power_of_white_noise_equals_its_variance() -> None:

@@ -3,16 +3,15 @@
 import numpy as np
 
 from lowfc.control.laws.integrator import Integrator, integrate
-from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.virtual import VirtualIntegrators
 
 
 def test_each_row_equals_a_loop_with_its_gain() -> None:
     rng = np.random.default_rng(1)
-    weights = tuple((lag, weight) for lag, weight in enumerate(delay_weights(1.5).astype(np.float32)) if weight)
+    half = np.float32(0.5)  # of each of two commands: a delay of 1.5 frames
     gain = np.array([[0, 0], [0.1, 0.4], [0.3, 0.2]], np.float32)
     leak, limit = np.array([0, 0.01], np.float32), np.array([2.0, 100], np.float32)
-    rows = VirtualIntegrators.at_rest(gain, 1 - leak, limit, weights)
+    rows = VirtualIntegrators.at_rest(gain, 1 - leak, limit, ((0, half), (1, half)))
     laws, commands = [Integrator(row, leak, limit) for row in gain], [[np.zeros(2, np.float32)] * 2 for _ in gain]
     for frame in range(200):
         if frame % 50 == 7:  # missing: the command is held
@@ -23,7 +22,7 @@ def test_each_row_equals_a_loop_with_its_gain() -> None:
         rows, errors = rows.advanced(pol)
         for row, law in enumerate(laws):
             newest, older = commands[row]
-            error = pol + np.float32(0.5) * newest + np.float32(0.5) * older
+            error = pol + half * newest + half * older
             np.testing.assert_allclose(errors[row], error, atol=1e-4)
             commands[row] = [integrate(law, newest, error)[0], newest]
         np.testing.assert_allclose(rows.history_nm[0], [newest for newest, _ in commands], atol=1e-4)
