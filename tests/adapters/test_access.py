@@ -51,12 +51,7 @@ def test_publish_and_receive_rights_follow_the_table_of_topics(topic: Topic) -> 
 
 
 def _covers(patterns: tuple[str, ...], key: str) -> bool:
-    parts = key.split("/")
-    return any(
-        len(words := pattern.split("/")) == len(parts)
-        and all(word in ("*", part) for word, part in zip(words, parts, strict=True))
-        for pattern in patterns
-    )
+    return any(zenoh.KeyExpr(pattern).includes(zenoh.KeyExpr(key)) for pattern in patterns)
 
 
 def test_processes_publish_under_their_own_names_and_only_operators_send_requests() -> None:

@@ -281,25 +281,28 @@ def test_the_latch_of_a_launchers_run_is_in_its_directory_only(tmp_path: Path, m
     assert latch_files(launched) == (tmp_path / "launched" / "safe",)
 
 
-def test_a_failed_write_leaves_the_old_file_only(tmp_path: Path, monkeypatch) -> None:
-    path = tmp_path / "file"
-    for content in (b"former", b"first"):
-        write_whole(path, content)
-    os.mkfifo(tmp_path / "pipe")
-    wrong = [(special, "not a regular file") for special in (tmp_path / "pipe", Path(), Path("/"), tmp_path)]
-    unwritable = Path("/proc/calibration.fits"), "No such file"  # for root too
-    for file, why in (*wrong, (tmp_path / ("x" * 300), "File name too long"), unwritable):
+def test_a_file_that_cannot_be_written_is_an_error_before_and_at_the_writing(tmp_path: Path) -> None:
+    pipe, loop = tmp_path / "pipe", tmp_path / "loop"
+    os.mkfifo(pipe)
+    loop.symlink_to("loop")
+    faults = dict.fromkeys((pipe, Path(), Path("/"), tmp_path), "not a regular file")
+    faults[tmp_path / ("x" * 300)] = "File name too long"
+    faults[Path("/proc/calibration.fits")] = "No such file"  # for root too
+    for file, why in faults.items():
         for write in (require_folder, partial(write_whole, content=b"")):
             with pytest.raises(DataFileError, match=f"^{file} cannot be written: {why}"):
                 write(file)
-    (tmp_path / "pipe").unlink()
-    (tmp_path / "loop").symlink_to("loop")
-    for allowed in (tmp_path / "loop", tmp_path / ("x" * 255)):
-        require_folder(path, allowed)
+    for allowed in (loop, tmp_path / ("x" * 255)):
+        require_folder(tmp_path / "file", allowed)
         write_whole(allowed, b"")
-        allowed.unlink()
     with pytest.raises(DataFileError, match="nowhere/file cannot be written: No such file"):
         write_whole(tmp_path / "nowhere" / "file", b"")
+
+
+def test_a_failed_write_leaves_the_old_file_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "file"
+    for content in (b"former", b"first"):
+        write_whole(path, content)
     monkeypatch.setattr(Path, "replace", FULL_DISK)
     with pytest.raises(DataFileError, match=r"file cannot be written: No space left on device"):
         write_whole(path, b"second")
