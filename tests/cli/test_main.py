@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 import click
@@ -25,18 +26,22 @@ def test_every_command_is_listed_under_its_heading_with_its_whole_description() 
             assert any(line.split(maxsplit=1) == [row.name, row.description] for line in lines), row.name
 
 
+def contexts(context: click.Context) -> Iterator[click.Context]:
+    """The context of a command, and those of all commands below it."""
+    yield context
+    if hasattr(context.command, "list_commands"):
+        for name in context.command.list_commands(context):
+            command = context.command.get_command(context, name)
+            yield from contexts(click.Context(command, parent=context, info_name=name))
+
+
 def test_every_help_page_has_an_example_whole_descriptions_and_no_colloquial_verbs() -> None:
-    pages, context = [], click.Context(typer.main.get_command(app))
-    pending = [(context.command, context)]
-    for command, parent_context in pending:
-        own_context = click.Context(command, parent=parent_context, info_name=command.name)
-        page = command.get_help(own_context)
+    pages = []
+    for context in contexts(click.Context(typer.main.get_command(app), info_name="lowfc")):
+        page = context.command.get_help(context)
         pages.append(" ".join(page.split()))
         assert "Example: lowfc " in pages[-1]
         assert "..." not in page.partition("\nCommands:\n")[2]
-        if hasattr(command, "list_commands"):
-            commands = (command.get_command(own_context, name) for name in command.list_commands(own_context))
-            pending.extend((each, own_context) for each in commands if each is not None)
     assert len(pages) > 70
     colloquial = r"\b(?:told|tells?|hears?|listen to|lies to|nobody can|last words)\b.*"
     assert re.findall(colloquial, "\n".join(pages)) == []
@@ -59,14 +64,8 @@ def test_a_run_named_before_the_request_is_the_run_of_every_command_of_ctl() -> 
     group: Any = typer.main.get_command(ctl_app)
     with group.make_context("ctl", ["--run", "other", "status"]) as context:
         context.invoke(group.callback, **context.params)
-    pending = [(context, group)]
-    runs: dict[str, str | None] = {}
-    for parent_context, parent in pending:
-        for name, command in parent.commands.items():
-            own_context = click.Context(command, parent=parent_context, info_name=name)
-            runs[own_context.command_path] = own_context.lookup_default("run")
-            if hasattr(command, "commands"):
-                pending.append((own_context, command))
+    _, *below = contexts(context)
+    runs = {each.command_path: each.lookup_default("run") for each in below}
     assert {"ctl bench", "ctl dark", "ctl safe", "ctl record stop"} <= runs.keys()
     assert [path for path, run in runs.items() if run != "other"] == []
 
