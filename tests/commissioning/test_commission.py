@@ -73,7 +73,7 @@ class Bench:
             if text.startswith(start):
                 action()
 
-    def steps(self, *, model: Configuration | None = None, **options: Any) -> Commissioning:
+    def commissioning(self, *, model: Configuration | None = None, **options: Any) -> Commissioning:
         defaults = {"dark": None, "no_dark": True, "frames": 100, "snr": None, "cycles": 4, "resume": False}
         return Commissioning(
             self.loop,
@@ -87,7 +87,7 @@ class Bench:
 
     def commission(self, **options: Any) -> dict[str, Any]:
         with self.loop.reserved("a test"):
-            results, _ = self.steps(**options).run()
+            results, _ = self.commissioning(**options).run()
         return results
 
     @property
@@ -152,7 +152,7 @@ def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench,
     bench, results = commissioned
     bench.loop.open_loop()
     before = bench.loop.status().state
-    text = bench.steps(close=False)._predict_and_close(1.0)
+    text = bench.commissioning(close=False)._predict_and_close(1.0)
     assert "predicted error with noise in closed loop, at a gain of 0.1 in place of automatic gains: " in text
     assert "`lowfc ctl close` closes the loop" in text
     after = bench.loop.status().state
@@ -161,7 +161,7 @@ def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench,
     assert results["predicted_error_nm"] < 0.7 * np.sqrt(np.square(open_nm).sum(axis=1).mean())
     bench.actions = {"observing": bench.loop.open_loop}
     with pytest.raises(CalibrationError, match="the loop went from closed to open"):
-        bench.steps()._measured_nm(10, 1, 1.0)
+        bench.commissioning()._measured_nm(10, 1, 1.0)
     bench.actions.clear()
     errors_nm = np.where(np.arange(2000) == 1500, np.nan, 1.0)[:, None]
     assert commissioning._rms_nm(errors_nm, 1000) == 1.0, "a refused frame does not end the measurement, also at 1 kHz"
@@ -177,10 +177,10 @@ def test_a_wrong_sign_fails_the_check_with_automatic_gains(
     R = good.reconstructor.copy()
     R[reversed_modes] *= -1
     bench.loop.load(identified(replace(good, reconstructor=R)))
-    steps = bench.steps()
+    attempt = bench.commissioning()
     with bench.loop.reserved("a test"), pytest.raises(CalibrationError, match=r"nm rms, but .* was predicted"):
-        steps._predict_and_close(1.0)
-    advice = steps._how_to_continue(None)
+        attempt._predict_and_close(1.0)
+    advice = attempt._how_to_continue(None)
     assert "is saved in" in advice
     assert "the closed loop did not behave as predicted: check the sign" in advice
     assert "`lowfc ctl reset` removes the loop's command from the mirror" in advice
@@ -197,11 +197,11 @@ def test_with_a_linear_law_its_own_residual_is_predicted(commissioned: tuple[Ben
     law = replace(LAWS["pi"], rate_hz=100.0)
     bench.loop.law(law)
     before = bench.loop.status().state
-    steps = bench.steps()
+    attempt = bench.commissioning()
     with bench.loop.reserved("a test"):
-        steps._predict_and_close(1.0)
-    assert steps._results["measured_error_nm"] == pytest.approx(steps._results["predicted_error_nm"], rel=0.15)
-    assert steps._results["predicted_error_nm"] < 0.9 * results["predicted_error_nm"]
+        attempt._predict_and_close(1.0)
+    assert attempt._results["measured_error_nm"] == pytest.approx(attempt._results["predicted_error_nm"], rel=0.15)
+    assert attempt._results["predicted_error_nm"] < 0.9 * results["predicted_error_nm"]
     after = bench.loop.status().state
     assert (after.law.id, after.gain, after.automatic) == (law.id, before.gain, before.automatic)
     bench.loop.open_loop()
@@ -215,7 +215,7 @@ def test_a_given_number_of_cycles_changes_only_the_default_signal_to_noise_ratio
     commissioned: tuple[Bench, dict[str, Any]], snr: float | None, cycles: int | None, required: float
 ) -> None:
     bench, _ = commissioned
-    request = bench.steps(snr=snr, cycles=cycles)._request()
+    request = bench.commissioning(snr=snr, cycles=cycles)._request()
     assert (request.snr, request.cycles) == (required, cycles)
 
 

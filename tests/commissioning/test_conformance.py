@@ -164,7 +164,8 @@ class Mirror(Device):
 
     def receive(self, payload: bytes, now_ns: int) -> None:
         self._received += 1
-        if self.changes.get("deaf") or self._received % self.changes.get("drops", self._received + 1) == 0:
+        period = self.changes.get("drops")
+        if self.changes.get("deaf") or (period and self._received % period == 0):
             return
         try:
             command = wire.MirrorCommand.FromString(payload)
