@@ -4,6 +4,7 @@ import dataclasses
 import errno
 import tracemalloc
 import zlib
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -108,20 +109,21 @@ def test_a_truncated_log_yields_its_complete_chunks(tmp_path: Path) -> None:
     assert len(set(counts)) > 3
 
 
-def crafted(path: Path, *records: McapRecord) -> Path:
-    """Write an unfinished file of these records."""
+def serialised(records: Iterable[McapRecord]) -> bytes:
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
-    path.write_bytes(MAGIC + builder.end())
+    return builder.end()
+
+
+def crafted(path: Path, *records: McapRecord) -> Path:
+    """Write an unfinished file of these records."""
+    path.write_bytes(MAGIC + serialised(records))
     return path
 
 
 def chunk(*records: McapRecord, **changes: Any) -> Chunk:
-    builder = RecordBuilder()
-    for record in records:
-        record.write(builder)
-    return packed(builder.end(), **changes)
+    return packed(serialised(records), **changes)
 
 
 def packed(content: bytes, **changes: Any) -> Chunk:
