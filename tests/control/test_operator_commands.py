@@ -218,7 +218,8 @@ def checked_advance(setup: Settings, state: State, input_: Input) -> tuple[State
     assert controller_state(state, setup, 0) == before
     if isinstance(input_, Frame):
         assert outputs.step is not None
-        assert (outputs.command is None) == (after.loop is None)
+        assert (outputs.command is None) == (after.loop is None or not after.commanded)
+        assert after.commanded or after.loop is None or state.conditions.mirror_fault, "only a fault defers the first"
     if isinstance(input_, Request):
         assert outputs.reply.text
         assert outputs.reply.frame_sequence == state.frame_sequence + 1
