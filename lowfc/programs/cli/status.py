@@ -87,7 +87,7 @@ def json_object(
         "command_nm": command_nm,
         "command_rms_nm": float(np.linalg.norm(command_nm)),
         "offset_nm": list(state.offset_nm),
-        "offset_rms_nm": float(np.linalg.norm(state.offset_nm)),
+        "offset_rms_nm": float(np.linalg.norm(list(state.offset_nm))),
         "law": law,
         "gain": list(state.gain),
         "gain_automatic": list(state.automatic) or [False] * len(state.gain),
