@@ -153,9 +153,8 @@ def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) 
         processes = Client(run, bus=bus).processes()
     if not processes:
         raise BusError(f"no process of run {run!r} reports its health")
-    name = next(
-        (health.run_id for health in processes.values() if health.run_id), run
-    )  # a router's run has its own name
+    # If the router serves a run of another name, the processes report that name.
+    name = next((health.run_id for health in processes.values() if health.run_id), run)
     if links.network.router:
         if name == run:
             open_run(run, mirrors, network=settings.network)  # ctl and view now find it without the configuration
