@@ -97,7 +97,7 @@ class DirectReader:
     same second. The reader leaves the bus while the only publisher of a topic uses the socket; messages that arrive
     over the bus after a newer one from the socket are dropped as late. Those from the socket are in the publisher's
     order, and forwarded even if their sequences are not; once off the bus, the newest is forwarded again if repeated.
-    On a topic with several publishers the reader stays on the bus, and one that only the bus carried may be late.
+    With several publishers the reader stays on the bus, and a message that only the bus carried may follow a newer one.
     """
 
     def __init__(
