@@ -17,7 +17,7 @@ CHANNEL_RULE = "only a channel that exists is removed"
 CLOSE_RULE = "the loop is not closed while frames are refused, or on a camera that does not fit the calibration"
 CLEAR_RULE = "clear forgets the newest frame sequence"
 GAIN_RULE = "gain and leak of a mode are checked together, and only controlled modes have automatic gains"
-LOAD_RULE = "a calibration loaded in safe mode adopts no shape, one loaded during a probe sequence no shape of it"
+LOAD_RULE = "a calibration loaded in safe mode adopts no shape, one loaded during a probe sequence none of its shapes"
 
 _REQUEST_RULES = {
     **dict.fromkeys(("close", "step", "law"), CLOSE_RULE),
