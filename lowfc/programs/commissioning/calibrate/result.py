@@ -177,7 +177,7 @@ def result_of(
     """The result of a measured or computed calibration."""
     limit_nm = factory.settings(config).integrator(calibration.noll).limit_nm
     delay_frames = configured_delay(config)
-    optional: dict[str, Any] = {}
+    optional: dict[str, Any] = {"delay_error_frames": None, "cycles": None}  # set, so that --json always has them
     if data is not None:
         delay_frames, optional["delay_error_frames"] = data.delay[:2]
         optional["cycles"] = data.measured.cycles
