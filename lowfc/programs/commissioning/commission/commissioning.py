@@ -238,7 +238,9 @@ class Commissioning:
         delay = first_delay(player, self._config)
         self._announce("orientation and sign")
         first = aligned(player, self._config, self._computed, delay, self._results)
-        return poked(player, self._config, delay) if first is None else first, delay
+        if first is None:
+            first = poked(player, self._config, delay)
+        return first, delay
 
     def _predict_and_close(self, delay_frames: float) -> str:
         """Predict the residual; if requested, close the loop and compare."""

@@ -122,7 +122,7 @@ def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: f
             plan = _poke_cycle(modes, amplitude_nm, repetition)
             gains[level, repetition] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
     difference = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
-    variance = gains.var(axis=1, ddof=1).mean(axis=0)  # of a gain, and of the difference of the means of two each
+    variance = gains.var(axis=1, ddof=1).mean(axis=0)  # of a gain; that of the difference of two means of two is equal
     error = np.sqrt(np.maximum(variance, variance.mean()))
     worst = int((difference - _STANDARD_ERRORS * error).argmax())
     chosen_nm = default_nm / 2 if difference[worst] > MAX_NONLINEARITY + _STANDARD_ERRORS * error[worst] else default_nm
