@@ -49,7 +49,7 @@ class Estimator(NamedTuple):
         reference_nm = (R.astype(np.float64) @ I0).astype(np.float32)
         tables = Tables.of(kernel, calibration, reference_nm)
         rows, dark = aligned(np.vstack([R, calibration.good])), aligned(calibration.dark)
-        return cls(rows, reference_nm, dark, aligned(dark), kernel, tables)
+        return cls(rows, reference_nm, dark, scratch=aligned(dark), kernel=kernel, tables=tables)
 
     def estimate_fused(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
         """Estimate of a frame (pixels,) by the fused step; None if the frame needs the reference step."""
