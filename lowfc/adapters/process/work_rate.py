@@ -25,7 +25,7 @@ class WorkRate:
             past = (*self._known, self._last)
             usable = [it for it in past if work - it[1] >= UNITS and now_ns - it[0] >= WINDOW_NS]
             since_ns, done = usable[-1] if usable else self._known[0]
-            if not self._rate_hz:  # after a silence, measure from now on
+            if not self._rate_hz:  # at first and after a silence: measure from now on
                 self._known.clear()
             self._rate_hz = (work - done) * 1e9 / max(now_ns - since_ns, 1)
             self._known.append((now_ns, work))
