@@ -24,7 +24,8 @@ class Grant:
     """Rights of a role, the common name of a certificate, as lists of keys.
 
     A role publishes Health under its own name only; a mirror publishes, answers and receives under its name only. All
-    other keys have "*" in place of a name. `subscribed` and `queried` are the keys that others may use with this role.
+    other keys have "*" in place of a name: `subscribed` are those of this role to which others may subscribe, `queried`
+    those that they may query.
     """
 
     role: str

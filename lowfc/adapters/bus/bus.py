@@ -1,7 +1,7 @@
 """Interface of the message bus: publish, subscribe, answer, query.
 
 `ZenohBus` carries messages between processes, `MemoryBus` within one process, for tests. Handlers run on receive
-threads: a slow handler delays the next message of the same publisher, and may be called for another one meanwhile.
+threads: a slow handler delays the next message of the same publisher, and may be called for another's meanwhile.
 """
 
 import contextlib
