@@ -63,8 +63,8 @@ class Control(Section):
     start_mode: Literal["open", "closed"] = "open"
     """Loop mode once a calibration is loaded; sim-loop starts closed if the file does not set it."""
     delay_frames: float = Field(0.0, ge=0, le=10)
-    """Measured delay: frames from the frame that a command is computed from to the first frame exposed wholly with it;
-    0: camera.delay_frames. Twice the delay about halves the highest stable gain."""
+    """Measured delay in frames: a command computed from frame n first acts on the whole exposure of frame n + delay; 0:
+    camera.delay_frames. Twice the delay about halves the highest stable gain."""
     estimator: Literal["weighted", "pinv"] = "weighted"
     """Noise-weighted or plain pseudo-inverse of H."""
     nuisance: list[Literal["background", "shear"]] = Field(default_factory=list)
@@ -85,8 +85,8 @@ class Control(Section):
     limit_nm: ModalLimit = 50.0
     """Largest modal command of the other modes, wavefront rms."""
     max_frame_age_ms: Milliseconds = 0.0
-    """Age above which a frame is refused; 0: 20 ms or two frame periods, whichever is longer. A frame older than both
-    5 ms and three periods is refused in any case."""
+    """Age above which a frame is refused; 0: 20 ms or two frame periods, whichever is longer. A frame that is
+    older than both 5 ms and three periods on arrival is refused in any case."""
     frame_timeout_ms: Milliseconds = 0.0
     """Time without a frame after which an event is raised; 0: 50 ms or five frame periods, whichever is longer."""
     on_frame_timeout: Literal["hold", "flat"] = "hold"
@@ -94,8 +94,8 @@ class Control(Section):
     command_timeout_ms: float = Field(200.0, gt=0, le=1e9)
     """Time without a new command after which the mirror's last command expires; more than 2000 acts as 2000."""
     max_start_ahead_h: float = Field(24.0, ge=0, le=1e9)
-    """Hours by which a start time in the sequence of a camera or controller may be ahead of this host's clock; 0: no
-    limit, for a host whose clock is not set."""
+    """Hours by which the start time of a camera or controller may be ahead of this host's clock; 0: no limit, for a
+    host whose clock is not set."""
     min_flux_fraction: float = Field(0.2, ge=0, lt=1)
     """Fraction of the calibration's flux below which a frame is refused as dark."""
     max_saturated_pixels: int = Field(8, ge=0)

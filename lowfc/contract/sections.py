@@ -81,7 +81,8 @@ class SensorSection(Section):
     """Optics of the wavefront sensor and the coronagraph."""
 
     kind: Literal["sam", "clowfs", "zwfs", "bar", "open"] = "sam"
-    """Sparse aperture mask, coronagraphic low-order sensor, Zernike sensor, pupil with a bar, or open relay pupil."""
+    """sam: sparse aperture mask; clowfs: coronagraphic low-order sensor; zwfs: Zernike sensor; bar: relay pupil
+    with a bar; open: open relay pupil."""
     pupil: str = "shaped"
     """Coronagraph: the shaped pupil; circle for a classical Lyot, prolate for an apodised one; or FILE.npz."""
     focal_mask: Literal["disk", "bowtie"] = "disk"
@@ -175,7 +176,7 @@ class Camera(Section):
     nonuniformity: float = Field(0.0, ge=0, le=0.3)
     """Simulated camera: rms pixel response non-uniformity, a fraction; not included in an analytic calibration."""
     delay_frames: float = Field(1.0, ge=1, le=3)
-    """Delay: frames from the frame that a command is computed from to the first frame exposed wholly with it."""
+    """Delay in frames: a command computed from frame n first acts on the whole exposure of frame n + delay."""
     instants: int = Field(8, ge=1, le=64)
     """Simulated camera: instants of each period over which the true wavefront is averaged. With 1, wavefront and image
     are those at the start of the exposure, without blur."""

@@ -22,7 +22,7 @@ class Delay(NamedTuple):
     """Response to a poke.
 
     Attributes:
-        delay_frames: frames from the frame that a command is computed from to the first frame exposed wholly with it.
+        delay_frames: a command computed from frame n first acts on the whole exposure of frame n + delay_frames.
         error_frames: standard error of the delay.
         weights: (lags,) fraction of the response at each lag, in frames after the poke's own.
         response: (pixels,) image of the response to one unit of the poke, flux fractions.

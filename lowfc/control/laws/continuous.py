@@ -29,7 +29,7 @@ class Timing(NamedTuple):
     """When a loop exposes and moves its mirror, in frame periods.
 
     Attributes:
-        delay: from the frame that a command is computed from to the first frame exposed wholly with it.
+        delay: in frames; a command computed from frame n first acts on the whole exposure of frame n + delay.
         applied: from the start of an exposure until the command computed from it is in force.
         exposure: its length; 0 for an instant.
         held: time over which the residual counts, from `applied` on: a period, or 0 for that instant alone.
