@@ -151,7 +151,7 @@ LOG_COLUMNS = {
 RECORDER_COLUMNS = {
     "recorder at": "{offered_hz:.0f} Hz",
     "processor time": "{cpu_percent:.0f} %",
-    "times that of copying the payloads": "{ratio:.0f} x",
+    "relative to copying the payloads": "{ratio:.0f} x",
     "messages": "{messages_published}",
     "lost": "{messages_lost}",
     "longest time to write": "{longest_wait_ms:.0f} ms",
@@ -169,6 +169,7 @@ def render_logs(results: Results) -> str:
     rates = (rate | {"cpu_percent": 100 * rate["cpu_share"]} for rate in results["recording"]["rates"])
     return (
         f"{formatted_table(LOG_COLUMNS, logs)}\n{formatted_table(RECORDER_COLUMNS, rates)}\n"
-        "Replay speed is relative to real time. The recorder's processor time is of one processor, all its threads; "
-        "times to write and to flush are from a message's arrival until it is written, and until it survives a kill."
+        "Replay speed is relative to real time. The recorder's processor time is that of all its threads, as a "
+        "fraction of one processor; times to write and to flush are from a message's arrival until it is written, and "
+        "until it survives a kill."
     )
