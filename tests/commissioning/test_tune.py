@@ -149,7 +149,7 @@ def test_an_offset_does_not_belong_to_the_disturbance_at_a_measured_delay(tmp_pa
 
 
 def test_an_offset_or_a_channel_in_the_true_residual_is_reported(tmp_path: Path) -> None:
-    shaped = "an offset or channels were in force: achieved contains their shapes, theory does not"
+    shaped = "an offset or channels were in force: the achieved residual contains their shapes, theory does not"
     night = SyntheticLog().request("close").frames(100).request("offset", (0.0, 0.0, 20.0)).frames(2700)
     result = json_of("tune", night.write(tmp_path / "night.mcap"))
     assert result["modes"][2]["achieved_nm"] > 19

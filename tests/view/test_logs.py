@@ -270,7 +270,7 @@ def test_every_view_of_the_layout_has_data_and_the_plots_span_the_whole_log(tmp_
     ranges = [str(view.properties["TimeAxis"]) for view in operator if isinstance(view, rrb.TimeSeriesView)]
     assert len(ranges) > 4
     assert all(str(end_ns) in one for one in ranges)
-    assert not {sensor.FRAME, mirror.COMMAND, pointing.TRAIL} & {str(view.origin) for view in operator}
+    assert not {sensor.FRAME, mirror.ACTUATORS, pointing.TRAIL} & {str(view.origin) for view in operator}
 
 
 def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_the_lost_time(

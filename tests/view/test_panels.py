@@ -118,7 +118,7 @@ def test_a_hot_pixel_of_the_dark_does_not_darken_the_picture() -> None:
 
 def test_actuators_at_their_limit_are_marked() -> None:
     snapshot = snapshot_of(synthetic_log().samples)
-    marks = f"{mirror.COMMAND}/at_limit"
+    marks = f"{mirror.ACTUATORS}/at_limit"
     assert marks not in rendered(snapshot).logged
     surface_nm = actuators(snapshot.mirror).copy()
     surface_nm[1, 3] = -snapshot.stroke_nm

@@ -33,7 +33,7 @@ _PICTURES: dict[str, tuple[str, rrb.VisualBounds2D | None]] = {
     sensor.DIFFERENCE: ("I - I0, DN", None),
     sensor.REFERENCE: ("Reference I0, DN", None),
     sensor.RAW: ("Raw frame, DN", None),
-    mirror.COMMAND: ("Mirror, nm (yellow: at limit)", None),
+    mirror.ACTUATORS: ("Mirror, nm (yellow: at limit)", None),
     mirror.SURFACE: ("Mirror over the pupil, nm", None),
     pointing.TRAIL: ("Residual pointing, mas", pointing.BOUNDS),
     science.IMAGE: ("Science camera: contrast; numbers: mean over 2 λ/D from the mask's edge", science.BOUNDS),
@@ -79,7 +79,7 @@ def layout(
 
 def _operator() -> rrb.Container:
     pictures = rrb.Horizontal(
-        *map(_picture, (sensor.FRAME, sensor.DIFFERENCE, mirror.COMMAND, pointing.TRAIL, science.IMAGE)),
+        *map(_picture, (sensor.FRAME, sensor.DIFFERENCE, mirror.ACTUATORS, pointing.TRAIL, science.IMAGE)),
         column_shares=[1, 1, 1, 1, 2],
     )
     curves = rrb.Horizontal(_picture(trend.TREND), wavefront.RMS.view(), wavefront.TILT.view(), _CONTRAST())
@@ -97,7 +97,7 @@ def _whole_log() -> rrb.Container:
 def _optics() -> rrb.Container:
     return rrb.Vertical(
         rrb.Horizontal(*map(_picture, (sensor.FRAME, sensor.DIFFERENCE, sensor.REFERENCE, sensor.RAW))),
-        rrb.Horizontal(*map(_picture, (mirror.COMMAND, mirror.SURFACE, science.IMAGE)), column_shares=[1, 1, 2]),
+        rrb.Horizontal(*map(_picture, (mirror.ACTUATORS, mirror.SURFACE, science.IMAGE)), column_shares=[1, 1, 2]),
         name=Tab.OPTICS,
     )
 

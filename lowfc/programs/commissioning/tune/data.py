@@ -110,7 +110,7 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
         warnings,
     )
     if found.closed and found.true_nm2 is not None and any(map(holds_shape, history.controllers)):
-        shapes = "an offset or channels were in force: achieved contains their shapes, theory does not"
+        shapes = "an offset or channels were in force: the achieved residual contains their shapes, theory does not"
         return replace(found, warnings=(*found.warnings, shapes))
     return found
 
@@ -160,7 +160,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
     assumed = float(states[0].delay_frames)
     measured = delay_from_times(steps.sequence, steps.time_ns - config.exposure_ns, applied, applied_ns)
     if config.lockstep or (measured is not None and measured < assumed):
-        measured = None  # time is simulated, or a delay after the mirror's report is not in these times
+        measured = None  # time is simulated, or part of the delay follows the mirror's report
     played = np.zeros(steps.sequence.shape, np.bool_)
     for state in states:
         if state.HasField("play"):
@@ -230,8 +230,8 @@ def _weighting_warnings(state: wire.ControllerState | None, calibration: Calibra
     if not names:
         return []
     return [
-        f"automatic gains weighted the reconstructor for modes that they do not correct ({names}): gains for these "
-        "raise the noise of the others above the predicted"
+        f"automatic gains weighted the reconstructor for modes that they do not correct ({names}): if these get "
+        "gains, the noise of the others is higher than predicted"
     ]
 
 
@@ -239,7 +239,7 @@ def _last_change(states: Sequence[wire.ControllerState], modes: int) -> int:
     """Sequence of the frame after which the last law and gains were in force; 0 if they never changed."""
     newest, changed, before = 0, 0, None
     for state in states:
-        newest = max(newest, state.frame_sequence)  # that of a `clear` is 0
+        newest = max(newest, state.frame_sequence)  # 0 after a `clear`
         if len(state.gain) != modes:
             continue
         gains = [] if state.HasField("law") and not overruled(state) else [*state.gain, *state.leak]
@@ -296,7 +296,11 @@ def _telemetry(
     if np.count_nonzero(under_law) < FEWEST:
         under_law = rows
         if closed and (steps.sequence[rows] <= changed).any():
-            warnings = [*warnings, "law or gains changed late in these frames: achieved is of all, theory of the last"]
+            warnings = [
+                *warnings,
+                "law or gains changed late in these frames: the achieved residual is over all of them, theory is for "
+                "the last law and gains",
+            ]
     contrast = known_contrast(config) if config is not None and config.noll == calibration.noll else None
     known = [None if each is None else each[under_law & np.isfinite(each).all(axis=1)] for each in true_residual]
     true_nm, rms_nm = (each if each is not None and len(each) else None for each in known)

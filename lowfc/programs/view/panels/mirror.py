@@ -11,7 +11,7 @@ from lowfc.programs.view.draw.plots import Plot, at
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
 
-COMMAND, SURFACE = "mirror/command", "mirror/surface"
+ACTUATORS, SURFACE = "mirror/command", "mirror/surface"
 STROKE = Plot("mirror/stroke", "Mirror: stroke used, %", {"largest stroke used, % of the limit": YELLOW}, legend=None)
 _NEAR = 0.995
 """Fraction of the stroke at which an actuator counts as limited: the controller keeps a margin, the driver rounds."""
@@ -24,14 +24,14 @@ class Mirror(Panel):
     plots = (STROKE,)
 
     def __init__(self) -> None:
-        self._command, self._surface = SignedPicture(COMMAND, "nm"), SignedPicture(SURFACE, "nm")
+        self._actuators, self._surface = SignedPicture(ACTUATORS, "nm"), SignedPicture(SURFACE, "nm")
         self._limited = False
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
         """Show the surface at the actuators and over the pupil."""
         surface_nm = actuators(snapshot.mirror) if snapshot.mirror is not None else None
         if surface_nm is not None:
-            self._command.show_values(stream, snapshot.time_ns, surface_nm)
+            self._actuators.show_values(stream, snapshot.time_ns, surface_nm)
             self._mark(stream, snapshot, surface_nm)
         if snapshot.surface is not None:
             self._surface.show_values(stream, snapshot.time_ns, snapshot.surface)
@@ -46,7 +46,7 @@ class Mirror(Panel):
             rows, columns = np.nonzero(np.abs(surface_nm) >= _NEAR * stroke_nm)
             positions = np.stack([columns + 0.5, rows + 0.5], axis=1)
             at(stream, snapshot.time_ns)
-            stream.log(f"{COMMAND}/at_limit", rr.Points2D(positions, radii=0.3, colors=[YELLOW]))
+            stream.log(f"{ACTUATORS}/at_limit", rr.Points2D(positions, radii=0.3, colors=[YELLOW]))
         self._limited = limited
         if snapshot.complete:
             STROKE.add_one(stream, snapshot.time_ns, 100 * largest)
