@@ -27,7 +27,7 @@ MODULES = {
 LOOP = {"camera", "controller", "mirror"}
 
 _EVERY_S = 0.2
-_FRACTION = 0.8  # of the duration, at its end, over which the use is averaged
+_FRACTION = 0.8  # the use is averaged over this last part of the duration
 _START_S, _TIMEOUT_RATIO = 60.0, 12.0
 
 
@@ -77,11 +77,11 @@ def _moment() -> Moment:
 
 
 def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
-    """Use by each role over the last 80 % of `seconds`, the duration of the frames, before the processes end.
+    """Use by each role over the last 80 % of the frames, which are sent for `seconds`.
 
-    `share`: processor time of all threads over that of one processor. Empty with fewer than two samples in that time.
+    `share`: processor time of all threads, in processors. Empty with fewer than two samples in that time.
     """
-    complete = [moment for moment in moments if moment.roles.keys() >= LOOP][:-1]  # the processes may end at the last
+    complete = [moment for moment in moments if moment.roles.keys() >= LOOP][:-1]  # the last may be during shutdown
     inside = [moment for moment in complete if moment.at_s >= complete[-1].at_s - _FRACTION * seconds]
     if len(inside) < 2:
         return {}

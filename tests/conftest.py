@@ -1,4 +1,4 @@
-"""Fixtures of all tests: private runtime directories and caches, and no silent skips where none are allowed."""
+"""Fixtures of all tests: private runtime directories and caches; with LOWFC_NO_SKIPS=1 a skipped test fails."""
 
 import contextlib
 import gc
@@ -109,7 +109,8 @@ def _scheduling() -> tuple[int, int, set[int]]:
 @pytest.fixture
 def own_runtime(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Give a test its own runtime directory, without runs and latches of other tests."""
-    path = tmp_path_factory.mktemp("own")  # not `tmp_path`: a folder `lowfc` there would hide the package
+    # Not `tmp_path`: in tests that change to it, a folder `lowfc` there would hide the package.
+    path = tmp_path_factory.mktemp("own")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(path))
     monkeypatch.setenv("XDG_STATE_HOME", str(path / "state"))
     return path

@@ -31,7 +31,7 @@ class ComparisonError(Exception):
 class Implementation:
     """An implementation of the loop: description, log, protection of the mirror, use across machines.
 
-    Roles are in the order of their start; a run ends with the source. lowfc has a kernel and no roles.
+    Roles are in the order of their start; a run ends when the source ends. lowfc has a kernel and no roles.
     """
 
     name: str

@@ -29,7 +29,7 @@ from tests.support import toy
 RATE_HZ = 1000.0
 SAME_NM = 2e-4  # the order of sums depends on the processor: 1.5e-4 nm with AVX-512, in a million frames
 ROUNDINGS = 10
-"""Allowed difference in float32 roundings of a step's largest number, up to 500 nm if no pixel counts as saturated."""
+"""Allowed difference, in float32 roundings of a step's largest number (up to 500 nm without a saturation limit)."""
 COMMAND_ARRAYS = 2
 """Number of arrays of a step that are commands."""
 BAD_IMAGES = ("dark", "faint", "saturated pixel", "saturated pixels", "frozen", "aberrated")

@@ -207,8 +207,8 @@ def test_pupil_image_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
 
 
 def test_direct_kernels_conserve_energy():
-    """Over the full period of the sampled focal plane the columns of each kernel are orthonormal."""
-    distance = 27.25  # its period, 8 distances, is an integer number of samples
+    """A sampled focal plane repeats its image; over one period the columns of each kernel are orthonormal."""
+    distance = 27.25  # the period, 8 times this distance, is an integer number of samples
     matrix = direct_kernel(Defocus(distance), 1744, 64, 8, 1.0)
     np.testing.assert_allclose(matrix.conj().T @ matrix, np.eye(64), atol=1e-12)
     for scale in (1.0, 1.1):
@@ -258,7 +258,7 @@ def test_shear_is_equivalent_to_moving_the_relay_mask_the_other_way(axis, sensor
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("name", ["clowfs", "zwfs"])
 def test_shear_moves_the_image(name, axis):
-    """By the shear itself where the detector sees the pupil; behind focus, where the image is inverted, by -z shear."""
+    """An image of the pupil moves by the shear; behind focus the image is inverted and moves by -distance x shear."""
     fine = replace(sensor_named(name), pixels=160 if name == "clowfs" else 640, binning=1)
     moves_by = -fine.relay.distance if name == "clowfs" else 1.0
     I0 = reference(fine)
@@ -308,7 +308,7 @@ def test_unresolved_defocus_is_refused():
 
 
 @pytest.mark.parametrize("name", ["sam", "bar", "lyot"])
-def test_behind_an_aperture_mask_modes_are_odd_and_shear_and_flux_even(name, modes):
+def test_behind_an_aperture_mask_modal_responses_are_odd_but_image_and_shear_response_even(name, modes):
     """The focal-plane mask is real and symmetric: the field in the relay pupil is real, modes add imaginary parts."""
     optics = sensor_named(name)
     H, slopes = response(optics, modes[:14]), shear_response(optics)

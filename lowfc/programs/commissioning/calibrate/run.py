@@ -40,7 +40,7 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pok
 from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size, warn_of_additions
 
 _MIN_CORRELATION = 0.3
-"""Smallest correlation of the first poke's image with the calibration in use without a warning."""
+"""A smaller correlation of the first poke's image with the calibration in use is reported as a warning."""
 
 
 class CalibrationData(NamedTuple):
@@ -142,12 +142,12 @@ class Calibrator:
         R = calibration.reconstructor.astype(np.float64)
         cycles = data.measured.cycles
         count = check_cycles(cycles)
-        answers = []
+        products = []
         for number in range(count):
             self._show(f"check {number + 1} of {count}", cycles, cycles + number)
             plan = self.pokes.cycle(cycles + number)
-            answers.append(R @ self._player.cycle(plan, data.delay.delay_frames).response)
-        return check(np.array(answers), R @ data.measured.response, data.measured.error * np.sqrt(cycles))
+            products.append(R @ self._player.cycle(plan, data.delay.delay_frames).response)
+        return check(np.array(products), R @ data.measured.response, data.measured.error * np.sqrt(cycles))
 
     @property
     def _quietest_mode(self) -> int:
