@@ -310,6 +310,24 @@ def test_imperfections_of_the_simulated_world_are_named(tmp_path: Path) -> None:
     assert "simulated with disturbance.wheel_hz = 40.0, camera.hot_pixels = 0.01;" in page(report)
 
 
+@pytest.mark.parametrize(
+    ("events", "level"),
+    [
+        ("camera NO_FRAMES, camera STOPPED", "good"),
+        ("camera NO_FRAMES, camera FRAMES_BACK, camera STOPPED", "look"),
+        ("camera NO_FRAMES, controller STOPPED", "look"),
+    ],
+)
+def test_the_silence_of_a_camera_that_stopped_for_good_is_no_warning(
+    events: str, level: str, good_night: SyntheticLog, tmp_path: Path
+) -> None:
+    results = results_of(good_night.write(tmp_path / "x.mcap"))
+    named = [event.split() for event in events.split(", ")]
+    levels = {"NO_FRAMES": "warning"}
+    results["events"] = [{"process": who, "name": what, "level": levels.get(what, "info")} for who, what in named]
+    assert check_of({"verdict": verdict(results)}, "events")["level"] == level
+
+
 def test_a_loop_in_safe_mode_is_not_a_good_run(tmp_path: Path) -> None:
     night = uneventful(SyntheticLog())
     night.request("safe").frames(50).request("clear")

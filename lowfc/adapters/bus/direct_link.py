@@ -8,6 +8,7 @@ without this library, arrive over the bus only.
 import contextlib
 import errno
 import math
+import mmap
 import os
 import socket
 import threading
@@ -228,7 +229,7 @@ class DirectReader:
 
     def _serve(self, connection: socket.socket) -> None:
         """Receive from a writer until it disconnects."""
-        buffer = memoryview(bytearray(2 * _BUFFER_BYTES))
+        buffer = memoryview(mmap.mmap(-1, 2 * _BUFFER_BYTES))  # a bytearray is zeroed first: 5 ms without a frame
         with connection, contextlib.suppress(OSError):
             while not self._closed:
                 size = connection.recv_into(buffer)

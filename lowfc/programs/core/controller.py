@@ -114,6 +114,8 @@ class Controller:
         if calibration is not None:
             self._arrays.publish(Request(now_ns, "load", calibration=calibration))
             self._apply_report(Load(now_ns, calibration, source))
+            if self._state.loop is not None:
+                self._gain_watch.prepare(self._state.loop)
         service.awaited = lambda: "" if self._state.frame_sequence else "a camera"
 
     def run(self) -> None:

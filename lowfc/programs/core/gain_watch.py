@@ -92,7 +92,7 @@ class GainWatch:
         loop = state.loop
         if loop is None or not loop.calibration.noll:
             return NOTHING
-        self._restart_if_changed(loop)
+        self.prepare(loop)
         if loop.weighting is not self._weighting:
             self._weighting = weighting = loop.weighting
             from_own_modes = np.eye(len(loop.calibration.noll), dtype=np.float32)
@@ -165,7 +165,8 @@ class GainWatch:
         per_nm2 = np.diag(self._contrast)
         return float(per_nm2 @ open_nm2), per_nm2 * now_nm2
 
-    def _restart_if_changed(self, loop: ActiveLoop) -> None:
+    def prepare(self, loop: ActiveLoop) -> None:
+        """Set up the groups of a loop with other modes, leaks or limits; as this takes long, before the first frame."""
         identity = loop.calibration.id, loop.integrator.leak.tobytes(), loop.integrator.limit_nm.tobytes()
         if identity == self._identity:
             return

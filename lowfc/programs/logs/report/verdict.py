@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping
 
-from lowfc.contract.messages import CALIBRATION, STEP
+from lowfc.contract.messages import CALIBRATION, STEP, Role
 from lowfc.control.loop.wording import counted
 from lowfc.programs.logs.report.source import Results
 
@@ -155,13 +155,20 @@ def _mirror(results: Results) -> Results:
 
 
 def _events(results: Results) -> Results:
-    grave = [event for event in results["events"] if event["level"] in ("error", "fatal")]
-    warned = [event for event in results["events"] if event["level"] == "warning"]
+    events = results["events"]
+    grave = [event for event in events if event["level"] in ("error", "fatal")]
+    warned = [event for k, event in enumerate(events) if event["level"] == "warning" and not _of_end(events[k:])]
     if not (worst := grave or warned):
         return _check("events", GOOD, "no warning, no error")
     names = _with_counts(Counter(sorted(event["name"] for event in worst)))
     what = "error" if grave else "warning"
     return _check("events", BAD if grave else LOOK, f"{counted(len(worst), what)}: {names}")
+
+
+def _of_end(events: list[Results]) -> bool:
+    """Whether the first of these events is that frames ceased because the camera stopped, for good."""
+    names = [event["name"] for event in events if event["name"] != "STOPPED" or event["process"] == Role.CAMERA]
+    return names[0] == "NO_FRAMES" and "STOPPED" in names and "FRAMES_BACK" not in names
 
 
 def _with_counts(counts: dict[str, int]) -> str:
