@@ -33,6 +33,7 @@ from tests.support.theory import noise_gain, rejection
 from tests.support.toy import NOLL, calibration
 
 RATE_HZ = 1000.0
+GOLDEN = Path(__file__).parents[1] / "golden" / "0.1" / "night.mcap"
 
 
 def results_of(log: Path) -> dict[str, Any]:
@@ -436,6 +437,15 @@ def test_a_camera_ahead_and_a_clear_for_a_lower_start_move_no_law_and_no_request
     assert [one["from_s"] for one in results["laws"]] == pytest.approx([0, 0.05, 0.11])
     assert [one["time_s"] for one in results["requests"]] == pytest.approx([0.05, 0.099, 0.1, 0.11], abs=0.0011)
     assert (results["run"]["steps_s"], results["light"]["refused"]) == (pytest.approx(0.119), {"ahead": 1})
+
+
+def test_frames_refused_as_out_of_order_or_saturated_change_no_time_and_are_no_used_frames() -> None:
+    run = read_run((GOLDEN,))  # it has one of each, that out of order with the time 0
+    report = report_of(run)
+    assert np.diff(run.step_s).min() >= 0
+    assert min(one["time_s"] for one in report.results["requests"] + report.results["events"]) > -1
+    assert report.results["light"]["refused"]["saturated"] == 1
+    assert "used frames with saturated pixels</th><td>0</td>" in page(report)
 
 
 def test_a_law_whose_step_is_lost_is_found_also_with_another_clock_of_the_camera(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def laws(run: Run) -> list[Results]:
 
 
 def light_results(history: History) -> Results:
-    """Flux, saturation, and frames refused by reason."""
+    """Flux, saturation of the used frames, and frames refused by reason."""
     steps = history.steps
     flux = steps.flux_dn[steps.flux_dn > 0]
     counts = count_reasons(steps.reasons).items()

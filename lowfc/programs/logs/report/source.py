@@ -17,6 +17,7 @@ from lowfc.contract.codecs.law_codec import driving, overruled
 from lowfc.contract.envelope import COUNT_BITS
 from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.control.laws.linear_law import LinearLaw
+from lowfc.control.laws.what_if import exposed
 from lowfc.control.loop import guard
 from lowfc.control.loop.safety import Rejection
 
@@ -94,11 +95,14 @@ def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None
     log.progress = progress
     history = read_history(log)
     history.true  # noqa: B018  # joined and cached now, by the sequences that the frames have in the log
-    steps, known = history.steps, np.flatnonzero(history.steps.reasons >> Rejection.AHEAD & 1 == 0)
+    steps, known = history.steps, np.flatnonzero(exposed(history.steps.reasons))
     if 0 < known.size < steps.sequence.size:
-        # A step whose frame is ahead of the clock gets sequence and time of the step before.
+        # A step whose frame is ahead of the clock gets sequence and time of the step before; an old frame its time.
         rows = known[np.maximum(np.searchsorted(known, np.arange(steps.sequence.size), "right") - 1, 0)]
-        history.steps = replace(steps, sequence=steps.sequence[rows], time_ns=steps.time_ns[rows])
+        ahead = steps.reasons >> Rejection.AHEAD & 1 == 1
+        time_ns = np.maximum(np.where(ahead, 0, steps.time_ns), steps.time_ns[rows])
+        sequence = np.where(ahead, steps.sequence[rows], steps.sequence)
+        history.steps = replace(steps, sequence=sequence, time_ns=time_ns)
     return Run(history, _laws_in_force(history))
 
 

@@ -139,7 +139,7 @@ def _frames(results: Results) -> Results:
     if light["frames_refused"]:
         faults.append(f"{counted(light['frames_refused'], 'frame')} refused ({_with_counts(light['refused'])})")
     if light["frames_saturated"]:
-        faults.append(f"{counted(light['frames_saturated'], 'frame')} with saturated pixels")
+        faults.append(f"{counted(light['frames_saturated'], 'used frame')} with saturated pixels")
     return _check("light", LOOK if faults else GOOD, "; ".join(faults) or "no frame refused, none saturated")
 
 
