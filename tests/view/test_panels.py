@@ -36,7 +36,7 @@ from lowfc.programs.view.draw.plots import BOX_HEIGHT, Plot
 from lowfc.programs.view.panels import latency, loop, mirror, pointing, science, sensor, spectra, wavefront
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.renderer import RETRY_NS, Renderer
-from lowfc.programs.view.snapshot import Accumulator, LastHealth, Snapshot
+from lowfc.programs.view.snapshot import Accumulator, LastHealth, LogEnd, Snapshot
 from lowfc.programs.view.verdicts import steady
 from lowfc.programs.view.verdicts.steady import LawInForce
 from tests.support.report_log import SyntheticLog
@@ -437,7 +437,10 @@ def test_spectra_stay_in_their_box_and_restart_when_the_mode_changes(tone: tuple
     few = np.ones((20, MODES))
     drawn(panel, tape, round(9e9), steps=steps(3000, few, few, LoopMode.OPEN), camera=CAMERA, controller=controller)
     assert not values_of(tape.last(shown).strips)
-    assert values_of(tape.last(state).labels) == ["loop open: too few frames yet"]
+    assert values_of(tape.last(state).labels) == ["loop open: fewer than 64 steady frames"]
+    drawn(panel, tape, round(9.5e9), camera=CAMERA, controller=controller, ended=LogEnd(*[""] * 4, 0, 0, 0, None))
+    assert len(values_of(tape.last(shown).strips)) == 3, "the last of the log that are known"
+    assert values_of(tape.last(state).labels) == ["loop closed, last 4.1 s before a change"]
 
 
 def test_a_constant_wavefront_has_no_spectrum() -> None:

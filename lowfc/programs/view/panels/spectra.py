@@ -10,7 +10,7 @@ from lowfc.arrays import Array, Mask
 from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import rejection
-from lowfc.control.laws.spectra import Spectrum, in_bins, spectrum, time_series
+from lowfc.control.laws.spectra import SHORTEST, Spectrum, in_bins, spectrum, time_series
 from lowfc.control.loop.safety import LoopMode, mode_name
 from lowfc.programs.view.draw.colours import GREEN, GREY, YELLOW
 from lowfc.programs.view.draw.plots import BOX_HEIGHT, Axes, at, labels
@@ -33,11 +33,15 @@ _WIDTHS = (1.2, 1.8, 0.6)
 
 
 class Spectra(Panel):
-    """Spectra of the last frames under one loop mode and one law, drawn every two seconds."""
+    """Spectra of the last frames under one loop mode and one law, drawn every two seconds.
+
+    At the end of a log with too few of these frames, the last spectra before them are drawn.
+    """
 
     def __init__(self) -> None:
         self._steady = Steady()
         self._axes = [Axes(path, WIDTH) for path in (TILTS, OTHERS)]
+        self._last: dict[str, tuple[str, Array, list[Array]]] = {}
         self._decades = dict.fromkeys((TILTS, OTHERS), (0, 0))
 
     def begin(self, stream: rr.RecordingStream) -> None:
@@ -48,24 +52,29 @@ class Spectra(Panel):
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
         """Keep the new frames; draw when due."""
         calibration, steady = snapshot.calibration, self._steady
-        if not steady.feed(snapshot) or calibration is None or not self.due(snapshot):
+        fed, ended = steady.feed(snapshot), snapshot.ended is not None
+        if calibration is None or not steady.mode or not (ended or (fed and self.due(snapshot))):
             return
         rate_hz = frame_rate_hz(snapshot.camera, snapshot.steps)
         series = time_series(*steady.rows())
         spectra = spectrum(series, rate_hz) if rate_hz else None
         tilts = np.isin(calibration.noll, TIP_TILT)
         law = steady.law if steady.mode == LoopMode.CLOSED else None
+        loop = f"loop {mode_name(steady.mode)}"
         at(stream, snapshot.time_ns)
         for axes, modes in zip(self._axes, (tilts, ~tilts), strict=True):
-            frequency_hz, powers = np.zeros(0), list[Array]()
-            state = ": too few frames yet" if modes.any() else ": no such modes"
+            why = f"fewer than {SHORTEST} steady frames" if modes.any() else "no such modes"
+            text, frequency_hz, powers = f"{loop}: {why}", np.zeros(0), list[Array]()
             if spectra is not None and modes.any():
-                state = f", last {series.frames / rate_hz:.1f} s"
+                text = f"{loop}, last {series.frames / rate_hz:.1f} s"
                 frequency_hz, powers = power_curves(spectra, modes, law, rate_hz)
+                self._last[axes.path] = text, frequency_hz, powers
+            elif ended and modes.any() and axes.path in self._last:  # no more frames will come
+                text, frequency_hz, powers = self._last[axes.path]
+                text += " before a change"
             if powers:
                 self._fit(stream, axes, rate_hz, np.concatenate(powers))
             axes.draw(stream, np.log10(frequency_hz), [np.log10(power) for power in powers], _COLOURS, _WIDTHS)
-            text = f"loop {mode_name(steady.mode)}{state}"
             stream.log(f"{axes.path}/state", labels([_STATE_POSITION], [text]))
 
     def _fit(self, stream: rr.RecordingStream, axes: Axes, rate_hz: float, power: Array) -> None:
