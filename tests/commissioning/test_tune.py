@@ -110,10 +110,17 @@ def test_the_picture_has_the_words_of_the_page_and_the_line_of_the_model(
 ) -> None:
     drawn: list[Any] = []
     monkeypatch.setattr("lowfc.adapters.files.drawing.png", drawn.append)
-    picture(telemetry, tuned_as("lqg")[0])
+    best, gains = tuned_as("lqg")
+    picture(telemetry, best)
     page = " ".join((Path(__file__).parents[2] / "docs/howto/tuning.md").read_text().split())
     curves = {line.get_label().split(" (")[0]: line.get_ydata() for line in drawn[0].axes[0].lines}
     assert [label for label in curves if f"the {label}" not in page] == []
+    assert drawn[0].axes[0].get_ylabel() < drawn[0].axes[1].get_ylabel()
+    tip = result_of(telemetry, best, gains, "lqg").modes[0]
+    spacing_hz = drawn[0].axes[0].lines[0].get_xdata()[0]
+    for law, rms_nm in (("present", tip.predicted_now_nm), ("tuned", tip.predicted_nm)):
+        variance_nm2 = curves[f"predicted true residual with the {law} law"].sum() * spacing_hz
+        assert variance_nm2 == pytest.approx(rms_nm**2, rel=0.05)
     line = curves["model of the pseudo-open-loop"].sum() / curves["pseudo-open-loop"].sum()
     assert line == pytest.approx(1, rel=0.2)  # of a width far below the distance of the frequencies
     drawn[0].draw_without_rendering()

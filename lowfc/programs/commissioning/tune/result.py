@@ -117,10 +117,10 @@ class TuneResult(Result):
 
 def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> TuneResult:
     """Predicted residual of a tuned law, with the residual of the run."""
-    now = run.driving or integrator(run.law.gain, run.law.leak, run.noll, run.timing.delay, run.rate_hz)
+    now, stable = _present_law(run)
     leak = run.law.leak.astype(np.float64)
     integrators = tune_integrator(best.models, gains, run.noll, leak, run.timing)
-    now_nm = predicted_nm(now, best.models, run.timing) if margins.margins(now, run.timing.delay).stable else None
+    now_nm = predicted_nm(now, best.models, run.timing) if stable else None
     achieved_nm = _achieved_nm(run, gains.noise_nm)
     has_truth = run.true_nm2 is not None or run.continuous_rms_nm is not None
     if achieved_nm is not None and now_nm is not None and run.continuous_rms_nm is None:
@@ -178,40 +178,48 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
         phase_margin_deg=best.margins.phase_margin_deg.min(),
         max_rejection=best.margins.peak.max(),
         modes=modes,
-        warnings=[*run.warnings, *_doubts(run, tilt_mas["open"], now_nm is not None)],
+        warnings=[*run.warnings, *_doubts(run, tilt_mas["open"], stable)],
     )
 
 
 def picture(run: Telemetry, best: Tuned) -> bytes:
-    """PNG: spectra of the two largest modes: measured, modelled, and predicted with the tuned law."""
+    """PNG: spectra of the two largest modes: measured, modelled, and predicted with the present and the tuned law."""
     from lowfc.adapters.files.drawing import figure_class, png
 
     drawing = figure_class()(figsize=(10, 8), layout="constrained")
     pol_spectrum = spectrum(run.pol, run.rate_hz)
     assert pol_spectrum is not None  # noqa: S101  # tuning needs more frames than a spectrum
-    largest = np.argsort(-pol_spectrum.variance_nm2())[:2]
+    largest = np.sort(np.argsort(-pol_spectrum.variance_nm2())[:2])
     shown_hz = pol_spectrum.frequency_hz[1:]
     edges = np.append(shown_hz - pol_spectrum.spacing_hz / 2, shown_hz[-1]) * 2 * np.pi / run.rate_hz
     noise_nm2 = np.array([each.noise_nm2 for each in best.models])
     closed = spectrum(run.error, run.rate_hz) if run.closed else None
+    now, stable = _present_law(run)
     for axes, mode in zip(drawing.subplots(2, 1, sharex=True), largest.tolist(), strict=False):
         omega = fine_frequencies(best.models[mode])
         modelled = best.models[mode].spectrum_nm2(omega) + noise_nm2[mode]
         measured = np.repeat(modelled[:, None], len(noise_nm2), axis=1)  # only the column of this mode is used
-        residual = residual_spectrum(best.law, omega, measured, noise_nm2, run.timing)[:, mode]
-        model_nm2_hz = 2 / run.rate_hz * _means(modelled, omega, edges)
-        residual_nm2_hz = 2 / run.rate_hz * _means(residual, omega, edges)
+        curves = {"model of the pseudo-open-loop": ("tab:blue", modelled)}
+        laws = {"present law": ("black", now)} if stable else {}
+        for name, (colour, law) in {**laws, f"tuned law ({best.kinds[mode]})": ("tab:green", best.law)}.items():
+            residual = residual_spectrum(law, omega, measured, noise_nm2, run.timing)[:, mode]
+            curves[f"predicted true residual with the {name}"] = colour, residual
         axes.loglog(shown_hz, pol_spectrum.power_nm2_hz[1:, mode], color="0.6", label="pseudo-open-loop")
         if closed is not None:
             binned_hz, (power,) = in_bins(closed.frequency_hz, [closed.power_nm2_hz[:, mode]])
-            axes.loglog(binned_hz, power, color="tab:orange", label="error")
-        axes.loglog(shown_hz, model_nm2_hz, color="tab:blue", lw=1, label="model of the pseudo-open-loop")
-        label = f"predicted residual with the tuned law ({best.kinds[mode]})"
-        axes.loglog(shown_hz, residual_nm2_hz, color="tab:green", label=label)
+            axes.loglog(binned_hz, power, color="tab:orange", label="measured error")
+        for label, (colour, power) in curves.items():
+            axes.loglog(shown_hz, 2 / run.rate_hz * _means(power, omega, edges), color=colour, lw=1, label=label)
         axes.set(ylabel=f"Z{run.noll[mode]} {mode_name(run.noll[mode])}, nm$^2$/Hz")
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2, frameon=False)  # covers no line
     axes.set(xlabel="frequency, Hz")
     return png(drawing)
+
+
+def _present_law(run: Telemetry) -> tuple[LinearLaw, bool]:
+    """The law in force, and whether it is stable with the run's delay."""
+    law = run.driving or integrator(run.law.gain, run.law.leak, run.noll, run.timing.delay, run.rate_hz)
+    return law, margins.margins(law, run.timing.delay).stable
 
 
 def _means(power: Array, omega: Array, edges: Array) -> Array:
