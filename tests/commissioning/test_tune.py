@@ -171,8 +171,9 @@ def test_a_loop_that_was_closed_for_too_few_frames_is_not_simply_called_open(tmp
     """Then no residual achieved is given: an offset is not in it."""
     night = SyntheticLog().request("open").frames(400).request("close").frames(100)
     night.request("offset", (0.0, 0.0, 20.0)).frames(1900)
-    result = json_of("tune", night.write(tmp_path / "night.mcap"))
+    result = json_of("tune", log := night.write(tmp_path / "night.mcap"))
     assert not result["closed"]
+    assert "2400 frames at 1000 Hz, loop closed in 2000 of them, delay" in lowfc("tune", log).stdout
     (warning,) = result["warnings"]
     assert "in closed loop at most 2000 good frames are consecutive, fewer than 2048" in warning
 

@@ -49,7 +49,7 @@ class Telemetry:
         noll: Noll index of each mode.
         timing: delay and exposure of the loop, measured if possible.
         law: the integrator's gains at the end; `driving` is the linear law in force instead, if any.
-        closed: whether the loop was closed in these frames.
+        closed: whether the loop was closed in these frames; `frames_closed`: in how many of them.
         pol: pseudo-open-loop modes (frames, modes), in pieces without gaps.
         error: modal error (frames, modes). Like the true residual it is from the frames after the last change of law or
             gains, or from all frames if those are fewer than `FEWEST`.
@@ -68,6 +68,7 @@ class Telemetry:
     law: Integrator
     driving: LinearLaw | None
     closed: bool
+    frames_closed: int
     pol: TimeSeries
     error: TimeSeries
     true_nm2: Array | None
@@ -312,6 +313,7 @@ def _telemetry(
         law=laws[0],
         driving=laws[1],
         closed=closed,
+        frames_closed=int((rows & was_closed).sum()),
         pol=pol,
         error=time_series(steps.sequence[under_law], steps.error_nm[under_law]),
         true_nm2=None if true_nm is None else true_nm.T.astype(float) @ true_nm / len(true_nm),

@@ -82,6 +82,7 @@ class TuneResult(Result):
     rate_hz: float = result_field()
     delay_frames: float = result_field()
     closed: bool = result_field()
+    frames_closed: int = result_field(exclude=True)
     frames: int = result_field()
     achieved_from: str | None = result_field()
     tilt_mas: dict[str, float | None] = result_field()
@@ -96,9 +97,10 @@ class TuneResult(Result):
 
     def head(self) -> Sequence[str]:
         """Source of the tuning data."""
+        some = f"closed in {self.frames_closed} of them" if self.frames_closed else "open"
         return [
             f"{self.source}: {counted(self.frames, 'frame')} at {self.rate_hz:.4g} Hz, loop "
-            f"{'closed' if self.closed else 'open'}, delay {self.delay_frames:.2f} frames, law {self.law_now}"
+            f"{'closed' if self.closed else some}, delay {self.delay_frames:.2f} frames, law {self.law_now}"
         ]
 
     def remarks(self) -> Sequence[str]:
@@ -170,6 +172,7 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
         rate_hz=run.rate_hz,
         delay_frames=run.timing.delay,
         closed=run.closed,
+        frames_closed=run.frames_closed,
         frames=run.pol.frames,
         achieved_from=None if achieved_nm is None else "truth" if has_truth else "error less noise",
         tilt_mas=tilt_mas,
