@@ -10,10 +10,11 @@ from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.optics.chain.added_contrast import by_group, costliest
 from sim_camera.scene import Truth, Wavefront
 
-BLOCK = 500
-"""Frames per block at first; the second half of the run begins at the border of a block."""
-MAX_BLOCKS = 256
-"""Blocks stored; then pairs are merged and blocks are twice as long, so that memory does not grow with the run."""
+MAX_BLOCKS = 1024
+"""Blocks stored, at first of one frame; then pairs are merged, so that memory does not grow with the run.
+
+The second half of the run begins at the border of a block.
+"""
 
 _RMS = "disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas"
 
@@ -39,10 +40,8 @@ class WavefrontAccumulator:
         self._value_count = 1 + len(noll) + (8 if instants else 4)
         self._tilts = slice(0, sum(index in TIP_TILT for index in noll))  # tip and tilt are the first modes
         self._nm_per_mas = nm_per_mas
-        self._blocks: list[list[float]] = []
-        self._sums = [0.0] * self._value_count
-        self._in_block = self._frames = 0
-        self._block_frames = BLOCK
+        self._blocks = np.zeros((MAX_BLOCKS, self._value_count))
+        self._frames, self._block_frames = 0, 1
         self._recent = np.zeros((recent, self._value_count))
 
     def add(self, truth: Truth, added_flat: float = 0.0, added: Single | None = None) -> None:
@@ -57,31 +56,19 @@ class WavefrontAccumulator:
         values = (*contrasts, *self._squares(truth.sampled))
         if truth.continuous is not None:
             values += self._squares(truth.continuous)
-        self._sums = [total + value for total, value in zip(self._sums, values, strict=True)]
+        if self._frames == len(self._blocks) * self._block_frames:
+            merged = self._blocks[::2] + self._blocks[1::2]
+            self._blocks = np.concatenate((merged, np.zeros_like(merged)))
+            self._block_frames *= 2
+        self._blocks[self._frames // self._block_frames] += values
         self._recent[self._frames % len(self._recent)] = values
         self._frames += 1
-        self._in_block += 1
-        if self._in_block == self._block_frames:
-            self._blocks.append(self._sums)
-            self._sums, self._in_block = [0.0] * self._value_count, 0
-        if len(self._blocks) == MAX_BLOCKS:
-            pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
-            self._blocks = [[first + second for first, second in zip(*pair, strict=True)] for pair in pairs]
-            self._block_frames *= 2
 
     def wavefront(self) -> dict[str, Any]:
-        """Statistics over the second half of the complete blocks, or over all frames before the first is complete.
-
-        Empty before the first frame, as are those of `recent`.
-        """
-        if self._blocks:
-            half = self._blocks[len(self._blocks) // 2 :]
-            mean = np.sum(half, axis=0) / (self._block_frames * len(half))
-        elif self._in_block:
-            mean = np.array(self._sums) / self._in_block
-        else:
-            return {}
-        return self._statistics(mean)
+        """Statistics over the second half of the frames; empty before the first, as are those of `recent`."""
+        first = self._frames // 2 // self._block_frames
+        frames = self._frames - first * self._block_frames
+        return self._statistics(self._blocks[first:].sum(axis=0) / frames) if frames else {}
 
     def recent(self) -> dict[str, Any]:
         """Statistics over the most recent frames."""

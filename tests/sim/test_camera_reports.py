@@ -14,7 +14,7 @@ from lowfc.testing.listener import Listener
 from sim_camera.driver import SimulatedCamera
 from sim_camera.lateness import WINDOW, Lateness
 from sim_camera.scene import Scene, Truth, Wavefront
-from sim_camera.wavefront_statistics import BLOCK, MAX_BLOCKS, WavefrontAccumulator
+from sim_camera.wavefront_statistics import MAX_BLOCKS, WavefrontAccumulator
 
 NOLL = (2, 3, 4)
 
@@ -35,19 +35,20 @@ def statistics(
     return accumulator
 
 
-@pytest.mark.parametrize("blocks", [2, MAX_BLOCKS - 1, MAX_BLOCKS, MAX_BLOCKS + 2, 2 * MAX_BLOCKS + 4])
-def test_statistics_cover_the_second_half_of_a_run_of_any_length(monkeypatch: pytest.MonkeyPatch, blocks: int) -> None:
-    monkeypatch.setattr("sim_camera.wavefront_statistics.BLOCK", 2)
-    half = blocks // 2 * 2
-    run = statistics(*[5.0] * half, *[3.0] * (2 * blocks - half))
+@pytest.mark.parametrize("frames", [2, 3, 750, MAX_BLOCKS, MAX_BLOCKS + 1, 3 * MAX_BLOCKS - 1, 9 * MAX_BLOCKS + 5])
+def test_statistics_cover_the_second_half_of_a_run_of_any_length(frames: int) -> None:
+    half = frames // 2
+    run = statistics(*[5.0] * half, *[3.0] * (frames - half))
     found = run.wavefront()
-    assert (found["residual_rms_nm"], found["tilt_disturbance_mas"]) == pytest.approx((3.0, 6.0), rel=0.05)
-    assert len(run._blocks) < MAX_BLOCKS
+    exact = frames <= MAX_BLOCKS
+    expected = pytest.approx((3.0, 6.0), rel=1e-12 if exact else 0.003)
+    assert (found["residual_rms_nm"], found["tilt_disturbance_mas"]) == expected
+    assert len(run._blocks) == MAX_BLOCKS
 
 
-def test_statistics_before_the_first_block_cover_all_frames() -> None:
+def test_statistics_are_rms_over_frames_and_tilts_per_axis() -> None:
     assert statistics().wavefront() == {}
-    found = statistics(*[3.0, 5.0] * (BLOCK // 4), nm_per_mas=2.0).wavefront()
+    found = statistics(*[3.0, 5.0] * 250, nm_per_mas=2.0).wavefront()
     rms_nm = np.sqrt((3**2 + 5**2) / 2)
     assert [*found.values()][:4] == pytest.approx(np.array((2, 1, 1, 0.5)) * rms_nm), "tilts per axis"
     assert not any([*found.values()][4:])
@@ -66,7 +67,7 @@ def test_the_costliest_modes_are_named_without_contrast_from_a_disturbance() -> 
 
 def test_recent_statistics_cover_only_recent_frames() -> None:
     assert statistics(recent=100).recent() == {}
-    run = statistics(*[50.0] * BLOCK, *[2.0] * 100, recent=100)
+    run = statistics(*[50.0] * 500, *[2.0] * 100, recent=100)
     found, overall = run.recent(), run.wavefront()
     assert (found["residual_rms_nm"], found["tilt_disturbance_mas"]) == pytest.approx((2.0, 4.0))
     assert overall["residual_rms_nm"] > 40.0, "includes the frames before"
