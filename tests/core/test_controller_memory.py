@@ -207,12 +207,25 @@ def test_closing_the_loop_corrects_every_mode(rig: Rig) -> None:
     assert (np.abs(pol - injected) < allowed).all()
 
 
+def not_closed_ns(rig: Rig) -> int:
+    health = wire.Health()
+    with rig.controller._lock:  # after the last step
+        rig.controller.fill(health)
+    return health.not_closed_ns
+
+
 def test_the_time_not_closed_is_counted_from_the_first_frame(rig: Rig) -> None:
     rig.expose(20)
     rig.steps(1)
-    health = wire.Health()
-    rig.controller.fill(health)
-    assert health.not_closed_ns == 19 * CONFIG.period_ns
+    assert not_closed_ns(rig) == 19 * CONFIG.period_ns
+
+
+def test_the_time_not_closed_ends_with_the_newest_frame(calibration: Calibration, scene: Scene) -> None:
+    with running(configured(lockstep=False), calibration, scene) as rig:
+        rig.expose(2)
+        before_ns = not_closed_ns(rig)
+        rig.until("NO_FRAMES", lambda: "NO_FRAMES" in rig.events())
+        assert not_closed_ns(rig) == before_ns > 0
 
 
 def test_a_reply_names_the_first_frame_that_the_request_affects(rig: Rig) -> None:

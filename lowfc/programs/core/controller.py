@@ -109,8 +109,7 @@ class Controller:
         service.bus.queryable(REQUEST_KEY.format(name=ALL), self._queue_query)
         self._frame_to_command = Durations()
         self._state_due_ns = 0
-        self._last_frame_ns = service.clock.host_ns()
-        now_ns = service.clock.now_ns()
+        self._last_frame_ns = now_ns = service.clock.now_ns()
         if calibration is not None:
             self._arrays.publish(Request(now_ns, "load", calibration=calibration))
             self._apply_report(Load(now_ns, calibration, source))
@@ -163,7 +162,7 @@ class Controller:
         health.mode = self._state.mode.value  # type: ignore[assignment]  # numbered alike
         health.counts.extend(reason_counts(self._state))
         now_ns = self._service.clock.now_ns()
-        health.not_closed_ns, health.not_closed_cause = self._not_closed.note(self._state, now_ns)
+        health.not_closed_ns, health.not_closed_cause = self._not_closed.note(self._state, now_ns, self._last_frame_ns)
         if self._state.mode is LoopMode.CLOSED:
             health.holding = holding_cause(self._state)
         fill_harm_and_contrast(health, self._gain_watch, self._state)
@@ -204,12 +203,12 @@ class Controller:
         self._send(outputs)
         sent_ns = self._commands.handed_ns if outputs.command is not None else clock.host_ns()
         let_send()
+        if self._state.frame_sequence != newest:  # an old frame does not show that the camera is alive
+            self._last_frame_ns = clock.now_ns() if clock.lockstep else start_ns
+        if not newest:  # the first frame
+            self._not_closed.note(self._state, self._last_frame_ns)
         self._publish(outputs)
         self._watch_gains(outputs)
-        if self._state.frame_sequence != newest:  # an old frame does not show that the camera is alive
-            self._last_frame_ns = start_ns
-        if not newest:  # the first frame
-            self._not_closed.note(self._state, clock.now_ns())
         self._service.work += 1
         self._frame_to_command.add(sent_ns - sample.publish_time_ns)
         self._timing.add(sample.sequence, sample.publish_time_ns, (sample.receive_time_ns, start_ns, ready_ns, sent_ns))
@@ -387,7 +386,7 @@ class Controller:
             self._service.event(event.name, **event.details)
         if outputs.changed:
             now_ns = self._service.clock.now_ns()
-            self._not_closed.note(self._state, now_ns)
+            self._not_closed.note(self._state, now_ns, self._last_frame_ns)
             self._publish_state(now_ns)
 
     def _publish_state(self, time_ns: int) -> None:

@@ -159,7 +159,7 @@ class Arrays:
 
 
 class NotClosed:
-    """Total time, counted from the first frame, for which the loop was not closed, and the causes."""
+    """Total time, from the first frame to the newest, for which the loop was not closed, and the causes."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -170,16 +170,20 @@ class NotClosed:
         self._caused_ns: Counter[str] = Counter()
         self._occurrences = 0
 
-    def note(self, state: State, now_ns: int) -> tuple[int, str]:
-        """Note the loop mode; return the time not closed, ns, and the causes, the longest first."""
+    def note(self, state: State, now_ns: int, newest_ns: int | None = None) -> tuple[int, str]:
+        """Note the loop mode; return the time not closed, ns, and the causes, the longest first.
+
+        `newest_ns` is the time of the newest frame if it is not `now_ns`.
+        """
         with self._lock:  # called from the main and the receiving thread
             if not state.frame_sequence:
                 return self._total_ns, self._causes_in_words()
             before_ns, self._since_ns = self._since_ns, None
             if before_ns is not None:
-                self._total_ns += max(0, now_ns - before_ns)
+                lasted_ns = max(0, (now_ns if newest_ns is None else newest_ns) - before_ns)
+                self._total_ns, now_ns = self._total_ns + lasted_ns, before_ns + lasted_ns
                 if self._cause in self._causes:
-                    self._caused_ns[self._cause] += max(0, now_ns - before_ns)
+                    self._caused_ns[self._cause] += lasted_ns
             if state.mode is not LoopMode.CLOSED:
                 cause, self._since_ns = state.conditions.mode_cause, now_ns
                 if cause and (before_ns is None or cause != self._cause):
