@@ -17,7 +17,7 @@ from pydantic.fields import FieldInfo
 
 from lowfc.contract import toml_text
 from lowfc.contract.codecs import input_file
-from lowfc.contract.errors import ConfigurationError, brief
+from lowfc.contract.errors import ConfigurationError, brief, reworded
 from lowfc.contract.former_names import renamed_keys
 from lowfc.contract.network import Network as Network
 from lowfc.contract.network import WithoutNul
@@ -45,7 +45,6 @@ _MAX_KEY_LENGTH = 100  # characters of an unknown key that are compared with the
 _ALTERNATIVE = re.compile(
     r"\.(?:constrained-\w+|literal\[[^]]*\])|(?<=\.value)\.(?:bool|float)"
 )  # appended by pydantic to a key of two types
-_SHOULD = re.compile("^(?:Input|String|List|Tuple) should")
 
 
 Milliseconds = Annotated[float, Field(ge=0, le=1e9)]
@@ -387,5 +386,5 @@ def explain(detail: Any) -> str:
         known = [*keys(), *Configuration.model_fields, *keys(InterlockSection, "interlocks.")]
         plain = ".".join(part for part in detail["loc"] if isinstance(part, str))
         return f"unknown key {brief(key)}{_nearest(plain[:_MAX_KEY_LENGTH], known)}"
-    message = _SHOULD.sub("must", detail["msg"].removeprefix("Value error, "))
+    message = reworded(detail["msg"])
     return printable(f"{key[:_MAX_KEY_LENGTH]} = {brief(detail['input'])}: {message[:300]}" if key else message)

@@ -11,6 +11,7 @@
 Numerical code raises ValueError; the adapters above it name the file or the key and re-raise one of these.
 """
 
+import re
 import reprlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -64,6 +65,12 @@ def raised_as(
 
 _BRIEF = reprlib.Repr()
 _BRIEF.maxstring = _BRIEF.maxother = _BRIEF.maxlong = 100
+
+
+def reworded(message: str) -> str:
+    """A message of pydantic without its own terms."""
+    message = re.sub("^Value error, |, unable to (?:parse|interpret) .*", "", message)
+    return re.sub("^(?:Input|String|List|Tuple) should", "must", message)
 
 
 def brief(value: object) -> str:

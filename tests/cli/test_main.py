@@ -60,6 +60,15 @@ def test_the_error_of_an_unknown_command_suggests_the_nearest() -> None:
         group.resolve_command(context, ["sim-lop"])
 
 
+def test_the_error_of_a_wrong_argument_names_what_was_expected_and_found() -> None:
+    for words, expected in (
+        ("calibrate --method foo", "'--method': 'foo' is not one of 'analytic'"),
+        ("sim-loop --rate fast", "'--rate': must be a valid number, got 'fast'\n"),
+        ("sim-loop --duration 0", "'--duration': must be greater than or equal to 0.01, got '0'\n"),
+    ):
+        assert expected in CliRunner().invoke(app, words.split()).output
+
+
 def test_a_run_named_before_the_request_is_the_run_of_every_command_of_ctl() -> None:
     group: Any = typer.main.get_command(ctl_app)
     with group.make_context("ctl", ["--run", "other", "status"]) as context:

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from lowfc.adapters.bus import DEFAULT_RUN as DEFAULT_RUN
-from lowfc.contract.errors import LowfcError
+from lowfc.contract.errors import LowfcError, brief, reworded
 from lowfc.contract.printable import LINES, printable
 
 if TYPE_CHECKING:
@@ -46,21 +46,33 @@ LogsOrMeasure = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one: 
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).", show_default=False)]
 
 
-class _Group(TyperGroup):
-    """Command group that lists each command with its full first sentence."""
+class AppGroup(TyperGroup):
+    """Command group."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """List each command with its full first sentence."""
         with formatter.section("Commands"):
             formatter.write_dl(
                 [(name, command.get_short_help_str(limit=999)) for name, command in self.commands.items()]
             )
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; an error about one of its arguments is reworded."""
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as fault:
+            cause: Any = fault.__cause__
+            fault.message = reworded(fault.message)
+            if fault.message.startswith("must ") and hasattr(cause, "errors"):  # a ValidationError
+                fault.message += f", got {brief(cause.errors()[0]['input'])}"
+            raise
 
 
 def new_app(help_text: str) -> typer.Typer:
     """Make a command line with plain error messages."""
     return typer.Typer(
         help=help_text,
-        cls=_Group,
+        cls=AppGroup,
         add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,

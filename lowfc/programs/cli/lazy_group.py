@@ -5,10 +5,9 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 import typer
-from typer.core import TyperGroup
 from typer.main import get_command
 
-from lowfc.adapters.process.terminal import new_app
+from lowfc.adapters.process.terminal import AppGroup, new_app
 
 
 class Row(NamedTuple):
@@ -64,7 +63,7 @@ def lazy_app(help_text: str, panels: Mapping[str, Sequence[Row]], parts: Sequenc
     rows = [row for panel in panels.values() for row in panel]
     width = max(len(row.name) for row in rows)
 
-    class Group(TyperGroup):
+    class Group(AppGroup):
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
             self.commands = Commands(rows, parts)  # type: ignore[assignment]  # read only
