@@ -613,6 +613,7 @@ def test_an_invalid_number_is_quoted_in_the_error() -> None:
         done = lowfc("ctl", *words)
         assert done.exit_code == 2
         assert "'0,3' is not a number: write 0.3" in done.output
+    assert "'4=-5' is not a number: write -5 --modes 4" in lowfc("ctl", "offset", "4=-5").output
     assert "'1.5' is not a whole number" in lowfc("ctl", "step", "1.5").output
     assert isinstance(lowfc("ctl", "gain", "auto", "0.3").exception, ConfigurationError)
     bench = ("ctl", "bench", "--run", "none-such", "celsius")

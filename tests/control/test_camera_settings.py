@@ -307,10 +307,10 @@ def test_a_probe_sequence_advances_with_refused_frames() -> None:
     dark = np.zeros(SHAPE, np.uint16)
     state, _ = feed(DEFAULTS, state, frame(4, pixels=dark))
     stopped = advance(DEFAULTS, state, Request(0, "stop"))[1]
-    assert stopped.reply.text == "stopped on the mirror: 4 of 5 frames were left"
+    assert stopped.reply.text == "probe sequence stopped on the mirror: 4 of 5 frames were left"
     state, _ = feed(DEFAULTS, state, *(frame(count, pixels=dark) for count in range(5, 10)))
     state, outputs = advance(DEFAULTS, state, Request(0, "stop"))
-    assert outputs.reply.text == "nothing is being played"
+    assert outputs.reply.text == "no probe sequence is being played"
     play(state, np.ones((5, 1), np.float32), 0.1 * BASIS)
 
 

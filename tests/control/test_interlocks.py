@@ -188,7 +188,7 @@ def test_a_permit_holds_a_closed_loop_for_its_duration() -> None:
     setup = under(Action.WARN)
     state = running(setup)
     _, outputs = permit(setup, state)
-    check_reply(outputs, False, "the loop is closed")
+    check_reply(outputs, False, "the loop is closed", "with `--hold 5`")
     waiting = state.conditions._replace(mode_cause=MEASURED_FIRST)
     check_reply(permit(setup, state._replace(mode=LoopMode.OPEN, conditions=waiting))[1], False, "closes once")
     state, outputs = permit(setup, state, 0.01)

@@ -251,9 +251,9 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
 def _stop(settings: Settings, state: State, request: Request) -> Handled:
     loop = state.loop
     if loop is None or loop.play is None or loop.play.over(state.frame_sequence + 1):
-        return state, "nothing is being played"
+        return state, "no probe sequence is being played"
     remaining = loop.play.remaining(state.frame_sequence + 1)
-    text = f"stopped on the {loop.play.target}: {remaining} of {loop.play.frames} frames were left"
+    text = f"probe sequence stopped on the {loop.play.target}: {remaining} of {loop.play.frames} frames were left"
     return state._replace(loop=loop.stopped(state.frame_sequence)), text
 
 

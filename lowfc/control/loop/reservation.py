@@ -97,7 +97,7 @@ def permit(settings: Settings, state: State, request: Request) -> tuple[State, s
     if not request.values:
         if closed or state.waits_for_gains:
             what = "is closed" if closed else "closes once its gains are measured"
-            raise ValueError(f"the loop {what}, and would follow the move: request a hold of some seconds")
+            raise ValueError(f"the loop {what}, and would follow the move: request a hold, as with `--hold 5`")
         return state, f"granted: the loop is {state.mode.in_words}"
     granted = _extended(settings, state, request)._replace(holds=True)
     what = "holds its command" if closed else f"is {state.mode.in_words} and stays so"

@@ -36,7 +36,9 @@ def number(word: str) -> float:
     try:
         return float(word)
     except ValueError:
-        raise typer.BadParameter(f"{word!r} is not a number: write 0.3, and several as 0.3 0.2") from None
+        mode, equals, value = word.partition("=")
+        write = f"{value} --modes {mode}" if equals else "0.3, and several as 0.3 0.2"
+        raise typer.BadParameter(f"{word!r} is not a number: write {write}") from None
 
 
 def gain_word(word: str) -> str:
