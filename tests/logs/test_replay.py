@@ -431,6 +431,7 @@ def test_a_log_without_input_numbers_is_refused() -> None:
 
 def test_a_log_with_nothing_to_check_is_not_identical() -> None:
     assert not replay([]).identical
+    assert replay([]).text() == "nothing could be replayed"
     night = night_of(frames(5))
     assert not replay([message for message in night.messages if message.key != CALIBRATION.key]).identical
 

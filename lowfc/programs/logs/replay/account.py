@@ -112,8 +112,8 @@ class Account(Result):
         """Verdict, and counts of what was checked."""
         frames = counted(self.frames, "frame")
         if not self.frames:
-            verdict = "nothing could be replayed"
-        elif self.other_kernel:
+            return ["nothing could be replayed"]
+        if self.other_kernel:
             verdict = f"{frames}, computed by {self.other_kernel}: not the same kernel as the log's"
         elif self.identical:
             within = f" within {self.tolerance_nm:g} nm" if self.tolerance_nm else ""
@@ -147,4 +147,5 @@ class Account(Result):
             lines += [f"                   {line}" for line in first.fields]
         for key, (there, here) in self.host_differs.items():
             lines.append(f"{key:18} {there or 'none'} in the log, {here or 'none'} here")
-        return [*lines, f"speed              {self.log_s:.1f} s of log, {self.speed:.1f} times as fast as recorded"]
+        speed = f"speed              {self.log_s:.1f} s of log, {self.speed:.1f} times as fast as recorded"
+        return [*lines, speed] if self.frames else lines
