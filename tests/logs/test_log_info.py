@@ -66,6 +66,7 @@ def test_info_reports_what_was_written(log: Path) -> None:
     found = json_of("info", log)
     frame = found["topics"].pop(FRAME.key)
     assert not any(line["restarts"] for line in found["topics"].values()), "only the camera restarted"
+    rates = {key: line["rate_hz"] for key, line in found["topics"].items() if key != HEALTH.at("controller")}
     assert {key: line["messages"] for key, line in found.pop("topics").items()} == {
         CALIBRATION.key: 1,
         CONTROLLER_STATE.key: 3,
@@ -73,6 +74,7 @@ def test_info_reports_what_was_written(log: Path) -> None:
         EVENT.key: 4,
         HEALTH.at("controller"): 1,
     }
+    assert rates == {CALIBRATION.key: None, CONTROLLER_STATE.key: None, STEP.key: 10.0, EVENT.key: None}
     assert frame.pop("bytes") > 94_000
     assert frame == {
         "messages": 94,
@@ -106,10 +108,11 @@ def test_info_reports_what_was_written(log: Path) -> None:
     }
 
 
-def test_only_the_digest_of_a_run_known_not_to_be_lockstep_has_a_remark(log: Path) -> None:
+def test_the_text_of_a_run_known_to_be_lockstep_or_not_has_a_remark(log: Path) -> None:
     contents = survey.survey(log, digest=True)
     texts = [info.render(contents | {"lockstep": lockstep}) for lockstep in (True, None, False)]
     assert ["(not a lockstep run" in text for text in texts] == [False, False, True]
+    assert ["simulated time" in text for text in texts] == [True, False, False]
     longer = SyntheticLog().frames(20).write(log.parent / "longer.mcap")
     assert survey.survey(longer, digest=True)["digest"] != contents["digest"]
 

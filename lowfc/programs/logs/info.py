@@ -86,6 +86,9 @@ def _summary(contents: Mapping[str, Any]) -> dict[str, str]:
         "recovery": recovery_in_words(metadata),
         "damage": "\n".join(damage),
         "start": "" if contents["start"] is None else f"{contents['start']}, {contents['duration_s']:.3f} s",
+        "lockstep": "simulated time in the messages; start, duration and rates are the host's"
+        if contents["lockstep"]
+        else "",
         "messages": f"{contents['messages']}; {', '.join(lost)}",
         "loop": ", ".join(contents["loop_modes"]),
         "events": ", ".join(f"{name} {count}" for name, count in contents["events"].items()),

@@ -28,6 +28,7 @@ from lowfc.contract.messages import (
     FRAME,
     HEALTH,
     Log,
+    Rate,
     RawImage,
     Topic,
     from_timestamp,
@@ -35,6 +36,9 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.loop.safety import mode_name
+
+_MIN_FOR_RATE = 10
+"""Fewest messages of a topic from which a rate is computed."""
 
 
 class Digest:
@@ -98,11 +102,12 @@ class _Line:
     size: int = 0
     starts: set[tuple[str, int]] = field(default_factory=set)
 
-    def json_object(self, missing: int | None) -> dict[str, Any]:
+    def json_object(self, topic: Topic | None, missing: int | None) -> dict[str, Any]:
         length_s = (self.last_ns - self.first_ns) / 1e9
+        has_rate = self.messages >= _MIN_FOR_RATE and (topic is None or topic.rate is not Rate.EVENT)
         return {
             "messages": self.messages,
-            "rate_hz": round((self.messages - 1) / length_s, 3) if length_s > 0 else None,
+            "rate_hz": round((self.messages - 1) / length_s, 3) if has_rate and length_s > 0 else None,
             "bytes": self.size,
             "restarts": len(self.starts) - len({author for author, _ in self.starts}),
             "missing": missing,
@@ -157,7 +162,7 @@ class _Account:
         topics = {}
         for key, line in sorted(self._lines.items()):
             counted = (topic := _topic(key)) is None or self._selection.records_all(topic)
-            topics[key] = line.json_object(missing.get(key, 0) if counted else None)
+            topics[key] = line.json_object(topic, missing.get(key, 0) if counted else None)
         return {
             "start": None if begin is None else begin.isoformat(timespec="milliseconds"),
             "duration_s": None if self._begin_ns is None else round((self._end_ns - self._begin_ns) / 1e9, 3),
