@@ -221,6 +221,15 @@ def test_a_starting_loop_is_listed_and_makes_an_unnamed_request_ambiguous(
         sim_loop.sim_loop(load(None), 1.0, record=False, name="other")
 
 
+def test_a_folder_without_permission_is_refused_before_anything_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sim_loop, "_new_run", Mock(side_effect=AssertionError("started")))
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)  # root may write everywhere
+    with pytest.raises(DataFileError, match="not writable; name another"):
+        sim_loop.sim_loop(load(None, {"recorder.folder": str(tmp_path / "logs")}), 1.0, record=True)
+
+
 def test_an_interruption_or_a_fault_before_the_first_process_leaves_no_run(
     own_runtime: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

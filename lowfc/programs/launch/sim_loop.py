@@ -24,7 +24,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, LowfcError
 from lowfc.contract.messages import EVENT, HEALTH, Role
 from lowfc.programs.commissioning.analytic import analytic
-from lowfc.programs.core.recording.volume import estimate
+from lowfc.programs.core.recording.volume import check_folder, estimate
 from lowfc.programs.launch.processes import program, stop_all
 from lowfc.programs.launch.status import screen, status_line
 from lowfc.programs.launch.watch import Watch, summary
@@ -51,6 +51,8 @@ def sim_loop(
     """
     console = Console(stderr=True)
     require_screen(show)
+    if record:
+        check_folder(config)
     watch = Watch({}, [])
     children: list[Child] = []
     run = _new_run(config, name)

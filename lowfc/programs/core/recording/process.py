@@ -8,7 +8,7 @@ from pathlib import Path
 from lowfc.adapters.bus.run import MODE, Run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files.whole_file import write_whole
-from lowfc.adapters.logs.series import LogLimits, shortage
+from lowfc.adapters.logs.series import LogLimits
 from lowfc.adapters.logs.writer import Attachment
 from lowfc.adapters.process.join import clock_of
 from lowfc.adapters.process.provenance import provenance
@@ -21,7 +21,7 @@ from lowfc.contract.messages import Role, wire
 from lowfc.programs.core.recording.alarm import Alarm
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
-from lowfc.programs.core.recording.volume import bytes_per_s, configured_selection, estimate
+from lowfc.programs.core.recording.volume import bytes_per_s, check_folder, configured_selection, estimate
 
 _MAX_ATTACHMENT_BYTES = 1 << 28
 
@@ -37,8 +37,7 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
     """
     recorder_section, realtime = config.recorder, config.realtime
     limits, selection = log_limits(config), configured_selection(config)
-    if short := shortage(input_file.user_path(recorder_section.folder), limits.min_free_bytes):
-        raise DataFileError(short)
+    check_folder(config)
 
     def announced_bytes_per_s(camera: wire.CameraState | None) -> float:
         sys.stderr.write(f"{estimate(config, camera)}\n")

@@ -1,13 +1,15 @@
-"""Estimate of the disk space that a recording will use."""
+"""Estimate of the disk space that a recording will use, and a check of its folder."""
 
+import os
 import shutil
 from pathlib import Path
 
 from lowfc.adapters.files.sensors import PUPIL_IMAGE_PIXELS
 from lowfc.adapters.logs.selection import Selection, selection
-from lowfc.adapters.logs.series import existing
+from lowfc.adapters.logs.series import existing, shortage
 from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import COMMAND, FRAME, MIRROR_STATE, STEP, SURFACE, TRUTH, Rate, Topic, wire
 from lowfc.optics.chain.sensor import Sensor
 
@@ -57,6 +59,16 @@ def estimate(config: Configuration, camera: wire.CameraState | None = None) -> s
     selected = f" ({recorded.description})" if recorded.description else ""
     size = f"{rows} x {columns} pixels{source}{selected}"
     return f"recording into {folder}: {growth}, at {config.camera.rate_hz:g} Hz and {size}"
+
+
+def check_folder(config: Configuration) -> None:
+    """Raise DataFileError if the recorder's folder can hold no log: no access, no permission or too little space."""
+    folder = user_path(config.recorder.folder)
+    fault = shortage(folder, round(config.recorder.min_free_mb * 1e6))
+    if not fault and not os.access(existing(folder), os.W_OK):
+        fault = f"no log can be recorded in {folder}: it is not writable; name another (recorder.folder)"
+    if fault:
+        raise DataFileError(fault)
 
 
 def growth_in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: float) -> str:
