@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.ma  # `np.median` would import it during the first verdict, which takes 10 ms
 
 from lowfc.arrays import Array, Integers, Mask, Single
 from lowfc.control.laws.stability import highest_gain

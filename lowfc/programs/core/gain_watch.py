@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+import numpy.ma  # `np.median` would import it during the first verdict, which takes 10 ms
 
 from lowfc.arrays import Array, Mask, Single
 from lowfc.control.calibration.map_reconstructor import map_rows, noise_covariance_nm2
