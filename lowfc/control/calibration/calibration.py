@@ -18,7 +18,7 @@ FIRST = "+first"
 """Suffix of `Calibration.estimator` for the first calibration of a commissioning."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)  # equal if the same object, so that a cache can hold it
 class Calibration:
     """Matrices from a frame to modes and from modes to actuators; single precision, as in the loop.
 

@@ -1,5 +1,7 @@
 """Maximum-a-posteriori (MAP) reconstructor of the corrected modes: the uncorrected ones have a prior mean square."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from lowfc.arrays import Array, Single, single
@@ -7,10 +9,11 @@ from lowfc.control.calibration.calibration import Calibration, noise_nm2
 from lowfc.control.loop.camera import CameraSettings
 
 
+@lru_cache(maxsize=2)  # a verdict on the gains, the request for them and their use need the same one
 def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: CameraSettings | None) -> Array | None:
     """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront rms, with the flux normalisation.
 
-    It includes photon noise of I0 and read noise; None if the camera's gain or the flux is unknown.
+    It includes photon noise of I0 and read noise; None if the camera's gain or the flux is unknown. Read-only.
     """
     if camera is None or not camera.gain_e_per_dn > 0 or not flux_dn > 0:
         return None
@@ -19,7 +22,9 @@ def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: Camer
     flux_e = flux_dn * camera.gain_e_per_dn / em_gain
     read_noise_e = camera.read_noise_e / em_gain / excess**0.5
     R, I0 = calibration.reconstructor.astype(np.float64), calibration.reference.astype(np.float64)
-    return excess * noise_nm2(R, I0, flux_e, read_noise_e)
+    covariance = excess * noise_nm2(R, I0, flux_e, read_noise_e)
+    covariance.flags.writeable = False
+    return covariance
 
 
 def map_rows(

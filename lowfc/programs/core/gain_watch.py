@@ -84,8 +84,6 @@ class GainWatch:
         self._former_flux_dn = 0.0
         self._changed_in_a_row = 0
         self._mode = LoopMode.IDLE
-        self._noise_conditions: tuple[object, ...] = ()
-        self._last_noise_nm2: Array | None = None
         self.closing_harm = ""
 
     def observe(self, step: Step, state: State) -> Actions:
@@ -187,7 +185,8 @@ class GainWatch:
         self._flux_frames += 1
         if self._flux_frames < max(FLUX_S * self._settings.rate_hz, 10):
             return 0.0
-        mean, self._flux_sum_dn, self._flux_frames = self._flux_sum_dn / self._flux_frames, 0.0, 0.0
+        mean = float(np.float32(self._flux_sum_dn / self._flux_frames))  # as a request for gains carries it
+        self._flux_sum_dn = self._flux_frames = 0.0
         if not self._former_flux_dn:
             self._former_flux_dn = mean
         ratio = mean / self._former_flux_dn
@@ -265,12 +264,8 @@ class GainWatch:
     def _noise_nm2(self, loop: ActiveLoop) -> Array | None:
         """Noise variance of one frame (modes,) at this star's flux; None if the camera's gain is unknown."""
         flux_dn = self._former_flux_dn or loop.calibration.flux_dn
-        conditions = loop.calibration.id, loop.camera, flux_dn
-        if conditions != self._noise_conditions:
-            covariance = noise_covariance_nm2(loop.calibration, flux_dn, loop.camera)
-            self._last_noise_nm2 = None if covariance is None else np.diag(covariance)
-            self._noise_conditions = conditions
-        return self._last_noise_nm2
+        covariance = noise_covariance_nm2(loop.calibration, flux_dn, loop.camera)
+        return None if covariance is None else np.diag(covariance)
 
     def _gain_request(self, step: Step, loop: ActiveLoop, gain: Single) -> Request:
         """The request for gains (modes,), with the prior of the uncorrected modes for R."""
@@ -282,10 +277,16 @@ class GainWatch:
                 assert group.verdict is not None  # noqa: S101  # checked above
                 prior[group.mask] = uncorrected_prior_nm2(group.verdict, uncorrected[group.mask], noise_nm2[group.mask])
             prior_nm2 = tuple(prior.tolist())
-        flux_dn = float(np.float32(self._former_flux_dn))
         values = tuple(gain.astype(np.float32).tolist())
         return Request(
-            step.time_ns, "gain", (), values, AUTO, requester=REQUESTER, prior_nm2=prior_nm2, flux_dn=flux_dn
+            step.time_ns,
+            "gain",
+            (),
+            values,
+            AUTO,
+            requester=REQUESTER,
+            prior_nm2=prior_nm2,
+            flux_dn=self._former_flux_dn,
         )
 
     def _harm_events(self, group: _Group, verdict: Verdict, loop: ActiveLoop) -> list[PendingEvent]:
