@@ -19,7 +19,7 @@ HIGHEST = 1.5  # gain at the right end of a knob's bar
 STEP, FINE_STEP = 0.05, 0.01
 FINE_BELOW = 0.1
 """Knobs below this gain are turned in fine steps."""
-_BAR = 8  # columns of the bar beside that of the knob
+_BAR = 8  # columns of the bar without its mark
 _BEFORE = 11  # columns before the bar
 _PENDING_S = 1.0  # time for which a knob shows the requested gain: by then the controller's state has it
 
@@ -28,7 +28,7 @@ class Gains(Lines):
     """The knobs, scrolled to the chosen one. Keys or a click on a bar turn it; its modes keep their ratios."""
 
     class Turned(Message):
-        """A knob was turned: gains requested for these modes; no values request automatic gains."""
+        """A knob was turned: gains requested for these modes, automatic ones if `values` is empty."""
 
         def __init__(self, modes: tuple[int, ...], values: list[float]) -> None:
             super().__init__()
@@ -62,9 +62,9 @@ class Gains(Lines):
     def turn(self, steps: int) -> None:
         """Turn the chosen knob."""
         if self._noll:
-            knob = round(self._knob(self._chosen), 3)  # the controller's gains are float32
-            fine = knob < FINE_BELOW or (steps < 0 and knob <= FINE_BELOW)
-            self._request(self._chosen, knob + steps * (FINE_STEP if fine else STEP))
+            gain = round(self._shown_gain(self._chosen), 3)  # the controller's gains are float32
+            fine = gain < FINE_BELOW or (steps < 0 and gain <= FINE_BELOW)
+            self._request(self._chosen, gain + steps * (FINE_STEP if fine else STEP))
 
     def automatic(self) -> None:
         """Request automatic gains for the chosen knob."""
@@ -83,28 +83,28 @@ class Gains(Lines):
                 self._request(self._chosen, (event.x - _BEFORE) / _BAR * HIGHEST)
             self._draw()
 
-    def _request(self, number: int, knob: float) -> None:
-        knob = round(min(max(knob, 0.0), max(HIGHEST, self._knob(number))), 3)
+    def _request(self, number: int, gain: float) -> None:
+        gain = round(min(max(gain, 0.0), max(HIGHEST, self._shown_gain(number))), 3)
         present = self._gain[self._indices(number)]
-        gains = np.full(len(present), knob) if not present.any() else present / present.max() * knob
-        self._pending[number] = knob, time.monotonic() + _PENDING_S
+        gains = np.full(len(present), gain) if not present.any() else present / present.max() * gain
+        self._pending[number] = gain, time.monotonic() + _PENDING_S
         values = [float(f"{value:.4g}") for value in gains.tolist()]
         self.post_message(self.Turned(groups(self._noll)[number][1], values))
 
     def _indices(self, number: int) -> list[int]:
         return [self._noll.index(mode) for mode in groups(self._noll)[number][1]]
 
-    def _knob(self, number: int) -> float:
-        knob, until_s = self._pending.get(number, (0.0, 0.0))
-        return knob if time.monotonic() < until_s else float(self._gain[self._indices(number)].max())
+    def _shown_gain(self, number: int) -> float:
+        gain, until_s = self._pending.get(number, (0.0, 0.0))
+        return gain if time.monotonic() < until_s else float(self._gain[self._indices(number)].max())
 
     def _draw(self) -> None:
         lines = []
         for number, (name, _) in enumerate(groups(self._noll)):
-            knob, indices = self._knob(number), self._indices(number)
-            at = round(min(max(knob / HIGHEST, 0.0), 1.0) * _BAR)
+            gain, indices = self._shown_gain(number), self._indices(number)
+            at = round(min(max(gain / HIGHEST, 0.0), 1.0) * _BAR)
             lowest = float(self._gain[indices].min())
-            range_start = "" if lowest >= 0.99 * knob else f"{lowest:.2g}-"
+            range_start = "" if lowest >= 0.99 * gain else f"{lowest:.2g}-"
             chosen = number == self._chosen
             lines.append(
                 Text.assemble(
@@ -112,7 +112,7 @@ class Gains(Lines):
                     ("━" * at, style(BLUE)),
                     ("●", BOLD),
                     ("━" * (_BAR - at), style(GREY)),
-                    f" {range_start}{knob:.2g}" if range_start else f" {knob:.3g}",
+                    f" {range_start}{gain:.2g}" if range_start else f" {gain:.3g}",
                     (" auto" if self._automatic[indices].all() else "", DIM),
                 )
             )
