@@ -36,8 +36,7 @@ from tools.shared import ROOT, markdown
 
 API = ("client", "device", "optics", "design", "control")
 """Packages of the Python API."""
-_MESSAGES = 4  # numbers of `message_type` and `field` in descriptors: protoc addresses comments by them
-_FIELDS = 2
+_MESSAGES, _FIELDS = 4, 2  # field numbers of `message_type` and `field`, in protoc's paths of comments
 _UNCOMMENTED = {"timestamp": "Time of the reported quantity"}
 _TAKEOVER = (
     ("frames for which a new law observes", SETTLING_FRAMES),

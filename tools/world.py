@@ -17,8 +17,8 @@ from tools.shared import Results, markdown
 
 SENSORS, MAGNITUDES = ("sam27d10_bal14", "zwfs"), (2, 5)
 PRESET, RATE_HZ, SECONDS = "bench", 500.0, 4.0
-_UNTIL_GAINS_S = 2.5
-_FRAMES = 2000  # mean for the dark and for the reference image
+_UNTIL_GAINS_S = 2.5  # run after which the automatic gains are read
+_FRAMES = 2000  # averaged for the dark and for the reference image
 WHEEL = {"disturbance.wheel_hz": 12.0}
 CASES: dict[str, dict[str, Any]] = {
     "none": {},
@@ -126,9 +126,9 @@ def render(results: Results) -> str:
         f"{markdown(head, lines)}\nTrue residual wavefront over the open pupil in continuous time, and mean "
         "contrast that the modes add to the dark zone (quadratic form), over the second half of "
         f"{results['seconds']:g} s at {RATE_HZ:g} Hz, disturbance `{PRESET}`, one seed, with the automatic gains "
-        "of the loop without imperfections. Sensor images pass through the live loop's own `advance` and the simulated "
-        "mirror. The calibration is analytic and includes no imperfection except dark current, or has dark and "
-        "reference image measured on that detector."
+        "of the loop without imperfections. The live loop's own `advance` processes the sensor images and commands the "
+        "simulated mirror. The calibration is analytic and includes no imperfection except dark current, or has dark "
+        "and reference image measured on that detector."
     )
 
 
