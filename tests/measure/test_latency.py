@@ -132,7 +132,7 @@ def test_frames_without_command_are_counted_as_crowded_out_only_in_a_burst() -> 
     assert repeat_statistics(frames(1, scheduled=False))["frames_sent_late"] is None
     found = repeat_statistics(frames(put_ns, command_us, (put_ns - due_ns) / 1e3))
     assert (found["frames_without_command"], found["frames_crowded_out"]) == (3, 2)
-    assert found["frames_sent_late"] == 1  # one by 2 ms, the other by less than a period
+    assert found["frames_sent_late"] == 1  # frame 800, by 2 ms; frame 801 is late by less than a period
     put_ns[900:] += 3600 * 10**9  # the camera waited for its trigger
     found = repeat_statistics(frames(put_ns, command_us))
     assert (found["frames_crowded_out"], found["rate_hz"]) == (2, pytest.approx(1000, abs=5))
@@ -215,7 +215,7 @@ def test_the_last_of_many_processors_is_read(tmp_path: Path, monkeypatch: pytest
     assert stolen_ns == 511 * 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 
 
-def test_evidence_of_a_stall_is_against_the_host_or_the_loop() -> None:
+def test_signs_of_a_stall_are_sorted_by_cause_host_or_loop() -> None:
     nothing: Any = dict.fromkeys(CountChanges.model_fields, 0)
     cases: list[tuple[dict[str, float], tuple[list[str], list[str]]]] = [
         ({"bare_late_us": 250}, (["bare loop 250 us late"], [])),

@@ -25,7 +25,7 @@ class _Tally:
 
     Attributes:
         gaps: gaps in the received sequences.
-        published: number published according to its last Health; a message sent twice counts twice.
+        published: number published, once the publisher has reported that it stopped; a message sent twice counts twice.
         recorded: number recorded.
         duplicates: number of those recorded that were duplicates.
         never_sent: frames that a camera lost and never sent, according to its Health, less `lost_before`.
@@ -51,9 +51,9 @@ class _Tally:
 
     @property
     def confirmed(self) -> int:
-        """Number lost; if the camera loses frames, only those already lost at the last call of `newly_lost`.
+        """Number lost; once the camera has lost frames, at most as many as at the last call of `newly_lost`.
 
-        The camera reports frames that it never sent in its next Health, after the gap in their sequences.
+        The newest gap may be of frames that the camera never sent: its next Health reports them.
         """
         return min(self.lost, self.last_lost) if self.never_sent else self.lost
 
@@ -120,7 +120,7 @@ class LossAccount:
                     tally.lost_before = count.missing if tally.gaps.first else 0
                 tally.never_sent = count.missing - tally.lost_before
                 if health.state == "stopped":
-                    tally.published = min(count.published, 1 << COUNT_BITS)  # later ones have another start
+                    tally.published = min(count.published, 1 << COUNT_BITS)  # the next start counts further ones
 
     def mark_flushed(self) -> None:
         """Note that everything recorded so far has been flushed."""
@@ -169,7 +169,7 @@ class LossAccount:
         return sums
 
     def _author(self, topic: Topic, sample: Sample) -> str:
-        """Publisher of an event, since several processes with equal starts publish events; otherwise empty."""
+        """Publisher of an event, since several processes with equal starts publish events; empty for other topics."""
         if topic is not EVENT:
             return ""
         try:

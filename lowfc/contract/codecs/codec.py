@@ -50,7 +50,8 @@ _PIXEL = np.dtype("<u2")  # parsing its name would cost 0.2 us in every frame
 def decode_frame(payload: bytes, sequence: int, age_ns: int, *, ahead: bool = False) -> Frame:
     """Frame of a RawImage; its pixels are None if the message has no complete mono16 image.
 
-    `ahead`: whether its sequence starts too far in the future. BadMessageError if its time or sequence is out of range.
+    `ahead`: whether the camera's start time, encoded in `sequence`, is too far in the future. BadMessageError if the
+    time or the sequence is out of range.
     """
     checked_sequence(sequence)
     try:
@@ -217,7 +218,7 @@ def max_bytes(name: str) -> int:
 
 
 def only_requester(payload: bytes) -> bytes:
-    """A request with nothing but the requester of this one; empty if it cannot be read."""
+    """A request reduced to its requester; empty if it cannot be read."""
     try:
         request = wire.Request.FromString(payload[:_BYTES_WITHOUT_ARRAYS])
         return wire.Request(requester=request.requester).SerializeToString()
@@ -279,8 +280,8 @@ def request(
 def encode_request(request: Request, reply: Reply, input_number: int, state: wire.ControllerState | None) -> bytes:
     """Request with its reply; the input number is 0 if the controller did not act on it.
 
-    Only the identity of a calibration is written, and of law and table if the request is prepared: they have topics of
-    their own. `state` is the answer to `status`.
+    Calibrations, laws and tables have topics of their own, so only their identities are written. A request that is not
+    prepared contains its law and table. `state` is the answer to `status`.
     """
     played = request.played
     message = wire.Request(

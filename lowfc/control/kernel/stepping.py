@@ -57,7 +57,7 @@ def _fused(
         return None
     x, matrices, from_error = tables.no_states, (tables.no_law, tables.no_law), True
     if law_runner is not None:
-        if not law_runner.alone(1):
+        if not law_runner.alone(later=1):
             return None
         law, x = law_runner.law, law_runner.x
         matrices, from_error = (law.joined, law.output), law.signal == "error"
@@ -71,6 +71,7 @@ def _fused(
     signals = measured_nm, loop.seen_nm(), shift_nm, target_nm, loop.history_nm[0]
     integrator = loop.integrator.rows
     mirror = tables.shapes, channels_nm, loop.actuators_nm
+    # limits less the margin, which is half as large between neighbours
     limits_nm = limits.kept_stroke_nm, limits.kept_slew_nm, limits.neighbour_nm - limits.margin_nm / 2
     if not tables.respond(*signals, integrator, x, *matrices, from_error, *mirror, *limits_nm, results, actuators_nm):
         return None
@@ -115,7 +116,7 @@ def _update_guard(
             guard = guard.at_rest()
         elif advanced.frames <= SETTLING_FRAMES or not closed:
             guard = guard.observed(pol_from_target_nm, advanced.frames)
-        else:  # virtual commands have the modal limit, too
+        else:  # the guard's virtual commands have the modal limit, too: the comparison stays valid
             limited = any(reason is not Limit.MODAL_LIMIT for reason in state.limits_hit)
             commands = advanced.law, advanced.x, loop.integrator, loop.delay_weights, loop.history_nm
             guard, guard_events = guard.judged(*commands, error_nm, pol_from_target_nm, limited=limited)
@@ -132,7 +133,7 @@ def next_command(
         return step_to_flat(settings, loop), (), False
     channels, returning_to_zero = loop.command_channels, state.returning_to_zero
     closed = state.mode is LoopMode.CLOSED
-    # After a command that a limit changed, the mirror has not reached its channels, even if they count as reached.
+    # If a limit changed the last command, the mirror lacks a part of the channels, even if all count as reached.
     channels_move = channels is not None and bool(channels.moving or state.limits_hit)
     if not (state.may_command and (closed or returning_to_zero or channels_move)):
         return loop.holding_command(1), (), returning_to_zero

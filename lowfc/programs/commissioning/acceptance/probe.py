@@ -194,7 +194,7 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
                 f"{path}: ends {cut} of {frames} frames before the end of a measurement ({', '.join([kind, *named])}): "
                 "give all files of the log, or measure again"
             )
-        request_ns = from_timestamp(request.timestamp)  # compared by time: a state after a `clear` has no frame
+        request_ns = from_timestamp(request.timestamp)  # not the frame: a state after a `clear` has none
         states = [state for state in history.controllers if len(state.gain) == modes]
         before = [state for state in states if from_timestamp(state.timestamp) <= request_ns]
         if not before:
@@ -210,7 +210,7 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
 
 
 def _check_undisturbed(history: History, first: int, end: int, *, play: bool) -> None:
-    """DataFileError if a request disturbed the frames from `first` to before `end`, or an event a probe sequence."""
+    """DataFileError if a request, or during a probe an event, disturbed the frames from `first` to before `end`."""
     path, sequence = history.log.path, history.steps.sequence
     for request in history.requests:
         if request.accepted and request.name in _DISTURBING and first < request.frame_sequence < end:
@@ -225,7 +225,7 @@ def _check_undisturbed(history: History, first: int, end: int, *, play: bool) ->
 
 
 def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[str, Any], wire.Request]]:
-    """The measurements of a test: parameters, and the request that started each, of repeated ones the last."""
+    """Parameters and starting request of each measurement of a test; of a repeated measurement, only the last."""
     latest: dict[str, tuple[dict[str, Any], wire.Request]] = {}
     starting = "note" if kind == "noise-floor" else "play"  # noise-floor has no probe sequence
     parameters: dict[str, Any] | None = None

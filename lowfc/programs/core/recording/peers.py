@@ -11,7 +11,7 @@ from lowfc.contract.messages import CAMERA_STATE, HEALTH, TOPICS, wire
 
 
 class Peers:
-    """States of the processes by their last Health; `newest` has calibration and states, with which a log starts."""
+    """The last `Health.state` of each process; `newest` has the calibration and state messages that start a log."""
 
     def __init__(self, bus: Bus) -> None:
         self.newest: dict[str, Sample] = {}
@@ -56,7 +56,7 @@ class Peers:
         return known
 
     def query(self) -> list[Sample]:
-        """Query calibration and states published before this process started, or lost; return the new ones."""
+        """Query calibration and states; return the new ones: published before this process started, or lost."""
         return self._store_new(self._query_all())
 
     def query_soon(self) -> None:
