@@ -125,9 +125,16 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, Prob
     loop.ask("safe")
     with pytest.raises(AcceptanceError, match="it must be open or closed for a test"):
         Live(loop, lambda *_: None)
+
+
+def test_an_interrupted_probe_sequence_is_repeated_in_the_same_mode(capsys: pytest.CaptureFixture[str]) -> None:
     silent = InProcessLoop(configured(), lose=lambda index: index == 60 and silent.silence_camera())
-    with pytest.raises(AcceptanceError, match="NO_FRAMES no frame for 60 ms"):
-        responses_of(silent, linearity, hold_frames=7, cycles=3, modes=(2,))
+    (response,) = responses_of(silent, linearity, hold_frames=7, cycles=3, modes=(2,))
+    assert linearity.judge([response], silent.config).passed
+    assert capsys.readouterr().out.count("NO_FRAMES no frame for 60 ms; holding the command) during a probe") == 1
+    again = InProcessLoop(configured(), lose=lambda index: index > 20 and not index % 30 and again.silence_camera())
+    with pytest.raises(AcceptanceError, match=r"in 3 attempts no probe sequence was undisturbed; .*NO_FRAMES"):
+        responses_of(again, linearity, hold_frames=7, cycles=3, modes=(2,))
 
 
 def test_linearity_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain() -> None:

@@ -155,7 +155,7 @@ def _carry_out(
         config_in_use = history.configuration.model_copy(update=required)
     else:
         with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:
-            live = Live(client, partial(count, test.KIND))
+            live = Live(client, partial(count, test.KIND), partial(print, file=sys.stderr))
             config_in_use = live.configuration = live.configuration.model_copy(update=required)
             with client.reserved("lowfc acceptance"), live.restored():
                 responses = play(live)

@@ -26,6 +26,8 @@ from lowfc.programs.commissioning.acceptance.probe import (
     probe_response,
 )
 
+ATTEMPTS = 3
+"""Plays of a probe sequence that the mirror or the camera interrupts, before the test ends with an error."""
 _OTHER_BYTES = 1000  # bytes of a request to play, without its table and shapes
 _LAW_FIELDS = ("gain", "leak", "limit_nm", "law", "calibration_id")
 
@@ -33,7 +35,9 @@ _LAW_FIELDS = ("gain", "leak", "limit_nm", "law", "calibration_id")
 class Live:
     """The live loop; `restored` stops probe sequences and restores the mode at the end."""
 
-    def __init__(self, client: Client, progress: Callable[[int, int], None]) -> None:
+    def __init__(
+        self, client: Client, progress: Callable[[int, int], None], report: Callable[[str], object] = print
+    ) -> None:
         """Read calibration, configuration and mode of the loop; AcceptanceError unless it is open or closed."""
         self.client = client
         self.calibration = client.calibration()
@@ -42,7 +46,7 @@ class Live:
         self._initial_mode = LoopMode(state.mode)
         if self._initial_mode not in (LoopMode.OPEN, LoopMode.CLOSED):
             raise AcceptanceError(f"the loop is {self._initial_mode.in_words}: it must be open or closed for a test")
-        self._progress = progress
+        self._progress, self._report = progress, report
         self._done = self._expected = 0
         self.loop = loop_of(state, self.calibration, self.configuration.camera.rate_hz, self.client.laws())
 
@@ -96,16 +100,32 @@ class Live:
         """Play a table and return the loop's response; without shapes in `basis` the table is added to the offset.
 
         A table without columns adds no probe: only the steps are recorded. AcceptanceError if the table is too large
-        for a request, gains or law changed, or the mirror or the camera failed.
+        for a request, gains or law changed, or the mirror or the camera interrupted `ATTEMPTS` plays.
         """
-        modes = len(self.calibration.noll)
-        basis = np.zeros((modes, 0), np.float32) if basis is None else basis
+        basis = np.zeros((len(self.calibration.noll), 0), np.float32) if basis is None else basis
         frames, columns = table.shape
         most_frames = (max_bytes("play") - _OTHER_BYTES - basis.nbytes) // (table.itemsize * max(columns, 1))
         if columns and frames > most_frames:
             longest_s = most_frames / self.loop.rate_hz
             raise AcceptanceError(f"a probe sequence of {columns} columns is too long: shorten it to {longest_s:.0f} s")
         self.set_mode(mode)
+        for _ in range(ATTEMPTS):
+            response, interruption = self._played(kind, parameters, mode, table, basis)
+            if not interruption:
+                self._done += frames
+                return response
+            now = LoopMode(self._state().mode)
+            if now is not mode:  # an interlock, for example: the loop is not closed again
+                raise AcceptanceError(f"{interruption} during the measurement, and the loop is {now.in_words} now")
+            self._report(f"{kind}: {interruption} during a probe sequence, which is repeated")
+            self.wait(self.loop.settling_frames())
+        raise AcceptanceError(f"in {ATTEMPTS} attempts no probe sequence was undisturbed; the last: {interruption}")
+
+    def _played(
+        self, kind: Kind, parameters: dict[str, Any], mode: LoopMode, table: Single, basis: Single
+    ) -> tuple[ProbeResponse, str]:
+        """The response to a table played once, and what interrupted it; empty if nothing did."""
+        frames, columns = table.shape
         before = self._state()
         steps, watch = self.client.steps(), self.client.mirror_watch()
         answer = self.client.note(ANNOUNCEMENT + json.dumps({"test": kind, **parameters, "frames": frames}))
@@ -117,6 +137,7 @@ class Live:
         first = answer.frame_sequence
         recorded: list[Step] = []
         for step in steps:
+            watch.read()
             if step.frame_sequence < first:
                 continue
             if step.frame_sequence >= first + frames:
@@ -124,18 +145,18 @@ class Live:
             recorded.append(step)
             passed = step.frame_sequence - first + 1
             self._progress(self._done + passed, max(self._expected, self._done + frames))
-            if step.mode is not mode or set(step.reasons) & set(LIMITS):
-                break  # `judge` reports the cause
+            if step.mode is not mode or set(step.reasons) & set(LIMITS) or (columns and watch.interruption):
+                break  # `judge` reports the cause, `play` an interruption
         steps.close()
-        self._done += frames
         after = self._state()
         if [getattr(before, name) for name in _LAW_FIELDS] != [getattr(after, name) for name in _LAW_FIELDS]:
             raise AcceptanceError("gains or control law changed during the measurement: measure again")
         watch.read()
-        if columns and watch.interruption:
-            raise AcceptanceError(f"{watch.interruption} during the measurement: measure again")
         loop = loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws())
-        return probe_response(parameters, loop, target, table, basis, first, steps_as_columns(recorded, modes))
+        response = probe_response(
+            parameters, loop, target, table, basis, first, steps_as_columns(recorded, len(loop.noll))
+        )
+        return response, watch.interruption if columns else ""
 
     def _state(self) -> wire.ControllerState:
         state = self.client.status().state
