@@ -221,7 +221,7 @@ def test_a_probe_sequence_ends_with_a_request_a_limit_a_restart_or_another_calib
         ({"text": MIRROR, "table": np.ones((3, 1), np.float32)}, "actuators"),
         ({"text": MIRROR, "table": np.ones((3, 2), np.float32), "actuators_nm": np.ones(ACTUATORS)}, "per column"),
         ({"text": MIRROR, "table": np.zeros((0, 1), np.float32), "actuators_nm": np.ones(ACTUATORS)}, "row"),
-        ({"text": MIRROR, "table": np.full((3, 1), 1e3), "actuators_nm": np.ones(ACTUATORS)}, "stroke"),
+        ({"text": MIRROR, "table": np.full((3, 1), 1e3), "actuators_nm": np.ones(ACTUATORS)}, "to 1000 nm"),
         ({"text": MIRROR, "table": np.full((3, 1), np.nan), "actuators_nm": np.ones(ACTUATORS)}, "finite"),
         ({"text": OFFSET, "table": np.ones((3, 2), np.float32)}, "columns"),
     ],
@@ -237,6 +237,13 @@ def test_an_inconsistent_probe_sequence_is_refused(fields: dict[str, object], wh
     assert not reply.accepted
     assert why in reply.text
     assert loop.state.loop is before.loop
+
+
+def test_pokes_of_single_actuators_may_together_exceed_the_stroke() -> None:
+    loop = ToyLoop(mode=LoopMode.OPEN)
+    loop.run(2)
+    one_each = np.eye(ACTUATORS, dtype=np.float32)
+    assert loop.ask("play", text=MIRROR, table=300 * one_each, actuators_nm=one_each.ravel()).accepted
 
 
 @pytest.mark.parametrize(

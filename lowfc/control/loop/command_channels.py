@@ -262,7 +262,7 @@ def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
         raise ValueError("every number of a probe sequence must be finite")
     basis = basis.reshape(columns, -1) if target == MIRROR else np.zeros((0, 0), np.float32)
     largest = np.abs(rows).max(axis=0).astype(np.float64)
-    reach_nm = float(largest @ np.abs(basis).max(axis=1)) if basis.size else 0.0
+    reach_nm = float((largest @ np.abs(basis)).max()) if basis.size else 0.0
     table_id = identity((("target", target), ("table", rows), ("columns", columns), ("basis", basis)))
     return PlayTable(target, rows, basis, largest, reach_nm, table_id)
 

@@ -235,7 +235,8 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
             actuators = f"{grid[0]} x {grid[1]} actuators per column of its table"
             raise ValueError(f"a probe sequence needs {actuators}, got {table.basis.shape[1]}")
         if table.reach_nm > settings.limits.stroke_nm:
-            raise ValueError(f"the probe sequence may exceed the stroke of {settings.limits.stroke_nm:g} nm")
+            stroke = f"the stroke of {settings.limits.stroke_nm:g} nm"
+            raise ValueError(f"the probe sequence may exceed {stroke}: an actuator may go to {table.reach_nm:.4g} nm")
     else:
         modes = len(loop.calibration.noll)
         if len(table.largest) != modes:
