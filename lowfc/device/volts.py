@@ -54,7 +54,11 @@ class VoltMap:
         self._channel = order[self._wired].astype(int)
         self.channels = int(self._channel.max()) + 1 if channels is None else channels
         if len(set(self._channel)) < len(self._channel) or self._channel.max() >= self.channels:
-            raise ConfigurationError(f"option order: each actuator needs its own channel below {self.channels}")
+            raise ConfigurationError(
+                f"option order ({options.order or 'none: row by row'}): each actuator needs its own channel below "
+                f"{self.channels}, or -1 without one; got {self._channel.min()} to {self._channel.max()} for "
+                f"{len(self._channel)} actuators"
+            )
         if not (gain.ravel()[self._wired] > 0).all():
             raise ConfigurationError("option gain_map: the gain of every actuator with a channel must be above 0")
         self._zero = zero.ravel()[self._wired]

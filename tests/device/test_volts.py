@@ -42,7 +42,7 @@ def test_a_surface_is_converted_to_clipped_values_in_channel_order(tmp_path: Pat
     ("name", "values", "why"),
     [
         ("order", [[0, 0, 1], [2, 3, 4]], "its own channel"),
-        ("order", [[0, 9, 1], [2, 3, 4]], "below 8"),
+        ("order", [[0, 9, 1], [2, -1, 4]], "below 8, or -1 without one; got 0 to 9 for 5 actuators"),
         ("order", [[0, 1, 2], [3, 4, 5.5]], "whole number"),
         ("order", [[0, 1, 2], [3, 4, 1e30]], "whole number"),
         ("order", [[-1, -1, -1], [-1, -1, -1]], "no actuator has a channel"),
@@ -55,6 +55,11 @@ def test_invalid_maps_are_refused(tmp_path: Path, name: str, values: Any, why: s
     options = VoltOptions(**{name: stored(tmp_path / "map.npy", values)})
     with pytest.raises(ConfigurationError, match=why):
         VoltMap(options, CONFIG, channels=8)
+
+
+def test_without_an_order_the_message_says_how_the_channels_are_numbered() -> None:
+    with pytest.raises(ConfigurationError, match=r"order \(none: row by row\).*below 5.*got 0 to 5 for 6 actuators"):
+        VoltMap(VoltOptions(), CONFIG, channels=5)
 
 
 class BmcDm:
