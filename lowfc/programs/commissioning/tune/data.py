@@ -295,13 +295,11 @@ def _telemetry(
         warnings = [*warnings, "in some of these frames the integrator drove in place of a law (LAW_OVERRULED)"]
     under_law = rows & (steps.sequence > changed + settling)
     if np.count_nonzero(under_law) < FEWEST:
-        under_law = rows
-        if closed and (steps.sequence[rows] <= changed).any():
-            warnings = [
-                *warnings,
-                "law or gains changed late in these frames: the achieved residual is over all of them, theory is for "
-                "the last law and gains",
-            ]
+        under_law, extent = rows, "over all of them, theory is for the last law and gains"
+    else:
+        extent = f"over the last {np.count_nonzero(under_law)}, theory is for all"
+    if closed and (steps.sequence[rows] <= changed).any():
+        warnings = [*warnings, f"law or gains changed in these frames: the achieved residual is {extent}"]
     contrast = known_contrast(config) if config is not None and config.noll == calibration.noll else None
     known = [None if each is None else each[under_law & np.isfinite(each).all(axis=1)] for each in true_residual]
     true_nm, rms_nm = (each if each is not None and len(each) else None for each in known)
