@@ -21,7 +21,7 @@ DRIFT_PM = 20.0
 """Drift of each of 14 modes, pm per root second."""
 ROLL_NM, ROLLED = 1.0, 1e-11
 """Step of every mode by a roll of the telescope, and the contrast to which it must decay."""
-_SAMPLES_PER, _SMALL_NM = 2, 0.3  # samples per lambda/D, and amplitude of the second-order maps
+_SAMPLES_PER, _SMALL_NM = 4, 0.3  # samples per lambda/D, and amplitude of the second-order maps
 _PLANCK_NM_K = 1.438777e7
 _LONGEST_FRAMES = 1 << 20
 
