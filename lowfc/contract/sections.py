@@ -262,9 +262,9 @@ class Mirror(Section):
     """Actuators that stay flat: row * columns + column."""
     stuck_nm: dict[str, Signed] = Field(default_factory=dict)
     """Actuators stuck at a height: row * columns + column = nm."""
-    slew_nm: float = Field(150.0, gt=0.01)
+    slew_nm: float = Field(150.0, gt=0.01, le=MAX_VALUE)
     """The mirror's own limit: largest change of an actuator per command."""
-    neighbour_nm: float = Field(500.0, gt=0.01)
+    neighbour_nm: float = Field(500.0, gt=0.01, le=MAX_VALUE)
     """The mirror's own limit: largest difference between neighbouring actuators."""
     on_command_timeout: Literal["hold", "flat"] = "flat"
     """Action after a command timeout: hold the shape, or relax to flat within the slew limit."""

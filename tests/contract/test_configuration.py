@@ -142,6 +142,7 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(
         ("mirror.dead", ["x"]),
         ("mirror.flat", 7),
         ("safety.slew_nm", 0),
+        ("safety.slew_nm", 1e308),
         *((key, "a\0b") for key in ("gateway.search", "network.certificates", "recorder.folder", "recorder.on_event")),
         ("network.router", "tls/a\0b:7447"),
         ("gateway.listen", ""),  # the library would listen on all addresses

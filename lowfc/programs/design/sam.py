@@ -22,7 +22,7 @@ from lowfc.control.loop.wording import counted
 from lowfc.design.goal import predictions
 from lowfc.design.paper import TABLE4_MODES
 from lowfc.design.sam_merit import FOCAL_MASKS, Hole, Optics, SamCandidate, build_optics, hole_fields
-from lowfc.design.sam_search import BLOCK, Chain, advance, holes, start
+from lowfc.design.sam_search import Chain, advance, holes, start
 from lowfc.optics.chain.sam import Layout
 from lowfc.programs.design.options import command_line
 from lowfc.programs.design.sam_executors import is_lost
@@ -33,7 +33,7 @@ STATE_PERIOD_S = 10.0
 """Shortest time between two writes of the state file."""
 _PUPIL_SAMPLES = 256
 """One sample per cell of the package's shaped pupil; predictions agree with 512 samples to 4e-4, contrast to 2 %."""
-_NOTHING = f"no chain had finished its first {BLOCK} steps: nothing was found, nothing is written"
+_NOTHING = "no chain had finished its first steps: nothing was found, nothing is written"
 
 
 def begin(search: Search) -> list[Chain]:

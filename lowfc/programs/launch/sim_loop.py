@@ -75,7 +75,7 @@ def sim_loop(
         prepare(config, run, console)
         children += children_of(config, run, duration_s, record)
         if show is not None:
-            children.insert(3, _view(run, show, console))  # after the mirror; the recorder, if any, ends last
+            children.insert(len(children) - record, _view(run, show, console))  # the recorder, if any, ends last
         for child in children:
             child.start()
         _supervise(config, children, watch, console, duration_s)
