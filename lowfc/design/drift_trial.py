@@ -38,7 +38,7 @@ class DriftTrial:
 
         Args:
             step_nm2: (modes,) variance of each mode's step in a frame, nm^2.
-            gain: (modes,) gains of the integrators; 0 for a mode that is not controlled, but not for all.
+            gain: (modes,) gains of the integrators; 0 for a mode that is not controlled; at least one is above 0.
             frames: Number of frames averaged, after those in which the loop settles.
             rng: Generator of all random numbers.
         """

@@ -219,14 +219,16 @@ def checked_advance(setup: Settings, state: State, input_: Input) -> tuple[State
     if isinstance(input_, Frame):
         assert outputs.step is not None
         assert (outputs.command is None) == (after.loop is None or not after.commanded)
-        assert after.commanded or after.loop is None or state.conditions.mirror_fault, "only a fault defers the first"
+        assert after.commanded or after.loop is None or state.conditions.mirror_fault, (
+            "only a mirror fault defers the first command"
+        )
     if isinstance(input_, Request):
         assert outputs.reply.text
         assert outputs.reply.frame_sequence == state.frame_sequence + 1
         assert outputs.command is None, "the next frame moves the mirror, not a request"
         if not outputs.reply.accepted:
             assert all(now is was for now, was in zip(after[:-1], state[:-1], strict=True)), (
-                "all but `input_number`, the last"
+                "a refusal changes nothing but `input_number`, the last field"
             )
         if state.loop is not None and after.loop is not None and after.loop.actuators_nm.size:
             assert np.array_equal(after.loop.actuators_nm, state.loop.actuators_nm)

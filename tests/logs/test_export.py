@@ -53,7 +53,7 @@ CALIBRATED = identified(replace(toy.calibration(), good=GOOD.astype(np.float32))
 
 
 def a_night() -> SyntheticLog:
-    """An open and 29 closed steps, one of them refused; a command and a truth are missing; the camera is restarted."""
+    """30 steps, the first in open loop, one refused; a command and a truth are missing; the camera is restarted."""
     night = SyntheticLog(calibration=CALIBRATED).request("open").frames(1).request("close")
     night.frames(STEPS // 2 - 1, dark={REFUSED - 1})
     night.start_camera()

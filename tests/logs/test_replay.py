@@ -83,7 +83,7 @@ class Night:
         self._start()
 
     def apply(self, input_: Input, logged: Request | None = None) -> None:
-        """Apply an input and log it, or log `logged` in its place, as by a former version with another rule."""
+        """Apply an input and log it, or log `logged` in its place, as a version with another rule would."""
         self.now_ns += 1_000_000
         if isinstance(input_, Frame):
             self._frame(input_)
@@ -160,7 +160,7 @@ def night_of(input_list: list[Input], **changes: object) -> Night:
 
 
 @pytest.mark.skipif(not compiled.available(), reason="needs the extra `fast`")
-def test_a_log_of_the_fused_kernel_is_replayed_bit_by_bit_with_it_and_with_a_difference_by_numpy() -> None:
+def test_a_log_of_the_fused_kernel_is_replayed_bit_for_bit_with_it_and_with_a_difference_by_numpy() -> None:
     channel = Request(0, "channel", text="dark-hole", actuators_nm=SHAPE)
     law = Request(0, "law", law=integrator([0.3] * 3, [0.0] * 3, NOLL, 2.5, 1000.0))
     input_list = [*frames(60, 1), channel, *frames(100, 61), law, *frames(400, 161)]
@@ -190,7 +190,7 @@ def frames(count: int, first: int = 0) -> list[Input]:
 
 @hypothesis_settings(deadline=None, max_examples=EXAMPLES)
 @given(*[inputs()] * 2, *map(st.sampled_from, (["hold", "flat"], [1.0, 2.5], ["numpy", "fused"])))
-def test_any_sequence_of_inputs_is_replayed_bit_by_bit(
+def test_any_sequence_of_inputs_is_replayed_bit_for_bit(
     before: list[Input], after: list[Input], on_frame_timeout: str, delay_frames: float, kernel: str
 ) -> None:
     night = night_of(
@@ -207,7 +207,7 @@ def test_any_sequence_of_inputs_is_replayed_bit_by_bit(
     assert account.states == sent[CONTROLLER_STATE.key] - 2  # the replay begins with a state at each start
 
 
-def test_an_overruled_law_is_replayed_bit_by_bit_even_from_the_middle() -> None:
+def test_an_overruled_law_is_replayed_bit_for_bit_even_from_the_middle() -> None:
     night = night_of([], guard=True, rate_hz=1000.0, limit_nm=(150.0, 150.0))
     night.apply(
         Request(night.now_ns, "law", law=integrator((0.05,) * len(NOLL), (0.0,) * len(NOLL), NOLL, 1.0, 1000.0))
@@ -321,7 +321,7 @@ def test_after_a_gap_the_replay_continues_at_the_next_state_and_reports_unchecke
 
 
 def test_a_recording_that_begins_in_the_middle_of_a_run_lacks_no_input() -> None:
-    """A recorder that starts receives the newest state; the inputs since then are from before the recording."""
+    """A recorder that starts receives the newest state; earlier inputs since that state are not recorded."""
     messages = night_of(frames(100)).messages
     head = [message for message in messages if message.key == CALIBRATION.key]
     later = messages[len(messages) // 2 :]
@@ -456,7 +456,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_several_processes_give_the_account_of_one(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    chunk_ends_ns = workers._chunk_ends_ns  # unsorted, as with a repeated calibration: it keeps its old time
+    chunk_ends_ns = workers._chunk_ends_ns  # unsorted, as after a calibration recorded again with its old time
     monkeypatch.setattr(workers, "_chunk_ends_ns", lambda path: chunk_ends_ns(path)[::-1])
     monkeypatch.setattr(workers, "_WORTH_BYTES", 1)
     by_one, by_two = (workers.replay_files([log], 0.0, jobs, lambda done: None) for jobs in (1, 2))

@@ -99,7 +99,7 @@ def test_screens_have_the_structure_function_of_a_periodic_kolmogorov_screen():
             steps = [screen[shift:] - screen[:-shift], screen[:, shift:] - screen[:, :-shift]]
             found[k] += np.mean([np.mean(step**2) for step in steps]) / 24
     r = separations / samples
-    # Without waves longer than the periodic screen: its zero-frequency cell is replaced by a disk of equal area.
+    # From the radius of a disk as large as the zero-frequency cell: the periodic screen has no longer waves.
     f = np.geomspace(1.0 / (width * np.sqrt(np.pi)), samples / 2, 4000)
     density = 0.0229 * f ** (-11 / 3) * 2 * np.pi * f
     expected = 2 * np.trapezoid(density * (1 - j0(2 * np.pi * r[:, None] * f)), f, axis=1)
@@ -150,7 +150,7 @@ def test_fast_science_image_agrees_with_the_exact_image_to_one_percent(shaped, m
     assert np.abs(found - exact).max() < 1e-3  # including the star's core
 
 
-def test_pupil_without_equal_squares_is_not_averaged():
+def test_a_pupil_that_differs_within_2_x_2_samples_keeps_all_of_them():
     plain = Coronagraph(circle(64))
     modes_nm = np.array([20.0, -35.0, 12.0])
     radii = 2 * pupil_axis(64)

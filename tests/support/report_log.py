@@ -1,4 +1,4 @@
-"""A log of the toy's loop, with the messages of the real controller's `advance`, without processes."""
+"""A log of the loop of `tests.support.toy`, from the real controller's `advance`, without processes."""
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -58,7 +58,7 @@ class SyntheticLog:
         """Start a loop with `changes` to its settings."""
         self.samples: list[Sample] = []
         self.truth = truth
-        self.instants = 0  # of each truth; unless 0, its continuous modes are twice the sampled ones
+        self.instants = 0  # `instants` of each truth; above 0, the continuous modes are twice the sampled ones
         self.now_ns = START * 10**9
         self.calibration = calibration
         self.settings = settings(**({"gain": (0.4, 0.2)} | changes))
@@ -191,7 +191,7 @@ class SyntheticLog:
         attached: Calibration | None = None,
         **more: str,
     ) -> Path:
-        """Write the log, finished (with `more` in the recorder's account) or as left by a recorder that died."""
+        """Write the log, finished (with `more` in the metadata of its end) or as left by a recorder that died."""
         content = (Configuration().to_toml() if toml is None else toml).encode()
         attachments = [Attachment("config.toml", "application/toml", content)] if config else []
         if attached is not None:

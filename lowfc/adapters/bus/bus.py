@@ -1,7 +1,8 @@
 """Interface of the message bus: publish, subscribe, answer, query.
 
 `ZenohBus` carries messages between processes, `MemoryBus` within one process, for tests. Handlers run on receive
-threads: a slow handler delays the next message of the same publisher, and may be called for another's meanwhile.
+threads: a slow handler delays the next message of the same publisher, and may meanwhile be called for one of another
+publisher.
 """
 
 import contextlib
@@ -150,7 +151,7 @@ class Faults:
         self._lock = threading.Lock()
 
     def add(self, place: str, key: str, fault: Exception) -> None:
-        """Count a fault at a `place`, such as "camera: handler of", and a key; a bad message counts as unreadable."""
+        """Count a fault; `place` says where, such as "camera: handler of" a key. A bad message counts as unreadable."""
         if isinstance(fault, UNREADABLE):
             self.add_unreadable(key, fault)
             return

@@ -101,7 +101,7 @@ def open_by_router(config: zenoh.Config, network: Network, role: str) -> zenoh.S
             return zenoh.open(config)
         except zenoh.ZError as fault:
             trouble = router_trouble(network, role)
-            refused = 0 if trouble else refused + 1  # the first refusal may precede the router's start
+            refused = 0 if trouble else refused + 1  # the first attempt may precede the router's start
             if refused > 1:
                 raise BusError(
                     f"the router at {network.router} accepts {role}'s certificate, but zenoh opens no session: "
@@ -135,7 +135,7 @@ def router_trouble(network: Network, role: str) -> str:
             with contextlib.suppress(TimeoutError):
                 link.recv(1)  # a refusal arrives only here
     except ssl.SSLEOFError:
-        return "the connection was closed during the handshake: the router is shutting down, or it is another program"
+        return "connection closed during the handshake: the router is shutting down, or another program listens there"
     except ssl.SSLError as fault:
         why = ": ".join(filter(None, (fault.reason or str(fault), getattr(fault, "verify_message", ""))))
         raise BusError(
@@ -173,7 +173,7 @@ class RouterWatch:
         if why != self._reported:
             self._reported = why
             text = f"no link to the router at {self._network.router}: {why}" if why else "the router is back"
-            with contextlib.suppress(OSError):  # a closed terminal must not end the comparison of clocks
+            with contextlib.suppress(OSError):  # a closed terminal must not end this thread, which also compares clocks
                 sys.stderr.write(f"{self._role}: {text}\n")
 
 

@@ -84,7 +84,7 @@ class StreamReader:
             stream = Stream(self._path)
         except StreamAbsentError:
             return False
-        except StreamError as fault:  # some versions of the C library write the version before the rest
+        except StreamError as fault:  # a library may write the version field before the rest: try once more
             if not self.generation or str(fault) == self._fault:
                 raise
             self._fault = str(fault)

@@ -44,7 +44,7 @@ from lowfc.control.loop.safety import NOT_NEW, Limit, LoopMode, Reason, Rejectio
 from lowfc.control.loop.state import ActiveLoop, Settings, State
 
 UNMEASURED = frozenset({Rejection.NO_CALIBRATION, Rejection.WRONG_SIZE})
-"""Rejections after which channels and probe sequences move all the same, in open and idle loops."""
+"""Rejections after which channels and probe sequences still move in open and idle loops."""
 STEPPED = "its last step is done"
 
 
@@ -129,7 +129,7 @@ def _command_message(state: State, loop: ActiveLoop, command_nm: Single) -> Comm
     """The command of the newest frame."""
     safe = state.mode is LoopMode.SAFE
     sequence, conditions = state.frame_sequence, state.conditions
-    # Before the first frame, the mirror may know a newer sequence: a new identity makes it forget that.
+    # Before the first frame, the mirror may know a newer sequence: a new `clear_id` makes it forget that.
     clear_id = conditions.clear_id or (0 if sequence else conditions.mode_since_ns)
     return Command(sequence, state.frame_time_ns, loop.actuators_nm, command_nm, safe, clear_id)
 
@@ -154,7 +154,7 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
 
 
 def _camera_started(state: State, frame: Frame) -> State:
-    """The state at the first frame after a start of the camera; settings known from another start are awaited."""
+    """The state at the first frame after a start of the camera: its settings are awaited, unless they are known."""
     camera = state.conditions.camera
     if camera is None or camera.start_s in (0, frame.sequence >> COUNT_BITS):
         return state

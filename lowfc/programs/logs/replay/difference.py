@@ -26,7 +26,7 @@ class Difference:
         frame_sequence: sequence of the newest frame at this input.
         fields: one sentence for each field that differs.
         largest_nm: largest difference of a number in nm.
-        otherwise: whether anything other than numbers in nm differs.
+        otherwise: whether anything other than numbers in nm differs; then no tolerance applies.
     """
 
     message: str
