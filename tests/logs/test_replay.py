@@ -357,6 +357,16 @@ def test_an_input_of_a_former_version_whose_rule_has_changed_is_named_and_replay
     assert replay(night.messages).different  # as a log of this version
 
 
+def test_a_request_that_a_former_version_refused_is_refused_by_the_replay() -> None:
+    night = night_of([Request(0, "open"), *frames(30)], interlocks=())
+    night.apply(Request(0, "gain", values=(9.0,)), Request(0, "gain", values=(0.2,)))
+    for one in frames(30, 31):
+        night.apply(one)
+    account = replay(night.messages, former=FormerVersion({}))
+    assert (account.frames, account.different, account.rules_changed) == (60, 0, {})
+    assert replay(night.messages).different  # as a log of this version
+
+
 def raise_actuator(command: Any, number: int) -> None:
     """Change one actuator of a command by the smallest amount."""
     surface = np.frombuffer(command.actuators, np.float32).copy()

@@ -3,7 +3,7 @@
 import contextlib
 from collections import deque
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from google.protobuf.message import Message
 
@@ -277,6 +277,8 @@ class ControllerReplay:
                 with contextlib.suppress(ValueError):
                     time_ns, known = from_timestamp(request.timestamp), self._context.published
                     decoded = codec.request(request, request.name, time_ns, known.calibrations, known.laws, known.plays)
+                    if self._context.former is not None and not request.accepted:  # also if it would be accepted now
+                        decoded = replace(decoded, refusal=request.reply or "refused in the log")
                     return decoded if self._settings is None else prepared(self._settings, decoded)
             case wire.ControlInput() as other:
                 with contextlib.suppress(ValueError):
