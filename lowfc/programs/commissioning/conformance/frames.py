@@ -51,6 +51,11 @@ def _frames(camera: Camera) -> Check:
     return ok(f"{count} in {camera.seconds:g} s")
 
 
+_ONE_CLOCK = (
+    "use the same clock for the timestamp and the publish time: `lowfc.device.CameraClock` converts a camera's own"
+)
+
+
 @FRAMES.check("frame time", "end of the exposure, on the clock of the publish time, increasing")
 def _frame_time(camera: Camera) -> Check:
     times = [frame.time_ns for frame in camera.frames]
@@ -65,9 +70,9 @@ def _frame_time(camera: Camera) -> Check:
     got = f"{age_ns / 1e6:.3g} ms before the publish time"
     if age_ns < -_AGE_NS:
         got = f"{-age_ns / 1e6:.3g} ms after the publish time"
-        return wrong(got, "use the same clock for the timestamp and the publish time")
+        return wrong(got, _ONE_CLOCK)
     if age_ns > _READOUT_NS + exposure_ns:
-        return wrong(got, "use the same clock for the timestamp and the publish time, in nanoseconds since the epoch")
+        return wrong(got, f"{_ONE_CLOCK}; both are nanoseconds since the epoch")
     if exposure_ns > _AGE_NS and 0.9 * exposure_ns <= age_ns < 1.5 * exposure_ns:
         advice = (
             "about one exposure: is the timestamp the start of the exposure? Ignore this if the readout takes so long"
