@@ -135,7 +135,7 @@ def router_trouble(network: Network, role: str) -> str:
             with contextlib.suppress(TimeoutError):
                 link.recv(1)  # a refusal arrives only here
     except ssl.SSLEOFError:
-        return "connection closed during the handshake: the router is shutting down, or another program listens there"
+        return "the connection was closed during the handshake: the router shuts down, or another program listens"
     except ssl.SSLError as fault:
         why = ": ".join(filter(None, (fault.reason or str(fault), getattr(fault, "verify_message", ""))))
         raise BusError(
