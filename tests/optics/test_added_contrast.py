@@ -79,7 +79,7 @@ def test_contrast_is_summed_by_group_and_large_tilt_is_beyond_quadratic(shaped: 
     assert each.sum() == pytest.approx(by_image(shape), rel=0.01, abs=0)
     groups = by_group(NOLL, each)
     assert groups["coma"] == pytest.approx(each[coma] + each[coma - 1], abs=0)
-    assert costliest(groups) == ("coma", pytest.approx(groups["coma"] / sum(max(one, 0.0) for one in groups.values())))
+    assert costliest(groups) == ("coma", 1.0), "the cross term with coma makes the share of tilt negative"
     assert costliest({"coma": 3.0, "focus": 1.0, "tilt": -9.0}) == ("coma", 0.75)
     assert not modal.is_beyond_quadratic(0.3**2 * np.eye(len(NOLL)))
     assert modal.is_beyond_quadratic(20**2 * np.diag(np.eye(len(NOLL))[tilt]))

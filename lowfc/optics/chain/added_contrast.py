@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from lowfc.arrays import Array, Complex, Single
-from lowfc.optics.chain.coronagraph import Coronagraph, wedge_samples
+from lowfc.optics.chain.coronagraph import SAMPLES_PER, Coronagraph, wedge_samples
 from lowfc.optics.chain.fourier import kernel
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.science_camera import ScienceCamera
@@ -19,7 +19,6 @@ from lowfc.optics.chain.zernike import mode_group, zernikes
 
 _BEYOND_QUADRATIC = 0.1
 _IMAGE_ROUNDING = 1e-13  # contrast; the images, of single precision, are exact to some 1e-14 behind a shaped pupil
-_SAMPLES_PER = 4  # samples per lambda / D: tilt is sensitive to the sharp edge of the zone; within 10 % of 32 samples
 _DRAWS = 24  # random wavefronts compared, each with both signs
 
 
@@ -35,7 +34,7 @@ class ModalContrast:
         """Compute the form and prepare the images."""
         self.noll, self.form = noll, contrast_form(coronagraph, noll, wavelength_nm)
         self._zone = coronagraph.dark_zone
-        self._camera = ScienceCamera(coronagraph, noll, wavelength_nm, int(np.ceil(self._zone.outer)), _SAMPLES_PER)
+        self._camera = ScienceCamera(coronagraph, noll, wavelength_nm, int(np.ceil(self._zone.outer)))
 
     def by_image(self, modes_nm: Array | Single) -> float:
         """Mean contrast of the dark zone with a wavefront (modes,), including that of the coronagraph itself."""
@@ -86,9 +85,9 @@ def contrast_form(coronagraph: Coronagraph, noll: tuple[int, ...], wavelength_nm
         wavelength_nm: The wavelength.
     """
     pupil, wedge, lyot = coronagraph.pupil, coronagraph.dark_zone, coronagraph.lyot
-    side = 2 * int(np.ceil(wedge.outer * _SAMPLES_PER))
-    inside = wedge_samples(wedge, side, side, _SAMPLES_PER)
-    to_focus = kernel(side, _SAMPLES_PER, len(pupil), 1.0)
+    side = 2 * int(np.ceil(wedge.outer * SAMPLES_PER))
+    inside = wedge_samples(wedge, side, side)
+    to_focus = kernel(side, SAMPLES_PER, len(pupil), 1.0)
     radius = 2 * pupil_axis(len(pupil))
     rows, columns = np.nonzero(pupil)
     shapes = zernikes(noll, radius[columns], radius[rows])

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Array, Integers, Single, SingleComplex
-from lowfc.optics.chain.coronagraph import Coronagraph, LyotStop, Wedge, wedge_samples
+from lowfc.optics.chain.coronagraph import SAMPLES_PER, Coronagraph, LyotStop, Wedge, wedge_samples
 from lowfc.optics.chain.fourier import kernel
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.zernike import zernikes
@@ -34,7 +34,7 @@ class ScienceCamera:
         noll: Sequence[int],
         wavelength_nm: float,
         half_width: int = 12,
-        samples_per: int = 4,
+        samples_per: int = SAMPLES_PER,
     ) -> None:
         """Prepare the kernels.
 

@@ -9,7 +9,7 @@ import numpy as np
 from lowfc.arrays import Array, Mask
 from lowfc.design.tolerance import best_gain, drift_residual_nm2
 from lowfc.optics.chain.band import Band, gauss_legendre
-from lowfc.optics.chain.coronagraph import DARK_ZONE, contrast, wedge_samples
+from lowfc.optics.chain.coronagraph import DARK_ZONE, SAMPLES_PER, contrast, wedge_samples
 from lowfc.optics.chain.sensor import reference, response
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.programs.paper.cases import Row, prepared
@@ -21,7 +21,7 @@ DRIFT_PM = 20.0
 """Drift of each of 14 modes, pm per root second."""
 ROLL_NM, ROLLED = 1.0, 1e-11
 """Step of every mode by a roll of the telescope, and the contrast to which it must decay."""
-_SAMPLES_PER, _SMALL_NM = 4, 0.3  # samples per lambda/D, and amplitude of the second-order maps
+_SMALL_NM = 0.3  # amplitude of the second-order maps
 _PLANCK_NM_K = 1.438777e7
 _LONGEST_FRAMES = 1 << 20
 
@@ -43,18 +43,18 @@ def coloured(temperature_K: float) -> Band:
 @lru_cache(maxsize=1)
 def _maps() -> tuple[Array, Array, Mask]:
     """Second-order maps (modes, samples, samples) of contrast per nm^2, the map of a flat wavefront, the dark zone."""
-    samples = 2 * int(np.ceil(DARK_ZONE.outer)) * _SAMPLES_PER
+    samples = 2 * int(np.ceil(DARK_ZONE.outer)) * SAMPLES_PER
     flat = _image(np.zeros(len(NOLLS_14)), samples)
     pure_modes_nm = _SMALL_NM * np.eye(len(NOLLS_14))
     maps = np.array([(_image(nm, samples) + _image(-nm, samples)) / 2 - flat for nm in pure_modes_nm])
-    return maps / _SMALL_NM**2, flat, wedge_samples(DARK_ZONE, samples, samples, _SAMPLES_PER)
+    return maps / _SMALL_NM**2, flat, wedge_samples(DARK_ZONE, samples, samples)
 
 
 def _image(modes_nm: Array, samples: int) -> Array:
     """Contrast (samples, samples) of the shaped pupil with a wavefront (modes,)."""
     ready = prepared("sam")
     wavelength_nm = ready.sensor.wavelength_nm
-    return contrast(ready.coronagraph, ready.opd_nm(modes_nm), wavelength_nm, samples, samples_per=_SAMPLES_PER)
+    return contrast(ready.coronagraph, ready.opd_nm(modes_nm), wavelength_nm, samples)
 
 
 def zero_point_nm(name: str) -> Array:
