@@ -24,12 +24,12 @@ from lowfc.contract.network import WithoutNul
 from lowfc.contract.printable import printable
 from lowfc.contract.sections import (
     IMPERFECTIONS,
-    MAX_VALUE,
     Camera,
     Disturbance,
     Gateway,
     InterlockSection,
     Mirror,
+    MirrorLimit,
     Positive,
     Section,
     SensorSection,
@@ -111,11 +111,11 @@ class Control(Section):
 class Safety(Section):
     """Limits enforced by the controller; the mirror enforces its own."""
 
-    stroke_nm: float = Field(700.0, gt=0.01, le=MAX_VALUE)
+    stroke_nm: MirrorLimit = 700.0
     """Largest deviation of an actuator from flat, in either direction, nm of surface."""
-    slew_nm: float = Field(100.0, gt=0.01, le=MAX_VALUE)
+    slew_nm: MirrorLimit = 100.0
     """Largest change of an actuator per command."""
-    neighbour_nm: float = Field(400.0, gt=0.01, le=MAX_VALUE)
+    neighbour_nm: MirrorLimit = 400.0
     """Largest difference between neighbouring actuators."""
 
 

@@ -16,6 +16,7 @@ BENCH_NAME = r"^[A-Za-z][A-Za-z0-9_-]{0,63}$"
 Positive = Annotated[float, Field(gt=0)]
 MAX_VALUE = 1e12
 """Largest value of a key without a limit of its own; a far larger number overflows in single precision."""
+MirrorLimit = Annotated[float, Field(gt=0.01, le=MAX_VALUE)]
 NotNegative = Annotated[float, Field(ge=0, le=MAX_VALUE)]
 Signed = Annotated[float, Field(ge=-MAX_VALUE, le=MAX_VALUE)]
 
@@ -262,9 +263,9 @@ class Mirror(Section):
     """Actuators that stay flat: row * columns + column."""
     stuck_nm: dict[str, Signed] = Field(default_factory=dict)
     """Actuators stuck at a height: row * columns + column = nm."""
-    slew_nm: float = Field(150.0, gt=0.01, le=MAX_VALUE)
+    slew_nm: MirrorLimit = 150.0
     """The mirror's own limit: largest change of an actuator per command."""
-    neighbour_nm: float = Field(500.0, gt=0.01, le=MAX_VALUE)
+    neighbour_nm: MirrorLimit = 500.0
     """The mirror's own limit: largest difference between neighbouring actuators."""
     on_command_timeout: Literal["hold", "flat"] = "flat"
     """Action after a command timeout: hold the shape, or relax to flat within the slew limit."""
