@@ -46,7 +46,7 @@ configured = partial(configuration, FIXED_GAINS | SMALL_MIRROR | THREE_MODES)
 def responses_of(loop: InProcessLoop, test: Any, **options: Any) -> list[ProbeResponse]:
     """Run a test on a loop, check that the loop mode is restored, and return the responses to its probe sequences."""
     loop.run(5)
-    live = Live(loop, lambda *_: None)
+    live = Live(loop, lambda *_: None, print)
     mode_before = loop.status().state.mode
     with loop.reserved("a test"), live.restored():
         responses = test.play(live, **options)
@@ -124,7 +124,7 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, Prob
     assert "interpolated" in result.text()
     loop.ask("safe")
     with pytest.raises(AcceptanceError, match="it must be open or closed for a test"):
-        Live(loop, lambda *_: None)
+        Live(loop, lambda *_: None, print)
 
 
 def test_an_interrupted_probe_sequence_is_repeated_in_the_same_mode(capsys: pytest.CaptureFixture[str]) -> None:

@@ -35,9 +35,7 @@ _LAW_FIELDS = ("gain", "leak", "limit_nm", "law", "calibration_id")
 class Live:
     """The live loop; `restored` stops probe sequences and restores the mode at the end."""
 
-    def __init__(
-        self, client: Client, progress: Callable[[int, int], None], report: Callable[[str], object] = print
-    ) -> None:
+    def __init__(self, client: Client, progress: Callable[[int, int], None], report: Callable[[str], object]) -> None:
         """Read calibration, configuration and mode of the loop; AcceptanceError unless it is open or closed."""
         self.client = client
         self.calibration = client.calibration()

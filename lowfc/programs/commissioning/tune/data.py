@@ -294,10 +294,10 @@ def _telemetry(
     if Limit.LAW_OVERRULED in count_reasons(steps.reasons[rows]):
         warnings = [*warnings, "in some of these frames the integrator drove in place of a law (LAW_OVERRULED)"]
     under_law = rows & (steps.sequence > changed + settling)
-    if np.count_nonzero(under_law) < FEWEST:
+    last = np.count_nonzero(under_law)
+    extent = f"over the last {last}, theory is for all"
+    if last < FEWEST:
         under_law, extent = rows, "over all of them, theory is for the last law and gains"
-    else:
-        extent = f"over the last {np.count_nonzero(under_law)}, theory is for all"
     if closed and (steps.sequence[rows] <= changed).any():
         warnings = [*warnings, f"law or gains changed in these frames: the achieved residual is {extent}"]
     contrast = known_contrast(config) if config is not None and config.noll == calibration.noll else None
