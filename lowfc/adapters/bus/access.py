@@ -1,7 +1,7 @@
 """Access control at the router, derived from the table of topics; everything else is denied.
 
 The common name of a process's certificate is its role: "camera", "mirror-dm". Directions are the router's: ingress is
-from a process, egress to it.
+from a process to the router, egress from the router to a process.
 """
 
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ from lowfc.contract.messages import HEALTH, RECORD_KEY, REQUEST_KEY, TOPICS, Rol
 ROUTER = "router"
 """Role of the router itself: its common name, and its name in Health."""
 CLOCK_KEY = "lowfc/clock"
-"""Key of the router's queryable for its time, the time of all envelopes in a run on several hosts."""
+"""Key of the queryable that answers with the router's time, which all envelopes have in a run on several hosts."""
 
 _LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # never part of a run on several hosts
 
@@ -23,9 +23,9 @@ _LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # never part of a run on sever
 class Grant:
     """Rights of a role, the common name of a certificate, as lists of keys.
 
-    A role publishes Health under its own name only; a mirror publishes, answers and receives under its name only. All
-    other keys have "*" in place of a name: `subscribed` are those of this role to which others may subscribe, `queried`
-    those that they may query.
+    `subscribed` are the role's keys to which other processes may subscribe, `queried` those that they may query. A role
+    publishes Health under its own name only; a mirror publishes, answers and receives under its name only. All other
+    keys have "*" in place of a name.
     """
 
     role: str

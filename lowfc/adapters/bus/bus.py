@@ -1,8 +1,8 @@
 """Interface of the message bus: publish, subscribe, answer, query.
 
 `ZenohBus` carries messages between processes, `MemoryBus` within one process, for tests. Handlers run on receive
-threads: a slow handler delays the next message of the same publisher, and may meanwhile be called for one of another
-publisher.
+threads: a slow handler delays the next message of the same publisher; meanwhile it may be called, on another thread,
+with a message of another publisher.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ class Sample(NamedTuple):
         payload: protobuf bytes.
         sequence: sequence as in `Envelope`.
         publish_time_ns: time at which the publisher sent it, host clock.
-        receive_time_ns: time at which a receive thread had it, or a ring was drained; host clock.
+        receive_time_ns: time at which a receive thread got it, or its ring was drained; host clock.
     """
 
     key: str
@@ -60,9 +60,10 @@ class Publisher(Protocol):
     """Publishes one topic under one key.
 
     Attributes:
-        published: count of the next message: the number of messages so far plus `skipped`.
-        skipped: number of counts without a message, because the camera lost the frame.
-        handed_ns: time at which the last message was handed to the direct link, otherwise to the bus, host clock.
+        published: count that the next message's sequence has: the number of messages so far plus `skipped`.
+        skipped: number of counts that no message has, because the camera lost the frame.
+        handed_ns: time at which the last message was handed to the direct link, or to the bus if the link did not take
+            it; host clock.
     """
 
     topic: Topic
@@ -72,7 +73,7 @@ class Publisher(Protocol):
     handed_ns: int
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
-        """Send `payload`, by default with the present time and the next sequence; it may wait for slow readers.
+        """Send `payload`, by default with the present time and the next sequence; this may wait for slow readers.
 
         A caller that sets sequences (a replay sets those of the log) must set them in every call.
         """
@@ -89,7 +90,7 @@ class Ring(Protocol):
 
 
 class Bus(Protocol):
-    """A process's connection to all others of its run; `offset` is the router's clock offset, across hosts only."""
+    """A process's connection to all others of its run; `offset` is the router's clock offset, None on one host."""
 
     faults: "Faults"
     offset: ClockOffset | None
@@ -113,7 +114,7 @@ class Bus(Protocol):
         """Number of other processes connected to this one."""
 
     def restart(self) -> None:
-        """Give the messages a new start time; publishers count from 0, as when a camera restarts its frame numbers."""
+        """Give later messages a new start time; publishers count from 0, as when a camera restarts its numbers."""
 
     def close(self) -> None:
         """Leave the run."""
@@ -138,7 +139,7 @@ class Faults:
     """Counts exceptions of handlers, and unreadable messages.
 
     The first exception at each place is printed on standard error with its traceback. Unreadable messages are only
-    counted, until `take_unreadable`.
+    counted; `take_unreadable` returns and resets their numbers.
 
     Attributes:
         counts: number of exceptions, by place.
@@ -151,7 +152,7 @@ class Faults:
         self._lock = threading.Lock()
 
     def add(self, place: str, key: str, fault: Exception) -> None:
-        """Count a fault; `place` says where, such as "camera: handler of" a key. A bad message counts as unreadable."""
+        """Count a fault at `place` and `key`, such as "camera: handler of" "lowfc/frame", or an unreadable message."""
         if isinstance(fault, UNREADABLE):
             self.add_unreadable(key, fault)
             return
@@ -161,7 +162,7 @@ class Faults:
             self.counts[where] = before + 1
         if not before:
             text = "".join(traceback.format_exception(fault))
-            with contextlib.suppress(OSError):  # for example a full disk: the receive thread goes on
+            with contextlib.suppress(OSError):  # for example a full disk: the receive thread must go on
                 sys.stderr.write(f"{where}: {text}(further ones at this place are only counted)\n")
 
     def add_unreadable(self, key: str, why: object) -> None:

@@ -95,10 +95,15 @@ class DirectReader:
     """Forwards each message once, from the socket or the bus, whichever is first.
 
     A copy is recognised by its envelope; the sequence alone is not enough, as two publishers may have started in the
-    same second. The reader leaves the bus while the only publisher of a topic uses the socket; messages that arrive
-    over the bus after a newer one from the socket are dropped as late. Those from the socket are in the publisher's
-    order, and forwarded even if their sequences are not; once off the bus, the newest is forwarded again if repeated.
-    With several publishers the reader stays on the bus, and a message that only the bus carried may follow a newer one.
+    same second.
+
+    A topic with one publisher: once the socket works, a message from the bus is dropped as late unless it is newer than
+    all before. Once a message has come both ways, the reader unsubscribes from the bus, until the publisher disconnects
+    from the socket. Messages from the socket are forwarded as they arrive, even if their sequences decrease; without
+    the bus, the newest one is forwarded again if the publisher repeats it.
+
+    A topic with several publishers: the reader stays subscribed to the bus, and a message that only the bus carried may
+    be forwarded after a newer one.
     """
 
     def __init__(
@@ -120,7 +125,8 @@ class DirectReader:
             handler: called with each message, one at a time, on a thread of the bus, of this reader or of a writer.
             subscribe: subscribes a handler to the same topic on the bus; the function it returns unsubscribes.
             now_ns: the host's clock.
-            failed: called if a message that did not come over the bus has an invalid envelope, or `handler` raises.
+            failed: called with the exception if a message of the direct link has an invalid envelope, or `handler`
+                raises on one; the bus handles exceptions on its own messages.
             shared: whether the topic has several publishers.
         """
         self._handler = handler
@@ -194,7 +200,7 @@ class DirectReader:
             self._handler(sample)
 
     def _leave_bus(self) -> None:
-        """Unsubscribe from the bus; nothing happens without a subscription."""
+        """Unsubscribe from the bus; no effect without a subscription."""
         if self._unsubscribe is not None:
             self._unsubscribe()
             self._unsubscribe, self._on_both_paths = None, False
@@ -229,7 +235,7 @@ class DirectReader:
 
     def _serve(self, connection: socket.socket) -> None:
         """Receive from a writer until it disconnects."""
-        buffer = memoryview(mmap.mmap(-1, 2 * _BUFFER_BYTES))  # a bytearray is zeroed first: 5 ms without a frame
+        buffer = memoryview(mmap.mmap(-1, 2 * _BUFFER_BYTES))  # zeroing a bytearray would take 5 ms first
         with connection, contextlib.suppress(OSError):
             while not self._closed:
                 size = connection.recv_into(buffer)

@@ -8,9 +8,9 @@ MAX_NAMES = 64
 """Largest number of names on one topic, in addition to those of `Role`."""
 MAX_NAME_LENGTH = 128
 MAX_HEALTH_BYTES = 256_000
-"""Enough for a recorder's Health with the paths of `MAX_HEALTH_LOGS`."""
+"""Enough for a recorder's Health with the paths of `MAX_HEALTH_LOGS` logs."""
 MAX_HEALTH_LOGS = 1000
-"""Largest number of logs, the newest, in a recorder's Health."""
+"""Largest number of logs in a recorder's Health, which then lists the newest."""
 
 
 class Names:

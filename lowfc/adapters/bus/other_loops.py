@@ -36,7 +36,8 @@ def no_loop_message() -> str:
 def other_loops() -> Iterator[tuple[str, bool]]:
     """Yield, for each simulated loop and each separate controller on this host, of any user, a sentence and a flag.
 
-    The flag is set for a new loop of this user with this runtime directory: not found there, it is starting or ending.
+    The flag is set for a young process of this user with this runtime directory: as no run was found there, the loop is
+    starting or ending.
     """
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):  # it has ended, or is not readable
@@ -50,7 +51,7 @@ def other_loops() -> Iterator[tuple[str, bool]]:
 
 
 def _program(words: Sequence[str]) -> str:
-    """Short form `lowfc controller --run NAME` of a loop's command line; empty for others, including sudo's."""
+    """Short form `lowfc controller --run NAME` of a loop's command line; empty for all others, such as `sudo lowfc`."""
     if not words or not words[0].rpartition("/")[2].startswith("python"):
         return ""
     for before, word in itertools.pairwise(words):
@@ -61,9 +62,9 @@ def _program(words: Sequence[str]) -> str:
 
 
 def _directory_clause(process: psutil.Process, owner: int) -> tuple[str, bool]:
-    """Clause on the runtime directory of a process, and whether it is a new process of this user and directory.
+    """Clause on a process's runtime directory, and whether it is a young process of this user with this directory.
 
-    The clause is empty for such a process, and for another user's that is not readable.
+    The clause is empty for such a process, and for a process of another user whose environment cannot be read.
     """
     try:
         folder = process.environ().get(_FOLDER, "")

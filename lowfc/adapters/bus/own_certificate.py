@@ -16,7 +16,7 @@ _ROUNDS = 4  # of the handshake; three are needed
 class OwnCertificate(NamedTuple):
     """A certificate's common name (its role), and the end of its validity or the authority's, whichever is first.
 
-    `ends_with_authority`: the authority's is first, so that a renewal of the certificate does not help.
+    `ends_with_authority`: whether the authority's is first, so that a renewal of the certificate does not help.
     """
 
     name: str

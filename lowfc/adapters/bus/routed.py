@@ -27,7 +27,7 @@ CA_KEY = "ca.key"
 
 CONNECT_MS = 1000
 LEASE_MS = 2000
-_ALERT_S = 0.5  # in which a router that refuses the certificate sends its TLS alert
+_ALERT_S = 0.5  # time in which a router that refuses the certificate sends its TLS alert
 _ABSENT = {
     *(errno.ECONNREFUSED, errno.ECONNRESET, errno.ETIMEDOUT),
     *(errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ENETUNREACH, errno.ENETDOWN),
@@ -95,14 +95,14 @@ def open_by_router(config: zenoh.Config, network: Network, role: str) -> zenoh.S
         BusError: router and process do not accept each other's certificates; the router cannot be reached for a reason
             other than its absence; or zenoh refuses the session although the router is running.
     """
-    reported, refused = "", 0
+    reported, failures = "", 0
     while True:
         try:
             return zenoh.open(config)
         except zenoh.ZError as fault:
             trouble = router_trouble(network, role)
-            refused = 0 if trouble else refused + 1  # the first attempt may precede the router's start
-            if refused > 1:
+            failures = 0 if trouble else failures + 1  # try again once: the router may have started since this attempt
+            if failures > 1:
                 raise BusError(
                     f"the router at {network.router} accepts {role}'s certificate, but zenoh opens no session: "
                     f"{plain(fault)}"
@@ -113,7 +113,7 @@ def open_by_router(config: zenoh.Config, network: Network, role: str) -> zenoh.S
 
 
 def router_trouble(network: Network, role: str) -> str:
-    """Reason for a missing link to the router: absent or shutting down; empty if it is running.
+    """Reason why the router cannot be reached: it is absent or shutting down. Empty if it is running.
 
     Raises:
         BusError: router and process do not accept each other's certificates, or the router cannot be reached for

@@ -86,7 +86,7 @@ class Links:
     def live(self) -> set[str]:
         """Roles whose processes listen now; a killed run leaves its directory behind.
 
-        With a router, only the router listens: while it does, any role may be running.
+        With a router, only the router listens: while it does, all roles are returned, as any may be running.
         """
         if self.network.router:
             return set(self.ports) if _listens(*self.network.address) else set()
@@ -167,12 +167,12 @@ def open_run(
         base: parent of its directory; the user's runtime directory when None.
         listeners: additional roles with a port, if this call creates the run: a launcher must listen to receive from a
             viewer, which only connects.
-        network: router of the run, if this call creates it. An existing run must have the same one, unless this is None
-            or a launcher created the run, which then stays on its host.
+        network: router of the run, if this call creates the run. An existing run must have the same one, unless this is
+            None or a launcher created the run: its runs stay on one host.
 
     Raises:
-        BusError: the name is invalid, or the run exists without one of `mirrors`, or with another network; without
-            `mirrors`, it does not exist.
+        BusError: the name is invalid; the run exists without one of `mirrors`, or with another network; or `mirrors` is
+            empty and the run does not exist.
         DataFileError: the run's directory is damaged, or cannot be made.
     """
     path, requested = run_path(run_id, base), _absolute(network or Network())
@@ -273,7 +273,7 @@ def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], netw
     """Create the directory under another name and rename it; a later process uses the first one's directory."""
     # Monitors connect and do not listen: there may be several, and no other process connects to them.
     roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, *listeners]
-    taken = set[int]()  # by other runs: on their ports a killed one would seem live, and a new one could not listen
+    taken = set[int]()  # ports of other runs: on a shared port, a killed run would seem live and could not listen again
     for other in path.parent.glob(f"*/{_LINKS}"):
         with contextlib.suppress(DataFileError):
             taken |= set(_read(other.parent).ports.values())
@@ -315,7 +315,7 @@ def free_ports(count: int, taken: AbstractSet[int] = frozenset()) -> list[int]:
 
     An outgoing connection could take an ephemeral port before its role listens; and a connection that is retried to
     such a port without a listener could get the same port on its own side, and connect to itself. If the ephemeral
-    range begins at 15000 or below, the ports are in it all the same.
+    range begins at 15000 or below, the kernel chooses ports within it.
     """
     candidates = sorted({*range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))} - taken)
     chooser = random.SystemRandom()

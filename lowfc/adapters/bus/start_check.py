@@ -1,4 +1,4 @@
-"""Refusal of sequences that start too far in the future: after one of them, valid messages would be out of order."""
+"""Refusal of sequences with a start too far in the future, after which valid sequences would be out of order."""
 
 from collections.abc import Callable
 from datetime import UTC, datetime

@@ -69,14 +69,14 @@ class ZenohPublisher:
         self.published = self.skipped = 0
         self.handed_ns = 0
         self.last: tuple[bytes, Envelope] | None = None
-        self._keeps = topic.queryable
+        self._keeps_last = topic.queryable
         self._host_ns = bus.clock.host_ns
         self._bus = bus
         self._encode = bus.encode
         self._replying = bus.replying
         self._publisher = declare_publisher(session, topic, key, lockstep=bus.clock.lockstep)
         self._direct_link = direct_link
-        if self._keeps:
+        if self._keeps_last:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
@@ -86,7 +86,7 @@ class ZenohPublisher:
             self._host_ns() if publish_time_ns is None else publish_time_ns,
         )
         self.published += 1
-        if self._keeps:
+        if self._keeps_last:
             self.last = (payload, envelope)
         handed = self._direct_link is not None and self._direct_link.send(envelope.encode(), payload)
         if handed:
@@ -153,8 +153,8 @@ class ZenohBus:
             links: links of the run.
             role: role of this process.
             clock: clock of the run.
-            monitor: whether this process is a monitor, which polls `Ring`s. It gets `latest_only` topics at display
-                rate, a pool of receive buffers and one receive thread: half the cost. Set it in a process's first bus.
+            monitor: whether this process is a monitor; set it in a process's first bus. A monitor polls `Ring`s, and at
+                half the cost: `latest_only` topics at display rate, a pool of receive buffers, one receive thread.
             beside: bus of another role in this process, already subscribed: the direct link to it is a function call.
 
         Raises:
@@ -300,7 +300,7 @@ class ZenohBus:
                 priority=priority,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
-                # A request waits for room in the queue, or a large one would be lost; other queries are empty.
+                # A query with a payload, a request, waits for room in the queue: a large one would be lost otherwise.
                 congestion_control=zenoh.CongestionControl.BLOCK if payload else zenoh.CongestionControl.DROP,
             )
         done.wait(timeout_s + 1.0)

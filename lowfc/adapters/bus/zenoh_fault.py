@@ -15,7 +15,7 @@ _PLACE = re.compile(r"\s*\bat /?\S+\.rs:\d+\.?")
 def plain(fault: zenoh.ZError) -> str:
     """Cause of an error, without zenoh's source locations and component names."""
     text = _PLACE.sub("", str(fault).partition("\n")[0]).strip(" .")
-    if text.endswith("]") and ": [" in text:  # the cause; an IPv6 address has brackets, too
+    if text.endswith("]") and ": [" in text:  # ": [cause]" at the end; an IPv6 address may end in "]", too
         text = text[:-1].rpartition(": [")[2]
     return text[:_LONGEST]
 

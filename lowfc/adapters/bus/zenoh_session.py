@@ -23,7 +23,7 @@ _DISPLAY_HZ = 40.0  # a viewer draws 30 images a second, each from a new message
 _BATCH_BYTES = 65535  # zenoh's default
 _SMALL_BATCH_BYTES = 16384  # of a monitor, which keeps messages: each holds its receive buffer
 _OPEN_MS = 2000  # a closing session waits this long for a process that is stopped; zenoh's default is 10 s
-_SPARE_BUFFERS = 1024  # otherwise zenoh allocates and clears one for every message
+_SPARE_BUFFERS = 1024  # of a monitor; otherwise zenoh allocates and clears one for every message
 _PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
 
 _kept = threading.local()
@@ -43,8 +43,8 @@ def keep_thread_state() -> None:
 def close_links_at_once(session: zenoh.Session) -> None:
     """Set options of this process's TCP sockets after each new link of a session, so that no dead link delays it.
 
-    SO_LINGER is turned off; zenoh sets 10 s. Closing the link of a process that is stopped would block the thread that
-    receives, and no request would be answered for as long. The kernel still sends what was written.
+    SO_LINGER is turned off. With zenoh's 10 s, closing the link of a process that is stopped blocks the thread that
+    receives for this time, in which no request is answered. The kernel still sends what was written.
 
     Across hosts, TCP_USER_TIMEOUT is set to the lease. Otherwise a link that was cut while data waited in its buffer is
     not closed until the network is back and the kernel sends again, up to two minutes later.
@@ -121,7 +121,7 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
             # No gain at these sizes, and a receiver descheduled for 100 ms loses messages silently.
             "shared_memory": {"enabled": False},
         },
-        # Monitors connect by socket and get no more of these messages than they display: sending costs the loop time.
+        # Monitors connect by Unix socket, and get as many of these as they display: sending costs the loop time.
         "downsampling": [
             {"id": "monitor", "flows": ["egress"], "messages": ["put"], "link_protocols": [_SOCKET], "rules": throttled}
         ],
