@@ -42,7 +42,7 @@ def test_the_clock_does_not_step_with_the_wall_clock(tmp_path: Path, monkeypatch
     assert clock.host_ns() >= before
     assert before // 1_000_000_000 - clock.start_s in (0, 1)
     assert clock.now_ns() - time.monotonic_ns() <= clock.offset_ns
-    for deadline in (clock.now_ns() + 3_000_000, before):  # the second has passed
+    for deadline in (clock.now_ns() + 3_000_000, before):  # the second deadline has passed
         clock.sleep_until_ns(deadline)
         assert clock.now_ns() >= deadline
 
@@ -233,7 +233,7 @@ def fifo_permitted() -> bool:
 
 
 @pytest.mark.skipif(not fifo_permitted(), reason="this user may not have SCHED_FIFO")
-def test_a_host_that_allows_it_grants_real_time() -> None:
+def test_real_time_is_granted_on_a_host_that_allows_it() -> None:
     cpu = min(os.sched_getaffinity(0))
     reported = report(f"set_up(10, {{{cpu}}}, lock_memory=False, disable_cpu_idle=False)")
     if reported["refused"]:  # a container's root may not have CAP_SYS_NICE
@@ -273,7 +273,7 @@ def test_install_advice_lists_the_packages_of_an_extra(monkeypatch: pytest.Monke
     assert install_advice("deploy") == f"{sys.executable} -m pip install 'cryptography>=44'"
     assert install_advice("epics") == f"{sys.executable} -m pip install 'p4p>=4.3'", "without those of epics-test"
     monkeypatch.setattr(metadata, "requires", Mock(side_effect=metadata.PackageNotFoundError))
-    assert install_advice("plots").endswith("pip install -e '.[plots]' in its checkout")
+    assert install_advice("plots").endswith("pip install -e '.[plots]' in the checkout of lowfc")
 
 
 def test_zenohs_errors_are_shown_without_source_locations() -> None:

@@ -94,7 +94,7 @@ class Child:
 @contextlib.contextmanager
 def interrupt_blocked() -> Iterator[None]:
     """Block Ctrl-C until the end of the context; processes started in it never receive it."""
-    resource_tracker.ensure_running()  # its start unblocks Ctrl-C
+    resource_tracker.ensure_running()  # started within the context, it would unblock Ctrl-C
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

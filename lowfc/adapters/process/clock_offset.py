@@ -39,7 +39,7 @@ class ClockOffset:
     def exchanged(self, queried_ns: int, theirs_ns: int, answered_ns: int) -> None:
         """Add one exchange: this host's time at query and receipt, and the other's time at its answer."""
         new = Exchange(theirs_ns - (queried_ns + answered_ns) // 2, answered_ns - queried_ns)
-        apart_ns = abs(new.offset_ns - self.offset_ns) - 1_000_000  # ten times the drift
+        apart_ns = abs(new.offset_ns - self.offset_ns) - 1_000_000  # 1 ms, ten times the drift
         if self.best is not None and apart_ns > (new.round_trip_ns + self.best.round_trip_ns) // 2:
             self._recent.clear()  # another clock, as after the other host's reboot
         self._recent.append(new)

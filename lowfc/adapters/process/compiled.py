@@ -1,4 +1,4 @@
-"""The fused step compiled by numba (extra `fast`), before the first frame."""
+"""The fused step, compiled by numba (extra `fast`) before the first frame."""
 
 import importlib.util
 import threading

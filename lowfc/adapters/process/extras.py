@@ -15,7 +15,7 @@ def install_advice(extra: str) -> str:
     try:
         required = metadata.requires("lowfc") or []
     except metadata.PackageNotFoundError:  # a checkout on the path that is not installed
-        return f"{pip} -e '.[{extra}]' in its checkout"
+        return f"{pip} -e '.[{extra}]' in the checkout of lowfc"
     of_extra = [line for line in required if re.search(rf"extra == ['\"]{extra}['\"]", line)]
     names = [line.partition(";")[0].strip() for line in of_extra]
     return " ".join([pip, *(f"'{name}'" for name in names)])

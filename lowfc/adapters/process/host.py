@@ -19,7 +19,7 @@ import psutil
 CPUS = "sys/devices/system/cpu"
 _STA_UNSYNC, _STA_NANO, _TIME_ERROR = 0x40, 0x2000, 5
 _STAT = Path("/proc/stat")
-_MAX_READ_BYTES = 1 << 14  # of a file; of /proc/stat, after the beginning of the processor's line
+_MAX_READ_BYTES = 1 << 14  # of a file; of /proc/stat, counted from the beginning of the processor's line
 
 
 class Synchronisation(NamedTuple):
@@ -211,7 +211,7 @@ def resident_bytes(process: int | None = None) -> int:
 
 @functools.lru_cache(1)
 def _own_memory(process: int) -> int:
-    """The open file with the size of this process's memory; `process` is its id, which a fork changes."""
+    """Descriptor of the open file with this process's memory use; `process`, its id, differs after a fork."""
     return os.open(f"/proc/{process}/statm", os.O_RDONLY)
 
 

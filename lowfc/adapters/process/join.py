@@ -50,7 +50,7 @@ def join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Serv
 
 
 def join_beside(config: Configuration, service: Service, role: str) -> Service:
-    """Join the run of `service` again, in another role of the same process; direct links in it are function calls.
+    """Join the run of `service` again, in another role of this process; a direct link to `service` is a function call.
 
     The service manager is notified by `service` only.
     """

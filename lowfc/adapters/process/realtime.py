@@ -144,7 +144,7 @@ def lower_priority() -> None:
 
 
 def leave_real_time() -> None:
-    """Leave the real-time class of a parent in the loop; a class below the normal one, which a person chose, stays."""
+    """Leave the real-time class inherited from the loop; a class below the normal one, chosen by a person, stays."""
     if os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
@@ -186,7 +186,7 @@ def _disable_cpu_idle() -> None:
 
 
 def _lock_memory() -> None:
-    """Lock present pages and all pages of mapped files now, as reading them is slow; other pages once touched.
+    """Lock resident pages, and all pages of mapped files, as reading them later is slow; other pages once touched.
 
     Locking all reserved memory would allocate it: most of it is buffers and thread stacks that BLAS does not use.
     Under a memory-lock limit nothing is locked, as later allocations would fail.

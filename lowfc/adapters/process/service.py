@@ -77,7 +77,7 @@ class Service:
             clock: clock of the run.
             bus: bus of the process.
             granted: real-time measures requested before.
-            at_ready: requests further ones once the process is ready; no event tells of a refusal, as on older kernels.
+            at_ready: requests further measures once the process is ready; a refusal (older kernels) gives no event.
             fill: adds the role's own fields to each Health.
             announces: see the attribute.
             supervisor: the host's by default.
@@ -102,7 +102,7 @@ class Service:
         self._state: ProcessState = "starting"
         self._fault: Exception | None = None
         self._names = Names()
-        self._starts: dict[str, int] = {}  # by name; in containers a restarted process has its former id
+        self._starts: dict[str, int] = {}  # by name, not by id: in containers a restarted process has its former id
         self._known_starts: dict[str, int] = {}
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
@@ -218,7 +218,7 @@ class Service:
     def beat(self, *, alive: bool = True) -> None:
         """Publish Health when due, twice a second, and send the watchdog signal to the service manager if `alive`.
 
-        Call it often, and only on the thread that does the process's work: the watchdog must notice that it hangs.
+        Call it often, and only on the thread that does the process's work, as the watchdog must notice if it hangs.
         """
         now_ns = self.clock.host_ns()
         if alive:
@@ -243,7 +243,7 @@ class Service:
     def event(self, event: str, **details: object) -> None:
         """Publish an event of the table; callable from any thread.
 
-        Warnings and errors are also printed on standard error; of one warning, `PRINTED` within `PRINTED_NS`.
+        Errors are also printed on standard error, and warnings, at most `PRINTED` of each kind within `PRINTED_NS`.
         """
         kind = EVENTS[event]
         log = kind.log(self.name, self.clock.now_ns(), **details)

@@ -4,7 +4,7 @@ from collections import deque
 
 WINDOW_NS = 500_000_000
 UNITS = 4
-"""Least work in the time over which a rate is measured."""
+"""Least number of units of work (such as frames) from which a rate is measured."""
 
 
 class WorkRate:
