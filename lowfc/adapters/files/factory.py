@@ -37,7 +37,7 @@ from lowfc.optics.twin.twin_mirror import TwinMirror, poke_wavefronts_nm
 Progress = Callable[[int, int], None]
 
 _log = logging.getLogger(__name__)
-_SHARED = ("bias_dn", "gain_e_per_dn", "em_gain", "read_noise_e")  # by Detector and CameraSettings
+_SHARED = ("bias_dn", "gain_e_per_dn", "em_gain", "read_noise_e")  # attributes of both Detector and CameraSettings
 _TWINS = {spec.nodes: spec for spec in (FAST, ACCURATE)}
 
 
@@ -66,7 +66,7 @@ def twin(config: Configuration, progress: Progress | None, warn: Callable[[str],
 
 
 def contrast_of(config: Configuration) -> ModalContrast:
-    """Contrast that the modes add in the dark zone; 0.1 s (Lyot stop: 0.5 s), cached unless the pupil is a file."""
+    """Contrast that the modes add in the dark zone, in 0.1 s (Lyot stop: 0.5 s); cached unless the pupil is a file."""
     key = config.sensor, config.noll, config.star.wavelength_nm
     return _contrast_of(*key) if config.sensor.pupil.endswith(".npz") else _cached_contrast_of(*key)  # files change
 
@@ -176,7 +176,7 @@ def _interlock(section: InterlockSection) -> Interlock:
 def analytic_calibration(
     config: Configuration, optics: Twin, on_nodes: TwinMirror, opd_nm: Array | None = None
 ) -> Calibration:
-    """Calibration from the sensor's digital twin: I0 and H, eqs. (6) to (12), R from them, and the mirror's modes.
+    """Calibration from the sensor's digital twin: I0 and H (the paper's eqs. 6 to 12), R, and the mirror's modes.
 
     The modes are fitted to the influence functions, then mixed slightly so that the sensor measures each modal command
     as itself: through the shaped pupil, the mirror's print-through looks like low orders, up to 0.3 % of a command.
@@ -318,8 +318,8 @@ def _dark_dn(camera: Detector) -> float:
 def equivalent_read_noise_e(camera: Detector) -> float:
     """Read noise equivalent to all noise except photon noise, in electrons before multiplication, for the weights.
 
-    The variance is 2 (I0 + read_noise^2 / (2 gain^2)): the register doubles that of the photons. Charge without light
-    counts as light.
+    With EM gain a pixel's variance is 2 (I0 + read_noise^2 / (2 gain^2)), as the register doubles that of the photons.
+    Charge without light adds noise as light does.
     """
     read_noise_e = camera.read_noise_e
     if camera.em_gain > 1:

@@ -25,8 +25,8 @@ def load_layout(name: str) -> sams.Layout:
     """Load a layout by name and check it.
 
     Args:
-        name: A shipped layout, `file.json` with one layout, or `file.json:name` with several. A file is written as
-            the shipped one: {"layouts": {name: {"purpose", "hole_diameter", "holes": [[x, y], ...]}}} in pupil
+        name: A shipped layout, `file.json` with one layout, or `file.json:name` with several. A file has the form
+            of the shipped one: {"layouts": {name: {"purpose", "hole_diameter", "holes": [[x, y], ...]}}} in pupil
             diameters; a hole [x, y, diameter] has its own size. A single layout may stand alone, without "layouts".
 
     Raises:

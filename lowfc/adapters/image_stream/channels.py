@@ -34,7 +34,7 @@ def other_channel_names(channel: str) -> tuple[str, ...]:
 class OtherChannels:
     """Sum of a mirror's channels except one, in the unit of the streams.
 
-    Unusable channels are left out: another grid, another layout, or a value that is not finite. A channel that is being
+    Unusable channels are left out: those with another grid or layout, or a value that is not finite. A channel being
     written, or whose writer died meanwhile, counts with its last complete shape, or as it is if none was read before.
     """
 

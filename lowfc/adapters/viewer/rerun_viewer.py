@@ -11,8 +11,8 @@ Measured with rerun 0.41:
   new viewer on the same port continues the recording.
 - `disconnect`, `del`, and the end of the process block while the viewer hangs: call stop() first.
 - A browser's page must be reloaded after its server has restarted.
-- The memory limit applies to the data as counted by rerun: a viewer levelled off at 184 MB for "100MB", a headless one
-  at 545 MB for "200MB".
+- The memory limit applies to the data as counted by rerun: the memory of a viewer levelled off at 184 MB for "100MB",
+  of a headless one at 545 MB for "200MB".
 - ViewerClient has no timeout: all calls here run in a thread that may be abandoned.
 """
 
@@ -132,7 +132,7 @@ class RerunViewer:
 
     @property
     def alive(self) -> bool:
-        """Whether its process exists; a hanging one does."""
+        """Whether its process exists, hanging or not."""
         return self._child.process is not None and self._child.status is None
 
     def answers(self, timeout_s: float = 1.0) -> bool:
@@ -163,11 +163,11 @@ class RerunViewer:
             self._page.stop()
             self._page = None
         self._child.stop(_STOP_S)
-        self._failure()  # read for the last time
+        self._failure()  # keeps the output for `exit_description`
         self._stderr.close()
 
     def screenshot(self, path: Path | None = None, timeout_s: float = 20.0) -> bytes:
-        """PNG of the whole viewer once it has loaded and its image is constant, or keeps changing for `timeout_s`.
+        """PNG of the whole viewer once it has loaded and two images in turn are equal, at the latest after `timeout_s`.
 
         Raises:
             ViewerError: the viewer does not answer, or has not loaded everything within the timeout.
@@ -268,7 +268,7 @@ class RerunViewer:
             return answers[0]
         if not self.alive:
             raise ViewerError(self.exit_description())
-        fault = str(faults[0]).partition("\n")[0] if faults else ""  # metadata follow
+        fault = str(faults[0]).partition("\n")[0] if faults else ""  # the other lines are metadata
         what = f"answers with {fault}" if faults else f"does not answer within {_CALL_S:g} s"
         raise ViewerError(f"the viewer on {self.url} {what}; stop it and start it again")
 
@@ -280,7 +280,7 @@ def _state(client: "ViewerClient") -> "ViewerState":
 _REINSTALL = "install it again: pip install --force-reinstall rerun-sdk"
 _NO_SCREEN = "use --web and a browser, --headless-screenshot FILE.png, or --save FILE.rrd"
 _PACKAGES = "apt install mesa-vulkan-drivers libvulkan1"
-_ADVICE = {Show.NATIVE: f"; {_NO_SCREEN}", Show.HEADLESS: f"; if it has no Vulkan driver: {_PACKAGES}", Show.WEB: ""}
+_ADVICE = {Show.NATIVE: f"; {_NO_SCREEN}", Show.HEADLESS: f"; if there is no Vulkan driver: {_PACKAGES}", Show.WEB: ""}
 
 
 def stream_url(port: int) -> str:
