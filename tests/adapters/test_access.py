@@ -256,7 +256,7 @@ def test_an_unknown_name_of_the_router_and_a_session_that_does_not_open_are_erro
 
 
 def test_a_roles_certificate_is_not_accepted_as_the_routers(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
-    # As a router of another program, which does not check its own certificate.
+    # As if another program were the router, which does not check its own certificate.
     monkeypatch.setattr("lowfc.adapters.bus.zenoh_bus.require_certificate", lambda *_: None)
     folder = hosts.folder / "false"
     folder.mkdir()

@@ -256,20 +256,20 @@ def test_monitors_connect_by_port_if_the_socket_path_is_too_long(tmp_path: Path)
 
 
 @pytest.mark.exclusive
-def test_a_monitor_receives_every_row_and_images_at_display_rate(join: Join) -> None:
+def test_a_monitor_receives_every_truth_and_frames_at_display_rate(join: Join) -> None:
     camera, viewer, recorder = join("camera"), join("viewer", monitor=True), join("recorder")
     frames, truths = camera.publisher(FRAME), camera.publisher(TRUTH)
-    images, rows, recorded = viewer.ring(FRAME, 5000), viewer.ring(TRUTH, 5000), Mailbox()
+    frame_ring, truth_ring, recorded = viewer.ring(FRAME, 5000), viewer.ring(TRUTH, 5000), Mailbox()
     recorder.subscribe(FRAME, recorded.put)
     drained: dict[Topic, list[Sample]] = {FRAME: [], TRUTH: []}
 
     def drain() -> None:
-        drained[FRAME] += images.drain()
-        drained[TRUTH] += rows.drain()
+        drained[FRAME] += frame_ring.drain()
+        drained[TRUTH] += truth_ring.drain()
 
     def put() -> Envelope:
-        frames.put(b"picture")
-        return truths.put(b"row")
+        frames.put(b"frame")
+        return truths.put(b"truth")
 
     until(lambda: drained[FRAME] and drained[TRUTH] and recorded.received, each=lambda: (put(), drain()))
     first = {topic: len(samples) for topic, samples in drained.items()}

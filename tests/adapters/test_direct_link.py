@@ -97,7 +97,7 @@ def test_a_reader_in_the_same_process_receives_each_message_by_a_call(ends: Ends
     assert ends.received == list(range(100)), "none twice, although the bus carried them too"
     assert set(ends.threads) == {threading.current_thread().name}
     del ends.threads[:]
-    again = ends.bus("camera").publisher(FRAME)  # in a separate process
+    again = ends.bus("camera").publisher(FRAME)  # as in a separate process
     ends.until_direct_only(again)
 
 
@@ -109,7 +109,7 @@ def test_switching_to_the_direct_link_loses_and_repeats_nothing(ends: Ends) -> N
     until(lambda: controller.peers() and camera.peers())
     ends.publish(frames, 250)
     until(lambda: ends.received[-1:] == [frames.published - 1])
-    first = min(ends.received)  # it may be in the socket still when the bus delivers the next ones
+    first = min(ends.received)  # by the socket, it may arrive after the next ones by the bus
     assert sorted(ends.received) == list(range(first, frames.published))
     assert [number for number in ends.received if number != first] == list(range(first + 1, frames.published))
     assert "direct-link" in ends.threads
@@ -178,7 +178,7 @@ def test_a_reader_is_closed_although_a_handler_never_returns(reader: ReaderOnTwo
 def test_messages_that_a_publisher_repeats_or_reorders_are_delivered_as_they_were_published(
     reader: ReaderOnTwoPaths, direct_only: bool
 ) -> None:
-    """The controller must see the fault of such a camera."""
+    """The controller must see the fault of a camera that repeats or reorders frames."""
     reader.by_socket(10, 1)
     if direct_only:
         reader.by_bus(10, 1)
@@ -187,7 +187,7 @@ def test_messages_that_a_publisher_repeats_or_reorders_are_delivered_as_they_wer
         reader.by_socket(sequence, time_ns)
         if not direct_only:
             reader.by_bus(sequence, time_ns)
-    # The same time twice: a repetition without the bus, but perhaps the copy from the bus while that is in use.
+    # The same envelope twice: a repetition without the bus; in parallel with the bus it counts as a copy.
     copies = 2 if direct_only else 1
     for _ in range(copies):
         reader.by_socket(13, 9)
@@ -327,7 +327,7 @@ def test_handed_ns_precedes_the_bus_put_with_a_direct_reader_and_follows_it_with
 
 
 def test_after_a_stall_with_the_bus_ahead_nothing_is_delivered_twice(tmp_path: Path) -> None:
-    """A socket buffers at most a few thousand commands."""
+    """A socket buffers at most a few thousand commands, fewer than the reader remembers."""
     reader, commands = ReaderOnTwoPaths(tmp_path / "mirror-dm.in", shared=True), 5000
     for count in range(commands):
         reader.by_bus(sequence_of(5, count), count)

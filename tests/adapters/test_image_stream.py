@@ -213,7 +213,7 @@ def test_a_recreated_stream_is_reopened(path: Path) -> None:
     writer = new_stream(path, version=b"")
     writer.map[writer.semaphores + 8] ^= 1
     writer.map[:4] = b"2.00"
-    assert reader.next(0) is None, "it may be in creation"
+    assert reader.next(0) is None, "the stream may still be incomplete"
     new_stream(path).write(image(4))
     newest(reader)
 

@@ -20,7 +20,7 @@ except OSError:
 
 
 class Image:
-    """An IMAGE of the C library; `array` and `md` are at their offsets in it."""
+    """An IMAGE of the C library, which has the pointer `md` at byte 120 and `array` at byte 128."""
 
     def __init__(self, name: str) -> None:
         self.memory = ctypes.create_string_buffer(512)
@@ -51,7 +51,7 @@ class Image:
 
 @pytest.fixture
 def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """One folder for all tests of this module: the library reads its name once."""
+    """A stream's path; all tests of this module use one folder, as the library reads MILK_SHM_DIR only once."""
     folder = tmp_path.parent / "milk"
     folder.mkdir(exist_ok=True)
     monkeypatch.setenv("MILK_SHM_DIR", str(folder))

@@ -80,7 +80,7 @@ def test_a_damaged_log_yields_no_false_message_and_no_silent_loss(tmp_path: Path
 
 
 def chunk_headers(size: int, content: bytes) -> bytes:
-    """Chunk headers every 64 bytes, each of a chunk that begins with `content` and takes almost the whole rest."""
+    """A chunk header every 64 bytes, each of a chunk with `content` that fills almost the rest of the file."""
     file = b""
     for at in range(0, size, 64):
         length = max(size - at - 9, 43)
@@ -90,7 +90,7 @@ def chunk_headers(size: int, content: bytes) -> bytes:
 
 
 def chunks_and_long_records(size: int, chunk: bytes) -> bytes:
-    """Copies of an intact chunk, each followed by a record that declares almost the rest of the file."""
+    """Copies of an intact chunk, each followed by a record whose stated length is almost the rest of the file."""
     file = b""
     while len(file) < size:
         file += chunk
@@ -155,7 +155,7 @@ NO_CHUNKS = {"use_chunking": False}
         NO_CHUNKS,
         NO_CHUNKS | NO_CRCS,
         NO_CHUNKS | {"enable_data_crcs": True},
-        NO_CHUNKS | {"library": "lowfc 0.1.0"},  # the header copied
+        NO_CHUNKS | {"library": "lowfc 0.1.0"},  # with the header of the original
         {"compression": CompressionType.ZSTD, "library": "lowfc 0.1.0"},
     ],
     ids=str,
@@ -187,8 +187,10 @@ def test_a_channel_that_another_tool_added_without_a_schema_is_read_and_copied(t
     assert survey(copied)["state"] == "complete"
 
 
-def test_a_log_is_recovered_without_permissions(tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file system such as FAT has none."""
+def test_a_log_is_recovered_on_a_file_system_without_permissions(
+    tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On FAT, for example, chmod fails."""
     os.truncate(source, source.stat().st_size - 1)
     out, chmod = tmp_path / "recovered.mcap", Path.chmod
     refused = Mock(side_effect=PermissionError(1, "Operation not permitted"))

@@ -178,13 +178,13 @@ def test_the_summary_replaces_the_declarations_of_a_damaged_chunk(tmp_path: Path
         (0, b"\x07"),  # opcode of a message index
         (0, b"\x86"),  # opcode of a private record
         (0, b"\x03"),  # opcode of a declaration without checksum
-        (1, b"\x00"),  # its length, as the next three
+        (1, b"\x00"),  # the chunk's length, as in the next three
         (4, b"\x01"),  # 16 MB longer
         (6, b"\xff"),
         (8, b"\xff"),
         (25, bytes(12)),  # size and checksum of an empty chunk
         (32, b"\xff"),  # size: more than the memory
-        (33, bytes(4)),  # "no checksum"
+        (33, bytes(4)),  # checksum 0, which means none
         (41, b"zzz"),
         (44, b"\x00\x01"),
     ],
@@ -216,7 +216,7 @@ def test_a_damaged_attachment_is_left_out_and_damaged_metadata_are_reported(tmp_
     path = written(tmp_path / "a.mcap", SENT[:8])
     data = path.read_bytes()
     flipped(path, data.index(b"[loop]"))
-    path.write_bytes(path.read_bytes()[: chunks_of(path)[-1][1]])  # only its own checksum detects it
+    path.write_bytes(path.read_bytes()[: chunks_of(path)[-1][1]])  # without the summary, which detects it, too
     with pytest.raises(DataFileError, match="the checksum of an attachment is wrong"):
         list(LogReader(path))
     reader = LogReader(path, skip_damaged=True)

@@ -28,7 +28,7 @@ FULL_DISK = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
 
 def test_a_run_has_ports_a_secret_and_private_files(monkeypatch: pytest.MonkeyPatch) -> None:
     lowest_outgoing = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
-    monkeypatch.setattr("lowfc.adapters.bus.run._LOWEST_PORT", lowest_outgoing - 12)  # few to choose from
+    monkeypatch.setattr("lowfc.adapters.bus.run._LOWEST_PORT", lowest_outgoing - 12)  # 12 ports to choose from
     run = open_run("night", mirrors=("dm", "tip"))
     assert set(run.links.ports) == {"camera", "controller", "mirror-dm", "mirror-tip", "recorder"}
     assert len(set(run.links.ports.values())) == 5
@@ -82,7 +82,7 @@ def test_damaged_files_of_a_run_are_an_error(name: str, text: str | None) -> Non
     file = open_run("night").path / name
     file.unlink()
     if text is not None:
-        file.write_text(text, encoding="latin-1")  # of which some are not UTF-8
+        file.write_text(text, encoding="latin-1")  # "\xff" is then not UTF-8
     with pytest.raises(DataFileError, match=name):
         _ = open_run("night").links.secret
 
@@ -287,7 +287,7 @@ def test_a_file_that_cannot_be_written_is_an_error_before_and_at_the_writing(tmp
     loop.symlink_to("loop")
     faults = dict.fromkeys((pipe, Path(), Path("/"), tmp_path), "not a regular file")
     faults[tmp_path / ("x" * 300)] = "File name too long"
-    faults[Path("/proc/calibration.fits")] = "No such file"  # for root too
+    faults[Path("/proc/calibration.fits")] = "No such file"  # not even root can write there
     for file, why in faults.items():
         for write in (require_folder, partial(write_whole, content=b"")):
             with pytest.raises(DataFileError, match=f"^{file} cannot be written: {why}"):

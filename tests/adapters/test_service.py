@@ -159,7 +159,7 @@ def test_processes_are_connected_when_each_has_received_the_others_health(listen
     camera.beat()
     assert controller.wait_for(["camera"], 0.0) == ()
     mirror = listener.service("mirror-dm")
-    mirror.beat()  # running, but not ready
+    mirror.beat()  # it exists, but is not ready
     assert camera.wait_for(["mirror-dm"], 0.0) == ("mirror-dm",)
     assert camera.last_health["mirror-dm"].state == "starting"
 
@@ -180,10 +180,10 @@ def test_a_newcomer_gets_a_health_before_the_next_is_due(listener: Listener) -> 
     listener.service("controller").beat()  # restarted; in a container, with its former process id
     assert camera.has_newcomers()
     before = len(listener.messages(HEALTH))
-    for number in (1, 2, 1):  # two views, in turns
+    for number in (1, 2, 1):  # two viewers, in turns
         listener.bus.publisher(HEALTH, "viewer").put(wire.Health(pid=number).SerializeToString())
         camera.beat()
-    assert [health.process for health in listener.messages(HEALTH)[before:]] == ["", "camera", "", ""]  # "": a view
+    assert [health.process for health in listener.messages(HEALTH)[before:]] == ["", "camera", "", ""]  # "": a viewer
 
 
 def test_a_flood_of_bad_messages_gives_one_event_and_the_last_health_has_all_counts(listener: Listener) -> None:
