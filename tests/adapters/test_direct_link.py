@@ -23,8 +23,8 @@ from tests.support.loops import until
 PATIENCE_S = 30.0
 
 
-class Ends:
-    """A run, and what `receive` received: counts and sizes of messages, and the thread of each."""
+class LinkedRun:
+    """A run with its buses, and the counts, sizes and threads of the messages that `receive` received."""
 
     def __init__(self, base: Path) -> None:
         self.run: Run = open_run("direct-link", base=base)
@@ -63,56 +63,56 @@ class Ends:
 
 
 @pytest.fixture
-def ends(tmp_path: Path) -> Iterator[Ends]:
-    both = Ends(tmp_path)
+def linked(tmp_path: Path) -> Iterator[LinkedRun]:
+    both = LinkedRun(tmp_path)
     yield both
     both.close()
 
 
-def test_the_direct_subscriber_receives_over_the_direct_link_and_others_over_the_bus(ends: Ends) -> None:
-    controller, recorder, camera = ends.bus("controller"), ends.bus("recorder"), ends.bus("camera")
-    controller.subscribe(FRAME, ends.receive)
+def test_the_direct_subscriber_receives_over_the_direct_link_and_others_over_the_bus(linked: LinkedRun) -> None:
+    controller, recorder, camera = linked.bus("controller"), linked.bus("recorder"), linked.bus("camera")
+    controller.subscribe(FRAME, linked.receive)
     recorded: list[int] = []
     recorder.subscribe(FRAME, lambda sample: recorded.append(count_of(sample.sequence)))
     frames = camera.publisher(FRAME)
-    ends.until_direct_only(frames)
-    ends.publish(frames, 100)
-    until(lambda: recorded[-1:] == [frames.published - 1] == ends.received[-1:])
-    assert ends.received == list(range(ends.received[0], frames.published))
-    assert set(ends.threads) == {"direct-link"}
-    assert recorded[-100:] == ends.received[-100:]
+    linked.until_direct_only(frames)
+    linked.publish(frames, 100)
+    until(lambda: recorded[-1:] == [frames.published - 1] == linked.received[-1:])
+    assert linked.received == list(range(linked.received[0], frames.published))
+    assert set(linked.threads) == {"direct-link"}
+    assert recorded[-100:] == linked.received[-100:]
 
 
-def test_a_reader_in_the_same_process_receives_each_message_by_a_call(ends: Ends) -> None:
-    controller, recorder = ends.bus("controller"), ends.bus("recorder")
-    controller.subscribe(FRAME, ends.receive)
+def test_a_reader_in_the_same_process_receives_each_message_by_a_call(linked: LinkedRun) -> None:
+    controller, recorder = linked.bus("controller"), linked.bus("recorder")
+    controller.subscribe(FRAME, linked.receive)
     recorded: list[int] = []
     recorder.subscribe(FRAME, lambda sample: recorded.append(count_of(sample.sequence)))
-    camera = ZenohBus(ends.run.links, "camera", ends.clock, beside=controller)
+    camera = ZenohBus(linked.run.links, "camera", linked.clock, beside=controller)
     frames = camera.publisher(FRAME)
     until(lambda: camera.peers() == 2)
-    ends.publish(frames, 100)
+    linked.publish(frames, 100)
     until(lambda: recorded[-1:] == [99])
     camera.close()
-    assert ends.received == list(range(100)), "none twice, although the bus carried them too"
-    assert set(ends.threads) == {threading.current_thread().name}
-    del ends.threads[:]
-    again = ends.bus("camera").publisher(FRAME)  # as in a separate process
-    ends.until_direct_only(again)
+    assert linked.received == list(range(100)), "none twice, although the bus carried them too"
+    assert set(linked.threads) == {threading.current_thread().name}
+    del linked.threads[:]
+    again = linked.bus("camera").publisher(FRAME)  # as in a separate process
+    linked.until_direct_only(again)
 
 
-def test_switching_to_the_direct_link_loses_and_repeats_nothing(ends: Ends) -> None:
-    camera = ends.bus("camera")
+def test_switching_to_the_direct_link_loses_and_repeats_nothing(linked: LinkedRun) -> None:
+    camera = linked.bus("camera")
     frames = camera.publisher(FRAME)
-    controller = ends.bus("controller")
-    controller.subscribe(FRAME, ends.receive)
+    controller = linked.bus("controller")
+    controller.subscribe(FRAME, linked.receive)
     until(lambda: controller.peers() and camera.peers())
-    ends.publish(frames, 250)
-    until(lambda: ends.received[-1:] == [frames.published - 1])
-    first = min(ends.received)  # by the socket, it may arrive after the next ones by the bus
-    assert sorted(ends.received) == list(range(first, frames.published))
-    assert [number for number in ends.received if number != first] == list(range(first + 1, frames.published))
-    assert "direct-link" in ends.threads
+    linked.publish(frames, 250)
+    until(lambda: linked.received[-1:] == [frames.published - 1])
+    first = min(linked.received)  # by the socket, it may arrive after the next ones by the bus
+    assert sorted(linked.received) == list(range(first, frames.published))
+    assert [number for number in linked.received if number != first] == list(range(first + 1, frames.published))
+    assert "direct-link" in linked.threads
 
 
 class ReaderOnTwoPaths:
@@ -195,33 +195,33 @@ def test_messages_that_a_publisher_repeats_or_reorders_are_delivered_as_they_wer
 
 
 def test_reader_and_writer_reconnect_after_restarts_and_the_bus_serves_without_a_writer(
-    ends: Ends, monkeypatch: pytest.MonkeyPatch
+    linked: LinkedRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    controller, camera = ends.bus("controller"), ends.bus("camera")
-    controller.subscribe(FRAME, ends.receive)
+    controller, camera = linked.bus("controller"), linked.bus("camera")
+    controller.subscribe(FRAME, linked.receive)
     frames = camera.publisher(FRAME)
-    ends.until_direct_only(frames)
+    linked.until_direct_only(frames)
     controller.close()
-    ends.publish(frames, 5)
-    controller = ends.bus("controller")
-    controller.subscribe(FRAME, ends.receive)
-    ends.until_direct_only(frames)
+    linked.publish(frames, 5)
+    controller = linked.bus("controller")
+    controller.subscribe(FRAME, linked.receive)
+    linked.until_direct_only(frames)
     camera.close()
-    camera = ends.bus("camera")
-    ends.until_direct_only(camera.publisher(FRAME))
+    camera = linked.bus("camera")
+    linked.until_direct_only(camera.publisher(FRAME))
     camera.close()
     monkeypatch.setattr(direct_link.DirectWriter, "send", lambda *_: None)  # as a publisher without this library
-    frames = ends.bus("camera").publisher(FRAME)
-    until(lambda: ends.threads[-1:] not in ([], ["direct-link"]), each=lambda: frames.put(b""))
+    frames = linked.bus("camera").publisher(FRAME)
+    until(lambda: linked.threads[-1:] not in ([], ["direct-link"]), each=lambda: frames.put(b""))
 
 
-def test_a_message_too_large_for_the_socket_arrives_over_the_bus(ends: Ends) -> None:
-    controller, camera = ends.bus("controller"), ends.bus("camera")
-    controller.subscribe(FRAME, ends.receive)
+def test_a_message_too_large_for_the_socket_arrives_over_the_bus(linked: LinkedRun) -> None:
+    controller, camera = linked.bus("controller"), linked.bus("camera")
+    controller.subscribe(FRAME, linked.receive)
     frames = camera.publisher(FRAME)
     large = 17 << 20
-    until(lambda: ends.sizes[-1:] == [large], each=lambda: (frames.put(bytes(large)), time.sleep(0.05)))
-    assert ends.threads[-1] != "direct-link"
+    until(lambda: linked.sizes[-1:] == [large], each=lambda: (frames.put(bytes(large)), time.sleep(0.05)))
+    assert linked.threads[-1] != "direct-link"
 
 
 def test_a_stalled_reader_never_blocks_the_writer(tmp_path: Path) -> None:
@@ -240,37 +240,39 @@ def test_a_stalled_reader_never_blocks_the_writer(tmp_path: Path) -> None:
     listener.close()
 
 
-def test_an_invalid_message_is_counted_and_the_next_is_delivered(ends: Ends, capfd: pytest.CaptureFixture[str]) -> None:
-    controller = ends.bus("controller")
-    controller.subscribe(FRAME, ends.receive)
-    writer = direct_link.DirectWriter(ends.run.links.direct_link("controller"))
+def test_an_invalid_message_is_counted_and_the_next_is_delivered(
+    linked: LinkedRun, capfd: pytest.CaptureFixture[str]
+) -> None:
+    controller = linked.bus("controller")
+    controller.subscribe(FRAME, linked.receive)
+    writer = direct_link.DirectWriter(linked.run.links.direct_link("controller"))
     writer.send(b"short", b"")
     writer.send(b"\xff" * 16, b"from the end of time")
     writer.send(Envelope(7, 0).encode(), b"fine")
-    until(lambda: ends.received == [7])
+    until(lambda: linked.received == [7])
     ((key, (count, _)),) = controller.faults.take_unreadable().items()
     assert (key, count) == (FRAME.key, 2)
     assert "Traceback" not in capfd.readouterr().err
     writer.close()
 
 
-def test_only_direct_subscribers_have_a_direct_link(ends: Ends) -> None:
-    ends.bus("recorder").subscribe(FRAME, ends.receive)
-    ends.bus("mirror-other").subscribe(COMMAND, lambda _: None, "dm")
-    assert not list(ends.run.path.glob("*.in"))
-    ends.bus("controller").subscribe(FRAME, ends.receive)
-    ends.bus("mirror-dm").subscribe(COMMAND, lambda _: None, "dm")
-    assert sorted(path.name for path in ends.run.path.glob("*.in")) == ["controller.in", "mirror-dm.in"]
+def test_only_direct_subscribers_have_a_direct_link(linked: LinkedRun) -> None:
+    linked.bus("recorder").subscribe(FRAME, linked.receive)
+    linked.bus("mirror-other").subscribe(COMMAND, lambda _: None, "dm")
+    assert not list(linked.run.path.glob("*.in"))
+    linked.bus("controller").subscribe(FRAME, linked.receive)
+    linked.bus("mirror-dm").subscribe(COMMAND, lambda _: None, "dm")
+    assert sorted(path.name for path in linked.run.path.glob("*.in")) == ["controller.in", "mirror-dm.in"]
 
 
 class CommandedMirror:
     """A mirror that records its commands, with a controller and an operator that both publish commands."""
 
-    def __init__(self, ends: Ends) -> None:
+    def __init__(self, linked: LinkedRun) -> None:
         self.received: list[Sample] = []
         self.threads: list[str] = []
-        ends.bus("mirror-dm").subscribe(COMMAND, self.receive, "dm")
-        controller, operator = ends.bus("controller"), ends.bus("operator")
+        linked.bus("mirror-dm").subscribe(COMMAND, self.receive, "dm")
+        controller, operator = linked.bus("controller"), linked.bus("operator")
         self.controller, self.operator = controller.publisher(COMMAND, "dm"), operator.publisher(COMMAND, "dm")
 
     def receive(self, sample: Sample) -> None:
@@ -288,8 +290,8 @@ class CommandedMirror:
         self.operator.put(b"operator")
 
 
-def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct_link(ends: Ends) -> None:
-    mirror = CommandedMirror(ends)
+def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct_link(linked: LinkedRun) -> None:
+    mirror = CommandedMirror(linked)
     mirror.until_both_paths()
     begun = len(mirror.received)
     for _ in range(100):
@@ -314,11 +316,11 @@ def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct
     assert all(sample.payload != b"a copy" for sample in mirror.received)
 
 
-def test_handed_ns_precedes_the_bus_put_with_a_direct_reader_and_follows_it_without(ends: Ends) -> None:
-    mirror = CommandedMirror(ends)
+def test_handed_ns_precedes_the_bus_put_with_a_direct_reader_and_follows_it_without(linked: LinkedRun) -> None:
+    mirror = CommandedMirror(linked)
     mirror.until_both_paths()
     put_ns: list[int] = []
-    timed = SimpleNamespace(put=lambda payload, attachment: put_ns.append(ends.clock.host_ns()))
+    timed = SimpleNamespace(put=lambda payload, attachment: put_ns.append(linked.clock.host_ns()))
     for publisher, has_reader in ((mirror.controller, True), (mirror.operator, False)):
         publisher._publisher = timed
         envelope = publisher.put(b"")
@@ -337,8 +339,8 @@ def test_after_a_stall_with_the_bus_ahead_nothing_is_delivered_twice(tmp_path: P
     assert reader.delivered == [sequence_of(5, count) for count in range(commands + 1)]
 
 
-def test_with_a_router_there_is_no_direct_link(ends: Ends) -> None:
-    assert ends.run.links.direct_link("mirror-dm") is not None
-    across = replace(ends.run.links, network=Network(router="tls/localhost:7447", certificates="certs"))
+def test_with_a_router_there_is_no_direct_link(linked: LinkedRun) -> None:
+    assert linked.run.links.direct_link("mirror-dm") is not None
+    across = replace(linked.run.links, network=Network(router="tls/localhost:7447", certificates="certs"))
     assert across.direct_link("mirror-dm") is None
     assert across.direct_link("controller") is None

@@ -91,7 +91,7 @@ def test_every_message_is_taken_skipped_missing_or_waiting(actions: list[str]) -
 PERIOD_NS = 1_000_000
 
 
-class Bench:
+class TimedDispatch:
     """A Dispatch whose handler takes a given time, and messages that arrive as soon as they are due."""
 
     def __init__(self, period_ns: int | None = PERIOD_NS, *, handle_superseded: bool = False) -> None:
@@ -115,58 +115,58 @@ class Bench:
 
 def test_only_the_newest_of_the_queued_messages_is_handled() -> None:
     """The process was stopped for ten periods, in which ten messages arrived."""
-    bench = Bench(handle_superseded=True)
-    bench.work_ns = 20_000
-    begun_ns = bench.now_ns + 10**8
-    bench.arrive(0, begun_ns)
-    bench.now_ns = begun_ns + 10 * PERIOD_NS + 1000
+    timed = TimedDispatch(handle_superseded=True)
+    timed.work_ns = 20_000
+    begun_ns = timed.now_ns + 10**8
+    timed.arrive(0, begun_ns)
+    timed.now_ns = begun_ns + 10 * PERIOD_NS + 1000
     for count in range(1, 11):
-        bench.arrive(count, begun_ns + count * PERIOD_NS)
-    assert (bench.handled, bench.superseded) == ([0, 10], list(range(1, 10)))
-    assert (bench.dispatch.received, bench.dispatch.skipped, bench.dispatch.missing) == (11, 0, 0)
+        timed.arrive(count, begun_ns + count * PERIOD_NS)
+    assert (timed.handled, timed.superseded) == ([0, 10], list(range(1, 10)))
+    assert (timed.dispatch.received, timed.dispatch.skipped, timed.dispatch.missing) == (11, 0, 0)
 
 
 def test_superseded_messages_are_skipped_without_their_own_handler() -> None:
-    bench = Bench()
-    begun_ns = bench.now_ns + 10**8
-    bench.now_ns = begun_ns + 9 * PERIOD_NS + PERIOD_NS // 2
+    timed = TimedDispatch()
+    begun_ns = timed.now_ns + 10**8
+    timed.now_ns = begun_ns + 9 * PERIOD_NS + PERIOD_NS // 2
     for count in range(10):
-        bench.arrive(count, begun_ns + count * PERIOD_NS)
-    assert len(bench.handled) + bench.dispatch.skipped == 10
-    assert bench.handled == [9]
+        timed.arrive(count, begun_ns + count * PERIOD_NS)
+    assert len(timed.handled) + timed.dispatch.skipped == 10
+    assert timed.handled == [9]
 
 
 def test_a_single_old_message_counts_as_superseded() -> None:
-    bench = Bench()
-    bench.arrive(0, bench.now_ns + 10**8)
-    bench.now_ns += 10**9
-    bench.arrive(1, bench.now_ns - OLD_NS)
-    bench.now_ns += 10**9
-    bench.arrive(2, bench.now_ns - PERIOD_NS)  # late by a period, without a sign of a newer one
-    assert bench.handled == [0, 2]
+    timed = TimedDispatch()
+    timed.arrive(0, timed.now_ns + 10**8)
+    timed.now_ns += 10**9
+    timed.arrive(1, timed.now_ns - OLD_NS)
+    timed.now_ns += 10**9
+    timed.arrive(2, timed.now_ns - PERIOD_NS)  # late by a period, without a sign of a newer one
+    assert timed.handled == [0, 2]
 
 
 def test_without_a_period_nothing_is_superseded() -> None:
-    bench = Bench(None)
+    timed = TimedDispatch(None)
     for count in range(50):
-        bench.arrive(count, 0)
-    assert bench.handled == list(range(50))
-    assert bench.dispatch.skipped == 0
+        timed.arrive(count, 0)
+    assert timed.handled == list(range(50))
+    assert timed.dispatch.skipped == 0
 
 
 def test_a_slow_handler_never_falls_far_behind() -> None:
-    bench = Bench(handle_superseded=True)
-    bench.work_ns = 3 * PERIOD_NS
-    begun_ns, lags = bench.now_ns + 10**8, []  # lags in periods
+    timed = TimedDispatch(handle_superseded=True)
+    timed.work_ns = 3 * PERIOD_NS
+    begun_ns, lags = timed.now_ns + 10**8, []  # lags in periods
     for count in range(500):
         put_ns = begun_ns + count * PERIOD_NS
-        before = len(bench.handled)
-        bench.arrive(count, put_ns)
-        if len(bench.handled) > before:
-            lags.append((bench.now_ns - bench.work_ns - put_ns) / PERIOD_NS)
+        before = len(timed.handled)
+        timed.arrive(count, put_ns)
+        if len(timed.handled) > before:
+            lags.append((timed.now_ns - timed.work_ns - put_ns) / PERIOD_NS)
     assert max(lags) < 5
-    assert len(bench.handled) > 5
-    assert len(bench.handled) + len(bench.superseded) + bench.dispatch.skipped == bench.dispatch.received == 500
+    assert len(timed.handled) > 5
+    assert len(timed.handled) + len(timed.superseded) + timed.dispatch.skipped == timed.dispatch.received == 500
 
 
 def test_two_receive_threads_take_turns() -> None:

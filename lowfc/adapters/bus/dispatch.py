@@ -7,9 +7,9 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.sequence_gaps import Arrivals
 
 MAX_IN_A_ROW = 16
-"""Messages dispatched back to back before waiting ones are skipped."""
+"""Number of messages dispatched back to back before waiting ones are skipped."""
 QUEUED_WITHIN_NS = 50_000
-"""A message received within this time of the end of the previous one's dispatch was queued."""
+"""A message received within this time of the end of the previous one's dispatch counts as queued."""
 OLD_NS = 5_000_000
 """Age from which any message counts as superseded, or three periods if that is longer."""
 

@@ -33,7 +33,7 @@ _ABSENT = {
     *(errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ENETUNREACH, errno.ENETDOWN),
     socket.EAI_AGAIN,
 }
-"""Errors of a router or network that is not up yet; timeouts and a handshake cut short also mean that."""
+"""Error numbers of a router or network that is not up yet; timeouts and a handshake cut short mean the same."""
 
 
 def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict[str, Any]:

@@ -270,7 +270,7 @@ def _absolute(network: Network) -> Network:
 
 
 def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], network: Network) -> None:
-    """Create the directory under another name and rename it; a later process uses the first one's directory."""
+    """Create the directory under another name and rename it; if another process was first, its directory is used."""
     # Monitors connect and do not listen: there may be several, and no other process connects to them.
     roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, *listeners]
     taken = set[int]()  # ports of other runs: on a shared port, a killed run would seem live and could not listen again

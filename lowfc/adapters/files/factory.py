@@ -66,13 +66,16 @@ def twin(config: Configuration, progress: Progress | None, warn: Callable[[str],
 
 
 def contrast_of(config: Configuration) -> ModalContrast:
-    """Contrast that the modes add in the dark zone, in 0.1 s (Lyot stop: 0.5 s); cached unless the pupil is a file."""
+    """Contrast that the modes add in the dark zone, computed in 0.1 s (0.5 s with a Lyot stop).
+
+    It is cached unless the pupil is a file.
+    """
     key = config.sensor, config.noll, config.star.wavelength_nm
     return _contrast_of(*key) if config.sensor.pupil.endswith(".npz") else _cached_contrast_of(*key)  # files change
 
 
 def known_contrast(config: Configuration | None) -> ModalContrast | None:
-    """`contrast_of` the configuration of a log or running loop; None without one, or with a warning if it fails."""
+    """`contrast_of` the configuration of a log or running loop; None without one or, with a warning, if it fails."""
     try:
         return None if config is None else contrast_of(config)
     except LowfcError as error:
@@ -251,7 +254,7 @@ def analytic_calibration(
 def actuators_to_modes(
     reconstructor: Array, reference: Array, good: Array, optics: Twin, on_nodes: TwinMirror, opd_nm: Array | None = None
 ) -> Array:
-    """Z (modes, actuators) = R H: nm of wavefront that R measures per nm of surface of each actuator.
+    """Matrix Z (modes, actuators): nm of wavefront that R measures per nm of surface of each actuator.
 
     Args:
         reconstructor: (modes, pixels) R, nm per flux fraction.

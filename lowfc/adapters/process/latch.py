@@ -45,7 +45,7 @@ class Latch:
     """
 
     def __init__(self, files: Sequence[Path], failed: Callable[[str], None] = lambda why: None) -> None:
-        """Read the files; `failed` is called with the reason, once until the file works again."""
+        """Read the files; `failed` is called with the fault of a file, once until the file works again."""
         self._files = tuple(files)
         self._failed = failed
         self._reported: set[Path] = set()

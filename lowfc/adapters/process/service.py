@@ -178,7 +178,7 @@ class Service:
         return before != self._known_starts
 
     def catch_signals(self) -> None:
-        """Stop at SIGTERM and SIGINT; a SIGINT while stopping ends the process at once. For the main thread."""
+        """Stop at SIGTERM and SIGINT; a SIGINT while stopping ends the process at once. Main thread only."""
         signal.signal(signal.SIGTERM, self._caught)
         signal.signal(signal.SIGINT, self._caught)
 
