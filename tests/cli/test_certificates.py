@@ -22,10 +22,10 @@ make, CA_DAYS = certificates.make_certificates, certificates.CA_DAYS
 
 
 def handshake(server: Path, client: Path, role: str, name: str = "localhost") -> None:
-    """Mutual TLS handshake, in memory, of the router of one folder with a role of another.
+    """Mutual TLS handshake, in memory, between a router and a client in a role, with the certificates of two folders.
 
     Raises:
-        ssl.SSLError: one of them does not accept the other.
+        ssl.SSLError: router or client does not accept the other.
     """
     server_context, client_context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     server_context.verify_mode = ssl.CERT_REQUIRED
@@ -187,7 +187,7 @@ def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
         for role in ("camera", "router")
     ]
     warnings = certificate_warnings(network, now + (CA_DAYS - WARN_DAYS + 1) * day)
-    assert len(warnings) == 3, "the authority ends first"
+    assert len(warnings) == 3, "the authority's certificate ends before the viewer's"
     assert warnings[2].endswith("with its authority's ca.pem: make all anew in an empty folder (lowfc certs)")
     (tmp_path / "viewer.key").chmod(0o644)
     (warning,) = certificate_warnings(network, now)

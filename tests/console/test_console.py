@@ -314,7 +314,7 @@ def test_a_knob_is_chosen_and_shown_whatever_the_number_of_modes(monkeypatch: py
     update(2, 3, gain=1.8)
     knobs.turn(1)
     assert turned[-1].values == [1.8, 1.8], "a gain beyond the bar, entered as a number, is not lowered"
-    for gain, automatic in ((np.inf, ()), (np.nan, ()), (0.5, (True,))):  # of another program
+    for gain, automatic in ((np.inf, ()), (np.nan, ()), (0.5, (True,))):  # another program's messages
         update(2, 3, gain=gain, automatic=automatic)
         assert [line.plain for line in knobs._lines] == ["gains are not known yet"]
     update(2, gain=-1e30)
@@ -405,7 +405,7 @@ def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatc
     until(lambda: console_feed.read() and console_feed._configured)
     assert not console_feed._complete(Mock(controller=None)), "a controller whose state is unknown is queried again"
     asked = ask.call_count
-    console_feed._query()  # repeated while there is no calibration
+    console_feed._query()  # called again, as it is while there is no calibration
     until(lambda: not any(thread.name == "query" for thread in threading.enumerate()))
     assert ask.call_count == asked, "a known configuration is not requested again: each request is in the log"
     assert console_feed._config == CONFIG
@@ -487,7 +487,7 @@ def test_pictures_and_sparklines_have_a_fixed_size() -> None:
     assert sparkline([1.0, float("nan"), 0.5, 0.0], 3) == " █▁"
     assert sparkline([], 3) == ""
     assert sparkline([1.0, float("inf")], 3) == "▁█"
-    assert sparkline([-0.01, -0.02], 3) == "▁▁"  # light of a blocked star, less the dark
+    assert sparkline([-0.01, -0.02], 3) == "▁▁"  # less than no light: the dark is subtracted
     for shape in ((6, 7), (34, 34), (1, 300)):
         small = reduced(np.full(shape, 4.0))
         assert small.shape == (_PIXELS, _PIXELS)

@@ -49,7 +49,7 @@ def test_events_during_the_command_run_it_once_more_for_the_worst(tmp_path: Path
 
 
 def test_the_command_runs_in_the_normal_scheduling_class_and_at_most_once_per_interval(tmp_path: Path) -> None:
-    notes = tmp_path / "notes"  # absolute: the second run may come when other tests are running
+    notes = tmp_path / "notes"  # absolute: by the second run another test may have changed the working directory
     run = Alarmed(f"chrt -p $$ >> {notes}; nice >> {notes}", min_interval_s=60.0)
     run.camera.event("CAMERA_RESTARTED")
     until(lambda: notes.exists() and len(notes.read_text().splitlines()) == 3)
@@ -60,7 +60,7 @@ def test_the_command_runs_in_the_normal_scheduling_class_and_at_most_once_per_in
     assert ("SCHED_IDLE" if os.sched_getscheduler(0) == os.SCHED_IDLE else "SCHED_OTHER") in lines[0]
     assert lines[2] == str(min(os.nice(0) + 5, 19)), "the niceness of the alarm's thread, not of the recorder"
     run.alarm.close()
-    assert len(notes.read_text().splitlines()) == 6, "the waiting event runs it when the recorder ends"
+    assert len(notes.read_text().splitlines()) == 6, "the waiting event runs the command when the recorder ends"
 
 
 def test_a_command_that_fails_or_hangs_raises_an_event_that_does_not_run_it_again(monkeypatch) -> None:

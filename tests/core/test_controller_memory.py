@@ -209,7 +209,7 @@ def test_closing_the_loop_corrects_every_mode(rig: Rig) -> None:
 
 def not_closed_ns(rig: Rig) -> int:
     health = wire.Health()
-    with rig.controller._lock:  # after the last step
+    with rig.controller._lock:  # not in the middle of a step
         rig.controller.fill(health)
     return health.not_closed_ns
 
@@ -278,7 +278,7 @@ def test_a_camera_that_changes_opens_the_loop(rig: Rig) -> None:
 
 
 def test_frames_with_wrong_times_do_not_stop_the_controller(calibration: Calibration, scene: Scene) -> None:
-    """A frame of 1970 is late, one of the future is used, durations are clipped; without frames the command repeats."""
+    """A frame of 1970 is late, a future one is used, durations are clipped; without frames the command is repeated."""
     with running(configured(lockstep=False), calibration, scene) as rig:
         pixels = scene.expose(0, rig.offset_nm)
         rig.put(pixels, publish_time_ns=1)
@@ -318,7 +318,7 @@ def test_a_signal_makes_the_loop_safe(rig: Rig) -> None:
 
 
 def test_oversized_requests_are_refused_before_decoding(rig: Rig) -> None:
-    """The reply is short too."""
+    """The replies are short: they do not repeat the requests."""
     for name in ("step", "gain", "note", "channel", "dance"):
         values = wire.Request(modes=range(200_000), values=[1.0] * 200_000, text="x" * 100).SerializeToString()
         (answer,) = rig.operator.get(f"lowfc/request/{name}", values, PATIENCE_S)
@@ -331,7 +331,7 @@ def test_oversized_requests_are_refused_before_decoding(rig: Rig) -> None:
 
 
 def test_states_refer_to_law_and_probe_sequence_by_identity(rig: Rig) -> None:
-    """Their arrays are separate messages, which can be queried."""
+    """The arrays of law and probe sequence are separate messages, which can be queried."""
     rig.expose(1)
     settings = factory.settings(rig.config)
     noll = rig.calibration.noll
@@ -358,7 +358,7 @@ def test_states_refer_to_law_and_probe_sequence_by_identity(rig: Rig) -> None:
 
 
 def test_safe_mode_outlives_the_controller(calibration: Calibration, tmp_path: Path) -> None:
-    """The latch is a file; it acts also if an operator loads the first calibration."""
+    """The latch is a file; it also acts on a controller without a calibration, once an operator loads one."""
     file = tmp_path / "safe"
 
     def mode(first: Calibration | None = calibration) -> LoopMode:
@@ -418,7 +418,7 @@ def test_without_a_calibration_the_configured_law_is_not_in_force(tmp_path: Path
     until(lambda: "LAW_NOT_IN_FORCE" in listener.events())
 
 
-def test_what_clients_changed_before_a_late_mirror_does_not_end_the_controller(
+def test_start_requests_refused_because_clients_changed_the_loop_do_not_end_the_controller(
     calibration: Calibration, tmp_path: Path
 ) -> None:
     shape, noll = np.full(GRID, 500, np.float32), (2, 3)
@@ -426,18 +426,18 @@ def test_what_clients_changed_before_a_late_mirror_does_not_end_the_controller(
     law_file.save(integrator([0.3] * 2, [0.0] * 2, noll, 1.0, CONFIG.camera.rate_hz), tmp_path / "law")
     config = configured(lockstep=False, mirror__flat=str(tmp_path / "flat.npy"), control__law=str(tmp_path / "law"))
     listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), config)
-    controller._mirror_adopted = True  # it has not reported within `MIRROR_PATIENCE_S`
+    controller._mirror_adopted = True  # as in `run` if the mirror has not reported within `MIRROR_PATIENCE_S`
     controller._carry_out_internal(Request(0, "channel", text="dig", actuators_nm=shape.reshape(-1)))
     controller._send_start_requests()
     until(lambda: {"LAW_NOT_IN_FORCE", "FLAT_NOT_IN_FORCE"} <= set(listener.events()))
 
 
-def test_a_gain_request_of_a_camera_with_another_clock_ends_no_reservation(
+def test_an_automatic_gain_request_dated_by_the_cameras_clock_ends_no_reservation(
     calibration: Calibration, tmp_path: Path
 ) -> None:
     _, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     assert controller._carry_out_internal(Request(0, "lease", (), (5.0,), "somebody", lease_id=1)).accepted
-    reply = controller._carry_out_internal(Request(2**62, "gain", (), (0.1,), "auto"))  # the time of its frame
+    reply = controller._carry_out_internal(Request(2**62, "gain", (), (0.1,), "auto"))  # the frame's time
     assert (reply.accepted, "the loop is reserved for somebody" in reply.text) == (False, True)
 
 
@@ -485,7 +485,7 @@ def test_a_warm_up_changes_no_state_publishes_nothing_and_loses_no_settings(
 def test_an_exception_in_frame_processing_ends_the_controller(
     calibration: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If the bus's thread only counted it, the loop would stop silently."""
+    """If the bus's thread only counted the exception, the loop would stop silently."""
     monkeypatch.setattr("lowfc.programs.core.controller.MIRROR_PATIENCE_S", 0.01)
     listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     monkeypatch.setattr(controller, "_frame", Mock(side_effect=ArithmeticError("one and one is three")))

@@ -149,7 +149,7 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
     state, _ = feed(SETTINGS, state, Request((START + 2) * SECOND, "offset", (2,), (20.0,)))
     assert "residual 2.50 nm rms, noise included (true 2.00, with offset and channels) ·" in first_line()
     state = before
-    words = ("paused", "open", "open", "closed", "in safe mode")  # a second `pause` finds the loop open already
+    words = ("paused", "open", "open", "closed", "in safe mode")  # `pause` of an open loop leaves it open
     for name, word in zip(("pause", "open", "pause", "close", "safe"), words, strict=True):
         state, (outputs,) = feed(SETTINGS, state, Request((START + 2) * SECOND, name))
         assert outputs.reply.accepted
@@ -206,7 +206,7 @@ def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame
     assert "closed for 1.6 s     250 Hz" in status_line(early, 5.0), "the residual includes open-loop frames"
     assert "closed for 2.0 s     250 Hz" in status_line(early, 5.0, 225.0), "simulated time in lockstep"
     begun.topics[0].received, begun.not_closed_ns = 250 * 3601, 3600 * SECOND
-    early.health["camera"].rate_hz = 250.4  # of the last half second
+    early.health["camera"].rate_hz = 250.4  # the rate of the last half second
     assert "closed for 1.0 s     250 Hz" in status_line(early, 5.0)
     with Console(width=120, file=io.StringIO(), record=True) as console:
         console.print(screen(watch, Configuration(), None, 10.0))

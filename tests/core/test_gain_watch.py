@@ -52,7 +52,7 @@ def bench(magnitude: float, preset: str = "bench", sensor: str = "sam", **change
 
 
 def modal_bench() -> ModalBench:
-    """A loop with the noise of the images, but without images, for tests of requests."""
+    """A loop of modes with the noise that images would give them, for tests of requests."""
     config = configuration(2.0)
     return ModalBench(config, factory.frame_noise_nm2(config, calibration(2.0, "sam")))
 
@@ -144,9 +144,9 @@ def test_modes_not_corrected_reduce_the_noise_of_the_others(faint: Bench) -> Non
     state = controller_state(faint.state, faint.settings, 0)
     in_use = calibration_in_use(state, active_loop.calibration).reconstructor
     np.testing.assert_array_equal(in_use, active_loop.estimator.rows[:-1])
-    channels = active_loop.to_modes @ active_loop.calibration.modes_to_actuators  # with the shapes of the modes
-    np.testing.assert_allclose(channels, in_use @ active_loop.calibration.response, atol=0.02)
-    assert np.abs(channels - np.eye(len(channels))).max() > 0.1
+    measured_modes = active_loop.to_modes @ active_loop.calibration.modes_to_actuators  # of the shape of each mode
+    np.testing.assert_allclose(measured_modes, in_use @ active_loop.calibration.response, atol=0.02)
+    assert np.abs(measured_modes - np.eye(len(measured_modes))).max() > 0.1
     original, reweighted = (
         np.diag(
             noise_covariance_nm2(
@@ -220,7 +220,7 @@ def test_a_decoded_state_has_the_same_reconstructor(faint: Bench) -> None:
 
 
 def test_a_state_decoded_before_gains_are_measured_has_the_same_law() -> None:
-    """An operator may close the loop before: the replay must continue with the same command."""
+    """An operator may close the loop before they are measured: the replay must continue with the same command."""
     loop = bench(2.0)
     active_loop, message = loop.state.loop, controller_state(loop.state, loop.settings, 1)
     again = decode_state(message, active_loop.calibration)[1].loop
@@ -308,7 +308,7 @@ def test_the_integrator_takes_over_from_a_harmful_law_once_the_loop_is_not_reser
     loop.process_input(Request(loop.steps[-1].time_ns, "lease", (), (60.0,), "another client", lease_id=1))
     loop.run(1000)
     assert [event["action"] for event in named(loop, "LOOP_HARMS")] == ["the integrator takes over"]
-    assert loop.state.loop.law_runner is not None  # refused
+    assert loop.state.loop.law_runner is not None, "the request of the gain watch was refused"
     loop.ask("release", lease_id=1)
     loop.run(700)
     assert loop.state.loop.law_runner is None
@@ -364,7 +364,7 @@ def watched(*inputs: Input) -> list[str]:
         [frame(5)],
         [frame(0, sequence=2 * frame_sequence(0)), Request(0, "safe"), Request(1, "clear"), Request(2, "open")],
     ],
-    ids=["ahead", "out of order", "a clear for a camera that starts lower"],
+    ids=["ahead", "out of order", "a clear, then a camera with lower sequences"],
 )
 def test_frames_out_of_sequence_do_not_prevent_the_measurement_of_gains(between: list[Input]) -> None:
     first = [frame(count) for count in range(1, 11)]

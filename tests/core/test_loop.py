@@ -18,7 +18,7 @@ QUIET = SMALL_MIRROR | {
     "mirror.settling_us": 0,
     "mirror.driver_bits": 24,
     "camera.noise": False,
-    "camera.instants": 1,  # sufficient without a disturbance in time
+    "camera.instants": 1,  # sufficient, as the disturbance is static
     "camera.gain_e_per_dn": 0.0008,  # small enough that rounding changes a mode by less than a picometre
     "camera.full_well_e": 52.0,
 }
@@ -35,7 +35,7 @@ def calibration() -> Calibration:
 def test_the_limiting_gain_is_accurate_to_one_percent(
     delay: int, factor: float, stable: bool, calibration: Calibration
 ) -> None:
-    """2 sin(pi / (2 (2d - 1))), with noiseless diffraction images and a tilt of less than 1 mas."""
+    """It is 2 sin(pi / (2 (2d - 1))), d the delay in frames; noiseless diffraction images, tilt of less than 1 mas."""
     gain = factor * 2 * np.sin(np.pi / (2 * (2 * delay - 1)))
     assert limiting_gain(delay) == pytest.approx(gain / factor, rel=1e-9)
     start_nm = 0.2 * tilt_nm_per_mas(2.0)

@@ -63,7 +63,7 @@ def test_everything_is_recorded_verbatim(bench: Bench) -> None:
 @pytest.mark.parametrize("camera_present", [False, True])
 def test_a_log_is_kept_only_if_the_run_had_another_process(tmp_path: Path, camera_present: bool) -> None:
     hub, clock = MemoryHub(), HostClock()
-    folder = tmp_path / "caf\udce9"  # in Latin-1
+    folder = tmp_path / "caf\udce9"  # a name in Latin-1, not valid as UTF-8
     recorder = Recorder(MemoryBus(hub, "recorder", clock), clock, "bnch", folder, metadata={})
     thread = threading.Thread(target=recorder.run, daemon=True)
     thread.start()
@@ -131,7 +131,7 @@ def test_every_lost_message_is_counted(bench: Bench, tmp_path: Path, monkeypatch
 
     bench.hub.lose = lose
     bench.start()
-    started_in.rmdir()  # the recorder does not depend on it
+    started_in.rmdir()  # the recorder does not need its working directory
     put(frames, 50)  # the last one is lost too: only the camera's Health reveals it
     put(steps, 5)  # none arrives
     summary = bench.stop()

@@ -68,7 +68,7 @@ class Bench:
         """Send the recorder these signals, 50 ms apart; return its output."""
         for number in signals:
             self.recorder.send_signal(number)
-            time.sleep(0.05)  # by then it waits for the camera's last Health
+            time.sleep(0.05)  # by then the recorder waits for the camera's last Health
         if len(signals) == 1 and signals[0] != signal.SIGKILL:
             until(lambda: self.recorder_is("stopping"))
             self.service.finish()
@@ -83,9 +83,9 @@ class Bench:
 
 @pytest.fixture
 def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
-    hang_up = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests under nohup would leave it ignored
+    inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup the recorder would ignore SIGHUP
     started = Bench(tmp_path, *getattr(request, "param", ()))
-    signal.signal(signal.SIGHUP, hang_up)
+    signal.signal(signal.SIGHUP, inherited)
     with closing(started):
         until(lambda: started.recorder_is("ready"))
         yield started

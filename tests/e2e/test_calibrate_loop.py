@@ -1,4 +1,4 @@
-"""A running loop is calibrated, with an interruption and a resumption, and accepted, over the bus."""
+"""A running loop is calibrated over the bus, with an interruption and a resumption; its rejection is tested."""
 
 import json
 import time
@@ -32,7 +32,7 @@ disable_cpu_idle = false
 @pytest.mark.slow
 def test_an_interrupted_calibration_of_a_running_loop_is_resumed(tmp_path: Path) -> None:
     (tmp_path / "test.toml").write_text(CONFIG)
-    options = ("--config", "test.toml", "--no-record", "--open", "--lockstep")  # nothing is late on a busy host
+    options = ("--config", "test.toml", "--no-record", "--open", "--lockstep")  # a busy host delays nothing
     loop = start(tmp_path, "sim-loop", *options)
     try:
         until(running)
@@ -93,7 +93,7 @@ lowest_hz = 1.5
 def test_rejection_of_a_running_loop_and_of_its_log(tmp_path: Path) -> None:
     (tmp_path / "loop.toml").write_text(REJECTION_CONFIG)
     words = ("--duration", "4", "--lines", "8", "--json", "--plot", "live.png")
-    loop = start(tmp_path, "sim-loop", "--config", "loop.toml", "--lockstep")  # nothing is late on a busy host
+    loop = start(tmp_path, "sim-loop", "--config", "loop.toml", "--lockstep")  # a busy host delays nothing
     try:
         until(lambda: recorded_bytes(tmp_path) > 4_000_000)
         done = run(tmp_path, "acceptance", "rejection", *words)

@@ -74,7 +74,7 @@ def test_commands_contain_the_flat_map_and_leave_dead_actuators_at_zero(logged: 
 
 
 def test_the_mean_command_is_published_once_a_second(logged: dict[str, list[bytes]]) -> None:
-    """One in 1000 frames at 1 kHz; another adaptive-optics system can take it over."""
+    """Every 1000 frames at 1 kHz, so that another adaptive-optics system can take over the mean command."""
     steps = [wire.ControlStep.FromString(body) for body in logged[f"/{STEP.key}"]]
     offloads = [wire.ModalOffload.FromString(body) for body in logged[f"/{OFFLOAD.key}"]]
     assert len(offloads) == len(steps) // 1000 > 2

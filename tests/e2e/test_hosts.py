@@ -83,7 +83,7 @@ class Bench:
         }
 
     def start(self) -> None:
-        for name, place in PLACES.items():  # before the router: any order will do
+        for name, place in PLACES.items():  # before the router: processes may start in any order
             self.begin(self.lab[place], name)
         self.begin(self.lab.middle, "router")
         config = str(self.lab.middle.folder / "lowfc.toml")
@@ -197,7 +197,7 @@ def test_a_log_of_several_hosts_states_the_clock_error_of_its_latencies(bench: B
     results = json.loads(done.stdout)
     bound_us = results["host"]["clock_error_us"]
     assert bound_us > 0
-    # By the hosts' own clocks, frames would arrive 287 ms before they are sent, and the mirror would move 3 s later.
+    # By the hosts' own clocks, frames would arrive 287 ms before they are sent, and the mirror would move 3 s too late.
     for span in ("frame_to_command", "frame_to_mirror", "command_to_mirror"):
         assert -bound_us < results["latency_us"][span]["p50"] < 100_000
     text = desk.run("-m", "lowfc", "latency", str(log), timeout_s=90)
@@ -325,7 +325,7 @@ def forge(host: Host, certificate: Path | None, protocol: str = "tls") -> str:
 
 
 def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(bench: Bench) -> None:
-    """The forged message itself is accepted, so the next test would detect a forger that gets in."""
+    """The router lets this role's commands through, so the next test would detect a forged command that passes."""
     bench.wait_until_settled()
     copy_certificates(bench.lab["desk"], bench.authority, "controller")
     before = bench.events("mirror-dm COMMAND_REFUSED")
@@ -338,13 +338,13 @@ def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(be
         "forged command at the mirror",
     )
     mirror = bench.lab["mirror"]
-    mirror.children.pop("mirror-dm").stop(5.0)  # it waits for frames beyond the forged one
+    mirror.children.pop("mirror-dm").stop(5.0)  # otherwise it waits for a frame later than the forged command's
     bench.begin(mirror, "mirror-dm")
     bench.wait_until_settled()
 
 
 def test_a_forger_gets_nothing_and_moves_nothing(bench: Bench, tmp_path: Path) -> None:
-    """With certificates of another role, of no known role, of a foreign authority; with none, and without TLS."""
+    """A forger has a certificate of another role, of no known role or of a foreign authority, or none, or no TLS."""
     bench.wait_until_settled()
     camera, desk = bench.lab["camera"], bench.lab["desk"]
     make_certificates(bench.authority, ["stranger"], [])
@@ -352,7 +352,7 @@ def test_a_forger_gets_nothing_and_moves_nothing(bench: Bench, tmp_path: Path) -
     copy_certificates(desk, bench.authority, "stranger")
     before = bench.events("mirror-dm COMMAND_REFUSED")
     start = len(bench.reports())
-    assert forge(camera, camera.folder / "certs" / "camera") in ("[] []", "['lowfc/event'] []")  # events are for all
+    assert forge(camera, camera.folder / "certs" / "camera") in ("[] []", "['lowfc/event'] []")  # events are public
     assert forge(desk, desk.folder / "certs" / "stranger") == "[] []"
     for certificate, protocol in ((tmp_path / "controller", "tls"), (None, "tls"), (None, "tcp")):
         assert forge(desk, certificate, protocol) == "refused"

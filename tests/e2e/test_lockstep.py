@@ -127,12 +127,12 @@ def test_stored_light_budgets_match_the_sensors() -> None:
         assert budget.peak == pytest.approx(results["peak"], rel=1e-6), name
 
 
-def test_a_loop_starts_open_only_for_a_named_key_or_option(tmp_path: Path) -> None:
+def test_a_loop_starts_open_only_if_configured_and_names_the_key_or_option(tmp_path: Path) -> None:
     file = tmp_path / "open.toml"
     file.write_text('[control]\nstart_mode = "open"\n')
     for options, chosen in ((("--config", file), f"control.start_mode of {file}"), (("--open",), "--open")):
         done = lowfc("sim-loop", *options, "--view", "--web")
         assert f"the loop starts open ({chosen}): `lowfc ctl close` closes it" in done.stderr
-        assert isinstance(done.exception, ConfigurationError), "ends before a process is started"
+        assert isinstance(done.exception, ConfigurationError), "--view with --web is refused before a process starts"
     file.write_text(output_of(tmp_path, "lowfc config show"))
     assert "starts open" not in lowfc("sim-loop", "--config", file, "--view", "--web").stderr

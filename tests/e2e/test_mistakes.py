@@ -107,7 +107,7 @@ def _refused(folder: Path, *words: str, expected: str, config: str = "") -> str:
     if config:
         (folder / "test.toml").write_text(config)
         words = (*words, "--config", "test.toml")
-    if words[0] in {"record", "view"}:  # they lower the priority of their process for good
+    if words[0] in {"record", "view"}:  # these commands lower the priority of their process for good
         done = run(folder, *words)
         assert (done.returncode, done.stdout) == (2, ""), done.stderr
         complaint = done.stderr.removeprefix("error: ").rstrip("\n")
@@ -136,7 +136,7 @@ def _refused_here(folder: Path, *words: str) -> str:
         ("runs --help", "2>&-", 0, ""),
     ],
 )
-def test_a_full_disk_or_a_closed_stream_is_one_line(words: str, output: str, status: int, error: str) -> None:
+def test_a_full_disk_or_a_closed_stream_has_a_one_line_error(words: str, output: str, status: int, error: str) -> None:
     script = ["sh", "-c", f'exec "$@" {words} {output}', "sh", *LOWFC]
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     done = subprocess.run(script, env=buffered, capture_output=True, text=True, check=False)
@@ -144,7 +144,7 @@ def test_a_full_disk_or_a_closed_stream_is_one_line(words: str, output: str, sta
 
 
 @pytest.mark.parametrize("fault", ["EDQUOT", "EFBIG"])
-def test_a_used_up_quota_is_one_line(fault: str) -> None:
+def test_a_used_up_quota_has_a_one_line_error(fault: str) -> None:
     imports = "import errno; from unittest.mock import Mock; from lowfc.adapters.process.terminal import run_app"
     code = f"{imports}; run_app(Mock(side_effect=OSError(errno.{fault}, 'no room')))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -192,10 +192,10 @@ def test_unusable_logs_and_files_are_refused_in_one_line(tmp_path: Path, words: 
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
-def test_a_starting_loop_is_listed_and_makes_an_unnamed_request_ambiguous(
+def test_a_starting_loop_is_listed_and_makes_a_request_without_a_run_ambiguous(
     own_runtime: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An unnamed request must not reach the only other run."""
+    """A request that names no run must not reach the only other one."""
     found: list[object] = []
 
     def meanwhile(config: Configuration, run: Run, console: object) -> None:

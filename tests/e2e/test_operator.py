@@ -175,7 +175,7 @@ def _make_requests_beyond_the_document(night: Night) -> None:
 
 
 def test_every_request_is_made_by_a_command_of_the_document() -> None:
-    names = {command.split()[2] for command in COMMANDS} - {"bench"}  # publishes a value and makes no request
+    names = {command.split()[2] for command in COMMANDS} - {"bench"}  # `bench` makes no request
     assert names == {one.example.split()[0] for one in DECLARED if one.example}
 
 

@@ -108,7 +108,7 @@ def test_operators_a_restart_dropped_frames_and_rotation(night: Night, tmp_path:
     results = json_of("replay", *logs)
     assert (results["identical"], results["different"], results["largest_difference_nm"]) == (True, 0, 0.0)
     assert results["frames"] + results["unchecked"] == steps_of(*logs) > 500
-    assert results["unchecked"] < 5, results["unchecked_because"]  # what the kill cut off
+    assert results["unchecked"] < 5, results["unchecked_because"]  # steps around the kill
     assert results["requests"] == 4
     events = [message.payload for log in logs for message in LogReader(log, topics=[EVENT])]
     for name in (b"FRAMES_MISSING", b"MIRROR_ADOPTED"):

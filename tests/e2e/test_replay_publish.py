@@ -104,7 +104,7 @@ def test_a_subscriber_receives_the_log_in_order_and_at_its_rate(
         assert times == sorted(times)
         assert times[0] > begun_ns, "the time of publication is that of today"
         span_ns = sent[-1].receive_time_ns - sent[0].receive_time_ns
-        assert times[-1] - times[0] > 0.9 * span_ns / 2, "played in its own time, twice as fast"
+        assert times[-1] - times[0] > 0.9 * span_ns / 2, "published at twice the log's pace"
     frames = {sample.sequence for sample in tool.received[FRAME.key]}
     joined = {wire.ControlStep.FromString(sample.payload).frame_sequence for sample in tool.received[STEP.key]}
     assert joined

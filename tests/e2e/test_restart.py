@@ -70,7 +70,7 @@ class ManualRun:
         self.running.pop(name).wait()
 
     def wait_until_settled(self) -> None:
-        """Wait for more than 20 consecutive good frames: loop closed, no reason, error below 3 nm."""
+        """Wait for more than 20 consecutive good frames: loop closed, no refusal or limit, error below 3 nm."""
         self.good_frames = 0
         until(lambda: self.good_frames > 20)
 

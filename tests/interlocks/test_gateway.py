@@ -164,7 +164,7 @@ def test_a_value_queried_at_the_start_is_as_old_as_its_publication() -> None:
     assert report.call_args.args[0].age_ns == 9
 
 
-def test_an_unreadable_step_leaves_the_one_before() -> None:
+def test_an_unreadable_step_does_not_replace_the_previous_one() -> None:
     hub, clock = MemoryHub(), FakeClock()
     steps = MemoryBus(hub, "controller", clock).publisher(STEP)
     watch = Watch(MemoryBus(hub, "operator", clock), clock)
@@ -186,7 +186,7 @@ def test_an_unreadable_step_leaves_the_one_before() -> None:
         wire.ControllerState(interlocks_acting=[wire.ActingInterlock(number=1)]),
     ],
 )
-def test_an_unusable_state_leaves_the_one_before(damaged: wire.ControllerState) -> None:
+def test_an_unusable_state_does_not_replace_the_previous_one(damaged: wire.ControllerState) -> None:
     hub, clock = MemoryHub(), FakeClock()
     states = MemoryBus(hub, "controller", clock).publisher(CONTROLLER_STATE)
     watch = Watch(MemoryBus(hub, "operator", clock), clock)

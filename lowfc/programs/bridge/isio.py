@@ -129,7 +129,7 @@ class ExternalChannels:
         for name in names:
             stream_path(name)
         self._names = names
-        self._others: OtherChannels | None = None  # until a controller reports the grid
+        self._others: OtherChannels | None = None  # None until a controller has reported the mirror's grid
         self._known = b""  # shape of the channel at the controller, as last reported or requested
         self._next_request_s = 0.0
         self._report = ""

@@ -30,7 +30,7 @@ def added_contrast(contrast: ModalContrast | None, covariance_nm2: Mapping[str, 
 def with_variances(covariance_nm2: Array, rms_nm: Array) -> Array:
     """Replace the variances of a sampled covariance (modes, modes) by those of the continuous-time rms (modes,).
 
-    The other terms stay: they come from command noise, which is constant over a period.
+    The covariances between modes stay: they come from command noise, which is constant over a period.
     """
     return np.asarray(covariance_nm2 + np.diag(rms_nm**2 - np.diag(covariance_nm2)))
 

@@ -270,7 +270,7 @@ for _measurement in (dark, reference):
 def _run_before_request(context: typer.Context, run: AnyRun = None) -> None:
     """Accept --run also before the request; `start` and `stop` are those of `record`."""
     defaults, group = {"run": run}, context.command
-    assert isinstance(group, TyperGroup)  # noqa: S101  # of `ctl_app`
+    assert isinstance(group, TyperGroup)  # noqa: S101  # `ctl_app` is a group
     context.default_map = {name: {**defaults, "start": defaults, "stop": defaults} for name in group.commands}
 
 

@@ -84,7 +84,9 @@ def certs(
 def router(
     config: ConfigFile = None,
     run: RunId = DEFAULT_RUN,
-    show: Annotated[bool, typer.Option("--show", help="Only print its configuration, for your own zenohd.")] = False,
+    show: Annotated[
+        bool, typer.Option("--show", help="Only print the router's configuration, for your own zenohd.")
+    ] = False,
 ) -> None:
     """Run the router of a run on several hosts: mutual TLS, and only the messages that each role may send or receive.
 

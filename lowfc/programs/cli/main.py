@@ -16,7 +16,7 @@ COMMANDS = {
         Row("console", "console.command:console", "Operate a running loop from one screen."),
         Row("controller", "cli.processes:controller", "Run the controller: frames in, mirror commands out."),
         Row("camera", "cli.devices:camera_app", "Run a camera: publish the frames of its driver."),
-        Row("mirror", "cli.devices:mirror_app", "Run a mirror: apply a run's commands by its driver."),
+        Row("mirror", "cli.devices:mirror_app", "Run a mirror: its driver applies a run's commands."),
         Row("record", "cli.processes:record", "Record the messages of a run."),
         Row("bridge", "", "Share a mirror with CACAO or another control system."),
         Row("gateway", "", "Serve a run to an observatory's control system (EPICS)."),

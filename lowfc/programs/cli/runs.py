@@ -35,7 +35,7 @@ def _row(name: str, roles: set[str]) -> dict[str, Any]:
     """State of a run from the Health of its processes; a process that has not sent one yet is starting."""
     with Client(name) as loop:
         found = loop.processes()
-    roles = set(found) if open_run(name, ()).links.network.router else roles  # with a router, no other process listens
+    roles = set(found) if open_run(name, ()).links.network.router else roles  # only the router listens, if there is one
     controller, recorder = found.get(Role.CONTROLLER, NO_HEALTH), found.get(Role.RECORDER, NO_HEALTH)
     starting = [{"process": role, "state": "starting", "pid": None} for role in roles - {*found, Role.LAUNCHER}]
     processes = [{"process": key, "state": health.state, "pid": health.pid} for key, health in found.items()]

@@ -193,7 +193,7 @@ class Console(OrderedKeys):
     def action_help(self) -> None:
         """Show the keys."""
         rows = [
-            ("s F12", "SAFE", f"At once, in a form with F12: {SAFE.description}"),
+            ("s F12", "SAFE", f"At once (with a form open, only F12): {SAFE.description}"),
             *((action.key, action.name, action.description) for action in ACTIONS),
             *_OTHER_KEYS,
         ]

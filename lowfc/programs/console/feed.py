@@ -77,7 +77,7 @@ class Feed(Monitor):
         super().__init__(bus, clock)
         self._run_id, self._requests = run_id, bus.ring(REQUEST, 200)
         self._config: Configuration | None = None
-        self._configured: set[tuple[str, int]] = set()  # role and start, Unix s, of the controller that sent it
+        self._configured: set[tuple[str, int]] = set()  # role and start, Unix s, of the controller that sent `_config`
         self._frame: Pixels | None = None
         self._command_nm = np.zeros(0, np.float32)
         self._trend: deque[tuple[float, float]] = deque(maxlen=TREND_S)

@@ -25,7 +25,7 @@ _PENDING_S = 1.0  # time for which a knob shows the requested gain: by then the 
 
 
 class Gains(Lines):
-    """The knobs, scrolled to the chosen one. Keys or a click on a bar turn it; its modes keep their ratios."""
+    """The knobs, scrolled to the chosen one. Keys or a click turn a knob; the gains of its modes keep their ratios."""
 
     class Turned(Message):
         """A knob was turned: gains requested for these modes, automatic ones if `values` is empty."""
@@ -40,7 +40,7 @@ class Gains(Lines):
         self._noll: tuple[int, ...] = ()
         self._gain = np.zeros(0, np.float32)
         self._automatic: Mask = np.zeros(0, bool)
-        self._pending: dict[int, tuple[float, float]] = {}  # requested gain, and end of `_PENDING_S`, by knob
+        self._pending: dict[int, tuple[float, float]] = {}  # by knob: requested gain, and time until which it is shown
 
     def update(self, reading: Reading) -> None:
         """Show the gains of the run."""

@@ -86,7 +86,7 @@ class Controller:
         self._last_sample: Sample | None = None
         self._valid_ns = round(config.control.command_timeout_ms * 1e6)
         self._state = State()
-        self._lock = threading.RLock()  # reentrant: a step or the start may carry out requests within it
+        self._lock = threading.RLock()  # reentrant: a step or the start may carry out requests while it holds the lock
         self._mirror_adopted = False
         self._first_frame: Sample | None = None
         self._unsubscribe_frames = service.dispatch(
@@ -118,7 +118,7 @@ class Controller:
         service.awaited = lambda: "" if self._state.frame_sequence else "a camera"
 
     def run(self) -> None:
-        """Do everything except frames, which the receiving thread processes; `_lock` serialises both."""
+        """Do all work except on frames, which the receiving thread processes; `_lock` serialises the two threads."""
         self._service.state = "ready"  # from here on the service manager expects beats
         self._camera.await_first()
         self._adopt_mirror()
@@ -230,7 +230,7 @@ class Controller:
                 codec.encode_command(outputs.command, self._valid_ns, CHANNEL, self._state.input_number)
 
     def _between_frames(self, camera: Sample | None) -> None:
-        """Apply new camera settings, bench values and mirror reports; without frames, hold the command."""
+        """Apply new camera settings, bench values and mirror reports; apply a `Tick` if no frame arrives."""
         if camera is not None:
             self._camera.apply(camera)
         if not self._service.clock.lockstep:
@@ -258,7 +258,7 @@ class Controller:
         message = controller_state(state, self._settings, now_ns) if request.name == "status" else None
         short = Request(request.time_ns, request.name, request.modes, request.values, request.text)
         query.reply(codec.encode_request(short, reply, number, message))  # without the arrays: the requester has them
-        with self._requests_lock:  # in lockstep the receiving thread has requests, too
+        with self._requests_lock:  # in lockstep the receiving thread publishes requests, too
             self._requests.put(codec.encode_request(request, reply, number, message))
 
     def _carry_out(self, request: Request) -> tuple[Reply, State, int]:
@@ -291,7 +291,7 @@ class Controller:
                 self._camera.wake()
 
     def _carry_out_internal(self, request: Request) -> Reply:
-        """Carry out an internal request, at the controller's time, and publish it like an operator's."""
+        """Carry out an internal request, dated by the controller's clock, and publish it like an operator's."""
         request = prepared(self._settings, replace(request, time_ns=self._service.clock.now_ns()))
         reply, _, number = self._carry_out(request)
         with self._requests_lock:
@@ -304,14 +304,14 @@ class Controller:
         self._camera.wake()
 
     def _update_latch(self) -> None:
-        """Set or clear the latch if safe mode has changed: after the reply, and in a separate thread."""
+        """Set or clear the latch if safe mode has changed; called after the reply, and the latch has its own thread."""
         safe = self._state.mode is LoopMode.SAFE or safe_pending(self._settings, self._state)
         if safe is not self._latched_safe:
             self._latched_safe = safe
             self._latch.set(safe)
 
     def _adopt_mirror(self) -> None:
-        """Read the mirror's shape before the first command, so that it does not jump."""
+        """Read the mirror's shape before the first command, so that the mirror does not jump."""
         lockstep = self._service.clock.lockstep
         if lockstep and self._state.loop is not None:  # every lockstep run starts from flat
             self._mirror.close()
@@ -351,7 +351,7 @@ class Controller:
                 continue
             law = request.name == "law"
             unfit = law and (misfit(self._state) or uncalibrated(self._state))  # the loop stays open or idle
-            # Once the controller runs, clients may have changed the loop.
+            # Once the controller runs, clients may have changed the loop, so that a refusal is no fault of the file.
             if unfit or (self._mirror_adopted and request.text != ADOPTED):
                 self._service.event("LAW_NOT_IN_FORCE" if law else "FLAT_NOT_IN_FORCE", why=reply.text)
             else:

@@ -19,7 +19,7 @@ from lowfc.programs.core.gain_watch import GainWatch
 TIMING_PERIOD_NS = 100_000_000
 SECOND_NS = 1_000_000_000
 CAUSES_NAMED = 4
-"""Number of causes that are listed with their counts, the longest in total first."""
+"""Number of causes that are listed with their counts: those that lasted longest in total, the longest first."""
 MAX_CAUSES = 200
 """Largest number of different causes counted: a cause may contain values, so that their number has no limit."""
 
@@ -36,9 +36,9 @@ class StageTiming:
         """Add a step.
 
         Args:
-            frame_sequence: sequence of its frame.
+            frame_sequence: sequence of the step's frame.
             published_ns: time at which the frame was published.
-            times_ns: times at which it was received, the step began and was computed, and its command was sent.
+            times_ns: times at which the frame was received, the step began and was computed, and the command was sent.
         """
         received_ns, start_ns, ready_ns, sent_ns = times_ns
         message = self._message
@@ -91,7 +91,10 @@ class Offload:
 
 
 class LastSecond:
-    """Modal error and flux of the frames used in the last second; above the configured rate, of the newest only."""
+    """Modal error and flux of the frames used in the last second.
+
+    If frames arrive faster than the configured rate, only the newest count.
+    """
 
     def __init__(self, period_ns: int) -> None:
         self._rows = np.zeros((SECOND_NS // period_ns + 1, 3))
@@ -143,7 +146,7 @@ class Arrays:
             self._plays.put(wire_play(request.played, request.time_ns).SerializeToString())
 
     def publish_in_use(self, refused: Request, state: State) -> None:
-        """Publish the arrays in use again after a refused request, because those of the request were published last."""
+        """Publish the arrays in use again after a refused request, whose arrays are otherwise the last published."""
         loop = state.loop
         if loop is None:
             return

@@ -50,7 +50,10 @@ class _Group:
     """Modes that are evaluated together: tip and tilt, or the others."""
 
     def __init__(self, mask: Mask, tilt: Mask | None, settings: Settings, loop: ActiveLoop, window_s: float) -> None:
-        """Evaluate the modes in `mask` (modes,); `tilt` (modes,): tip and tilt, if their cross-talk counts."""
+        """Evaluate the modes in `mask` (modes,).
+
+        `tilt` (modes,) selects tip and tilt if their cross-talk into these modes is measured, and is None otherwise.
+        """
         rate_hz = settings.rate_hz or 1.0
         frames = [max(round(seconds * rate_hz), MIN_FRAMES) for seconds in (FIRST_S, window_s)]
         self.mask, self.tilt = mask, tilt
@@ -104,7 +107,7 @@ class GainWatch:
             return NOTHING
         self._newest = newest
         same_camera = newest >> COUNT_BITS == before >> COUNT_BITS
-        held = newest - before - 1 if same_camera and newest > before else 1  # after a clear, the number may be lower
+        held = newest - before - 1 if same_camera and newest > before else 1  # after `clear` it may be lower
         channels = loop.command_channels
         playing = channels is not None and channels.play is not None
         if (
@@ -185,7 +188,7 @@ class GainWatch:
         self._flux_frames += 1
         if self._flux_frames < max(FLUX_S * self._settings.rate_hz, 10):
             return 0.0
-        mean = float(np.float32(self._flux_sum_dn / self._flux_frames))  # as a request for gains carries it
+        mean = float(np.float32(self._flux_sum_dn / self._flux_frames))  # the precision of a request for gains
         self._flux_sum_dn = self._flux_frames = 0.0
         if not self._former_flux_dn:
             self._former_flux_dn = mean
@@ -197,7 +200,7 @@ class GainWatch:
         return ratio
 
     def _star_changed(self, step: Step, loop: ActiveLoop, ratio: float) -> Actions:
-        """Halve the automatic gains until they are measured again; lower them further if the flux fell by more."""
+        """Halve the automatic gains until measured again; if the flux fell below half, lower them in its proportion."""
         for group in self._groups:
             group.bank.restart()
         events = (PendingEvent("STAR_CHANGED", {"ratio": ratio}),)

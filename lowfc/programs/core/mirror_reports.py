@@ -18,7 +18,7 @@ from lowfc.control.loop.state import State
 
 CHECK_PERIOD_NS = 100_000_000
 SILENT_NS = 1_600_000_000
-"""Longest time without a Health, which is sent twice a second: three may be late."""
+"""Longest time without a Health: the mirror sends two per second, so that three in a row may be missing."""
 
 
 class MirrorReports:
@@ -44,7 +44,7 @@ class MirrorReports:
         return self._service.clock.host_ns() >= self._due_ns
 
     def first(self, timeout_s: float = 0.0) -> MirrorShape | None:
-        """The first shape that the mirror reports; None if none has arrived, and after the first."""
+        """The first shape that the mirror reports; None if none has arrived, and once the first has been returned."""
         sample = None if self._reported else self._states.take(timeout_s)
         try:
             shape = codec.decode_mirror(sample.payload) if sample is not None else None
@@ -59,7 +59,8 @@ class MirrorReports:
     def fault(self, state: State) -> str:
         """Fault of the mirror, as a predicate after "the mirror"; empty if there is none.
 
-        It counts after two Healths in a row with a fault, even if different: the first may predate the last command.
+        A fault counts after two Healths in a row with faults, even different ones: the first Health may predate the
+        last command.
         """
         now_ns = self._service.clock.host_ns()
         self._due_ns = now_ns + CHECK_PERIOD_NS

@@ -26,7 +26,7 @@ from lowfc.control.loop.safety import Limit, LoopMode, limit
 from lowfc.control.loop.state import Settings, State
 
 MIN_FLAT_SHARE = 0.5
-"""Share of the flat map in the mirror's shape above which it is assumed to be on the mirror already (1: all of it)."""
+"""Share of the flat map in the mirror's shape (1: all of it) above which the mirror is assumed to have it already."""
 
 
 def check_files(config: Configuration) -> None:
@@ -68,8 +68,8 @@ def _configured_law(config: Configuration) -> LinearLaw | None:
 def settings_under(latch: Latch, config: Configuration, event: Callable[..., None]) -> Settings:
     """The settings of a configuration with its kernel loaded; they start in safe mode if the latch is set.
 
-    If the latch cannot be stored, the loop starts open until an operator closes it. An event reports a kernel other
-    than numpy, or a missing one.
+    If the latch cannot be stored, the loop starts open and stays open until an operator closes it. An event reports a
+    kernel other than numpy, or a missing one.
     """
     configured = config.realtime.kernel
     settings = replace(factory.settings(config), kernel=compiled.kernel(configured, config.realtime.threads))
@@ -94,8 +94,8 @@ class StartUp:
         """The requests in the order to send them, once the mirror's shape is known.
 
         If the mirror already has the flat map, from an earlier controller, the flat map is subtracted from the adopted
-        shape and added as a channel of its own, so that nothing moves. The requests have the identity of the present
-        lease, which may have been granted before the mirror was known, so that it does not refuse them.
+        shape and added as a channel of its own, so that nothing moves. A lease may have been granted before the
+        mirror's shape was known: the requests carry its identity, so that they are not refused.
         """
         lease = state.conditions.lease
         lease_id = 0 if lease is None or lease.ended or lease.over(time_ns, 0) else lease.id

@@ -42,13 +42,13 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
     run_id, run_config = joined.run_id, joined.path / "config.toml"
     settings = configuration(config) if config is not None or not run_config.exists() else load(run_config)
     clock = clock_of(settings)
-    signalled = list[int]()  # not an Event, whose lock a second signal's handler may wait for forever
+    signalled = list[int]()  # not an Event: the handler of a second signal could wait for its lock forever
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda number, _: signalled.append(number))
     bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
 
     def request(put: Put, value: Any) -> None:
-        put(Client(run_id, bus=bus), value)  # on a thread of this variable: `safe` waits for no other put
+        put(Client(run_id, bus=bus), value)  # called on the variable's own thread: `safe` waits for no other put
 
     def ended() -> bool:
         return bool(signalled) or joined.restarted()

@@ -1,4 +1,4 @@
-"""EPICS PV Access: serve the variables as PVs, and read other servers' PVs as bench values; by default on loopback."""
+"""EPICS PV Access, by default on loopback: serve the variables as PVs, read other servers' PVs for interlocks."""
 
 import threading
 import time
@@ -34,7 +34,7 @@ def protocol() -> Any:
 
 
 class EpicsGateway:
-    """Server of the variables, and PV monitors whose valid values are in `bench`; each update sets `changed`."""
+    """Server of the variables; monitors of other PVs keep the valid values in `bench`, and set `changed` on updates."""
 
     def __init__(self, config: Gateway, variables: Sequence[Variable], carry_out: CarryOut) -> None:
         """Serve; BusError if it cannot listen."""

@@ -115,7 +115,7 @@ def children_of(config: Configuration, run: Run, duration_s: float | None, recor
     camera = ["-m", "sim_camera", *shared, *(word for name in awaited for word in ("--wait-for", str(name)))]
     if duration_s is not None:
         camera += ["--frames", str(max(1, math.ceil(duration_s * config.camera.rate_hz)))]
-    # Recording starts before the controller, so that all logs of one seed start with the same message.
+    # In lockstep, recording starts before the controller: all logs of one seed start with the same message.
     after_recorder = ["--wait-for", str(Role.RECORDER)] if record and config.lockstep else []
     commands = {
         str(Role.CAMERA): camera,
@@ -167,7 +167,7 @@ def _supervise(
             continue
         if child.name == Role.RECORDER and watch.health_of(Role.RECORDER).recording.failure:
             continue  # the loop ended normally without it; the summary gives the reason
-        if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # the last two: stopped before it was ready
+        if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # not 0: stopped before it was ready
             raise died(child)
 
 

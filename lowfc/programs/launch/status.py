@@ -17,7 +17,7 @@ from lowfc.programs.cli.contrast import contrast_cases, contrast_in_words, costl
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 SILENT_S = 2.0
-"""Time without Health (sent twice a second) after which its values are no longer shown."""
+"""Time without Health (sent twice a second) after which the values of a process are no longer shown."""
 _RECENT_S = 2.5
 """Span of the recent wavefront statistics, plus the delay of their report."""
 _EVENTS_SHOWN = 4
@@ -51,7 +51,7 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
 
 
 def status_line(watch: Watch, elapsed_s: float, lockstep_hz: float | None = None) -> str:
-    """The status in one line, for output that is not a terminal; `lockstep_hz` as in `summary`."""
+    """The status in one line, if the output is not a terminal; `lockstep_hz` is the frame rate in simulated time."""
     camera, controller = watch.health_of(Role.CAMERA), watch.health_of(Role.CONTROLLER)
     if not camera.HasField("recent_wavefront"):
         return f"{elapsed_s:5.0f} s  no frame yet"

@@ -25,7 +25,7 @@ from lowfc.contract.printable import printable
 TIMEOUT_S = 60.0
 """Time after which a command is killed."""
 _MAX_WAITING_EVENTS = 1000
-_END_S = 2.0  # time that a recorder waits for the command when it ends; then a service manager kills the command
+_END_S = 2.0  # time that an ending recorder waits for the command; a service manager kills the command after that
 _LEVELS: dict[int, str] = {level.value: level.name.lower() for level in Level}
 _FAILED = EVENTS["ON_EVENT_FAILED"].name
 
@@ -43,7 +43,7 @@ class Alarm:
         self._thread.start()
 
     def close(self) -> None:
-        """Run the command for waiting events, once a running command has ended; wait up to `_END_S`."""
+        """Run the command for waiting events, once a running command has ended; wait at most `_END_S` for both."""
         self._deadline_s = time.monotonic() + _END_S
         self._closing.set()
         self._arrived.set()

@@ -65,9 +65,10 @@ class Recorder:
     ) -> None:
         """Subscribe to everything; `run` starts the recording. Each log starts with `metadata` and `attachments`.
 
-        Recording starts once each of the `awaited` processes has sent Health, or after a timeout. If none is named, it
-        awaits all peers; across hosts only one, as the router is then the only peer. `expected_bytes_per_s` is
-        called before the first log begins, with the camera's state or None; its result holds until growth is measured.
+        Recording starts once each of the `awaited` processes has sent Health, or after a timeout. If none is named, as
+        many processes are awaited as the bus has peers; across hosts one, as the router is then the only peer.
+        `expected_bytes_per_s` is called before the first log begins, with the camera's state or None; its result holds
+        until growth is measured.
         """
         self._awaited = awaited
         self._bus = bus
@@ -76,7 +77,7 @@ class Recorder:
         self._account = LossAccount()
         self._selection = selection
         self._folder, self._min_free_bytes = folder, limits.min_free_bytes
-        self._working_folder = encodable(str(Path.cwd()))  # it may be removed later
+        self._working_folder = encodable(str(Path.cwd()))  # read now: the folder may be removed later
         self._expect, self._expected_bytes_per_s = expected_bytes_per_s, 0.0
         self._series = LogSeries(folder, clock, {**metadata, **selection.metadata}, attachments, limits)
         self._peers = Peers(bus)
@@ -137,7 +138,7 @@ class Recorder:
                 return
 
     def _begin(self, *, anew: bool = True) -> None:
-        """Begin a log, or without `anew` its next file, with the calibration and states that its messages depend on."""
+        """Begin a recording, or without `anew` its next file, with the calibration and states its messages refer to."""
         if anew:
             self._messages_before, self._lost_before = self._series.messages, self._account.lost()
         self._series.begin(self._peers.newest.values(), new_recording=anew)
@@ -241,7 +242,7 @@ class Recorder:
         except BadMessageError as fault:
             self.service.unreadable(topic.key, fault)
             return
-        written = self._peers.already_received(sample)  # when a query returned it
+        written = self._peers.already_received(sample)  # and was written when a query returned it
         unwanted = self._paused or not self._selection.keeps(topic, sample.sequence, sample.payload)
         recorded = not self._failure if written else not unwanted and self._write(sample)
         self._account.enter(topic, sample, recorded=recorded, unwanted=unwanted)

@@ -13,7 +13,7 @@ from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import COMMAND, FRAME, MIRROR_STATE, STEP, SURFACE, TRUTH, Rate, Topic, wire
 from lowfc.optics.chain.sensor import Sensor
 
-_FLOAT_BYTES, _COUNT_BYTES = 4, 2
+_FLOAT_BYTES, _PIXEL_BYTES = 4, 2
 _SURFACE_SIDE = 64  # pixels of the published image of the mirror's surface
 _MESSAGE_BYTES = 110  # times, sequence, flags, record header and index entry of a message
 _COMPRESSED_FRACTION = {FRAME: 0.6, COMMAND: 0.9, MIRROR_STATE: 0.55}
@@ -28,7 +28,7 @@ def payload_bytes(config: Configuration, camera: wire.CameraState | None = None)
     rows, columns, _ = _frame_size(config, camera)
     actuators, modes = config.mirror.rows * config.mirror.columns, config.sensor.modes
     return {
-        FRAME: rows * columns * _COUNT_BYTES,
+        FRAME: rows * columns * _PIXEL_BYTES,
         COMMAND: actuators * _FLOAT_BYTES,
         MIRROR_STATE: actuators * _FLOAT_BYTES,
         SURFACE: _SURFACE_SIDE**2 * _FLOAT_BYTES,
@@ -79,7 +79,7 @@ def growth_in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: flo
 
 
 def _frame_size(config: Configuration, camera: wire.CameraState | None) -> tuple[int, int, str]:
-    """Rows and columns of a frame, and a remark if no camera reports them, and they are the simulated camera's."""
+    """Rows and columns of a frame; if no camera reports them, the simulated camera's, and a remark that says so."""
     if camera is not None and camera.rows and camera.columns:
         return camera.rows, camera.columns, ""
     side = PUPIL_IMAGE_PIXELS if config.sensor.kind == "zwfs" else Sensor.pixels
