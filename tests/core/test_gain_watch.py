@@ -57,7 +57,8 @@ def modal_bench() -> ModalBench:
     return ModalBench(config, factory.frame_noise_nm2(config, calibration(2.0, "sam")))
 
 
-def named(loop: Bench, name: str) -> list[dict[str, object]]:
+def details_of(loop: Bench, name: str) -> list[dict[str, object]]:
+    """Details of all events of this name."""
     return [event.details for _, event in loop.events if event.name == name]
 
 
@@ -96,8 +97,8 @@ def test_gains_are_measured_in_open_loop_before_it_is_closed(faint: Bench) -> No
     closed = modes.index(LoopMode.CLOSED)
     assert closed == 500  # first window: FIRST_S at 250 Hz
     assert set(modes[closed:]) == {LoopMode.CLOSED}
-    assert named(faint, "MODE_CHANGED")[-1]["why"] == "auto: the gains were measured"
-    assert len(named(faint, "GAINS_CHANGED")) >= 1
+    assert details_of(faint, "MODE_CHANGED")[-1]["why"] == "auto: the gains were measured"
+    assert len(details_of(faint, "GAINS_CHANGED")) >= 1
 
 
 def test_closing_reduces_the_residual_on_a_faint_star(faint: Bench) -> None:
@@ -270,11 +271,11 @@ def test_manual_gains_are_kept_and_harm_is_reported_before_and_after_closing() -
     loop.ask("close")
     loop.run(250, record=False)
     loop.run(600)
-    assert named(loop, "CLOSING_HARMS")[0]["harm"].startswith("closing adds")
-    assert named(loop, "LOOP_HARMS")[0]["action"] == "nothing is done"
+    assert details_of(loop, "CLOSING_HARMS")[0]["harm"].startswith("closing adds")
+    assert details_of(loop, "LOOP_HARMS")[0]["action"] == "nothing is done"
     active_loop = loop.state.loop
     assert set(active_loop.integrator.gain.tolist()) == {np.float32(0.5), np.float32(0.05)}
-    assert not named(loop, "GAINS_CHANGED")
+    assert not details_of(loop, "GAINS_CHANGED")
     residual_nm, open_nm = rms_nm(loop, 600)
     assert residual_nm > open_nm
 
@@ -284,7 +285,7 @@ def test_a_harmful_loop_opens_if_configured() -> None:
     loop.run(1149, record=False)
     loop.run(1)
     assert loop.steps[-1].mode is LoopMode.OPEN
-    assert named(loop, "MODE_CHANGED")[-1]["why"] == "auto: the loop increased the residual"
+    assert details_of(loop, "MODE_CHANGED")[-1]["why"] == "auto: the loop increased the residual"
 
 
 def harmful() -> ModalBench:
@@ -296,7 +297,7 @@ def harmful() -> ModalBench:
 def test_a_harmful_loop_without_a_law_opens_if_the_integrator_should_take_over() -> None:
     loop = harmful()
     loop.run(1150)
-    assert [event["action"] for event in named(loop, "LOOP_HARMS")] == ["the loop opens"]
+    assert [event["action"] for event in details_of(loop, "LOOP_HARMS")] == ["the loop opens"]
     assert loop.state.mode is LoopMode.OPEN
 
 
@@ -307,7 +308,7 @@ def test_the_integrator_takes_over_from_a_harmful_law_once_the_loop_is_not_reser
     loop.run(100)
     loop.process_input(Request(loop.steps[-1].time_ns, "lease", (), (60.0,), "another client", lease_id=1))
     loop.run(1000)
-    assert [event["action"] for event in named(loop, "LOOP_HARMS")] == ["the integrator takes over"]
+    assert [event["action"] for event in details_of(loop, "LOOP_HARMS")] == ["the integrator takes over"]
     assert loop.state.loop.law_runner is not None, "the request of the gain watch was refused"
     loop.ask("release", lease_id=1)
     loop.run(700)
@@ -378,8 +379,8 @@ def test_a_fainter_star_lowers_the_gains_and_restarts_their_measurement() -> Non
     gains_before = gains(loop)
     loop.scene = scene(configuration(3.5))
     loop.run(150, record=False)
-    assert named(loop, "STAR_CHANGED")[0]["ratio"] == pytest.approx(0.25, rel=0.1)
+    assert details_of(loop, "STAR_CHANGED")[0]["ratio"] == pytest.approx(0.25, rel=0.1)
     assert (gains(loop) <= 0.5 * gains_before).all()
-    changes = len(named(loop, "GAINS_CHANGED"))
+    changes = len(details_of(loop, "GAINS_CHANGED"))
     loop.run(550, record=False)
-    assert len(named(loop, "GAINS_CHANGED")) > changes
+    assert len(details_of(loop, "GAINS_CHANGED")) > changes

@@ -85,7 +85,7 @@ def test_the_health_of_a_recorder_of_many_logs_names_the_newest_ones_and_is_acce
     assert health.recording.file == str(recorder._series.files[-1])
 
 
-def test_states_published_before_the_recorder_started_are_first_in_the_log_and_once(bench: Bench) -> None:
+def test_states_published_before_the_recorder_started_are_written_first_and_once(bench: Bench) -> None:
     calibrations = bench.controller.publisher(CALIBRATION)
     states = bench.camera.publisher(CAMERA_STATE), bench.controller.publisher(CONTROLLER_STATE)
     put(calibrations, 2)

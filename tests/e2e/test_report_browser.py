@@ -52,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def results(folder: Path) -> dict[str, Any]:
-    """Results of a run with a request and a warning in it, from the command that writes the page too."""
+    """Results of a run with requests and a warning, printed by the command that also writes the page."""
     night = SyntheticLog().request("open").frames(150).request("close").frames(900, lost={300})
     log = night.write(folder / "night.mcap")
     found: dict[str, Any] = json.loads(output_of(folder, f"lowfc report {log} --json --out report.html"))
@@ -118,7 +118,7 @@ def test_the_pictures_are_visible_in_light_and_dark_mode(
     for name, (left, top, width, height) in seen["pictures"].items():
         region = shown[int(top) : int(top + height), int(left) : int(left + width)]
         brightness = region.mean(axis=2, dtype=np.float32)
-        # Lines and letters cover a part of the picture, in contrast to the background.
+        # Lines and letters, brighter or darker than the background, cover a part of the picture.
         drawn = np.abs(brightness - background) > 60
         assert 0.005 < drawn.mean() < 0.9, name
         assert drawn.any(axis=1).mean() > 0.5, f"{name} is empty over half of its height"

@@ -32,7 +32,7 @@ on_command_timeout = "hold"
 
 
 class ManualRun:
-    """Processes of one run, and their received messages."""
+    """Processes of one run, and what their messages report."""
 
     def __init__(self, folder: Path) -> None:
         self.run_id = new_run_id()

@@ -197,7 +197,7 @@ def test_an_unusable_state_does_not_replace_the_previous_one(damaged: wire.Contr
 
 @pytest.fixture
 def ioc() -> Iterator[tuple[Process, int]]:
-    """A running IOC, and the UDP port of its searches."""
+    """A running IOC, and the UDP port on which it answers searches."""
     pytest.importorskip("softioc", reason="needs softioc")
     tcp, udp, channel_access = free_ports(3)
     ports = {"EPICS_PVAS_SERVER_PORT": tcp, "EPICS_PVAS_BROADCAST_PORT": udp, "EPICS_CA_SERVER_PORT": channel_access}

@@ -22,7 +22,7 @@ from lowfc.contract.printable import printable
 
 _HEADER = (
     "# Keys after a # have their defaults; remove the # to set a value. For keys that are not set, a command may use",
-    "# another default: sim-loop starts with the loop closed and distributes the processors.",
+    "# another default: sim-loop starts with the loop closed and distributes its processes over the processors.",
     "",
 )
 

@@ -1,7 +1,7 @@
 """Typed result of a command: the source of both its `--json` object and its text.
 
 `result_field` declares a field with label, unit and format. The text has a line for each labelled field, then a table
-for each list of parts; fields declared as columns have the same length and share one table.
+for each list of nested results; fields declared as columns have the same length and share one table.
 """
 
 from collections.abc import Iterator, Sequence

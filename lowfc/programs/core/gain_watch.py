@@ -168,7 +168,7 @@ class GainWatch:
         return float(per_nm2 @ open_nm2), per_nm2 * now_nm2
 
     def prepare(self, loop: ActiveLoop) -> None:
-        """Set up the groups of a loop with other modes, leaks or limits; as this takes long, before the first frame."""
+        """Set up the groups if modes, leaks or limits of the loop differ; slow, so call it before the first frame."""
         identity = loop.calibration.id, loop.integrator.leak.tobytes(), loop.integrator.limit_nm.tobytes()
         if identity == self._identity:
             return

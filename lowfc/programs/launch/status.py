@@ -70,7 +70,7 @@ def status_line(watch: Watch, elapsed_s: float, lockstep_hz: float | None = None
 
 
 def _closed_for(controller: wire.Health, rate_hz: float) -> str:
-    """Text of the time closed if shorter than the span of the residual's statistics; otherwise empty."""
+    """Text of how long the loop has been closed, if less than the span of the residual's statistics; else empty."""
     frames = topic_count(controller, FRAME.key).received
     closed_s = frames / rate_hz - controller.not_closed_ns * 1e-9 if rate_hz else 0.0
     just_closed = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _RECENT_S
