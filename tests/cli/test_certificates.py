@@ -81,7 +81,7 @@ def test_existing_certificates_are_kept_unless_renewed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("gone", [(), ("camera.key",), ("camera.pem",), ("camera.key", "camera.pem")])
 @pytest.mark.parametrize("file", ["camera.key", "camera.pem", "viewer.pem"])
-def test_an_interruption_leaves_no_certificate_with_another_key(
+def test_an_interruption_leaves_no_certificate_that_does_not_fit_its_key(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, gone: tuple[str, ...]
 ) -> None:
     roles = (ROUTER, "camera", "viewer")

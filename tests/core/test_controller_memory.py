@@ -298,7 +298,7 @@ def test_a_loop_whose_latch_cannot_be_written_starts_open(calibration: Calibrati
     warnings: list[str] = []
     _, service, controller = alone(calibration, Latch([tmp_path / "file" / "safe"], warnings.append), CLOSED)
     assert service.awaited() == "a camera"
-    assert service.state == "starting", "its camera may take longer to open than the watchdog waits"
+    assert service.state == "starting", "opening a camera may take longer than the watchdog waits"
     assert (mode_of(controller), len(warnings)) == (LoopMode.OPEN, 1)
 
 

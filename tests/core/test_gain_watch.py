@@ -92,7 +92,7 @@ def faint(gain_bank_responses: list[Array | Single]) -> Bench:
     return loop
 
 
-def test_gains_are_measured_in_open_loop_before_it_is_closed(faint: Bench) -> None:
+def test_gains_are_measured_in_open_loop_before_the_loop_is_closed(faint: Bench) -> None:
     modes = [step.mode for step in faint.steps]
     closed = modes.index(LoopMode.CLOSED)
     assert closed == 500  # first window: FIRST_S at 250 Hz
@@ -186,8 +186,8 @@ def test_the_command_of_a_mode_with_automatic_gain_zero_relaxes_to_zero() -> Non
     assert after_nm[2] == before_nm[2] != 0
 
 
-def _contrast_over_open_loop(magnitude: float, seed: int, frames: int) -> float:
-    """Contrast of the residual over that in open loop: Zernike sensor, reaction-wheel jitter, second half of a run."""
+def _contrast_relative_to_open_loop(magnitude: float, seed: int, frames: int) -> float:
+    """Ratio of the residual's contrast to that in open loop: Zernike sensor, reaction wheels, second half of a run."""
     loop = bench(magnitude, "reaction-wheel", "zwfs", seed=seed)
     form = np.diag(factory.contrast_of(loop.config).form)
     loop.run(frames - frames // 2, record=False)
@@ -200,13 +200,13 @@ def _contrast_over_open_loop(magnitude: float, seed: int, frames: int) -> float:
 
 def test_closing_reduces_contrast_on_a_zernike_sensor_beyond_its_linear_range() -> None:
     """The square of the residual tilt looks like focus, astigmatism and spherical aberration to a Zernike sensor."""
-    assert _contrast_over_open_loop(2.0, 1, 1250) < 1
+    assert _contrast_relative_to_open_loop(2.0, 1, 1250) < 1
 
 
 @pytest.mark.slow
 def test_closing_seldom_adds_contrast_on_a_faint_star_with_a_zernike_sensor() -> None:
     """The cross-talk is close to the noise: whether it is detected depends on the host's rounding."""
-    assert sum(_contrast_over_open_loop(8.0, seed, 2500) > 1 for seed in range(1, 7)) <= 1
+    assert sum(_contrast_relative_to_open_loop(8.0, seed, 2500) > 1 for seed in range(1, 7)) <= 1
 
 
 def test_a_decoded_state_has_the_same_reconstructor(faint: Bench) -> None:

@@ -102,7 +102,7 @@ def test_a_subscriber_receives_the_log_in_order_and_at_its_rate(
         assert [sample.sequence for sample in received] == [message.sequence for message in sent], key
         times = [sample.publish_time_ns for sample in received]
         assert times == sorted(times)
-        assert times[0] > begun_ns, "the time of publication is that of today"
+        assert times[0] > begun_ns, "the time of publication is the present, not the log's"
         span_ns = sent[-1].receive_time_ns - sent[0].receive_time_ns
         assert times[-1] - times[0] > 0.9 * span_ns / 2, "published at twice the log's pace"
     frames = {sample.sequence for sample in tool.received[FRAME.key]}
@@ -179,7 +179,7 @@ def test_ctrl_c_prints_the_summary_and_the_mirrors_role_is_taken_until_then(log:
     assert "interrupted" in render(results)
 
 
-def test_publishing_takes_over_the_roles_of_its_topics_and_with_frames_the_mirrors(run: Run) -> None:
+def test_publishing_takes_the_roles_of_its_topics_and_with_frames_also_the_mirrors_role(run: Run) -> None:
     frames, steps = [FRAME.key], [STEP.key]
     assert PublishedKeys(run.links, frames, ()).roles == ("camera", "mirror-dm")
     assert PublishedKeys(run.links, frames, (), allow_commands=True).roles == ("camera",)

@@ -124,7 +124,7 @@ def test_the_loop_recovers_from_kill_and_restart_of_each_process(bench: ManualRu
         largest_move_nm = np.abs(np.diff(shapes, axis=0)).max()
         assert largest_move_nm < 100, "no jump beyond the controller's slew limit"
         np.testing.assert_allclose(shapes[-1], before, atol=5)
-        if name == "controller":  # it starts from where the mirror is: nothing moves but noise
+        if name == "controller":  # the new one starts from the mirror's shape: only noise moves it
             assert np.abs(shapes - before).max() < 12
 
 
@@ -133,7 +133,7 @@ def _alive(bench: ManualRun, name: str) -> bool:
     return bool(bench.bus.get(f"lowfc/health/{process}", timeout_s=0.1))
 
 
-def test_the_controller_holds_while_the_mirror_is_dead_and_closes_when_it_is_back(bench: ManualRun) -> None:
+def test_the_controller_holds_while_the_mirror_is_dead_and_can_close_when_the_mirror_is_back(bench: ManualRun) -> None:
     bench.wait_until_settled()
     before = bench.shapes[-1]
     bench.kill("mirror")

@@ -93,7 +93,7 @@ def test_the_log_grows_at_the_estimated_rate(live: dict[str, Any]) -> None:
     assert bytes_per_s(load(None, {"camera.rate_hz": 500.0}), EVERYTHING) == pytest.approx(growth, rel=0.25)
 
 
-def test_frame_step_command_and_state_join(topics: dict[str, list[bytes]]) -> None:
+def test_frame_step_command_and_state_can_be_joined(topics: dict[str, list[bytes]]) -> None:
     """Each carries the frame's sequence, steps and commands also its time: the path of one frame can be followed."""
     frames = {from_timestamp(RawImage.FromString(payload).timestamp) for payload in topics["/lowfc/camera/frame"]}
     steps = [wire.ControlStep.FromString(payload) for payload in topics["/lowfc/control/step"]]
@@ -129,7 +129,7 @@ def test_npm_mcap_core_reads_the_same_messages(live: dict[str, Any], topics: dic
 
 
 def test_a_signal_makes_the_loop_safe_and_a_process_that_dies_is_named(tmp_path: Path) -> None:
-    """The documented pattern finds the controller, and the log has the signal as a request."""
+    """The documented pattern of pkill finds the controller, and the log has the signal as a request."""
     (pattern,) = re.findall(r"pkill -USR1 -f '(.*)'", SIGNAL)
     process = start(tmp_path, "sim-loop", "--rate", "200", "--duration", "60")
     until(lambda: recorded_bytes(tmp_path) > 4e6)
@@ -145,7 +145,7 @@ def test_a_signal_makes_the_loop_safe_and_a_process_that_dies_is_named(tmp_path:
     assert not stdout
     assert "mirror-dm was killed by SIGKILL" in stderr
     assert "Traceback" not in stderr
-    (log,) = (tmp_path / "logs").glob("*.mcap")  # it is finished nevertheless
+    (log,) = (tmp_path / "logs").glob("*.mcap")  # the log is finished nevertheless
     assert stderr.endswith(f"recorded until then: logs/{log.name}\n")
     recorded = payloads(log)
     assert recorded["/lowfc/camera/frame"]

@@ -113,7 +113,7 @@ def test_invalid_view_options_are_one_line_errors(
 
 
 @pytest.mark.parametrize(("show", "expected"), [(Show.NATIVE, False), (Show.WEB, True)])
-def test_sim_loop_starts_a_view_with_the_ports_of_its_target(show: Show, expected: bool) -> None:
+def test_sim_loop_starts_a_view_with_a_web_port_only_for_a_browser(show: Show, expected: bool) -> None:
     command = sim_loop._view(open_run("shown"), show, Console(quiet=True)).command
     assert f"--{show}" in command
     assert ("--web-port" in command) == expected

@@ -268,7 +268,7 @@ for _measurement in (dark, reference):
 
 @ctl_app.callback()
 def _run_before_request(context: typer.Context, run: AnyRun = None) -> None:
-    """Accept --run also before the request; `start` and `stop` are those of `record`."""
+    """Accept --run also before the request; `start` and `stop` are the commands in the group `record`."""
     defaults, group = {"run": run}, context.command
     assert isinstance(group, TyperGroup)  # noqa: S101  # `ctl_app` is a group
     context.default_map = {name: {**defaults, "start": defaults, "stop": defaults} for name in group.commands}
@@ -284,4 +284,4 @@ def _request_and_print(run: str | None, as_json: bool, ask: "Callable[[Client], 
     with _client(run) as loop:
         answer = ask(loop)
         result = {name: getattr(answer, name) for name in ("run", "accepted", "reply", "frame", "frame_sequence")}
-        print_result(result, answer.sentence, as_json=as_json)  # before the end of the connection, which may take long
+        print_result(result, answer.sentence, as_json=as_json)  # before the connection is closed, which may take long

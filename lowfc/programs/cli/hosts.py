@@ -145,7 +145,7 @@ def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) 
         run = the_known_run(run)
     run = DEFAULT_RUN if run is None else run  # with a router, all processes of the run may be on other hosts
     with ExitStack() as stack:
-        exists = run_path(run).is_dir()  # without an answer no run is created
+        exists = run_path(run).is_dir()  # if not, the run is created once a process has answered
         base = None if exists else Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lowfc-")))
         mirrors = () if exists else (settings.mirror.name,)
         links = open_run(run, mirrors, base, network=settings.network).links

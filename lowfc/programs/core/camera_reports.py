@@ -30,7 +30,7 @@ class CameraReports:
         return self._mailbox.take(timeout_s)
 
     def wake(self) -> None:
-        """End a `wait`; from any thread."""
+        """End a `wait`; may be called from any thread."""
         self._mailbox.wake()
 
     def apply(self, sample: Sample) -> None:

@@ -68,7 +68,7 @@ class Controller:
     def __init__(
         self, config: Configuration, service: Service, calibration: Calibration | None, source: str, latch: Latch
     ) -> None:
-        """Join the bus; load the calibration (None: idle), named `source` in events; LowfcError for an invalid file."""
+        """Join the bus; load the calibration (None: idle), called `source` in events. LowfcError: a file is invalid."""
         name = config.mirror.name
         self._service = service
         self._latch = latch

@@ -1,4 +1,4 @@
-"""Liveness of the mirror from its Health: receiving its states would cost time in every frame."""
+"""The mirror's first shape, and its faults from its Health: receiving all states would cost time in every frame."""
 
 import contextlib
 from collections import deque

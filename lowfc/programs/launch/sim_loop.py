@@ -166,7 +166,7 @@ def _supervise(
         if child.name == Role.VIEWER:
             continue
         if child.name == Role.RECORDER and watch.health_of(Role.RECORDER).recording.failure:
-            continue  # the loop ended normally without it; the summary gives the reason
+            continue  # the loop ended normally without a recorder; the summary gives the reason
         if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # not 0: stopped before it was ready
             raise died(child)
 
@@ -186,7 +186,7 @@ def check(children: list[Child]) -> None:
 
 
 def _report_view_ended(view: Child, console: Console) -> None:
-    """Report why the view ended, with the last line of its standard error, unless its window was just closed."""
+    """Report why the view ended, with the last line of its standard error, unless the user closed its window."""
     if view.status != 0:
         why = view.stderr_tail().splitlines()[-1:] if view.status is not None and view.status > 0 else []
         ending = "; ".join([view.exit_description(), *why])

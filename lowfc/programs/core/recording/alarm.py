@@ -81,7 +81,7 @@ class Alarm:
             command = subprocess.Popen(  # noqa: S603  # configured by the user
                 ["/bin/sh", "-c", self._command],
                 stdin=subprocess.DEVNULL,
-                env={**os.environb, **{key.encode(): value.encode() for key, value in arguments.items()}},  # any locale
+                env={**os.environb, **{key.encode(): value.encode() for key, value in arguments.items()}},  # UTF-8
                 start_new_session=True,
             )
             due_s = time.monotonic() + TIMEOUT_S

@@ -95,7 +95,7 @@ class Recorder:
         bus.queryable(RECORD_KEY.format(name=ALL), self._queries.append)
 
     def catch_signals(self) -> None:
-        """Finish the log at SIGTERM or Ctrl-C; for the main thread.
+        """Finish the log at SIGTERM or Ctrl-C; to be called in the main thread.
 
         After a second signal the recorder does not wait for the last Health of the others.
         """
@@ -202,7 +202,7 @@ class Recorder:
                 self._paused = self._stopping = True
             if self._series.finishing:
                 return None
-            self._series.end({})  # raises the fault of finishing
+            self._series.end({})  # raises if the log could not be finished
         except DataFileError as fault:
             self._fail(fault)
         self._paused, self._stopping = not self._failure, False
@@ -255,7 +255,7 @@ class Recorder:
         try:
             _, health = self._account.names.health(sample.key, sample.payload)
         except UNREADABLE:
-            return  # the log has it as received; the service counts it
+            return  # the log has the message as received; the service counts it as unreadable
         self._peers.note(sample, health)
         try:
             self._account.reconcile(sample, health)

@@ -51,7 +51,7 @@ def configured_selection(config: Configuration) -> Selection:
 
 
 def estimate(config: Configuration, camera: wire.CameraState | None = None) -> str:
-    """Sentence on the disk space that a recording will use, and on the rate and frame size that this rests on."""
+    """Sentence on the disk space that a recording will use, with the assumed rate and frame size."""
     recorded = configured_selection(config)
     folder, min_free_bytes = user_path(config.recorder.folder), config.recorder.min_free_mb * 1e6
     growth = growth_in_words(bytes_per_s(config, recorded, camera), folder, min_free_bytes)
