@@ -25,6 +25,8 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.loop.safety import Rejection
+from lowfc.programs.logs.report.results import report_of
+from lowfc.programs.logs.report.source import read_run
 from lowfc.programs.view.layout import layout
 from lowfc.programs.view.live_view import earlier_events
 from lowfc.programs.view.panels import mirror, pointing, sensor, tiles, trend, wavefront
@@ -136,7 +138,20 @@ def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) ->
 def test_a_log_of_a_loop_that_did_harm_needs_attention(tmp_path: Path, shown: Shown) -> None:
     drawn(SyntheticLog(gain=(1.95, 1.95)).frames(300).write(tmp_path / "night.mcap"))
     assert shown[-1].level is tile(shown[-1], "WAVEFRONT").level is Level.WARNING
-    assert re.search(r"residual \S+ nm rms, worse than \S+ nm with a flat mirror", shown[-1].headline)
+    assert re.search(r"residual while closed \S+ nm rms, worse than \S+ nm with a flat mirror", shown[-1].headline)
+
+
+@pytest.mark.parametrize(
+    ("gain", "of_view", "of_report"),
+    [(0.5, Level.GOOD, "good"), (0.02, Level.NEUTRAL, "unknown"), (1.95, Level.WARNING, "look")],
+)
+def test_view_and_report_judge_the_residual_of_a_log_alike(
+    tmp_path: Path, shown: Shown, gain: float, of_view: Level, of_report: str
+) -> None:
+    log = SyntheticLog(gain=(gain, gain)).frames(1000).write(tmp_path / "night.mcap")
+    drawn(log)
+    check = next(one for one in report_of(read_run(log)).results["verdict"]["checks"] if one["name"] == "residual")
+    assert (tile(shown[-1], "WAVEFRONT").level, check["level"]) == (of_view, of_report)
 
 
 def test_the_verdict_on_a_log_says_that_its_residual_includes_a_shape(tmp_path: Path, shown: Shown) -> None:

@@ -5,9 +5,11 @@ from collections.abc import Mapping
 
 from lowfc.contract.messages import CALIBRATION, STEP, Role
 from lowfc.control.loop.wording import counted
+from lowfc.programs.cli.correction import Correction, correction
 from lowfc.programs.logs.report.source import Results
 
 GOOD, LOOK, BAD, UNKNOWN = "good", "look", "bad", "unknown"
+_LEVELS = {Correction.GOOD: GOOD, Correction.LITTLE: UNKNOWN, Correction.HARM: LOOK}
 
 _MANY_WITHOUT_COMMAND = 0.01
 _MANY_LATE = 0.01
@@ -23,7 +25,7 @@ def verdict(results: Results) -> Results:
     first = next((check["text"] for check in checks if check["level"] == level), "")
     heading = {
         GOOD: "A good run",
-        UNKNOWN: "No fault found, but some data are missing",
+        UNKNOWN: "No fault found, but not all checks are good",
         LOOK: "To be checked",
         BAD: "Not a good run",
     }[level]
@@ -96,14 +98,15 @@ def _residual(results: Results) -> Results:
     if before_nm is None or after_nm is None or not results["mode_steps"].get("closed"):
         why = results["error_budget"].get("why_not", "this log has no good closed-loop frame")
         return _check("residual", UNKNOWN, why)
-    text = f"{before_nm:.3g} nm before, {after_nm:.3g} nm after {over}"
+    text = f"{before_nm:.3g} nm before, {after_nm:.3g} nm after {over} in the longest stretch under one law"
     if tilts[before] and tilts[after]:
         text += f"; tip and tilt {tilts[before]['per_axis']:.3g} mas to {tilts[after]['per_axis']:.3g} mas per axis"
     text += f" ({'true' if true else 'measured, both with sensor noise'})"
     if shaped:
         shapes = "an offset or channels were in force, and their shapes are in the true residual"
         text += f"; {shapes} of {pupil_nm[1] or totals['residual']:.3g} nm"
-    return _check("residual", GOOD if after_nm < before_nm else LOOK, text)
+    level = _LEVELS[correction(after_nm, before_nm)]
+    return _check("residual", level, f"{text}; little is corrected" if level == UNKNOWN else text)
 
 
 def _commands(results: Results) -> Results:

@@ -11,6 +11,7 @@ from lowfc.adapters.logs.columns import Steps
 from lowfc.control.durations import Durations
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted, hertz
+from lowfc.programs.cli.correction import Correction, correction
 from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.view.snapshot import LogEnd, Snapshot
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
@@ -20,10 +21,11 @@ from lowfc.programs.view.verdicts.span_means import SpanMeans
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, rounded, worst_of
 from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, stroke
 from lowfc.programs.view.verdicts.watcher import FRAMES_SILENT_S
-from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR, WORSE
 
 _MODES = {mode.value: mode for mode in LoopMode}
 _NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", None: "without frames"}
+
+_LEVELS = {Correction.GOOD: Level.GOOD, Correction.LITTLE: Level.NEUTRAL, Correction.HARM: Level.WARNING}
 
 
 class LogVerdict:
@@ -104,10 +106,9 @@ class LogVerdict:
             f"while closed,{shapes} {compared} than {rounded(flat_nm)} nm with a flat mirror; worst "
             f"{_span(self._closed)}: {rounded(worst_nm)} nm; {'true' if self._closed.true else 'measured, with noise'}"
         )
-        harmful = factor < 1 / WORSE and not on_purpose
-        level = Level.WARNING if harmful else Level.GOOD if factor >= GOOD_FACTOR else Level.NEUTRAL
-        value = f"{rounded(residual_nm)} nm rms"
-        advice = f"residual {value},{shapes} {'worse than ' if harmful else ''}{rounded(flat_nm)} nm with a flat mirror"
+        level = _LEVELS[Correction.LITTLE if on_purpose and factor < 1 else correction(residual_nm, flat_nm)]
+        value, than = f"{rounded(residual_nm)} nm rms", "worse than " if level is Level.WARNING else ""
+        advice = f"residual while closed {value},{shapes} {than}{rounded(flat_nm)} nm with a flat mirror"
         return Tile("WAVEFRONT", value, detail, level, advice)
 
     def _star(self) -> Tile:

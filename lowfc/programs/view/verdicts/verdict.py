@@ -14,11 +14,12 @@ from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.safety import Limit, LoopMode, Reason, reason_name
 from lowfc.control.loop.wording import CAMERA_MISFIT, counted
+from lowfc.programs.cli.correction import Correction, correction
 from lowfc.programs.view.verdicts.camera_verdict import all_refused, frames, star
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import Liveness, RunState
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, absent, duration, rounded, short, worst_of
-from lowfc.programs.view.verdicts.wavefront_verdict import WORSE, contrast, wavefront
+from lowfc.programs.view.verdicts.wavefront_verdict import contrast, wavefront
 
 NEAR_STROKE = 0.9
 """Fraction of the stroke above which the mirror has little reserve."""
@@ -126,7 +127,7 @@ def _since(state: wire.ControllerState | None) -> str:
 
 def _open(state: RunState) -> Tile:
     shape, rms = "mirror holds its last shape", state.wavefront
-    if rms is not None and rms.residual_nm > WORSE * rms.open_nm:
+    if rms is not None and correction(*rms[:2]) is Correction.HARM:
         shape += ", worse than a flat mirror: `lowfc ctl safe` flattens it"
     level, advice = Level.NEUTRAL, "The loop is open: nothing is corrected, `lowfc ctl close` closes it."
     if state.why.startswith(CAMERA_MISFIT):

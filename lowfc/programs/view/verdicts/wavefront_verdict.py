@@ -5,17 +5,14 @@ from math import hypot, sqrt
 
 from lowfc.contract.messages import wire
 from lowfc.contract.printable import printable
+from lowfc.programs.cli.correction import Correction, correction
 from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.steady import ResidualComparison
 from lowfc.programs.view.verdicts.tile import Level, Tile, rounded, short
 
-WORSE = 1.1
-"""Residual over open wavefront above which a closed loop does harm; the rms of a second scatters less."""
 DIVERGING = 3.0
 """Residual over open wavefront above which the loop is unstable or has wrong signs, not only bad gains."""
-GOOD_FACTOR = 2.0
-"""Leaked starlight scales with the square of the wavefront: this reduction leaves a quarter, one of 1.5 leaves 44 %."""
 NEAR_BEST = 1.3
 """Residual over that of the best gains above which the gains are worth tuning."""
 NOISE_FLOOR = 0.2
@@ -44,14 +41,15 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
         why = f"The wavefront is {value}, including the shapes of offset and channels; {flat}."
         return tile(value, f"with offset and channels; {flat}; {remarks}", advice=why)
     raw, latest = rms.open_nm / rms.residual_nm if rms.residual_nm else 1.0, state.latest
-    if raw < 1 / WORSE and latest is not None and latest.residual_nm > WORSE * latest.open_nm:
+    if latest is not None and {correction(*one[:2]) for one in (rms, latest)} == {Correction.HARM}:
         level = Level.BAD if raw < 1 / DIVERGING else Level.WARNING
         advice = f"The loop does harm: {residual} nm rms, {flat}. Lower the gain or open the loop."
         return tile(value, f"worse than {flat}; {remarks}", level, advice)
     noise_nm = comparison.noise_nm if comparison is not None and not state.true else 0.0
     level, why = merit(factor(rms.residual_nm, rms.open_nm, noise_nm), comparison)
     compared = f"{raw:.1f} x better than" if raw >= 1 else "of"
-    return tile(value, f"{compared} {flat}; {remarks}", level, f"The residual is {value}, compared with {flat}{why}.")
+    advice = f"The residual of the last second is {value}, compared with {flat}{why}."
+    return tile(value, f"{compared} {flat}; {remarks}", level, advice)
 
 
 def contrast(known: wire.WavefrontFigures, *, now: bool) -> Tile:
@@ -72,12 +70,13 @@ def factor(residual_nm: float, open_nm: float, noise_nm: float) -> float:
 
 def merit(reduction: float, comparison: ResidualComparison | None) -> tuple[Level, str]:
     """Level of a closed loop that does no harm, and the reason if it is not good."""
+    good = correction(1.0, reduction) is Correction.GOOD
     if comparison is None:
-        return (Level.GOOD, "") if reduction >= GOOD_FACTOR else (Level.NEUTRAL, ": little is corrected")
+        return (Level.GOOD, "") if good else (Level.NEUTRAL, ": little is corrected")
     if comparison.residual_nm > hypot(NEAR_BEST * comparison.best_nm, NOISE_FLOOR * comparison.noise_nm):
         ratio = comparison.residual_nm / max(comparison.best_nm, 1e-9)
         return Level.NEUTRAL, f", {ratio:.1f} x the residual of the best gains: run `lowfc tune`"
-    if reduction >= GOOD_FACTOR:
+    if good:
         return Level.GOOD, ""
     best = comparison.residual_nm <= NEAR_BEST * comparison.best_nm
     return Level.NEUTRAL, ": little is corrected" + (", and other gains would not correct more" if best else "")
