@@ -157,6 +157,20 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
         assert status.json_object(controller_state(state, SETTINGS, 0))["paused"] == (word == "paused")
 
 
+def test_the_rate_in_lockstep_is_simulated_and_the_computations_speed_is_called_that() -> None:
+    camera = wire.Health(rate_hz=830.0, mean_rate_hz=831.25)
+    camera.recent_wavefront.SetInParent()
+    watch, config = Watch({"camera": camera}, []), Configuration(lockstep=True)
+    rate = "250 Hz in simulated time, computed at {} frames per second"
+    assert rate.format("831.2") in summary_text(summary(watch, False, 250.0), 250.0)
+    assert rate.format(830) in status_line(watch, 5.0, 250.0)
+    with Console(width=160, file=io.StringIO(), record=True) as console:
+        console.print(screen(watch, config, None, 5.0))
+    assert rate.format(830) in console.export_text()
+    assert "rate               831.2 Hz" in summary_text(summary(watch, False)).splitlines()
+    assert "rate               -" in summary_text(summary(Watch({}, []), False)).splitlines()
+
+
 def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None:
     recent = wire.WavefrontFigures(added_contrast_flat=7e-10, added_contrast=-4e-11)
     published = wire.TopicCount(topic=FRAME.key, published=1)
@@ -204,7 +218,7 @@ def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame
     begun = wire.Health(mode=wire.LOOP_MODE_CLOSED, topics=[received], not_closed_ns=2 * SECOND)
     early = Watch(watch.health | {"controller": begun}, [])
     assert "closed for 1.6 s     250 Hz" in status_line(early, 5.0), "the residual includes open-loop frames"
-    assert "closed for 2.0 s     250 Hz" in status_line(early, 5.0, 225.0), "simulated time in lockstep"
+    assert "closed for 2.0 s  225 Hz in simulated time" in status_line(early, 5.0, 225.0)
     begun.topics[0].received, begun.not_closed_ns = 250 * 3601, 3600 * SECOND
     early.health["camera"].rate_hz = 250.4  # the rate of the last half second
     assert "closed for 1.0 s     250 Hz" in status_line(early, 5.0)

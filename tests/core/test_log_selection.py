@@ -212,6 +212,8 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     added_per_s = bytes_per_s(config, configured_selection(config), camera) - growth
     assert added_per_s == pytest.approx((160 * 120 - 80 * 80) * 2 * 0.6 * 250)
     assert estimate(config, wire.CameraState()) == estimate(config)
+    lockstep = config.model_copy(update={"lockstep": True})
+    assert " h, at 250 Hz in simulated time and 80 x 80 pixels" in estimate(lockstep)
     assert estimate(load(None, keys | {"sensor.kind": "zwfs"})).endswith(" 40 x 40 pixels, the simulated camera's")
     fields = *wire.ControlStep.DESCRIPTOR.fields, *wire.Truth.DESCRIPTOR.fields
     modal = sum(field.is_repeated and field.name.endswith("_nm") for field in fields)

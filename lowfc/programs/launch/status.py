@@ -34,7 +34,9 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     table.add_column(style="dim", justify="right")
     table.add_column()
     silent = _silence_notice(watch)
-    rate = silent or f"{hertz(camera.rate_hz)} of {config.camera.rate_hz:g} Hz"
+    nominal_hz = config.camera.rate_hz
+    live = f"{hertz(camera.rate_hz)} of {nominal_hz:g} Hz"
+    rate = silent or _rate(live, camera.rate_hz, nominal_hz if config.lockstep else None)
     table.add_row("loop", Text(f"{mode(controller)}, {rate}"))  # a string would be read as rich's markup
     table.add_row("wavefront", silent or _wavefront_in_words(camera))
     table.add_row("frame to command", latency(controller.frame_to_command))
@@ -60,13 +62,20 @@ def status_line(watch: Watch, elapsed_s: float, lockstep_hz: float | None = None
     frames, recent = topic_count(controller, FRAME.key), wavefront(camera.recent_wavefront)
     added = recent["added_contrast"]
     contrast = "" if added is None else f"contrast {added['closed']:+.1e} of {added['open']:+.1e}  "
+    rate = _rate(f"{hertz(camera.rate_hz):>9}", camera.rate_hz, lockstep_hz)
     just_closed = _closed_for(controller, lockstep_hz or camera.mean_rate_hz)
     return (
-        f"{elapsed_s:5.0f} s  {mode(controller)}{just_closed}  {hertz(camera.rate_hz):>9}  "
+        f"{elapsed_s:5.0f} s  {mode(controller)}{just_closed}  {rate}  "
         f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms  {contrast}"
         f"frame to command {latency(controller.frame_to_command)}  "
         f"skipped {frames.skipped} missing {frames.missing}  {recording(watch.health_of(Role.RECORDER))}"
     )
+
+
+def _rate(live: str, rate_hz: float, lockstep_hz: float | None) -> str:
+    """Text of the frame rate: `live`, or in lockstep the rate in simulated time and the speed of the computation."""
+    computed = f", computed at {rate_hz:.4g} frames per second" if rate_hz else ""
+    return live if lockstep_hz is None else f"{lockstep_hz:g} Hz in simulated time{computed}"
 
 
 def _closed_for(controller: wire.Health, rate_hz: float) -> str:
@@ -159,8 +168,8 @@ def _wavefront_lines(results: dict[str, Any]) -> list[str]:
     ]
 
 
-def summary_text(results: dict[str, Any]) -> str:
-    """The summary of a run as text."""
+def summary_text(results: dict[str, Any], lockstep_hz: float | None = None) -> str:
+    """The summary of a run as text; `lockstep_hz` as in `summary`."""
     command, mirror = (results["latency_us"][name] for name in ("frame_to_command", "frame_to_mirror"))
 
     def percentiles(values: dict[str, float]) -> str:
@@ -168,9 +177,10 @@ def summary_text(results: dict[str, Any]) -> str:
             return "-"
         return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in values.items())
 
+    live = f"{results['rate_hz']:.1f} Hz" if results["rate_hz"] else "-"
     lines = [
         f"loop               {_loop_in_words(results)}",
-        f"rate               {results['rate_hz']:.1f} Hz",
+        f"rate               {_rate(live, results['rate_hz'], lockstep_hz)}",
         f"frames             {results['frames_published']} published, {results['frames_processed']} processed, "
         f"{results['frames_skipped']} skipped, {results['frames_missing']} missing",
         f"commands           {results['commands_applied']} applied, {results['commands_late']} after the start of the "

@@ -58,7 +58,8 @@ def estimate(config: Configuration, camera: wire.CameraState | None = None) -> s
     rows, columns, source = _frame_size(config, camera)
     selected = f" ({recorded.description})" if recorded.description else ""
     size = f"{rows} x {columns} pixels{source}{selected}"
-    return f"recording into {folder}: {growth}, at {config.camera.rate_hz:g} Hz and {size}"
+    time = " in simulated time" if config.lockstep else ""
+    return f"recording into {folder}: {growth}, at {config.camera.rate_hz:g} Hz{time} and {size}"
 
 
 def check_folder(config: Configuration) -> None:
