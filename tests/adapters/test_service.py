@@ -46,7 +46,7 @@ def test_health_is_published_when_due_with_all_fields(listener: Listener, clock:
     clock.advance(HEALTH_PERIOD_NS)
     camera.beat()
     first, second = listener.messages(HEALTH)
-    assert (first.state, first.rate_hz, second.rate_hz) == ("starting", 0.0, 10.0)
+    assert (first.state, first.rate_hz) == ("starting", 0.0)
     assert (second.process, second.run_id, second.pid, second.version) == ("camera", "test", os.getpid(), __version__)
     assert (second.commands_late, second.uptime_ns) == (3, HEALTH_PERIOD_NS)
     assert second.realtime_granted == ["one BLAS thread"]
@@ -57,6 +57,20 @@ def test_health_is_published_when_due_with_all_fields(listener: Listener, clock:
         "lowfc/health/camera": 2,
         "lowfc/camera/frame": 5,
     }
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 5.0, 1000.0])
+def test_the_time_before_the_first_work_is_not_in_the_rate(
+    listener: Listener, clock: FakeClock, rate_hz: float
+) -> None:
+    camera = listener.service("camera")
+    for number in range(40):
+        clock.advance(HEALTH_PERIOD_NS if number else 10_250_000_000)  # a long start-up
+        camera.work = max(0, 1 + int((number - 8.25) * 0.5 * rate_hz)) if number > 8 else 0
+        camera.beat()
+    rates = [health.rate_hz for health in listener.messages(HEALTH) if health.rate_hz]
+    assert rates
+    assert all(0.75 * rate_hz <= rate <= 1.34 * rate_hz for rate in rates), rates
 
 
 @pytest.mark.parametrize("rate_hz", [0.1, 0.7, 1.6, 5.0, 1000.0])

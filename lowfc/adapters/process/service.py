@@ -110,7 +110,7 @@ class Service:
         self._warned: dict[str, tuple[int, int]] = {}
         self._supervisor = supervisor or Supervisor()
         self._started_ns = clock.host_ns()
-        self._work_rate = WorkRate(self._started_ns)
+        self._work_rate = WorkRate()
         self._due_ns = 0
         self._events = self.publisher(EVENT)
         self._health = self.publisher(HEALTH, name)
