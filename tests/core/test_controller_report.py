@@ -94,20 +94,29 @@ def test_the_closed_fraction_is_that_of_the_time_between_first_and_last_frame(
 
 def test_summary_and_status_show_the_time_not_closed() -> None:
     def first_line(**health: Any) -> str:
-        watch = Watch({"controller": wire.Health(**health)}, [])
+        received = wire.TopicCount(topic=FRAME.key, received=1001)
+        controller, camera = wire.Health(topics=[received], **health), wire.Health(mean_rate_hz=100.0)
+        watch = Watch({"controller": controller, "camera": camera}, [])
         return summary_text(summary(watch, record=False)).splitlines()[0].split(maxsplit=1)[1]
 
     without_frames = summary_text(summary(Watch({}, []), record=False))
     assert [line.split()[-1] for line in without_frames.splitlines()[-3:]] == ["frame", "-", "-"]
     camera = wire.Health(topics=[wire.TopicCount(topic=FRAME.key, published=1)])
     results = summary(Watch({"camera": camera}, []), record=False)
-    assert "over the open pupil, second half of the run" in summary_text(results)
+    assert "over the open pupil, second half of the run, sampled" in summary_text(results)
+    assert "second half of the run, in part not closed, sampled" in summary_text(results | {"closed_fraction": 0.2})
     not_closed = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
     assert first_line(mode=wire.LOOP_MODE_CLOSED) == "closed"
     expected = "closed; not closed for 3.0 s in total: the camera does not fit"
     assert first_line(mode=wire.LOOP_MODE_CLOSED, **not_closed) == expected
     assert first_line(mode=wire.LOOP_MODE_OPEN, **not_closed) == expected.replace("closed;", "open;")
     assert first_line(mode=wire.LOOP_MODE_SAFE, **not_closed) == expected.replace("closed;", "in safe mode;")
+    not_closed["not_closed_ns"] = 10 * SECOND
+    expected = "; not closed during the run: the camera does not fit"
+    assert first_line(mode=wire.LOOP_MODE_OPEN, **not_closed) == f"open{expected}"
+    assert first_line(mode=wire.LOOP_MODE_CLOSED, **not_closed) == f"closed at the end{expected}"
+    just = first_line(mode=wire.LOOP_MODE_CLOSED, not_closed_ns=SECOND // 25)
+    assert just == "closed; not closed for 0.04 s in total"
     assert screen(Watch({}, [Log(message="without a level")]), Configuration(), None, 1.0)
     assert first_line() == "no controller reported", "no time is shown before the controller reports a mode"
     state, _ = feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1), replace(CAMERA, bias_dn=DARK_DN + 300))
@@ -155,6 +164,16 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
         assert outputs.reply.accepted
         assert first_line().startswith(f"{word} ·")
         assert status.json_object(controller_state(state, SETTINGS, 0))["paused"] == (word == "paused")
+
+
+@pytest.mark.parametrize(("count", "names"), [(99, ("p50", "max")), (100, ("p50", "p99", "max"))])
+def test_a_summary_has_no_percentile_that_is_only_the_longest_of_few(count: int, names: tuple[str, ...]) -> None:
+    latency = wire.Latency(count=count, p50_ns=1000, p99_ns=2000, p99_9_ns=2000, max_ns=2000)
+    received = wire.TopicCount(topic=FRAME.key, received=count)
+    controller = wire.Health(topics=[received], frame_to_command=latency)
+    lines = summary_text(summary(Watch({"controller": controller}, []), False)).splitlines()
+    shown = next(line for line in lines if line.startswith("frame to command")).split()[3:]
+    assert tuple(word for word in shown if word[0] in "pm") == names
 
 
 def test_the_rate_in_lockstep_is_simulated_and_the_computations_speed_is_called_that() -> None:

@@ -21,6 +21,8 @@ SILENT_S = 2.0
 _RECENT_S = 2.5
 """Span of the recent wavefront statistics, plus the delay of their report."""
 _EVENTS_SHOWN = 4
+_LEAST = {"p99": 100, "p99_9": 1000}
+"""Least number of durations of which a percentile is not simply the largest."""
 _STYLES: dict[int, str] = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
 
 
@@ -127,14 +129,17 @@ def recording(recorder: wire.Health) -> str:
 
 
 def _loop_in_words(results: dict[str, Any]) -> str:
-    seconds, cause = f"{results['not_closed_s']:.1f} s", results["not_closed_cause"]
+    cause = f": {results['not_closed_cause']}" if results["not_closed_cause"] else ""
     match results["mode"]:
         case None:
             return "no controller reported"
         case "closed" if not results["not_closed_s"]:
             return "closed"
+        case mode if not results["closed_fraction"]:
+            return f"{'closed at the end' if mode == 'closed' else mode_word(mode)}; not closed during the run{cause}"
         case mode:
-            return f"{mode_word(mode)}; not closed for {seconds} in total" + (f": {cause}" if cause else "")
+            seconds = results["not_closed_s"]
+            return f"{mode_word(mode)}; not closed for {seconds:{'.1f' if seconds >= 1 else '.2g'}} s in total{cause}"
 
 
 def _sampling(results: dict[str, Any], name: str, instants: str = "") -> str:
@@ -158,9 +163,10 @@ def _wavefront_lines(results: dict[str, Any]) -> list[str]:
     """The lines with the true wavefront and the contrast; without a frame there are no values."""
     if not results["frames_published"]:
         return ["wavefront          no frame"]
+    partly = ", in part not closed" if 0 < results["closed_fraction"] < 0.5 else ""
     return [
         f"wavefront          residual {results['residual_rms_nm']:.2f} of {results['disturbance_rms_nm']:.2f} nm rms "
-        "over the open pupil, second half of the run, "
+        f"over the open pupil, second half of the run{partly}, "
         + _sampling(results, "residual_rms_nm", f"{results['instants_per_frame']} instants per frame; "),
         f"tilt per axis      residual {results['tilt_residual_mas']:.2f} of "
         f"{results['tilt_disturbance_mas']:.2f} mas rms, second half, " + _sampling(results, "tilt_residual_mas"),
@@ -172,10 +178,11 @@ def summary_text(results: dict[str, Any], lockstep_hz: float | None = None) -> s
     """The summary of a run as text; `lockstep_hz` as in `summary`."""
     command, mirror = (results["latency_us"][name] for name in ("frame_to_command", "frame_to_mirror"))
 
-    def percentiles(values: dict[str, float]) -> str:
+    def percentiles(values: dict[str, float], count: int) -> str:
         if not values["max"]:
             return "-"
-        return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in values.items())
+        known = {name: value for name, value in values.items() if count >= _LEAST.get(name, 1)}
+        return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in known.items())
 
     live = f"{results['rate_hz']:.1f} Hz" if results["rate_hz"] else "-"
     lines = [
@@ -186,8 +193,8 @@ def summary_text(results: dict[str, Any], lockstep_hz: float | None = None) -> s
         f"commands           {results['commands_applied']} applied, {results['commands_late']} after the start of the "
         "next exposure",
         *_wavefront_lines(results),
-        f"frame to command   {percentiles(command)}",
-        f"frame to mirror    {percentiles(mirror)}",
+        f"frame to command   {percentiles(command, results['frames_processed'])}",
+        f"frame to mirror    {percentiles(mirror, results['commands_applied'])}",
     ]
     if results["log"]:
         lines.append(
