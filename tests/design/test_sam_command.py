@@ -100,6 +100,7 @@ def test_interrupted_search_writes_its_best_and_resumes(blocks, uninterrupted, t
     load_layout(str(out))  # the best layout so far is valid
     text = program.render(result)
     assert f"--resume {result['resume']}" in text
+    assert " nm (monochromatic), which adds " in text
     assert "reproduced" not in text
     search, chains = read_state(tmp_path / "state.json", program.pupil_digest())
     assert search == search_with()

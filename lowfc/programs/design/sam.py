@@ -193,7 +193,7 @@ def render(result: dict[str, Any]) -> str:
                 fits = "  ".join(f"{modes} modes x {x:.3f} y {y:.3f}" for modes, (x, y) in tilts.items())
                 lines.append(f"    Table 4  {estimator:<9} {fits} mas")
             lines.append(
-                f"    weighted noise of 14 modes {predicted['noise_nm']:.3g} nm, which adds "
+                f"    weighted noise of 14 modes {predicted['noise_nm']:.3g} nm (monochromatic), which adds "
                 f"{predicted['contrast_noise']:.2e} of contrast; {predicted['quantum_share']:.1%} of the quantum limit"
             )
     lines.append(
