@@ -19,6 +19,7 @@ from lowfc.programs.cli import status
 from lowfc.programs.core.controller_report import Arrays, LastSecond, NotClosed, Offload
 from lowfc.programs.launch.status import screen, status_line, summary_text
 from lowfc.programs.launch.watch import Watch, summary
+from lowfc.programs.view.verdicts import wavefront_verdict
 from tests.support.toy import DARK_DN, GRID, SATURATION_DN, SHAPE, START, calibration, feed, frame, loaded, settings
 
 SETTINGS = settings()
@@ -197,9 +198,13 @@ def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None
     message = controller_state(loaded(SETTINGS), SETTINGS, (START + 12) * SECOND)
     watch = Watch({"camera": camera}, [])
     expected = "added to the dark zone's contrast: flat mirror +7.0e-10, residual -4.0e-11"
-    assert expected in status.text(status.json_object(message, {"camera": camera}))
-    assert expected in summary_text(summary(watch, record=False))
-    assert "  contrast -4.0e-11 of +7.0e-10  " in status_line(watch, 5.0)
+    quadratic = f"{expected}; quadratic form, valid to 3 nm of a mode"
+    assert quadratic in status.text(status.json_object(message, {"camera": camera}))
+    assert quadratic in summary_text(summary(watch, record=False))
+    assert "  contrast by quadratic form -4.0e-11 of +7.0e-10  " in status_line(watch, 5.0)
+    assert quadratic.removeprefix(expected) in wavefront_verdict.contrast(recent, now=True).detail
+    camera.wavefront.science_images = 200
+    assert f"{expected}; computed from full images of the true wavefront" in summary_text(summary(watch, False))
     for frames in (50, 0):  # without frames the controller's estimate is an old one
         controller = wire.Health(recent_wavefront=recent, last_second=wire.LoopFigures(frames=frames))
         assert (expected in status.text(status.json_object(message, {"controller": controller}))) == bool(frames)

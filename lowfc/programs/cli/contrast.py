@@ -8,6 +8,9 @@ import numpy as np
 from lowfc.arrays import Array
 from lowfc.optics.chain.added_contrast import ModalContrast, by_group, costliest
 
+QUADRATIC = "; quadratic form, valid to 3 nm of a mode"
+"""How the added contrast of a running loop is known: within 10 % for up to 3 nm rms of a mode (shaped pupil)."""
+
 
 def added_contrast(contrast: ModalContrast | None, covariance_nm2: Mapping[str, Array | None]) -> dict[str, Any] | None:
     """Contrast added by wavefronts with these covariances (modes, modes), by name; None where one is unknown.
@@ -47,13 +50,13 @@ def contrast_cases(added: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def contrast_in_words(
-    added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = ()
+    added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = (), how: str = ""
 ) -> str:
-    """The added contrast of each case, and the modes that contribute most to the last case."""
+    """The added contrast of each case, the modes that contribute most to the last case, and `how` it is known."""
     cases = ", ".join(f"{name} {value:+.1e}" for name, value in added.items() if value is not None)
     largest = "" if most is None else f"; {most[0]} contributes most ({100 * most[1]:.0f} %)"
     caveat = f"; full images differ from the quadratic form by more than 10 %: {', '.join(beyond)}" if beyond else ""
-    return f"added to the dark zone's contrast: {cases}{largest}{caveat}"
+    return f"added to the dark zone's contrast: {cases}{largest}{how}{caveat}"
 
 
 def added_contrast_in_words(result: Mapping[str, Any]) -> str:

@@ -13,7 +13,7 @@ from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, FRAME, Role, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.wording import counted, hertz, mode_word
-from lowfc.programs.cli.contrast import contrast_cases, contrast_in_words, costliest_modes
+from lowfc.programs.cli.contrast import QUADRATIC, contrast_cases, contrast_in_words, costliest_modes
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 SILENT_S = 2.0
@@ -63,7 +63,7 @@ def status_line(watch: Watch, elapsed_s: float, lockstep_hz: float | None = None
         return f"{elapsed_s:5.0f} s  {mode(controller)}  {silent}"
     frames, recent = topic_count(controller, FRAME.key), wavefront(camera.recent_wavefront)
     added = recent["added_contrast"]
-    contrast = "" if added is None else f"contrast {added['closed']:+.1e} of {added['open']:+.1e}  "
+    contrast = "" if added is None else f"contrast by quadratic form {added['closed']:+.1e} of {added['open']:+.1e}  "
     rate = _rate(f"{hertz(camera.rate_hz):>9}", camera.rate_hz, lockstep_hz)
     just_closed = _closed_for(controller, lockstep_hz or camera.mean_rate_hz)
     return (
@@ -156,7 +156,10 @@ def _contrast_lines(results: dict[str, Any]) -> list[str]:
         return []
     own = "" if results["dark_zone_contrast"] is None else f"coronagraph alone {results['dark_zone_contrast']:.1e}; "
     beyond = ("residual",) if results["beyond_quadratic"] else ()
-    return [f"contrast           {own}{contrast_in_words(contrast_cases(added), costliest_modes(results), beyond)}"]
+    how = QUADRATIC if results["beyond_quadratic"] is None else "; computed from full images of the true wavefront"
+    return [
+        f"contrast           {own}{contrast_in_words(contrast_cases(added), costliest_modes(results), beyond, how)}"
+    ]
 
 
 def _wavefront_lines(results: dict[str, Any]) -> list[str]:

@@ -17,7 +17,7 @@ from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
 
 IMAGE = "science/image"
-CONTRAST = Plot("science/contrast", "Mean contrast over 2 λ/D from the mask's edge, log10", width=1.6)
+CONTRAST = Plot("science/contrast", "Computed contrast, mean over 2 λ/D from the mask's edge, log10", width=1.6)
 _ZONE_WIDTH = 2.0
 """Width of the zone in which contrast is averaged, from the inner edge of the dark zone on, lambda / D."""
 

@@ -5,6 +5,7 @@ from math import hypot, sqrt
 
 from lowfc.contract.messages import wire
 from lowfc.contract.printable import printable
+from lowfc.programs.cli.contrast import QUADRATIC
 from lowfc.programs.cli.correction import Correction, correction
 from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.view.verdicts.run_state import RunState
@@ -56,9 +57,9 @@ def contrast(known: wire.WavefrontFigures, *, now: bool) -> Tile:
     """Tile CONTRAST: what the wavefront adds to the contrast of the dark zone; it has no threshold."""
     if not now:
         return Tile("CONTRAST", "?", "not measured now")
-    share = f"{short(printable(known.costliest_modes))} contributes most ({100 * known.costliest_share:.0f} %)"
+    share = f"most from {short(printable(known.costliest_modes))} ({100 * known.costliest_share:.0f} %)"
     flat = f"added to the dark zone; {known.added_contrast_flat:.1e} with a flat mirror"
-    return Tile("CONTRAST", f"{known.added_contrast:+.1e}", f"{flat}; {share}")
+    return Tile("CONTRAST", f"{known.added_contrast:+.1e}", f"{flat}; {share}{QUADRATIC}")
 
 
 def factor(residual_nm: float, open_nm: float, noise_nm: float) -> float:
