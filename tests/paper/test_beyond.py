@@ -52,6 +52,14 @@ def test_a_long_table_prints_selected_rows_and_agrees_with_simulation():
             assert row["measured"] <= 1.0001 * row["limit"]
 
 
+def test_a_tolerated_line_is_stated_by_its_rms():
+    lines = [row for row in committed("tolerance")["rows"] if row["quantity"].startswith("line of")]
+    assert lines
+    assert {row["assumption"] for row in lines} == {f"{tolerance.LOOP}\n{tolerance.LINE}"}
+    assert tolerance.LINE.startswith("Rms of a line")
+    assert "rms of a line in it" in " ".join(tolerance.ABOUT.split())
+
+
 def test_every_published_value_has_a_verdict_and_no_noise_is_below_the_quantum_limit():
     rows = committed("anchors")["rows"]
     verdicts = {(row["name"], row["quantity"]): row for row in rows if row["quantity"].startswith("verdict")}

@@ -38,7 +38,7 @@ _FRAMES_PER_TRIAL = 20  # times 1 / gain, the loop's time constant in frames: 10
 _SHOWN_NOLLS, _SHOWN_ENDS = (2, 4, 8, 11), tuple(f"V = {magnitude}, {SHOWN_CONTRAST:g}" for magnitude in (2, 5))
 _LARGEST = 6e-9  # contrast up to which the fourth order is fitted
 
-ABOUT = """Drift rate of one mode, and amplitude of a line in it, that add a contrast of 1e-9, 1e-10 or 1e-11: theory of
+ABOUT = """Drift rate of one mode, and rms of a line in it, that add a contrast of 1e-9, 1e-10 or 1e-11: theory of
 `lowfc/design/tolerance.py`, from the contrast's Hessian (and its fourth order, which matters for tilt) and the noise of
 a frame. `--json` has every mode, star and contrast; this page has four modes, two stars and 1e-10. Then twelve points
 by simulation, and a pair of stars as a coronagraph observes them: a reference of V = 2 and a target of V = 5 with
@@ -52,7 +52,10 @@ LOOP = (
     "over the dark zone. limit: the same with noise at the quantum limit."
 )
 DRIFT = "A random walk. For drift alone LQG equals the integrator of the best gain, unless margins bound the latter."
-LINE = f"A line at {LINE_HZ:g} Hz, {100 * LINE_WIDTH:g} % wide between half-power points; LQG has it in its model."
+LINE = (
+    f"Rms of a line at {LINE_HZ:g} Hz, {100 * LINE_WIDTH:g} % wide between half-power points; LQG has the line in its "
+    "model."
+)
 CHECK = (
     "predicted: the contrast that this drift should add; lowfc: residual variance of a simulated loop on noisy images, "
     "times the contrast per variance."
