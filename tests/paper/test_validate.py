@@ -103,6 +103,12 @@ def test_the_document_is_rendered_from_its_results(committed):
         assert table["plot"] is None or (DOCS / "pictures" / "paper" / table["plot"]).is_file()
 
 
+def test_the_least_scatter_of_tilt_is_stated_with_its_read_noise(committed):
+    notes = {row["assumption"] for row in committed["conditioning"]["rows"] if row["quantity"] == "least std of x tilt"}
+    assert notes == {conditioning.FIXED_STAR}
+    assert f"{conditioning.TABLE4_READ_NOISE_E:g} e- read noise" in conditioning.FIXED_STAR
+
+
 @pytest.mark.parametrize("name", ["table1", "photometry", "table2", "table3", "table4", "conditioning"])
 def test_a_table_of_one_sensor_agrees_with_the_committed_one(few, committed, name):
     others = {each[0] for each in compare(few[name], committed[name])}

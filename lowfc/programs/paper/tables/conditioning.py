@@ -30,7 +30,8 @@ HOLES = (0.09, 0.08, 0.07, 0.06, 0.05, 0.04, 0.03)
 MONOCHROMATIC = "H at the central wavelength, per nm rms of each mode over the full circle."
 FIXED_STAR = (
     f"Cramer-Rao bound at the central wavelength: V = {STAR.magnitude}, {STAR.diameter_m:g} m, {TABLE4_EXPOSURE_S} s, "
-    "our own masks. Smaller holes are better conditioned but noisier: the condition number ignores the light."
+    f"{TABLE4_READ_NOISE_E:g} e- read noise, our own masks. Smaller holes are better conditioned but noisier: the "
+    "condition number ignores the light."
 )
 NOISE = (
     f"Cramer-Rao bound, all 14 modes fitted, root of the sum of their variances, no read noise: V = {STAR.magnitude}, "
