@@ -151,7 +151,8 @@ def reconstructor(
     """R (modes, pixels) from normalised I0 and H: error = R (I - I0), the least-squares solution of eq. (11).
 
     `weighted` is (H' W H)^-1 H' W with W = 1 / (I0 + read_noise^2) in electrons, the unbiased linear estimate with the
-    least noise; `pinv` weights all pixels equally. Bad pixels have zero weight.
+    least noise, apart from the noise of the flux by which a frame is divided; `pinv` weights all pixels equally. Bad
+    pixels have zero weight.
 
     Args:
         reference: (pixels,) I0, normalised.

@@ -62,11 +62,13 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
     """One frame (rows, columns) in DN.
 
     Electrons are drawn from the Poisson distribution. Multiplication draws from the gamma distribution of a long
-    register, whose excess noise doubles the variance of the photons.
+    register at a high gain, whose excess noise doubles the variance of the photons. At a gain g the factor is about
+    2 - 1 / g.
 
     If `noise_table_of` returns a table, it yields the digital numbers of pixels with a mean below `FAINT_E` electrons.
     Their distribution is exact at means that are multiples of 1/64 electron. Between these the mean is exact and the
-    variance too large by at most 6e-5 electrons squared, which a chi-square test of a million draws does not detect.
+    variance too large by at most 6e-5 electrons squared. A chi-square test of a million draws does not detect this from
+    a read noise of half an electron on; with less, two electrons in a pixel with a mean near 0.005 are too frequent.
 
     Args:
         detector: The detector.
