@@ -27,7 +27,7 @@ class Answer(NamedTuple):
 
     @property
     def frame(self) -> int:
-        """Number of the first frame in force, counted from its camera's start."""
+        """Number, counted from its camera's start, of the first frame for which the request is in force."""
         return count_of(self.frame_sequence)
 
     @property

@@ -12,10 +12,10 @@ from lowfc.control.loop.interlocks import Value
 
 
 def bench_message(name: str, value: Value, time_ns: int) -> bytes:
-    """Encode a device's value, measured at this time, as a BenchValue.
+    """Encode a device's value, measured at `time_ns`, as a BenchValue.
 
     Raises:
-        ConfigurationError: its name or the value is invalid.
+        ConfigurationError: the name or the value is invalid.
     """
     if not isinstance(name, str) or not re.fullmatch(BENCH_NAME, name):
         raise ConfigurationError(

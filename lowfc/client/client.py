@@ -120,7 +120,7 @@ class Client:
         """Leave the run; the loop continues unchanged."""
         if self._own_bus is not None:
             self._own_bus.close()
-            self._bench.clear()  # so that `bench` raises BusError: publishers of a closed bus raise zenoh's error
+            self._bench.clear()  # a new publisher on the closed bus raises BusError, an old one would raise zenoh's
 
     status = _plain("status")
     open_loop = _plain("open")
@@ -158,8 +158,8 @@ class Client:
     def channel(self, name: str, actuators_nm: npt.ArrayLike | None = None) -> Answer:
         """Add a shape to the mirror, (rows, columns) nm of surface, as channel `name`; None removes the channel.
 
-        The sensor's zero point shifts with the shape, so that the loop does not undo it; the channel "flat" shifts
-        nothing.
+        The sensor's zero point shifts with the shape, so that the loop does not undo it; the channel "flat" does not
+        shift the zero point.
         """
         shape = floats("channel", () if actuators_nm is None else actuators_nm)
         if actuators_nm is not None and shape.shape != self.mirror_grid():
@@ -187,7 +187,7 @@ class Client:
         """Play a probe sequence of the loop's target: (frames, modes), nm rms of wavefront, added frame by frame."""
         table = floats("play", table_nm)
         if table.ndim != 2:
-            raise RequestRefusedError(f"play refused: it takes a table (frames, modes), got an array of {table.shape}")
+            raise RequestRefusedError(f"play refused: it takes a table (frames, modes), got shape {table.shape}")
         return self.ask("play", text=OFFSET, table=table)
 
     def load(self, calibration: Calibration) -> Answer:
@@ -241,7 +241,7 @@ class Client:
         try:
             yield
         finally:
-            with contextlib.suppress(LowfcError):  # it expires anyway
+            with contextlib.suppress(LowfcError):  # the hold expires anyway
                 self.ask("release", lease_id=identity)
 
     def bench(self, name: str, value: Value) -> None:
@@ -270,7 +270,7 @@ class Client:
 
     def calibration(self) -> Calibration:
         """The calibration in use; BusError if there is none, or the answer is not a calibration."""
-        # Without one in use, the last published one may be one that was refused.
+        # While no calibration is in use, the last published one may be one that the controller refused.
         if not self._get_message(CONTROLLER_STATE, wire.ControllerState, Role.CONTROLLER).calibration_id:
             remedy = "`lowfc ctl load FILE` loads one, `lowfc commission` measures one"
             raise BusError(f"no calibration is loaded in run {self.run_id!r}: {remedy}")
@@ -313,7 +313,7 @@ class Client:
         return published.laws
 
     def frames(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Frame]:
-        """Stream sensor images from now on, `count` of them or without end; BusError without one for `patience_s`."""
+        """Stream sensor images from now on, `count` of them or without end; BusError if none comes for `patience_s`."""
         return Stream(self._bus.ring(FRAME, WAITING), frame_of, "frame", count, patience_s)
 
     def steps(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Step]:
@@ -337,7 +337,7 @@ class Client:
         calibration: Calibration | None = None,
         lease_id: int | None = None,
     ) -> Answer:
-        """Send any request to the controller, with the fields of `lowfc.v1.Request`: values (modes,), actuators nm.
+        """Send any request, with the fields of `lowfc.v1.Request`: `values` (modes,), `actuators_nm` in nm of surface.
 
         Raises:
             BusError: no controller is running, or it is too slow.

@@ -12,12 +12,12 @@ from lowfc.contract.errors import BusError
 from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
 
 INTERRUPTIONS = ("COMMAND_EXPIRED ", "NO_FRAMES ")
-"""Starts of the events after which the mirror is no longer where a probe sequence puts it."""
+"""First words of the events after which the mirror is no longer where a probe sequence puts it."""
 _POLL_S = 0.002
 
 
 class MirrorWatch:
-    """States of a run's mirrors received since construction, which returns after the first one.
+    """States of a run's mirrors received since construction; construction waits for the first state.
 
     Attributes:
         applied: frame sequences of the last applied commands, each with the time of the mirror's report, ns of the
@@ -33,7 +33,7 @@ class MirrorWatch:
         self.applied: deque[tuple[int, int]] = deque(maxlen=WAITING)
         self._events: Ring = bus.ring(EVENT, WAITING)
         self._states: Ring = bus.ring(MIRROR_STATE, WAITING)
-        # by name: start of its process, frame of its command, whether it follows commands
+        # by name of the mirror: start of its process, frame of its command, whether it follows commands
         self._mirrors: dict[str, tuple[int, int, bool]] = {}
         deadline_s = time.monotonic() + SILENT_S
         self.read()

@@ -15,8 +15,8 @@ class Declaration(NamedTuple):
     Attributes:
         key: key of the query.
         fields: fields of the message, with their content.
-        description: what it does.
-        example: an example of its command, as after `lowfc ctl`; empty if it has none.
+        description: what the request does.
+        example: an example of its command, as after `lowfc ctl`; empty if the request has no command.
     """
 
     key: str
@@ -75,15 +75,15 @@ DECLARED: tuple[Declaration, ...] = (
     _declared(
         "channel",
         "Add a shape to the mirror, and shift the sensor's zero point with it so that the loop does not undo it; "
-        "`flat` shifts nothing.",
+        "the channel `flat` does not shift the zero point.",
         "channel dark-hole shape.fits",
         ("text", "name: up to 32 of a-z, 0-9 and -, a letter first"),
         ("actuators", "float32, nm of surface, rows x columns; empty removes the channel"),
     ),
     _declared(
         "play",
-        "Play a probe sequence, one row of a table per frame, beginning with the frame in the answer, unknown to the "
-        "control law; it ends by itself.",
+        "Play a probe sequence, unknown to the control law: one row of a table per frame, from the frame in the answer "
+        "to the end of the table.",
         "",
         ("text", "`mirror` or `offset`"),
         ("table", "float32, frames x columns: factors of the shapes, or nm rms of wavefront of each mode"),

@@ -46,7 +46,10 @@ def the_run(name: str | None) -> str:
 
 
 def _silent_routers(name: str | None) -> str:
-    """Clauses on the routers of stored runs, or of the one of that name, for runs that are not live."""
+    """Say of each stored run with a router, or of run `name` alone, that its router does not answer.
+
+    Call it only for runs that are not live.
+    """
     clauses = []
     for run in _stored():
         with contextlib.suppress(BusError, DataFileError, OSError):

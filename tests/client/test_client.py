@@ -360,15 +360,16 @@ def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., 
         the_run("ngiht")
     with pytest.raises(BusError, match="there is no run 'nnn"):
         the_run("n" * 300)  # longer than any file's name
-    open_run("noo")  # which is stopped: the request is not for another run
+    open_run("noo")  # a stopped run: its name must not select the run "noon"
     with pytest.raises(BusError, match="there is no run 'noo'"):
         the_run("noo")
 
 
 def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With its owner, its process and, if readable, its runtime directory.
+    """The report has the loop's owner, its process and, if readable, its runtime directory.
 
-    A loop of the same user in the same directory is starting. A shell with a loop's command as arguments is no loop.
+    A loop of the same user in the same directory is reported as starting. A shell that has a loop's command as
+    arguments is not reported.
     """
     name = f"night-{os.getpid()}"
     words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", name]
@@ -582,7 +583,7 @@ def test_a_bench_value_arrives_unchanged(controller: FakeController, loop: Clien
             loop.bench(name, wrong)
 
 
-# The declaration, the document and the command line.
+# The table of requests and the command line.
 
 
 def test_the_declared_requests_match_the_implemented_ones() -> None:
@@ -657,13 +658,14 @@ def test_the_status_shows_the_whole_state() -> None:
     assert text(shown).splitlines()[-1].endswith("abc, provisional: from the first steps of commissioning")
     assert json_object(wire.ControllerState())["mode"] == "starting"
     assert "provisional" not in text(json_object(wire.ControllerState(calibration_id="abc")))
-    later = wire.ControllerState(mode=9, refused=40, limits_hit=[41], counts=[wire.ReasonCount(reason=42, count=3)])
-    shown = json_object(later)
+    counts = [wire.ReasonCount(reason=42, count=3)]
+    of_a_newer_version = wire.ControllerState(mode=9, refused=40, limits_hit=[41], counts=counts)
+    shown = json_object(of_a_newer_version)
     assert [shown[key] for key in ("mode", "refused", "limits_hit", "counts")] == ["mode 9", "40", ["41"], {"42": 3}]
     assert "reason 42 3 times" in text(shown)
 
 
-# The recorder's switch.
+# Start and stop of recordings.
 
 
 @pytest.fixture
@@ -676,7 +678,7 @@ def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
     put(bench.controller.publisher(CALIBRATION), 1)
     states = bench.camera.publisher(CAMERA_STATE)
     frames = bench.camera.publisher(FRAME)
-    # One frame of each recording: the first has frames 0 to 49, the second begins with frame 90.
+    # Lose one frame of each recording: the first has frames 0 to 49, the second begins with frame 90.
     bench.hub.lose = lambda role, key, envelope: (
         role == "recorder" and key == FRAME.key and count_of(envelope.sequence) in (5, 95)
     )
@@ -707,7 +709,7 @@ def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
     summary = bench.stop()
     assert [path.absolute() for path in summary.files] == [stopped, Path(started.text)]
     read = list(LogReader(summary.files[1]))
-    assert [message.key for message in read[:2]] == [CALIBRATION.key, CAMERA_STATE.key], "with the latest state"
+    assert [message.key for message in read[:2]] == [CALIBRATION.key, CAMERA_STATE.key], "a log begins with these"
     assert bodies_of(read, FRAME) == second[:5] + second[6:]
     assert "RECORDING recording" in [Log.FromString(body).message for body in bodies_of(read, EVENT)]
     assert (summary.lost, summary.failure) == ({FRAME.key: 2}, ""), "messages while stopped do not count as lost"
