@@ -31,7 +31,7 @@ configured = partial(configuration, BRIGHT)
 FEW = {"sensor.modes": 3}
 """Few modes give short cycles, for tests that do not depend on the number of modes."""
 NOISELESS = FEW | {"camera.noise": False}
-"""Without noise a frame takes half the time, for tests that do not depend on it."""
+"""For tests that do not depend on noise: without it, computing a frame takes half the time."""
 
 
 @pytest.fixture(autouse=True)
@@ -103,7 +103,7 @@ def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, 
         assert np.allclose(scaled.actuators_to_modes, calibration.actuators_to_modes, atol=1e-3)
     assert calibration.id != before.id
     assert calibration.estimator == f"weighted+{method}"
-    # A calibration measured with the provisional one of commissioning as the initial one is not provisional itself.
+    # The fit may start from the provisional R of a commissioning; the calibration is then not provisional itself.
     from_first = data.measured._replace(initial=data.measured.initial._replace(estimator=f"weighted+{method}+first"))
     assert not measured_calibration(config, before, from_first, CalibrationRequest(method, OUT, 50.0))[0].provisional
 
@@ -111,7 +111,7 @@ def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, 
 def closed_residual_nm(
     config: Configuration, calibration: Calibration, frames: int, world: Configuration
 ) -> np.ndarray:
-    """True residual (frames, modes) of the second half of a closed loop."""
+    """True residual (frames, modes) in the second half of `frames` frames of a closed loop in a simulated `world`."""
     loop = InProcessLoop(config, calibration, world)
     loop.close_loop()
     loop.run(frames)
@@ -147,13 +147,13 @@ def test_a_mirror_with_dead_actuators_and_misregistration_is_calibrated_and_clos
 
 
 def test_the_loop_holds_a_zero_point_that_is_not_flat() -> None:
-    state = {"3": -10.0, "4": 15.0}
+    zero_point_nm = {"3": -10.0, "4": 15.0}
     config = configured(**NOISELESS)
-    loop = InProcessLoop(config, world=configured(**NOISELESS, disturbance__static_nm=state))
+    loop = InProcessLoop(config, world=configured(**NOISELESS, disturbance__static_nm=zero_point_nm))
     calibration, _ = calibrated(loop, "hadamard")
     zero = loop.residual_nm(0, 1)[0]
-    moved_by_20_nm = configured(**NOISELESS, disturbance__static_nm={"2": 20.0, "3": -10.0, "4": 35.0})  # from `state`
-    difference = closed_residual_nm(config, calibration, 200, moved_by_20_nm).mean(axis=0) - zero
+    moved = configured(**NOISELESS, disturbance__static_nm={"2": 20.0, "3": -10.0, "4": 35.0})  # Z2 and Z4 by 20 nm
+    difference = closed_residual_nm(config, calibration, 200, moved).mean(axis=0) - zero
     assert np.abs(difference).max() < 0.02 * 20.0
 
 
@@ -276,7 +276,7 @@ def test_a_sequence_during_a_device_restart_is_stopped_at_once_and_repeated() ->
         assert re.search(why, report)
     assert (len(loop.begun), loop.stops) == (1 + 4 + 4, 4)
     for play in faults:
-        assert loop.begun[play] < loop.begun[play - 1] + 80, "the sequence did not stop at the fault"
+        assert loop.begun[play] < loop.begun[play - 1] + 80, "a sequence ends soon after the fault, 50 frames in"
     assert np.abs(cross_talk(loop.calibration().reconstructor, data.measured.response)).max() < 0.05
 
 

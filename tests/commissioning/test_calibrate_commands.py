@@ -59,7 +59,7 @@ def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
 
 @pytest.fixture
 def noiseless_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
-    """The same without noise, so that a frame takes half the time, and with a slew limit that shrinks the pokes."""
+    """Like `loop`, but without noise, so that a frame takes half the time, and with a slew limit that shrinks pokes."""
     monkeypatch.chdir(tmp_path)
     config = load(None, CONFIG | {"control.max_identical_frames": 0, "safety.slew_nm": 5.0})
     return connected(InProcessLoop(config, world=load(None, STATIC | {"camera.noise": False})), monkeypatch)
@@ -178,7 +178,7 @@ def test_cycles_that_are_not_kept_are_not_reported(
 def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """First with a faint star; then its image also moves before R is checked, which the verdict reports too."""
+    """First the star is faint; then its image also moves before R is checked, and the verdict reports both."""
     monkeypatch.chdir(tmp_path)
     loop = connected(InProcessLoop(load(None, CONFIG | {"star.magnitude": 3.0})), monkeypatch)
     before = loop.calibration()
@@ -322,7 +322,7 @@ def test_a_poke_resolves_the_rotation_by_180_degrees(noiseless_loop: InProcessLo
 
 
 def test_no_calibration_is_aligned_to_a_turned_mirror(loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A poke of tip is one of tilt: its image has no correlation with the computed one, so the sign says nothing."""
+    """A poke of tip makes tilt, so its image does not correlate with the computed one and cannot show the sign."""
     play = loop.play
 
     def turned(basis_nm: Any, table: Any) -> Any:
@@ -452,7 +452,7 @@ def test_a_comparison_of_different_sensors_and_a_missing_directory_are_refused(l
 
 
 def test_two_calibrations_are_compared_on_the_pixels_that_are_good_in_both() -> None:
-    """A star on the same sensor, with dead pixels in one of the calibrations."""
+    """Both calibrations are for the same star and sensor; in one of them some pixels are dead."""
     first = toy.calibration()
     good = np.ones(first.good.size)
     good[np.argsort(-first.reference)[[2, 7, 11, 20, 33]]] = 0
@@ -491,14 +491,14 @@ def test_the_option_at_takes_a_mirror_shape_for_the_wavefront_that_it_makes(
     command_nm[[flat.noll.index(4), flat.noll.index(7)]] = 20.0, -20.0
     np.save(tmp_path / "shape.npy", (flat.modes_to_actuators @ command_nm).reshape(flat.grid))
     shaped = analytic(config, SILENT, zero_point(config, str(tmp_path / "shape.npy"))[1])
-    moved = at_zero_point.reference - flat.reference
-    assert np.linalg.norm(shaped.reference - at_zero_point.reference) < 0.1 * np.linalg.norm(moved)
+    change = at_zero_point.reference - flat.reference
+    assert np.linalg.norm(shaped.reference - at_zero_point.reference) < 0.1 * np.linalg.norm(change)
     assert at_zero_point.id != flat.id
     assert at_zero_point.operator_hash == flat.operator_hash
     identity = np.eye(len(flat.noll))
     assert np.abs(at_zero_point.actuators_to_modes @ at_zero_point.modes_to_actuators - identity).max() < 1e-4
-    changed = at_zero_point.response - flat.response
-    assert np.linalg.norm(shaped.response - at_zero_point.response) < 0.1 * np.linalg.norm(changed)
+    change = at_zero_point.response - flat.response
+    assert np.linalg.norm(shaped.response - at_zero_point.response) < 0.1 * np.linalg.norm(change)
 
 
 def test_the_noise_of_a_mode_is_compared_with_its_own_limit(config: Configuration) -> None:
@@ -513,7 +513,7 @@ def test_a_mirror_that_does_not_span_the_pupil_causes_a_warning() -> None:
     analytic(load(None, {"mirror.rows": 8, "mirror.columns": 8, "sensor.modes": 6}), Console(file=printed, width=400))
     assert "8 x 8 actuators at 31 pitches per pupil make at most" in printed.getvalue()
     printed = StringIO()
-    for limits in ({}, {"control.limit_nm": 1e5, "control.tilt_limit_nm": 1e5}):  # the latter are no limits
+    for limits in ({}, {"control.limit_nm": 1e5, "control.tilt_limit_nm": 1e5}):  # or limits that never act
         analytic(load(None, SMALL_MIRROR | limits), Console(file=printed))
     assert not printed.getvalue()
 

@@ -44,7 +44,10 @@ class Outcome(NamedTuple):
 
 
 def true_response(loop: InProcessLoop, first: int, *, closed: bool) -> np.ndarray:
-    """Computed H (pixels, modes) at the mirror's mean shape since frame `first`; averaged over the run in open loop."""
+    """Computed H (pixels, modes) at the mirror's mean shape since frame `first`.
+
+    In open loop it is averaged over the moving part of the disturbance, too.
+    """
     before, config, scene = loop.calibration(), loop.config, loop.scene
     optics = factory.twin(config, None, lambda _: None)
     mirror = factory.mirror_on_twin(config, optics, lambda _: None)
@@ -84,7 +87,7 @@ def outcome(method: str, preset: str, seed: int, snr: float, folder: Path, modes
 
 
 def assert_accurate(result: Outcome, snr: float) -> None:
-    """A good verdict, cross-talk of at most 1.2 / snr rms and 4 / snr at the largest, at most 1.5 times the noise."""
+    """Expect no faults, cross-talk below 1.2 / snr rms and 4 / snr at most, and noise below 1.5 times the computed."""
     assert not result.verdict.faults
     rms, largest = np.sqrt((result.talk**2).mean()), np.abs(result.talk).max()
     assert rms * snr < 1.2

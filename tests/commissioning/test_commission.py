@@ -119,7 +119,7 @@ def test_commissioning_closes_a_loop_with_another_frame_size(commissioned: tuple
     assert list(state.automatic) == [True, True, False]
     calibration = calibration_file.load(bench.out)
     assert calibration.shape == (64, 64)
-    modelled = computed(DISTURBED.to_toml()).actuators_to_modes  # also of shapes outside the modes
+    modelled = computed(DISTURBED.to_toml()).actuators_to_modes  # for all shapes, not for the modes' alone
     assert np.linalg.norm(calibration.actuators_to_modes - modelled) < 0.2 * np.linalg.norm(modelled)
     assert calibration.saturation_dn == 2**14 - 1
     assert not provisional_path(bench.out).exists()
@@ -164,7 +164,7 @@ def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench,
         bench.commissioning()._measured_nm(10, 1, 1.0)
     bench.actions.clear()
     errors_nm = np.where(np.arange(2000) == 1500, np.nan, 1.0)[:, None]
-    assert commissioning._rms_nm(errors_nm, 1000) == 1.0, "a refused frame does not end the measurement, also at 1 kHz"
+    assert commissioning._rms_nm(errors_nm, 1000) == 1.0, "one refused frame is left out"
 
 
 @pytest.mark.parametrize("reversed_modes", [[0], [0, 1, 2]])
@@ -220,7 +220,7 @@ def test_a_given_number_of_cycles_changes_only_the_default_signal_to_noise_ratio
 
 
 @pytest.mark.parametrize(("noise", "poked"), [(0.0, [1]), (0.3, [])], ids=["the configured sensor", "another"])
-def test_tilt_is_poked_for_a_reflection_if_the_sensor_is_the_configured_one(noise: float, poked: list[int]) -> None:
+def test_tilt_is_poked_to_find_a_reflection_unless_the_sensor_is_another_one(noise: float, poked: list[int]) -> None:
     config = Configuration.model_validate({**tomllib.loads(TOML), "sensor": {"kind": "clowfs", "modes": 3}})
     first, geometry = computed(config.to_toml()), Geometry(1.0, 40.2, 39.5, 12.0, -1)
     H = onto(first.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
@@ -286,7 +286,7 @@ def test_a_commissioning_is_not_resumed_with_other_modes_or_commands(tmp_path: P
     bench, same = Bench(tmp_path, NOISELESS), computed(NOISELESS.to_toml())
     for other in (computed(CONFIG.to_toml()), identified(replace(same, modes_to_actuators=-same.modes_to_actuators))):
         calibration_file.save(other, provisional_path(bench.out))
-        with pytest.raises(CalibrationError, match="other modes, or commands of the mirror, than the configuration"):
+        with pytest.raises(CalibrationError, match="other modes or mirror commands than the configuration"):
             bench.commission(resume=True)
 
 
@@ -301,7 +301,7 @@ def test_a_failed_commissioning_restores_the_previous_calibration(commissioned: 
         assert bench.loop.calibration().id == before
         assert why in bench.reports[-1]
     bench.actions.clear()
-    assert not partial_of(bench.out).exists(), "cycles of a former commissioning"
+    assert not partial_of(bench.out).exists(), "a new commissioning removes the cycles of a former one"
 
 
 def test_a_finished_commissioning_cannot_be_resumed(commissioned: tuple[Bench, dict[str, Any]]) -> None:
@@ -387,7 +387,7 @@ def test_an_existing_calibration_is_replaced_only_with_force(own_runtime: Path) 
     out.write_text("mine")
     assert "already exists" in refusal("commission", "--no-dark", "--out", out, kind=DataFileError)
     for option in ("--force", "--resume"):
-        refusal("commission", "--no-dark", "--out", out, option, kind=BusError)  # of a connection without a loop
+        refusal("commission", "--no-dark", "--out", out, option, kind=BusError)  # there is no loop to join
     assert out.read_text() == "mine"
 
 

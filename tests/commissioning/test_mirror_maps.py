@@ -213,7 +213,7 @@ def test_the_flat_map_is_applied_at_the_start(tmp_path: Path, calibration: Calib
 def test_the_flat_map_is_applied_during_a_permit_from_before_the_mirror_was_known(
     tmp_path: Path, calibration: Calibration, age_s: int
 ) -> None:
-    """If the request were refused, the controller would end: the loop would be without its configured flat map."""
+    """If the request were refused, the controller would end, as it does not run without its configured flat map."""
     config = load(None, {"mirror.flat": saved(tmp_path, "flat.npy", wavy(120.0))})
     settings = factory.settings(config)
     state, _ = feed(settings, State(), Load(0, calibration, "test"), PERMIT)

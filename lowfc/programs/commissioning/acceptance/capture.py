@@ -102,7 +102,7 @@ def removed(trial: ProbeResponse) -> bool:
 
 
 def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> CaptureResult:
-    """Evaluate the capture range of each tested mode; AcceptanceError if there is none, or the loop was disturbed."""
+    """Evaluate the capture range of each tested mode; AcceptanceError without a trial, or if the loop was disturbed."""
     if not trials:
         raise AcceptanceError("the gains of the tested modes are zero: they have no capture range")
     modes = []

@@ -98,13 +98,13 @@ def capture_range(
 def noise_floor(
     context: typer.Context,
     logs: LogsIfAny = None,
-    duration: Annotated[float, typer.Option(min=0.01, max=1e5, help="Seconds in open loop and in closed loop.")] = 10.0,
+    duration: Annotated[float, typer.Option(min=0.01, max=1e5, help="Seconds of each of the two recordings.")] = 10.0,
     config: Required = None,
     run: AnyRun = None,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure the white noise of each mode, and compare it with photon and read noise.
+    """Record the open and the closed loop, and compare the white noise of each mode with photon and read noise.
 
     Example: lowfc acceptance noise-floor --duration 10
     """
@@ -142,7 +142,7 @@ def _carry_out(
                 raise ConfigurationError(f"{option} is for a test of a running loop, but a log is evaluated: omit it")
     required = {} if config is None else {"acceptance": configuration(config).acceptance}
     require_folder(plot)
-    # an error now rather than after the test if matplotlib is missing
+    # if matplotlib is missing, the error comes before the test, not after it
     figure = None if plot is None else figure_class()(figsize=(10, 5), layout="constrained")
     if logs:
         log = WholeLog(named_log(logs), skip_damaged=True)

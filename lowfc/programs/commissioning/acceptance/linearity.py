@@ -66,7 +66,7 @@ class LinearityResult(AcceptanceResult):
     modes: list[LinearityMode] = result_field("modes")
 
     def remarks(self) -> Sequence[str]:
-        """Explain the marks; the verdict."""
+        """Key to the marks, and the verdict."""
         key = f"amplitude, nm: gain - 1 (largest cross-talk); !: beyond the requirement by {SURE:g} standard errors"
         unsure = any(row.within is None for mode in self.modes for row in mode.levels)
         noisy = ["?: too noisy to judge; use more cycles or longer levels"] if unsure else []
@@ -148,7 +148,7 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> L
 def _levels(stairs: Array, averaged: int) -> tuple[Array, Integers]:
     """Levels (levels,) of a staircase (frames,), and the first of the last `averaged` frames (levels,) at each."""
     edges = np.flatnonzero(np.diff(stairs, prepend=np.nan, append=np.nan))
-    hold = min(frames for frames in np.diff(edges).tolist() if frames > 1)  # a value between levels lasts for one
+    hold = min(frames for frames in np.diff(edges).tolist() if frames > 1)  # values between levels last one frame
     starts = np.concatenate([np.arange(at, end - hold + 1, hold) for at, end in pairwise(edges)])
     starts = starts[stairs[starts] != 0]  # the staircase ends at zero
     return stairs[starts], starts + hold - averaged

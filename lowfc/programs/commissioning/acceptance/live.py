@@ -54,7 +54,7 @@ class Live:
         try:
             yield
         finally:
-            self.client.check_lease()  # raises if another operator ended it: the loop is left to them
+            self.client.check_lease()  # raises if another operator ended the lease: the loop is left to them
             self.client.stop()
             now = LoopMode(self._state().mode)
             if now in (LoopMode.OPEN, LoopMode.CLOSED) and now is not self._initial_mode:
@@ -113,7 +113,7 @@ class Live:
                 self._done += frames
                 return response
             now = LoopMode(self._state().mode)
-            if now is not mode:  # an interlock, for example: the loop is not closed again
+            if now is not mode:  # changed by an interlock, for example: the loop is not closed again
                 raise AcceptanceError(f"{interruption} during the measurement, and the loop is {now.in_words} now")
             self._report(f"{kind}: {interruption} during a probe sequence, which is repeated")
             self.wait(self.loop.settling_frames())
@@ -144,7 +144,7 @@ class Live:
             passed = step.frame_sequence - first + 1
             self._progress(self._done + passed, max(self._expected, self._done + frames))
             if step.mode is not mode or set(step.reasons) & set(LIMITS) or (columns and watch.interruption):
-                break  # `judge` reports the cause, `play` an interruption
+                break  # `play` reports an interruption, `judge` any other cause
         steps.close()
         after = self._state()
         if [getattr(before, name) for name in _LAW_FIELDS] != [getattr(after, name) for name in _LAW_FIELDS]:

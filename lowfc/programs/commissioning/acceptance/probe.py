@@ -194,7 +194,7 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
                 f"{path}: ends {cut} of {frames} frames before the end of a measurement ({', '.join([kind, *named])}): "
                 "give all files of the log, or measure again"
             )
-        request_ns = from_timestamp(request.timestamp)  # not the frame: a state after a `clear` has none
+        request_ns = from_timestamp(request.timestamp)  # states are selected by time: one after a `clear` has no frame
         states = [state for state in history.controllers if len(state.gain) == modes]
         before = [state for state in states if from_timestamp(state.timestamp) <= request_ns]
         if not before:

@@ -34,7 +34,7 @@ MIN_JUDGED = 0.5
 
 The noise transfer has no such limit: where it is small, it is below the measurement noise.
 """
-_LEAD_FRAMES = 50  # in addition to the settling time: until the bus delivers the first steps
+_LEAD_FRAMES = 50  # played before the measured period, besides the settling time: the bus delivers the first steps late
 
 
 class Comparison(Result):
@@ -100,8 +100,8 @@ def play(
 ) -> list[ProbeResponse]:
     """Play a multisine in closed loop; AcceptanceError if its lines do not fit into the duration.
 
-    It is added to the loop's offset. With a law on pseudo-open-loop modes it is added to the mirror, because such a law
-    responds to an offset differently than to a disturbance.
+    The multisine is added to the loop's offset; with a law on pseudo-open-loop modes it is added to the mirror, because
+    such a law responds to an offset differently than to a disturbance.
 
     Args:
         live: The loop, and the requirements in its configuration.

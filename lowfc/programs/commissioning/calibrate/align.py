@@ -128,7 +128,7 @@ def oriented(
 ) -> tuple[Alignment, Calibration, float]:
     """Choose the orientation that fits pokes of tip, and of tilt if needed, among those that the image allows.
 
-    `poke` measures the response to a mode, by its place; other arguments as for `on_sensor`.
+    `poke` measures the response to a mode, given its index; other arguments as for `on_sensor`.
 
     Returns:
         The alignment, its calibration, and the mean correlation of the measured responses with the computed ones.
@@ -141,7 +141,7 @@ def oriented(
         calibration = on_sensor(config, computed, geometry, flux_dn, before)
         return float(np.mean([correlation(responses[k], calibration.response[:, k]) for k in modes])), calibration
 
-    if alignment.circular:  # the correlation with the responses to tip and tilt is a cosine of the rotation
+    if alignment.circular:  # the responses' correlation is a cosine of the rotation: two values give its maximum
         orientations = [
             each.rotated(float(np.degrees(np.arctan2(scored(each.rotated(90))[0], scored(each)[0]))))
             for each in orientations[::2]

@@ -151,13 +151,13 @@ def check_size(shape: tuple[int, ...], before: Calibration) -> None:
 
 
 def warn_of_additions(loop: Client, report: Report) -> None:
-    """Report the offset and the channels that a new reference image contains, as a loop with it adds them again."""
+    """Warn of an offset and channels that a new reference image contains: a loop with this image adds them again."""
     state = loop.status().state or wire.ControllerState()
     added = [f"channel {channel.name}" for channel in state.channels if channel.shifts]
     added += ["the offset"] * any(state.offset_nm)
     if added:
         report(
-            f"warning: the new reference image contains {', '.join(added)}, and a loop with it adds them again: "
+            f"warning: the new reference image contains {', '.join(added)}; a loop with this image adds them again: "
             "set the offset to zero, and remove the channels, or keep their shapes on the channel flat"
         )
 
@@ -192,7 +192,7 @@ def _checked_mode(loop: Client, step: Step, before: LoopMode | None, *, over: bo
 
 
 def _commanded(step: Step) -> bool:
-    """Whether the mirror received the next row with this step; unless closed, also if the frame was not measured."""
+    """Whether the mirror received the next row with this step; in open loop also if the frame was not measured."""
     return step.error_nm is not None or (step.mode is not LoopMode.CLOSED and step.reasons[0] in UNMEASURED)
 
 

@@ -51,7 +51,7 @@ class CalibrationData(NamedTuple):
 
 
 class Calibrator:
-    """One calibration of a running loop; afterwards the mirror returns to its shape.
+    """One calibration of a running loop; afterwards the mirror returns to its former shape.
 
     Attributes:
         config: configuration of the loop.
@@ -71,7 +71,7 @@ class Calibrator:
             request: The requested calibration.
             report: Receives messages for the user.
             progress: Receives the number of frames done and in total.
-            computed: The computed calibration, used for R if its pixels are the loop's.
+            computed: The computed calibration; its R may start the fit, if it has the loop's frame size and modes.
         """
         self._loop = loop
         self._request = request
@@ -121,7 +121,7 @@ class Calibrator:
             yield
         except BaseException:
             try:
-                self._loop.check_lease()  # if another operator ended it, leave the loop to them
+                self._loop.check_lease()  # raises if another operator ended the lease: the loop is left to them
                 self._loop.close_loop()
             except LowfcError as fault:  # the first fault is the one that is raised
                 self._report(f"warning: the loop was not closed again: {fault}")
@@ -151,12 +151,12 @@ class Calibrator:
 
     @property
     def _quietest_mode(self) -> int:
-        """Index of the mode with the lowest noise; not tip or tilt, the most disturbed, unless there is no other."""
+        """Index of the mode with the lowest noise; tip and tilt, the most disturbed, only if there is no other."""
         tilt = np.isin(self.before.noll, TIP_TILT)
         return int(np.where(tilt & ~tilt.all(), np.inf, self.noise_nm).argmin())
 
     def delay(self) -> Delay:
-        """Measure the delay from a poke of the quietest mode to its image; warn if it is not the expected image."""
+        """Measure the delay from a poke of the quietest mode to its image; warn if the image is unexpected."""
         mode = self._quietest_mode
         plan = self.pokes.delay(mode)
         self._show("detecting pokes", max(self.pokes.cycles(), self.completed), self.completed)

@@ -176,7 +176,7 @@ def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> Re
     with Client(run) as loop, loop.reserved("lowfc calibrate reference"), _in_use(loop) as (before, noise):
         warn_of_additions(loop, reporter(Console(stderr=True)))
         cube = next_frames(loop, frames)
-        loop.check_lease()  # another shape of the mirror is another zero point
+        loop.check_lease()  # without the lease another client may have changed the mirror's shape, so the zero point
         check_size(cube.shape[1:], before)
         pixels, allowed = cube.reshape(frames, -1), configuration_of(loop).control.max_saturated_pixels
         if (saturated := max(saturated_pixels(before, frame) for frame in pixels)) > allowed:

@@ -139,7 +139,7 @@ class Commissioning:
             same_modes = first.noll == self._computed.noll and first.grid == self._computed.grid
             if not (same_modes and np.allclose(first.modes_to_actuators, commands, atol=1e-3)):
                 raise CalibrationError(
-                    f"{first_file} is for other modes, or commands of the mirror, than the configuration: omit --resume"
+                    f"{first_file} has other modes or mirror commands than the configuration: omit --resume"
                 )
             camera = self._loop.camera()
             if camera is not None and camera.shape != first.shape:
@@ -316,7 +316,7 @@ class Commissioning:
                 )
         except BaseException as error:
             with contextlib.suppress(LowfcError):
-                self._loop.check_lease()  # if another operator ended it, leave the loop to them
+                self._loop.check_lease()  # raises if another operator ended the lease: the loop is left to them
                 self._loop.open_loop()
             if isinstance(error, ValueError):
                 raise CalibrationError(f"the residual cannot be measured: {error}") from None
@@ -343,6 +343,6 @@ class Commissioning:
 def _rms_nm(error_nm: Single, settling: int) -> float:
     """Root mean square of the measured error of all modes, noise included, after the settling frames."""
     used = np.isfinite(error_nm).all(axis=1) & (np.arange(len(error_nm)) >= settling)
-    if used.sum() < MIN_RESIDUAL_FRAMES / 2:  # the others may have been refused, such as late frames
+    if used.sum() < MIN_RESIDUAL_FRAMES / 2:  # up to half may have been refused, such as late frames
         raise ValueError(f"{int(used.sum())} frames after {settling} of settling are too few for a residual")
     return float(np.linalg.norm(rms(error_nm, used)))

@@ -23,7 +23,7 @@ FIRST_NM = AMPLITUDE_NM["poke"]
 MAX_FIRST_NM = 32.0
 """Largest amplitude of the first pokes, which is doubled until they are detected, nm rms of wavefront."""
 MAX_MISFIT = 0.35
-"""Largest rms of the image minus the fitted computed one, relative to that of the image; else it is another sensor."""
+"""Largest rms difference of image and fitted computed image, as a fraction of the image's rms, for the same sensor."""
 CYCLES = 12  # cycles of pokes that measure the response without an optical model
 MAX_NONLINEARITY = 0.1
 """Largest relative difference of the gains at full and half amplitude, beyond `_STANDARD_ERRORS` standard errors."""
@@ -122,7 +122,7 @@ def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: f
             plan = _poke_cycle(modes, amplitude_nm, repetition)
             gains[level, repetition] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
     difference = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
-    variance = gains.var(axis=1, ddof=1).mean(axis=0)  # of a gain; that of the difference of two means of two is equal
+    variance = gains.var(axis=1, ddof=1).mean(axis=0)  # of one gain; two means of two gains differ with this variance
     error = np.sqrt(np.maximum(variance, variance.mean()))
     worst = int((difference - _STANDARD_ERRORS * error).argmax())
     chosen_nm = default_nm / 2 if difference[worst] > MAX_NONLINEARITY + _STANDARD_ERRORS * error[worst] else default_nm
