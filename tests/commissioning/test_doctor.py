@@ -77,11 +77,12 @@ METAL = {
 }
 """A suitable host: eight processors, four of them reserved for the loop. Files by path, readings by name."""
 
-OF_THE_HOST = [
+HOST_CHECKS = [
     *("real-time share", "processors", "isolation", "quota", "frequency", "idle states", "kernel", "virtualisation"),
     *("clock source", "wake-up", "load", "scheduling class", "locked memory", "swap", "huge pages"),
     *("socket buffers", "open files"),
 ]
+"""Checks that pass on the suitable host and need its data."""
 DMI = ("sys/class/dmi/id/sys_vendor", "sys/class/dmi/id/product_name")
 DYNAMIC = {"proc/version": "Linux version 6.1.0 (gcc) #1 SMP PREEMPT_DYNAMIC Thu"}
 NAMED: dict[str, object] = {
@@ -134,7 +135,7 @@ def briefly(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
     checks = examine(facts(tmp_path))
-    assert {name: checks[name] for name in OF_THE_HOST if checks[name].status != "ok"} == {}
+    assert {name: checks[name] for name in HOST_CHECKS if checks[name].status != "ok"} == {}
     assert checks["isolation"].got == "4-7; of these without a timer tick: 4-6"
     assert "turbo off" in checks["frequency"].got
     assert "C1 with 2 us" in checks["idle states"].got
@@ -218,7 +219,7 @@ def test_unreadable_data_gives_a_note(tmp_path: Path) -> None:
     failed = OSError("the trial's process ended with exit status 1: no")
     checks = examine(facts(tmp_path, unreadable, trial=failed))
     unknown = {name for name, check in checks.items() if check.got.startswith("not known: ")}
-    assert unknown >= set(OF_THE_HOST)
+    assert unknown >= set(HOST_CHECKS)
     assert {checks[name].status for name in unknown} == {"note"}
     assert checks["scheduling class"].got == f"not known: {failed}"
     assert command.measured(facts(tmp_path, unreadable, trial=failed))["wake_up_us"] == {}
@@ -248,7 +249,7 @@ def test_the_check_of_the_disk_uses_the_recorders_volume(tmp_path: Path, monkeyp
 
 @pytest.mark.parametrize(("behind_ms", "status"), [(50, "ok"), (1000, "warning"), (-1000, "warning")])
 def test_a_wrong_boot_clock_is_a_warning(own_runtime: Path, behind_ms: int, status: str) -> None:
-    assert examine(facts(own_runtime))["boot's clock"][:2] == ok("not set yet: the first process of a run does it")[:2]
+    assert examine(facts(own_runtime))["boot's clock"][:2] == ok("not set yet: the first process of a run sets it")[:2]
     assert not (own_runtime / "lowfc").exists(), "the check changes nothing"
     file = boot_file(runtime_base())
     file.write_text(str(time.time_ns() - time.monotonic_ns() - behind_ms * 1_000_000))
@@ -330,8 +331,8 @@ def test_a_trial_ends_after_an_interrupt() -> None:
             doctor.kill()
 
 
-def test_a_failed_trial_has_its_cause(monkeypatch: pytest.MonkeyPatch) -> None:
-    multiprocessing.resource_tracker.ensure_running()  # by this Python, not by the program below
+def test_a_failed_trial_names_its_cause(monkeypatch: pytest.MonkeyPatch) -> None:
+    multiprocessing.resource_tracker.ensure_running()  # now, as the program below cannot run it
     monkeypatch.setattr(multiprocessing.spawn, "get_executable", lambda: b"/bin/false")
     with pytest.raises(OSError, match="the trial's process ended"):
         try_out(Realtime(), set(), 0.01)

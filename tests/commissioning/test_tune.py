@@ -90,7 +90,7 @@ def test_the_true_residual_over_all_time_is_read_from_the_log(tmp_path: Path) ->
     night = SyntheticLog()
     night.instants = 4
     night.request("close").frames(2100)
-    del night.samples[night.places(TRUTH)[1200]]  # a lost one
+    del night.samples[night.places(TRUTH)[1200]]  # as if it were lost
     run = telemetry_from_log(LogReader(night.write(tmp_path / "night.mcap")))
     np.testing.assert_allclose(run.continuous_rms_nm, 2 * np.sqrt(np.diag(run.true_nm2)), rtol=1e-5)
 
@@ -105,7 +105,7 @@ def test_the_command_writes_the_law_and_draws_it(
     assert law_file.load(out).id == tuned_as("lqg")[0].law.id
 
 
-def test_the_picture_has_the_words_of_the_page_and_the_line_of_the_model(
+def test_the_picture_has_the_labels_of_the_page_on_tuning_and_keeps_the_power_of_narrow_lines(
     telemetry: Telemetry, tuned_as: Callable[[str], tuple[Tuned, Gains]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[Any] = []
@@ -121,14 +121,14 @@ def test_the_picture_has_the_words_of_the_page_and_the_line_of_the_model(
     for law, rms_nm in (("present", tip.predicted_now_nm), ("tuned", tip.predicted_nm)):
         variance_nm2 = curves[f"predicted true residual with the {law} law"].sum() * spacing_hz
         assert variance_nm2 == pytest.approx(rms_nm**2, rel=0.05)
-    line = curves["model of the pseudo-open-loop"].sum() / curves["pseudo-open-loop"].sum()
-    assert line == pytest.approx(1, rel=0.2)  # of a width far below the distance of the frequencies
+    # The model's line is far narrower than the spacing of the drawn frequencies.
+    assert curves["model of the pseudo-open-loop"].sum() == pytest.approx(curves["pseudo-open-loop"].sum(), rel=0.2)
     drawn[0].draw_without_rendering()
     for axes in drawn[0].axes:
-        assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1  # it covers no line
+        assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1  # above all lines
 
 
-def test_the_result_is_printed_although_the_loop_refuses_it(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_result_is_printed_although_the_loop_refuses_the_law(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lowfc.client.the_run", lambda _: "bench")
     monkeypatch.setattr("lowfc.client.Client", Mock(side_effect=RequestRefusedError("another delay")))
     done = lowfc("tune", log, "--controller", "lqg", "--apply", "--json")
@@ -138,7 +138,7 @@ def test_the_result_is_printed_although_the_loop_refuses_it(log: Path, monkeypat
 
 @pytest.mark.parametrize(("frames", "extent"), [(3000, "over the last 2500, theory is for all"), (1000, "over all of")])
 def test_the_residual_achieved_is_that_of_the_last_gains(tmp_path: Path, frames: int, extent: str) -> None:
-    """The pseudo-open-loop modes of earlier gains are used, but their errors do not belong to the last law's theory."""
+    """Frames with earlier gains give pseudo-open-loop modes, but their errors do not follow the last law's theory."""
     night = SyntheticLog().request("close").frames(3600).request("gain", (0.1,) * 3).frames(frames)
     result = json_of("tune", night.write(tmp_path / "night.mcap"))
     tip = result["modes"][0]
@@ -169,7 +169,7 @@ def test_an_offset_or_a_channel_in_the_true_residual_is_reported(tmp_path: Path)
 
 
 def test_a_loop_that_was_closed_for_too_few_frames_is_not_simply_called_open(tmp_path: Path) -> None:
-    """Then no residual achieved is given: an offset is not in it."""
+    """Its achieved residual is not given, so there is no warning that the residual contains the offset."""
     night = SyntheticLog().request("open").frames(400).request("close").frames(100)
     night.request("offset", (0.0, 0.0, 20.0)).frames(1900)
     result = json_of("tune", log := night.write(tmp_path / "night.mcap"))
@@ -186,7 +186,7 @@ def test_a_loop_that_was_closed_for_just_enough_frames_and_then_opened_is_tuned_
 
 
 def test_a_weighted_reconstructor_is_reported(tmp_path: Path) -> None:
-    """A gain for a mode that it does not correct would replace it by one with more noise."""
+    """A gain for a mode that had none would replace this reconstructor by one with more noise."""
     night = SyntheticLog().request("close").frames(2700)
     night.change(CONTROLLER_STATE, -1, lambda state: state.prior_nm2.extend([0, 0, 4]))
     warnings = json_of("tune", night.write(tmp_path / "night.mcap"))["warnings"]
@@ -276,7 +276,7 @@ def test_tuning_uses_the_steps_of_a_running_loop() -> None:
 
 
 class ReportingLoop(StreamedLoop):
-    """Its mirror reports each command a fifth of a period after the exposure; its camera's clock is 7 periods late."""
+    """A loop whose mirror reports commands 0.2 periods after the exposure; the camera's clock is 7 periods behind."""
 
     processes = Mock(return_value={"camera": wire.Health(router_offset_ns=9 * PERIOD_NS)})
 
@@ -296,7 +296,7 @@ PROBE = wire.Play(first_sequence=frame_sequence(3050), frames=100, id="probe")
 class SteppedLoop(StreamedLoop):
     """A loop with these steps, whose mirror reports each command `report_periods` after the end of the exposure.
 
-    With a `later_gain` the state has the probe sequence once, at the request after 3100 steps, and then this gain.
+    With a `later_gain`, the state has the probe sequence only at the request after 3100 steps, and this gain from then.
     """
 
     def __init__(self, steps: list[Step], report_periods: float = 0.2, *, later_gain: float = 0.0) -> None:
@@ -430,7 +430,7 @@ def test_the_previous_law_is_restored_without_an_answer_or_the_error_says_that_i
 
 def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
     night = SyntheticLog().request("close").frames(2700).request("open")
-    night.load(identified(replace(night.calibration, flux_dn=1.0)))  # the frames of the former one do not count
+    night.load(identified(replace(night.calibration, flux_dn=1.0)))  # frames of the former calibration do not count
     short = night.request("close").frames(700).write(tmp_path / "short.mcap")
     error = refusal("tune", short, kind=DataFileError)
     assert "tuning requires at least 2048 consecutive frames, 2 s; the longest sequence of good" in error

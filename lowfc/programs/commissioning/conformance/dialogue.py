@@ -32,7 +32,7 @@ _MAX_MOVES = 400  # to a distant shape
 
 
 class Expected:
-    """The mirror as configured; dead, stuck and inactive actuators do not count.
+    """The mirror as configured; dead, stuck and inactive actuators are not checked.
 
     Attributes:
         name: name in the mirror's topics.

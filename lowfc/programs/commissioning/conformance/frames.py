@@ -14,13 +14,13 @@ from lowfc.programs.commissioning.conformance.connection import NS
 from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
 from lowfc.programs.commissioning.conformance.settings import SETTINGS
 
-_SILENT_PERIODS = 5  # longest wait between frames that is not reported
-_JITTER = 0.1  # of the period
+_SILENT_PERIODS = 5  # longest wait between frames that is not reported, in frame periods
+_JITTER = 0.1  # largest deviation of 99 % of the waits that is not reported, in frame periods
 _SMOOTHER = 2.0  # ratio of roughness at which bytes count as swapped
 _READOUT_NS = 50_000_000  # longest plausible time from end of exposure to publication
 _FULL = 0.01  # fraction of saturated pixels above which they are reported
 _STOPPED_NS = 300_000_000  # shorter silences, before the first frame and after the last together, do not count
-_VARIED = 8  # with more different values than these, the alignment of bits is judged
+_VARIED = 8  # the alignment of the bits is judged if the pixels have more different values than this
 _AGE_NS = 1_000_000  # tolerance of a frame's time
 _OWN_WAIT_NS = 10_000_000  # shorter waits may be caused by this host, not by the camera
 
@@ -52,7 +52,7 @@ def _frames(camera: Camera) -> Check:
 
 
 _ONE_CLOCK = (
-    "use the same clock for the timestamp and the publish time: `lowfc.device.CameraClock` converts a camera's own"
+    "use the same clock for the timestamp and the publish time: `lowfc.device.CameraClock` converts camera time"
 )
 
 

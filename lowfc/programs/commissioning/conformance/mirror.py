@@ -278,7 +278,7 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
     expired_ns = _expired_ns(mirror, sent_ns)
     expected = f"EXPIRED after valid_for_ns, here {EXPIRES_NS / 1e6:.0f} ms; refused commands do not extend it"
     if expired_ns is None:
-        advice = "time valid_for_ns on the mirror's clock, from a command's arrival; then hold or relax, report EXPIRED"
+        advice = "count valid_for_ns on the mirror's clock from a command's arrival; then hold or relax, report EXPIRED"
         late = f"not within {(EXPIRES_NS + SLACK_NS) / 1e6:.0f} ms"
         yield judged("dead-man", expected, False, late, advice)
     else:

@@ -126,6 +126,6 @@ def _topics(device: Collected) -> Check:
     unknown = sorted(key for key in keys if not any(topic.matches(key) for topic in TOPICS))
     if not unknown:
         return ok(f"{len(keys)} keys")
-    known = [topic.key for topic in TOPICS if topic is not EVENT]  # a short key, near to many unknown ones
+    known = [topic.key for topic in TOPICS if topic is not EVENT]  # EVENT's short key resembles many others
     got = ", ".join(f"{key}{nearest(key, known)}" for key in unknown)
     return wrong(got, "publish under the keys of the table; no process subscribes to others")

@@ -58,7 +58,12 @@ def apply(root: Path, user: str) -> list[str]:
 
 
 def undo(root: Path) -> list[str]:
-    """Remove files, group and access to the device; return the actions. ConfigurationError if not root, or OSError."""
+    """Remove files, group and access to the device; return the actions.
+
+    Raises:
+        ConfigurationError: not root.
+        OSError: a file cannot be removed, or the device cannot be changed.
+    """
     _require_root("--undo")
     done = []
     for name, text in FILES.items():

@@ -233,7 +233,7 @@ def _boot_clock(facts: Facts) -> Check:
     """The clock of all runs since boot, set from CLOCK_REALTIME by the first one, against CLOCK_REALTIME now."""
     file = boot_file()
     if not file.exists():
-        return ok("not set yet: the first process of a run does it")
+        return ok("not set yet: the first process of a run sets it")
     ahead_ns = HostClock(file.parent).ahead_ns()
     detail = f"{ahead_ns / 1e6:+.1f} ms from CLOCK_REALTIME"
     if abs(ahead_ns) <= WALL_TOLERANCE_NS:

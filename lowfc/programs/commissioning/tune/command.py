@@ -48,9 +48,9 @@ def tune(
     console = Console(stderr=True)
     require_folder(out, plot)
     if apply:
-        the_run(run)  # an error now rather than after the work if there is no such loop
+        the_run(run)  # if there is no such loop, the error comes before the work, not after it
     if plot is not None:
-        figure_class()  # an error now rather than after the work if matplotlib is missing
+        figure_class()  # the same if matplotlib is missing
     if logs:
         reader = WholeLog(named_log(logs), skip_damaged=True)
         with reading_bar(console) as count:
@@ -77,7 +77,7 @@ def tune(
                 integrator = controller == "integrator"
                 answer = apply_gains(loop, gains.gain.tolist(), telemetry.noll) if integrator else loop.law(best.law)
             result.applied = answer.sentence
-    finally:  # also if the loop refuses it: a warning may say why
+    finally:  # also if the loop refuses the law: a warning may say why
         print_result(result, as_json=as_json)
 
 

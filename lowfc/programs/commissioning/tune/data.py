@@ -51,7 +51,7 @@ class Telemetry:
         law: the integrator's gains at the end; `driving` is the linear law in force instead, if any.
         closed: whether the loop was closed in these frames; `frames_closed`: in how many of them.
         pol: pseudo-open-loop modes (frames, modes), in pieces without gaps.
-        error: modal error (frames, modes). Like the true residual it is from the frames after the last change of law or
+        error: modal error (frames, modes). Error and true residual are from the frames after the last change of law or
             gains, or from all frames if those are fewer than `FEWEST`.
         true_nm2: mean products of the true residual at the start of each exposure (modes, modes); None if unknown.
         continuous_rms_nm: rms of the true residual over all time (modes,); None if unknown.
@@ -80,7 +80,7 @@ class Telemetry:
 
 
 def telemetry_from_log(log: LogReader) -> Telemetry:
-    """The used closed-loop frames of a log; all used frames if there are too few of them.
+    """The used closed-loop frames of a log; if these are too few, all used frames.
 
     Frames with a probe sequence, as in an acceptance test, or of an earlier calibration are excluded.
     """
@@ -240,7 +240,7 @@ def _last_change(states: Sequence[wire.ControllerState], modes: int) -> int:
     """Sequence of the frame after which the last law and gains were in force; 0 if they never changed."""
     newest, changed, before = 0, 0, None
     for state in states:
-        newest = max(newest, state.frame_sequence)  # 0 after a `clear`
+        newest = max(newest, state.frame_sequence)  # a state after a `clear` has the sequence 0
         if len(state.gain) != modes:
             continue
         gains = [] if state.HasField("law") and not overruled(state) else [*state.gain, *state.leak]
@@ -274,7 +274,7 @@ def _telemetry(
     settling = settling_frames(laws[0].gain, laws[0].leak)
     if laws[1] is not None:
         settling = SETTLING_FRAMES + FADING_FRAMES + margins.settling_frames(laws[1], timing.delay)
-    settling = min(max(settling, round(_SETTLING_S * rate_hz)), int(frames_closed.max()) - FEWEST)  # leaves enough
+    settling = min(max(settling, round(_SETTLING_S * rate_hz)), int(frames_closed.max()) - FEWEST)  # `FEWEST` remain
     closed, rows = True, usable & was_closed & (frames_closed > settling)
     pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if pol.longest < FEWEST:

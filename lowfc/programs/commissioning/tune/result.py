@@ -214,7 +214,7 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
         for label, (colour, power) in curves.items():
             axes.loglog(shown_hz, 2 / run.rate_hz * _means(power, omega, edges), color=colour, lw=1, label=label)
         axes.set(ylabel=f"Z{run.noll[mode]} {mode_name(run.noll[mode])}, nm$^2$/Hz")
-        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2, frameon=False)  # covers no line
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2, frameon=False)  # above all lines
     axes.set(xlabel="frequency, Hz")
     return png(drawing)
 
