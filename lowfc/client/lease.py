@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 DURATION_S = 10.0
 """Time in force without renewal: after the holder's death, other clients are refused for this long."""
 RENEWAL_S = 0.5
-"""Time between renewals; short, because in lockstep the loop's time, which counts here, may run twenty times faster."""
+"""Time between renewals; `DURATION_S` is in the loop's time, which in lockstep may run twenty times faster."""
 
 Ask = Callable[[str, int, float, str], object]
 """Function that sends `lease`, `renew` or `release`: name of the request, lease id, seconds, holder."""

@@ -88,7 +88,7 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
 ) -> None:
     loop = noiseless_loop
     check = Calibrator.check
-    delay_measurement_frames = DELAY_FRAMES + 2 * 8  # before the first report of the time to go
+    delay_measurement_frames = DELAY_FRAMES + 16  # with some at its ends; before the first report of the time to go
     monkeypatch.setattr(Calibrator, "check", Mock(side_effect=KeyboardInterrupt))
     before = loop.calibration()
     words = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]

@@ -88,7 +88,7 @@ def test_predictions_contain_the_part_of_a_constant_disturbance_that_a_leak_leav
 
 def test_the_true_residual_over_all_time_is_read_from_the_log(tmp_path: Path) -> None:
     night = SyntheticLog()
-    night.instants = 4
+    night.instants = 4  # the residual over all time is then twice that at the start of the exposures
     night.request("close").frames(2100)
     del night.samples[night.places(TRUTH)[1200]]  # as if it were lost
     run = telemetry_from_log(LogReader(night.write(tmp_path / "night.mcap")))

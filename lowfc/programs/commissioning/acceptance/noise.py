@@ -41,7 +41,7 @@ class NoiseMode(ModeResult):
 class NoiseResult(AcceptanceResult):
     """Noise floor of every mode."""
 
-    noise_ratio: float = result_field("required ratio", form="g")
+    noise_ratio: float = result_field("required noise / expected", form="g")
     law: str = result_field("law")
     frames: dict[str, int] = result_field()
     added_contrast: dict[str, Any] | None = result_field()

@@ -16,7 +16,7 @@ Method = Literal["analytic", "poke", "hadamard", "in-loop"]
 Out = Annotated[Path, typer.Option("--out", help="Output file (FITS).")]
 Load = Annotated[bool, typer.Option("--load", help="Load the result into the loop, which must be open.")]
 Snr = Annotated[float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")]
-_CYCLES = "Number of cycles; default: as many as --snr requires. With --cycles only the verdict uses --snr, default 20."
+_CYCLES = "Number of cycles; default: as many as --snr requires. The verdict still requires --snr, by default 20 then."
 Cycles = Annotated[int | None, typer.Option(min=MIN_CYCLES, help=_CYCLES)]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted calibration.")]
 Frames = Annotated[int, typer.Option(min=16, max=100_000, help="Number of frames to average.")]

@@ -290,7 +290,9 @@ def comparison(first: Calibration, second: Calibration) -> Comparison:
 
 
 def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array, response: Array) -> Array:
-    """Modes (modes, actuators) that R measures per nm of each actuator: modal shapes as measured, others as modelled.
+    """Modes (modes, actuators) that R measures per nm of each actuator.
+
+    They agree with the measurement for the mirror's modal shapes, and with the optical model for its other shapes.
 
     A common factor between measurement and model, such as that of the mirror's stroke or sign, also applies to other
     shapes. A negative factor is accepted only if focus or spherical is among the modes: a mirror of the opposite sign

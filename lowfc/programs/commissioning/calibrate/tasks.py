@@ -156,7 +156,7 @@ def _modes(text: str) -> dict[int, float]:
 def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, load: bool) -> DarkResult:
     """Write the calibration in use with a new dark and mask, from the loop's frames or a cube."""
     require_folder(out)
-    with Client(run) as loop, _in_use(loop) as (before, noise):
+    with Client(run) as loop, _in_use(loop) as (before, noise_and_gain):
         cube = next_frames(loop, frames) if file is None else images(file)
         if file is None:
             check_size(cube.shape[1:], before)
@@ -164,7 +164,8 @@ def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, loa
             raise DataFileError(f"{file}: its frames have {cube.shape[1:]} pixels, the calibration {before.shape}")
         measured = measure_dark(cube.reshape(len(cube), -1))
         check_dark(measured.dark_dn, before.reference.astype(np.float64), before.flux_dn)
-        write(with_dark(before, measured.dark_dn, measured.good, *noise), out, loop if load else None)
+        calibration = with_dark(before, measured.dark_dn, measured.good, *noise_and_gain)
+        write(calibration, out, loop if load else None)
     counts = {name: int(np.count_nonzero(getattr(measured, name))) for name in ("hot", "noisy", "dead")}
     level, noise_dn = float(np.median(measured.dark_dn)), float(np.median(measured.noise_dn))
     return DarkResult(frames=len(cube), dark_dn=level, noise_dn=noise_dn, **counts, file=str(out))
@@ -173,7 +174,7 @@ def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, loa
 def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> ReferenceResult:
     """Write the calibration in use with the present image as its reference."""
     require_folder(out)
-    with Client(run) as loop, loop.reserved("lowfc calibrate reference"), _in_use(loop) as (before, noise):
+    with Client(run) as loop, loop.reserved("lowfc calibrate reference"), _in_use(loop) as (before, noise_and_gain):
         warn_of_additions(loop, reporter(Console(stderr=True)))
         cube = next_frames(loop, frames)
         loop.check_lease()  # without the lease another client may have changed the mirror's shape, so the zero point
@@ -186,7 +187,8 @@ def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> Re
             )
         light, flux = normalised(pixels, before.dark.astype(np.float64), before.good.astype(np.float64))
         image = light.mean(axis=0)
-        calibration = write(with_reference(before, image, float(flux.mean()), *noise), out, loop if load else None)
+        calibration = with_reference(before, image, float(flux.mean()), *noise_and_gain)
+        calibration = write(calibration, out, loop if load else None)
     shift = before.reconstructor.astype(np.float64) @ (image - before.reference)
     shift_nm, noll = shift.tolist(), list(calibration.noll)
     return ReferenceResult(
@@ -198,12 +200,12 @@ def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> Re
 def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
     """The calibration in use; the camera's read noise per pixel, e-, and gain, e-/DN."""
     camera = factory.detector(configuration_of(loop))
-    noise = factory.equivalent_read_noise_e(camera), camera.gain_e_per_dn / camera.em_gain
+    noise_and_gain = factory.equivalent_read_noise_e(camera), camera.gain_e_per_dn / camera.em_gain
     before = replace(loop.calibration(), camera=loop.camera())
     if before.camera is not None:  # also with frames from a file: the calibration is written with this camera
         check_size(before.camera.shape, before)
     with raised_as(CalibrationError, ValueError):
-        yield before, noise
+        yield before, noise_and_gain
 
 
 def write(calibration: Calibration, out: Path, loop: Client | None) -> Calibration:

@@ -52,7 +52,8 @@ def _frames(camera: Camera) -> Check:
 
 
 _ONE_CLOCK = (
-    "use the same clock for the timestamp and the publish time: `lowfc.device.CameraClock` converts camera time"
+    "use the same clock for the timestamp and the publish time: `lowfc.device.CameraClock` converts the times of a "
+    "camera's own clock"
 )
 
 

@@ -32,7 +32,7 @@ def _envelope(device: Collected) -> Check | None:
     if not bare:
         return ok(f"on all of {len(messages)} messages") if messages else None
     sizes = sorted({"none" if attachment is None else f"{len(attachment)} bytes" for attachment in bare})
-    got = f"{len(bare)} of {len(messages)} messages with {', '.join(sizes)}"
+    got = f"attachment of {len(bare)} of {len(messages)} messages: {', '.join(sizes)}"
     return wrong(got, "attach it to every message; its bytes are in docs/reference/device_messages.md")
 
 

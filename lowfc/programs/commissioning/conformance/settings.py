@@ -125,7 +125,7 @@ def _on_request(camera: Camera) -> Check | None:
     if not camera.states:
         return None
     if not camera.answers:
-        return warning("no answer", "declare a queryable on that key: recorder and late processes query it")
+        return warning("no answer", "declare a queryable on that key: recorder and processes that start later query it")
     for answer in camera.answers:
         if answer.envelope is None:
             return wrong("an answer without an envelope", "attach the envelope of the published message")

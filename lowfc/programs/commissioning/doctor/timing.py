@@ -247,8 +247,8 @@ def _boot_clock(facts: Facts) -> Check:
 
 @CHECKS.check(
     "wake-up",
-    advice="see scheduling class, processors, idle states, virtualisation and load; `lowfc latency --trace` shows "
-    "which stalls of a loop are caused by the host",
+    advice="see the checks scheduling class, processors, idle states, virtualisation and load; `lowfc latency --trace` "
+    "shows which stalls of a loop are caused by the host",
     cost="every frame waits this long before processing, however fast the loop computes",
 )
 def _wake_up(facts: Facts) -> Check:
