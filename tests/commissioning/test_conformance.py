@@ -43,7 +43,7 @@ from lowfc.programs.commissioning.conformance.command import FIELDS, STATUSES
 from lowfc.programs.commissioning.conformance.connection import Connection, Received
 from lowfc.programs.commissioning.conformance.dialogue import Dialogue, Expected
 from lowfc.programs.commissioning.conformance.frames import camera_checks
-from lowfc.programs.commissioning.conformance.mirror import mirror_checks
+from lowfc.programs.commissioning.conformance.mirror import EXPIRES_NS, mirror_checks
 from lowfc.testing.clock import FakeClock
 from tests.support.loops import json_of, refusal, until
 from tests.support.safety_checks import Simulated
@@ -90,6 +90,7 @@ class Device:
         return received
 
     def put(self, topic: Topic, name: str, payload: bytes) -> None:
+        self.clock.advance(1)  # a moment after its last message
         self.receive(payload, self.now_ns())
 
     def ask(self, key: str) -> list[Received]:
@@ -175,6 +176,8 @@ class Mirror(Device):
         self.status, refused = self.mirror.apply_command(self.status, decoded, now_ns)
         if refused is None:
             self._publish(self.status.time_ns, now_ns)
+        elif self.changes.get("loses"):
+            self._received = -1  # of the next command, which `drops` then skips
         elif self.changes.get("renews"):
             self.status = self.status._replace(received_ns=now_ns)
 
@@ -359,6 +362,8 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "silent and deaf": ({"silent": lambda *_: 1, "deaf": True}, {"idle state": WRONG, "answers": WRONG} | UNTRIED),
     "no answers": ({"deaf": True}, {"answers": WRONG} | UNTRIED),
     "one command in three unanswered": ({"drops": 3}, {"answers": WRONG} | UNTRIED),
+    "one command in 15 skipped after a stall": ({"drops": 15}, {"answers": WARNING}),
+    "loses what follows a bad command": ({"drops": 999, "loses": True}, {"after bad commands": WRONG} | UNTRIED),
     "silent when idle": ({"silent": lambda *_: 1}, {"idle state": WRONG, "silence": WRONG} | NEVER_EXPIRED),
     "silent until a command expires": ({"silent": lambda _, status: status.following}, {"silence": WRONG} | UNTRIED),
     "no envelope": ({"attach": lambda *_: None}, {"envelope": WRONG}),
@@ -440,6 +445,20 @@ def test_an_answer_that_is_read_late_because_this_host_stalls_is_no_fault() -> N
             super().wait(0.6037 if self._received in (31, 33) else seconds)
 
     assert mirror_faults(Stalled()) == {}
+
+
+def test_a_command_that_expires_once_because_of_a_stall_is_tried_again() -> None:
+    early = [MS]
+
+    def tick(tick: Any) -> Any:
+        valid = mirror.status.valid_for_ns == EXPIRES_NS and early and early.pop()
+        mirror.status = mirror.status._replace(valid_for_ns=valid or mirror.status.valid_for_ns)
+        return tick
+
+    mirror = Mirror(tick=tick)
+    checks = mirror_checks(Dialogue(mirror, Expected(CONFIG)), 0.2, lambda _: None)
+    assert not_ok(iter(checks)) == {}
+    assert "(1 failed attempt before)" in {check.name: check.got for check in checks}["dead-man"]
 
 
 def test_gentle_does_not_test_the_limits() -> None:

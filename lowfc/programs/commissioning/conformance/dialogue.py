@@ -16,6 +16,8 @@ from lowfc.programs.commissioning.conformance.connection import NS, Collected, C
 
 ANSWER_S = 0.5
 """Timeout for an answer; a slower mirror cannot be used in a loop."""
+ATTEMPTS = 3
+"""Attempts before a check fails: a mirror skips commands that a stall of the host delayed."""
 VALID_NS = NS
 """Validity of an ordinary test command."""
 MODAL_NM = (0.5, -0.25)
@@ -77,13 +79,14 @@ class Dialogue(Collected):
     Attributes:
         states: every state that could be decoded, with its message.
         unreadable: number of states that could not be decoded.
+        failed: number of attempts that failed and were repeated, since it was last set to 0.
     """
 
     def __init__(self, connection: Connection, expected: Expected) -> None:
         super().__init__(connection, MIRROR_STATE.at(expected.name), mirror_role(expected.name))
         self.expected = expected
         self.states: list[tuple[Received, wire.MirrorState]] = []
-        self.unreadable = 0
+        self.unreadable = self.failed = 0
         self._next = 1
         self._commanded_nm: Single = np.zeros(expected.grid, np.float32)
 
@@ -169,21 +172,25 @@ class Dialogue(Collected):
         self.connection.put(COMMAND, self.expected.name, command.SerializeToString())
         return sequence, time_ns
 
-    def ask(self, surface_nm: Single, valid_ns: int = VALID_NS) -> tuple[wire.MirrorState | None, int, int]:
-        """Send a command and wait for the state that answers it.
+    def ask(
+        self, surface_nm: Single, valid_ns: int = VALID_NS, sequence: int | None = None, clear_id: int = 0
+    ) -> tuple[wire.MirrorState | None, int, int]:
+        """Send a command, again if it is not answered, and wait for the state that answers it.
 
         Returns:
             The state, None without an answer; the command's time; and the time until the answer, ns, 0 without one.
         """
-        self._commanded_nm, before = surface_nm, len(self.states)
-        sequence, sent_ns = self.put(surface_nm, valid_ns=valid_ns)
-        while True:
-            for message, state in self.states[before:]:
-                if state.frame_sequence == sequence:
-                    return state, sent_ns, message.receive_time_ns - sent_ns
-            if self.connection.now_ns() >= sent_ns + ANSWER_S * NS:
-                return None, sent_ns, 0
-            self.collect(POLL_S)
+        self._commanded_nm, before, times_ns, sent_ns = surface_nm, len(self.states), dict[int, int](), 0
+        for attempt in range(ATTEMPTS):
+            self.failed += attempt > 0
+            sent, sent_ns = self.put(surface_nm, valid_ns=valid_ns, sequence=sequence, clear_id=clear_id)
+            times_ns[sent] = sent_ns
+            while self.connection.now_ns() < sent_ns + ANSWER_S * NS:
+                self.collect(POLL_S)
+                for message, state in self.states[before:]:
+                    if (put_ns := times_ns.get(state.frame_sequence)) is not None:
+                        return state, put_ns, message.receive_time_ns - put_ns
+        return None, sent_ns, 0
 
     def go(self, surface_nm: Single) -> wire.MirrorState | None:
         """Move to a shape in steps of at most half the slew limit; return the last answer, None if one was missing."""
