@@ -139,7 +139,7 @@ def test_the_phase_spot_has_the_area_of_its_circle_and_a_soft_edge(radius, spot)
 
 
 def test_custom_pupil_is_read_from_a_file(tmp_path):
-    quarter = np.linspace(1.0, 0.5, 64 * 64).reshape(64, 64)
+    quarter = np.linspace(1.0, 0.5, 64 * 64).reshape(64, 64) * circle(128)[64:, 64:]
     np.savez(tmp_path / "mine.npz", quarter=quarter)
     pupil = sensor_from(SensorSection(pupil=str(tmp_path / "mine.npz"))).pupil
     assert pupil.shape == (SAMPLES, SAMPLES)

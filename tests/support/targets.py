@@ -325,7 +325,7 @@ def _files(folder: Path) -> list[Target]:
     with_modes = identified(replace(CALIBRATION, actuators_to_modes=np.ones((len(NOLL), 20), np.float32)))
     fits = tuple(calibration_file.to_bytes(each) for each in (CALIBRATION, with_modes))
     laws = _bytes_of(partial(law_file.save, LAW), folder / "law.fits")
-    pupils = _bytes_of(lambda path: np.savez(path, quarter=np.ones((4, 4))), folder / "pupil.npz")
+    pupils = _bytes_of(lambda path: np.savez(path, quarter=np.ones((2, 2))), folder / "pupil.npz")
     sam = json.loads(layouts.SHIPPED.read_text(encoding="utf-8"))["layouts"]["sam27d07"]
     sams = tuple(json.dumps(one).encode() for one in (sam, {"layouts": {"a": sam}}))
     toml = Configuration().to_toml().encode()

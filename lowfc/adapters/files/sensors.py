@@ -16,6 +16,7 @@ from lowfc.arrays import Array
 from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest, raised_as
 from lowfc.contract.sections import SENSORS, SensorSection, sensor_keys
+from lowfc.control.loop.wording import counted
 from lowfc.optics.chain import sam as sams
 from lowfc.optics.chain.coronagraph import DARK_ZONE, Coronagraph, LyotStop, Wedge
 from lowfc.optics.chain.focal_mask import bowtie, disk, phase_spot
@@ -42,13 +43,21 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
         file: An npz file whose array `quarter` is the quadrant x >= 0, y >= 0.
 
     Raises:
-        DataFileError: The file is missing, damaged or holds no such quadrant.
+        DataFileError: The file is missing, damaged, or holds no such quadrant or one that transmits beyond the circle.
         ConfigurationError: `samples` is not such a multiple.
     """
     with _opened(file) as arrays:
         quarter = np.asarray(arrays["quarter"])
     with raised_as(DataFileError, ValueError, file):
-        from_quarter(quarter, 2 * max(len(np.atleast_1d(quarter)), 1))
+        from_quarter(quarter, 2 * max(cells := len(np.atleast_1d(quarter)), 1))
+        corner = np.arange(cells)  # of each cell, the nearest to the centre
+        beyond = quarter[corner[:, None] ** 2 + corner**2 >= cells**2]
+        if beyond.any():
+            found = f"up to {float(beyond.max()):g} in {counted(int(np.count_nonzero(beyond)), 'cell')}"
+            raise ValueError(
+                f"`quarter` must be 0 beyond the pupil's circle, whose radius is its {cells} cells, got {found}: "
+                "set these to 0, or scale the opening down"
+            )
     with raised_as(ConfigurationError, ValueError, "pupil sampling"):
         return from_quarter(quarter, samples)
 
