@@ -58,7 +58,7 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
                 f"`quarter` must be 0 beyond the pupil's circle, whose radius is its {cells} cells, got {found}: "
                 "set these to 0, or scale the opening down"
             )
-    with raised_as(ConfigurationError, ValueError, "pupil sampling"):
+    with raised_as(ConfigurationError, ValueError, file):
         return from_quarter(quarter, samples)
 
 

@@ -90,7 +90,11 @@ def from_quarter(quarter: ArrayLike, samples: int) -> Array:
         raise ValueError("a quadrant's transmission must lie between 0 and 1")
     repeat, remainder = divmod(samples, 2 * quarter.shape[0])
     if remainder or not repeat:
-        raise ValueError(f"samples must be a multiple of {2 * quarter.shape[0]}, got {samples}")
+        cells = len(quarter)
+        raise ValueError(
+            f"the samples across a pupil must be a multiple of {2 * cells}, twice the quadrant's {cells} cells, "
+            f"got {samples}: resample the quadrant"
+        )
     if not quarter.max() > 0.5:
         raise ValueError(
             "a quadrant must let some light through: wavefronts are judged where its transmission exceeds one half, "
