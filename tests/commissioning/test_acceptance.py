@@ -226,11 +226,18 @@ def test_a_note_announces_the_probe_sequences_of_a_test_in_a_log() -> None:
         recorded("note", 'acceptance {"test": "noise-floor", "loop": "open", "frames": 9}'),
         recorded("play", "mirror"),
     ]
+    for incomplete in (
+        '"noise-floor", "frames": 9',
+        '"noise-floor", "loop": "open", "frames": 0',
+        '"linearity", "noll": 4, "frames": 9',
+        '"capture-range", "noll": 4, "level_nm": 5.0, "before": [0, 1], "after": [1], "frames": 9',
+    ):
+        requests += recorded("note", f'acceptance {{"test": {incomplete}}}'), recorded("play", "mirror")
     assert [(parameters, request.text) for parameters, request in _announced(requests, "rejection")] == [
         ({"period_frames": 10, "frames": 12}, "offset")
     ]
     assert [parameters for parameters, _ in _announced(requests, "noise-floor")] == [{"loop": "open", "frames": 9}]
-    assert _announced(requests, "linearity") == []
+    assert _announced(requests, "linearity") == _announced(requests, "capture-range") == []
 
 
 OPEN, CLOSED = (f'acceptance {{"test": "noise-floor", "loop": "{loop}", "frames": 50}}' for loop in ("open", "closed"))

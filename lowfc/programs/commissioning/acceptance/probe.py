@@ -38,6 +38,13 @@ _LIMIT_BITS = sum(1 << limit for limit in LIMITS)
 
 ANNOUNCEMENT = "acceptance "
 """First word of a note that announces a test; its parameters follow as JSON."""
+_ANNOUNCED: dict[Kind, dict[str, Any]] = {
+    "rejection": {"period_frames": 0},
+    "linearity": {"noll": 0, "averaged": 0},
+    "capture-range": {"noll": 0, "level_nm": 0.0, "before": [0, 0], "after": [0, 0]},
+    "noise-floor": {"loop": ""},
+}
+"""The parameters of each test, with values of their types."""
 _DISTURBING = ("gain", "leak", "limit", "law", "load", "offset", "channel", "reset", "stop")
 """Requests that make a measurement unusable."""
 
@@ -240,13 +247,20 @@ def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[
 
 
 def _parameters(note: str, kind: Kind) -> dict[str, Any] | None:
-    """The parameters that a note announces; None for another test, or another note that starts with the same word."""
+    """The parameters that a note announces; None for another test or without one, as in an operator's own note."""
     try:
         parameters = json.loads(note.removeprefix(ANNOUNCEMENT))
     except (ValueError, RecursionError):
         return None
-    of_kind = isinstance(parameters, dict) and parameters.pop("test", None) == kind
-    return parameters if of_kind and isinstance(parameters.get("frames"), int) else None
+    if not isinstance(parameters, dict) or parameters.pop("test", None) != kind:
+        return None
+    needed = {"frames": 1, **_ANNOUNCED[kind]}
+    complete = all(_types(parameters.get(name)) == _types(value) for name, value in needed.items())
+    return parameters if complete and parameters["frames"] > 0 else None
+
+
+def _types(value: object) -> object:
+    return list(map(type, value)) if isinstance(value, list) else type(value)
 
 
 def probe_response(
