@@ -112,7 +112,7 @@ ADVICE: dict[str, Advice] = {
         "came in time, or a limit acted.",
         "remove the cause, and run the calibration or test again (with `--resume` if available).",
     ),
-    "LEASE_TAKEN": Advice("a program reserved the loop.", "wait, or `lowfc ctl open`, which ends the reservation."),
+    "LEASE_TAKEN": Advice("a program reserved the loop.", "wait, or `lowfc ctl stop`, which ends the reservation."),
     "LEASE_RELEASED": Advice("the program has finished and released the loop.", _NOTHING),
     "LEASE_ENDED": Advice(
         "the holder did not renew it in time, its time is over, or somebody requested safe, open, pause or stop.",

@@ -221,8 +221,8 @@ def test_a_permit_is_granted_while_the_loop_is_not_closed() -> None:
             check_reply(outputs, True, f"the loop is {state.mode.in_words}")
         _, outputs = applied(setup, after, "close" if name == "open" else "clear")
         check_reply(outputs, False, "reserved for moving the mask")
-    check_reply(outputs, False, "in safe mode `lowfc ctl safe`, ends that")  # `open` is refused there
-    state, _ = applied(setup, after, "safe")
+    check_reply(outputs, False, "`lowfc ctl stop` ends that")  # in every mode; `open` is refused in safe mode
+    state, _ = applied(setup, after, "stop")
     check_reply(applied(setup, state, "clear")[1], True)
 
 
@@ -236,6 +236,7 @@ def test_a_permit_is_refused_during_a_lease_or_a_probe_sequence() -> None:
         for seconds in (0.0, 5.0):
             after, outputs = permit(setup, state, seconds)
             check_reply(outputs, False, why)
+            check_reply(outputs, False, "`lowfc ctl stop` ends that")
             assert after.conditions.lease == state.conditions.lease
     _, outputs = permit(setup, running(setup), 61.0)
     check_reply(outputs, False, "at most 60 s")

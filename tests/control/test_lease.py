@@ -58,7 +58,7 @@ GRANTED = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", 
 def test_requests_of_other_clients_are_refused_with_the_holders_name(name: str) -> None:
     state = held()
     after, outputs = applied(state, Request(4 * SECOND_NS, name))
-    check_reply(outputs, False, HOLDER, "6 s", "lowfc ctl open")
+    check_reply(outputs, False, HOLDER, "6 s", "lowfc ctl stop")
     assert all(now is was for now, was in zip(after[:-1], state[:-1], strict=True))
 
 

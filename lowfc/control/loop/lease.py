@@ -67,6 +67,10 @@ class Lease(NamedTuple):
             return f"the loop is reserved for {self.holder} (for at most {remaining_s} s more)"
         return f"the loop is reserved for {self.holder} (while that runs, and for at most {remaining_s} s after it)"
 
+    def refused_message(self, time_ns: int) -> str:
+        """Message that the loop is reserved, and how to end that in every mode."""
+        return f"{self.reserved_message(time_ns)}; `lowfc ctl stop` ends that, `open`, `pause` and `safe` too"
+
 
 def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
     """Why a request is refused; empty if it is granted.
@@ -80,7 +84,7 @@ def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
     if lease is not None and not lease.ended:
         if lease_id == lease.id:
             return ""
-        return f"{lease.reserved_message(time_ns)}; `lowfc ctl open`, or in safe mode `lowfc ctl safe`, ends that"
+        return lease.refused_message(time_ns)
     if not lease_id:
         return ""
     if lease is None or lease.id != lease_id:

@@ -18,7 +18,7 @@ def lease(settings: Settings, state: State, request: Request) -> tuple[State, st
     if state.mode is LoopMode.SAFE:
         raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
     if before is not None and not before.ended and before.id != request.lease_id:
-        raise ValueError(before.reserved_message(request.time_ns))
+        raise ValueError(before.refused_message(request.time_ns))
     granted = _extended(settings, state, request)
     event = PendingEvent("LEASE_TAKEN", {"holder": granted.holder})
     return _with(state, granted), granted.reserved_message(request.time_ns), event
@@ -90,10 +90,12 @@ def permit(settings: Settings, state: State, request: Request) -> tuple[State, s
     """
     before, loop, closed = state.conditions.lease, state.loop, state.mode is LoopMode.CLOSED
     if before is not None and not before.ended and before.id != request.lease_id:
-        raise ValueError(before.reserved_message(request.time_ns))
+        raise ValueError(before.refused_message(request.time_ns))
     play = None if loop is None else loop.play
     if play is not None and not play.over(state.frame_sequence + 1):
-        raise ValueError("a probe sequence is being played, and the move would disturb its measurement")
+        raise ValueError(
+            "a probe sequence is being played, and the move would disturb its measurement; `lowfc ctl stop` ends that"
+        )
     if not request.values:
         if closed or state.waits_for_gains:
             what = "is closed" if closed else "closes once its gains are measured"
