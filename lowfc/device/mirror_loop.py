@@ -178,7 +178,8 @@ class MirrorLoop:
         self._publish(self._status.time_ns or clock.now_ns())
         self._service.work += 1
         if refused is not None and refused is not refused_before:
-            self._service.event("COMMAND_REFUSED", reason=refused.name)
+            why = f", {self.watch.why}" if refused is Rejection.NO_MIRROR else ""
+            self._service.event("COMMAND_REFUSED", reason=f"{refused.name}{why}")
         if refused is None:
             self._applied_ns = clock.host_ns()
         if not before.following and before.frame_sequence and refused is None:

@@ -69,6 +69,7 @@ class DriverWatch:
 
     Attributes:
         failures: number of failures since the start, including calls that did not return.
+        why: the last failure, as text.
         hangs: whether the current call has exceeded its timeout.
         failed_ns: time of the last failure, ns of the host's clock.
         retry_ns: time before which the driver is not called, ns of the host's clock.
@@ -77,7 +78,7 @@ class DriverWatch:
     def __init__(self, service: Service, timeout_s: float, hanging: Callable[[], None] = lambda: None) -> None:
         """Set the timeout of a call, after which `hanging` is called on another thread."""
         self.failures = self.failed_ns = self.retry_ns = 0
-        self.hangs = False
+        self.hangs, self.why = False, ""
         self.timeout_s = timeout_s
         self._service = service
         self._hanging = hanging
@@ -154,11 +155,11 @@ class DriverWatch:
         if isinstance(fault, LowfcError):
             raise fault
         self._count()
-        why = described(fault)
-        kind = re.sub(r"\d+", "", why)  # a message that differs only in its numbers is the same fault
+        self.why = described(fault)
+        kind = re.sub(r"\d+", "", self.why)  # a message that differs only in its numbers is the same fault
         if kind != self._kind or self.failed_ns >= self._reported_ns + REPEAT_NS:
             self._kind, self._reported_ns = kind, self.failed_ns
-            self._service.event("DRIVER_FAILED", why=why)
+            self._service.event("DRIVER_FAILED", why=self.why)
 
     def check(self) -> None:
         """Report a call that lasts too many checks; checks are counted, not time, as the host may have stopped."""
@@ -168,7 +169,7 @@ class DriverWatch:
                 return
             self._checks += 1
             if self._checks * CHECK_S >= self.timeout_s and not self.hangs:
-                self.hangs = True
+                self.hangs, self.why = True, "the driver does not return"
                 self._count()
                 self._service.event("DRIVER_HANGS", hangs_s=self._checks * CHECK_S)
                 self._hanging()

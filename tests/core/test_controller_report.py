@@ -146,6 +146,8 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
     )
     warned = "10 s ago camera: COMMANDS_LATE 9 % late"
     assert first_line() == f"{normal} · run night · law integrator · {warned}"
+    failed = wire.Health(command_refused=wire.REASON_NO_MIRROR, last_warning="DRIVER_FAILED: 1 / 0 (my.py, line 3)")
+    assert first_line(**{"mirror-dm": failed}).endswith(" s ago mirror-dm: DRIVER_FAILED: 1 / 0 (my.py, line 3)")
     stopped = wire.Health(state="ready", recording=wire.Recording(file="logs/a.mcap", stopped=True))
     assert "· recording stopped ·" in first_line(recorder=stopped)
     failed = wire.Health(state="ready", recording=wire.Recording(failure="full"))

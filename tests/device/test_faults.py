@@ -427,6 +427,7 @@ def test_a_fault_in_the_shape_of_other_programs_is_a_failure_of_the_driver(fault
     bench = MirrorBench(mirror)
     assert bench.command(30.0).refused == Rejection.NO_MIRROR
     assert bench.listener.events() == ["STARTED", "DRIVER_FAILED", "COMMAND_REFUSED"]
+    assert bench.service.health().last_warning.endswith(f"NO_MIRROR, {bench.loop.watch.why}")
 
 
 def test_a_mirror_starts_from_the_position_that_its_driver_reads() -> None:

@@ -235,14 +235,13 @@ def _in_short(known: dict[str, Any]) -> str:
 
 
 def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Health]) -> dict[str, Any] | None:
-    found = [
-        (from_timestamp(one.last_warning_timestamp), name, one.last_warning)
-        for name, one in processes.items()
-        if one.last_warning
-    ]
+    """The newest warning; first that of a mirror whose driver fails, before what it causes in other processes."""
+    found = [(from_timestamp(one.last_warning_timestamp), name) for name, one in processes.items() if one.last_warning]
     if not found:
         return None
-    time_ns, process, text = max(found)
+    failing = [one for one in found if processes[one[1]].command_refused == wire.REASON_NO_MIRROR]
+    time_ns, process = max(failing or found)
+    text = processes[process].last_warning
     age_s = max(0, from_timestamp(state.timestamp) - time_ns) * 1e-9
     return {"process": process, "age_s": round(age_s, 3), "text": text}
 
