@@ -22,7 +22,10 @@ def single(array: npt.ArrayLike) -> Single:
 
 
 def aligned(array: npt.ArrayLike) -> Single:
-    """Copy to single precision in C order, starting at a cache line: numpy's 16 bytes split every other vector load."""
+    """Copy to single precision in C order, starting at a cache line.
+
+    numpy aligns arrays to 16 bytes only, where every other vector load would cross the border of a cache line.
+    """
     values = np.asarray(array, np.float32)
     memory = np.empty(values.nbytes + _CACHE_LINE, np.uint8)
     start = -memory.ctypes.data % _CACHE_LINE

@@ -128,8 +128,8 @@ ADVICE: dict[str, Advice] = {
         "`lowfc ctl close`, if the residual fell.",
     ),
     "MIRROR_LOST": Advice(
-        "the mirror's process died, hangs, or does not follow; a closed loop returns to the mirror's last "
-        "shape and holds it.",
+        "the mirror's process died, hangs, or does not follow. The command of a closed loop stays at the mirror's last "
+        "known shape, so that it does not wind up.",
         "check the mirror's process and its driver's events; restart it. The loop resumes by itself.",
     ),
     "MIRROR_BACK": Advice("the mirror follows again.", _NOTHING),

@@ -51,10 +51,10 @@ _ALTERNATIVE = re.compile(
 Milliseconds = Annotated[float, Field(ge=0, le=1e9)]
 Cpus = list[Annotated[int, Field(ge=0, lt=8192)]]  # the kernel's largest number of processors
 Gain = Annotated[float, Field(ge=0, le=4)]
-Amplitude = Annotated[float, Field(ge=1e-6, le=1e5)]  # a staircase to a far larger one fills the memory
+Amplitude = Annotated[float, Field(ge=1e-6, le=1e5)]  # acceptance plays it in small steps, whose table must fit memory
 ModalLimit = Annotated[float, Field(gt=0, le=MAX_LIMIT_NM)]
 FIXED_GAINS = {"control.tilt_gain": 0.5, "control.gain": 0.05}
-"""For runs that must not depend on automatic gains, such as timing measurements."""
+"""Integrator gains for runs that must not depend on automatic gains, such as timing measurements."""
 
 
 class Control(Section):
@@ -85,8 +85,8 @@ class Control(Section):
     limit_nm: ModalLimit = 50.0
     """Largest modal command of the other modes, wavefront rms."""
     max_frame_age_ms: Milliseconds = 0.0
-    """Age above which a frame is refused; 0: 20 ms or two frame periods, whichever is longer. A frame that is
-    older than both 5 ms and three periods on arrival is refused in any case."""
+    """Age above which a frame is refused; 0: 20 ms or two frame periods, whichever is longer. A frame whose age on
+    arrival is above both 5 ms and three periods is refused in any case."""
     frame_timeout_ms: Milliseconds = 0.0
     """Time without a frame after which an event is raised; 0: 50 ms or five frame periods, whichever is longer."""
     on_frame_timeout: Literal["hold", "flat"] = "hold"
@@ -125,15 +125,15 @@ class Acceptance(Section):
     rejection_db: Positive = 1.0
     """Largest deviation of the measured rejection and noise transfer from theory."""
     lowest_hz: Positive = 0.1
-    """Lowest frequency at which they are measured."""
+    """Lowest frequency at which rejection and noise transfer are measured."""
     highest_of_rate: float = Field(0.3, gt=0, le=0.5)
-    """Frequency up to which they are measured, as a fraction of the frame rate."""
+    """Highest frequency at which rejection and noise transfer are measured, as a fraction of the frame rate."""
     linear_nm: Amplitude = 12.0
     """Wavefront rms of a mode up to which the sensor must be linear; 12 nm is 5 mas of tilt at 2 m."""
     gain_error: Positive = 0.05
-    """Largest deviation from 1 of the ratio of measured to true amplitude of a mode, in this range."""
+    """Largest deviation from 1 of the ratio of measured to true amplitude of a mode, up to linear_nm."""
     crosstalk: Positive = 0.05
-    """Largest fraction of a mode that is measured as another mode, in this range."""
+    """Largest fraction of a mode that is measured as another mode, up to linear_nm."""
     capture_tilt_nm: Amplitude = 34.0
     """Wavefront rms of tip or tilt from which the loop must close; 34 nm is 14 mas at 2 m."""
     capture_nm: Amplitude = 20.0
@@ -368,7 +368,7 @@ def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str
 
 
 def _nearest(key: str, known: Sequence[str]) -> str:
-    """Suffix of an error about an unknown key: the most similar known one of any section, or a remark on its quotes."""
+    """Suffix of an error about an unknown key: the most similar known key of any section, or a remark on its quotes."""
     if key in known:
         return "; write it without quotes, which make it one name"
     by_name = {dotted.rpartition(".")[2]: dotted for dotted in reversed(known)}

@@ -8,7 +8,7 @@
     │   └── BadMessageError  a message from the bus that violates the contract; reported in an event
     └── RequestRefusedError  the controller refused the request, with the reason
 
-Numerical code raises ValueError; the adapters above it name the file or the key and re-raise one of these.
+Numerical code raises ValueError; the code that calls it raises one of these instead, which names the file or the key.
 """
 
 import re
@@ -68,7 +68,7 @@ _BRIEF.maxstring = _BRIEF.maxother = _BRIEF.maxlong = 100
 
 
 def reworded(message: str) -> str:
-    """A message of pydantic without its own terms."""
+    """Reword a message of pydantic for the user: "must" for "Input should"; no "Value error" and no parser details."""
     message = re.sub("^Value error, |, unable to (?:parse|interpret) .*", "", message)
     return re.sub("^(?:Input|String|List|Tuple) should", "must", message)
 

@@ -108,7 +108,7 @@ EVENTS: dict[str, Event] = {
         Event(
             "MIRROR_LOST",
             Level.ERROR,
-            "the mirror {fault}: until it follows, a closed loop returns to the mirror's last shape and holds it",
+            "the mirror {fault}: until it follows, the command of a closed loop stays at the mirror's last known shape",
         ),
         Event("MIRROR_BACK", Level.INFO, "the mirror follows again"),
         Event("MIRROR_REFUSED", Level.WARNING, "the mirror's shape is not adopted: {why}"),

@@ -87,7 +87,7 @@ class Topic:
 
     @property
     def in_loop(self) -> bool:
-        """Whether it is published every frame by or for the controller: it is sent before all other topics."""
+        """Whether it is published every frame by or for the controller; such topics are sent before all others."""
         return self.rate is Rate.LOOP and Role.CONTROLLER in self.publishers | self.subscribers
 
     def matches(self, key: str) -> bool:
@@ -186,7 +186,7 @@ LAW = Topic(
     wire.LinearLaw,
     Rate.EVENT,
     _CONTROLLER,
-    "Control law in use instead of the integrator, with its matrices; states hold its identity.",
+    "Control law in use instead of the integrator, with its matrices; the controller's states have only its identity.",
     queryable=True,
 )
 PLAY = Topic(
@@ -194,7 +194,7 @@ PLAY = Topic(
     wire.Play,
     Rate.EVENT,
     _CONTROLLER,
-    "Table of the current probe sequence; states hold its identity.",
+    "Table of the current probe sequence; the controller's states have only its identity.",
     queryable=True,
 )
 CALIBRATION = Topic(
@@ -320,7 +320,7 @@ def floats(data: bytes, *shape: int) -> Single:
 
 
 def fields_of(source: object, names: Iterable[str]) -> dict[str, Any]:
-    """Attributes of `source`, a value or a message, by name: both use the same names."""
+    """Attributes of `source` by name; it is a value or a message, in which these fields have the same names."""
     return {name: getattr(source, name) for name in names}
 
 

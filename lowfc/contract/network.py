@@ -36,7 +36,7 @@ class Section(BaseModel):
 
 
 def _docstrings(section: type[Section]) -> Iterator[tuple[str, str]]:
-    """Keys of a class, with the docstrings below them; none if it has no source, as when a program made it."""
+    """Keys of a class, with the docstrings below them; none if the class has no source, as one made at run time."""
     try:
         source = inspect.getsource(section)
     except (OSError, TypeError):
@@ -54,11 +54,11 @@ class Network(Section):
     """Connection between hosts; without a router, all processes run on this host."""
 
     router: str = Field("", pattern=r"^(tls/[^\x00]+:[1-9][0-9]{0,4})?$")
-    """Where the router listens, such as "tls/bench.example.org:7447"; empty for none."""
+    """Address at which processes reach the router, such as "tls/bench.example.org:7447"; empty for no router."""
     certificates: WithoutNul = ""
     """Folder with ca.pem and, for each role on this host, ROLE.pem and ROLE.key, made by `lowfc certs`."""
     listen: str = Field("", pattern=r"^(tls/[^\x00]+:[1-9][0-9]{0,4})?$")
-    """Address on which the router listens, if it differs from `router`."""
+    """Address on which the router itself listens, if it differs from `router`."""
 
     @model_validator(mode="after")
     def _valid(self) -> "Network":

@@ -1,4 +1,4 @@
-"""Calibrations, laws and tables on topics of their own; requests and states refer to them by identity."""
+"""Calibrations, laws and probe tables on topics of their own; requests and states contain only their identities."""
 
 import contextlib
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ class Published:
     plays: dict[str, PlayTable] = field(default_factory=dict)
 
     def store(self, topic: Topic, payload: bytes) -> None:
-        """Store a received message of `TOPICS`. An incomplete one is ignored, and then what refers to it is refused."""
+        """Store a received message of `TOPICS`; an incomplete one is ignored, so that its identity stays unknown."""
         with contextlib.suppress(DecodeError, ValueError):
             if topic is CALIBRATION:
                 calibration = decode_calibration(wire.Calibration.FromString(payload))

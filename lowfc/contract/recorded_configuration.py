@@ -61,7 +61,7 @@ def _mend(data: dict[str, Any], detail: Any) -> str:
     """Remove the key at fault; return the consequence in words."""
     section, *path = detail["loc"]
     table = data.get(section)
-    if isinstance(table, list) and path:  # of one interlock
+    if isinstance(table, list) and path:  # the key is in one interlock, whose index is path[0]
         if detail["type"] != "extra_forbidden" or table[path[0]] is None:
             table[path[0]] = None
             return "this interlock is left out"

@@ -10,7 +10,7 @@ from lowfc.contract.network import WithoutNul
 Preset = Literal["quiet", "bench", "thermal", "reaction-wheel", "reaction-wheel-ideal", "step", "kolmogorov"]
 
 MIRROR_NAME = r"^[a-z][a-z0-9_]{0,49}$"
-"""Regular expression for the name of a mirror; its role, "mirror-NAME", fits a certificate."""
+"""Regular expression for the name of a mirror; with "mirror-" before it, the name is short enough for a certificate."""
 BENCH_NAME = r"^[A-Za-z][A-Za-z0-9_-]{0,63}$"
 """Regular expression for the name of a bench value."""
 Positive = Annotated[float, Field(gt=0)]
@@ -22,7 +22,7 @@ Signed = Annotated[float, Field(ge=-MAX_VALUE, le=MAX_VALUE)]
 
 
 class InterlockSection(Section):
-    """A condition on a bench value, and the action while the condition holds."""
+    """A condition on a bench value, and the action while the condition is true."""
 
     name: str = Field(pattern=BENCH_NAME)
     """Name of the value: the last part of its topic, lowfc/bench/NAME."""
@@ -32,9 +32,9 @@ class InterlockSection(Section):
     """Value to compare with: true or false, a number (required for above and below), or a text."""
     action: Literal["hold", "open", "safe", "refuse_close", "warn"]
     """Action: a closed loop holds its command, the loop opens, goes to safe mode, cannot be closed, or only a warning
-    is raised. All but warn refuse to close the loop while the condition holds."""
+    is raised. All but warn refuse to close the loop while the condition is true."""
     max_age_s: float = Field(5.0, ge=0.01, le=3600)
-    """Age above which a value is too old; publish at least twice as often."""
+    """Age above which a value is too old; its publisher must send it at least twice in this time."""
     when_old: Literal["acts", "passes"] = "acts"
     """Whether the interlock acts on a value that is too old, of the wrong type, or never received."""
 
@@ -60,7 +60,7 @@ class Gateway(Section):
         default_factory=dict, max_length=64
     )
     """Variables of other servers that become bench values: name of the value = name of the variable. At most 64, as a
-    recorder takes no more names."""
+    recorder records no more bench values."""
 
 
 class Star(Section):
@@ -95,8 +95,8 @@ class SensorSection(Section):
     sam: str = "sam27d07"
     """For sam: a layout of the package, FILE.json, or FILE.json:NAME."""
     hole_samples: int = Field(1, ge=1, le=16)
-    """For sam: subsamples across a pupil sample for partial coverage by a hole. 1, as in the paper: all or nothing, by
-    the centre; 4 for a real mask."""
+    """For sam: subsamples across a pupil sample, to find its open fraction. 1, as in the paper: a sample is open if its
+    centre is in a hole; 4 for a real mask."""
     defocus_mm: float = Field(6.0, ge=1, le=50)
     """For clowfs: defocus of the detector."""
     focal_ratio: float = Field(20.0, ge=1, le=200)
@@ -217,7 +217,8 @@ class Disturbance(Section):
     """Rate of change of the wheel's speed: ramp, Hz per second; walk, Hz per root second; run-down, decrease at time 0
     in Hz per second. 0 for constant speed."""
     second_wheel_hz: Signed = 0.0
-    """Initial excess speed of a second, identical wheel, turns per second, so that the two beat; 0: no second wheel."""
+    """Initial speed of a second, identical wheel above that of the first, turns per second; the two beat. 0: no second
+    wheel."""
 
     @model_validator(mode="after")
     def _possible(self) -> "Disturbance":

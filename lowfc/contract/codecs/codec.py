@@ -1,4 +1,4 @@
-"""Encode and decode the messages of the bus, as values of `lowfc.control`."""
+"""Conversion between the messages of the bus and values of `lowfc.control`."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -157,7 +157,7 @@ def encode_input(report: Report, input_number: int) -> bytes:
 
 
 def decode_input(message: wire.ControlInput, calibrations: Mapping[str, Calibration]) -> Input:
-    """Input of a ControlInput; ValueError if it is invalid, or its calibration is not among these (by id)."""
+    """Input of a ControlInput; ValueError if it is invalid, or its calibration is not in `calibrations` (by id)."""
     match message.WhichOneof("input"):
         case "mirror":
             shape = _mirror_shape(message.mirror)
@@ -280,8 +280,8 @@ def request(
 def encode_request(request: Request, reply: Reply, input_number: int, state: wire.ControllerState | None) -> bytes:
     """Request with its reply; the input number is 0 if the controller did not act on it.
 
-    Calibrations, laws and tables have topics of their own, so only their identities are written. A request that is not
-    prepared contains its law and table. `state` is the answer to `status`.
+    Calibrations, laws and tables have topics of their own, so only their identities are written; but the law and the
+    table of a request that is not `prepared` are written in full. `state` is the answer to `status`.
     """
     played = request.played
     message = wire.Request(

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import BinaryIO
 
 UNBOUNDED = (1 << 63) - 1
-"""Size limit of a file that is read piece by piece."""
+"""Value of `largest_bytes` without a limit, for a file that is read piece by piece."""
 
 
 def user_path(text: str) -> Path:
-    """Path that a user wrote, with "~" and "~name" replaced by a home directory; unchanged without such a user."""
+    """Path that a user wrote, with "~" and "~name" replaced by a home directory; unchanged if there is no such user."""
     return Path(os.path.expanduser(text))  # noqa: PTH111  # Path.expanduser raises RuntimeError
 
 

@@ -17,7 +17,7 @@ _PLAIN = ("name", "signal", "delay_frames", "rate_hz")  # fields of the same nam
 
 
 def law_header(law: LinearLaw) -> wire.LinearLaw:
-    """Message of a law without its matrices, which follow from its identity."""
+    """Message of a law without its matrices, which the reader finds by the law's identity."""
     return wire.LinearLaw(noll=law.noll, states=len(law.transition), id=law.id, **fields_of(law, _PLAIN))
 
 
@@ -45,7 +45,7 @@ def law_of(message: wire.LinearLaw, known: Mapping[str, LinearLaw] = MappingProx
 
 
 def driving(state: wire.ControllerState | None, laws: Mapping[str, LinearLaw]) -> LinearLaw | None:
-    """The law that drives the mirror, or is about to; None for the integrator."""
+    """The law that drives the mirror, or will once the loop is closed; None for the integrator."""
     return law_of(state.law, laws) if state is not None and state.HasField("law") else None
 
 
@@ -92,9 +92,10 @@ def put_command_channels(message: wire.ControllerState, command_channels: Comman
 def command_channels_of(
     message: wire.ControllerState, empty: CommandChannels, to_modes: Single, plays: Mapping[str, PlayTable]
 ) -> CommandChannels | None:
-    """Offset, command channels and probe sequence of a state; None if it has none. `empty` gives the shapes.
+    """Offset, command channels and probe sequence of a state; None if it has none.
 
-    The table of a probe sequence is found in `plays` by its identity; states from before 0.2 hold the played rows.
+    `empty` has the shapes of the arrays. The table of a probe sequence is found in `plays` by its identity; states from
+    before 0.2 contain the rows to play instead.
 
     Raises:
         ValueError: the shapes do not match, or the table is missing.

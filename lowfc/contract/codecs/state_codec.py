@@ -90,7 +90,7 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
 
 
 def calibration_in_use(message: wire.ControllerState, calibration: Calibration) -> Calibration:
-    """The calibration with the reconstructor in use: automatic gains weight it by the uncorrected modes."""
+    """The calibration with the reconstructor in use, which automatic gains may have weighted by uncorrected modes."""
     prior_nm2 = np.array(message.prior_nm2, np.float32)
     if message.calibration_id != calibration.id or prior_nm2.size != len(calibration.noll):
         return calibration
@@ -138,7 +138,7 @@ def decode_state(
                 raise ValueError("the law of the controller's state does not fit")
         if message.HasField("camera_expected"):
             loop = loop._replace(camera=camera_settings(message.camera_expected))
-        if prior_nm2.size:  # first: it changes the past shifts of channels
+        if prior_nm2.size:  # before the channels are set: it would change their past shifts
             loop = loop.with_weighting(Weighting(prior_nm2, message.weighting_flux_dn))
         loop = loop._replace(
             law_runner=law_runner,
