@@ -33,7 +33,7 @@ class Contrast:
         )
 
     def measure(self) -> dict[str, float]:
-        """Means at up to `IMAGES` instants of the second half, by their names in the message; empty before a frame.
+        """Means at up to `IMAGES` instants of the run's second half, by field of `WavefrontFigures`; empty at first.
 
         The contrast added with a flat mirror and by the residual, and the coronagraph's own, are from full images;
         `quadratic_added_contrast` is from the quadratic form.

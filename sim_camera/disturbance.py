@@ -354,7 +354,7 @@ def _thermal_nm(noll: tuple[int, ...]) -> Array:
 
 
 def _drift(rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]) -> tuple[Array, Complex]:
-    """Sine waves, even in log frequency, whose power per hertz falls as 1/f^2; `rms_nm` (modes,): of their sum."""
+    """Sine waves, even in log frequency, with power per hertz falling as 1/f^2; `rms_nm` (modes,) is of their sum."""
     frequencies = np.geomspace(*band_hz, _WAVES_PER_BAND) * rng.uniform(0.95, 1.05, _WAVES_PER_BAND)
     weights = frequencies**-0.5
     weights *= np.sqrt(2 / np.sum(weights**2))
@@ -364,7 +364,7 @@ def _drift(rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]
 def _undamped_lines(
     rng: np.random.Generator, rms: Array, frequencies_hz: tuple[float, ...], unit_nm: Array
 ) -> tuple[Array, Complex]:
-    """Sine waves at fixed frequencies; `rms` of each in units of `unit_nm` (modes,)."""
+    """Sine waves at fixed frequencies; `rms` (waves,) is that of each wave in units of `unit_nm` (modes,)."""
     amplitude = np.sqrt(2) * rms[:, None] * unit_nm
     return np.array(frequencies_hz), amplitude * _phases(rng, amplitude.shape)
 

@@ -41,8 +41,8 @@ PATIENCE_S = 5.0
 RECENT_S = 2.0
 """Averaging time of the wavefront statistics reported while the loop runs."""
 MAX_WAIT_NS = 500_000_000
-"""Longest wait of a call of `expose`, as of any camera."""
-_REMEMBERED = 256  # mirror states, and publication times of frames
+"""Longest wait in a call of `expose`: half a second, as for every driver (see `Camera.expose`)."""
+_REMEMBERED = 256  # largest number of waiting mirror states, and of stored publication times of frames
 
 
 def disturbance_of(config: Configuration) -> Disturbance:
@@ -105,7 +105,7 @@ def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scen
 
 
 def _centred_region(name: str, size: int, available: int) -> tuple[int, int]:
-    """First and number of the rows or columns of the centred readout region; all for size 0."""
+    """First row (or column) of the centred readout region, and their number; the whole sensor for size 0."""
     if size > available:
         raise ConfigurationError(f"options of the simulated camera: {name} is {size}, the sensor has {available}")
     return ((available - size) // 2, size) if size else (0, available)

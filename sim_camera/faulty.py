@@ -14,7 +14,7 @@ from lowfc.contract.messages import RawImage, from_timestamp, image
 from sim_camera.faults import MAX_FRAMES_LATE, Fault, Frame, Kind
 
 EARLIER_S = 3600
-"""Time by which the clock is set back in the fault "old-sequence"."""
+"""Time by which the camera's start in the sequences is too early with the fault "old-sequence"."""
 
 
 def read_fault(file: Path) -> Fault:

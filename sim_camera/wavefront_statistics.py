@@ -11,7 +11,7 @@ from lowfc.optics.chain.added_contrast import by_group, costliest
 from sim_camera.scene import Truth, Wavefront
 
 MAX_BLOCKS = 1024
-"""Blocks stored, at first of one frame; then pairs are merged, so that memory does not grow with the run.
+"""Blocks stored, at first of one frame each. When all are full, pairs are merged: memory does not grow with the run.
 
 The second half of the run begins at the border of a block.
 """
@@ -20,7 +20,7 @@ _RMS = "disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_re
 
 
 class WavefrontAccumulator:
-    """Block sums over frames of the contrast added by each mode, and of the squared wavefront.
+    """Sums, in blocks of frames, of the contrast added by each mode and of the squared wavefront.
 
     Statistics are named as in the message `WavefrontFigures`: rms over the open pupil in nm, and rms of the tilt per
     axis in mas, at the starts of exposures. Those named `continuous_...` are over whole periods, from `instants`
@@ -31,7 +31,7 @@ class WavefrontAccumulator:
         """Start without frames.
 
         Args:
-            noll: Noll index of each mode of the truths.
+            noll: Noll index of each mode.
             nm_per_mas: wavefront rms of a milliarcsecond of tilt.
             recent: number of frames in the recent statistics.
             instants: samples of each period in the continuous truth; 0 if it is not computed.
@@ -65,7 +65,7 @@ class WavefrontAccumulator:
         self._frames += 1
 
     def wavefront(self) -> dict[str, Any]:
-        """Statistics over the second half of the frames; empty before the first, as are those of `recent`."""
+        """Statistics over the second half of the frames; empty before the first frame, like those of `recent`."""
         first = self._frames // 2 // self._block_frames
         frames = self._frames - first * self._block_frames
         return self._statistics(self._blocks[first:].sum(axis=0) / frames) if frames else {}

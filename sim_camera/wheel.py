@@ -17,10 +17,10 @@ _WALK_WAVES = 64
 
 
 def walk(rng: np.random.Generator, per_root_s: Array, slope: float = 2.0) -> tuple[Array, Complex]:
-    """Frequencies (waves,) and amplitudes (waves, any) of sine waves, 1e-4 to 10 Hz, nearly even in log frequency.
+    """Frequencies (waves,) and amplitudes (waves, n) of sine waves, 1e-4 to 10 Hz, nearly even in log frequency.
 
-    Their power density is per_root_s^2 / (2 pi^2 f^slope) per Hz. Slope 2 is a random walk: its rms displacement after
-    t seconds is per_root_s sqrt(t).
+    Their power density is per_root_s^2 / (2 pi^2 f^slope) per Hz, for each element of `per_root_s` (n,). Slope 2 is a
+    random walk: its rms displacement after t seconds is per_root_s sqrt(t).
     """
     low, high = _WALK_HZ
     spacing = np.log(high / low) / _WALK_WAVES
@@ -90,7 +90,10 @@ class Wheel:
 def wheels(
     seed: int, speeds_hz: tuple[float, ...], rms_nm: Array, course: str = "ramp", change: float = 0.0
 ) -> tuple[Wheel, ...]:
-    """Wheels of equal amplitude, one for each speed at time 0; `rms_nm` (modes,): first harmonic at high speed."""
+    """Wheels of equal amplitude, one for each speed at time 0.
+
+    `rms_nm` (modes,) is the rms of the first harmonic at high speed.
+    """
     spinning = []
     for number, start_hz in enumerate(speeds_hz):
         rng = np.random.default_rng([seed, 7, number])

@@ -17,7 +17,7 @@ SETTINGS_NS = round(1e9 / float(CAMERA_STATE.rate))
 PATIENCE_S = 1.0
 """Timeout of an exposure, or three periods if that is longer."""
 REST_NS = 100_000_000
-"""Longest sleep between beats while the driver must not be called."""
+"""Longest sleep between two heartbeats of the process (`beat`) while a failed driver is not called."""
 AHEAD_NS = 5_000_000
 """Largest time by which the end of an exposure may be ahead of its clock."""
 MAX_LOST_FRAMES, MAX_RATE_RATIO = 100, 4

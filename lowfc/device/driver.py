@@ -275,10 +275,10 @@ class MirrorExtras:
         return None
 
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
-        """Replace `apply` in simulated mirrors: (rows, columns), nm of surface; also called without a new command.
+        """Called instead of `apply`, for simulated mirrors; also called repeatedly without a new command.
 
-        `elapsed_ns` is the run's time since the last command; without a new command, since the last call; infinite at
-        first.
+        Arguments are the shape to approach, (rows, columns) nm of surface, and the run's time since the previous
+        command, ns; without a new command, since the last call; infinite at first. Return the positions reached.
         """
         raise NotImplementedError
 

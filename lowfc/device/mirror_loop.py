@@ -39,7 +39,7 @@ from lowfc.optics.chain.mirror import influence_factors
 TICK_NS = 10_000_000
 """Period of the calls of `tick` without commands."""
 IDLE_STATE_NS = 100_000_000
-"""Period of the published state without commands; a restarted controller starts from it."""
+"""Period at which the state is published without commands; a restarted controller starts from the published shape."""
 PICTURE_PIXELS = 64
 """Pixels across the published picture of the surface."""
 PATIENCE_S = 0.5
@@ -221,7 +221,7 @@ class MirrorLoop:
                     raise ValueError("it returned positions that are NaN or infinite, expected nm of surface")
             if self.watch.returned():
                 return shape_nm
-        except (Exception, SystemExit) as fault:  # of `sys.exit`, which would end only the receive thread
+        except (Exception, SystemExit) as fault:  # a driver's `sys.exit` would end only the receive thread
             self.watch.failed(fault)
         self._known, self._returning, self._driven_nm = False, True, None
         self._status = self._status._replace(following=False, channels={}, command_nm=_NONE)
@@ -274,7 +274,7 @@ class MirrorLoop:
             self._picture_due_ns = now_ns + int(1e9 / float(SURFACE.rate))
 
     def _fill(self, health: wire.Health) -> None:
-        """Add to a Health what an operator's `status` shows of the mirror."""
+        """Add the mirror's fields to a Health; an operator's `status` shows them."""
         status = self._status
         health.command_refused = self._refused.value if self._refused is not None else 0  # type: ignore[assignment]
         health.command_expired = bool(status.received_ns) and not status.following

@@ -20,12 +20,12 @@ _NONE: Single = np.zeros(0, np.float32)
 MAX_VALID_NS = 2_000_000_000
 """Longest time for which a command may be held; a longer `valid_for_ns` is shortened to it."""
 AHEAD_NS = 1_000_000_000
-"""Largest time by which a frame may be ahead of the mirror's clock; beyond it the surface is timed by that clock."""
+"""Largest time by which a frame's time may be ahead of the mirror's clock; beyond it, `tick` uses only that clock."""
 
 
 Move = Callable[[Single, float], Single]
 """Function that drives the actuators (rows, columns), nm of surface, and returns their positions; its second argument
-is the run's time, ns, since the last command; without a new command, since the last call; infinite at first."""
+is the run's time, ns, since the previous command; without a new command, since the last call; infinite at first."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def apply_command(
     move: Move,
     others_nm: Single | None = None,
 ) -> tuple[Status, Reason | None]:
-    """Apply a command received at `now_ns`; a refused command changes nothing, and its reason is returned.
+    """Apply a command received at `now_ns`; return the status, unchanged if the command is refused, and why it is.
 
     `others_nm` (rows, columns) is the shape of other programs on the mirror; it uses part of the stroke.
     """

@@ -61,7 +61,7 @@ def load(kind: Kind, name: str) -> Any:
 
 
 def section(name: str) -> str:
-    """Return NAME of a driver's section [drivers.NAME]: the driver's own or its module's name."""
+    """NAME of a driver's section [drivers.NAME]: the driver's name or, for a class, the name of the class's module."""
     module = name.partition(":")[0]
     return Path(module).stem if module.endswith(".py") else module
 
@@ -84,7 +84,7 @@ def faults(config: Configuration, folder: Path) -> list[str]:
         kinds = [kind for kind in KINDS if name in installed(kind)]
         module = name.partition(".")[0]
         importable = module in sys.modules or importlib.util.find_spec(module) is not None
-        # An unknown name is a fault only if it is like a driver's or no identifier: a file elsewhere may have it.
+        # Other unknown names are no faults: they may belong to driver files in other folders.
         similar = nearest(name, {*installed("camera"), *installed("mirror")})
         if not kinds and name not in files and not importable and (similar or not module.isidentifier()):
             sentences.append(

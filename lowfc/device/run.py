@@ -22,7 +22,7 @@ from lowfc.device.watch import closed_on_fault, opening
 
 
 def driver_command(kind: Kind, name: str | None = None) -> type[TyperCommand]:
-    """Make a command whose help lists the options of the driver `name`, or of that in its argument `driver`."""
+    """Make a command whose help lists the options of the driver `name`, if None of the command's argument `driver`."""
 
     class WithOptions(TyperCommand):
         driver = name
@@ -47,7 +47,7 @@ PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_opt
 """Settings of a command that passes unknown words to the driver as its options."""
 Frames = Annotated[int | None, typer.Option(min=1, help="Stop after this many frames; default: at Ctrl-C or SIGTERM.")]
 LEAVE_S = 2.0
-"""Time in which a camera in the controller's process has to end."""
+"""Longest time for which an ending controller waits for a camera in its process."""
 WaitFor = Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; may be repeated.")]
 
 
@@ -84,7 +84,7 @@ def run_camera(
 
 @contextmanager
 def camera_beside(driver: Camera, config: Configuration, service: Service) -> Iterator[None]:
-    """Run a camera in the controller's process: the thread that reads a frame also handles it, without a link.
+    """Run a camera in the controller's process: the thread that reads a frame also computes its command.
 
     Other processes see the same role, topics and Health as from a camera in its own process. When the camera or the
     controller ends, so does the other.

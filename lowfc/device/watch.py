@@ -131,7 +131,7 @@ class DriverWatch:
             self._since_recovery, self._kind = 0, ""
 
     def call(self, method: Callable[..., None], *arguments: object) -> None:
-        """Call an optional method; count and report a fault, raise a `LowfcError` again. No other call is delayed."""
+        """Call an optional method; count and report a fault, but raise a `LowfcError` again. No pause follows."""
         try:
             method(*arguments)
         except Exception as fault:
@@ -162,7 +162,7 @@ class DriverWatch:
             self._service.event("DRIVER_FAILED", why=self.why)
 
     def check(self) -> None:
-        """Report a call that lasts too many checks; checks are counted, not time, as the host may have stopped."""
+        """Report a call that lasts too many checks. Checks are counted because the host may have stopped for a time."""
         with self._ending:
             if not self._in_call or self._calls != self._checked_call:
                 self._checked_call, self._checks = self._calls, 0

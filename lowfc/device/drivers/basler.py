@@ -36,7 +36,7 @@ class BaslerCamera:
             self._open(options.camera)
         except importlib.import_module("pypylon.genicam").GenericException as fault:
             which = options.camera or "(the first found)"
-            why = re.split(r" : \w+ thrown", str(fault))[0]  # without the place in the library
+            why = re.split(r" : \w+ thrown", str(fault))[0]  # without the line of the library's source
             raise ConfigurationError(f"Basler camera {which}: {why}") from None
 
     @classmethod

@@ -9,12 +9,13 @@ from lowfc.contract.configuration import Configuration
 from lowfc.device import CameraSettings, DriverOptions
 
 FRAME_ID_WRAP = 65535
-"""GigE Vision counts frames from 1 to 65535, then from 1 again: numbers are compared modulo 65535, 64-bit ones too."""
+"""GigE Vision counts frames from 1 to 65535, then from 1 again; all frame numbers are compared modulo 65535, also
+those of 64 bits."""
 WAIT_MS = 500
 """Longest wait for a frame."""
 MAX_QUEUED = 2
-"""Number of frames that may wait, the newest ones. Older ones are dropped and count as lost: those that came while the
-process was stopped all saw the same mirror shape."""
+"""Number of frames, the newest ones, that may wait for the process. Older ones are dropped and count as lost: after a
+stop of the process, they all saw the same mirror shape."""
 
 
 class GenicamOptions(DriverOptions):

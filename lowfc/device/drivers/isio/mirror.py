@@ -29,7 +29,7 @@ SAME_NM = 0.05
 """Largest difference between commanded and reached shape, nm, that float32 rounding in micrometres explains."""
 _POLL_S = 50e-6
 _SEARCH_S = 0.1
-"""Period of the search for an absent sum: recreated, it must be found well within `SUM_SILENT_S`."""
+"""Period of the search for an absent sum, which must be found well within `SUM_SILENT_S` after it was recreated."""
 
 
 class IsioMirror:
