@@ -138,7 +138,8 @@ class CameraLoop:
         end_ns += clock.offset_ns if settings.clock == "monotonic" else clock.ahead_ns()
         ahead_ns = end_ns - clock.host_ns()
         if ahead_ns > AHEAD_NS or end_ns < 0:
-            raise ValueError(f"end_ns is {ahead_ns * 1e-9:.3f} s ahead of the {settings.clock} clock")
+            expected = f"expected at most {AHEAD_NS * 1e-9:g} s, and a time after 1970"
+            raise ValueError(f"end_ns is {ahead_ns * 1e-9:.3f} s ahead of the {settings.clock} clock, {expected}")
         return end_ns
 
     def _follow_numbers(self, exposure: Exposure, settings: CameraSettings) -> None:

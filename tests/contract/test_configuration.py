@@ -156,7 +156,7 @@ def test_an_invalid_value_is_reported_in_one_line_with_key_and_value(key: str, v
     assert "\n" not in message
 
 
-def test_a_gateway_has_no_more_bench_values_than_a_recorder_takes_names() -> None:
+def test_a_gateway_has_no_more_bench_values_than_a_recorder_records() -> None:
     variables = {f"value-{number}": "PV" for number in range(MAX_NAMES + 1)}
     assert "at most 64 items" in error_of(None, {"gateway.bench": variables})
     del variables["value-0"]
@@ -253,7 +253,7 @@ def test_contradicting_values_are_refused(overrides: dict[str, Any], words: tupl
     assert "\n" not in message
 
 
-def test_imperfections_are_off_by_default_and_all_are_measured() -> None:
+def test_imperfections_are_off_by_default_and_each_has_a_case_in_the_measurements() -> None:
     assert load(None).imperfections == {}
     assert {key for keys in CASES.values() for key in load(None, keys).imperfections} == set(IMPERFECTIONS)
 

@@ -57,7 +57,7 @@ def schema() -> list[str]:
 
 
 def test_the_schema_only_grows() -> None:
-    """tests/logs/test_golden.py compares with the descriptor of 0.1."""
+    """Each change shows in the golden file; tests/logs/test_golden.py compares the schema with that of version 0.1."""
     assert GOLDEN.read_text(encoding="utf-8").splitlines() == schema(), (
         "the schema has changed: existing numbers, names, types and labels must stay, and a new field needs a new "
         f"number; if they do, run `python {Path(__file__).relative_to(ROOT)}` and commit the golden file"

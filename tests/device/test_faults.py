@@ -162,12 +162,12 @@ def test_a_close_that_hangs_is_reported() -> None:
         ({"clock": "Realtime"}, "clock of the settings is 'Realtime', expected monotonic, realtime, run"),
     ],
 )
-def test_settings_that_cannot_be_true_are_named(setting: dict[str, Any], message: str) -> None:
+def test_the_error_on_impossible_settings_names_them(setting: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         camera_state(replace(SETTINGS, **setting), 0)
 
 
-def test_settings_of_another_type_are_named() -> None:
+def test_a_driver_whose_settings_are_of_another_type_is_refused() -> None:
     with pytest.raises(TypeError, match=r"settings\(\) returned dict, expected CameraSettings"):
         CameraBench(settings={"rows": 3})  # type: ignore[arg-type]
 
@@ -209,7 +209,7 @@ def test_frame_numbers_are_unwrapped_and_gaps_count_as_lost_frames() -> None:
     assert len({start_of(sample.sequence) for sample in listener.samples[FRAME]}) == 1
     frames = next(count for count in listener.messages(HEALTH)[-1].topics if count.topic == FRAME.key)
     assert (frames.published, frames.missing) == (9, 4)
-    assert listener.event_texts("FRAMES_LOST") == ["FRAMES_LOST 2 frames lost by the camera"] * 2, "the last at the end"
+    assert listener.event_texts("FRAMES_LOST") == ["FRAMES_LOST 2 frames lost by the camera"] * 2, "one at the end"
 
 
 @pytest.mark.parametrize("kind", [np.uint32, np.uint64])
@@ -446,7 +446,8 @@ def test_a_mirror_starts_from_the_position_that_its_driver_reads() -> None:
 def test_a_driver_is_closed_after_its_last_command_and_called_no_more() -> None:
     mirror, calls = Mirror(), list[str]()
 
-    def fill(_: wire.Health) -> None:  # the command ends some time after the last one
+    def fill(_: wire.Health) -> None:
+        """Let the driver's last command end 0.1 s after this call."""
         calls.append("fill")
         if bench.loop._turn.locked():
             Timer(0.1, lambda: (calls.append("applied"), bench.loop._turn.release())).start()
@@ -455,6 +456,6 @@ def test_a_driver_is_closed_after_its_last_command_and_called_no_more() -> None:
     mirror.close = lambda: calls.append("close")  # type: ignore[method-assign]
     bench = MirrorBench(mirror)
     bench.service.stop("the test")
-    bench.loop._turn.acquire()  # a command is with the driver
+    bench.loop._turn.acquire()  # as while the driver applies a command
     bench.loop.run()
     assert calls[-3:] == ["fill", "applied", "close"]

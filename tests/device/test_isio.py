@@ -237,7 +237,7 @@ class Sum(threading.Thread):
         self.total = channel(folder, "dm00disp", make=True)
         self.others = channel(folder, "dm00disp00", make=True)
         self.own, self.running = channel(folder), True
-        self.own.take(4)  # its semaphore
+        self.own.take(4)  # the semaphore that `run` waits for
         self.start()
 
     def run(self) -> None:
@@ -254,14 +254,15 @@ def test_the_reached_position_comes_from_the_sum_of_channels(folder: Path, monke
     channel(folder, make=True)
     summing = Sum(folder)
     driver, _ = mirror()
-    summing.others.write(shape_nm(3) / 1000 + 0.1)
+    others_nm = shape_nm(3) + 100
+    summing.others.write(others_nm / 1000)
     assert driver.apply(shape_nm(1)) is None  # as written, except for piston
-    assert np.allclose(driver.beside(), shape_nm(3) - shape_nm(3).mean(), atol=1e-3)
+    assert np.allclose(driver.beside(), others_nm - others_nm.mean(), atol=1e-3)
     too_far = shape_nm(2)
     too_far[5, 7] = 600
     reached = driver.apply(too_far)
     assert reached is not None
-    assert reached[5, 7] == pytest.approx(500 - shape_nm(3)[5, 7] - 100, abs=0.1)
+    assert reached[5, 7] == pytest.approx(500 - others_nm[5, 7], abs=0.1)
     assert np.abs(np.delete(reached - too_far, 5 * GRID[1] + 7)).max() < 0.1
     summing.running = False
     summing.join()
@@ -273,7 +274,7 @@ def test_the_reached_position_comes_from_the_sum_of_channels(folder: Path, monke
         driver.apply(shape_nm(1))
 
 
-def test_a_sum_that_is_always_late_follows(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mirror_whose_sum_is_always_late_counts_as_following(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mirror_module, "SUM_SILENT_S", 0.1)
     channel(folder, make=True)
     summing = Sum(folder, delay_s=0.01)
@@ -292,14 +293,14 @@ def test_a_sum_that_is_absent_although_expected_counts_as_not_following(
     monkeypatch.setattr(mirror_module, "SUM_SILENT_S", 0.01)
     monkeypatch.setattr(mirror_module, "_SEARCH_S", 0.0)
 
-    def absent_for_a_while(driver: IsioMirror, name: str) -> None:
+    def check_failure_without_sum(driver: IsioMirror, name: str) -> None:
         assert driver.apply(shape_nm(1)) is None
         time.sleep(0.02)
         with pytest.raises(RuntimeError, match=f"no stream '{name}' of {GRID[1]} x {GRID[0]} float32 pixels"):
             driver.apply(shape_nm(1))
 
     driver, _ = mirror(total="dm99disp")
-    absent_for_a_while(driver, "dm99disp")
+    check_failure_without_sum(driver, "dm99disp")
     for total in (None, ""):  # the default name is read if it exists; an empty one is not read
         driver, _ = mirror(total=total)
         assert driver.apply(shape_nm(1)) is None
@@ -310,7 +311,7 @@ def test_a_sum_that_is_absent_although_expected_counts_as_not_following(
     summing = Sum(folder)
     assert driver.apply(shape_nm(1)) is None
     (folder / "dm00disp.im.shm").unlink()
-    absent_for_a_while(driver, "dm00disp")
+    check_failure_without_sum(driver, "dm00disp")
     summing.total = channel(folder, "dm00disp", make=True)
     assert driver.apply(shape_nm(1)) is None, "it follows again"
     assert summing.total.count
@@ -318,7 +319,7 @@ def test_a_sum_that_is_absent_although_expected_counts_as_not_following(
     summing.join()
 
 
-def test_a_channel_whose_writer_died_meanwhile_stays_in_the_sum(folder: Path) -> None:
+def test_a_channel_whose_writer_died_while_writing_stays_in_the_sum(folder: Path) -> None:
     dark_hole, turbulence, begun = (channel(folder, f"dm00disp0{index}", make=True) for index in range(3))
     dark_hole.write(shape_nm(1) / 1000)
     begun.begin(shape_nm(2) / 1000)
@@ -336,9 +337,9 @@ def test_a_channel_read_between_its_counter_and_its_flag_is_read_again(folder: P
     others = OtherChannels(other_channel_names("dm00disp03"), GRID)
     assert not others.sum().any()
     dark_hole.begin(shape_nm(1) / 1000)
-    dark_hole.pack("<Q", 264, dark_hole.count + 1)  # cnt0
+    dark_hole.pack("<Q", 264, dark_hole.count + 1)  # the counter, cnt0
     assert not others.sum().any()
-    dark_hole.pack("B", 288, 0)  # write
+    dark_hole.pack("B", 288, 0)  # the flag `write`
     assert np.allclose(1000 * others.sum(), shape_nm(1), atol=1e-3)
 
 
@@ -360,7 +361,7 @@ def test_a_shrunk_channel_is_no_longer_read(folder: Path) -> None:
     assert np.allclose(driver.position(), shape_nm(1), atol=1e-3)
 
 
-def test_the_position_of_a_channel_whose_writer_died_is_what_it_holds(folder: Path) -> None:
+def test_the_position_from_a_channel_whose_writer_died_is_its_present_content(folder: Path) -> None:
     channel(folder, make=True).begin(shape_nm(1) / 1000)
     driver, _ = mirror()
     assert np.allclose(driver.position(), shape_nm(1), atol=1e-3)

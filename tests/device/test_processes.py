@@ -233,7 +233,7 @@ def test_a_dead_mirror_process_is_reported_and_the_loop_holds_until_its_restart(
     with subprocess.Popen([*LOWFC, *MIRROR.split()[1:]], cwd=bench.folder) as process:
         try:
             bench.wait_until_settled()
-            time.sleep(1.2)  # two Health messages: the controller returns to the command of the last but one
+            time.sleep(1.2)  # after a fault, the controller returns to the command of two Health messages before
             before_nm = list(bench.steps[-1].command_nm)
             bench.inject("mirror", "die")
             assert process.wait(10) == 7, "a failure: the units in deploy restart it"
@@ -244,7 +244,7 @@ def test_a_dead_mirror_process_is_reported_and_the_loop_holds_until_its_restart(
     calls = len(bench.calls_nm())
     with in_background(bench.folder, MIRROR):
         until(lambda: bench.count_of("controller", "MIRROR_BACK"))
-        assert bench.calls_nm()[calls] == 0, "its idle state comes first"
+        assert bench.calls_nm()[calls] == 0, "it goes flat before it follows commands"
         bench.wait_until_settled()
         assert bench.is_commanded(before_nm)
     assert bench.count_of("controller", "MIRROR_LOST") == 1

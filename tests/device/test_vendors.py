@@ -57,10 +57,12 @@ def test_a_missing_package_gives_install_advice(monkeypatch: pytest.MonkeyPatch,
     assert "install " in need.advice
 
 
-@pytest.mark.parametrize("place", ["", " : OutOfRangeException thrown in node 'Gain' (file 'x.h', line 1)"])
-def test_the_reason_of_a_refusing_basler_camera_is_reported(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("source", ["", " : OutOfRangeException thrown in node 'Gain' (file 'x.h', line 1)"])
+def test_a_refusal_by_a_basler_camera_is_reported_without_the_library_source(
+    source: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse() -> None:
-        raise RuntimeError(f"Cannot set 'Gain'.{place}")
+        raise RuntimeError(f"Cannot set 'Gain'.{source}")
 
     stub = SimpleNamespace(DeviceInfo=refuse, GenericException=RuntimeError)
     for module in ("pylon", "genicam"):

@@ -59,7 +59,7 @@ def test_tilt_per_axis_is_that_of_the_axes_among_the_modes() -> None:
     assert (found["tilt_disturbance_mas"], found["tilt_residual_mas"]) == pytest.approx((3.0, 1.5))
 
 
-def test_the_costliest_modes_are_named_without_contrast_from_a_disturbance() -> None:
+def test_the_costliest_modes_are_named_although_the_disturbance_adds_no_contrast() -> None:
     run = statistics()
     run.add(truth(1.0), 0.0, np.arange(3))
     assert [*run.wavefront().values()][-2:] == ["focus", pytest.approx(2 / 3)]

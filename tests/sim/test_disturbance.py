@@ -53,7 +53,7 @@ def rms_nm(disturbance: Disturbance) -> np.ndarray:
 
 
 def check_order_and_block(name: str, first: int, count: int, cut: int) -> None:
-    """Compare `count` frames from `first` on with those after `cut`, with one alone, and with another object's."""
+    """Check that frames are the same if computed from `first` on, from `cut` later on, alone, or by a second object."""
     disturbance = preset(name, static_nm={4: 3.0})
     expected = modes_nm(disturbance, first, count, RATE_HZ)
     cut = min(cut, count - 1)
@@ -295,7 +295,7 @@ def test_message_faults_change_the_payload() -> None:
 
 @pytest.mark.parametrize("kind", [Kind.DUPLICATED, Kind.REORDERED, Kind.LATE, Kind.OLD_SEQUENCE, Kind.TRUNCATED])
 def test_faulty_publisher_sends_the_configured_frames(kind: Kind) -> None:
-    hub, clock = MemoryHub(), FakeClock(EARLIER_S * 10**10)  # late enough for a start EARLIER_S before
+    hub, clock = MemoryHub(), FakeClock(EARLIER_S * 10**10)  # so that the start minus EARLIER_S is above 0
     camera, reader = MemoryBus(hub, "camera", clock), MemoryBus(hub, "controller", clock)
     received: list[Sample] = []
     reader.subscribe(FRAME, received.append)

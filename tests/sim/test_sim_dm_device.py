@@ -47,12 +47,12 @@ def follow(device: Simulated, status: Status, *heights_nm: float) -> Status:
 def test_clear_id_resets_the_newest_sequence_of_the_mirror() -> None:
     device = mirror()
     status, _ = device.apply_command(device.initial, command(even(5.0), (1 << 63)), START_NS)
-    late, refused = device.apply_command(status, command(even(9.0), 3), START_NS)
-    assert (refused, late) == (Rejection.OUT_OF_ORDER, status)
+    unchanged, refused = device.apply_command(status, command(even(9.0), 3), START_NS)
+    assert (refused, unchanged) == (Rejection.OUT_OF_ORDER, status)
     status, refused = device.apply_command(status, command(even(9.0), 3, clear_id=77), START_NS)
     assert (refused, status.frame_sequence) == (None, 3)
     _, refused = device.apply_command(status, command(even(9.0), 2, clear_id=77), START_NS)
-    assert refused is Rejection.OUT_OF_ORDER, "once for each clear"
+    assert refused is Rejection.OUT_OF_ORDER, "a clear_id resets the sequence only once"
     assert device.apply_command(status, command(even(9.0), 2, clear_id=78), START_NS)[1] is None
 
 

@@ -42,10 +42,10 @@ def test_phase_of_wheel_harmonics_is_the_integral_of_the_speed(course: str, chan
     spinning, speed = wheel(course, change), speed_hz(TIME_S)
     phase = 2 * np.pi * cumulative_trapezoid(speed, TIME_S, initial=0)
     expected = np.zeros((TIME_S.size, 2))
-    for order, at_rest in zip(ORDERS, spinning.amplitude_nm, strict=True):
+    for order, amplitude_nm in zip(ORDERS, spinning.amplitude_nm, strict=True):
         height = (order * speed) ** 2 / ((order * speed) ** 2 + SOFT_HZ**2)
-        expected += (height * np.exp(1j * order * phase))[:, None].real * at_rest.real
-        expected -= (height * np.exp(1j * order * phase))[:, None].imag * at_rest.imag
+        expected += (height * np.exp(1j * order * phase))[:, None].real * amplitude_nm.real
+        expected -= (height * np.exp(1j * order * phase))[:, None].imag * amplitude_nm.imag
     np.testing.assert_allclose(spinning.speed_hz(TIME_S), speed, atol=1e-9)
     np.testing.assert_allclose(spinning.modes_nm(TIME_S), expected, atol=2e-3)
     np.testing.assert_allclose(np.abs(spinning.amplitude_nm[0]) / np.sqrt(2), [2.0, 3.0])
@@ -91,7 +91,7 @@ def test_a_wheel_that_would_not_run_down_is_refused(wrong: dict[str, float]) -> 
 
 
 def test_two_wheels_beat() -> None:
-    """The sum of two equal harmonics goes from twice one to zero and back at the difference of the speeds."""
+    """The amplitude of two equal harmonics' sum beats, at the difference of the speeds, between double and zero."""
     one, other = wheels(1, (30.0, 30.5), np.array([2.0]))
     time_s = np.arange(0, 4, 1e-3)
     both = [replace(each, amplitude_nm=np.array([[2.0], *[[0]] * 4]) + 0j) for each in (one, other)]
