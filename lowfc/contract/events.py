@@ -96,7 +96,8 @@ EVENTS: dict[str, Event] = {
         Event(
             "LOOP_HARMS",
             Level.WARNING,
-            "the loop increases the residual, mostly {modes}: {closed_nm:.3g} nm rms, open {open_nm:.3g}; {action}",
+            "the loop increases the residual, mostly {modes}: {closed_nm:.3g} nm rms instead of {open_nm:.3g} nm in "
+            "open loop; {action}",
         ),
         Event("PLAY_ENDED", Level.WARNING, "the probe sequence ended: {why}"),
         Event("LEASE_TAKEN", Level.INFO, "the loop is reserved for {holder}"),

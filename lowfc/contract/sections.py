@@ -53,7 +53,7 @@ class Gateway(Section):
     listen: WithoutNul = Field("127.0.0.1", min_length=1)
     """Address on which the gateway serves; default: loopback only."""
     port: int = Field(5075, ge=1, le=65534)
-    """TCP port; searches are answered on the next UDP port."""
+    """TCP port; searches are answered on the UDP port with the next number."""
     search: WithoutNul = "127.0.0.1"
     """Addresses searched for variables of other servers, separated by spaces."""
     bench: dict[Annotated[str, Field(pattern=BENCH_NAME)], Annotated[str, Field(min_length=1)]] = Field(
@@ -258,8 +258,8 @@ class Mirror(Section):
     driver_bits: int = Field(16, ge=8, le=24)
     """Bits of the driver over the full range."""
     settling_us: NotNegative = 50.0
-    """Simulated mirror: time constant of an actuator's first-order response; without lockstep, at most a
-    fifth of the period."""
+    """Simulated mirror: time constant of an actuator's first-order response; without lockstep, images are correct for
+    up to a fifth of the period."""
     dead: list[int] = Field(default_factory=list)
     """Actuators that stay flat: row * columns + column."""
     stuck_nm: dict[str, Signed] = Field(default_factory=dict)

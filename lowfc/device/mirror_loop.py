@@ -93,8 +93,8 @@ class MirrorLoop:
         self._beside = getattr(driver, "beside", None)
         getattr(driver, "join", _NO_EXTRAS.join)(service)
         self._fill_extra = getattr(driver, "fill", _NO_EXTRAS.fill)
-        self.watch = DriverWatch(service, PATIENCE_S, self._hang)
-        self._turn = threading.Lock()
+        self.watch = DriverWatch(service, PATIENCE_S, self._report_hang)
+        self._driver_lock = threading.Lock()
         self._applied_ns = self._picture_due_ns = self._state_due_ns = 0
         self._states = service.publisher(MIRROR_STATE, name)
         self._surfaces = service.publisher(SURFACE, name)
@@ -130,28 +130,28 @@ class MirrorLoop:
         with self.watch.over(self._close, self._fill_extra):
             while service.running:
                 time.sleep(TICK_NS * 1e-9)
-                acquired = self._turn.acquire(timeout=TICK_NS * 1e-9)
+                acquired = self._driver_lock.acquire(timeout=TICK_NS * 1e-9)
                 if acquired:
                     try:
                         if not service.clock.lockstep and service.clock.host_ns() - self._applied_ns >= TICK_NS:
                             self._idle()
                     finally:
-                        self._turn.release()
+                        self._driver_lock.release()
                 service.beat(alive=acquired)
         service.finish()
 
     def _close(self) -> None:
         self._service.stop(self._service.why)  # also after a fault: no further command is passed to the driver
-        acquired = self._turn.acquire(timeout=CLOSE_S)  # a call of the driver may still run, and never return
+        acquired = self._driver_lock.acquire(timeout=CLOSE_S)  # a call of the driver may still run, and never return
         try:
             self._driver.close()
         finally:
             if acquired:
-                self._turn.release()
+                self._driver_lock.release()
 
     def _arrived(self, sample: Sample) -> None:
         """Handle a command on the receive thread; superseded commands are skipped."""
-        with self._turn:
+        with self._driver_lock:
             if self._service.running:
                 self._next_command(sample)
 
@@ -227,12 +227,12 @@ class MirrorLoop:
         self._status = self._status._replace(following=False, channels={}, command_nm=_NONE)
         raise _LostError
 
-    def _hang(self) -> None:
+    def _report_hang(self) -> None:
         """Publish the position as unknown; called on the watch's thread."""
         self._known, self._refused = False, Rejection.NO_MIRROR
         self._publish(self._service.clock.now_ns())
 
-    def _return(self) -> None:
+    def _return_to_idle(self) -> None:
         """After a fault, step towards the idle state: flat, or the shape read back or last commanded."""
         if self._service.clock.host_ns() < self.watch.retry_ns:
             return
@@ -253,7 +253,7 @@ class MirrorLoop:
         before = self._status
         with contextlib.suppress(_LostError):
             if self._returning:
-                self._return()
+                self._return_to_idle()
             else:
                 self._status = tick(self._protection, before, now_ns, self._drive)
         if before.following and not self._status.following and not self._returning:

@@ -114,8 +114,9 @@ def test_options_come_from_configuration_and_command_line() -> None:
     nested = load(None, {"drivers": {"package": {"module": {"level": 6}}}})
     assert plugins.opened("camera", "package.module:Class", nested, (), Ramp).level == 6
     for kind in plugins.KINDS:
-        serial = {"camera": "an option, not the part for cameras"}
-        assert plugins.table(load(None, {"drivers.basler": serial}), kind, "basler") == serial
+        option_called_camera = {"camera": "a serial number, not the part for cameras"}
+        config = load(None, {"drivers.basler": option_called_camera})
+        assert plugins.table(config, kind, "basler") == option_called_camera
     for table, words, why in [
         ({"levle": 1}, (), "there is no 'levle'; there are level, ports, binning"),
         ({"level": 7, "camera": {"level": 1}}, (), "has options, or the parts camera and mirror"),

@@ -449,13 +449,13 @@ def test_a_driver_is_closed_after_its_last_command_and_called_no_more() -> None:
     def fill(_: wire.Health) -> None:
         """Let the driver's last command end 0.1 s after this call."""
         calls.append("fill")
-        if bench.loop._turn.locked():
-            Timer(0.1, lambda: (calls.append("applied"), bench.loop._turn.release())).start()
+        if bench.loop._driver_lock.locked():
+            Timer(0.1, lambda: (calls.append("applied"), bench.loop._driver_lock.release())).start()
 
     mirror.fill = fill  # type: ignore[attr-defined]
     mirror.close = lambda: calls.append("close")  # type: ignore[method-assign]
     bench = MirrorBench(mirror)
     bench.service.stop("the test")
-    bench.loop._turn.acquire()  # as while the driver applies a command
+    bench.loop._driver_lock.acquire()  # as while the driver applies a command
     bench.loop.run()
     assert calls[-3:] == ["fill", "applied", "close"]

@@ -1,4 +1,4 @@
-"""Driver processes that die or hang for 5 s, restarted as by a service manager."""
+"""Driver processes that hang for 5 s, or die and are restarted as by a service manager."""
 
 import subprocess
 import time
@@ -48,7 +48,7 @@ def test_a_restarted_camera_process_is_a_new_start(tmp_path: Path) -> None:
     (tmp_path / "dying.py").write_text(DYING)
     words = ("camera", "dying.py:Dying", "--run", "dying")
     starts: list[int] = []
-    with closing(ZenohBus(open_run("dying").links, Role.RECORDER, HostClock())) as bus:  # a peer for the camera
+    with closing(ZenohBus(open_run("dying").links, Role.RECORDER, HostClock())) as bus:
         bus.subscribe(FRAME, lambda sample: starts.append(start_of(sample.sequence)))
         died = subprocess.run([*LOWFC, *words], cwd=tmp_path, timeout=60, check=False)
         assert died.returncode == 7, "a failure: the units in deploy restart it"

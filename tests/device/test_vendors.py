@@ -81,7 +81,7 @@ def test_settings_default_to_the_configuration() -> None:
 class Buffers:
     """Stand-in for a stream of aravis: buffers of 2 x 3 pixels with the given frame numbers; 0 for a failed buffer.
 
-    At first all but the last `later` are in the queue; by default each arrives when the driver waits for it.
+    All but the last `later` are in the queue at first. By default none is: each arrives when the driver waits for it.
     """
 
     def __init__(self, *numbers: int, later: int = 99) -> None:

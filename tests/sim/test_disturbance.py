@@ -132,8 +132,8 @@ def test_reaction_wheel_and_ideal_preset_have_the_same_power() -> None:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_sampler_instants_are_sums_of_the_waves(name: str) -> None:
-    """Waves, square wave and constant at two instants of a period, also at the end of a block."""
+def test_modes_at_the_instants_of_a_sampler_are_sums_of_the_waves(name: str) -> None:
+    """Sums of waves, square wave and constant at two instants of a period, also at the end of a block."""
     disturbance = replace(preset(name, static_nm={4: 3.0}), lines=())
     sampler = Sampler(disturbance, np.array([0.0, 0.5]), RATE_HZ)
     for index in (0, BLOCK - 1, 5, 12_345 * BLOCK + 1):

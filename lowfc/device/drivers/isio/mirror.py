@@ -81,7 +81,7 @@ class IsioMirror:
         return self._beside[1]
 
     def apply(self, actuators_nm: Single) -> Single | None:
-        """Write the channel (rows, columns); once the sum is updated, return this channel's part of it."""
+        """Write the channel (rows, columns); return its part of the sum if that is updated in time and differs."""
         self._reopen()
         self._check_writer()
         total = self._current_total()
