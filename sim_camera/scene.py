@@ -170,7 +170,7 @@ class Scene:
         shapes_nm, weights = [actuators_nm], np.ones((len(self.instants), 1), np.float32)
         if path is not None and len(self.instants):
             shapes_nm, weights = [actuators_nm, *path[0]], np.hstack([0 * weights, path[1]])
-        # Modes (1 + instants, modes): in row 0 at the start of the exposure, then at each instant; likewise `residual`.
+        # Modes (1 + instants, modes): row 0 at the start of the exposure, then a row per instant; likewise `residual`.
         disturbance = np.concatenate([modes[:1], modes[len(modes) - len(self.instants) :]])
         shape_weights = np.vstack([np.eye(1, len(shapes_nm), dtype=np.float32), weights])
         opd_nm = disturbance @ self._basis

@@ -196,7 +196,7 @@ class MirrorLoop:
             return self._status.surface_nm
         else:
             reached_nm = self._call(self._driver.apply, actuators_nm)
-        self.watch.worked()  # not after other calls: a failing `apply` would be retried without pauses
+        self.watch.worked()  # not after other calls: they would reset the pauses between retries of a failing `apply`
         self._driven_nm = actuators_nm
         return actuators_nm if reached_nm is None else reached_nm
 
@@ -240,7 +240,7 @@ class MirrorLoop:
         if self._driven_nm is None:
             if (held_nm := self._read_shape()) is not None:
                 self._status = self._status._replace(driven_nm=held_nm)
-            else:  # the failed call may have moved the mirror: only its last shape is surely within the slew limit
+            else:  # the failed call may have moved the mirror: repeat the last shape, surely within the slew limit
                 protection = replace(protection, flatten=False)
         self._status = tick(protection, self._status, self._service.clock.now_ns(), self._drive)
         self._known = True
@@ -266,7 +266,7 @@ class MirrorLoop:
     def _publish(self, time_ns: int) -> None:
         status = self._status
         self._states.put(state_of(status, time_ns, self._refused, known=self._known).SerializeToString())
-        now_ns = self._service.clock.now_ns()  # a command's time cannot be trusted
+        now_ns = self._service.clock.now_ns()  # not `time_ns`, which may be the time in a command, and wrong
         self._state_due_ns = now_ns + IDLE_STATE_NS
         if now_ns >= self._picture_due_ns and self._known:
             picture = np.asarray(self._y_factors @ status.surface_nm @ self._x_factors.T, np.float32)

@@ -1,4 +1,4 @@
-"""Calibrations as FITS files: no loss, damage is detected, units are in the headers."""
+"""Calibrations in FITS files are loaded without loss; damage is detected; the headers have the units."""
 
 import io
 from dataclasses import fields, replace
@@ -18,7 +18,7 @@ from tests.support import toy
 
 
 def calibration(flux_dn: float = 1234.5678901234) -> Calibration:
-    """The toy's calibration with bad pixels and noise in some arrays."""
+    """The calibration of `tests.support.toy` with bad pixels and noise in some arrays."""
     toy_calibration, rng = toy.calibration(), np.random.default_rng(3)
     arrays = {
         name: single(rng.standard_normal(getattr(toy_calibration, name).shape))

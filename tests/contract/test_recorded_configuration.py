@@ -29,7 +29,7 @@ REMARKS = [
 ]
 
 
-def test_known_keys_are_used_and_unknown_or_invalid_ones_are_remarks() -> None:
+def test_known_keys_are_used_and_unknown_or_invalid_ones_cause_remarks() -> None:
     config, remarks = recorded(OTHER.encode())
     assert config == load(None, {"camera.rate_hz": 300.0})
     assert remarks == REMARKS
@@ -82,7 +82,7 @@ def test_the_number_of_remarks_is_limited() -> None:
 
 
 @pytest.mark.parametrize("toml", ["[camera", "a = " + "[" * 100_000, "#" * (1 << 20) + "#"])
-def test_an_unreadable_configuration_is_a_remark(tmp_path: Path, toml: str) -> None:
+def test_an_unreadable_configuration_causes_a_remark_on_its_log(tmp_path: Path, toml: str) -> None:
     with pytest.raises(ConfigurationError, match="not a readable TOML file"):
         recorded(toml.encode())
     night = SyntheticLog().frames(5)
@@ -107,7 +107,7 @@ def night() -> SyntheticLog:
 
 @pytest.fixture(scope="module")
 def written(night: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], bytes]:
-    """Return a function from a configuration to the content of the log with it."""
+    """Function that returns the content of the log with a configuration, which is given as TOML text."""
     return cache(lambda toml: night.write(tmp_path_factory.mktemp("night") / "night.mcap", toml=toml).read_bytes())
 
 

@@ -189,7 +189,7 @@ def test_a_channel_written_by_another_process_is_refused(folder: Path) -> None:
     other.pack("<i", other.writers, os.getppid())
     with pytest.raises(RuntimeError, match=f"process {os.getppid()} writes stream 'dm00disp03'"):
         driver.apply(shape_nm(2))
-    driver.apply(shape_nm(2))  # no other write since
+    driver.apply(shape_nm(2))  # the other process has not written again
     assert np.allclose(other.pixels[0] * 1000, shape_nm(2), atol=1e-4)
 
 
@@ -211,7 +211,7 @@ def test_a_channel_that_is_being_created_is_awaited(folder: Path, monkeypatch: p
     assert events.events()[1:] == ["STREAM_RENEWED"]
 
 
-def test_a_recreated_channel_that_cannot_be_used_fails_commands_until_it_can(folder: Path) -> None:
+def test_commands_fail_while_a_recreated_channel_cannot_be_used(folder: Path) -> None:
     driver, events = mirror()
     driver.apply(shape_nm(1))
     PlainStream.make(folder / "dm00disp03.im.shm", GRID[1] + 1, GRID[0], FLOAT32)
@@ -409,7 +409,7 @@ def test_the_stroke_limit_applies_to_the_sum_of_channels() -> None:
     assert not status.command_nm.size
     reached = status.surface_nm
     assert reached[2, 2] == pytest.approx(50, abs=0.1)
-    assert reached[4, 4] == 0  # the other channels already exceed the stroke: no further
+    assert reached[4, 4] == 0  # the other channels already exceed the stroke in this direction
     assert (reached[6, 6], reached[8, 8], reached[9, 9]) == (100, -100, 100)
     assert np.abs(reached + beside)[2, 2] < CONFIG.mirror.stroke_nm / 2
     status, _ = apply_command(protection, Status(flat, flat), command, AT_NS, lambda shape, _: shape, flat)

@@ -210,7 +210,7 @@ def test_screen_has_a_kolmogorov_spectrum_and_depends_on_the_seed() -> None:
     """Power averaged over seeds falls as frequency to the power -11/3 between 1 and 5 cycles per diameter."""
     power = np.zeros((64, 64))
     for seed in range(30):
-        power += np.abs(np.fft.fft2(screen(seed, 64, 4 / 64))) ** 2  # one full period
+        power += np.abs(np.fft.fft2(screen(seed, 64, 4 / 64))) ** 2  # the samples cover one period of the screen
     radius = np.hypot(*np.meshgrid(np.fft.fftfreq(64, 4 / 64), np.fft.fftfreq(64, 4 / 64)))
     bands = [(radius > low) & (radius <= 1.3 * low) for low in (1.0, 2.0, 4.0)]
     slope = np.polyfit(np.log([radius[b].mean() for b in bands]), np.log([power[b].mean() for b in bands]), 1)[0]

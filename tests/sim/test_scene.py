@@ -160,7 +160,7 @@ def test_exposure_nodes_average_a_vibration_and_are_two_if_it_is_slow() -> None:
 
 @pytest.mark.slow
 def test_blurred_image_is_as_accurate_as_one_at_rest() -> None:
-    """The twin with two nodes against the full optics at 64 instants: error at most 10 % above a single image's."""
+    """The twin's two nodes against 64 images of the full optics: an error of at most 1.1 times that of one image."""
     keys = {"disturbance__preset": "reaction-wheel-ideal", "camera__rate_hz": 1000.0}
     config = configured(**FINE, **keys)
     blurred, optics = scene_of(config), sensor(config, print)
@@ -179,7 +179,7 @@ def test_blurred_image_is_as_accurate_as_one_at_rest() -> None:
 
 
 def test_continuous_truth_is_the_rms_over_the_period_with_a_moving_mirror(calibration: Calibration) -> None:
-    """Compared with static scenes with the wavefront of each instant; the mirror moves in mid-period."""
+    """Compared with static scenes, one for the wavefront at each instant; the mirror moves in mid-period."""
     config = configured(disturbance__preset="bench", camera__rate_hz=20.0, camera__instants=4)
     scene, sampler = scene_of(config), Sampler(disturbance_of(config), np.array([0.125, 0.375, 0.625, 0.875]), 20.0)
     shapes = [shape_of(calibration, height_nm * np.eye(MODES)[3]) for height_nm in (5.0, -8.0)]

@@ -97,7 +97,7 @@ def test_two_wheels_beat() -> None:
     both = [replace(each, amplitude_nm=np.array([[2.0], *[[0]] * 4]) + 0j) for each in (one, other)]
     total = sum(each.modes_nm(time_s)[:, 0] for each in both)
     envelope = np.abs(total).reshape(-1, 100).max(axis=1)
-    # In the middle of each tenth of a second; 900 / 925 is the height at 30 Hz with the corner at 5 Hz.
+    # Expected in the middle of each tenth of a second; 900 / 925 is the amplitude at 30 Hz relative to high speed.
     expected = 4 * np.abs(np.cos(np.pi * 0.5 * (0.05 + 0.1 * np.arange(40)))) * 900 / 925
     np.testing.assert_allclose(envelope, expected, atol=0.4)
     config = quiet(disturbance__wheel_hz=30.0, disturbance__second_wheel_hz=0.5)
