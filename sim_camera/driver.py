@@ -21,6 +21,7 @@ from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE, TRUTH, timestamp, wire
 from lowfc.control.durations import Durations
+from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.laws.stability import delay_weights
 from lowfc.device import CameraSettings, DriverOptions, Exposure, Puts
@@ -153,7 +154,8 @@ class SimulatedCamera:
         self._latched = flat
         # In lockstep a shape applies from the start of an exposure, and the mirror's state already includes settling.
         settling = 0.0 if config.lockstep else config.mirror.settling_us * 1e3 / config.period_ns
-        self._path = MirrorPath(flat, config.camera.delay_frames - 1, settling)
+        applied = Timing.of(config.camera.delay_frames, config.camera.exposure_fraction).applied
+        self._path = MirrorPath(flat, applied - 1, settling)
         self._index, self._origin_ns = 0, 0
         self._exposing = self._exposed = _Exposed(-1, 0, 0, 0, flat)
         self._newest_state = self._last_frame = 0  # sequences
@@ -326,9 +328,12 @@ class SimulatedCamera:
                     self._frame_to_mirror.add(sample.publish_time_ns - published_ns)
 
     def _moment(self, publish_time_ns: int) -> float:
-        """Time at which the mirror reached a shape, in periods; in lockstep, the start of the next exposure."""
+        """Time at which the mirror reached a shape, in periods.
+
+        In lockstep and with a fractional delay, whose shape moves during an exposure: the start of the next exposure.
+        """
         index, start_ns = self._exposed.frame, self._exposed.start_ns
-        if self._service.clock.lockstep or index < 0:
+        if self._service.clock.lockstep or index < 0 or self._config.camera.delay_frames % 1:
             return index + 1
         return index + (publish_time_ns - start_ns) / self._config.period_ns
 

@@ -101,7 +101,7 @@ class Bench:
         self.start_mirror()
         self._weights = delay_weights(self.world.camera.delay_frames).astype(np.float32)
         self._shapes = [self._status.surface_nm] * len(self._weights)
-        self._path = MirrorPath(self._status.surface_nm, self.world.camera.delay_frames - 1)
+        self._path = MirrorPath(self._status.surface_nm, timing_of(self.world).applied - 1)
 
     def _begin(self, config: Configuration, first: Input) -> None:
         self.config, self.frames_refused, self._index = config, 0, 0

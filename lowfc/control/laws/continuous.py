@@ -42,8 +42,12 @@ class Timing(NamedTuple):
 
     @classmethod
     def of(cls, delay: float, exposure: float) -> "Timing":
-        """Timing in which a command is in force when the first exposure wholly with it begins."""
-        return cls(delay, delay, exposure)
+        """Timing in which a command is in force when the first exposure wholly with it begins.
+
+        With a fractional delay the mirror moves when this fraction of an exposure is over.
+        """
+        whole = delay // 1
+        return cls(delay, whole + (delay - whole) * exposure, exposure)
 
     @classmethod
     def measured(cls, delay: float, exposure: float, waited: float) -> "Timing":

@@ -66,6 +66,21 @@ def test_the_residual_power_of_a_wave_agrees_with_a_fine_simulation(timing: Timi
     assert residual_nm2 == pytest.approx(simulated_residual(law, omega, timing), rel=0.01)
 
 
+@pytest.mark.parametrize(("delay", "exposure"), [(1.0, 0.5), (1.5, 0.5), (2.3, 0.2), (1.4, 1.0)])
+def test_the_mirror_moves_within_the_exposure_that_sees_parts_of_two_commands(delay: float, exposure: float) -> None:
+    """Simulated in fine steps, in which an exposure sees what the mirror does."""
+    frames, omega, timing = 800, 0.11, Timing.of(delay, exposure)
+    wave = np.sqrt(2) * np.cos(omega * np.arange(frames * FINE) / FINE + 1)
+    mirror, c = np.zeros(frames * FINE), 0.0
+    for k in range(frames):
+        exposed = slice(k * FINE, k * FINE + round(exposure * FINE))
+        c -= 0.3 * np.mean(wave[exposed] + mirror[exposed])
+        mirror[k * FINE + round(timing.applied * FINE) :] = c
+    residual_nm2 = np.mean((wave + mirror)[frames // 4 * FINE :] ** 2)
+    theory_nm2 = residual_power(integrator_of_tip(0.3, delay), np.array([omega]), timing)[0, 0]
+    assert theory_nm2 == pytest.approx(residual_nm2, rel=0.01)
+
+
 def test_the_floor_is_the_residual_of_the_best_held_value() -> None:
     t = np.linspace(0, 1, 20_001)
     for omega in (0.1, 1.0, 4.0):
