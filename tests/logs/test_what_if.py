@@ -23,7 +23,9 @@ from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import reconstructor
 from lowfc.control.laws.stability import delay_weights, limiting_gain
 from lowfc.control.laws.what_if import counterfactual, limited_integrator, rms
+from lowfc.control.loop.inputs import Outputs
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
+from lowfc.control.loop.state import State
 from lowfc.optics.chain.added_contrast import contrast_form
 from lowfc.optics.chain.coronagraph import Coronagraph
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -171,6 +173,33 @@ def test_added_contrast_of_shaped_pupil_and_lyot_coronagraph() -> None:
     behind_lyot = found(sensor__pupil="circle")
     assert behind_lyot is not None
     assert behind_lyot["what if"] > 0
+
+
+class BetweenFramesLog(SyntheticLog):
+    """A log with a delay of 1.5 frames: the mirror moves in the middle of each exposure."""
+
+    def _publish(self, advanced: tuple[State, Outputs], late_ns: int = 0) -> None:
+        before_nm = self._to_modes @ np.ravel(self._state.loop.actuators_nm) if self._frames else self._moved_nm
+        super()._publish(advanced, late_ns)
+        self._moved_nm = (before_nm + self._moved_nm) / 2
+
+
+def test_the_continuous_residual_of_a_fractional_delay_is_that_of_the_moving_mirror(tmp_path: Path) -> None:
+    """Compared with the true disturbance, the commands and a mirror that moves a quarter of a period after t_k."""
+    toml = load(None, {"sensor.modes": 10, "camera.delay_frames": 1.5}).to_toml()
+    log = BetweenFramesLog(delay_frames=1.5, gain=(0.6, 0.6)).frames(FRAMES)
+    run = LoggedRun(read_history(LogReader(log.write(tmp_path / "x.mcap", toml=toml))))
+    results = results_of(run)
+    assert results["delay_frames"] == 1.5
+    assert run.true_nm is not None
+    disturbance_nm, command_nm = run.true_nm[0][:, 0].astype(float), run.steps.command_nm[:, 0].astype(float)
+    squares = []
+    for moment in (np.arange(8) + 0.5) / 8:
+        between_nm = np.interp(np.arange(FRAMES) + moment, np.arange(FRAMES), disturbance_nm)
+        squares.append((between_nm + np.roll(command_nm, 2 if moment < 0.25 else 1)) ** 2)
+    expected_nm = np.sqrt(np.mean(np.array(squares)[:, SETTLING:-50]))
+    assert column(results, "continuous_was")[0] == pytest.approx(expected_nm, rel=0.02)
+    np.testing.assert_allclose(column(results, "continuous_what_if"), column(results, "continuous_was"), rtol=1e-4)
 
 
 def test_a_what_if_predicts_the_residual_of_a_run_with_other_gains(runs: dict[str, LoggedRun]) -> None:

@@ -164,13 +164,17 @@ def held_residual_nm2(
     return squares - rows.sum() * by_noise_nm2, int(rows.sum())
 
 
-def continuous_residual_nm2(disturbance_nm: Array, mirror_nm: Array, moves_at: float = 1.0) -> Array:
+def continuous_residual_nm2(
+    disturbance_nm: Array, mirror_nm: Array, moves_at: float = 1.0, next_nm: Array | None = None
+) -> Array:
     """Mean square residual over each period (frames, modes), from the states at the start of each exposure.
 
     The disturbance (frames, modes) is interpolated between those instants, and the mirror (frames, modes) holds until
-    it moves to its next state, `moves_at` periods later; NaN where there are too few neighbours.
+    it moves `moves_at` periods later to `next_nm`, by default its state in the next frame; NaN where there are too few
+    neighbours.
     """
-    mean_square, next_nm = np.zeros_like(disturbance_nm), np.roll(mirror_nm, -1, axis=0)
+    mean_square = np.zeros_like(disturbance_nm)
+    next_nm = np.roll(mirror_nm, -1, axis=0) if next_nm is None else next_nm
     for moment in ((np.arange(_MOMENTS) + 0.5) / _MOMENTS).tolist():
         between_nm, _ = means_while_applied(disturbance_nm, Timing(1.0, moment, 0.0, 0.0))
         mean_square += (between_nm + (mirror_nm if moment < moves_at else next_nm)) ** 2 / _MOMENTS

@@ -70,7 +70,7 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
     contrast = None
     columns = {"open": rms(pol_nm, rows), "was": rms(was_nm, rows), "what_if": rms(what_if_nm, rows)}
     if run.true_nm is not None:
-        true, contrast = _true(run, rows, what_if_nm - pol_nm - seen_nm)
+        true, contrast = _true(run, rows, what_if_nm - pol_nm - seen_nm, command_nm)
         columns |= true
     return {
         "log": str(run.history.log.path),
@@ -109,23 +109,32 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
     }
 
 
-def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> tuple[dict[str, Array], dict[str, Any] | None]:
+def _true(
+    run: LoggedRun, rows: Mask, moved_nm: Single, command_nm: Single
+) -> tuple[dict[str, Array], dict[str, Any] | None]:
     """Rms (modes,) of the true residual, sampled in the frames and continuous, as logged and for the what-if.
 
-    `moved_nm` (steps, modes) is the what-if's command minus the logged one, as seen by each exposure. The second value
-    is the contrast added to the dark zone by the continuous residual, if known.
+    `moved_nm` (steps, modes) is the what-if's command minus the logged one, as seen by each exposure, `command_nm` the
+    what-if's command. The second value is the contrast added to the dark zone by the continuous residual, if known.
     """
     assert run.true_nm is not None  # noqa: S101  # the caller knows
     disturbance_nm, residual_nm = (values.astype(np.float64) for values in run.true_nm)
     found, covariances = dict[str, Array](), dict[str, Array | None]()
     known = rows & np.isfinite(residual_nm).all(axis=1)
-    for name, after_nm in (("was", residual_nm), ("what_if", residual_nm + moved_nm)):
+    fraction = run.simulated_delay % 1
+    for name, after_nm, law_nm in (
+        ("was", residual_nm, run.steps.command_nm),
+        ("what_if", residual_nm + moved_nm, command_nm),
+    ):
         if known.any():
             found[f"true_{name}"] = rms(after_nm, known)
         squares = np.full(after_nm.shape, np.nan)
         for piece in np.split(np.arange(len(rows)), np.flatnonzero(run.missing)):
-            mirror_nm = (after_nm - disturbance_nm)[piece]
-            squares[piece] = continuous_residual_nm2(disturbance_nm[piece], mirror_nm, run.moves_at)
+            mirror_nm, next_nm = (after_nm - disturbance_nm)[piece], None
+            if fraction:  # the instant has a mean of the two commands that the exposure sees
+                move_nm = _move_nm(law_nm[piece], run.simulated_delay)
+                mirror_nm, next_nm = mirror_nm - (1 - fraction) * move_nm, mirror_nm + fraction * move_nm
+            squares[piece] = continuous_residual_nm2(disturbance_nm[piece], mirror_nm, run.moves_at, next_nm)
         with_squares = rows & np.isfinite(squares).all(axis=1)
         if with_squares.any():
             found[f"continuous_{name}"] = np.sqrt(squares[with_squares].mean(axis=0))
@@ -133,6 +142,12 @@ def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> tuple[dict[str, Array
             covariances[name.replace("_", " ")] = with_variances(sampled_nm2, found[f"continuous_{name}"])
     contrast = added_contrast(known_contrast(run.history.configuration), covariances)
     return {name: found[name] for name in _TITLES if name in found}, contrast
+
+
+def _move_nm(command_nm: Single, delay_frames: float) -> Single:
+    """The mirror's move (steps, modes) within each exposure, from the older command to the newer one."""
+    newer, older = (np.roll(command_nm, int(delay_frames) + later, axis=0) for later in (0, 1))
+    return newer - older
 
 
 def render(results: dict[str, Any]) -> str:

@@ -13,6 +13,7 @@ from lowfc.arrays import Integers, Mask, Sequences, Single
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.codecs.law_codec import integrator_of
 from lowfc.contract.codecs.state_codec import calibration_in_use
+from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME, Role, floats, wire
 from lowfc.control.calibration.calibration import Calibration
@@ -145,8 +146,18 @@ class LoggedRun:
         return self.history.timing(self.delay_frames)
 
     @property
+    def simulated_delay(self) -> float:
+        """Delay of the simulated camera, frames; the true wavefront comes only from it."""
+        return (self.history.configuration or Configuration()).camera.delay_frames
+
+    @property
     def moves_at(self) -> float:
-        """Time at which the mirror moves, periods after the start of an exposure: 1 in a lockstep log."""
+        """Time at which the mirror moves, periods after the start of an exposure: 1 in a lockstep log.
+
+        With a fractional delay of the simulated camera it moves during the exposure.
+        """
+        if self.simulated_delay % 1:
+            return self.history.timing(self.simulated_delay).applied % 1
         timing = self.history.timing(float(np.ceil(self.delay_frames)))
         return timing.applied - timing.delay + 1
 
