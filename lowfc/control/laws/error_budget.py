@@ -70,9 +70,9 @@ def sensor_noise(
     return SensorNoise(np.sqrt(excess) * photon, np.sqrt(np.maximum(both**2 - photon**2, 0.0)))
 
 
-def white_noise(law: LinearLaw, noise_nm: Array) -> Term:
-    """Residual from noise of the modes (modes,) that is independent from frame to frame."""
-    return Term(noise_nm**2 * noise_gain(law))
+def white_noise(law: LinearLaw, noise_nm: Array, timing: Timing) -> Term:
+    """Residual from noise of the modes (modes,) that is independent from frame to frame, over time as in `lag`."""
+    return Term(noise_nm**2 * noise_gain(law, held=timing.held > 0))
 
 
 def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -> Term:

@@ -144,16 +144,20 @@ def noise_transfer(law: LinearLaw, frequency_hz: Array, delay_frames: float | No
     return np.abs(sensitivity(law, 2 * np.pi * np.asarray(frequency_hz, float) / law.rate_hz, delay_frames) - 1)
 
 
-def noise_gain(law: LinearLaw, delay_frames: float | None = None) -> Array:
-    """Residual variance (modes,) caused by white measurement noise, per variance of that noise in one frame."""
+def noise_gain(law: LinearLaw, delay_frames: float | None = None, *, held: bool = False) -> Array:
+    """Residual variance (modes,) caused by white measurement noise, per variance of that noise in one frame.
+
+    It is that in an exposure, which with a fractional delay sees a mean of two commands, or with `held` over all time.
+    """
     gain, weights = np.zeros(len(law.noll)), _weights(law, delay_frames)
     for part in _parts(law):
         if not part.driven:
             continue
         omega = _frequencies(_poles(part.closed(weights)))
         S = part.sensitivity(omega, weights)
+        seen = np.polynomial.polynomial.polyval(np.exp(-1j * omega), weights) if held else 1.0
         for place, mode in enumerate(part.modes.tolist()):
-            gain[mode] = np.trapezoid(np.abs(S[:, place, place] - 1) ** 2, omega) / np.pi
+            gain[mode] = np.trapezoid(np.abs((S[:, place, place] - 1) / seen) ** 2, omega) / np.pi
     return gain
 
 

@@ -12,6 +12,7 @@ from lowfc.control.laws.continuous import Timing, residual_power
 from lowfc.control.laws.error_budget import Term, lag, lag_under_noise, measurement_error, sensor_noise, white_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import TimeSeries, spectrum
+from lowfc.control.laws.stability import delay_weights
 from tests.support.in_process_loop import SMALL_MIRROR, run_loop
 from tests.support.theory import one_piece, rejection
 from tools.law_bench import calibrated
@@ -26,13 +27,26 @@ def law_of_two_modes(gain: tuple[float, ...] = (0.5, 0.1), leak: tuple[float, ..
 
 
 def test_the_noise_of_a_loop_with_one_frame_of_delay_has_a_closed_form() -> None:
-    noise = white_noise(law_of_two_modes((0.5, 0.1)), np.array([4.0, 2.0]))
+    noise = white_noise(law_of_two_modes((0.5, 0.1)), np.array([4.0, 2.0]), SAMPLED)
     assert noise.variance_nm2 == pytest.approx([16 * 0.5 / 1.5, 4 * 0.1 / 1.9], rel=1e-3)
+
+
+@pytest.mark.parametrize(("delay", "gain", "leak"), [(1.5, 0.5, 0.0), (2.3, 0.2, 0.02), (2.0, 0.3, 0.0)])
+def test_over_all_time_the_noise_is_that_of_the_commands(delay: float, gain: float, leak: float) -> None:
+    """With a fractional delay an exposure sees a mean of two commands, with less noise; from a single frame's noise."""
+    weights, commands, seen = delay_weights(delay), [0.0] * 5, [0.0]
+    for frame in range(2000):
+        seen.append(float(weights @ commands[: -1 - len(weights) : -1]))
+        commands.append((1 - leak) * commands[-1] - gain * ((frame == 0) + seen[-1]))
+    law = integrator((gain,), (leak,), (2,), delay, RATE_HZ)
+    for timing, response in ((Timing.of(delay, 0.5), commands), (Timing.sampled(delay), seen)):
+        noise = white_noise(law, np.array([2.0]), timing)
+        assert noise.variance_nm2[0] == pytest.approx(4 * np.sum(np.square(response)), rel=2e-3)
 
 
 def test_a_mode_without_gain_keeps_its_disturbance_and_adds_no_noise() -> None:
     law = law_of_two_modes((0.5, 0.0))
-    assert white_noise(law, np.ones(2)).variance_nm2[1] == 0
+    assert white_noise(law, np.ones(2), SAMPLED).variance_nm2[1] == 0
     drift = spectrum(one_piece(np.random.default_rng(1).standard_normal((4000, 2))), RATE_HZ)
     assert lag(law, drift, np.array([0.0, 3.0]), SAMPLED).variance_nm2[1] == pytest.approx(9 + drift.variance_nm2()[1])
 
@@ -181,8 +195,8 @@ def test_the_terms_add_up_to_the_residual_of_a_simulated_loop() -> None:
         noise.total_nm,
     )
     terms = [
-        white_noise(law, noise.photon_nm),
-        white_noise(law, noise.read_nm),
+        white_noise(law, noise.photon_nm, SAMPLED),
+        white_noise(law, noise.read_nm, SAMPLED),
         lag(law, disturbance, signals["disturbance_nm"].mean(axis=0), SAMPLED),
         split.crosstalk,
         split.nonlinearity,

@@ -72,7 +72,8 @@ def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None,
             ("read noise", noise.read_nm, "camera's read noise, rounding and dark charge"),
         ):
             how = f"{source}, through the reconstructor, {_THROUGH}"
-            entries[name] = (white_noise(law, frame_nm), how if noise.total_nm.any() else "the simulation has no noise")
+            how = how if noise.total_nm.any() else "the simulation has no noise"
+            entries[name] = (white_noise(law, frame_nm, timing), how)
     if spectra is None:
         entries["lag"] = (None, f"requires {_TOO_SHORT}")
     elif stretch.true:
