@@ -10,7 +10,7 @@ from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, reference, response
 
-_INSTANTS = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)])  # Gauss-Legendre, in exposure times
+_INSTANTS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)  # at which an exposure is evaluated (Gauss-Legendre)
 _SAMPLE_TIMES = (np.arange(8) + 0.5) / 8  # times at which the residual is sampled, in periods
 _SETTLING_TIME_CONSTANTS = 8.0  # settling, in time constants of the slowest mode
 
@@ -20,11 +20,11 @@ class DriftTrial:
     """Sensor, flux and exposure of a simulated loop with a delay of one frame.
 
     Attributes:
-        twin: twin of the sensor.
+        twin: Twin of the sensor.
         noll: Noll indices of the fitted modes.
-        light_e: electrons per exposure of the light through the open circle.
-        read_noise_e: read noise of a pixel, electrons.
-        exposure: exposure time, in periods.
+        light_e: Electrons per exposure of the light through the open circle.
+        read_noise_e: Read noise of a pixel, electrons.
+        exposure: Exposure time, in frame periods.
     """
 
     twin: Twin

@@ -1,4 +1,4 @@
-"""Estimators of modes from an image: plain and noise-weighted pseudo-inverse (Sect. 2.3), iterated full model."""
+"""Estimators of modes from an image: plain and noise-weighted pseudo-inverse, and iterations with the full model."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Fit:
 
 
 def fit(I0: Array, H: Array, scale_e: float, read_noise_e: float, kind: str, nuisance: Array | None = None) -> Fit:
-    """The least-squares solution of eq. (11) for one exposure.
+    """The least-squares solution of the paper's eq. (11) for one exposure.
 
     Args:
         I0: (pixels,) image of a flat wavefront, fractions of the open circle's light.

@@ -11,7 +11,7 @@ from lowfc.optics.chain.grid import OPEN_AREA
 
 
 def variance_e(reference_e: Array, read_noise_e: float) -> Array:
-    """Variance (pixels,) of photon and read noise in the image of a flat wavefront (Sects. 3 and 3.3).
+    """Variance (pixels,) of photon and read noise in the image of a flat wavefront (the paper's Sects. 3 and 3.3).
 
     Rounding to whole electrons is neglected: its 1/12 e-^2 changes no scatter of Table 4 by more than 1 %.
 

@@ -147,7 +147,7 @@ def sweep(merit_of: Callable[[float], float], low: float, high: float, count: in
         merit_of: Function from a value to its merit, which is minimised.
         low: Lower end of the range.
         high: Upper end; equal to `low` for a single value.
-        count: Number of values, at least 3.
+        count: Number of evenly spaced values, at least 3.
     """
     if low == high:
         return np.array([low]), low

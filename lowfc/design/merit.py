@@ -1,7 +1,7 @@
 """Predicted performance of a sensor: the values that a search can minimise.
 
-A `Candidate` provides I0 and H of eqs. (6) and (12). These determine its values in Tables 3 and 4, and the contrast
-that the noise of an exposure adds to the dark zone.
+A `Candidate` provides I0 and H, eqs. (6) and (12) of the paper. These determine its values in the paper's Tables 3 and
+4, and the contrast that the noise of an exposure adds to the dark zone.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from lowfc.optics.chain.coronagraph import Coronagraph
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
 
-WAVELENGTH_NM = 550.0  # Table 1
+WAVELENGTH_NM = 550.0  # central wavelength, Table 1 of the paper
 CONTROLLED = len(NOLLS_14)
 """Number of controlled modes, for the noise, the added contrast and the share of the quantum limit."""
 
@@ -70,7 +70,7 @@ class Candidate(Protocol):
 
     @property
     def forms(self) -> PupilForms:
-        """Quadratic forms of its coronagraph's pupil."""
+        """Quadratic forms of the pupil of the sensor's coronagraph."""
 
     @property
     def paper_rows(self) -> tuple[str, ...]:

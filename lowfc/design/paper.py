@@ -1,4 +1,4 @@
-"""Conditions and results of the paper used by the tables and by the search for better masks (Sects. 2 and 3)."""
+"""Conditions and results of Subedi et al. 2015, used by the tables and by the search for better masks."""
 
 from lowfc.optics.detector.photometry import Photometry
 
@@ -15,7 +15,8 @@ STAR = Photometry()
 TABLE4_EXPOSURE_S = 0.05
 TABLE4_READ_NOISE_E = 1.0
 TABLE4_MODES = 2
-"""Number of fitted modes, tip and tilt: with 14, even the Cramer-Rao bound of the SAM is twice the paper's value."""
+"""Number of fitted modes, tip and tilt. The paper does not state it; with 14, even the SAM's Cramer-Rao bound would be
+twice the paper's value."""
 
 TABLE3_WAVES = {
     "disk": {14: (5.1e-4, 8.9e-3), 20: (8.0e-4, 0.021)},

@@ -2,8 +2,8 @@
 
 The fields in the relay pupil, after the focal-plane mask, do not depend on the holes: the field of the flat wavefront
 and the first-order field of each mode are propagated once (`build_optics`). Each hole adds a small product of matrices
-to every field at the sensor (`hole_fields`), so that a search that moves one hole recomputes only that hole. I0 and H,
-eqs. (6) and (12), follow from the fields (`SamCandidate`); `lowfc.design.merit` computes their performance.
+to every field at the sensor (`hole_fields`), so that a search that moves one hole recomputes only that hole. I0 and H
+(the paper's eqs. (6) and (12)) follow from the fields (`SamCandidate`); `lowfc.design.merit` computes the performance.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ Hole = tuple[float, float, float]
 FOCAL_MASKS: dict[str, Callable[[int], Array]] = {"disk": disk, "bowtie": bowtie}
 
 IMAGE_WIDTH = 20
-"""Width of the sensor's image, in lambda0 / D (Table 1)."""
+"""Width of the sensor's image, in lambda0 / D (Table 1 of the paper)."""
 PIXELS_PER = 4
 """Pixels per lambda0 / D (Table 1)."""
 FOCAL_SAMPLES_PER = 8

@@ -15,7 +15,7 @@ from lowfc.design.goal import Goal, merit
 from lowfc.design.sam_merit import RELAY_SAMPLES, Optics, SamCandidate, hole_fields
 
 Orbit = tuple[int, int, int]
-"""Centre x, y and diameter of a hole, in thousandths of the pupil's diameter."""
+"""One hole of an orbit: centre x, y and diameter, in thousandths of the pupil's diameter; `images` adds the other."""
 
 UNIT = 1000  # lengths are integers, this many to the diameter of the pupil
 SMALLEST = ceil(UNIT / RELAY_SAMPLES)
@@ -50,14 +50,14 @@ class Bounds:
 
     def __post_init__(self) -> None:
         if not 1 <= self.count[0] <= self.count[1]:
-            raise ValueError(f"the number of holes must be at least 1 and in order, got {self.count}")
+            raise ValueError(f"the number of holes must be at least 1, and fewest:most in order, got {self.count}")
         if not SMALLEST <= self.diameter[0] <= self.diameter[1] <= UNIT - 2 * self.edge:
             raise ValueError(
                 f"hole diameters must be in order and lie between {SMALLEST / UNIT} and {1 - 2 * self.edge / UNIT:g} "
                 f"pupil diameters, got {self.diameter[0] / UNIT} to {self.diameter[1] / UNIT}"
             )
         if self.gap < 0 or self.edge < 0:
-            raise ValueError(f"gaps must not be negative, got {self.gap / UNIT} and {self.edge / UNIT}")
+            raise ValueError(f"gap and edge must not be negative, got {self.gap / UNIT} and {self.edge / UNIT}")
         if self.symmetry not in SYMMETRIES:
             raise ValueError(f"symmetry must be one of {', '.join(SYMMETRIES)}, got {self.symmetry!r}")
 

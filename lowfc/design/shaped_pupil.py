@@ -4,8 +4,8 @@ The variables are the transmissions of the cells of one quadrant. A mask that is
 field, so that `|E| <= sqrt(contrast) E(0)` is two linear inequalities at every point. Less symmetry would gain nothing:
 the mean of any mask and its mirror images is as open, and as dark in a zone with the same symmetries.
 
-Between the points of a coarse grid the intensity is tens of times higher than at the points. Exchange: the maxima of
-the solution on a fine grid are added as points to the next program, until none exceeds the required contrast.
+Between the points of a coarse grid the intensity is tens of times higher than at the points. `exchange` therefore adds
+the maxima of the solution on a fine grid as points to the next program, until none exceeds the required contrast.
 """
 
 from bisect import bisect_left
@@ -26,7 +26,7 @@ from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, pupil_axis
 from lowfc.optics.chain.pupil import circle, from_quarter
 
 FOCAL_MASK_RADIUS = 4.0
-"""Radius of the disk for which the fraction of the light is reported, in lambda / D (Sect. 2.1)."""
+"""Radius of the disk for which the fraction of the light is reported, in lambda / D."""
 
 MIN_OPEN_AREA = 0.01
 """Smallest open fraction of the circle: below it a request counts as infeasible, since a closed mask is dark."""
@@ -89,7 +89,7 @@ class Request:
 
     @property
     def zone(self) -> Wedge:
-        """The part of the dark zone without its mirror images."""
+        """The dark zone; with octant symmetry only its part within 45 degrees of the x axis."""
         most_deg = 45.0 if self.symmetry == "octant" else 90.0
         return Wedge(self.inner, self.outer, min(self.half_angle_deg, most_deg))
 

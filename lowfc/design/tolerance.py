@@ -45,7 +45,7 @@ class Drift:
 
     Attributes:
         step_nm2: D, variance of the drift per frame.
-        gain: gain of the integrator.
+        gain: Gain of the integrator.
     """
 
     step_nm2: float
@@ -71,8 +71,8 @@ def tolerated_drift(residual_nm2: float, noise_nm2: float, exposure: float, kind
     Args:
         residual_nm2: Allowed variance of the residual.
         noise_nm2: Variance of the noise of a frame.
-        exposure: Exposure time, in periods.
-        kind: The gain of an integrator is limited to the highest within its margins.
+        exposure: Exposure time, in frame periods.
+        kind: "integrator", with a gain limited to the highest within the stability margins, or "lqg".
     """
     # At the best gain the step D solves square D^2 + linear D + residual_nm2^2 = 0.
     square = (exposure - 1.0) ** 2 / 4.0 - exposure / 3.0 + 0.5
@@ -86,13 +86,15 @@ def tolerated_drift(residual_nm2: float, noise_nm2: float, exposure: float, kind
 
 
 def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> Callable[[Array], Array]:
-    """Function from the allowed residual variance of a line to its tolerated variance, both over the noise of a frame.
+    """Function from the allowed residual variance of a line to its tolerated variance.
+
+    Both variances are divided by that of a frame's noise.
 
     Args:
         kind: Integrator with the best gain, or LQG with the line in its model.
         line: Frequency and width of the line.
         rate_hz: Frame rate.
-        exposure: Exposure time, in periods.
+        exposure: Exposure time, in frame periods.
     """
     timing = Timing.of(DELAY, exposure)
 
@@ -102,7 +104,7 @@ def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> 
     def residual(law: LinearLaw, variance: float) -> float:
         return float(predicted_nm(law, [model(variance)], timing)[0] ** 2)
 
-    if kind == "integrator":  # v = A line + B noise at each gain
+    if kind == "integrator":  # residual = A line + B noise at each gain
         laws = [integrator([gain], [0.0], (2,), DELAY, rate_hz) for gain in np.append(_GAINS, highest_gain(DELAY))]
         of_noise = np.array([0.0, *(float(noise_gain(law)[0]) for law in laws)])  # the first value: without a loop
         of_line = np.array([1.0, *(residual(law, 1.0) for law in laws)]) - of_noise
@@ -116,6 +118,6 @@ def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> 
 
 
 def tolerated_variance(form: float, quartic: float, contrast: float) -> float:
-    """Variance, nm^2, of a Gaussian mode that adds this mean contrast, if amplitude a adds form a^2 + quartic a^4."""
+    """Variance, nm^2, of a Gaussian mode that adds this mean contrast; an amplitude a adds form a^2 + quartic a^4."""
     root = np.sqrt(form**2 + 12.0 * max(quartic, 0.0) * contrast)  # the mean of a^4 is three times the variance squared
     return float(2.0 * contrast / (form + root))

@@ -1,4 +1,4 @@
-"""Random wavefronts and noisy images (Sect. 3.1), and statistics of the residuals of estimates."""
+"""Random wavefronts and noisy images (Subedi et al. 2015, Sect. 3.1), and statistics of the residuals of estimates."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,8 @@ from lowfc.arrays import Array
 from lowfc.optics.chain.zernike import noll_to_orders
 
 LITERAL_WAVES = (0.04, 0.016)
-"""Bounds of Sect. 3.1 for radial degrees 1 and 2, and above; interpreted as uniform between minus and plus these."""
+"""Bounds in the paper's Sect. 3.1, for radial degrees 1 and 2, and for higher ones: coefficients lie between minus and
+plus these."""
 
 _BLOCK = 100  # wavefronts in memory at once
 

@@ -272,7 +272,7 @@ def test_command_is_recorded_and_reproduces_the_layout(tmp_path, monkeypatch):
         (("--diameter", "2"), "hole diameters"),
         (("--diameter", "0.007", "--holes", "1"), "between 0.008 and 1"),
         (("--diameter", "nan"), "--diameter must be a number"),
-        (("--gap", "-0.1"), "gaps must not be negative"),
+        (("--gap", "-0.1"), "gap and edge must not be negative"),
         (("--symmetry", "z"), "symmetry must be one of"),
         (("--seed", "-1"), "seed must not be negative"),
         (("--chains", "0"), "chains must be at least 1"),

@@ -195,7 +195,7 @@ def bounds(draw):
 
 
 def moved(orbits, at, orbit):
-    """Orbits without the one at index `at`, and with another one; None: none is removed, or none is added."""
+    """The orbits after a move: the one at index `at` is removed and `orbit` is added, each unless None."""
     kept = [one for index, one in enumerate(orbits) if index != at]
     return kept if orbit is None else [*kept, orbit]
 

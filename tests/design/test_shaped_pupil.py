@@ -39,7 +39,7 @@ def designed(request):
 def field_of(quarter, samples_per, extent):
     """Field by the sensor's transform, at half-integer offsets.
 
-    With 30 samples per lambda/D, none is a point at which the design is checked.
+    With 30 samples per lambda/D, no sample is a point at which the design is checked.
     """
     pupil = from_quarter(quarter, SAMPLES)
     axis = image_axis(2 * extent * samples_per, samples_per)
@@ -144,7 +144,7 @@ def test_infeasible_request_reports_the_nearest_feasible_one(tmp_path):
     path = tmp_path / "spc.npz"
     arguments = ["spc", "--inner", "2.5", "--outer", "5", "--cells", "16", "--out", str(path)]
     error = refusal("design", *arguments, kind=ConfigurationError)
-    assert "inner angle 2.5 lambda/D at 1e-09 is infeasible" in error
+    assert "inner angle 2.5 lambda/D at contrast 1e-09 is infeasible" in error
     nearest = r"nearest feasible inner angle is (\S+) \(same contrast\), or contrast is (\S+) \(same angle\)"
     inner, contrast = map(float, re.search(nearest, error).groups())
     request = replace(SMALL, inner=2.5, outer=5.0)
@@ -201,7 +201,7 @@ def test_unusable_file_is_reported_before_the_design(tmp_path, out, reported, me
     assert message in refusal("design", "spc", "--out", tmp_path / out, kind=reported)
 
 
-def test_ctrl_c_stops_within_a_program_and_leaves_no_file(tmp_path):
+def test_ctrl_c_interrupts_a_linear_program_and_leaves_no_file(tmp_path):
     source = "from lowfc.adapters.process.terminal import run_app; from lowfc.programs.design.command import design_app"
     command = [sys.executable, "-c", f"{source}; run_app(design_app)", "spc", "--outer", "8"]
     command += ["--out", str(tmp_path / "spc.npz")]

@@ -57,7 +57,7 @@ def broadband(sensor, cache_dir):
 
 @pytest.fixture(scope="session")
 def hcipy():
-    """An independent model; warnings of its import are suppressed."""
+    """hcipy, an independent diffraction code; the warnings of its import are suppressed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return importlib.import_module("hcipy")
@@ -65,7 +65,7 @@ def hcipy():
 
 @pytest.fixture(scope="session")
 def prysm():
-    """Another independent model; prysm 0.21 imports pkg_resources, which setuptools no longer has."""
+    """Another independent diffraction code; prysm 0.21 imports pkg_resources, which setuptools no longer has."""
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         stand_in = SimpleNamespace(get_distribution=importlib.metadata.distribution)

@@ -99,7 +99,7 @@ def test_screens_have_the_structure_function_of_a_periodic_kolmogorov_screen():
             steps = [screen[shift:] - screen[:-shift], screen[:, shift:] - screen[:, :-shift]]
             found[k] += np.mean([np.mean(step**2) for step in steps]) / 24
     r = separations / samples
-    # From the radius of a disk as large as the zero-frequency cell: the periodic screen has no longer waves.
+    # The screen has no power in the zero-frequency cell: the integral begins at the rim of a disk of equal area.
     f = np.geomspace(1.0 / (width * np.sqrt(np.pi)), samples / 2, 4000)
     density = 0.0229 * f ** (-11 / 3) * 2 * np.pi * f
     expected = 2 * np.trapezoid(density * (1 - j0(2 * np.pi * r[:, None] * f)), f, axis=1)
@@ -139,7 +139,7 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_fast_science_image_agrees_with_the_exact_image_to_one_percent(shaped, modes, camera, name):
-    """Each sample to 1 % of itself, 0.1 % of the mean and 1 % of the flat wavefront's contrast; the mean to 0.2 %."""
+    """Each sample agrees to 1 % of itself plus 0.1 % of the mean plus 1 % of the flat wavefront's contrast."""
     opd_nm = np.tensordot(CASES[name], modes[:14], 1)
     exact = contrast(shaped, opd_nm, WAVELENGTH_NM, camera.samples, samples_per=SAMPLES_PER)
     found = camera.image(CASES[name])
@@ -150,7 +150,7 @@ def test_fast_science_image_agrees_with_the_exact_image_to_one_percent(shaped, m
     assert np.abs(found - exact).max() < 1e-3  # including the star's core
 
 
-def test_a_pupil_that_differs_within_2_x_2_samples_keeps_all_of_them():
+def test_a_pupil_that_is_not_made_of_2_x_2_squares_is_summed_sample_by_sample():
     plain = Coronagraph(circle(64))
     modes_nm = np.array([20.0, -35.0, 12.0])
     radii = 2 * pupil_axis(64)

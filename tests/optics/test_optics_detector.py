@@ -46,7 +46,7 @@ def test_noise_table_has_the_exact_distribution_at_its_levels(camera):
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("mean_e", [0.0, 0.5 * STEP_E, 0.05, 1.3, 5.03, 13.0, FAINT_E - 0.01, FAINT_E, 60.0])
 def test_a_million_pixels_pass_the_chi_square_test(camera, mean_e):
-    """On levels of the table, between them, and above the table."""
+    """Means at levels of the table, between its levels, and above the table."""
     count, least = 1_000_000, 10
     frame = expose(camera, flat(mean_e, 1000), rng())
     numbers = np.arange(400)

@@ -1,4 +1,4 @@
-"""Layouts of sparse aperture masks and pupils: the packaged ones, and files of users."""
+"""Sparse-aperture layouts and pupils: the packaged ones, and files of users."""
 
 import json
 from dataclasses import replace

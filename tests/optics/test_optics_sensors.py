@@ -51,7 +51,7 @@ def test_the_chain_agrees_with_hcipy(hcipy, sensor, opd_nm, wavelength_nm):
 
 
 def test_the_chain_agrees_with_prysm(prysm, sensor, opd_nm):
-    # Table 1 in prysm's units (mm and um). Its grids have a sample on the axis; the ramp shifts by half a sample.
+    # Table 1 in prysm's units (mm and um). prysm's grids have a sample on the axis: the ramp shifts by half a sample.
     u = (np.arange(512) - 256) / 512
     ramp = np.exp(-2j * np.pi * (u + u[:, None]) / 16)
     pupil_mm, focal_mm, wavelength_um = 10.0, 200.0, 0.55
@@ -303,7 +303,7 @@ def test_unresolved_defocus_is_refused():
     assert light_budget(shortest).sensor == pytest.approx(1, abs=0.01)  # no repeated image on the detector
     with pytest.raises(ValueError, match="behind the focal-plane mask"):
         Defocus(0.0)
-    with pytest.raises(ValueError, match="must have a width"):
+    with pytest.raises(ValueError, match="must have a positive width"):
         PupilImage(0.0)
 
 

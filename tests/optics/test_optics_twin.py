@@ -108,7 +108,7 @@ def test_defocused_twin_is_accurate_at_any_distance(defocus_mm, limit, modes, co
 
 
 def test_twin_of_an_annulus_thinner_than_a_sample_agrees_with_the_full_chain():
-    """Some rows of samples, 0.125 lambda/D apart, have none in the annulus."""
+    """Some rows of the focal-plane mask's samples, which are 0.125 lambda/D apart, have no sample in the annulus."""
     sensor = sensor_from(SensorSection(kind="clowfs", inner_radius=3.9))
     assert relative_l2(twin_reference(build(sensor, FAST)), reference(sensor)) < 5e-4
 

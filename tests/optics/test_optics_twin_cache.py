@@ -58,7 +58,7 @@ def test_a_second_call_reads_the_file(sensor, stored, tmp_path):
     assert again.operator_hash == operator_hash(sensor, SMALL, monochromatic(550.0))
 
 
-def test_broadband_twins_survive_the_file(sensor, tmp_path):
+def test_broadband_twins_are_read_back_unchanged(sensor, tmp_path):
     band = gauss_legendre(550.0, count=2)
     built = load_or_build(sensor, SMALL, band, cache_dir=tmp_path)
     again = load_or_build(sensor, SMALL, band, cache_dir=tmp_path, progress=forbidden)

@@ -137,7 +137,7 @@ def test_the_part_of_a_dark_hole_that_the_loop_undoes_is_judged(undone, verdict,
 
 
 class Loops:
-    """Stand-in for the commands that run a loop and tune a law: tilt with a line and noise, and a given residual."""
+    """Stand-in for the commands that run a loop and tune a law; its log has tilt with a vibration line and noise."""
 
     residual_mas = 0.3
 
@@ -173,7 +173,7 @@ def test_loops_are_judged_by_the_published_pointing(monkeypatch):
         row = rows[f"tilt, {preset}"]
         assert (row.measured, row.paper) == (0.3, anchors.ROMAN_MAS)
         assert rows[f"verdict, tilt, {preset}"].measured == anchors.REACHED
-        assert 0 < row.limit * tilt_nm_per_mas(2.0) < 2.0, "of a line of 14 nm rms that the law has in its model"
+        assert 0 < row.limit * tilt_nm_per_mas(2.0) < 2.0, "nm of a line of 14 nm rms, which the law has in its model"
     for where, verdict in (("sky", anchors.REACHED), ("laboratory", anchors.NOT_REACHED)):
         row = rows[f"std of means over 2 s, {where}"]
         # Ten means of +-0.05 mas, in 24 s without the first four.
@@ -207,7 +207,7 @@ def test_only_requested_sensors_are_anchored_and_simulated(monkeypatch):
     assert {row.name for row in rows} == {"zwfs"}
     assert tolerance._checked(few) == []
     assert {row.name for row in tolerance._checked(Context(trials=2, sensors=("zwfs", SMALLEST)))} == {SMALLEST}
-    assert all("verdict" not in row.quantity for row in rows), "without a published value"
+    assert all("verdict" not in row.quantity for row in rows), "zwfs has no published value, so no verdict"
 
 
 def test_a_loop_that_fails_is_an_error_with_its_reason(monkeypatch, tmp_path):

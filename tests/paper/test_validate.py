@@ -374,7 +374,7 @@ def test_zernike_sensor_beats_sparse_apertures_and_sized_holes_beat_equal_ones_i
 
 
 def test_fitting_flux_and_shear_adds_noise_for_clowfs_but_not_for_sam(committed):
-    """With real pupil and mask, flux and shear change the image evenly and modes oddly: fitting them costs nothing."""
+    """For sam, flux and shear change the image evenly, and modes oddly: fitting flux and shear costs nothing."""
     without_nuisances, with_nuisances = (
         {name: find(committed["table3"], name, RMS, 14, kind)["measured"] for name in ("sam", "clowfs")}
         for kind in ("weighted", WITH_NUISANCES)

@@ -53,19 +53,19 @@ def test_every_row_is_finite_and_states_its_assumptions(tables, figure):
             assert row.measured == "above 0.15"
 
 
-PLACED = ("fig3", "fig6")
-"""Figures with few panels of pictures and of curves. Placing takes half of the time, so slow tests place the others."""
+LAID_OUT = ("fig3", "fig6")
+"""Figures that quick tests lay out: few panels, of pictures and of curves. Layout takes half of the time of a plot."""
 
 
 @pytest.mark.parametrize(
-    ("figure", "placed"),
+    ("figure", "laid_out"),
     [
-        *((figure, figure in PLACED) for figure in FIGURES),
-        *(pytest.param(figure, True, marks=pytest.mark.slow) for figure in FIGURES if figure not in PLACED),
+        *((figure, figure in LAID_OUT) for figure in FIGURES),
+        *(pytest.param(figure, True, marks=pytest.mark.slow) for figure in FIGURES if figure not in LAID_OUT),
     ],
 )
-def test_every_figure_is_plotted(figure, placed, tables, tmp_path, monkeypatch):
-    if not placed:
+def test_every_figure_is_plotted(figure, laid_out, tables, tmp_path, monkeypatch):
+    if not laid_out:
         monkeypatch.setattr(drawing, "lay_out", lambda figure, canvas, dpi: figure.set_layout_engine(None))
     from matplotlib.image import imread
 

@@ -70,7 +70,7 @@ def by_group(noll: Sequence[int], by_mode: Array) -> dict[str, float]:
 
 
 def costliest(groups: Mapping[str, float]) -> tuple[str, float]:
-    """The kind of modes that adds most contrast, and its share of all that adds; `groups` is a result of `by_group`."""
+    """The kind of modes that adds most contrast, and its share of the positive values of `groups` (from `by_group`)."""
     # Behind a classical Lyot coronagraph tilt removes light: its contrast is negative.
     added = [max(contrast, 0.0) for contrast in groups.values()]
     return next(iter(groups)), added[0] / (sum(added) or 1.0)

@@ -38,8 +38,8 @@ def monochromatic(wavelength_nm: float) -> Band:
 def gauss_legendre(centre_nm: float, fraction: float = 0.2, count: int = 3) -> Band:
     """Gauss-Legendre quadrature of a band of relative width `fraction`.
 
-    Over 20 %, the relative rms error of an image is below 3e-3 with three points and any mask in the package, and below
-    3e-4 with four.
+    For a band of 20 %, the relative rms error of an image is below 3e-3 with three wavelengths, and below 3e-4 with
+    four, with any mask in the package.
     """
     points, weights = np.polynomial.legendre.leggauss(count)
     wavelengths_nm = centre_nm * (1.0 + 0.5 * fraction * points)

@@ -1,4 +1,4 @@
-"""The science image of a coronagraph: contrast for a given wavefront (Fig. 1).
+"""The science image of a coronagraph: contrast for a given wavefront (Subedi et al. 2015, Fig. 1).
 
 A shaped pupil is imaged directly; a Lyot coronagraph has an opaque mask and a stop in between. Contrast is intensity
 over the peak intensity of the star off the mask with a flat wavefront; angles are in lambda / D (see `grid`).
@@ -14,7 +14,7 @@ from lowfc.optics.chain.grid import image_axis
 
 SAMPLES_PER = 4
 """Samples per lambda / D. Two represent the image, but not the sharp edge of a zone, on which the contrast added by
-tilt depends: behind the shaped pupil it is a tenth at two, and at four within 10 % of that at 32."""
+tilt depends: behind the shaped pupil two samples give a tenth of the value with 32 samples, four are within 10 %."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,8 @@ class LyotStop:
     """The elements of a Lyot coronagraph after its pupil: opaque mask and stop.
 
     Attributes:
-        opaque: (k, k) fraction of the amplitude that the focal-plane mask blocks, 0 to 1; it goes to the sensor.
+        opaque: (k, k) fraction of the amplitude that the focal-plane mask blocks, 0 to 1; the blocked light goes
+            to the sensor.
         stop: (n, n) amplitude transmission of the Lyot stop in the pupil after the mask.
         samples_per: Samples of the opaque part per lambda / D.
     """
@@ -92,7 +93,7 @@ class Coronagraph:
 
     @property
     def peak(self) -> float:
-        """Amplitude at the centre of the star's image with a flat wavefront, off the mask."""
+        """Amplitude at the centre of the star's image with a flat wavefront, as if the star were off the mask."""
         return float((self.pupil if self.lyot is None else self.pupil * self.lyot.stop).sum())
 
     def behind(self, field: Array | Complex) -> Array | Complex:

@@ -9,7 +9,7 @@ _FINE = 16  # subsamples across a sample, for the fraction covered by the phase 
 
 
 def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -> Array:
-    """Reflecting disk (Sect. 2.1) or annulus (Sect. 2.4), on the smallest square grid that contains it.
+    """Reflecting disk (Sect. 2.1 of the paper) or annulus (Sect. 2.4), on the smallest square grid that contains it.
 
     Args:
         samples_per: Samples per lambda0 / D.
@@ -23,8 +23,8 @@ def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -
 def phase_spot(samples_per: int = 8, radius: float = 4.0, spot_diameter: float = 1.06) -> Complex:
     """The disk with a central spot that delays by a quarter of a wave, as in a Zernike sensor.
 
-    Samples on the spot's edge are area-weighted means of both sides, as the spot is only eight samples wide. The phase
-    is assumed equal at all wavelengths, and the spot's physical size fixed.
+    Samples on the spot's edge are area-weighted means of both sides: by default the spot is only 8.5 samples wide. The
+    phase is assumed equal at all wavelengths, and the spot's physical size fixed.
 
     Args:
         samples_per: Samples per lambda0 / D.
@@ -40,7 +40,7 @@ def phase_spot(samples_per: int = 8, radius: float = 4.0, spot_diameter: float =
 
 
 def bowtie(samples_per: int = 8, radius: float = 4.0, outer_radius: float = 10.0, opening_deg: float = 95.0) -> Array:
-    """The disk, and wedges above and below it out to the outer radius (Fig. 3); radii in lambda0 / D."""
+    """The disk, and wedges above and below it out to the outer radius (Fig. 3 of the paper); radii in lambda0 / D."""
     r, from_vertical = _polar(samples_per, outer_radius)
     wedge = (r <= outer_radius) & (from_vertical <= np.deg2rad(opening_deg) / 2.0)
     return np.asarray((r <= radius) | wedge, dtype=np.float64)

@@ -27,7 +27,7 @@ def to_image(pupil: Complex, image_samples: int, samples_per: int, scale: float)
 def to_pupil(image: Complex, pupil_samples: int, samples_per: int, scale: float) -> Complex:
     """Complex (pupil_samples, pupil_samples) amplitude in the pupil after a square focal-plane field.
 
-    It undoes `to_image` for the light that the focal-plane field holds.
+    The inverse of `to_image`, except for the light that falls outside the focal-plane field.
     """
     matrix = kernel(image.shape[0], samples_per, pupil_samples, scale).conj()
     return (scale / samples_per**2) * (matrix.T @ image @ matrix)

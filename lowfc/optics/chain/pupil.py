@@ -14,7 +14,7 @@ def circle(samples: int) -> Array:
 
 
 def circle_with_bar(samples: int, width: float, angle_deg: float) -> Array:
-    """Circle (samples, samples) with a bar from the centre to the edge, which makes it asymmetric (Sect. 4, [46]).
+    """Circle (samples, samples) with a bar from the centre to the edge, which makes it asymmetric (paper's Sect. 4).
 
     Args:
         samples: Points across the diameter.
@@ -45,20 +45,20 @@ def prolate(samples: int, mask_radius: float) -> Array:
     rho = 0.25 * (points + 1.0)  # 0 to 1/2
     weights = 0.25 * weights * rho
     root = np.sqrt(weights)
-    _, vectors = np.linalg.eigh(root[:, None] * _within(rho, rho, mask_radius) * root)
+    _, vectors = np.linalg.eigh(root[:, None] * _mask_kernel(rho, rho, mask_radius) * root)
     values = weights * (vectors[:, -1] / root)
     u = pupil_axis(samples)
     r = np.hypot(u[:, None], u)
     inside = r <= 0.5
     amplitude = np.zeros((samples, samples))
     radii, where = np.unique(r[inside], return_inverse=True)
-    amplitude[inside] = (_within(radii, rho, mask_radius) @ values)[where]
-    centre = float((_within(np.zeros(1), rho, mask_radius) @ values)[0])
+    amplitude[inside] = (_mask_kernel(radii, rho, mask_radius) @ values)[where]
+    centre = float((_mask_kernel(np.zeros(1), rho, mask_radius) @ values)[0])
     return np.clip(amplitude / centre, 0.0, 1.0)
 
 
-def _within(r: Array, rho: Array, radius: float) -> Array:
-    """Kernel pupil to mask to pupil: integral of x J0(2 pi r x) J0(2 pi rho x) from 0 to the radius, for all pairs."""
+def _mask_kernel(r: Array, rho: Array, radius: float) -> Array:
+    """Kernel from pupil via mask to pupil: integral of x J0(2 pi r x) J0(2 pi rho x) over x from 0 to the radius."""
     from scipy.special import j0, j1  # its import takes a quarter of a second; most processes load a stored result
 
     a, b = 2.0 * np.pi * r[:, None], 2.0 * np.pi * rho[None, :]

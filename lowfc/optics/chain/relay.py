@@ -12,7 +12,7 @@ from lowfc.optics.chain.grid import image_axis
 
 @dataclass(frozen=True, eq=False)
 class ApertureMask:
-    """A mask in the relay pupil, then a focus: sparse aperture (Sect. 2.2), radial bar, or open (Sect. 4).
+    """A mask in the relay pupil, then a focus: sparse aperture (paper's Sect. 2.2), radial bar, or open (Sect. 4).
 
     Attributes:
         transmission: (n, n) amplitude transmission, sampled like the pupil.
@@ -23,7 +23,7 @@ class ApertureMask:
 
 @dataclass(frozen=True)
 class Defocus:
-    """No relay pupil, and the detector out of focus: the coronagraphic low-order wavefront sensor (Sect. 2.4).
+    """No relay pupil, and the detector out of focus: the coronagraphic low-order wavefront sensor (CLOWFS).
 
     Attributes:
         distance: Distance from the image of the focal-plane mask, in (lambda0/D)^2; see `fresnel_distance`.
@@ -48,14 +48,14 @@ class PupilImage:
 
     def __post_init__(self) -> None:
         if not self.width > 0:
-            raise ValueError(f"the image of the pupil must have a width, got {self.width}")
+            raise ValueError(f"the image of the pupil must have a positive width, got {self.width}")
 
 
 Relay = ApertureMask | Defocus | PupilImage
 
 
 def fresnel_distance(defocus_mm: float, focal_ratio: float, wavelength_nm: float) -> float:
-    """Distance z / (lambda0 F^2): 27.3 for the 6 mm, F/20 and 550 nm of Sect. 3."""
+    """Distance z / (lambda0 F^2): 27.3 for the 6 mm, F/20 and 550 nm of the paper's Sect. 3."""
     return defocus_mm * 1e6 / (wavelength_nm * focal_ratio**2)
 
 
@@ -65,8 +65,8 @@ def direct_kernel(
 ) -> Complex:
     """Kernel (samples, focal_samples), read-only, of one axis from focal-plane mask to detector; conserves energy.
 
-    For a `Defocus`, the Fresnel integral of eq. (13), exp(i pi (x' - x)^2 scale / distance), exact as long as the chirp
-    is resolved; for a `PupilImage`, the transform to the relay pupil.
+    For a `Defocus`, the Fresnel integral of the paper's eq. (13), exp(i pi (x' - x)^2 scale / distance), exact as long
+    as the chirp is resolved; for a `PupilImage`, the transform to the relay pupil.
 
     Args:
         relay: The optics between mask and detector.
@@ -90,11 +90,11 @@ def direct_kernel(
 
 
 def half_band(relay: Relay, width: float, mask_radius: float, scale: float) -> float:
-    """Half of the bandwidth of the field on the detector, in cycles per unit of its axis.
+    """Half of the bandwidth of the field on the detector, in cycles per unit of the detector's axis.
 
     Args:
         relay: The optics before the detector.
-        width: Width of the detector, in the unit of its axis.
+        width: Width of the detector, in the unit of the detector's axis.
         mask_radius: Radius of the focal-plane mask, in lambda0 / D.
         scale: lambda0 / lambda.
     """
@@ -104,6 +104,6 @@ def half_band(relay: Relay, width: float, mask_radius: float, scale: float) -> f
         case PupilImage():
             return scale * mask_radius
         case Defocus():
-            # A spatial frequency displaces light by distance times frequency; beyond this it misses the detector.
+            # Spatial frequency f displaces light by distance times f: light of higher frequencies misses the detector.
             distance = relay.distance / scale
             return (width / 2.0 + mask_radius + float(np.sqrt(distance))) / distance

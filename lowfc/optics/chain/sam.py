@@ -1,4 +1,4 @@
-"""The sparse aperture mask: circular holes in the relay pupil, eqs. (1) and (2)."""
+"""The sparse aperture mask: circular holes in the relay pupil, eqs. (1) and (2) of Subedi et al. 2015."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ class Layout:
 
 
 def check(layout: Layout) -> None:
-    """Raise ValueError if there is no hole, or one is impossible, reaches outside the pupil or overlaps another."""
+    """Raise ValueError if there is no hole, or a hole has an impossible size, leaves the pupil or overlaps another."""
     if not layout.holes:
         raise ValueError(f"{layout.name}: a sparse aperture mask needs at least one hole")
     holes = np.array(layout.holes, dtype=np.float64)
@@ -73,7 +73,7 @@ def transmission(layout: Layout, samples: int, points: int = 1) -> Array:
         points: Points evaluated across a sample in each direction; 1 for its centre only.
 
     Raises:
-        ValueError: A hole is so small that it holds no point.
+        ValueError: A hole is so small that no evaluated point lies in it.
     """
     u = pupil_axis(samples * points)
     mask = np.zeros((samples * points, samples * points), np.bool_)
@@ -83,7 +83,7 @@ def transmission(layout: Layout, samples: int, points: int = 1) -> Array:
         if not inside.any():
             raise ValueError(
                 f"{layout.name}: the hole at ({x}, {y}) is lost between points {1 / u.size:.2g} D apart, as its "
-                f"diameter is {diameter:g} D: lengths are in pupil diameters; for tiny holes raise sensor.hole_samples"
+                f"diameter is {diameter:g} D: give lengths in pupil diameters, or raise sensor.hole_samples"
             )
         mask[box] += inside
     return np.asarray(mask.reshape(samples, points, samples, points).mean(axis=(1, 3)))

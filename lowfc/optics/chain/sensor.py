@@ -1,4 +1,4 @@
-"""The full optical chain of a sensor, with diffraction: star to binned sensor image (Sect. 2, Table 1)."""
+"""The full optical chain of a sensor, with diffraction: star to binned sensor image (Subedi et al. 2015, Sect. 2)."""
 
 from dataclasses import dataclass
 
@@ -76,8 +76,9 @@ class LightBudget:
     Attributes:
         pupil: Fraction of the open circle's light that the pupil mask transmits.
         focal_mask: Fraction of the light after the pupil that the focal-plane mask reflects to the sensor.
-        relay_mask: Fraction of the light on a relay-pupil mask that it transmits; 1 without such a mask.
-        sensor: Fraction of the light on the relay mask that falls on the pixels.
+        relay_mask: Fraction of the light reflected by the focal-plane mask that a relay-pupil mask transmits; 1
+            without a relay-pupil mask.
+        sensor: Fraction of the light reflected by the focal-plane mask that falls on the pixels.
         total: Fraction of the open circle's light that falls on the pixels.
         peak: Fraction of the light on the pixels that falls on the brightest pixel.
     """
@@ -167,11 +168,12 @@ def reference(sensor: Sensor, band: Band | None = None) -> Array:
 def response(sensor: Sensor, basis: NDArray[np.floating], band: Band | None = None) -> Array:
     """H = dI/da (pixels squared, modes), in the units of `image` per nm of each mode.
 
-    H = 2 (2 pi / lambda) Re{E0 conj(i E_k)}: eq. (12) with the 2 of eq. (9), so that I - I0 = H a.
+    H = 2 (2 pi / lambda) Re{E0 conj(i E_k)}, where E0 is the field of the flat wavefront, and E_k that of the pupil
+    times mode k: eq. (12) with the 2 of eq. (9), so that I - I0 = H a.
 
     Args:
         sensor: The optics.
-        basis: Modes (modes, n, n), with unit rms for a in nm rms.
+        basis: Modes (modes, n, n); of unit rms if the coefficients a are to be in nm rms.
         band: The central wavelength alone when None.
     """
     band = monochromatic(sensor.wavelength_nm) if band is None else band

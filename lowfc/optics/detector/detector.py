@@ -73,7 +73,8 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
     Args:
         detector: The detector.
         electrons: (rows, columns) mean photo-electrons in the exposure; negative values count as zero.
-        rng: Generator of all random numbers; its bit generator must produce 64-bit words: any of numpy's but MT19937.
+        rng: Generator of all random numbers; its bit generator must produce 64-bit words, as all of numpy's but
+            MT19937 do.
 
     Raises:
         ValueError: A mean number of electrons is not finite.

@@ -79,7 +79,8 @@ def draw(table: NoiseTable, mean_e: Single, rng: np.random.Generator) -> Pixels:
     Args:
         table: The detector's table.
         mean_e: (pixels,) mean electrons, clipped to 0 ... FAINT_E.
-        rng: Generator of all random numbers; its bit generator must produce 64-bit words: any of numpy's but MT19937.
+        rng: Generator of all random numbers; its bit generator must produce 64-bit words, as all of numpy's but
+            MT19937 do.
     """
     words = rng.bit_generator.random_raw((mean_e.size + 1) // 2).view(np.uint32)[: mean_e.size]
     level = mean_e * np.float32((1 << _FRACTION_BITS) / STEP_E)

@@ -1,4 +1,4 @@
-"""Electrons from a star, and wavefront tilt per milliarcsecond (Sect. 3.3)."""
+"""Electrons from a star, and wavefront tilt per milliarcsecond (Subedi et al. 2015, Sect. 3.3)."""
 
 from dataclasses import dataclass
 

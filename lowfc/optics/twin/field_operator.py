@@ -1,4 +1,4 @@
-"""The optics at one wavelength as a real matrix, from separable functions in the pupil to the plane of the modes.
+"""The optics at one wavelength as a real matrix, from separable functions in the pupil to sensor or focal plane.
 
 The focal-plane mask is symmetric about both axes, so that pairs of focal samples become cosines and sines. With an
 aperture mask in the relay pupil, the operator from pupil to relay pupil is then real; on the sensor, prolate functions

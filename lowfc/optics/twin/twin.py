@@ -71,7 +71,8 @@ class Twin:
         spec: Degree of compression.
         axis: Coordinates of the nodes along one axis, with guards, in pupil diameters.
         used: Flat indices of the used nodes in the square grid of the axis (rows = y, columns = x).
-        area_weights: (used,) weights of sum 1 for means over the open pupil (transmission above 0.5, unweighted).
+        area_weights: (used,) weights of sum 1 for means over the open pupil: its samples (transmission above 0.5) count
+            equally.
         operators: One operator for each wavelength.
         to_pixels: (pixels, points) matrix from intensities at the points of an axis to pixels.
         operator_hash: Hexadecimal digest of all inputs of the build.
@@ -111,13 +112,13 @@ def reference(twin: Twin, opd_nm: Array | None = None) -> Array:
 
 
 def response(twin: Twin, basis: NDArray[np.floating], opd_nm: Array | None = None) -> Array:
-    """H = dI/da (pixels squared, modes) in float64, per nm: 2 (2 pi / lambda) Re{E0 conj(i E_k)}, eq. (12) times 2.
+    """H = dI/da (pixels squared, modes) in float64, per nm, as `lowfc.optics.chain.sensor.response`.
 
-    For a reference wavefront of phase phi, the pupil fields of E0 and E_k are multiplied by exp(i phi).
+    For a reference wavefront of phase phi, the pupil fields are multiplied by exp(i phi).
 
     Args:
         twin: The twin.
-        basis: Modes (modes, used) at the used nodes, with unit rms for a in nm rms.
+        basis: Modes (modes, used) at the used nodes; of unit rms if the coefficients a are to be in nm rms.
         opd_nm: Reference wavefront (used,); flat when None.
 
     Raises:

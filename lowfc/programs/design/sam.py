@@ -54,15 +54,15 @@ def design_sam(
 ) -> dict[str, Any]:
     """Search, write the best layout or the front, and return their predictions; Ctrl-C writes the best so far.
 
-    The chains are advanced in place, and stored in the file `state` until the end. LowfcError if the workers were lost;
-    KeyboardInterrupt if nothing was found before Ctrl-C.
+    The chains are advanced in place, and stored in the file `state` while the search runs. LowfcError if the workers
+    were lost; KeyboardInterrupt if nothing was found before Ctrl-C.
     """
     console = Console(stderr=True) if console is None else console
     _one_thread()
     if plot_file is not None:
         figure_class()  # report a missing package before the work, not after
     pupil = pupil_digest()
-    write_state(state, search, pupil, chains)  # likewise a folder that cannot be written
+    write_state(state, search, pupil, chains)  # fails here, before the work, if the folder cannot be written
     interrupted = False
     with counting_bar(console, TimeElapsedColumn(), TimeRemainingColumn()) as count:
         saved_s = time.monotonic()

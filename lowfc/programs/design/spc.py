@@ -135,8 +135,8 @@ def _infeasible(request: Request, inner: float | None, contrast: float | None) -
         ways.append(f"contrast is {contrast:g} (same angle)")
     nearest = f"the nearest feasible {', or '.join(ways)}" if ways else "nothing near it is feasible"
     return (
-        f"inner angle {request.inner:g} lambda/D at {request.contrast:g} is infeasible (no mask is more open than "
-        f"{MIN_OPEN_AREA:.0%}); {nearest}"
+        f"inner angle {request.inner:g} lambda/D at contrast {request.contrast:g} is infeasible (masks that meet both "
+        f"are open over less than {MIN_OPEN_AREA:.0%} of the circle); {nearest}"
     )
 
 

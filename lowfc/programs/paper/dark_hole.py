@@ -143,7 +143,7 @@ def apply_steps(loop: Client, step_rms_nm: float, base_nm: Array) -> tuple[dict[
 def channel_results(history: History, marks: dict[str, list[int]], channel_modes_nm: Array) -> dict[str, ChannelResult]:
     """Results of the channels, from the history of a simulated run and the values of `apply_steps`."""
     truths, sequences = history.true, history.steps.sequence
-    assert truths is not None  # noqa: S101  # a simulated loop's
+    assert truths is not None  # noqa: S101  # a simulated loop logs the truth
     reaction_nm = history.steps.command_nm + truths.disturbance_nm
     known = np.isfinite(truths.disturbance_nm[:, 0])
 

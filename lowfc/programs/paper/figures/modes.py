@@ -30,7 +30,7 @@ AMPLITUDES = np.array([0.005 * step for step in range(1, 31)])
 _MODE_TICKS = [str(noll) for noll in NOLLS_14]
 _PAPER_R2 = {"sam": (0.95, 0.97), "clowfs": (0.79, 0.90)}
 _PAPER_DEVIATIONS = {"sam": ("linear", 0.1), "clowfs": ("linear", 0.1), "zwfs": ("linear to 0.03 waves", None)}
-"""At lambda/20 and lambda/10."""
+"""The paper's deviations from linearity at lambda/20 and at lambda/10; None if it has none."""
 _PAPER_ERROR_WAVES = 0.01
 _DEVIATION = 0.1
 

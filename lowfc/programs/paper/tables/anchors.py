@@ -144,7 +144,7 @@ def _pointing(context: Context, name: str) -> list[Row]:
 def _means_row(new_row: Callable[..., Row], history: History, where: str) -> Row:
     """Row with the standard deviation of means of the true tilt after the first four seconds."""
     truths = history.true
-    assert truths is not None  # noqa: S101  # a simulated loop's
+    assert truths is not None  # noqa: S101  # a simulated loop logs the truth
     frames = round(MEAN_S * RATE_HZ)
     tilt_nm = truths.residual_nm[2 * frames :, :2].astype(np.float64)
     blocks = len(tilt_nm) // frames

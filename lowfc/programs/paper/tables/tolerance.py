@@ -1,4 +1,4 @@
-"""Drift and lines that a telescope may have for a given added contrast: theory, checked by simulation."""
+"""Drift and vibration lines that a telescope may have for a given added contrast: theory, checked by simulation."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -34,17 +34,17 @@ ESTIMATORS: dict[Kind, str] = {"integrator": "integrator of the best gain", "lqg
 
 CHECKED_SENSORS, CHECKED_MODES, CHECKED_MAGNITUDES = ("clowfs_tuned", "zwfs_tuned"), (4, 8, 11), (2.0, 5.0)
 CHECKED_CONTRAST, SHOWN_CONTRAST = 1e-11, 1e-10
-_FRAMES_PER_TRIAL = 20  # times 1 / gain, the loop's time constant in frames: 100 trials determine a variance to 3 %
+_FRAMES_PER_TRIAL = 20  # times 1 / gain, the loop's time constant: 100 trials determine a variance to 3 %
 _SHOWN_NOLLS, _SHOWN_ENDS = (2, 4, 8, 11), tuple(f"V = {magnitude}, {SHOWN_CONTRAST:g}" for magnitude in (2, 5))
 _LARGEST = 6e-9  # contrast up to which the fourth order is fitted
 
-ABOUT = """Drift rate of one mode, and rms of a line in it, that add a contrast of 1e-9, 1e-10 or 1e-11: theory of
-`lowfc/design/tolerance.py`, from the contrast's Hessian (and its fourth order, which matters for tilt) and the noise of
-a frame. `--json` has every mode, star and contrast; this page has four modes, two stars and 1e-10. Then twelve points
-by simulation, and a pair of stars as a coronagraph observes them: a reference of V = 2 and a target of V = 5 with
-another colour and roll angle, one exposure subtracted from the other. Behind a symmetric pupil and a real mask, a
-change of colour changes the image by an even function of position: the zero point of an aperture mask stays; those of
-the Zernike sensor and of CLOWFS move, and I0 has to be measured again on the target.
+ABOUT = """Drift rate of one mode, and rms of a vibration line in it, that add a contrast of 1e-9, 1e-10 or 1e-11:
+theory of `lowfc/design/tolerance.py`, from the contrast's quadratic form (and its fourth order, which matters for tilt)
+and the noise of a frame. `--json` has every mode, star and contrast; this page has four modes, two stars and 1e-10.
+Then come twelve points by simulation, and a pair of stars as a coronagraph observes them: a reference of V = 2
+and a target of V = 5 with another colour and roll angle, one exposure subtracted from the other. Behind a symmetric
+pupil and a real mask, a change of colour changes the image by an even function of position: the zero point of an
+aperture mask stays; those of the Zernike sensor and of CLOWFS move, and I0 has to be measured again on the target.
 """
 LOOP = (
     f"{RATE_HZ:g} Hz, exposure of half the period, delay of one frame, 1 e- read noise, weighted fit of all 14 modes, "
@@ -64,7 +64,7 @@ CHECK = (
 
 @dataclass(frozen=True, eq=False)
 class Contrasts:
-    """Contrast that each mode alone, a nm rms, adds: form a^2 + quartic a^4, both (modes,)."""
+    """Contrast that each mode adds alone: form a^2 + quartic a^4 for an amplitude a in nm rms; both are (modes,)."""
 
     form: Array
     quartic: Array
