@@ -134,7 +134,7 @@ def table4_mas(signal: Signal, modes: int, estimator: str) -> tuple[float, float
 
 
 def exposure_nm2(signal: Signal, modes: int, estimator: str) -> Array:
-    """Covariance (modes, modes) in one exposure of Table 4's star with our own photometry and 1 e- read noise."""
+    """Covariance (modes, modes) of a fit to one exposure of Table 4's star: our own photometry, 1 e- read noise."""
     light_e = electrons(STAR, TABLE4_EXPOSURE_S)
     return covariance_nm2(signal, light_e, TABLE4_READ_NOISE_E, modes, estimator)
 

@@ -53,8 +53,8 @@ class RelayFields:
     """Fields in the relay pupil at one wavelength.
 
     Attributes:
-        relay: (fields, relay, relay) fields in the relay pupil.
-        kernel: (samples, relay) kernel from the relay pupil to the sensor, along one axis; conserves energy.
+        relay: (fields, n, n) fields in the relay pupil.
+        kernel: (samples, n) kernel from the relay pupil to the sensor, along one axis; conserves energy.
     """
 
     relay: SingleComplex

@@ -22,7 +22,7 @@ SMALLEST = ceil(UNIT / RELAY_SAMPLES)
 """Smallest diameter of a hole: one sample of the relay pupil, since a smaller hole may cover none."""
 SYMMETRIES = ("none", "x", "y")
 BLOCK = 200
-"""Steps between two states of a chain that can be stored."""
+"""Steps of a block; the state of a chain can be stored after each block."""
 
 _ATTEMPTS = 60  # random placements of a hole
 _PACKINGS = 200  # random starting layouts

@@ -255,7 +255,7 @@ def _first(candidates: Sequence[float], feasible: Callable[[float], bool]) -> fl
 
 
 def _levels(request: Request) -> list[int]:
-    """Numbers of cells, up to the requested one."""
+    """Numbers of cells of successive programs; the last is the requested one."""
     finest = request.cells
     coarser = [cells for cells in (COARSEST_CELLS, 64, 128) if request.outer <= cells < finest]
     return [*coarser, finest]

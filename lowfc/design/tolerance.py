@@ -34,7 +34,7 @@ KINDS: tuple[Kind, ...] = ("integrator", "lqg")
 
 DELAY = 1.0
 """Delay of the loop, frames: a command takes effect at the next frame."""
-_MIN_DRIFT = 1e-12  # drift in the model of a filter for a line only, nm^2 per frame
+_MIN_DRIFT = 1e-12  # drift in the model of a filter for a line alone, nm^2 per frame
 _GAINS = np.geomspace(0.01, 1.0, 30)
 _LINE_RATIOS = np.geomspace(1e-15, 1e10, 76)  # variance of a line over that of a frame's noise
 

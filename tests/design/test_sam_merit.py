@@ -99,12 +99,12 @@ def test_predictions_agree_with_the_full_chain(pupil, modes, layout, fields, opt
     predicted = predictions(SamCandidate(optics, fields))
     mask = transmission(layout, 512)
     I0, H = full_chain(pupil, modes, mask, 550.0)
-    open_ = modes[:, pupil > 0.5]
+    open_modes = modes[:, pupil > 0.5]
     for estimator in ("pinv", "weighted"):
         for count in (14, 20):
             C = noise_nm2(I0, H[:, :count], 40_000 / I0.max(), 3.0, estimator)
             drawn = np.linalg.cholesky(C) @ np.random.default_rng(1).standard_normal((count, 20 * count))
-            rms = np.sqrt(np.mean(np.var(drawn.T @ open_[:count], axis=1))) / 550.0
+            rms = np.sqrt(np.mean(np.var(drawn.T @ open_modes[:count], axis=1))) / 550.0
             expected = np.hypot(rms, TABLE3_NONLINEARITY_WAVES[count])
             assert predicted["table3_waves"][estimator][str(count)] == pytest.approx(expected, rel=0.05)
     assert predicted["throughput"] == pytest.approx(I0.sum(), rel=0.02)
@@ -215,7 +215,8 @@ def test_moves_stay_within_the_bounds(bounds, seed):
         placed = holes(tuple(orbits), bounds.symmetry)
         assert bounds.count[0] <= len(placed) <= bounds.count[1]
         gap = bounds.gap / 1000
-        check(Layout("with gaps", "", tuple((x, y, d + min(gap, 2 * bounds.edge / 1000)) for x, y, d in placed)))
+        enlarged = tuple((x, y, d + min(gap, 2 * bounds.edge / 1000)) for x, y, d in placed)
+        check(Layout("holes that fill gap and edge", "", enlarged))
         for i, (x, y, d) in enumerate(placed):
             assert np.hypot(x, y) + d / 2 <= 0.5 - bounds.edge / 1000 + 1e-9
             for a, b, other in placed[:i]:

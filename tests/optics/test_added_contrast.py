@@ -14,7 +14,7 @@ from lowfc.optics.chain.zernike import zernikes
 from sim_camera.contrast import IMAGES, Contrast
 
 NOLL, WAVELENGTH_NM = tuple(range(2, 16)), 550.0
-ByImage = Callable[[Array], float]
+AddedInImage = Callable[[Array], float]
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def form(shaped: Coronagraph) -> Array:
 
 
 @pytest.fixture(scope="module")
-def by_image(shaped: Coronagraph, modes: Array) -> ByImage:
+def added_in_image(shaped: Coronagraph, modes: Array) -> AddedInImage:
     def added(modes_nm: Array) -> float:
         flat, aberrated = (
             mean_contrast(shaped, np.tensordot(one, modes[: len(NOLL)], 1), WAVELENGTH_NM, DARK_ZONE, 4)
@@ -40,15 +40,19 @@ def by_image(shaped: Coronagraph, modes: Array) -> ByImage:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_quadratic_form_matches_full_images_for_small_wavefronts(by_image: ByImage, form: Array, seed: int) -> None:
+def test_quadratic_form_matches_full_images_for_small_wavefronts(
+    added_in_image: AddedInImage, form: Array, seed: int
+) -> None:
     modes_nm = 0.3 * np.random.default_rng(seed).choice([-1.0, 1.0], len(NOLL))
-    assert modes_nm @ form @ modes_nm == pytest.approx(by_image(modes_nm), rel=0.01, abs=0)
+    assert modes_nm @ form @ modes_nm == pytest.approx(added_in_image(modes_nm), rel=0.01, abs=0)
 
 
 @pytest.mark.parametrize(("tilt_nm", "error"), [(1.0, 0.0), (10.0, -0.14), (40.0, -0.74)])
-def test_quadratic_form_underestimates_large_tilt(by_image: ByImage, form: Array, tilt_nm: float, error: float) -> None:
+def test_quadratic_form_underestimates_large_tilt(
+    added_in_image: AddedInImage, form: Array, tilt_nm: float, error: float
+) -> None:
     modes_nm = tilt_nm * np.eye(len(NOLL))[0]
-    assert modes_nm @ form @ modes_nm / by_image(modes_nm) - 1 == pytest.approx(error, abs=0.01)
+    assert modes_nm @ form @ modes_nm / added_in_image(modes_nm) - 1 == pytest.approx(error, abs=0.01)
 
 
 def test_spherical_adds_thousands_of_times_more_contrast_than_tilt(form: Array) -> None:
@@ -70,13 +74,15 @@ def test_form_without_negative_eigenvalues_differs_little(form: Array) -> None:
     assert np.linalg.norm(loss - form) < 1e-3 * np.linalg.norm(form)
 
 
-def test_contrast_is_summed_by_group_and_large_tilt_is_beyond_quadratic(shaped: Coronagraph, by_image: ByImage) -> None:
+def test_contrast_is_summed_by_group_and_large_tilt_is_beyond_quadratic(
+    shaped: Coronagraph, added_in_image: AddedInImage
+) -> None:
     """The cross term of two modes is included in the sum: half of it for each."""
     modal, coma, tilt = ModalContrast(shaped, NOLL, WAVELENGTH_NM), NOLL.index(8), NOLL.index(2)
     shape = np.zeros(len(NOLL))
     shape[[coma, coma - 1, tilt]] = 0.3
     each = modal.by_mode(np.outer(shape, shape))
-    assert each.sum() == pytest.approx(by_image(shape), rel=0.01, abs=0)
+    assert each.sum() == pytest.approx(added_in_image(shape), rel=0.01, abs=0)
     groups = by_group(NOLL, each)
     assert groups["coma"] == pytest.approx(each[coma] + each[coma - 1], abs=0)
     assert costliest(groups) == ("coma", 1.0), "the cross term with coma makes the share of tilt negative"
@@ -86,7 +92,7 @@ def test_contrast_is_summed_by_group_and_large_tilt_is_beyond_quadratic(shaped: 
     assert not modal.is_beyond_quadratic(0.5**2 * np.diag(np.eye(len(NOLL))[tilt])), "the images differ by rounding"
 
 
-def test_added_contrast_of_a_run_is_that_of_its_second_half(shaped: Coronagraph, by_image: ByImage) -> None:
+def test_added_contrast_of_a_run_is_that_of_its_second_half(shaped: Coronagraph, added_in_image: AddedInImage) -> None:
     contrast = Contrast(ModalContrast(shaped, NOLL, WAVELENGTH_NM))
     assert contrast.measure() == {}
     modes_nm = 0.3 * np.eye(len(NOLL), dtype=np.float32)[NOLL.index(11)]
@@ -94,7 +100,7 @@ def test_added_contrast_of_a_run_is_that_of_its_second_half(shaped: Coronagraph,
         contrast.add(2 * modes_nm, (10 if frame < 2000 else 1) * modes_nm)
     found = contrast.measure()
     assert found["science_images"] == IMAGES
-    expected = by_image(modes_nm.astype(float))
+    expected = added_in_image(modes_nm.astype(float))
     assert (found["added_contrast"], found["quadratic_added_contrast"]) == pytest.approx(
         (expected, expected), rel=0.02, abs=0
     )

@@ -37,9 +37,9 @@ def test_noise_table_has_the_exact_distribution_at_its_levels(camera):
     numbers = np.arange(table.first_dn, table.first_dn + table.remainder.shape[1])
     for level in (0, 1, 2, 17, 64, 500, len(table.entries) - 1):
         entries = table.entries[level].astype(int)
-        from_rest = (entries > numbers[-1]).sum()
+        of_remainder = (entries > numbers[-1]).sum()
         found = np.bincount(entries[entries <= numbers[-1]] - numbers[0], minlength=len(numbers)).astype(float)
-        found += from_rest * np.diff(table.remainder[level].astype(float), prepend=0.0)
+        found += of_remainder * np.diff(table.remainder[level].astype(float), prepend=0.0)
         assert 0.5 * np.abs(found / len(entries) - probabilities(camera, level * STEP_E, numbers)).sum() < 1e-7
 
 

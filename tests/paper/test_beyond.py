@@ -187,7 +187,7 @@ def test_loops_are_judged_by_the_published_pointing(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["aplc", "sam18_sized", "clowfs:2", "bowtie:sam18_sized", "masks/a.json:b"])
-def test_a_loop_has_every_sensor_of_the_command_line(name, tmp_path):
+def test_configuration_of_a_loop_selects_the_sensor_of_the_command_line(name, tmp_path):
     (tmp_path / "run.toml").write_text(anchors._sensor_toml(name))
     keys, loaded = (one.model_dump() for one in (section_of(name), load(tmp_path / "run.toml").sensor))
     assert loaded == keys | {"sam": str(Path(name).resolve()) if ".json" in name else keys["sam"]}

@@ -97,8 +97,8 @@ def from_quarter(quarter: ArrayLike, samples: int) -> Array:
         )
     if not quarter.max() > 0.5:
         raise ValueError(
-            "a quadrant must let some light through: wavefronts are judged where its transmission exceeds one half, "
-            f"got at most {quarter.max():g}"
+            "a quadrant's transmission must exceed one half somewhere, since wavefronts are judged there, got at most "
+            f"{quarter.max():g}"
         )
     right = np.vstack([quarter[::-1], quarter])
     return np.kron(np.hstack([right[:, ::-1], right]), np.ones((repeat, repeat)))

@@ -132,7 +132,7 @@ def _focal_rows(
 
 
 def on_sensor(sensor: Sensor, scale: float, functions: Array, modes: Array) -> Matrix:
-    """Coefficients (functions squared, modes) on the sensor of modes (rows, modes), with the rows of `field_operator`.
+    """Coefficients (functions squared, modes) on the sensor of modes (rows, modes); rows as in `field_operator`.
 
     The field at the sensor is F Y F', where F is the functions times `phases` and Y these coefficients. Its squared
     amplitude is in the units of an image.

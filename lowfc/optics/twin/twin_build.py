@@ -33,7 +33,8 @@ def build(
         progress: Called with the number of steps done and the total.
 
     Raises:
-        ValueError: The focal-plane mask is not symmetric, or complex with an aperture mask; or `spec` cannot be met.
+        ValueError: The focal-plane mask is not symmetric, or complex with an aperture mask; or the optics do not allow
+            `spec`.
     """
     mask = sensor.focal_mask
     if mask.shape[0] % 2 or not (np.array_equal(mask, mask[::-1]) and np.array_equal(mask, mask[:, ::-1])):
@@ -50,7 +51,7 @@ def build(
     area = np.count_nonzero(mask) / sensor.samples_per**2
     # Two thirds of the modes are degrees of freedom of the light, proportional to the mask's area; a third is for its
     # edge. An aperture mask blurs the contribution of the faintest modes; without one, a third more modes are needed.
-    # A pupil that is bright up to its edge excites the faintest modes: a tenth more.
+    # A pupil that is bright up to its edge excites the faintest modes and needs a tenth more.
     needed = spec.rank if isinstance(sensor.relay, ApertureMask) else 4 * spec.rank / 3
     if sensor.pupil.mean() > 0.5:
         needed *= 1.1

@@ -29,7 +29,7 @@ class Point(Result):
     throughput: float = result_field("throughput", form=".1%")
     table3_waves: float = result_field("Table 3, n<=4", "waves", ".2e")
     table4_mas: float = result_field("Table 4, 2 modes", "mas", ".3f")
-    condition: float = result_field("cond14", form=".0f")
+    condition: float = result_field("condition number, 14 modes", form=".0f")
     noise_nm: float = result_field("weighted noise of 14 modes, monochromatic", "nm", ".3g")
     contrast_noise: float = result_field("contrast from this noise", form=".2e")
     quantum_share: float = result_field("share of quantum limit", form=".1%")

@@ -58,7 +58,7 @@ class ShapedPupil(Result):
     grey_cells_fraction: float = result_field("grey cells", form=".2%")
     below_optimum_at_limit_fraction: float
     rounds: int = result_field("linear programs")
-    points: int = result_field("points in the last")
+    points: int = result_field("points in the last program")
     file: str = result_field("written to")
     dtype: str = result_field("stored as")
     command: str = result_field("reproduced by")
@@ -171,7 +171,7 @@ def _picture(quarter: Array, request: Request) -> bytes:
 
     edge = min(request.outer + 4.0, float(request.cells))
     axis = np.arange(-edge, edge + FINE_STEP / 2, FINE_STEP)
-    border = edge + FINE_STEP / 2  # of the outermost samples
+    border = edge + FINE_STEP / 2  # outer rim of the outermost samples
     decades = np.log10(np.maximum(relative_field(quarter, axis) ** 2, 1e-30))
     floor = np.log10(request.contrast) - 2.0
     drawn_image = image.imshow(

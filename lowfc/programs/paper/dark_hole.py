@@ -42,8 +42,8 @@ class ChannelResult:
     """Result of a channel; arrays (1 + steps, modes), nm rms of wavefront, the first row before the first step.
 
     Attributes:
-        channel_nm: modes of the channel's shape as the sensor sees them.
-        reaction_nm: the loop's command minus the part that cancels the disturbance, mean of each step's last frames.
+        channel_nm: Modes of the channel's shape as the sensor sees them.
+        reaction_nm: The loop's command minus the part that cancels the disturbance, mean of each step's last frames.
         residual_nm: (2,) rms of the true residual about its mean, before the first step, and after the last one
             while the shape is applied.
     """
@@ -75,14 +75,14 @@ def dark_hole(
     """Apply the steps on one channel, remove them, and apply them on the other, in one run of the processes.
 
     Args:
-        folder: folder of the log.
-        step_rms_nm: rms of each step, nm of surface.
-        toml: configuration.
+        folder: Folder of the log.
+        step_rms_nm: Rms of each step, nm of surface.
+        toml: Configuration in TOML, appended to `GAINS`.
         base_nm: (rows, columns) nm of surface, the configured flat map, to which the steps on channel `flat` are added.
-        seed: seed of the simulation; the configuration's if None.
+        seed: Seed of the simulation; the configuration's if None.
 
     Raises:
-        LowfcError: the loop did not start, failed, or refused a step.
+        LowfcError: The loop did not start, failed, or refused a step.
     """
     (folder / "run.toml").write_text(f"{GAINS}{toml}")
     run, failure = new_run_id(), ""

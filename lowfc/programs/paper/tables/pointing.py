@@ -19,7 +19,7 @@ from lowfc.programs.paper.cases import Context, Prepared, Row, prepared, sparse_
 OTHERS = ("clowfs", "clowfs:1", "clowfs_tuned", "zwfs", "zwfs_tuned")
 """Sensors in addition to the packaged sparse apertures."""
 FITTED = {1: (2, 14, 20), 10: (2, 14)}
-"""Numbers of modes, tip and tilt first, by the tilt in mas."""
+"""Numbers of fitted modes, tip and tilt first, by the tilt in mas."""
 NM_PER_MAS = tilt_nm_per_mas(STAR.diameter_m)
 
 PAPER_PUPIL, PAPER_FOCAL_MASK, PAPER_RELAY_MASK = 0.147, 0.567, 0.091

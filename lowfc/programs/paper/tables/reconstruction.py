@@ -24,7 +24,7 @@ EVEN = (
     "and the Zernike sensor mistake shear for tilt."
 )
 
-INPUT_PV_WAVES = {14: 0.097, 20: 0.11}
+PAPER_INPUT_PV_WAVES = {14: 0.097, 20: 0.11}
 PAPER_WAVES = TABLE3_WAVES | {"sam": TABLE3_WAVES["disk"]}
 
 NOISE = (
@@ -154,7 +154,7 @@ def _input_rows(sensor: Prepared, modes: int, wavefronts: Input, estimated: Ense
     drawn = partial(Row, f"input, pupil of {sensor.name}", modes=modes, assumption=wavefronts.assumption)
     for statistic, paper, (mean, error) in (
         ("RMS", TABLE3_INPUT_WAVES, _rms(sensor, estimated.truth_nm)),
-        ("P-V", INPUT_PV_WAVES, _pv(sensor, estimated.truth_nm)),
+        ("P-V", PAPER_INPUT_PV_WAVES, _pv(sensor, estimated.truth_nm)),
     ):
         yield drawn(f"{statistic}, {wavefronts.name} input", "waves", mean, paper[modes], error)
 

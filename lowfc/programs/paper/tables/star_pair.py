@@ -21,7 +21,7 @@ DRIFT_PM = 20.0
 """Drift of each of 14 modes, pm per root second."""
 ROLL_NM, ROLLED = 1.0, 1e-11
 """Step of every mode by a roll of the telescope, and the contrast to which it must decay."""
-_SMALL_NM = 0.3  # amplitude of the second-order maps
+_SMALL_NM = 0.3  # amplitude of the modes from which the second-order maps are computed
 _PLANCK_NM_K = 1.438777e7
 _LONGEST_FRAMES = 1 << 20
 

@@ -168,7 +168,8 @@ def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterat
 
 def _checked(context: Context) -> list[Row]:
     """Rows of the simulated points, six for each of `CHECKED_SENSORS`."""
-    names = [name for name in CHECKED_SENSORS if name in context.names(*CHECKED_SENSORS)]  # others need days
+    # Simulating other sensors takes days.
+    names = [name for name in CHECKED_SENSORS if name in context.names(*CHECKED_SENSORS)]
     twins = {name: prepared(name).twin for name in names}  # built before the threads use them
     cases = list(product(names, CHECKED_MAGNITUDES, CHECKED_MODES))
 
