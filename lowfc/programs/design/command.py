@@ -1,4 +1,4 @@
-"""The commands `lowfc design ...`: arguments only."""
+"""Arguments of the commands `lowfc design ...`; the other modules of this package do the work."""
 
 import os
 from dataclasses import fields

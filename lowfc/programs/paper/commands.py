@@ -1,4 +1,4 @@
-"""The command `lowfc validate`: arguments only."""
+"""Arguments of the command `lowfc validate`; the other modules of this package do the work."""
 
 import os
 import sys
