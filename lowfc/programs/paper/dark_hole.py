@@ -103,7 +103,7 @@ def dark_hole(
             try:
                 out, complaints = process.communicate(timeout=PATIENCE_S)
             finally:
-                process.kill()  # has no effect once it has ended
+                process.kill()  # has no effect once the process has ended
     if failure or process.returncode:
         raise LowfcError(f"{failure}output of the loop: {out}{complaints}")
     log = folder / json.loads(out)["log"]

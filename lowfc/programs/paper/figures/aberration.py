@@ -96,7 +96,7 @@ def fig1(context: Context) -> list[Row]:
 
 
 def _between_samples(ready: Prepared) -> list[Row]:
-    """Contrast with a flat wavefront halfway between the points of the fine grid of the pupil's design."""
+    """Contrast halfway between the points of the fine grid of the pupil's design, with a flat wavefront."""
     columns = 2 * _VIEW * _FINE_SAMPLES_PER
     image = _image(ready, np.zeros(MODES), _FINE_SAMPLES_PER)
     zone = image[wedge_samples(ready.coronagraph.dark_zone, columns, columns, _FINE_SAMPLES_PER)]

@@ -58,7 +58,7 @@ def _image(modes_nm: Array, samples: int) -> Array:
 
 
 def zero_point_nm(name: str) -> Array:
-    """Modes (14,) at which a loop with the reference star's I0 and R holds the target, due to its colour."""
+    """Modes (14,) at which a loop with the reference star's I0 and R holds the target star, due to its colour."""
     sensor = prepared(name)
     reference_star, target = (coloured(kelvin) for _, kelvin in STARS.values())
     I0, H = reference(sensor.sensor, reference_star).ravel(), response(sensor.sensor, sensor.modes[:14], reference_star)

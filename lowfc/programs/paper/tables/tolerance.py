@@ -80,13 +80,13 @@ class Contrasts:
 
 @lru_cache(maxsize=8)
 def contrasts(pupil: str, focal_radius: float) -> Contrasts:
-    """Contrast of a coronagraph's modes; the fourth order from full images."""
+    """Contrast that each mode adds behind a coronagraph; the fourth order is from full images."""
     section = SensorSection(pupil=pupil, focal_radius=focal_radius)
     modal = ModalContrast(coronagraph_from(section), NOLLS_14, prepared("sam").sensor.wavelength_nm)
     flat, form = modal.by_image(np.zeros(len(NOLLS_14))), np.diag(modal.form)
     if not (form > 0).all():
         raise ConfigurationError(
-            f"with pupil = {pupil!r} some modes reduce the light in the dark zone, which is bright: no tolerance"
+            f"with pupil = {pupil!r} some modes reduce the light in the bright dark zone: they have no tolerance"
         )
     quartic = np.zeros(len(NOLLS_14))
     for mode, per_nm2 in enumerate(form.tolist()):
@@ -102,7 +102,7 @@ def contrasts(pupil: str, focal_radius: float) -> Contrasts:
 
 
 def contrasts_of(name: str) -> Contrasts:
-    """Contrast of the modes behind a sensor's coronagraph."""
+    """Contrast that each mode adds behind a sensor's coronagraph."""
     section = prepared(name).section
     return contrasts(section.pupil, section.focal_radius)
 
@@ -134,7 +134,7 @@ def _quantum_noise_of_one_electron_nm2(name: str) -> Array:
 
 
 def tolerance(context: Context) -> list[Row]:
-    """Rows of tolerated drift and lines, of their check by simulation, and of the pair of stars."""
+    """Rows of tolerated drift and vibration lines, of their check by simulation, and of the pair of stars."""
     from lowfc.programs.paper.tables.star_pair import pair_rows
 
     names = context.names(*SENSORS_COMPARED)
