@@ -28,13 +28,13 @@ SMALL = Size(side=32, modes=5, mirror_side=10)
 
 
 def by_heading(lines: runner.Lines) -> list[dict[str, str]]:
-    """Each line as a dictionary, last column first; of columns with the same heading it holds the first."""
+    """Each line as a dictionary by heading, last column first; the first of several columns with one heading counts."""
     assert len({len(line) for line in lines}) == 1
     return [dict(reversed(list(zip(lines[0], line, strict=True)))) for line in lines[1:]]
 
 
 @pytest.mark.parametrize("words", ["--seconds 0", "--seconds nan", "--repeats 0"])
-def test_nothing_is_measured_in_no_time(capsys: pytest.CaptureFixture[str], words: str) -> None:
+def test_a_measurement_without_duration_or_repeats_is_refused(capsys: pytest.CaptureFixture[str], words: str) -> None:
     with pytest.raises(SystemExit):
         runner.run("kernels", kernels, words.split())
     assert "--seconds must be 0.01 to 100000, --repeats at least 1" in capsys.readouterr().err
@@ -280,7 +280,7 @@ def test_roles_of_processes_are_found_from_their_command_lines() -> None:
     assert load.role_of(["python", "-m"]) is load.role_of([]) is None
 
 
-# The comparison
+# The comparison with other implementations
 
 
 def parsed(*words: str | Path) -> Namespace:
@@ -381,7 +381,7 @@ def test_a_real_run_of_an_implementation_gives_its_latencies(chosen: implementat
     if why := implementations.missing(chosen, options):
         pytest.skip(why)
     found = comparison.one_run(chosen, options, 0)
-    assert found["frames"] == pytest.approx(seconds * rate_hz, abs=10)  # lowfc warms up by time
+    assert found["frames"] == pytest.approx(seconds * rate_hz, abs=10)  # the warm-up of lowfc is a time
     assert found["without_command"] < found["frames"]
     to_command, to_mirror = found["frame_to_command"], found["frame_to_mirror"]
     assert 0 < to_command["p50"] <= to_command["p99"] <= to_command["max"]

@@ -232,7 +232,7 @@ def test_signs_of_a_stall_are_sorted_by_cause_host_or_loop() -> None:
 def test_a_stall_has_only_the_counts_of_its_own_time() -> None:
     command_us = np.full(1000, 100.0)
     command_us[100] = 5000  # warm-up
-    command_us[600], command_us[601] = 3000, np.nan  # superseded during a stall of the host
+    command_us[600], command_us[601] = 3000, np.nan  # frame 601 is superseded while the host stalls
     command_us[[700, 800, 900, 950]] = 1500, 2000, 1200, 1100
     late_us = np.zeros(1000)
     late_us[900] = 800  # the stall starts when the frame is due, 0.8 ms before it is published

@@ -86,7 +86,7 @@ def test_a_child_that_a_process_leaves_behind_is_reported(sleeping: ChaosBench) 
     os.kill(int(left.split("(")[1].split(",")[0]), signal.SIGKILL)
 
 
-def test_a_disk_fills_up_by_a_limit_of_the_recorders_files(sleeping: ChaosBench) -> None:
+def test_a_full_disk_is_a_limit_on_the_size_of_the_recorders_files(sleeping: ChaosBench) -> None:
     sleeping.restart(Role.RECORDER, ready=False)
     (sleeping.folder / "a.mcap.part").write_bytes(bytes(500))
     sleeping.health[Role.RECORDER] = wire.Health(recording=wire.Recording(failure="no space left"))
@@ -97,14 +97,14 @@ def test_a_disk_fills_up_by_a_limit_of_the_recorders_files(sleeping: ChaosBench)
     sleeping.end()
 
 
-def test_a_recorder_on_a_slow_disk_writes_late_where_it_should(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_disk_delays_the_given_writes_and_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The program that replaces the recorder is executed here; instead of recording it writes ten times."""
-    started = Mock(
+    mock_bench = Mock(
         spec=ChaosBench, children={Role.RECORDER: SimpleNamespace(command=["python", "-m", "lowfc", "record"])}
     )
-    disk._on_slow_disk(started, 3.0, 4, 2)
-    assert started.method_calls[:2] == [call.signal(Role.RECORDER, signal.SIGTERM), call.await_end(Role.RECORDER, 0)]
-    (_, (python, option, program, *arguments)), ready = started.restart.call_args
+    disk._on_slow_disk(mock_bench, 3.0, 4, 2)
+    assert mock_bench.method_calls[:2] == [call.signal(Role.RECORDER, signal.SIGTERM), call.await_end(Role.RECORDER, 0)]
+    (_, (python, option, program, *arguments)), ready = mock_bench.restart.call_args
     assert (python, option, arguments, ready) == ("python", "-c", ["3.0", "4", "2", "record"], {"ready": True})
 
     waited: list[tuple[int, float]] = []
@@ -125,9 +125,9 @@ def test_a_recorder_on_a_slow_disk_writes_late_where_it_should(tmp_path: Path, m
 
 
 def test_a_camera_with_another_clock_is_replaced_by_one_with_the_hosts() -> None:
-    started = Mock(spec=ChaosBench, children={Role.CAMERA: SimpleNamespace(command=["sim-camera"])})
-    CASES["clock-behind"].act(started)
-    assert started.method_calls == [
+    mock_bench = Mock(spec=ChaosBench, children={Role.CAMERA: SimpleNamespace(command=["sim-camera"])})
+    CASES["clock-behind"].act(mock_bench)
+    assert mock_bench.method_calls == [
         call.kill(Role.CAMERA),
         call.restart(Role.CAMERA, ["unshare", "--time", "--monotonic", "-3600", "sim-camera"]),
         call.await_steps(WHILE_FRAMES),
@@ -169,7 +169,7 @@ def test_a_stall_is_compared_with_the_time_before_and_after(monkeypatch: pytest.
     timings, latency_us = bus.publisher(TIMING), {"now": 0}
 
     def pass_time(seconds: float) -> None:
-        """Publish frames with the latency of the phase; with 9 ms in the short waits between phases."""
+        """Publish timings with the latency of the phase; with 9 ms in the short waits between phases."""
         latency = latency_us["now"] if seconds > 1 else 9_000
         timings.put(wire.ControlTiming(frame_to_command_ns=[1000 * latency] * 3).SerializeToString())
 

@@ -82,7 +82,7 @@ class ToyBench(ChaosBench):
         self._steps = self._closed_frames = self._index = 0
         self._services: dict[str, Service] = {}
         self.hub, self.clock = MemoryHub(), FakeClock()
-        self._fault, self._noise = "", np.random.default_rng(rng.getrandbits(32))
+        self._start_error, self._noise = "", np.random.default_rng(rng.getrandbits(32))
         path = folder / "run"
         path.mkdir()
         self.run: Any = SimpleNamespace(path=path, run_id="toy", links=None, remove=lambda: None)
@@ -144,7 +144,7 @@ class ToyBench(ChaosBench):
         try:
             loaded = calibration_file.load(Path((command or self.children[Role.CONTROLLER].command)[-1]))
         except LowfcError as fault:
-            self._fault = str(fault)
+            self._start_error = str(fault)
             return
         service = self._service(name)
         self._latch = Latch([self.run.path / NAME], lambda why: service.event("LATCH_FAILED", why=why))
@@ -157,9 +157,9 @@ class ToyBench(ChaosBench):
         self._controller._mirror_adopted = True
 
     def await_end(self, name: str, status: int) -> str:
-        assert self._fault
+        assert self._start_error
         self.outcome.ended.append(ProcessEnd(name, status, 0.0, True))
-        return self._fault
+        return self._start_error
 
     def end(self, timeout_s: float = 0.0) -> None:
         self.mark("end")

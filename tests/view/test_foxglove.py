@@ -51,7 +51,7 @@ pytest.importorskip("foxglove")
 
 PATIENCE_S = 10.0
 COUNT = 200  # messages of each topic, one per millisecond
-_DATA = struct.Struct("<BIQ")  # 1, the subscription's number, time
+_DATA = struct.Struct("<BIQ")  # head of a message: operation 1, number of the subscription, time
 
 STEP_BYTES = wire.ControlStep(frame_sequence=7, mode=wire.LOOP_MODE_CLOSED, error_nm=[1.5, -2.0]).SerializeToString()
 FRAME_BYTES = image(np.arange(12, dtype=np.uint16).reshape(3, 4), 5, "camera").SerializeToString()
@@ -190,7 +190,7 @@ def test_a_client_that_does_not_read_loses_messages_and_blocks_nobody(bridge: Fo
         while times_ns[-1] < count:
             times_ns.append(frozen.next()[1])
     assert times_ns == sorted(times_ns)
-    assert 1000 < len(times_ns) < count, "a bounded number of messages waits for it"
+    assert 1000 < len(times_ns) < count, "a bounded number of messages waits for the client"
 
 
 def test_the_port_is_on_loopback_only_and_errors_have_one_line(

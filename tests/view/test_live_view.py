@@ -190,7 +190,7 @@ def viewer_grows(bench: ViewBench, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def view_grows(bench: ViewBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    sizes = [live_view.OWN_BYTES + 1]  # once too large
+    sizes = [live_view.OWN_BYTES + 1]  # too large in one check
     monkeypatch.setattr(live_view, "resident_bytes", lambda: sizes.pop() if sizes else 0)
 
 

@@ -62,7 +62,7 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
 
 def drawn(*logs: Path, config: Configuration | None = None) -> tuple[Drawn, Tape]:
     tape = Tape()
-    return draw_logs(logs, config or Configuration(), lambda own: Renderer(own, tape)), tape
+    return draw_logs(logs, config or Configuration(), lambda used: Renderer(used, tape)), tape
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_the_final_verdict_is_on_the_log_and_not_on_a_recording(
     ("in_health", "at_the_end", "detail"),
     [((0, 0), 3, "night, 3 messages lost"), ((2, 2), 0, "night, nothing lost"), ((2, 7), 0, "night, 5 messages lost")],
 )
-def test_the_verdict_has_the_losses_of_the_log_and_not_of_earlier_ones(
+def test_the_verdict_has_the_losses_during_the_log_and_not_the_recorders_earlier_ones(
     tmp_path: Path, shown: Shown, in_health: tuple[int, int], at_the_end: int, detail: str
 ) -> None:
     night = SyntheticLog()
@@ -161,7 +161,7 @@ def test_the_verdict_on_a_log_says_that_its_residual_includes_a_shape(tmp_path: 
     assert "with offset and channels" in shown[-1].headline
 
 
-def test_the_time_of_a_slow_loop_and_of_a_frame_with_a_wrong_clock_is_counted(
+def test_frames_two_seconds_apart_leave_no_gap_and_a_frame_with_a_wrong_time_adds_none(
     tmp_path: Path, shown: Shown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(report_log, "PERIOD_NS", 2_000_000_000)
@@ -273,8 +273,8 @@ def test_every_view_of_the_layout_has_data_and_the_plots_span_the_whole_log(tmp_
     assert np.all(np.diff(times_ns) > 0)
     origins = {str(view.origin) for view in views(layout().root_container)}
     assert not [origin for origin in origins if not any(path.startswith(origin) for path in tape.paths)]
-    flat, residual = values_of(tape.last(f"{trend.TREND}/curves").strips)  # the residual on top
-    assert np.mean([y for _, y in flat]) < np.mean([y for _, y in residual])  # y points down: the flat mirror is above
+    flat, residual = values_of(tape.last(f"{trend.TREND}/curves").strips)  # in the order of drawing
+    assert np.mean([y for _, y in flat]) < np.mean([y for _, y in residual])  # y points down: the flat mirror is higher
     assert len(residual) == len(flat) > 1
     names = tape.last(f"{trend.TREND}/names").labels.as_arrow_array().to_pylist()
     assert names == ["flat mirror", "residual", "true, 1 s mean"]
@@ -354,17 +354,17 @@ def test_a_log_of_a_simulated_run_is_drawn_without_a_runtime_directory(
 def test_logs_of_two_runs_are_not_drawn_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     logs = [SyntheticLog().frames(120).write(tmp_path / f"{name}.mcap") for name in "ab"]
     assert drawn(*logs)[0].snapshots > 0
-    lockstep = SyntheticLog().frames(120)
-    lockstep.samples = [one._replace(publish_time_ns=one.publish_time_ns + 10**9) for one in lockstep.samples]
-    others = [lockstep.write(tmp_path / "c.mcap")]
+    repetition = SyntheticLog().frames(120)
+    repetition.samples = [one._replace(publish_time_ns=one.publish_time_ns + 10**9) for one in repetition.samples]
+    others = [repetition.write(tmp_path / "c.mcap")]
     monkeypatch.setitem(report_log.METADATA["lowfc"], "run", "another")
     others.append(SyntheticLog().frames(120).write(tmp_path / "d.mcap"))
     for other in others:
         with pytest.raises(DataFileError, match="one run at a time"):
             drawn(logs[0], other)
-    lockstep.samples = [one._replace(receive_time_ns=one.receive_time_ns - 3 * 10**9) for one in lockstep.samples]
+    repetition.samples = [one._replace(receive_time_ns=one.receive_time_ns - 3 * 10**9) for one in repetition.samples]
     with pytest.raises(DataFileError, match="order of recording"):
-        drawn(others[1], lockstep.write(tmp_path / "earlier.mcap"))
+        drawn(others[1], repetition.write(tmp_path / "earlier.mcap"))
 
 
 # Events from before the start of the view.

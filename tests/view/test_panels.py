@@ -375,7 +375,7 @@ def test_the_trail_has_at_most_400_points_the_last_of_which_is_the_newest() -> N
     tape, residual_nm = Tape(), np.outer(np.arange(1.0, 800.0), np.ones(MODES))
     drawn(pointing.Pointing(1.0), tape, 0, truths=truths(residual_nm, residual_nm))
     points = values_of(tape.last(f"{pointing.TRAIL}/points").positions)
-    assert (len(points), points[-1]) == (400, pytest.approx([0.799, -0.799]))  # of the outer ring, 1000 mas
+    assert (len(points), points[-1]) == (400, pytest.approx([0.799, -0.799]))  # 1 is the outer ring, 1000 mas
 
 
 TONE_HZ, TONE_NM = 20.0, 3.0
@@ -439,7 +439,7 @@ def test_spectra_stay_in_their_box_and_restart_when_the_mode_changes(tone: tuple
     assert not values_of(tape.last(shown).strips)
     assert values_of(tape.last(state).labels) == ["loop open: fewer than 64 steady frames"]
     drawn(panel, tape, round(9.5e9), camera=CAMERA, controller=controller, ended=LogEnd(*[""] * 4, 0, 0, 0, None))
-    assert len(values_of(tape.last(shown).strips)) == 3, "the last of the log that are known"
+    assert len(values_of(tape.last(shown).strips)) == 3, "the last known spectra of the log"
     assert values_of(tape.last(state).labels) == ["loop closed, last 4.1 s before a change"]
 
 

@@ -128,7 +128,7 @@ def test_the_curves_of_plotjuggler_are_numbers() -> None:
         assert len(curves) > 10
         for curve in curves:
             assert plotjuggler_field(curve).cpp_type not in NOT_NUMBERS
-    for splitter in PLOTJUGGLER.iter("DockSplitter"):  # PlotJuggler does not check these
+    for splitter in PLOTJUGGLER.iter("DockSplitter"):  # PlotJuggler does not check its counts and sizes
         assert splitter.get("count") == str(len(splitter)) == str(len(splitter.get("sizes", "").split(";")))
 
 

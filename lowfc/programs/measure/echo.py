@@ -1,7 +1,8 @@
 """A bare zenoh echo, the reference for a loop's latency: a frame out, a command back, no work in between.
 
 Two processes with one plain zenoh session each use the loop's links and its settings of session, publishers and
-scheduling. The one that answers is set up like the controller: it then times the control step and the host's timer.
+scheduling. The process that answers is set up like the controller; afterwards it times the control step and the host's
+timer.
 """
 
 import dataclasses
@@ -34,12 +35,12 @@ from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S
 ECHO_FILE = "echo.npz"
 """File in the run's directory: round_trip_ns of every frame after the warm-up, -1 without an answer."""
 ALONE_FILE = "alone.npz"
-"""File in the run's directory: timer_ns and step_ns as from `time_alone`, and hot_step_ns, the step back to back."""
+"""File in the run's directory: timer_ns and step_ns as from `time_alone`, and hot_step_ns of steps back to back."""
 
 _READY_S = 30.0
 _POLL_S = 0.02
 _SETTLE_S = 0.1
-_HOT_S = 0.3  # duration of the steps back to back
+_HOT_S = 0.3  # time for which steps are run back to back
 _LOST = -1
 
 Seconds = Annotated[float, typer.Option(help="Duration, seconds.")]
@@ -78,7 +79,7 @@ def answer(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds
 
 
 def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) -> Long:
-    """Send frames for the warm-up and `seconds`, then an empty one; round trips after the warm-up, -1 if lost."""
+    """Time the round trip of each frame for `seconds` after the warm-up, -1 if lost; an empty frame ends the echo."""
     clock = HostClock()
     sent_ns: list[int] = []
     round_trip_ns: list[int] = []
@@ -142,7 +143,7 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
 
 
 def _join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Run:
-    """Set this process up like the loop's process with this role; return the run with only the two processes' links."""
+    """Set this process up like the loop's process with this role; return the run with only camera and controller."""
     prepare(config, role, cpus)
     run = open_run(run_id, (config.mirror.name,))
     ports = {str(role): run.links.ports[role] for role in (Role.CAMERA, Role.CONTROLLER)}

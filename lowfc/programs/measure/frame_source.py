@@ -37,7 +37,7 @@ _COUNT = 32  # different frames, sent in turns
 _TILT_NM, _OTHER_NM = 3.0, 1.0  # amplitudes, nm rms
 _MAX_CYCLES = 3  # oscillations of a mode in _COUNT frames
 _WAIT_S = 60.0  # a view may have to load
-_LEAD_PERIODS = 10
+_FIRST_FRAME_PERIODS = 10  # from the start to the first frame
 
 app = new_app("A camera that sends prepared frames.")
 
@@ -97,7 +97,7 @@ def frame_source(
         state = camera_state(CameraSettings.configured(settings, *payloads.shape), clock.now_ns())
         states.put(state.SerializeToString())
         service.state = "running"
-        begin_ns = clock.now_ns() + _LEAD_PERIODS * period_ns
+        begin_ns = clock.now_ns() + _FIRST_FRAME_PERIODS * period_ns
         write_whole(folder / BEGIN_FILE, str(begin_ns).encode())
         for index in range(math.ceil(seconds * settings.camera.rate_hz)):
             next_ns = begin_ns + index * period_ns

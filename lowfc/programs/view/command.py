@@ -20,7 +20,9 @@ def view(
     web: Annotated[bool, typer.Option("--web", help="Serve a page for a browser on this host.")] = False,
     save: Annotated[Path | None, typer.Option(help="Write a file (RRD) for rerun.")] = None,
     headless_screenshot: Annotated[Path | None, typer.Option(help="Write a picture (PNG), without a screen.")] = None,
-    foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove by its WebSocket protocol.")] = False,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="Serve the loop to Foxglove, by its WebSocket protocol.")
+    ] = False,
     tab: Annotated[Tab, typer.Option(help="Tab to open.")] = Tab.OPERATOR,
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="Show a running loop for this long; default for a picture: 8 s.")
@@ -28,7 +30,7 @@ def view(
     run: Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")] = None,
     config: ConfigFile = None,
     memory_mb: Annotated[float, typer.Option(min=16, max=1e6, help="Viewer's memory for past data, MB.")] = _MEMORY_MB,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port of the stream, or of Foxglove.")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port of the viewer, or for Foxglove.")] = None,
     web_port: Annotated[int | None, typer.Option(min=1, max=65535, help="TCP port of the page.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
 ) -> None:
@@ -43,9 +45,9 @@ def view(
 
     lower_priority()
     if foxglove:
-        others = logs, native, web, save, headless_screenshot, seconds, config, as_json, web_port
-        if any(others) or tab != Tab.OPERATOR or memory_mb != _MEMORY_MB:
-            raise ConfigurationError("--foxglove serves a running loop until Ctrl-C, with --run and --port alone")
+        other_options = logs, native, web, save, headless_screenshot, seconds, config, as_json, web_port
+        if any(other_options) or tab != Tab.OPERATOR or memory_mb != _MEMORY_MB:
+            raise ConfigurationError("--foxglove serves a running loop until Ctrl-C; only --run and --port go with it")
         from lowfc.adapters.process.clock import HostClock
         from lowfc.programs.view.foxglove_bridge import DEFAULT_PORT, serve_foxglove
 

@@ -81,7 +81,7 @@ class FoxgloveBridge:
         """Subscribe on the bus of a run; the bus of an earlier run of the same name is closed by then."""
         self._bus, self._names = bus, Names()
         self.last_states.clear()
-        # Before the service subscribes to Health: to peers, that shows that the viewer has all its subscriptions.
+        # Before the service subscribes to Health: peers take that for the last of the viewer's subscriptions.
         for topic in SHOWN:
             bus.subscribe(topic, partial(self._publish, topic))
         self.service = Service(Role.VIEWER, self._run_id, self._clock, bus)

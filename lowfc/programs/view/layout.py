@@ -51,10 +51,10 @@ def layout(
     span_ns: tuple[int, int] | None = None,
     still: bool = False,
 ) -> rrb.Blueprint:
-    """The blueprint, with the tab `active` in front.
+    """The layout as rerun's blueprint, with the tab `active` in front.
 
     Plots show the last `window_s` seconds or, for a log, the interval `span_ns`; with neither, the viewer chooses. In a
-    `still` picture of a whole log, the operator's tab has curves and problems in place of the last instant.
+    `still` picture of a whole log, the operator's tab has curves and problems in place of pictures of the last instant.
     """
     tabs = {
         Tab.OPERATOR: _whole_log() if still else _operator(),

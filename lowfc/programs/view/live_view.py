@@ -47,7 +47,7 @@ _RECORDER_S = 3.0  # after which a recorder without Health counts as absent
 _FILE_S = 60.0  # for the last data to be written to a file
 _POLL_S = 0.1
 _CHECK_S = 1.0
-_FROZEN_S = 3.0  # between two checks, after which this process counts as stopped meanwhile
+_FROZEN_S = 3.0  # a longer time between two checks means that this process was stopped meanwhile
 _MAX_RENEWALS = 5
 _RENEWALS_S = 60.0
 
@@ -77,7 +77,9 @@ class LiveView:
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
     def run(self, duration_s: float | None = None, ready: Callable[[], None] = lambda: None) -> None:
-        """Show the run until stopped, the window is closed or `duration_s` is over; call `ready` once the viewer runs.
+        """Show the run until this is stopped, the window is closed or `duration_s` is over.
+
+        `ready` is called once the viewer runs.
 
         Raises:
             ViewerError, ViewError: no viewer starts, it fails repeatedly, memory stays above its limit, or writing the
@@ -95,7 +97,7 @@ class LiveView:
                 now_s = time.monotonic()
                 if now_s - checked_s >= _CHECK_S:
                     if now_s - checked_s > _FROZEN_S:
-                        self._awake_s = now_s  # this process was stopped, and the render thread with it
+                        self._awake_s = now_s  # the render thread could not draw before
                     checked_s = now_s
                     self._check(now_s)
         finally:
@@ -183,7 +185,10 @@ class LiveView:
             self._renew(f"the viewer uses {viewer_bytes / 1e6:.0f} MB")
 
     def _renew(self, why: str) -> None:
-        """Restart with a new viewer on the same ports; a file cannot be continued and is kept as it is."""
+        """Restart with a new viewer on the same ports.
+
+        ViewError after too many restarts, and for a file, which cannot be continued: it is kept as it is.
+        """
         if self.viewer is None:
             raise ViewError(f"writing the view to a file failed: {why}")
         while True:
@@ -205,14 +210,14 @@ class LiveView:
 
 
 def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
-    """The newest events in a recorder's logs; if they cannot be read, a line with the reason.
+    """The newest events in a recorder's logs; if they cannot be read, an event of the view with the reason.
 
     Only chunks with events are read, which takes a second for a log of 4 GB.
     """
     if recorder is None:
-        return [_line("earlier events are not shown: there is no recorder", now_ns)]
+        return [_view_event("earlier events are not shown: there is no recorder", now_ns)]
     if recorder.host and recorder.host != platform.node():
-        return [_line(f"earlier events are not shown: they are in the log on {recorder.host}", now_ns)]
+        return [_view_event(f"earlier events are not shown: they are in the log on {recorder.host}", now_ns)]
     found: list[Sample] = []
     missing = []
     for name in reversed(recorder.recording.files):
@@ -222,12 +227,12 @@ def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
         try:
             found = [*LogReader(log, topics=(EVENT,), skip_damaged=True, sparse=True), *found]
         except DataFileError as fault:
-            missing.append(_line(f"some earlier events are missing: {fault}", now_ns))
+            missing.append(_view_event(f"some earlier events are missing: {fault}", now_ns))
         if len(found) >= MAX_EARLIER_EVENTS:
             break
     return [*found[-MAX_EARLIER_EVENTS:], *missing]
 
 
-def _line(text: str, now_ns: int) -> Sample:
+def _view_event(text: str, now_ns: int) -> Sample:
     log = Log(timestamp=timestamp(now_ns), level=Level.INFO.value, name="view", message=text)  # type: ignore[arg-type]
     return Sample(EVENT.key, log.SerializeToString(), 0, now_ns, now_ns)

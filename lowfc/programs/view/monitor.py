@@ -14,7 +14,7 @@ _QUERY_AGAIN_NS = 5_000_000_000  # until a controller that did not answer is que
 
 
 def import_late_modules() -> None:
-    """Import the modules that only later verdicts use; their slow import would delay all values of a reading."""
+    """Import the modules that only a later verdict uses: imported then, they would delay all values of that reading."""
     for name in ("lowfc.control.laws.tuning", "scipy.signal"):
         import_module(name)
 

@@ -54,10 +54,10 @@ def draw_logs(
     drawn, accumulator = Drawn(), Accumulator()
     renderer: Renderer | None = None
     due_ns = first_ns = last_ns = ended_ns = earlier_bytes = 0
-    newest_frame = last_frame = -1, 0  # sequence and publish time, so far and in the logs before
+    newest_frame = last_frame = -1, 0  # sequence and publish time: of all frames so far, and of the logs before this
     damaged, no_end, run, host = 0, "", "", ""
     stroke_nm: float | None = None
-    lost: dict[str, int] = {}  # by recording; its last file has the account of all its files
+    lost: dict[str, int] = {}  # by recording, whose last file has the count of all its files
     for log in logs:
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
         for number, message in enumerate(reader):
@@ -94,7 +94,7 @@ def draw_logs(
                     used_nm = stroke_used_nm(wire.MirrorState.FromString(message.payload))
                     stroke_nm = used_nm if stroke_nm is None else max(stroke_nm, used_nm)
             last_ns = max(last_ns, message.receive_time_ns)
-            if not topic.queryable:  # states requested at the log's start may be hours old
+            if not topic.queryable:  # states queried by the recorder at its start may be hours old
                 first_ns = first_ns or message.receive_time_ns
             if first_ns and last_ns >= due_ns:
                 snapshot = accumulator.snapshot(last_ns, complete=drawn.snapshots % PICTURES_PER_COMPLETE == 0)
@@ -115,8 +115,8 @@ def draw_logs(
             lost[reader.metadata.get(PART, {}).get("of", log.name)] = int(account)
     if renderer is None:
         raise DataFileError(f"nothing to show in {', '.join(map(str, logs))}: no message that a view shows")
-    name, gone = logs[-1].name.partition(".")[0], missing_between(logs)
-    ended = LogEnd(name, run, host, no_end, damaged, gone, sum(lost.values()), stroke_nm)
+    name, missing_files = logs[-1].name.partition(".")[0], missing_between(logs)
+    ended = LogEnd(name, run, host, no_end, damaged, missing_files, sum(lost.values()), stroke_nm)
     renderer.draw(accumulator.snapshot(last_ns, ended=ended))
     if accumulator.unreadable:
         drawn.remarks.append(f"{counted(accumulator.unreadable, 'message')} could not be read")
@@ -125,7 +125,7 @@ def draw_logs(
 
 
 def _configuration_of(reader: LogReader, remarks: list[str]) -> Configuration:
-    """The configuration in a log, or the default one; the reason is added to the remarks."""
+    """The configuration in a log, or the default one; what cannot be used is added to the remarks."""
     known, reasons = attached_configuration(reader)
     remarks += reasons
     if known is None:

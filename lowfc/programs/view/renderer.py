@@ -113,7 +113,7 @@ class RenderThread(threading.Thread):
         self._abandoned = False
 
     def add_earlier(self, samples: Iterable[Sample]) -> None:
-        """Also draw messages from before the view."""
+        """Also draw these messages, which were published before the view began."""
         self._earlier.extend(samples)
 
     def abandon(self) -> None:

@@ -68,7 +68,7 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
         "moments": view.snapshots,
         "renewals": view.renewals,
         "memory_mb": round(view.peak_bytes / 1e6, 1),
-        "file": _written(target),
+        "file": _report_written(target),
     }
 
 
@@ -112,7 +112,7 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
         "moments": drawn.snapshots,
         "log_s": round(drawn.log_s, 3),
         "remarks": drawn.remarks,
-        "file": _written(target),
+        "file": _report_written(target),
     }
 
 
@@ -129,7 +129,7 @@ def memory_remarks(log_bytes: int, target: Target) -> list[str]:
 def _draw(logs: list[Path], config: Configuration | None, stream: rr.RecordingStream, target: Target) -> Drawn:
     total = sum(log.stat().st_size for log in logs if log.exists())
     with reading_bar(Console(stderr=True)) as count:
-        drawn = draw_logs(logs, config, lambda own: Renderer(own, stream), lambda done: count("drawing", done, total))
+        drawn = draw_logs(logs, config, lambda used: Renderer(used, stream), lambda done: count("drawing", done, total))
     target.show_all(stream, drawn.span_ns)
     drawn.remarks += memory_remarks(total, target)
     for remark in drawn.remarks:
@@ -144,7 +144,7 @@ def _end(stream: rr.RecordingStream, viewer: RerunViewer | None) -> None:
     stream.disconnect()
 
 
-def _written(target: Target) -> str | None:
+def _report_written(target: Target) -> str | None:
     if target.written is None:
         return None
     sys.stderr.write(f"{target.written} written\n")

@@ -47,18 +47,19 @@ SHOWN = (FRAME, STEP, TRUTH, TIMING, MIRROR_STATE, SURFACE, CALIBRATION, CAMERA_
 
 PICTURES_HZ = 30.0
 PICTURES_PER_COMPLETE = 8
-"""Snapshots per complete one. Curves grow four times a second, because many rows cost hardly more than one."""
+"""One snapshot in eight is complete: curves grow four times a second, because many rows cost hardly more than one."""
 
-_KNOWN_EVENTS = 5000
+_MAX_KNOWN_EVENTS = 5000
 _UNREADABLE = (BadMessageError, DecodeError, KeyError, OverflowError, ValueError)
 
 
 class Wavefronts(NamedTuple):
     """The wavefront of some frames, nm: `residual`, and `open`, as it would be with a flat mirror.
 
-    `residual_nm` and `open_nm` (frames, modes) are values at one instant of each frame; `residual_rms_nm` and
-    `open_rms_nm` are rms over each frame if known. `rms_nm` (frames, 2): residual and open, of all modes or over the
-    open pupil.
+    `residual_nm` and `open_nm` (frames, modes): true ones at the start of each exposure, or as measured.
+    `residual_rms_nm` and `open_rms_nm` (frames, modes): rms over the frame period if known, otherwise the same
+    values up to their signs. `rms_nm` (frames, 2): rms of residual and open, true ones over the open pupil, measured
+    ones of all modes.
     """
 
     sequence: Sequences
@@ -88,13 +89,13 @@ class LogEnd:
     """End of the logs shown.
 
     Attributes:
-        name: name of the last one.
+        name: name of the last log.
         run, host: name of their run, and host of the recorder.
-        no_end: why one of them has no end; empty if all were finished.
+        no_end: why one of the logs has no end; empty if all were finished.
         damaged: number of damaged stretches that were left out.
         missing_files: number of files missing between the first and the last.
         lost: number of messages lost, from the recorder's accounts at the end of its recordings.
-        stroke_nm: largest deviation of an actuator from flat in any mirror state; None without one.
+        stroke_nm: largest deviation of an actuator from flat in any mirror state; None without a mirror state.
     """
 
     name: str
@@ -113,15 +114,17 @@ class Snapshot:
 
     Attributes:
         time_ns: time on the timeline: that of the newest step (without a controller: frame), plus the host time since
-            then. In lockstep it is simulated time.
-        host_ns: time of the host clock, as are `sent_ns` (last message of each topic) and `LastHealth`.
+            then; in lockstep, the simulated time of that step alone.
+        host_ns: time of the snapshot by the host clock. `sent_ns`, the time of each topic's last message, and
+            `LastHealth` are by the same clock.
         steps, truths, timings, events: new rows and events; timings are the durations of the controller's stages.
         frame, mirror, surface: newest frame (DN, at `frame_ns`), mirror state, and surface over the pupil (nm); None if
             none has arrived since the last snapshot or, in a `complete` one, since the last complete one. If there is a
             controller, `frame_ns` is at most `time_ns`, because the camera's clock may be ahead.
         calibration, camera, controller: the latest of each; None before the first. health: the latest by process.
-        complete: whether all new data are included; otherwise only the newest pictures, and rows and events wait.
-        behind_s: delay of this snapshot.
+        complete: whether all new data are included; otherwise only the newest pictures are; rows and events
+            wait for a complete one.
+        behind_s: time by which the snapshot may be late: that for which its messages may have waited.
         ended: end of the logs, in their last snapshot.
     """
 
@@ -160,8 +163,8 @@ class Snapshot:
         return self.controller.settings.stroke_nm if self.controller is not None else 0.0
 
     @property
-    def in_time(self) -> Mask:
-        """Whether the time of each step is that of an exposure, so that it can be drawn at that time."""
+    def new_exposures(self) -> Mask:
+        """Whether each step has a new exposure and its time, so that it can be drawn at that time."""
         return exposed(self.steps.reasons)
 
     @property
@@ -267,7 +270,7 @@ class Accumulator:
         if identity in known:
             return False
         known[identity] = None
-        if len(known) > _KNOWN_EVENTS:
+        if len(known) > _MAX_KNOWN_EVENTS:
             del known[next(iter(known))]
         return True
 
@@ -277,7 +280,7 @@ class Accumulator:
         return self._data_ns + max(0, host_ns - self._data_host_ns) if self._data_ns else host_ns
 
     def _read(self, topic: Topic, message: Sample) -> None:
-        """Read a message of a topic that keeps them all; another number of modes restarts the rows."""
+        """Read a message of a topic of which none is skipped; another number of modes discards the rows so far."""
         if topic is STEP:
             step = wire.ControlStep.FromString(message.payload)
             time_ns = checked_time_ns(step.timestamp)
@@ -306,7 +309,7 @@ class Accumulator:
             if isinstance(state, wire.ControllerState):
                 checked_time_ns(state.mode_timestamp)
                 if any(len(channel.actuators) % 4 for channel in state.channels):
-                    raise ValueError("a channel with a part of a number")
+                    raise ValueError("a channel whose bytes are not whole numbers of four bytes")
                 if any(acting.number >= len(state.settings.interlocks) for acting in state.interlocks_acting):
                     raise ValueError("an interlock that is not in its settings")
             self._states[topic] = decode_calibration(state) if isinstance(state, wire.Calibration) else state

@@ -67,7 +67,7 @@ class Target:
 
     @property
     def written(self) -> Path | None:
-        """The file or picture."""
+        """Path of the file or picture to write; None for a window or page."""
         return self.save or self.picture
 
     def viewer(self) -> RerunViewer | None:
@@ -78,7 +78,9 @@ class Target:
         return RerunViewer(self.show, memory_limit=memory, port=self.port, web_port=self.web_port)
 
     def stream(self, viewer: RerunViewer | None, recording: str, window_s: float | None) -> rr.RecordingStream:
-        """Stream to the viewer, or into the file; plots show the last `window_s` seconds, or the span of `show_all`.
+        """Stream to the viewer, or into the file; plots show the last `window_s` seconds.
+
+        If `window_s` is None, the viewer chooses what the plots show, until `show_all`.
 
         Data that the viewer does not read is buffered; when the buffer is full, the stream blocks.
         """

@@ -32,7 +32,7 @@ def bench_record(
     seconds: Annotated[float, typer.Option(min=0.5, max=3600, help="Seconds of measurement at each rate.")] = 5.0,
     rate: Annotated[
         list[float] | None,
-        typer.Option(min=10, max=20_000, help="Frames per second; repeat. Default: 1000, 2000 and 5000."),
+        typer.Option(min=10, max=20_000, help="Frames per second; may be repeated. Default: 1000, 2000 and 5000."),
     ] = None,
     folder: Annotated[
         Path | None, typer.Option(help="Folder on the disk to measure; default: the system's temporary folder.")

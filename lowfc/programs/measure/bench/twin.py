@@ -35,20 +35,21 @@ def twin(as_json: Json = False) -> None:
 
 
 def bench_twin(seconds: float = 1.0, cache_dir: Path | None = None) -> dict[str, Any]:
-    """Measure the three twins; the results of the live loop's default are also at the top level.
+    """Measure three twins; the results of the first, the default of the live loop, are also at the top level.
 
-    Times are medians of one frame, from the wavefront to the binned image, one model after the other. `relative_l2` is
-    the worst of 20 random wavefronts of radial degrees 1 to 5 within the bounds of Subedi et al. 2015, Sect. 3.1.
+    A time is the median for one frame, from the wavefront to the binned image; the models are timed one by one.
+    `relative_l2` is the worst of 20 random wavefronts of radial degrees 1 to 5 within the bounds of Subedi et al. 2015,
+    Sect. 3.1.
     """
     optics = sensor_named(SENSOR)
-    nm = optics.wavelength_nm
+    wavelength_nm = optics.wavelength_nm
     cases = (
-        ("monochromatic, rank 60", FAST, monochromatic(nm)),
-        ("monochromatic, rank 80", ACCURATE, monochromatic(nm)),
-        ("20 % band in 3 wavelengths, rank 60", FAST, gauss_legendre(nm)),
+        ("monochromatic, rank 60", FAST, monochromatic(wavelength_nm)),
+        ("monochromatic, rank 80", ACCURATE, monochromatic(wavelength_nm)),
+        ("20 % band in 3 wavelengths, rank 60", FAST, gauss_legendre(wavelength_nm)),
     )
     uniform = np.random.default_rng(1).uniform(-1.0, 1.0, (WAVEFRONTS, len(NOLLS_20)))
-    coefficients_nm = nm * uniform * bounds_waves(NOLLS_20, *LITERAL_WAVES)
+    coefficients_nm = wavelength_nm * uniform * bounds_waves(NOLLS_20, *LITERAL_WAVES)
     opds_nm = np.tensordot(coefficients_nm, zernikes(NOLLS_20, *pupil_radii(optics)), 1)
     results = []
     with threadpool_limits(1):

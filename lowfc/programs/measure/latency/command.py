@@ -75,7 +75,7 @@ def latency(
     if plot is not None:
         from lowfc.adapters.files.drawing import figure_class
 
-        figure_class()  # fail before the work if it is missing
+        figure_class()  # without matplotlib, fail before the measurement
     if logs:
         results = _from_log(logs)
     else:
@@ -164,7 +164,7 @@ def _from_log(names: list[Path]) -> dict[str, Any]:
 
 
 def _compare(files: tuple[Path, Path]) -> dict[str, Any]:
-    """Comparison of two results with their spread over the repeats, and both names."""
+    """Comparison of the results in two files with their spread over the repeats, and the names of the files."""
     from lowfc.programs.measure.latency.summary import compare
 
     try:

@@ -44,9 +44,9 @@ ALONE = {
 }
 """Labels of the host's reference times, by their names in the results."""
 RATIOS = {"ratio": ("step_us", ""), "ratio_hot": ("hot_step_us", " of those back to back")}
-"""Ratios by name: the latency from frame to command, over half a bare echo plus one control step.
+"""Ratios of the latency from frame to command to half a bare echo plus one control step.
 
-Each has the name of that step in `ALONE`, and the end of the ratio's label.
+By the name of the ratio: the name of that step in `ALONE`, and the end of the ratio's label.
 """
 RATIOS_AT = ("p50", "p99")
 COUNTS = {

@@ -18,8 +18,10 @@ _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
 def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Latency statistics of a log, as those of one repeat of `lowfc latency`; and its path, missing parts and host.
 
-    The host's `clock_error_us`, if there are several: largest error of a latency between two of them. DataFileError
-    without timing.
+    For a run on several hosts, `clock_error_us` is the largest error of a latency between two of them.
+
+    Raises:
+        DataFileError: no frame after the warm-up was timed.
     """
     log = WholeLog(files, skip_damaged=True)
     log.progress = progress

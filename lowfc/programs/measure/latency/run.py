@@ -64,7 +64,7 @@ class LatencyOptions:
 
 def write_shared_files(config: Configuration, run: Run) -> None:
     """Write the files that the processes share to the run's directory: calibration, configuration, frames."""
-    with threadpool_limits(limits=1):  # more threads would spin, and wait for those without a processor
+    with threadpool_limits(limits=1):  # of more threads, some would spin until others get a processor
         prepare(config, run, Console(stderr=True))
         with being_written(run.path / FRAMES_FILE) as part, part.open("wb") as file:
             np.save(file, prepared_frames(config))
@@ -91,9 +91,9 @@ def run_repeats(options: LatencyOptions, run: Run, progress: Callable[[str], Non
             realtime = options.config.realtime.model_copy(update={"kernel": kernel})
             turn = replace(options, config=options.config.model_copy(update={"realtime": realtime}))
             write_whole(run.path / "config.toml", turn.config.to_toml().encode())
-            progress(f"{number + 1} of {options.repeats}: the loop by {kernel}")
+            progress(f"{number + 1} of {options.repeats}: the loop with kernel {kernel}")
             loop = one_loop(turn, run)
-            progress(f"{number + 1} of {options.repeats}: the bare echo, the step by {kernel} and the timer")
+            progress(f"{number + 1} of {options.repeats}: the bare echo, the step with kernel {kernel}, and the timer")
             repeats.append(loop | _references(turn, run) | {"kernel": kernel})
     return repeats
 
@@ -182,7 +182,7 @@ def _children(options: LatencyOptions, run: Run) -> list[Child]:
         waits = [word for child in children[1:] for word in ("--wait-for", child.name)]
         arguments = ["-m", "lowfc.programs.measure.frame_source", *_options(run), "--seconds", str(seconds), *waits]
         children[0] = program(str(Role.CAMERA), arguments, run.path / f"{Role.CAMERA}.stderr")
-    elif options.view:  # it waits for the others already
+    elif options.view:  # the simulated camera's command has the other processes already
         children[0].command += ["--wait-for", str(Role.VIEWER)]
     if options.trace:
         for role in reversed(TRACED):

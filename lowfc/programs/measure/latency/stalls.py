@@ -144,7 +144,7 @@ def combine(repeats: Sequence[Stalls]) -> Stalls:
 
 
 def _ends_ns(frames: FrameOutcomes, period_ns: int) -> Array:
-    """Time of each frame's command, or of the next command if it has none."""
+    """Time of each frame's command or, if it has none, of the next one, at most a period after the last frame."""
     sent_ns = frames.put_ns + frames.spans_us["frame_to_command"] * 1e3
     next_ns = np.fmin.accumulate(sent_ns[::-1])[::-1]  # without the NaN of frames that have no command
     return np.where(np.isfinite(sent_ns), sent_ns, np.fmin(next_ns, frames.put_ns.max(initial=0) + period_ns))

@@ -19,11 +19,12 @@ def combine(repeats: Repeats) -> dict[str, Any]:
     """Results of all repeats.
 
     Returns:
-        latency_us, by span: for each percentile its median over the repeats (max: the largest). spread_us, by span: the
-        lowest and highest. Likewise echo_us{round_trip}, step_us, hot_step_us, timer_us, ratio and ratio_hot (p50 and
-        p99; see `RATIOS`), each with its spread, such as step_us_spread. histogram{edges_us, counts by span}; over_time
-        of each repeat; sums of `COUNTS` and reasons; rate_hz, the median; memory_mb, the largest of each process (live
-        loop only); repeats, the percentiles of each; and stalls (`Stalls`) if they were traced.
+        latency_us, by span: for each percentile its median over the repeats (max: the largest). spread_us, by span: for
+        each percentile its range over the repeats. Likewise echo_us{round_trip}, step_us, hot_step_us, timer_us, ratio
+        and ratio_hot (p50 and p99; see `RATIOS`), each with its spread, such as step_us_spread. histogram{edges_us,
+        counts by span}; over_time of each repeat; sums of `COUNTS` and reasons; rate_hz, the median; memory_mb, the
+        largest of each process (live loop only); repeats, the percentiles of each; and stalls (`Stalls`) if they were
+        traced.
     """
     spans = [span for span in repeats[0]["latency_us"] if all(span in repeat["latency_us"] for repeat in repeats)]
     by_span = {span: [repeat["latency_us"][span] for repeat in repeats] for span in spans}

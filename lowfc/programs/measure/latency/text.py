@@ -54,14 +54,15 @@ def compared(comparison: Mapping[str, Any]) -> str:
         )
     lines += [f"{COUNTS[name]}: a {a}, b {b}" for name, (a, b) in comparison["counts"].items() if a or b]
     lines.append(
-        "us, or a ratio (over ...); spread: the larger of both ranges over the repeats, unknown for a single repeat."
+        "in us, but `over echo and step` is a ratio; spread: the larger of both ranges over the repeats, unknown for a "
+        "single repeat."
     )
     return "\n".join(lines)
 
 
 def sparkline(counts: Sequence[int]) -> str:
     """Counts as blocks of logarithmic height; many bins are combined into at most `_LINE`."""
-    bins = math.ceil(len(counts) / _LINE)  # of each block
+    bins = math.ceil(len(counts) / _LINE)  # combined in one block
     sums = [sum(counts[start : start + bins]) for start in range(0, len(counts), bins)]
     highest = math.log1p(max(sums, default=0)) or 1.0
     return "".join(_BLOCKS[math.ceil(math.log1p(count) / highest * (len(_BLOCKS) - 1))] for count in sums).rstrip()
@@ -116,7 +117,7 @@ def _remarks(results: Mapping[str, Any]) -> list[str]:
         each = zip(_ratios(results, "kernel_ratio"), results["kernel_ratio_spread"], strict=True)
         ratios = ", ".join(f"{ratio}, numpy {results['numpy_us'][at]:.1f} us" for ratio, at in each)
         lines.append(
-            f"all results are of the fused step; its frame to command over numpy's, measured in turns: {ratios}"
+            f"all results are of the fused step; its frame to command over that of numpy, measured in turns: {ratios}"
         )
     counts = {name: results.get(name) for name in COUNTS}
     shown = [name for name, count in counts.items() if count or (name in _ALWAYS and count is not None)]
@@ -150,5 +151,5 @@ def _title(results: Mapping[str, Any]) -> str:
     also = "".join(f", with --{name}" for name in ("record", "view", "trace") if settings.get(name))
     duration = f"{settings['duration_s']:g} s"
     times = f"{count} repeats of {duration}: medians, largest max" if count > 1 else duration
-    reached = f" ({results['rate_hz']:.1f} Hz reached)" if results["rate_hz"] else ""  # 0 for a single frame
+    reached = f" ({results['rate_hz']:.1f} Hz reached)" if results["rate_hz"] else ""  # a single frame has no rate
     return f"{settings['rate_hz']:g} Hz{reached}, {settings['camera']} frames{also}, {times}"

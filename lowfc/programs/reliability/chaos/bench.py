@@ -149,7 +149,7 @@ class ChaosBench:
         self.wait(lambda: self._steps >= last, f"{count} steps")
 
     def await_settled(self, frames: int = SETTLED_FRAMES) -> None:
-        """Wait until this many frames were used with the loop closed, from now or the next closing."""
+        """Wait until this many frames were used with the loop closed; the count restarts while it is not."""
         self._closed_frames = 0
         timeout_s = WAIT_S + frames / self.config.camera.rate_hz
         self.wait(lambda: self._closed_frames >= frames, f"{frames} good frames with the loop closed", timeout_s)
@@ -167,7 +167,7 @@ class ChaosBench:
         time.sleep(self.rng.uniform(shortest_s, longest_s))
 
     def process(self, role: Role) -> str:
-        """Name of the process with a role; for the viewer, one that writes to a file is started first."""
+        """Name of the process with a role; the viewer is started by this call, and writes to a file."""
         if role is Role.VIEWER:
             arguments = ["-m", "lowfc", "view", "--run", self.run.run_id, "--save", str(self.folder / "view.rrd")]
             self._start(program(role, arguments, self.folder / f"{role}.stderr"), ready=True)

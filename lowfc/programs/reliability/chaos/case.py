@@ -1,4 +1,4 @@
-"""A chaos case as data: the injected fault, the required outcome, and the events that must name it."""
+"""A chaos case as data: the injected fault, the required outcome, and the events that must report the fault."""
 
 import contextlib
 import subprocess
@@ -15,7 +15,7 @@ Act = Callable[[ChaosBench], None]
 
 LOST = ("MESSAGES_LOST", "MIRROR_LOST")
 """Events of the level ERROR that many faults may cause."""
-WHILE_FRAMES = 250  # for which a case keeps a state, such as safe mode
+WHILE_FRAMES = 250  # number of frames for which a case keeps a state, such as safe mode
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Case:
         config: configuration keys that the case sets.
         expected: beginnings of the events that must be in the log.
         allowed: names of events of the level ERROR that may be in the log.
-        safe: whether the loop must end latched safe with a flat mirror, instead of closed with the former residual.
-        bad: whether the frame of a number must be refused; None if all may be used.
+        safe: whether the loop must end in safe mode with a flat mirror, instead of closed with the former residual.
+        bad: whether the frame with a given number must be refused; None if all may be used.
         statuses: exit status other than 0 with which a process may end, by process.
         noisy: whether tracebacks are expected, from messages that cannot be decoded.
         lacks: function that returns why this host cannot run the case; empty if it can.

@@ -28,7 +28,7 @@ FAILED_LOGS = Path("chaos-logs")
 
 def chaos(
     case: Annotated[list[str] | None, typer.Option(help="Name of a case; may be repeated.")] = None,
-    all_: Annotated[bool, typer.Option("--all", help="All cases.")] = False,
+    all_: Annotated[bool, typer.Option("--all", help="Run all cases.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
     keep: Annotated[
         Path | None,

@@ -26,7 +26,7 @@ from lowfc.programs.reliability.chaos.case import LOST, WHILE_FRAMES, case, no_m
 from lowfc.programs.reliability.chaos.processes import kill_and_restart
 
 STABLE_FRACTION = 0.9
-"""Fraction of the limiting gain: the loop is stable and nearly oscillates."""
+"""Fraction of the limiting gain at which the loop is stable but nearly oscillates."""
 
 
 @case("gain", "a gain above the stability limit, which is refused; then 90 % of the limit")

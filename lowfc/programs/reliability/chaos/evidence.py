@@ -18,7 +18,7 @@ from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import COMMAND, EVENT, HEALTH, MIRROR_STATE, STEP, TRUTH, Topic
 
 FORGED_S = 1
-"""Start time in the sequence of injected messages, 1970: no process of a run has it."""
+"""Start time in the sequence of injected messages; it is in 1970, so no process of a run has it."""
 DECODED = (COMMAND, MIRROR_STATE, STEP, EVENT, TRUTH, HEALTH)
 _NONE = np.zeros((0, 0), np.float32)
 
@@ -123,7 +123,7 @@ def _add(evidence: Evidence, message: Sample, number: int | None) -> None:
     shape = actuators(decoded) if topic in (COMMAND, MIRROR_STATE) else _NONE
     if shape is not None:
         evidence.entries[topic].append(Entry(message.sequence, message.receive_time_ns, decoded, shape))
-    elif topic is COMMAND or decoded.actuators:  # a mirror whose position is unknown reports none
+    elif topic is COMMAND or decoded.actuators:  # a mirror that does not know its shape reports no actuators
         evidence.unreadable.append(f"a message on {message.key} has {len(decoded.actuators)} bytes of actuators")
     if topic is HEALTH and decoded.state == "stopped" and number is not None:
         evidence.sent |= {(number, each.topic, start_s): each.published for each in decoded.topics if each.published}

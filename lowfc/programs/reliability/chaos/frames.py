@@ -6,7 +6,7 @@ from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, case
 
 FIRST = 600
-"""Index of the first frame with the fault: the loop has settled and been quiet for a second."""
+"""Index of the first frame with the fault; by then the loop has settled and been quiet for a second."""
 FAULTY_FRAMES = 250
 """Number of frames with the fault: one second."""
 MAX_FRAMES_LATE = 50

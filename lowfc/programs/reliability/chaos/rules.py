@@ -29,7 +29,7 @@ RMS_FRAMES = 50
 ROUNDING_NM = 0.03
 """Largest difference of a mirror state from its command: the driver rounds to 0.023 nm."""
 HOLDING = frozenset(Rejection) - {Rejection.NO_MIRROR}
-"""Rejections that hold the command unless a channel moves; after `NO_MIRROR` it becomes the mirror's last shape."""
+"""Rejections that hold the command unless a channel moves; `NO_MIRROR` sets the command to the mirror's last shape."""
 
 
 class Finding(NamedTuple):
@@ -77,7 +77,7 @@ def _limits(outcome: Outcome, evidence: Evidence) -> Finding:
 
 
 def _violations(what: str, limits: Limits, shapes: list[Entry], moving: Mask) -> Iterator[str]:
-    """Limits that shapes violate at the `moving` actuators; a gap of n in the sequence allows n + 1 slew steps."""
+    """Limits that shapes violate at the `moving` actuators; n missing messages allow n + 1 slew steps."""
     if not shapes:
         return
     surface = np.array([shape.actuators_nm for shape in shapes], np.float64)
@@ -85,9 +85,9 @@ def _violations(what: str, limits: Limits, shapes: list[Entry], moving: Mask) ->
         yield f"{what} that is not finite"
         return
     surface[:, ~moving] = np.nan
-    commands_apart = np.diff([shape.sequence for shape in shapes])
-    same_publisher = (np.diff([shape.start_s for shape in shapes]) == 0) & (commands_apart > 0)
-    slews = np.nanmax(np.abs(np.diff(surface, axis=0)), axis=(1, 2)) / np.maximum(commands_apart, 1)
+    messages_apart = np.diff([shape.sequence for shape in shapes])
+    same_publisher = (np.diff([shape.start_s for shape in shapes]) == 0) & (messages_apart > 0)
+    slews = np.nanmax(np.abs(np.diff(surface, axis=0)), axis=(1, 2)) / np.maximum(messages_apart, 1)
     neighbours = max(np.nanmax(np.abs(np.diff(surface, axis=axis)), initial=0) for axis in (1, 2))
     for name, value, bound in (
         ("stroke", np.nanmax(np.abs(surface)), limits.stroke_nm),

@@ -61,11 +61,11 @@ def process_statistics(samples: Sequence[Usage]) -> dict[str, Any]:
         checks = {"memory": leaks, "handles": _grew(handles), "threads": _grew(threads)}
         grows, too_short = [name for name, grew in checks.items() if grew], []
     measured = {"memory": [round(mb, 2) for mb in memory_mb], "handles": handles, "threads": threads}
-    ends: dict[str, Any] = {}
+    usage: dict[str, Any] = {}
     for what, values in measured.items():
         unit = "_mb" if what == "memory" else ""
-        ends |= {f"{what}_first{unit}": values[0], f"{what}_most{unit}": max(values), f"{what}_last{unit}": values[-1]}
-    return {**ends, **_per_hour("memory_mb", memory_slope), "grows": grows, "too_short": too_short}
+        usage |= {f"{what}_first{unit}": values[0], f"{what}_most{unit}": max(values), f"{what}_last{unit}": values[-1]}
+    return {**usage, **_per_hour("memory_mb", memory_slope), "grows": grows, "too_short": too_short}
 
 
 def latency_statistics(samples: Sequence[tuple[float, float, float]]) -> dict[str, float | None]:

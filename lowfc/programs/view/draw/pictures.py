@@ -15,7 +15,7 @@ _SHRINK_NS = 2_000_000_000
 
 
 class Scale:
-    """Largest magnitude shown, a round number, which grows at once and shrinks after two seconds."""
+    """Largest magnitude shown, a round number: it grows at once, and shrinks after two seconds of smaller values."""
 
     def __init__(self, least: float) -> None:
         self.least = least
@@ -36,7 +36,7 @@ class Scale:
 
 
 class Picture:
-    """Pictures at one path; the format is sent only when it changes, which saves two thirds of the time for each."""
+    """Pictures at one path; the format is sent only when it changes, which saves two thirds of a picture's time."""
 
     def __init__(self, path: str) -> None:
         self.path = path

@@ -69,7 +69,7 @@ class Latency(Panel):
             COUNTS.add_one(stream, now_ns, frames.skipped, frames.missing, lost)
 
     def _draw_histogram(self, stream: rr.RecordingStream, time_ns: int, us: Array) -> None:
-        """Draw bars of even width from 0 to the end of the axis, which changes rarely."""
+        """Draw bars of equal width from 0 to the end of the axis, which changes rarely."""
         width_us = max(self._scale.limit, _MIN_US) / BINS
         counts = np.bincount(np.minimum(us // width_us, BINS - 1).astype(int), minlength=BINS)
         middles_us = (np.arange(BINS) + 0.5) * width_us

@@ -54,10 +54,11 @@ class Loop(Panel):
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
         """Add the new data."""
-        steps, used, state = snapshot.steps.at(snapshot.in_time), snapshot.used[snapshot.in_time], snapshot.controller
+        new, state = snapshot.new_exposures, snapshot.controller
+        steps, used = snapshot.steps.at(new), snapshot.used[new]
         if not self._mode and state is not None and state.mode in _NAMES and state.HasField("mode_timestamp"):
             since_ns = from_timestamp(state.mode_timestamp)
-            if not steps.time_ns.size or since_ns < steps.time_ns[0]:  # before the start of the view
+            if not steps.time_ns.size or since_ns < steps.time_ns[0]:  # in force before the first step shown
                 self._change(stream, state.mode, since_ns)
         for row in np.flatnonzero(np.diff(steps.mode.astype(int), prepend=self._mode)):
             self._change(stream, int(steps.mode[row]), int(steps.time_ns[row]))

@@ -54,7 +54,7 @@ class Science(Panel):
         self._wavelength_nm = wavelength_nm
         self._noll: tuple[int, ...] = ()
         self._camera: ScienceCamera | None = None
-        self._flat = np.nan
+        self._unaberrated = np.nan
         self._wavefronts: dict[str, deque[tuple[Single, Single]]] = {
             source: deque(maxlen=_AVERAGED) for source in _NAMES
         }
@@ -80,7 +80,7 @@ class Science(Panel):
             self._noll = noll
             half_width = _SAMPLES // (2 * self._sampling)
             self._camera = ScienceCamera(self._coronagraph, noll, self._wavelength_nm, half_width, self._sampling)
-            self._flat = self._camera.mean_contrast(self._camera.image(np.zeros(len(noll))), self._wedge)
+            self._unaberrated = self._camera.mean_contrast(self._camera.image(np.zeros(len(noll))), self._wedge)
             self._clear()
         for source, wavefronts in self._wavefronts.items():
             new = snapshot.wavefronts(true=source == "true")
@@ -106,7 +106,7 @@ class Science(Panel):
         captions = [f"{title}: {mean:.1e}" for title, mean in zip(("now", "flat mirror"), means, strict=True)]
         positions = [(start + _SAMPLES / 2, -_LABEL - _GAP) for start in (0, _SECOND)]
         stream.log(f"{IMAGE}/captions", labels(positions, captions))
-        CONTRAST.add_one(stream, time_ns, *np.log10([*reversed(means), self._flat]))
+        CONTRAST.add_one(stream, time_ns, *np.log10([*reversed(means), self._unaberrated]))
 
 
 def _share(decade: npt.NDArray[np.floating] | float) -> npt.NDArray[np.floating]:

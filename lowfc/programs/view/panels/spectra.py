@@ -93,8 +93,8 @@ class Spectra(Panel):
 def power_curves(spectra: Spectrum, modes: Mask, law: LawInForce | None, rate_hz: float) -> tuple[Array, list[Array]]:
     """Frequency, Hz, and the power of some modes, nm^2/Hz: pseudo-open-loop, error and, for an integrator, prediction.
 
-    `spectra` has those of the errors, then those of the pseudo-open-loop, all with noise; `law` is None for an open
-    loop. A constant wavefront has no curves.
+    `spectra` has a column for the error of each mode, then one for each pseudo-open-loop, all with noise; `law` is None
+    for an open loop. A constant wavefront has no curves.
     """
     error, pol = spectra.power_nm2_hz[:, : modes.size], spectra.power_nm2_hz[:, modes.size :]
     columns = [pol[:, modes].sum(axis=1), error[:, modes].sum(axis=1)]

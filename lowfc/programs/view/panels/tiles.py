@@ -34,7 +34,7 @@ _TILES_END = 196
 _FACTS = (3, 4, 4, 4)  # relative widths of the facts below the tiles
 _MIN_FONT = 8
 _SHADES = 16
-_PITCH = 1.16  # of lines, in font sizes
+_PITCH = 1.16  # distance from line to line, in font sizes
 
 Box = tuple[int, int, int, int]
 """Left and top inside the box, right and bottom just outside."""
@@ -44,7 +44,7 @@ Shades = npt.NDArray[np.uint8]
 
 
 class Tiles(Panel):
-    """Draws the verdict on the run when its words change and once a second; at the end of a log, that on all of it."""
+    """Draws the verdict on the run when its words change and once a second; at the log's end, that on the whole log."""
 
     def __init__(self, nm_per_mas: float | None = None) -> None:
         """`nm_per_mas`: wavefront rms of a tilt of 1 mas, if the telescope is known."""
@@ -91,14 +91,14 @@ def tile_boxes(tiles: int) -> list[Box]:
 
 
 def png(image: Image.Image) -> bytes:
-    """Encode as PNG, less than a tenth of the size: the viewer keeps every picture of a night."""
+    """Encode as PNG, at less than a tenth of the raw size: the viewer keeps every picture of a night."""
     content = io.BytesIO()
     image.save(content, "PNG", compress_level=1)
     return content.getvalue()
 
 
 def _parts(verdict: Verdict, time_ns: int) -> Iterator[tuple[Box, Level, tuple[Text, ...]]]:
-    """Coloured boxes with their levels and texts; text boxes are relative to the corner."""
+    """Coloured boxes with their levels and texts; the box of a text is relative to the corner of its coloured box."""
     headline, *boxes = tile_boxes(len(verdict.tiles))
     word, top, bottom = WORD[verdict.level].upper(), _INSET // 2, _BAND - _INSET // 2
     left = _INSET + round(_width(word, 30)) + (_INSET if word else 0)

@@ -41,7 +41,7 @@ class Wavefront(Panel):
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
         """Add the new data."""
-        steps, truths = snapshot.steps.at(snapshot.in_time), snapshot.truths
+        steps, truths = snapshot.steps.at(snapshot.new_exposures), snapshot.truths
         if snapshot.calibration is None:
             return
         noll = snapshot.calibration.noll

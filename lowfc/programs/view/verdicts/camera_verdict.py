@@ -18,7 +18,7 @@ DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
 """Fractions of the expected light. Below a fifth the controller refuses frames by default; at half the noise is 1.4
 times larger; more than twice is not the calibrated star."""
 HEALTH_OVERDUE_S = 4.0
-"""Time without a frame after which a dead camera would count as silent: one that is not silent by then runs."""
+"""Time without a frame after which a camera that is not silent must be running: a dead one would be silent by then."""
 
 REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.DARK: ("too dark", "the star is gone; check pointing, shutter and clouds"),
@@ -43,7 +43,7 @@ def frames(state: RunState) -> Tile:
     """Tile FRAMES: whether frames arrive at the nominal rate and are used."""
     tile, camera, silent_s = partial(Tile, "FRAMES"), state.camera, state.frame_silent_s
     gone = absent("FRAMES", "camera", camera, state.running_s, "the loop holds")
-    if gone is not None and camera.life is not Liveness.SILENT:  # a silent camera is reported by its frames, below
+    if gone is not None and camera.life is not Liveness.SILENT:  # reported below, by the time without frames
         return gone
     if camera.life is Liveness.STARTING:
         return tile("STARTING", "the camera")

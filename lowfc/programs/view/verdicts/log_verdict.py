@@ -44,7 +44,7 @@ class LogVerdict:
         self._means.feed(snapshot)
         steps, wavefronts = snapshot.steps, snapshot.wavefronts(true=self._means.true)
         if steps.time_ns.size:
-            self._add_modes(steps.at(snapshot.in_time), snapshot.period_ns)
+            self._add_modes(steps.at(snapshot.new_exposures), snapshot.period_ns)
             closed = np.isin(wavefronts.sequence, steps.sequence[steps.mode == LoopMode.CLOSED.value])
             self._closed.add_wavefronts(wavefronts.at(closed), true=self._means.true)
         for duration_ns in snapshot.timings["frame_to_command"].tolist():
@@ -69,7 +69,7 @@ class LogVerdict:
         return Verdict(f"{headline}.{advice}", level, tiles, facts(state))
 
     def _add_modes(self, steps: Steps, period_ns: int) -> None:
-        """Add the time from step to step; a gap that the live view reports counts as time without frames."""
+        """Add the time before each step to its mode; a gap that the live view would report is time without frames."""
         time_ns = steps.time_ns
         if not time_ns.size:
             return

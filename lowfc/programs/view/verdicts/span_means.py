@@ -24,7 +24,7 @@ class SpanMeans:
         self.begin_ns: int | None = None
         self.span_ns = _FIRST_NS
         self.true = False
-        self._last_ns = 0  # after `begin_ns`
+        self._last_ns = 0  # newest time, after `begin_ns`
         self._sums = np.zeros((0, _COLUMNS))
 
     def feed(self, snapshot: Snapshot) -> None:

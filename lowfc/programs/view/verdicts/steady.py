@@ -41,7 +41,7 @@ class Steady:
         self._kept: deque[tuple[Sequences, Single]] = deque()
 
     def feed(self, snapshot: Snapshot) -> bool:
-        """Add the steps of a snapshot; False if it has none for its calibration."""
+        """Add the steps of a snapshot; False if it has none with the modes of its calibration."""
         steps, calibration = snapshot.steps, snapshot.calibration
         if calibration is None or not len(steps.error_nm) or steps.error_nm.shape[1] != len(calibration.noll):
             return False

@@ -25,7 +25,7 @@ FILL: dict[Level, Colour] = {
     Level.WARNING: (240, 200, 40),
     Level.BAD: (222, 80, 10),
 }
-"""They also differ in lightness, from dark to bright: grey, green, orange red (bad), yellow (warning)."""
+"""The colours also differ in lightness, from dark to bright: grey, green, orange red (bad), yellow (warning)."""
 INK: dict[Level, Colour] = {
     Level.NEUTRAL: (235, 235, 240),
     Level.GOOD: (235, 245, 240),

@@ -88,7 +88,7 @@ def _loop(state: RunState) -> Tile:
     if held := _held(reported):
         advice = f"The loop is closed and holds its command: {held}."
         return tile("HOLDING", f"closed, but {held}: command held", Level.WARNING, advice)
-    if mirror.life is Liveness.SILENT:  # normally a mirror fault, above; logs of version 0.1 have none
+    if mirror.life is Liveness.SILENT:  # in logs of version 0.1, which have no mirror fault
         return tile("CLOSED", "but the mirror is silent", Level.WARNING)
     if camera.life is Liveness.STOPPED:
         advice = "The camera was stopped: the loop is closed and holds its command."

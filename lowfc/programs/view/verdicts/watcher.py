@@ -37,7 +37,7 @@ _COUNTERS: dict[str, tuple[Role, Callable[[wire.Health], int]]] = {
     "late": (Role.CAMERA, lambda health: health.commands_late),
     "lost": (Role.RECORDER, lambda health: health.recording.lost),
 }
-"""Counts of the processes, and where they are in Health."""
+"""For each count: the process that reports it, and how it is read from that process's Health."""
 
 
 class _Sample(NamedTuple):
@@ -259,9 +259,9 @@ def _rate_hz(samples: list[_Sample]) -> float | None:
 
 
 def _squares(snapshot: Snapshot, wavefronts: Wavefronts) -> Array:
-    """Number of rows, and sums of squares of `Rms`.
+    """Number of rows, and the sum of squares of each field of `Rms`.
 
-    Tip and tilt are 0 if the calibration's modes are not those of the rows.
+    The sums of tilt are 0 if the calibration's modes are not those of the rows.
     """
     noll = snapshot.noll if len(snapshot.noll) == wavefronts.residual_nm.shape[1] else ()
     tilts = [column for column, index in enumerate(noll) if index in TIP_TILT]
