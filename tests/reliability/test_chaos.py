@@ -70,7 +70,7 @@ def event(level: Level, text: str) -> Entry:
 
 
 def received(*lost: int) -> Gaps:
-    """Account of a topic of which all messages but those lost were received."""
+    """The gaps of a topic of which all messages but the lost ones were received."""
     gaps = Gaps(0)
     for number in range(FRAMES):
         if number not in lost:

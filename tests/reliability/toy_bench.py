@@ -1,4 +1,7 @@
-"""A chaos bench in one process and in simulated time: real controller, mirror and log, frames of the toy sensor."""
+"""A chaos bench in one process and in simulated time: real controller, mirror and log.
+
+The frames are those of the toy sensor in `tests.support.toy`.
+"""
 
 import random
 import signal

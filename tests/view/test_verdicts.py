@@ -33,7 +33,7 @@ def levels(verdict: Verdict) -> dict[str, Level]:
 
 
 def begun(seconds: float = 0.0, **values: object) -> Stage:
-    """A stage with these attributes, after so many seconds."""
+    """A scripted run with these attributes, after so many seconds."""
     stage = Stage()
     setting(**values)(stage)
     stage.begin()

@@ -1,4 +1,4 @@
-"""A bare loop: an idle loop beside a process of the control loop. What delays both is the host.
+"""A bare loop: an idle loop beside a process of the control loop. The host is the cause of a delay of both.
 
 It runs on the processors of that process, in real-time scheduling at a higher priority, so that lowfc does not delay
 it. Halfway between two frames it wakes, notes how late it is, and reads the kernel's counters of processor and process.

@@ -35,7 +35,7 @@ RING_LENGTHS = {topic: 1 if topic.latest_only else 100 for topic in SHOWN} | {ST
 100 of the others. Each kept message holds its receive buffer of 16 kB."""
 OWN_BYTES = 512_000_000
 """Memory of this process above which the view restarts. Normal use is at most 390 MB: 160 MB for the process itself, 80
-MB in ring buffers, and 150 MB that the viewer has not read."""
+MB in ring buffers, and 150 MB of data that the viewer has not read."""
 VIEWER_SPARE_BYTES = 1_500_000_000
 """Memory granted to a viewer for textures, plots and window, beyond its limit for the stream."""
 STUCK_S = 10.0
@@ -77,7 +77,7 @@ class LiveView:
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
     def run(self, duration_s: float | None = None, ready: Callable[[], None] = lambda: None) -> None:
-        """Show the run until this is stopped, the window is closed or `duration_s` is over.
+        """Show the run until the view is stopped, its window is closed or `duration_s` is over.
 
         `ready` is called once the viewer runs.
 

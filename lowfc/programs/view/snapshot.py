@@ -94,7 +94,7 @@ class LogEnd:
         no_end: why one of the logs has no end; empty if all were finished.
         damaged: number of damaged stretches that were left out.
         missing_files: number of files missing between the first and the last.
-        lost: number of messages lost, from the recorder's accounts at the end of its recordings.
+        lost: number of messages lost, as counted by the recorder at the end of each recording.
         stroke_nm: largest deviation of an actuator from flat in any mirror state; None without a mirror state.
     """
 

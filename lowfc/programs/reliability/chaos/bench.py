@@ -72,7 +72,7 @@ class Outcome:
         config: configuration of the loop.
         marks: times by name, host clock, ns.
         ended: processes that ended.
-        alive: processes still there after the end.
+        alive: processes that still exist after the end of the case.
         killed_ns: times at which a recorder was killed, host clock.
         mode: last loop mode.
         lost: messages that the last recorder reports as lost, by key.

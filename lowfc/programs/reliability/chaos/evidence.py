@@ -56,7 +56,7 @@ class Evidence:
     Attributes:
         entries: messages of each topic of `DECODED`, in the order of the logs.
         received: counts of the messages in each finished log, by number of the log, key and start of the publisher;
-            each log is that of another recorder, which accounts for the messages of its time.
+            each log was written by another recorder, which counts the losses of its own time.
         sent: messages that each publisher reported at its end as sent, by the same keys as `received`.
         lost: messages that the recorders report as lost, by key.
         unreadable: errors of logs and messages that cannot be read.

@@ -40,9 +40,9 @@ class Finding(NamedTuple):
     found: str
 
 
-def _finding(rule: str, wrong: list[str], otherwise: str) -> Finding:
+def _finding(rule: str, wrong: list[str], if_held: str) -> Finding:
     """A rule that held if nothing is wrong; at most three violations are named."""
-    return Finding(rule, not wrong, "; ".join(wrong[:3]) or otherwise)
+    return Finding(rule, not wrong, "; ".join(wrong[:3]) or if_held)
 
 
 def judge(case: Case, outcome: Outcome, evidence: Evidence) -> list[Finding]:

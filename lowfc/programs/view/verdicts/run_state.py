@@ -11,7 +11,7 @@ from lowfc.programs.view.snapshot import Accumulator, Snapshot
 from lowfc.programs.view.verdicts.steady import ResidualComparison
 
 NOW_S = 1.0
-"""Length of "now": long enough for an rms of vibrations, short enough to show the effect of an operator's action."""
+"""Length of the span `now`: enough for an rms of vibrations, and short, to show the effect of an operator's action."""
 RECENT_S = 5.0
 """Time for which an incident stays visible, so that an operator notices it."""
 PERIODS = 10
@@ -72,7 +72,7 @@ class RunState:
         wavefront: rms of the last second; once the controller was stopped, of its last second with a step. `latest` is
             the rms of the last 0.3 s. With `true`, both are the simulation's true wavefront, otherwise measured.
         comparison: residual of the loop, and of the best gains.
-        latency_us: p50 and p99 from frame to command in the second of `wavefront`.
+        latency_us: p50 and p99 from frame to command in the second of `wavefront`; None if not measured.
         mirror_state: last state of the mirror; None before the first.
         note: last note of the operator.
     """

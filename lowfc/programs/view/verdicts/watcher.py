@@ -106,7 +106,7 @@ class Watcher:
         return RunState(
             snapshot=snapshot,
             mode=self._mode,
-            why=cause or self._why,  # the cause may change without an event, or before this view
+            why=cause or self._why,  # the cause may have changed without an event, or before this view
             running_s=(snapshot.host_ns - self._begun_ns) * 1e-9 if self._begun_ns else 0.0,
             rate_hz=_rate_hz(now),
             controller=controller,
