@@ -54,7 +54,7 @@ def draw_logs(
     drawn, accumulator = Drawn(), Accumulator()
     renderer: Renderer | None = None
     due_ns = first_ns = last_ns = ended_ns = earlier_bytes = 0
-    newest_frame = last_frame = -1, 0  # sequence and publish time: of all frames so far, and of the logs before this
+    newest_frame = last_frame = -1, 0  # largest sequence and its publish time: so far, and in the logs before
     damaged, no_end, run, host = 0, "", "", ""
     stroke_nm: float | None = None
     lost: dict[str, int] = {}  # by recording, whose last file has the count of all its files

@@ -124,7 +124,7 @@ class Snapshot:
         calibration, camera, controller: the latest of each; None before the first. health: the latest by process.
         complete: whether all new data are included; otherwise only the newest pictures are; rows and events
             wait for a complete one.
-        behind_s: time by which the snapshot may be late: that for which its messages may have waited.
+        behind_s: longest time for which its messages may have waited.
         ended: end of the logs, in their last snapshot.
     """
 
@@ -164,7 +164,7 @@ class Snapshot:
 
     @property
     def new_exposures(self) -> Mask:
-        """Whether each step has a new exposure and its time, so that it can be drawn at that time."""
+        """Whether each step is of a new exposure and has its time, so that it can be drawn at that time."""
         return exposed(self.steps.reasons)
 
     @property
@@ -280,7 +280,7 @@ class Accumulator:
         return self._data_ns + max(0, host_ns - self._data_host_ns) if self._data_ns else host_ns
 
     def _read(self, topic: Topic, message: Sample) -> None:
-        """Read a message of a topic of which none is skipped; another number of modes discards the rows so far."""
+        """Read a message of a topic whose every message counts; another number of modes discards the rows so far."""
         if topic is STEP:
             step = wire.ControlStep.FromString(message.payload)
             time_ns = checked_time_ns(step.timestamp)

@@ -11,7 +11,7 @@ from lowfc.programs.view.snapshot import Accumulator, Snapshot
 from lowfc.programs.view.verdicts.steady import ResidualComparison
 
 NOW_S = 1.0
-"""Length of the span `now`: enough for an rms of vibrations, and short, to show the effect of an operator's action."""
+"""Length of the span `now`: long enough for the rms of vibrations, short enough to show what an operator changed."""
 RECENT_S = 5.0
 """Time for which an incident stays visible, so that an operator notices it."""
 PERIODS = 10
@@ -67,7 +67,7 @@ class RunState:
         frame_silent_s, step_silent_s: time without a frame or step; None up to 1 s, or ten frame periods if longer.
         recent, now, totals: counts of each reason, of "steps", and of "skipped", "missing", "late" and "lost", in
             `RECENT_S`, in `NOW_S` (both at least `PERIODS` frame periods) and since the start.
-        flux: light on the newest frame as a fraction of the calibration's; None without both.
+        flux: light on the newest frame as a fraction of the calibration's; None without a frame or calibration.
         saturated: number of good pixels at full well in the newest frame.
         wavefront: rms of the last second; once the controller was stopped, of its last second with a step. `latest` is
             the rms of the last 0.3 s. With `true`, both are the simulation's true wavefront, otherwise measured.
