@@ -3,9 +3,9 @@
 from enum import Enum, auto
 
 WORSE = 1.1
-"""Residual over open wavefront above which a closed loop does harm; the rms of a second scatters less."""
+"""Residual over open wavefront above which a closed loop does harm; the rms of a second scatters by less than 10 %."""
 GOOD_FACTOR = 2.0
-"""Leaked starlight scales with the square of the wavefront: this reduction leaves a quarter, one of 1.5 leaves 44 %."""
+"""Reduction that counts as good: leaked starlight scales with the square of the wavefront, so a quarter is left."""
 
 
 class Correction(Enum):

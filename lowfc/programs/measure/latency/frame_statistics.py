@@ -191,7 +191,7 @@ def controller_counts(health: wire.Health) -> dict[str, Any]:
 
 
 def _over_time(put_ns: Long, command_us: Array) -> dict[str, list[float]]:
-    """Median and largest `frame_to_command` of up to `_TIME_PARTS` parts of equally many frames, and the start of each."""
+    """Median and largest `frame_to_command` of up to `_TIME_PARTS` parts of equally many frames; start of each part."""
     known = np.flatnonzero(np.isfinite(command_us))
     parts = np.array_split(known, min(_TIME_PARTS, known.size)) if known.size else []
     return {
