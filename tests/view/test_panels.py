@@ -441,6 +441,8 @@ def test_spectra_stay_in_their_box_and_restart_when_the_mode_changes(tone: tuple
     drawn(panel, tape, round(9.5e9), camera=CAMERA, controller=controller, ended=LogEnd(*[""] * 4, 0, 0, 0, None))
     assert len(values_of(tape.last(shown).strips)) == 3, "the last known spectra of the log"
     assert values_of(tape.last(state).labels) == ["loop closed, last 4.1 s before a change"]
+    drawn(panel, tape, round(9.6e9), controller=controller, ended=LogEnd(*[""] * 4, 0, 0, 0, None))
+    assert len(values_of(tape.last(shown).strips)) == 3, "also without a camera's state, which has the frame rate"
 
 
 def test_a_constant_wavefront_has_no_spectrum() -> None:
