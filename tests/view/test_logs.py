@@ -20,6 +20,7 @@ from lowfc.contract.messages import (
     SURFACE,
     TRUTH,
     Log,
+    Topic,
     image,
     timestamp,
     wire,
@@ -33,8 +34,10 @@ from lowfc.programs.view.panels import mirror, pointing, sensor, tiles, trend, w
 from lowfc.programs.view.recorded import Drawn, draw_logs
 from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.session import memory_remarks, show_logs
+from lowfc.programs.view.snapshot import Accumulator
 from lowfc.programs.view.target import Target
 from lowfc.programs.view.verdicts import span_means
+from lowfc.programs.view.verdicts.log_verdict import LogVerdict
 from lowfc.programs.view.verdicts.span_means import SpanMeans
 from lowfc.programs.view.verdicts.tile import Level, Verdict
 from tests.support import report_log
@@ -212,6 +215,22 @@ def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: S
     done, tape = drawn(night.without(EVENT).write(tmp_path / "states.mcap"))
     assert (done.log_s, tape.logged[tiles.TILES][-1][0]) == (0, night.samples[-1].receive_time_ns)
     assert [one.value for one in shown[-1].tiles] == ["NOT CLOSED", "?", "1000 Hz", "?", "?", "?", "FINISHED"]
+
+
+@pytest.mark.parametrize("late", [STEP, TRUTH])
+def test_the_residual_in_closed_loop_includes_wavefronts_that_were_recorded_apart_from_their_steps(late: Topic) -> None:
+    night = SyntheticLog().frames(200).request("open").frames(100)
+    verdict, accumulator = LogVerdict(), Accumulator()
+    for part in (False, True):
+        for one in night.samples:
+            if late.matches(one.key) is part:
+                accumulator.add(one)
+        verdict.feed(accumulator.snapshot(night.samples[-1].publish_time_ns))
+    closed = {one.frame_sequence for one in night.messages(STEP) if one.mode == wire.LOOP_MODE_CLOSED}
+    truths = [one for one in night.messages(TRUTH) if one.frame_sequence in closed]
+    assert 150 < len(truths) < 300
+    rms_nm = np.sqrt(np.mean([[one.residual_rms_nm**2, one.disturbance_rms_nm**2] for one in truths], axis=0))
+    assert verdict._closed.rms_nm() == pytest.approx(rms_nm, rel=1e-6)
 
 
 def test_the_trend_of_a_night_has_a_limited_number_of_spans() -> None:

@@ -13,7 +13,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted, hertz
 from lowfc.programs.cli.correction import Correction, correction
 from lowfc.programs.cli.status import holds_shape
-from lowfc.programs.view.snapshot import LogEnd, Snapshot
+from lowfc.programs.view.snapshot import LogEnd, Snapshot, Wavefronts
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import PERIODS, RunState
@@ -23,6 +23,8 @@ from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, stroke
 from lowfc.programs.view.verdicts.watcher import FRAMES_SILENT_S
 
 _MODES = {mode.value: mode for mode in LoopMode}
+_MOST = 8192
+"""Largest number of steps, and of wavefronts without a step, that are kept: a loaded host records one seconds late."""
 _NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", None: "without frames"}
 
 _LEVELS = {Correction.GOOD: Level.GOOD, Correction.LITTLE: Level.NEUTRAL, Correction.HARM: Level.WARNING}
@@ -34,6 +36,8 @@ class LogVerdict:
     def __init__(self) -> None:
         self._means = SpanMeans()
         self._closed = SpanMeans()
+        self._modes = np.zeros((2, 0), np.uint64)  # sequence and loop mode of the last steps
+        self._waiting = np.zeros(0, np.uint64), np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
         self._mode_ns: Counter[LoopMode | None] = Counter()
         self._first_ns = self._last_ns = 0
         self._latency = Durations()
@@ -42,11 +46,9 @@ class LogVerdict:
     def feed(self, snapshot: Snapshot) -> None:
         """Add a snapshot."""
         self._means.feed(snapshot)
-        steps, wavefronts = snapshot.steps, snapshot.wavefronts(true=self._means.true)
-        if steps.time_ns.size:
-            self._add_modes(steps.at(snapshot.new_exposures), snapshot.period_ns)
-            closed = np.isin(wavefronts.sequence, steps.sequence[steps.mode == LoopMode.CLOSED.value])
-            self._closed.add_wavefronts(wavefronts.at(closed), true=self._means.true)
+        if snapshot.steps.time_ns.size:
+            self._add_modes(snapshot.steps.at(snapshot.new_exposures), snapshot.period_ns)
+        self._add_closed(snapshot.steps, snapshot.wavefronts(true=self._means.true))
         for duration_ns in snapshot.timings["frame_to_command"].tolist():
             self._latency.add(duration_ns)
         self._shaped |= holds_shape(snapshot.controller)
@@ -67,6 +69,18 @@ class LogVerdict:
             headline += f", {wavefront.advice}"
         advice = f" {worst.advice}" if worst.advice and worst is not wavefront else ""
         return Verdict(f"{headline}.{advice}", level, tiles, facts(state))
+
+    def _add_closed(self, steps: Steps, wavefronts: Wavefronts) -> None:
+        """Add the wavefronts of the closed loop; step and true wavefront of a frame may be in different snapshots."""
+        self._modes = np.hstack([self._modes, np.stack([steps.sequence, steps.mode.astype(np.uint64)])])[:, -_MOST:]
+        waiting_sequence, waiting_ns, waiting_nm = self._waiting
+        sequence = np.concatenate([waiting_sequence, wavefronts.sequence])
+        time_ns = np.concatenate([waiting_ns, wavefronts.time_ns])
+        rms_nm = np.concatenate([waiting_nm, wavefronts.rms_nm])
+        closed = np.isin(sequence, self._modes[0, self._modes[1] == LoopMode.CLOSED.value])
+        self._closed.add_wavefronts(time_ns[closed], rms_nm[closed], true=self._means.true)
+        waiting = np.flatnonzero(~np.isin(sequence, self._modes[0]))[-_MOST:]
+        self._waiting = sequence[waiting], time_ns[waiting], rms_nm[waiting]
 
     def _add_modes(self, steps: Steps, period_ns: int) -> None:
         """Add the time before each step to its mode; a gap that the live view would report is time without frames."""

@@ -3,8 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Array, Long
-from lowfc.programs.view.snapshot import Snapshot, Wavefronts
+from lowfc.arrays import Array, Long, Single
+from lowfc.programs.view.snapshot import Snapshot
 
 MAX_SPANS = 600
 """Largest number of spans: beyond it, pairs are merged, so that a night needs no more memory than ten minutes."""
@@ -30,15 +30,16 @@ class SpanMeans:
     def feed(self, snapshot: Snapshot) -> None:
         """Add the steps and truths of a snapshot."""
         for true in (True, False):
-            self.add_wavefronts(snapshot.wavefronts(true=true), true=true)
+            new = snapshot.wavefronts(true=true)
+            self.add_wavefronts(new.time_ns, new.rms_nm, true=true)
         if snapshot.calibration is not None:
             steps, used = snapshot.steps, snapshot.used
             self.add(steps.time_ns[used], _LIGHT, steps.flux_dn[used, None] / snapshot.calibration.flux_dn)
 
-    def add_wavefronts(self, wavefronts: Wavefronts, *, true: bool) -> None:
-        """Add true or measured wavefronts."""
-        self.true |= true and wavefronts.time_ns.size > 0
-        self.add(wavefronts.time_ns, _TRUE if true else _MEASURED, wavefronts.rms_nm.astype(float) ** 2)
+    def add_wavefronts(self, time_ns: Long, rms_nm: Single, *, true: bool) -> None:
+        """Add true or measured wavefronts, rms (frames, 2): residual, with a flat mirror."""
+        self.true |= true and time_ns.size > 0
+        self.add(time_ns, _TRUE if true else _MEASURED, rms_nm.astype(float) ** 2)
 
     def wavefront(self) -> tuple[Array, Array]:
         """Middle of each span (spans,), ns after `begin_ns`, and rms nm (spans, 2): residual, with a flat mirror.
