@@ -16,7 +16,18 @@ from lowfc.adapters.logs.recovery import recover
 from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, REQUEST, STEP, TRUTH, Log, wire
+from lowfc.contract.messages import (
+    CALIBRATION,
+    COMMAND,
+    CONTROLLER_STATE,
+    EVENT,
+    FRAME,
+    REQUEST,
+    STEP,
+    TRUTH,
+    Log,
+    wire,
+)
 from lowfc.control.laws.error_budget import sensor_noise
 from lowfc.control.loop.state import State
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -119,6 +130,16 @@ def test_latencies_are_those_of_the_messages(eventful: dict[str, Any]) -> None:
     assert latency["frame_to_mirror"]["count"] == 2244
     assert eventful["timing"]["interval_us"]["frames"]["max"] == 1000
     assert eventful["timing"]["interval_us"]["commands"]["max"] == pytest.approx(6006)  # five frames lost in a row
+
+
+def test_a_message_that_the_log_lacks_is_not_a_pause_of_its_sender(tmp_path: Path) -> None:
+    night = uneventful(SyntheticLog())
+    gone = {place for topic in (FRAME, COMMAND) for place in night.places(topic)[100:120]}
+    night.samples = [one for place, one in enumerate(night.samples) if place not in gone]
+    intervals = results_of(night.write(tmp_path / "log.mcap"))["timing"]["interval_us"]
+    assert intervals["frames"]["count"] == len(night.places(FRAME)) - 2
+    assert intervals["frames"]["max"] == 1000
+    assert intervals["commands"]["max"] < 1100
 
 
 def test_the_longest_stretch_under_one_law_is_analysed(eventful: dict[str, Any]) -> None:

@@ -109,7 +109,7 @@ class History:
         camera: state of the camera in most steps under `calibration`, of those in closed loop if there are any.
         under_camera: whether each step (steps,) has the settings of `camera`.
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
-        command_publish_ns: publish time of every mirror command in the log.
+        command_sequence, command_publish_ns: the same of every mirror command (the message's own sequence).
         stepped_sequence: frame sequence of every step in the log, also of those that `steps` leaves out.
         steps, truths: those with the number of modes of the last calibration.
         stages_ns: (timed steps,) durations of each of `STAGES`, for the frames of `timed_sequence`.
@@ -134,6 +134,7 @@ class History:
     under_camera: Mask | bool = True
     frame_sequence: Sequences = field(default_factory=_SEQUENCES)
     frame_publish_ns: Long = field(default_factory=_INTEGERS)
+    command_sequence: Sequences = field(default_factory=_SEQUENCES)
     command_publish_ns: Long = field(default_factory=_INTEGERS)
     stepped_sequence: Sequences = field(default_factory=_SEQUENCES)
     steps: Steps = field(default_factory=lambda: StepRows(0).values())
@@ -254,8 +255,8 @@ class _HistoryBuilder:
         self._history = history
         self._calibration: wire.Calibration | None = None
         self._cameras: list[tuple[Array, wire.CameraState]] = []  # whenever its settings changed
-        self._frames = Columns(sequence="Q", publish_ns="q")
-        self._commands, self._stepped, self._timings = Columns(publish_ns="q"), Columns(sequence="Q"), TimingRows()
+        self._frames, self._commands = (Columns(sequence="Q", publish_ns="q") for _ in range(2))
+        self._stepped, self._timings = Columns(sequence="Q"), TimingRows()
         self._mirror = Columns(sequence="Q", publish_time_ns="q", stroke_nm="f", limits="q")
         self._rows: dict[int, tuple[StepRows, TruthRows]] = {}  # by number of modes
         self._set_modes(0)
@@ -283,7 +284,7 @@ class _HistoryBuilder:
         if topic is FRAME:
             self._frames.add(sequence=message.sequence, publish_ns=message.publish_time_ns)
         elif topic is COMMAND:
-            self._commands.add(publish_ns=message.publish_time_ns)
+            self._commands.add(sequence=message.sequence, publish_ns=message.publish_time_ns)
         elif topic in TOPICS:
             history.published.store(topic, message.payload)
         if topic not in _DECODED:
@@ -352,7 +353,7 @@ class _HistoryBuilder:
         """Convert all columns to arrays."""
         history = self._history
         history.frame_sequence, history.frame_publish_ns = map(self._frames.values, ("sequence", "publish_ns"))
-        history.command_publish_ns = self._commands.values("publish_ns")
+        history.command_sequence, history.command_publish_ns = map(self._commands.values, ("sequence", "publish_ns"))
         history.calibration = self._last_calibration()
         self._set_modes(len(history.calibration.noll) if history.calibration is not None else 0)
         history.excluded_messages += sum(len(steps) for steps, _ in self._rows.values() if steps is not self._steps)

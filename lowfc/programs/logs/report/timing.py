@@ -5,7 +5,7 @@ import numpy as np
 from lowfc.adapters.logs.columns import rows_of
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long
-from lowfc.contract.envelope import COUNT_BITS, start_of
+from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import FRAME, TRUTH, Role, wire
 from lowfc.programs.logs.report.source import Results, Run
 
@@ -28,16 +28,16 @@ def timing_results(run: Run) -> Results:
 
 
 def intervals_ns(run: Run) -> dict[str, Long]:
-    """Intervals between frames, except across a restart of the camera, and between commands, by their send times.
+    """Intervals between frames and between commands, by their send times; only between consecutive messages.
 
-    Intervals between frames are omitted if the log does not have every frame.
+    A message that the log does not have would appear as a pause of its sender.
     """
     history = run.history
-    frames = np.zeros(0, np.int64)
-    if history.log.selection.has_every_frame:
-        same_start = np.diff(history.frame_sequence >> COUNT_BITS) == 0
-        frames = np.diff(history.frame_publish_ns)[same_start]
-    return {"frames": frames, "commands": np.diff(history.command_publish_ns)}
+    messages = {
+        "frames": (history.frame_sequence, history.frame_publish_ns),
+        "commands": (history.command_sequence, history.command_publish_ns),
+    }
+    return {name: np.diff(times_ns)[np.diff(sequence) == 1] for name, (sequence, times_ns) in messages.items()}
 
 
 def latencies_ns(history: History) -> dict[str, Long]:
