@@ -142,6 +142,19 @@ def test_a_message_that_the_log_lacks_is_not_a_pause_of_its_sender(tmp_path: Pat
     assert intervals["commands"]["max"] < 1100
 
 
+def test_an_event_has_the_time_of_its_sending_however_late_it_was_recorded(tmp_path: Path) -> None:
+    night = uneventful(SyntheticLog(), 100)
+    night.event("RECORDING_FAILED", why="disk full")
+    night.frames(10).event("RECORDING")
+    uneventful(night, 700)
+    place = night.places(EVENT)[-2]
+    late = night.samples.pop(place)
+    night.samples.append(late._replace(receive_time_ns=late.receive_time_ns + 400_000_000))
+    *_, event, last = results_of(night.write(tmp_path / "log.mcap"))["events"]
+    assert (event["name"], last["name"]) == ("RECORDING_FAILED", "RECORDING")
+    assert (event["time_s"], last["time_s"]) == pytest.approx((0.099, 0.109))
+
+
 def test_the_longest_stretch_under_one_law_is_analysed(eventful: dict[str, Any]) -> None:
     stretch = eventful["closed_stretch"]
     assert stretch["gain"] == [0.4, 0.4, 0.2]

@@ -116,7 +116,7 @@ class History:
         excluded_messages: number of steps with another number of modes than the last calibration, and of messages with
             impossible values.
         requests: operators' requests, with the answers.
-        events: (log time in ns, message) of each event.
+        events: (publish time in ns, message) of each event.
         health: last Health of each process, by name.
         commands_late: commands that the camera counted as late between its first and last Health in the log, restarts
             included; None if it sent fewer than two.
@@ -317,7 +317,7 @@ class _HistoryBuilder:
             if name_in(HEALTH, message.key) == Role.CAMERA:
                 self._count_late(start_of(message.sequence), body.commands_late)
         elif isinstance(body, Log):
-            history.events.append((message.receive_time_ns, body))
+            history.events.append((message.publish_time_ns, body))
 
     def _mirror_state(self, state: wire.MirrorState, publish_time_ns: int) -> None:
         if (surface := actuators(state)) is None:

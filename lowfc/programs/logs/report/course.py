@@ -1,6 +1,7 @@
 """The course of a run: loop modes, events, requests, flux, refused frames, stroke of the mirror."""
 
 from collections import Counter
+from operator import itemgetter
 
 import numpy as np
 
@@ -36,8 +37,8 @@ def mode_steps(history: History) -> dict[str, int]:
 
 
 def events(run: Run) -> list[Results]:
-    """Events in order, with level, process, name and sentence."""
-    found = run.history.events
+    """Events in the order of their sending, with level, process, name and sentence."""
+    found = sorted(run.history.events, key=itemgetter(0))
     times_s = run.seconds([time_ns for time_ns, _ in found])
     return [
         {
