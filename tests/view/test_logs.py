@@ -117,7 +117,7 @@ def test_the_verdict_says_that_a_file_of_the_log_is_missing(
 
 def test_the_verdict_on_a_log_of_a_fraction_of_a_second_has_its_losses(shown: Shown) -> None:
     drawn(Path(__file__).parents[1] / "golden" / "0.1" / "night.mcap")
-    assert tile(shown[-1], "FRAMES").detail.startswith("of 163 frames: 1 lost, ")
+    assert tile(shown[-1], "FRAMES").detail.startswith("of 164 frames: 1 lost, ")
 
 
 def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) -> None:

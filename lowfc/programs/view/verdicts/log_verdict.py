@@ -163,9 +163,9 @@ def _frames(state: RunState) -> Tile:
     lost, steps = totals["skipped"] + totals["missing"], totals["steps"]
     refused = Counter({words: totals[reason] for reason, (words, _) in REFUSED.items() if totals[reason]})
     named = ", ".join(f"{count} {words}" for words, count in refused.most_common(3))
-    unused = lost + refused.total()
-    detail = f"of {counted(steps, 'frame')}: {lost} lost, {refused.total()} refused{f' ({named})' if named else ''}"
-    if unused >= FEW * max(steps, 1):
+    unused, frames = lost + refused.total(), lost + steps
+    detail = f"of {counted(frames, 'frame')}: {lost} lost, {refused.total()} refused{f' ({named})' if named else ''}"
+    if unused >= FEW * max(frames, 1):
         advice = f"{counted(lost, 'frame')} lost, {refused.total()} refused: see the events."
         return Tile("FRAMES", f"{unused} UNUSED", detail, Level.WARNING, advice)
     rate = hertz(1e9 / state.snapshot.period_ns) if state.snapshot.period_ns else f"{steps}"
