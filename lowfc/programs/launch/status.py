@@ -157,9 +157,8 @@ def _contrast_lines(results: dict[str, Any]) -> list[str]:
     own = "" if results["dark_zone_contrast"] is None else f"coronagraph alone {results['dark_zone_contrast']:.1e}; "
     beyond = ("residual",) if results["beyond_quadratic"] else ()
     how = QUADRATIC if results["beyond_quadratic"] is None else "; computed from full images of the true wavefront"
-    return [
-        f"contrast           {own}{contrast_in_words(contrast_cases(added), costliest_modes(results), beyond, how)}"
-    ]
+    most = None if beyond else costliest_modes(results)  # a share in the quadratic form
+    return [f"contrast           {own}{contrast_in_words(contrast_cases(added), most, beyond, how)}"]
 
 
 def _wavefront_lines(results: dict[str, Any]) -> list[str]:
