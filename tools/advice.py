@@ -84,7 +84,8 @@ ADVICE: dict[str, Advice] = {
     ),
     "LAW_NOT_IN_FORCE": Advice(
         "the law of `control.law` was refused: no calibration of its modes is loaded, or the camera does not fit it.",
-        "load a calibration of these modes for the camera's settings, or restore them; then `lowfc ctl law FILE`.",
+        "load a calibration of these modes for the camera's settings, or restore the camera's settings; then "
+        "`lowfc ctl law FILE`.",
     ),
     "LAW_OVERRULED": Advice(
         "the guard found that the law's residual exceeds the integrator's, or that the loop amplifies.",
@@ -104,8 +105,8 @@ ADVICE: dict[str, Advice] = {
     "LOOP_HARMS": Advice(
         "in three windows in a row the closed loop's residual exceeded that of an open loop: gains too high for the "
         "noise, a wrong calibration, or a wrong delay.",
-        "`lowfc ctl gain auto`; if it returns, check calibration and `control.delay_frames`. `control.on_harm` can "
-        "open the loop by itself.",
+        "`lowfc ctl gain auto`; if the event is raised again, check calibration and `control.delay_frames`. With "
+        "`control.on_harm` the loop can open by itself.",
     ),
     "PLAY_ENDED": Advice(
         "a probe sequence ended early: the camera restarted, the mirror was lost, a calibration was loaded, no frame "
@@ -115,8 +116,9 @@ ADVICE: dict[str, Advice] = {
     "LEASE_TAKEN": Advice("a program reserved the loop.", "wait, or `lowfc ctl stop`, which ends the reservation."),
     "LEASE_RELEASED": Advice("the program has finished and released the loop.", _NOTHING),
     "LEASE_ENDED": Advice(
-        "the holder did not renew it in time, its time is over, or somebody requested safe, open, pause or stop.",
-        "check the program that held it; it must stop by itself.",
+        "the holder did not renew the reservation in time, the reserved time is over, or somebody requested safe, "
+        "open, pause or stop.",
+        "check that the program that held the reservation has stopped.",
     ),
     "INTERLOCK_ACTS": Advice(
         "a value of the bench meets a condition of `[[interlocks]]`, or is too old.",
@@ -196,7 +198,9 @@ ADVICE: dict[str, Advice] = {
         "the shell command of `recorder.on_event` failed or took more than 60 s.",
         "run the command by hand and correct it.",
     ),
-    "VIEW_STUCK": Advice("the viewer's window reads no data.", "close it if it hangs, and start `lowfc view` again."),
+    "VIEW_STUCK": Advice(
+        "the viewer's window reads no data.", "close the window if it hangs, and start `lowfc view` again."
+    ),
     "VIEW_RENEWED": Advice(
         "the viewer hung, ended, failed to draw or exceeded its memory limit.",
         "reload the page in a browser; a window returns by itself.",

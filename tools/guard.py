@@ -1,6 +1,6 @@
-"""The guard of a law in the simulated loop: laws whose lines have shifted in frequency, and laws that fit.
+"""The guard of a law in the simulated loop: a table of docs/howto/tuning.md.
 
-The table in docs/howto/tuning.md.
+In one part the vibration lines shift in frequency after the law was identified; in the other the law fits all the time.
 """
 
 import timeit

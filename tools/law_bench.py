@@ -221,7 +221,7 @@ def timing_of(config: Configuration) -> Timing:
 
 
 def tuned(run: TimeSeries, config: Configuration, kinds: Sequence[str] = ("lqg",)) -> dict[str, Tuned]:
-    """Laws of these kinds for pseudo-open-loop modes (frames, modes), all or the first few."""
+    """Laws of these kinds for pseudo-open-loop modes (frames, modes): all modes of the loop, or the first few."""
     noll = config.noll[: run.values[0].shape[1]]
     rate_hz, leak = config.camera.rate_hz, np.zeros(len(noll))
     timing = timing_of(config)

@@ -203,7 +203,7 @@ def main() -> None:
     if unknown := set(options.names) - set(CASES):
         parser.error(f"no case is called {', '.join(sorted(unknown))}; there are {', '.join(CASES)}")
     run = measure_again(json.loads(CASES_FILE.read_text()), options.seed, options.names)
-    results = json.loads(CASES_FILE.read_text())  # again: another seed may have been measured meanwhile
+    results = json.loads(CASES_FILE.read_text())  # read again: another seed may have been measured meanwhile
     results["runs"] = [run if one["seed"] == options.seed else one for one in results["runs"]]
     CASES_FILE.write_text(json.dumps(results, indent=1) + "\n")
 
