@@ -14,7 +14,7 @@ class BostonMirror:
     """A mirror whose values are fractions of the voltage range, 0 to 1."""
 
     class Options(VoltOptions):
-        """Options in addition to the maps."""
+        """The mirror's serial number, in addition to the options of `VoltOptions`."""
 
         serial: str
         """Serial number of the mirror."""
