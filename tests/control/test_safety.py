@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 from lowfc.arrays import Single
 from lowfc.control.loop import safety
 from lowfc.control.loop.safety import Limit, Limits, LoopMode, limit, neighbour_difference_nm, request_mode
-from tests.support.safety_checks import CASES, LIMITS, check_kept, violations
+from tests.support.safety_checks import CASES, LIMITS, check_case, violations
 
 GRID = (4, 5)
 
@@ -264,7 +264,7 @@ def module_of(source: str) -> ModuleType:
 def check(module: Any) -> None:
     """Raise AssertionError, or an error of the mutation, if the module does not work."""
     for case in CASES:
-        check_kept(module.limit, case)
+        check_case(module.limit, case)
     _check_random_walks(module)
     for bad in (0.0, -1.0, 1e-3, np.nan, np.inf):
         for limits in ((bad, 100.0, 400.0), (700.0, bad, 400.0), (700.0, 100.0, bad)):

@@ -165,7 +165,7 @@ def test_the_units_match_the_programs_and_the_configuration() -> None:
         assert all(processors(name).isdisjoint(other) for other in others)
         assert len(processors(name)) == 1 or name not in LOOP
     assert Path(_LATENCY_DEVICE).name in (DEPLOY / "udev" / "70-lowfc.rules").read_text()
-    # Operations that may take this long do not trigger the watchdog.
+    # The longest waits of controller and camera must not trigger the watchdog.
     assert float(settings("lowfc-controller.service")["WatchdogSec"][0]) > MIRROR_PATIENCE_S
     assert float(settings("lowfc-sim-camera.service")["WatchdogSec"][0]) > PATIENCE_S
 

@@ -80,7 +80,7 @@ def test_the_design_mask_tutorial_runs_as_written(tmp_path: Path) -> None:
     assert all("frame to command" in one for one in loops)
 
 
-@pytest.mark.usefixtures("without_drawings")  # `test_golden` has those of this log
+@pytest.mark.usefixtures("without_drawings")  # `test_golden` tests the drawings of this log
 def test_the_bad_night_tutorial_runs_as_written(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "tests" / "golden", tmp_path / "tests" / "golden")
     info, report, replay, killed, recovered, recovered_info = followed(tmp_path, "bad_night").values()

@@ -97,7 +97,7 @@ class Night(ThreadedRun):
         self.shape_nm = actuators(wire.MirrorState.FromString(sample.payload))
 
     def expose(self, frames: int, change: Callable[[Any], Any] = lambda pixels: pixels, late_ns: int = 0) -> None:
-        """Expose frames, each after the step of the one before; `change` modifies their pixels."""
+        """Expose frames, each after the step of the one before; `change` modifies pixels, `late_ns` delays arrival."""
         for _ in range(frames):
             pixels = self.scene.expose(self.index, self.shape_nm)
             truth = self.scene.truth(self.index, self.shape_nm).sampled

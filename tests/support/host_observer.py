@@ -1,4 +1,8 @@
-"""Print what one host of a multi-host run receives, ten times a second as a line of JSON on standard error."""
+"""Print what one host of a multi-host run receives, ten times a second as a line of JSON on standard error.
+
+`good` counts the last steps in a row that are closed, without a reason, and with errors below 5 nm; `following` counts
+the last states in a row of a mirror that follows commands.
+"""
 
 import json
 import sys

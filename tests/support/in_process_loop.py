@@ -145,7 +145,7 @@ class InProcessLoop(Client):
             waiting.append(Image(frame.sequence, frame.time_ns, pixels) if kind == "frames" else outputs.step)
 
     def silence_camera(self) -> None:
-        """Let the controller find that no frame came within its frame timeout, before the next one."""
+        """Let the frame timeout pass without a frame, and publish the events that the controller raises."""
         for event in self._bench.process_input(Tick(0, 60_000_000)).events:
             message = EVENTS[event.name].log("controller", 0, **event.details)
             self.mirror_bus.publisher(EVENT).put(message.SerializeToString())

@@ -26,7 +26,7 @@ ATTACHMENTS = (
 )
 MUTATIONS = 1000
 MISPLACED = ("shuffled", "repeated", "removed", "swapped", "doubled")
-"""Kinds of damage that move, repeat or remove whole records; without a summary a missing one cannot be detected."""
+"""Kinds of damage that move, repeat or remove whole records; without a summary, a missing record is not detected."""
 
 
 def small_samples(frames: int = 40) -> list[Sample]:

@@ -37,7 +37,8 @@ class Host:
         self.folder = folder / name
         hold = ["unshare", "--net", "sh", "-c", "echo && exec cat"]
         self.holder = subprocess.Popen(hold, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
-        assert self.holder.stdout.readline(), "no namespace was created"  # before it, commands would run in our own
+        # Before this line arrives, the namespace may not exist yet, and commands would run in our own.
+        assert self.holder.stdout.readline(), "no namespace was created"
         self.children: dict[str, Child] = {}
         home = self.folder / "runtime" / "lowfc"
         home.mkdir(mode=0o700, parents=True)

@@ -103,7 +103,7 @@ def violations(limits: Limits, previous_nm: Single, actuators_nm: Single) -> lis
     return [f"{name}: {value} > {bound}" for name, (value, bound) in results.items() if not value <= bound]
 
 
-def check_kept(limit: Callable[[Limits, Single, Single], Limited], case: Case) -> None:
+def check_case(limit: Callable[[Limits, Single, Single], Limited], case: Case) -> None:
     """Assert that `limit` gives the expected result of a case."""
     shape = case.previous_nm
     outside = bool(violations(LIMITS, shape, shape))

@@ -1,4 +1,4 @@
-"""Helpers for the display: a scripted run of the toy, and a recording stream that stores what is drawn."""
+"""Helpers for the display: a scripted run of `tests.support.toy`, and a stream that stores what is drawn."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
@@ -55,7 +55,7 @@ def snapshot_of(samples: list[Sample]) -> Snapshot:
 
 
 class Stage:
-    """A scripted run of the toy's processes.
+    """A scripted run: messages as from the processes of a loop with the sensor of `tests.support.toy`.
 
     Attributes:
         silent: processes that no longer send; a silent camera sends no frames, and so on.
@@ -149,7 +149,7 @@ class Stage:
 
 
 class Tape:
-    """Stand-in for a RecordingStream.
+    """Stand-in for rerun's RecordingStream, which stores what is drawn.
 
     Attributes:
         now_ns: time of the next logged item.

@@ -1,6 +1,6 @@
 """Emulation of a CACAO bench: the simulated camera's frames in a stream, the mirror behind channels.
 
-A program with a configuration file and a folder of streams as arguments, independent of the run: it writes frames to
+A program outside the run, with a configuration file and a folder of streams as arguments: it writes frames to
 `camnsv`, sums the existing channels dm00disp00 to dm00disp11 into `dm00disp`, without the mean, and applies the sum to
 the optics. It executes lines of standard input between two frames: `renew` and `region` recreate the camera's stream,
 `die` ends the program in the middle of an image, `stop` prints the frame count and the residual, and ends.

@@ -30,7 +30,7 @@ class PlainStream:
         self.data = HEADER
         self.keywords = self.data + (length + 7) // 8 * 8
         self.semaphores = self.keywords + KEYWORD * keywords
-        self.readers = self.semaphores + 11 * SEMAPHORE  # ten, and one for the log
+        self.readers = self.semaphores + 11 * SEMAPHORE  # ten for readers, and one for the log
         self.writers = self.readers + 40  # ten process ids of four bytes each
         self.address = ctypes.addressof(ctypes.c_char.from_buffer(self.map))
 
