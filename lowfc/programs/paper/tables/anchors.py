@@ -68,7 +68,8 @@ SCEXAO = (
 )
 HICAT = (
     f"Part of {STEPS} random steps of 2 nm rms of surface on a dark hole's channel that the loop undoes (V = -2). "
-    "HiCAT digs while its low-order loop runs (A&A 663, A49, 2022; arXiv 2301.03242). The verdict is reached below 1 %."
+    "HiCAT digs while its low-order loop runs (A&A 663, A49, 2022; arXiv 2301.03242). The verdict is "
+    "'reached' if the part is below 1 %."
 )
 HUNDRED = (
     f"Standard deviation of a mode's mean over {AVERAGED_S:g} s of frames at {tolerance.RATE_HZ:g} Hz, V = 2, "
