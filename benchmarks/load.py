@@ -77,7 +77,7 @@ def _moment() -> Moment:
 
 
 def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
-    """Use by each role over the last 80 % of the frames, which are sent for `seconds`.
+    """Use of processors and memory by each role over the last 80 % of the frames, which are sent for `seconds`.
 
     `share`: processor time of all threads, in processors. Empty with fewer than two samples in that time.
     """

@@ -102,7 +102,7 @@ def random_calibration(size: Size, config: Configuration) -> tuple[Calibration, 
 
 @contextlib.contextmanager
 def prepared_run(size: Size, config: Configuration) -> Iterator[Run]:
-    """A run of that size with the files of its processes; removed afterwards."""
+    """A run of that size with the files of its processes; the run is removed afterwards."""
 
     def fill(config: Configuration, run: Run) -> None:
         calibration, frames = random_calibration(size, config)

@@ -89,7 +89,7 @@ def allocated(step: ControlStep, payloads: Payloads) -> dict[str, float]:
             before = tracemalloc.get_traced_memory()[0]
             step(payload)
             highest = max(highest, tracemalloc.get_traced_memory()[1] - before)
-        del payload  # it belongs to the frames, not to the step
+        del payload  # the last frame must not count as memory retained by the step
         kept = (tracemalloc.get_traced_memory()[0] - begun) / _TRACED
     finally:
         tracemalloc.stop()

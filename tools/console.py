@@ -15,7 +15,7 @@ from tools.pictures import BRIGHT, PICTURES, SMALL_WELL, PictureRun, picture_run
 SLOW = {"camera.rate_hz": 100.0}
 """At this rate the pictures do not need a quiet host."""
 LOOK_S = 6.0
-"""Time before the change of state, and after the console shows it."""
+"""Wait before the change of state, and again between its display and the picture."""
 PATIENCE_S = 60
 
 

@@ -140,7 +140,7 @@ class Bench:
         self.ask("law", law=law)
 
     def expose(self) -> tuple[Single, Pixels]:
-        """The mirror's shape (rows, columns) in the next exposure, and its frame."""
+        """Expose; the mirror's shape (rows, columns) in the exposure, and the frame."""
         self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
         single = len(self._weights) == 1
         exposed_nm = self._shapes[0] if single else np.tensordot(self._weights, np.array(self._shapes), 1)
@@ -158,7 +158,7 @@ class Bench:
         return Frame(start + self._index - 1, 10**18 + (self._index - 1) * self.config.period_ns, 0, pixels)
 
     def move_mirror(self, frame: Frame, command: ModalCommand) -> None:
-        """Move the mirror by the command for a frame; ValueError if it refuses."""
+        """Move the mirror by the command for a frame; ValueError if the mirror refuses it."""
         received = Command("lowfc", frame.sequence, frame.time_ns, 10**9, command.actuators_nm, command.command_nm)
         self._status, refused = apply_command(
             self._protection, self._status, received, frame.time_ns, self._mirror.settle

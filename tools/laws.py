@@ -90,7 +90,7 @@ def tilts(run: TimeSeries, frames: int) -> TimeSeries:
 
 
 def moved_lines_mas(config: Configuration, calibration: Calibration, law: LinearLaw) -> dict[str, float]:
-    """Residual with lines 2 % higher, mas rms per axis: with the former law, and with one identified from that loop."""
+    """Residual with lines 2 % higher, mas rms per axis: with `law`, and with a law identified from the higher lines."""
     bench = Bench(config, calibration, with_lines_moved(disturbance_of(config), 1.02))
     bench.load(law)
     bench.settle(SETTLE)
@@ -174,8 +174,8 @@ def render(results: Results) -> str:
             f"theoretical residual ({theory_mas:.3f} mas), and {got_mas / one['optimum_mas']:.2f} times that of an LQG "
             "law with the exact lines of the wheel and a random walk behind a low-pass as drift "
             f"({one['optimum_mas']:.3f} mas). Theory for LQG identified from shorter data: {shorter}. "
-            f"With the lines 2 % higher its residual was {one['moved']['before_mas']:.2f} mas, and "
-            f"{one['moved']['after_mas']:.3f} mas after identification from the same run.\n"
+            f"With the lines 2 % higher the residual of this LQG law was {one['moved']['before_mas']:.2f} mas, and "
+            f"{one['moved']['after_mas']:.3f} mas after identification from the run with the higher lines.\n"
         )
     return (
         f"{markdown(head, rows)}\n{''.join(notes)}\nReaction wheel with damped lines, 14 mas rms per axis, V = 0 "

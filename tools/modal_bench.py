@@ -1,4 +1,4 @@
-"""The simulated loop with a linear sensor instead of diffraction; its noise has a given covariance of the modes.
+"""The simulated loop with a linear sensor instead of diffraction: its measured modes have noise of a given covariance.
 
 The live loop's own `advance` receives frames of a few pixels that encode the measured modes, so that hours can be
 simulated. Not included: the sensor's nonlinearity, the mirror's print-through and DAC quantisation.

@@ -185,7 +185,7 @@ def _command_error(folder: Path, frames: int) -> float:
 
 
 def _lowfc(kernel: str, options: argparse.Namespace, priority: int) -> dict[str, Any]:
-    """Run lowfc's own loop with the size of the comparison; it warms up for half a second by itself."""
+    """Run lowfc's own loop with the size of the comparison; frames of its first half second do not count."""
     config = configuration(SIZE, options.rate_hz, priority=priority, disable_cpu_idle=True, kernel=kernel)
     with prepared_run(SIZE, config) as run:
         found = one_loop(LatencyOptions(config, options.seconds, 1), run)

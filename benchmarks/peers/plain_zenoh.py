@@ -1,4 +1,4 @@
-"""The processes of a loop in plain Python and zenoh; see `shared` for the arguments.
+"""The loop of the comparison in plain Python and zenoh: processes with the arguments in `benchmarks.peers.shared`.
 
 The source is also the mirror: it records when each command arrives.
 """

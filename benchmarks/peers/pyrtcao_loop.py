@@ -1,11 +1,11 @@
-"""The same loop in pyrtcao, each component a process; see `shared` for its arguments.
+"""The loop of the comparison in pyrtcao, each component a process with the arguments in `benchmarks.peers.shared`.
 
 Stock: a `WavefrontSensor`, a custom component that computes the signal from the pixels, `Loop.leaky_integrator`, and
 a `WavefrontCorrector`, which converts modes to actuators. Fused: one custom component between sensor and corrector
 computes the whole step in one compiled function, the fastest arrangement that pyrtcao permits.
 
-It runs in an interpreter with pyrtcao, and imports nothing of lowfc. If permitted, pyrtcao sets nice -20 under normal
-scheduling by itself.
+This module runs in an interpreter with pyrtcao, and imports nothing of lowfc. Under normal scheduling pyrtcao itself
+sets nice -20, if permitted.
 """
 
 import os

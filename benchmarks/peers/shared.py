@@ -73,7 +73,7 @@ class RoleProcess:
     def frame_numbers(self) -> Iterator[int]:
         """Report ready, wait for the start, then yield each frame's number at its absolute time; none is skipped.
 
-        After the last it sleeps for 50 ms, so that the last command can arrive.
+        After the last frame it sleeps for 50 ms, so that the last command can arrive.
         """
         self.ready()
         while not (self.folder / _GO).exists():

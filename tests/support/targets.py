@@ -107,7 +107,7 @@ class Loop:
         """Take a frame preceded by the 16 bytes of its envelope."""
         self.count += 1
         sequence, time_ns = Envelope.decode_checked(payload[:16])
-        self.process_input(codec.decode_frame(payload[16:], sequence, 0 - time_ns))  # its age, received at time 0
+        self.process_input(codec.decode_frame(payload[16:], sequence, 0 - time_ns))  # age at time 0
 
     def request(self, name: str, payload: bytes) -> None:
         request = codec.decode_request(payload, name, 0)
