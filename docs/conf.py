@@ -20,7 +20,7 @@ highlight_language = "bash"
 default_role = "code"  # of the docstrings, which have single backticks
 napoleon_use_ivar = True
 autodoc_member_order = "bysource"
-suppress_warnings = ["ref.python"]  # an attribute's name that several classes have
+suppress_warnings = ["ref.python"]  # ambiguous reference to an attribute that several classes have
 html_theme = "pydata_sphinx_theme"
 html_title = f"lowfc {release}"
 html_copy_source = False
@@ -32,7 +32,7 @@ _ARRAY = re.compile(r"~?numpy\.ndarray\[(?:tuple\[.*?\]|~?typing\.Any), ~?numpy\
 
 
 def _short(text: str | None) -> str | None:
-    """Types of arrays as `array of float64`: their shapes are in the docstrings."""
+    """Types of arrays shortened to `array[float64]`: their shapes are in the docstrings."""
     return _ARRAY.sub(lambda found: f"array[{found[1].rpartition('.')[2]}]", text) if text else text
 
 

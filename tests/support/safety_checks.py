@@ -57,7 +57,7 @@ CASES = (
         ("NEIGHBOUR",),
         columns(200, -200, -200),
     ),
-    Case("neighbours upside down", rows(-190, 190, 190), rows(-230, 230, 230), ("NEIGHBOUR",), rows(-200, 200, 200)),
+    Case("neighbours, other signs", rows(-190, 190, 190), rows(-230, 230, 230), ("NEIGHBOUR",), rows(-200, 200, 200)),
     Case("neighbours crossing over", rows(60, -60, 0), rows(-45, 45, 0), ("SLEW",), rows(-40, 40, 0)),
     Case("all neighbours together", rows(500, 500, 500), rows(550, 550, 550), (), rows(550, 550, 550)),
     Case(
