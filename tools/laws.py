@@ -33,7 +33,7 @@ CASES: dict[str, dict[str, Any]] = {
 }
 KINDS = ("integrator", "pi-notch", "lqg")
 SHORTER = (8_000, 16_000)
-"""Last frames of the same loop, from which further LQG laws are identified for comparison."""
+"""Numbers of the last frames of the same loop from which further LQG laws are identified for comparison."""
 IDENTIFY, SETTLE, MEASURE = 48_000, 12_000, 12_000
 """Frames of the closed loop: for identification of a law, for settling, for the measurement."""
 _DRIFT_BOUNDS = ((-5.0, 2.0), (-1.0, 4.0))

@@ -2,7 +2,7 @@
 
 Example:
     python -m tools.reliability --seed 1              # run the chaos cases missing from the table, with this seed
-    python -m tools.reliability --seed 1 kill-camera  # run this one again; then `python -m tools.measure` for the page
+    python -m tools.reliability --seed 1 kill-camera  # run this case again; `python -m tools.measure` makes the page
 """
 
 import argparse

@@ -105,7 +105,7 @@ def measure(options: argparse.Namespace, report: Report) -> Result:
     configuration(SIZE, options.rate_hz)  # refuses an impossible rate
     absent = {one.name: why for one in chosen if (why := missing(one, options))}
     present = [one for one in chosen if one.name not in absent]
-    realtime = set_up(None, None, lock_memory=False, disable_cpu_idle=True)  # for all, as long as this process lives
+    realtime = set_up(None, None, lock_memory=False, disable_cpu_idle=True)  # processors stay awake in all runs
     priority = PRIORITY if fifo_granted() else 0
     runs: dict[str, list[Any]] = {one.name: [] for one in chosen}
     failed = []
