@@ -84,6 +84,10 @@ a sparse aperture mask", J. Astron. Telesc. Instrum. Syst. 1(3), 039001 (2015): 
 shaped pupil and sparse aperture mask are not published, so agreement to a few per cent is not expected: the
 assumptions, numbered below each table, give our choices where the paper is silent or contradicts itself.
 
+An input of Table 3 is named by the bounds of its coefficients: *matched* gives the input rms of the table, *literal*
+has the bounds of the text, *quarter* a quarter of those. Table 4 is computed for the paper's electrons and for our own
+photometry.
+
 Three notes:
 
 - Table 3 gives every sensor 40,000 e- in its brightest pixel, so light that a mask loses costs nothing. Table 4 gives
