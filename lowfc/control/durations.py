@@ -15,7 +15,7 @@ class Durations:
     """Histogram of durations with bins of 1 %, from 1 us to 430 s; the largest duration is exact."""
 
     def __init__(self) -> None:
-        self._counts = array("q", [0] * _BINS)  # for adding one, faster than an array of numpy
+        self._counts = array("q", [0] * _BINS)  # an element is incremented faster than one of a numpy array
         self.count = 0
         self.max_ns = 0
 

@@ -116,7 +116,7 @@ def _update_guard(
             guard = guard.at_rest()
         elif advanced.frames <= SETTLING_FRAMES or not closed:
             guard = guard.observed(pol_from_target_nm, advanced.frames)
-        else:  # the guard's virtual commands have the modal limit, too: the comparison stays valid
+        else:  # a modal limit does not count: virtual commands have it, too, so that the comparison stays valid
             limited = any(reason is not Limit.MODAL_LIMIT for reason in state.limits_hit)
             commands = advanced.law, advanced.x, loop.integrator, loop.delay_weights, loop.history_nm
             guard, guard_events = guard.judged(*commands, error_nm, pol_from_target_nm, limited=limited)

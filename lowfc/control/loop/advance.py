@@ -129,7 +129,7 @@ def _command_message(state: State, loop: ActiveLoop, command_nm: Single) -> Comm
     """The command of the newest frame."""
     safe = state.mode is LoopMode.SAFE
     sequence, conditions = state.frame_sequence, state.conditions
-    # Before the first frame, the mirror may know a newer sequence: a new `clear_id` makes it forget that.
+    # Before the first frame the sequence is 0; the mirror may have had a newer one, which a new `clear_id` resets.
     clear_id = conditions.clear_id or (0 if sequence else conditions.mode_since_ns)
     return Command(sequence, state.frame_time_ns, loop.actuators_nm, command_nm, safe, clear_id)
 
@@ -154,7 +154,7 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
 
 
 def _camera_started(state: State, frame: Frame) -> State:
-    """The state at the first frame after a start of the camera: its settings are awaited, unless they are known."""
+    """The state at the first frame after a start of the camera: settings from an earlier start are not used further."""
     camera = state.conditions.camera
     if camera is None or camera.start_s in (0, frame.sequence >> COUNT_BITS):
         return state
@@ -197,7 +197,7 @@ def _measure(
 
 
 def _overruled(state: State, loop: ActiveLoop) -> bool:
-    """Whether the integrator has part of a closed loop's command because the law did worse."""
+    """Whether the integrator determines part of a closed loop's command because the law did worse."""
     guard = loop.law_runner.guard if loop.law_runner is not None else None
     return guard is not None and state.mode is LoopMode.CLOSED and guard.overruled
 
@@ -210,7 +210,7 @@ def _limit_cause(limits: tuple[Reason, ...]) -> str:
 def _refuse(
     settings: Settings, state: State, frame: Frame, reason: Rejection, events: list[PendingEvent]
 ) -> tuple[State, Outputs]:
-    """State and outputs after a refused frame: the command is held, except in safe mode and after `UNMEASURED`."""
+    """State and outputs after a refused frame: except in safe mode and as at `UNMEASURED`, the command is held."""
     if reason is not state.refused:
         events.append(PendingEvent("FRAMES_REFUSED", {"reason": reason.name}))
     loop, returning_to_zero, limits_hit = state.loop, state.returning_to_zero, state.limits_hit
@@ -265,7 +265,7 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
         action = "relaxing the mirror to flat" if flatten else "holding the command"
         events.append(PendingEvent("NO_FRAMES", {"silent_ms": tick.silent_ns / 1e6, "action": action}))
         counts = _counted(counts, (Rejection.NO_FRAME,))
-    if begins or flatten:  # a sequence requested during the timeout waits for the next frame, unless the mirror relaxes
+    if begins or flatten:  # otherwise the command is held, and a probe sequence requested since waits for a frame
         loop = end_probe(loop, state.frame_sequence, f"no frame for {tick.silent_ns / 1e6:.0f} ms", events)
     if flatten or safe:
         loop = step_to_flat(settings, loop)

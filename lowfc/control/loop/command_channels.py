@@ -2,8 +2,8 @@
 
 A channel is a mirror shape from a source other than the control law, such as one that digs a dark hole. The sensor sees
 it, so the sensor's zero point shifts with it (Subedi et al. 2015, Sect. 1 and 4), after the delay of a command, and the
-loop does not remove it; of the channels, only `FLAT` shifts nothing. A probe sequence ("play") is for calibration and
-tests and shifts nothing.
+loop does not remove it. Two additions do not shift the zero point: the channel `FLAT`, and a probe sequence ("play"),
+which is for calibration and tests.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from lowfc.control.identity import identity
 from lowfc.control.loop.wording import counted
 
 FLAT = "flat"
-"""Channel of the mirror's flat map: the reference image includes it, so it shifts nothing."""
+"""Channel of the mirror's flat map: the reference image includes it, so it does not shift the zero point."""
 ADOPTED = "adopted"
 """Channel of the mirror's shape outside the modes when the controller started or a calibration was loaded."""
 EXTERNAL = "external"

@@ -86,7 +86,7 @@ def difference(calibration: Calibration, pixels: Pixels, min_flux_dn: float, out
 def fill_saturated(calibration: Calibration, pixels: Pixels) -> Pixels:
     """Replace the saturated pixels of a frame (pixels,) DN by dark plus reference, at the flux of the other pixels.
 
-    A pixel with a cosmic ray hit carries no wavefront information, but would enter with all its charge.
+    A pixel with a cosmic ray hit carries no wavefront information, but its charge would enter the modal errors.
     """
     full = pixels >= calibration.saturation_dn
     others = calibration.good * ~full

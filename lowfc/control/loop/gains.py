@@ -16,7 +16,7 @@ from lowfc.control.loop.state import ActiveLoop, Settings, Weighting
 from lowfc.control.loop.wording import AUTO, counted
 
 _MAX_PREPARED = 64
-"""Most different leaks of a request for which `prepare_gains` caches the highest gains."""
+"""Largest number of different leaks in a request for which `prepare_gains` caches the highest gains."""
 
 Changed = tuple[ActiveLoop, str, *tuple[PendingEvent, ...]]  # the loop after a request, its reply, events
 
@@ -191,5 +191,5 @@ def check_offset(loop: ActiveLoop, largest_nm: npt.NDArray[np.floating[Any]]) ->
         raise ValueError(f"offset of mode {mode}: R measures it only in part (--truncate): the loop would overshoot")
 
 
-_MAX_DEPARTURE = 0.1  # norm of what R measures of a mode less that mode, above which its offset is refused
+_MAX_DEPARTURE = 0.1  # norm of the difference between a mode and what R measures of it, above which offsets are refused
 _ATTRIBUTES = {"gain": "gain", "leak": "leak", "limit": "limit_nm"}

@@ -1,7 +1,7 @@
 """The guard of a linear law: an integrator on the same frames, which takes over if the law does worse.
 
 Tip and tilt are judged apart from the other modes, as the larger group would hide the smaller. While the law drives a
-group, the integrator is virtual there, and vice versa.
+group, the integrator's commands and errors are computed only (virtual) there, and vice versa.
 
 Squared errors are compared in blocks of frames, and several blocks in a row decide: a step of the disturbance, from
 which a law may recover more slowly than the integrator, affects one or two blocks; shifted vibration lines affect all.
@@ -29,12 +29,12 @@ BETTER_S = 10.0
 MAX_TAKEOVERS = 4
 """Number of takeovers after which only an operator can let the law drive again."""
 WORSE, BETTER = 1.2, 0.25
-"""Ratio of the law's mean squared error to the integrator's above which it is worse, and below which it is better."""
+"""Ratio of the law's mean squared error to the integrator's above which the law is worse, and below which better."""
 LONG_TERM_S = 10.0
 """Time constant of the long-term mean square of the pseudo-open-loop modes."""
 AMPLIFIED = 2.5
-"""Ratio of mean squared error to the long-term mean square of the pseudo-open-loop modes above which the loop
-amplifies. Exception: if the error is below `BETTER` times their mean square in the block, the disturbance has grown."""
+"""Ratio of the mean squared error to the long-term mean square of the pseudo-open-loop modes above which the loop
+amplifies; not if the ratio to their mean square in the block is below `BETTER`: then the disturbance has grown."""
 
 NAMES = ("tip and tilt", "the other modes")  # of the groups
 LAW_RETURNS = "law returns"
@@ -84,8 +84,8 @@ class Group(NamedTuple):
         Args:
             means_nm2: means over the block of the squares of errors, virtual errors and pseudo-open-loop modes.
             spans: durations.
-            void: whether the comparison with the integrator is invalid. An amplifying loop is detected without it, so
-                also if a wrong delay falsifies the pseudo-open-loop modes, and with them the comparison.
+            void: whether the comparison with the integrator is invalid. An amplifying loop is detected without that
+                comparison, and so even if a wrong delay falsifies the pseudo-open-loop modes that it uses.
         """
         error_nm2, virtual_nm2, pol_nm2 = means_nm2
         after = self._replace(usual_nm2=self.usual_nm2 + (pol_nm2 - self.usual_nm2) / spans.long_term)
@@ -249,7 +249,7 @@ class LawGuard(NamedTuple):
 
 
 def _faded(group: Group, spans: Spans) -> Group:
-    """Advance the cross-fade to the controller that drives the group by one frame."""
+    """Advance by one frame the cross-fade to the controller that drives the group."""
     faded = min(group.faded + 1, spans.faded) if group.overruled else max(group.faded - 1, 0)
     return group._replace(faded=faded, blocks=0)
 

@@ -15,7 +15,7 @@ from lowfc.control.loop.interlocks import BenchReport
 from lowfc.control.loop.safety import LoopMode, Reason
 
 COUNT_BITS = 32
-"""A frame's sequence is its publisher's start in seconds, shifted by this many bits, plus its count."""
+"""A frame's sequence is its publisher's start in seconds, shifted left by this many bits, plus the frame's number."""
 TICK_NS = 10_000_000
 """Period at which the held command is repeated while no frame arrives."""
 
@@ -80,7 +80,7 @@ class MirrorShape:
     """The mirror's shape: actuators (rows, columns) nm of surface, and their modal command.
 
     Attributes:
-        safe: whether its last command was sent in safe mode.
+        safe: whether the mirror's last command was sent in safe mode.
     """
 
     time_ns: int

@@ -87,7 +87,7 @@ class Acting(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """The newest value of a name, None if none was received; the process computes its age before it calls `advance`."""
+    """The newest bench value of this name; None if none was received. The process computes its age before `advance`."""
 
     time_ns: int
     name: str

@@ -24,7 +24,7 @@ UNRELATED = frozenset({"status", "note", "lease", "renew", "release", "permit"})
 LEASE_OVER = "the lease ended: "
 """Beginning of the refusal of a renewal, before the cause."""
 REMAINING_TIME_SEPARATOR = ", about "
-"""Separates the holder from its remaining time in its description."""
+"""In a lease's `holder`, separates the holder from its expected remaining time."""
 
 
 class Lease(NamedTuple):

@@ -17,7 +17,7 @@ from lowfc.control.loop.wording import CAMERA_MISFIT, MEASURED_FIRST
 ADOPTED_NM = 1.0
 """Deviation of an actuator from the modal command above which a mirror's shape is adopted as a channel, nm."""
 REFUSED_IN_A_ROW = 3
-"""Frames refused in a row from which on the loop counts as holding; fewer are ignored."""
+"""Number of frames refused in a row from which on a closed loop counts as holding its command."""
 LATCHED = "it was in safe mode before the controller started"
 MIRROR_WAS_SAFE = "the mirror's last command was sent in safe mode"
 
@@ -245,7 +245,7 @@ def end_probe(loop: ActiveLoop, sequence: int, why: str, events: list[PendingEve
 
 
 def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
-    """Store the camera's settings; open a closed loop that they do not fit; `uncalibrated` decides on the idle mode."""
+    """Store the camera's settings; open a closed loop that they do not fit; enter or leave idle, see `uncalibrated`."""
     after = _with_camera(state, camera)
     if after is state:
         return state, Outputs()

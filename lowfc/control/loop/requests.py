@@ -107,7 +107,8 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
         reply = "the loop stays closed"
     if request.name == "close" and request.text.startswith(f"{AUTO}: ") and not state.waits_for_gains:
         raise ValueError("the loop no longer waits for its gains")
-    if (request.name == "open" and paused) or (after is LoopMode.OPEN and state.waits_for_gains):  # it stays open
+    # In these cases the mode is open already, so `in_mode` would keep the former cause.
+    if (request.name == "open" and paused) or (after is LoopMode.OPEN and state.waits_for_gains):
         state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
     if after is LoopMode.CLOSED and state.loop is not None and state.loop.calibration.provisional:
         reply += (
@@ -315,7 +316,7 @@ def _with(state: State, loop: ActiveLoop, command_channels: CommandChannels) -> 
 
 
 def _check_shape(limits: Limits | None, shape_nm: Single, prefix: str = "") -> None:
-    """Refuse a channel, or a sum of channels, that exceeds the mirror's limits without any command of the law."""
+    """Refuse a channel, or a sum of channels, that exceeds the mirror's limits even without a command of the law."""
     if not (np.abs(shape_nm) <= MAX_LIMIT_NM).all():
         raise ValueError(f"every actuator of a channel must be finite, and at most {MAX_LIMIT_NM:g} nm from flat")
     if limits is None:  # already on the mirror

@@ -45,11 +45,11 @@ def release(settings: Settings, state: State, request: Request) -> tuple[State, 
 
 
 def counted_to_frame(settings: Settings, state: State, frame: Frame) -> State:
-    """The state at a new frame, with its lease moved so that it loses the periods that passed since the last frame.
+    """The state at a new frame, with its lease shortened by the frame periods that passed since the last frame.
 
-    They follow from the difference of the frames' times, because the camera may have another clock. Instead, each frame
-    counts as one period if the times do not increase, or after a silence, during which ticks compared the clock. At a
-    start of the camera the lease keeps its remaining periods.
+    Their number follows from the times of the two frames, which may be from another clock than the lease's. If the
+    times do not increase, or after a silence (in which each tick compared the controller's clock with the lease), each
+    frame counts as one period. At a start of the camera the lease keeps its remaining periods.
     """
     held, frames = state.conditions.lease, frame.sequence - state.frame_sequence
     if held is None or held.ended or not (settings.rate_hz and held.same_start(state.frame_sequence)):

@@ -200,7 +200,7 @@ def _range_nm(actuators_nm: Single) -> tuple[float, float]:
 
 
 def neighbour_difference_nm(actuators_nm: npt.NDArray[np.floating]) -> float:
-    """Largest difference between actuators (rows, columns) side by side, in nm; rounded as the actuators are."""
+    """Largest difference between actuators (rows, columns) side by side, in nm, computed in the array's precision."""
     rows = np.abs(actuators_nm[1:] - actuators_nm[:-1]).max(initial=0)
     columns = np.abs(actuators_nm[:, 1:] - actuators_nm[:, :-1]).max(initial=0)
     return float(max(rows, columns))

@@ -125,7 +125,7 @@ class LawRunner(NamedTuple):
 
     @property
     def weight(self) -> np.float32 | Single:
-        """Its share of the command, for all modes or (modes,); the integrator has the rest."""
+        """The law's share of the command, one number or (modes,); the rest is the integrator's."""
         weight = np.float32(min(max(self.frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1))
         return weight if self.guard is None or not self.guard.overruled else weight * self.guard.weight
 
@@ -312,7 +312,7 @@ class State(NamedTuple):
         counts: number of frames, or of frame timeouts, for each reason.
         steps_left: used frames until the loop opens automatically; 0 for never.
         returning_to_zero: whether the modal command is returning to zero.
-        estimate: the last measurement, and `identical_frames`, the number of consecutive equal ones before.
+        estimate: the last measurement; directly before it, `identical_frames` measurements in a row were equal to it.
         input_number: count of the inputs that changed the state or produced output; the order of replay.
     """
 
@@ -336,7 +336,7 @@ class State(NamedTuple):
 
     @property
     def may_command(self) -> bool:
-        """Whether commands may be sent: the first one to a mirror with a fault only in safe mode, as it might jump."""
+        """Whether commands may be sent; at the first one, a faulty mirror might jump, so that needs safe mode."""
         return self.commanded or not self.conditions.mirror_fault or self.mode is LoopMode.SAFE
 
     @property
