@@ -15,7 +15,8 @@ _MIN_RESPONSE = 1e-3
 def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_e: float, gain_e: float) -> Calibration:
     """The calibration with another dark (pixels,), DN, and only the pixels (pixels,) that are 1 in `good`.
 
-    As `on_pixels`, but a plain R is recomputed from I0 and H, for this read noise of a pixel and electrons per DN.
+    As `on_pixels`, but an R that was computed from I0 and H alone (`_is_plain`) is computed anew, for this read noise
+    of a pixel and these electrons per DN.
 
     Raises:
         ValueError: the remaining pixels have no light, or do not tell the modes apart.
@@ -25,7 +26,7 @@ def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_
 
 
 def on_pixels(calibration: Calibration, good: Array) -> Calibration:
-    """The calibration with only the pixels (pixels,) that are 1 in `good`, and with an R that keeps R H, without unit.
+    """The calibration with fewer good pixels, 1 where `good` (pixels,) keeps them, and an R that leaves R H unchanged.
 
     Pixels that were bad stay bad. I0 and H are normalised to the flux on the remaining pixels. `operator_hash` and `id`
     of the result are empty.
@@ -52,7 +53,8 @@ def with_reference(
 ) -> Calibration:
     """The calibration with another zero point (pixels,), in flux fractions, and mean flux, DN.
 
-    H stays. A plain R is recomputed, for this read noise of a pixel and electrons per DN; any other stays.
+    H stays. An R that was computed from I0 and H alone (`_is_plain`) is computed anew, for this read noise of a pixel
+    and these electrons per DN; any other R stays.
     `operator_hash` and `id` of the result are empty.
 
     Raises:

@@ -1,10 +1,10 @@
 """Placement of a real sensor's image relative to the computed one: scale, centre, rotation, parity.
 
 The image of a flat wavefront through a pupil that is symmetric or without phase is unchanged by a rotation of 180
-degrees, so the reference image alone leaves this ambiguity. In the wrong orientation tip, tilt and other odd modes have
-the opposite sign, and all modes if the pupil has no phase: a poke of an odd mode shows which it is. If a reflection
-does not change the image either, as without a mask in the relay pupil, pokes of both tip and tilt are needed. If the
-image is circular, only these pokes show the rotation.
+degrees, so the reference image alone leaves this ambiguity. In the wrong orientation, odd modes such as tip and tilt
+have the opposite sign (all modes, if the pupil has no phase): a poke of an odd mode shows which orientation is right.
+If a reflection does not change the image either, as without a mask in the relay pupil, pokes of both tip and tilt are
+needed. If the image is circular, only these pokes show the rotation.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ _ANGLES = 72
 _ALIKE, _EXACT = 2.0, 0.01
 """The other parity is possible, too, if its residual is below this multiple of the better one's or below this value."""
 _CIRCULAR = 0.05
-"""Relative change by a rotation below which an image counts as circular; the samples of a circle change it by 0.01."""
+"""Relative change by a rotation below which an image counts as circular; a circle's, due to its pixels, is 0.01."""
 
 
 @dataclass(frozen=True, slots=True)

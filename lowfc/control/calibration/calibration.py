@@ -184,7 +184,7 @@ def reconstructor(
     if nuisance is None:
         return np.asarray(np.linalg.pinv(scaled) * root.T)
     both = np.hstack([scaled, root * nuisance])
-    sizes = np.linalg.norm(both, axis=0)  # pinv drops singular values that are small relative to the largest
+    sizes = np.linalg.norm(both, axis=0)  # divided out, as pinv drops singular values far below the largest
     if not (sizes.all() and condition_number(both / sizes) < SINGULAR):
         raise ValueError("the sensor cannot tell the nuisance modes from the others: fit fewer of either")
     inverse = np.linalg.pinv(both / sizes) / sizes[:, None]

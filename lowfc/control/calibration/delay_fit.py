@@ -50,7 +50,7 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
         command: (frames,) the loop's own command of the same mode; None if the loop is open.
 
     Raises:
-        ValueError: there are too few frames, or the response is spread over several or later than the longest lag.
+        ValueError: there are too few frames, or the response is spread over several frames or later than all lags.
         NotSeenError: the poke is not detected.
     """
     if len(fractions) < MIN_FRAMES:

@@ -23,7 +23,7 @@ def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, hi
         modes: Number of modes that are excited at once.
         lines_per_mode: Number of lines of each mode.
         lowest: Frequency of the first line, cycles per frame.
-        highest: Highest frequency of a line, cycles per frame; at 0.5, the last line is below.
+        highest: Highest frequency of a line, cycles per frame; if it is 0.5, all lines are below it.
 
     Returns:
         For each mode (lines,), cycles per period: odd, ascending, and used by no other mode.

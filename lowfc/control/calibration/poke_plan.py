@@ -24,7 +24,7 @@ class Plan:
         table: (frames, columns) amplitudes of each frame's command, in the unit of its shapes: nm rms of wavefront for
             modes, nm of surface for single actuators.
         used: (frames,) whether an exposure that sees this row alone may be used.
-        per_column: number of frames of the cycle that measure each column.
+        per_column: least number of used frames with a poke of a column.
     """
 
     table: Array
@@ -75,7 +75,7 @@ def dither(columns: int, amplitude: float, frames: int, hold: int, seed: int) ->
     """Pseudo-random pushes and pulls of all modes at once, to be played in a closed loop.
 
     Columns are modes, the amplitude is in nm rms of wavefront, and signs may change every `hold` frames: with a hold of
-    1, the loop removes the least of them. Each piece has its own seed.
+    1, the loop corrects the smallest part of the pokes. Each piece has its own seed.
     """
     rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, 7])))
     states = rng.integers(0, 2, (-(-frames // hold), columns)) * 2.0 - 1.0
@@ -115,7 +115,7 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
 
 
 def usable(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: int) -> Mask:
-    """Whether exposures (exposures,) see a usable row, and every frame from the row before it on led to a command.
+    """Whether each exposure (exposures,) sees a usable row, and each frame since the row before that led to a command.
 
     Args:
         plan: The plan that was played.
