@@ -17,8 +17,8 @@ CONFIDENCE = 2.0
 since one block may outweigh all others when the open loop wanders."""
 WINNING_BLOCKS = 9
 GRANTED = 3.0
-"""Standard errors of white noise by which a gain must beat the open loop in a first window, and for a mode with a gain
-of 0: on a faint star, a single gain granted because of noise may add as much contrast as the dark zone has."""
+"""Standard errors of white noise by which a gain must beat the open loop, in a first window and later for a mode with a
+gain of 0: on a faint star, a single gain granted because of noise may add as much contrast as the dark zone has."""
 EARLY = 5
 """Blocks of a window after which a mode may get another gain before the window ends: from a gain of 0 if the other one
 is better by `GRANTED`, from the least gain if the other one was better in this many blocks in a row."""
@@ -31,10 +31,10 @@ MAX_INJECTED = 0.1
 SURE = 4.0
 """Standard errors above which the cross-talk of tip and tilt into another mode counts as certain."""
 SUSPECTED = 2.0
-"""The same for the cross-talk that a gain must tolerate: uncertain cross-talk on a faint star may add ten times what
-the gain removes."""
+"""Standard errors above which cross-talk counts as suspected, so that a gain must tolerate it: on a faint star, it may
+add ten times what the gain removes."""
 MARGIN = 5.0
-"""Factor of the measured cross-talk that a gain must tolerate: beyond its range a sensor underestimates tilt."""
+"""Multiple of the measured cross-talk that a gain must tolerate: a sensor underestimates tilt beyond its range."""
 TOGETHER = 16
 """Frames whose statistics are summed in one go: for a single one, the calls of numpy cost more than the arithmetic."""
 _REGRESSORS = 5
@@ -158,8 +158,8 @@ class GainBank:
     def early(self, gain: Single) -> Single:
         """Gains (modes,) before the window is complete.
 
-        A better one for modes with a gain of 0 or the least gain (see `EARLY`), and 0 for modes that prove to be
-        cross-talk.
+        A mode with a gain of 0 or the least gain gets a better one if there is one (see `EARLY`), a mode whose signal
+        proves to be cross-talk gets 0, and all others keep theirs.
         """
         if self.first or len(self._excesses) < EARLY:
             return gain
@@ -185,7 +185,7 @@ class GainBank:
         self._cross_talk.held()
 
     def verdict(self, gain: Single, noise_nm2: Array | None) -> Verdict:
-        """Result of the window at gains (modes,), given a frame's noise (modes,) or None. It then restarts or grows."""
+        """Result of the window at gains (modes,), with a frame's noise (modes,) or None; then clear or lengthen it."""
         means, power = (np.mean(values, axis=0, dtype=float) for values in (self._means, self._powers))
         cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts)
         power -= (2 * means - cross_talk_nm) * cross_talk_nm

@@ -42,18 +42,19 @@ class Timing(NamedTuple):
 
     @classmethod
     def of(cls, delay: float, exposure: float) -> "Timing":
-        """Timing in which a command is in force when the first exposure wholly with it begins.
+        """Timing in which a command is in force from the start of the first exposure that sees it alone.
 
-        With a fractional delay the mirror moves when this fraction of an exposure is over.
+        With a fractional delay, the mirror moves when this fraction of the exposure before that one is over.
         """
         whole = delay // 1
         return cls(delay, whole + (delay - whole) * exposure, exposure)
 
     @classmethod
     def measured(cls, delay: float, exposure: float, waited: float) -> "Timing":
-        """Timing in which commands are in force `waited` periods after the end of their exposures.
+        """Timing in which a command is in force `waited` periods after the end of its frame's exposure.
 
-        Whole periods follow from `delay`; the result is that of `of` for a fractional delay or a time beyond it.
+        Only the fraction of a period is taken from `waited`, the whole periods from `delay`. For a fractional delay, or
+        if the command would be in force before the end of the exposure or after the delay, the result is that of `of`.
         """
         after = exposure + waited
         if delay != round(delay) or not exposure < after <= delay:
@@ -169,8 +170,8 @@ def continuous_residual_nm2(
 ) -> Array:
     """Mean square residual over each period (frames, modes), from the states at the start of each exposure.
 
-    The disturbance (frames, modes) is interpolated between those instants, and the mirror (frames, modes) holds until
-    it moves `moves_at` periods later to `next_nm`, by default its state in the next frame; NaN where there are too few
+    The disturbance (frames, modes) is interpolated between those instants. The mirror (frames, modes) holds for
+    `moves_at` periods and then moves to `next_nm`, by default its state in the next frame. NaN where there are too few
     neighbours.
     """
     mean_square = np.zeros_like(disturbance_nm)

@@ -71,14 +71,14 @@ def sensor_noise(
 
 
 def white_noise(law: LinearLaw, noise_nm: Array, timing: Timing) -> Term:
-    """Residual from noise of the modes (modes,) that is independent from frame to frame, over time as in `lag`."""
+    """Residual from noise of the modes (modes,) that is independent from frame to frame, averaged as in `lag`."""
     return Term(noise_nm**2 * noise_gain(law, held=timing.held > 0))
 
 
 def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -> Term:
     """Residual of a disturbance, from spectrum and mean (modes,) of its values at the start of each exposure.
 
-    It is a mean over the periods, or over the starts of exposures if `timing.held` is 0.
+    The residual is a mean over all time, or over the starts of exposures if `timing.held` is 0.
     """
     return Term(disturbance.variance_nm2(_passed(law, disturbance, timing)) + _steady_nm2(law, mean_nm))
 
@@ -153,11 +153,11 @@ def measurement_error(
     of_linear, of_nonlinear, of_basis = spectrum_of(linear), spectrum_of(nonlinear), spectrum_of(basis)
     if of_linear is None or of_nonlinear is None or of_basis is None:
         return None
-    passed, at_rest = noise_transfer(law, of_nonlinear.frequency_hz) ** 2, noise_transfer(law, np.zeros(1))[0] ** 2
-    steady = linear.mean(axis=0) ** 2 * at_rest
+    passed, at_0_hz = noise_transfer(law, of_nonlinear.frequency_hz) ** 2, noise_transfer(law, np.zeros(1))[0] ** 2
+    steady = linear.mean(axis=0) ** 2 * at_0_hz
     freedom = rows - basis.shape[1]
     # Residual from one unit of noise in each direction of the basis, (modes, directions).
-    by_chance = passed.T @ of_basis.power_nm2_hz * of_basis.spacing_hz + np.outer(at_rest, basis.mean(axis=0) ** 2)
+    by_chance = passed.T @ of_basis.power_nm2_hz * of_basis.spacing_hz + np.outer(at_0_hz, basis.mean(axis=0) ** 2)
     noise_nm2 = np.sum(nonlinear**2, axis=0) / freedom
     nonlinear_nm2 = of_nonlinear.variance_nm2(passed) * rows / freedom - noise_nm**2 * noise_gain(law)
     return MeasurementError(

@@ -147,7 +147,8 @@ def noise_transfer(law: LinearLaw, frequency_hz: Array, delay_frames: float | No
 def noise_gain(law: LinearLaw, delay_frames: float | None = None, *, held: bool = False) -> Array:
     """Residual variance (modes,) caused by white measurement noise, per variance of that noise in one frame.
 
-    It is that in an exposure, which with a fractional delay sees a mean of two commands, or with `held` over all time.
+    The residual is that of exposures, which see a mean of two commands if the delay is fractional; with `held`, it is
+    that over all time.
     """
     gain, weights = np.zeros(len(law.noll)), _weights(law, delay_frames)
     for part in _parts(law):
@@ -243,7 +244,7 @@ def _parts(law: LinearLaw) -> list[_Part]:
 
 
 def _first_linked(linked: Mask) -> Integers:
-    """First member (n,) of the connected group of each node, from links (n, n); importing scipy.sparse takes 0.3 s."""
+    """First member (n,) of each node's connected group, from links (n, n); the import of scipy.sparse takes 0.3 s."""
     while True:
         further = linked.astype(np.float32) @ linked.astype(np.float32) > 0
         if (further == linked).all():

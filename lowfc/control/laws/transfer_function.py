@@ -13,7 +13,7 @@ from lowfc.arrays import Array, Complex, Integers, Mask
 
 _FAINTEST = 1e-3  # relative to the mode's highest line; below is rounding to single precision
 _ADJACENT = np.array([*range(-16, -1), *range(2, 17)])  # bins from which a line's noise is measured
-_OF_FLANKS = 12 / 7  # white noise of a bin under Hann's window, relative to that of a flank less the line
+_OF_FLANKS = 12 / 7  # white noise power of a bin under Hann's window, over that of `flanks`, which lack the line
 _DB = 20 / np.log(10)
 
 SURE = 3.5
@@ -28,7 +28,7 @@ class Lines:
         mode: (lines,) index of its mode.
         frequency: (lines,) cycles per frame.
         rejection: (lines,) S, complex.
-        error: (lines,) standard error of each of S's two components.
+        error: (lines,) standard error of the real part of S, and of its imaginary part.
     """
 
     mode: Integers

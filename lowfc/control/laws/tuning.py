@@ -26,7 +26,8 @@ _WIDER = (10.0,)  # likewise, for lines that move
 _SETTLING_FRAMES = 5000
 _OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # overestimates of the noise variance, until the margins suffice
 _NEAR_ENOUGH = 0.25
-"""Octaves between a filter with sufficient margins and one without: their residuals agree within half a percent."""
+"""Octaves between a filter with sufficient margins and one without at which the search between them ends: their
+residuals agree within half a percent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +160,7 @@ def tune_lqg(
     residual_nm2 = np.nan_to_num([residual(blocks) for blocks in robust], nan=np.inf)
     best = residual_nm2.argmin(axis=0)
     modes = range(len(noll))
-    wins = residual_nm2.min(axis=0) < residual(integrators)  # integrators do not beat themselves
+    wins = residual_nm2.min(axis=0) < residual(integrators)  # false, too, for a mode that has no filter in `robust`
     chosen = [tried[best[mode]][mode] for mode in modes]
     law = law_of([robust[best[mode]][mode] if wins[mode] else integrators[mode] for mode in modes])
     return _tuned(law, timing, ["lqg" if better else "integrator" for better in wins], chosen)

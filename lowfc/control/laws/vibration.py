@@ -26,7 +26,7 @@ _HANN = 1.5  # neighbours are correlated: three count as two
 _LOBE = 12  # frequencies on either side of a line into which the window spreads it
 _FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
 _PER_DECADE = 48  # groups of averaged frequencies
-_MIN_DRIFT = 1e-8  # variance of its step per variance of noise: a constant is followed in 10^4 frames
+_MIN_DRIFT = 1e-8  # variance of the drift's step per variance of noise: a constant is followed in 10^4 frames
 _MIN_NOISE = 1e-3  # of the level at high frequencies, which drift may explain entirely: a filter needs some noise
 
 
@@ -83,7 +83,7 @@ class Model:
         return self.mean_over(1.0, 0.0), block_diag(*parts), np.array(seen)
 
     def mean_over(self, start: float, length: float) -> Array:
-        """Mean (states, states) of A^u, u from start to start + length frames, A as in `states`: predicts the mean."""
+        """Mean (states, states) of A^u over u from start to start + length frames, with A of `states`."""
 
         def mean_of(exponent: complex) -> complex:
             if not length or not exponent:
@@ -110,7 +110,7 @@ def identify(run: TimeSeries, rate_hz: float) -> Model | None:
     whittle = _Whittle.of(run, rate_hz)
     if whittle is None:
         return None
-    found = [whittle.fit(robust) for robust in (True, False)]  # a floor without the lowest frequencies may be far off
+    found = [whittle.fit(robust) for robust in (True, False)]  # a robust floor may be far off at the lowest frequencies
     return replace(min(found, key=whittle.cost), lowest_hz=rate_hz / run.longest)
 
 
@@ -268,7 +268,7 @@ class _Whittle:
         return line_of(minimize(cost, start, method="Nelder-Mead", options={"maxiter": 400, "xatol": 1e-3}).x)
 
     def needed(self, model: Model) -> tuple[Line, ...]:
-        """The lines that raise the likelihood significantly: one found early may have represented several."""
+        """The lines that raise the likelihood significantly; one found early may stand for several found after it."""
         for line in sorted(model.lines, key=lambda line: line.variance_nm2):
             fewer = replace(model, lines=tuple(other for other in model.lines if other is not line))
             if self.cost(fewer) < self.cost(model):
@@ -277,7 +277,7 @@ class _Whittle:
 
     def fit_all(self, model: Model) -> Model:
         """Fit all parameters together, starting from nearly right lines."""
-        model = self.fit_floor(model, robust=False)  # its range around the start is limited
+        model = self.fit_floor(model, robust=False)  # the fit of all parameters searches only near its start
         omega, power, counts = self.grouped(model.lines, robust=False)
         spacing, corner = self.spacing_hz, np.isfinite(model.cutoff_hz)
         allowed_hz = spacing, self.rate_hz / 2 - spacing

@@ -61,12 +61,12 @@ def missing_before(sequence: Sequences) -> Integers:
 
 
 def seen_nm(weights: Single, command_nm: Single, missing: Integers, first_nm: Single) -> Single:
-    """Command (steps, modes) that each exposure saw; under exposures without a step the command is held.
+    """Command (steps, modes) that each exposure saw; during exposures without a step the command is held.
 
     Args:
         weights: see `lowfc.control.laws.stability.delay_weights`.
         command_nm: (steps, modes) after each step.
-        missing: (steps,) of `missing_before`.
+        missing: (steps,) from `missing_before`.
         first_nm: (modes,) command before the first step.
     """
     held = np.minimum(missing, len(weights))  # holding longer than that changes nothing
@@ -88,7 +88,7 @@ def counterfactual(controller: Controller, weights: Single, pol_nm: Single, miss
         controller: the controller to fold; it is not called for refused frames, which hold the command.
         weights: see `lowfc.control.laws.stability.delay_weights`.
         pol_nm: (steps, modes) disturbance and measurement noise; NaN for refused frames, whose error is then NaN too.
-        missing: (steps,) of `missing_before`.
+        missing: (steps,) from `missing_before`.
     """
     usable = np.isfinite(pol_nm.sum(axis=1)).tolist()
     gaps = np.minimum(missing, len(weights)).tolist()
