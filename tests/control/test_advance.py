@@ -200,7 +200,7 @@ def test_before_the_first_command_a_tick_does_nothing_except_in_safe_mode() -> N
     assert outputs == Outputs()
     in_safe_mode, (_, outputs) = feed(DEFAULTS, state, Request(7, "safe"), Tick(7, 0))
     assert not outputs.command.actuators_nm.any()
-    assert outputs.command.clear_id == 7, "a mirror that knows newer frames applies it, too"
+    assert outputs.command.clear_id == 7, "so that even a mirror that has applied commands of newer frames accepts it"
     shape = MirrorShape(0, np.ones(GRID, np.float32), np.zeros(3, np.float32))
     assert feed(DEFAULTS, in_safe_mode, shape)[0] is in_safe_mode, "the shape is not adopted"
 

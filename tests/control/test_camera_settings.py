@@ -212,7 +212,7 @@ def surfaces(all_outputs: list[Outputs]) -> Single:
 
 
 def other_size() -> State:
-    """The model's calibration, and a camera of another size."""
+    """A controller with a calibration computed from the model, and a camera of another frame size."""
     computed = replace(calibration(), operator_hash="model")
     state, _ = feed(DEFAULTS, State(), Load(0, computed, "the configuration"), replace(CAMERA, shape=ODD.shape))
     return feed(DEFAULTS, state, *(odd(count) for count in range(1, 4)))[0]

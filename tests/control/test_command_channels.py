@@ -29,7 +29,7 @@ LOAD_OTHER = Request(0, "load", calibration=replace(calibration(scale=1.01), id=
 
 
 class ToyLoop:
-    """A loop with the toy's sensor and mirror: a command is seen in the next frame."""
+    """A loop with the sensor and the mirror of `TOY`: a command is seen in the next frame."""
 
     def __init__(self, setup: Settings = DEFAULTS, mode: LoopMode = LoopMode.CLOSED) -> None:
         self.setup = replace(setup, start_mode=mode)
@@ -155,7 +155,7 @@ def test_a_probe_sequence_plays_one_row_per_frame_and_ends(mode: LoopMode) -> No
     expected = [*(row @ basis for row in table[:2]), np.zeros(ACTUATORS), np.zeros(ACTUATORS)]
     for surface, shape in zip(played, expected, strict=True):
         assert np.allclose(surface.reshape(-1), shape, atol=1e-3)
-    assert np.allclose(loop.outputs[-3].step.command_nm, 0)  # the modal command excludes it
+    assert np.allclose(loop.outputs[-3].step.command_nm, 0)  # the modal command excludes the played shapes
 
 
 def test_a_probe_sequence_larger_than_the_slew_limit_leaves_no_offset() -> None:

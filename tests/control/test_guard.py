@@ -149,7 +149,7 @@ def test_one_bad_block_restarts_the_wait(law_nm2: float, void: bool) -> None:
 
 
 def test_the_law_returns_once_it_would_be_far_better() -> None:
-    """A law that hardly corrects is worse for a slow wave and better for white noise; at 200 Hz, for fewer frames."""
+    """A law that hardly corrects is worse for a slow wave and better for white noise; at 200 Hz few frames suffice."""
     setup = replace(SETUP, rate_hz=RATE_HZ / 5)
     spans = Spans.at(setup.rate_hz)
     law = integrator((0.01, 0.01, 0.3), (0.05, 0.05, 0.0), NOLL, 1.0, setup.rate_hz)

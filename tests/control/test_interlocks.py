@@ -17,7 +17,7 @@ from tests.support.toy import GRID, SOME, calibration, check_reply, feed, frame,
 
 SECOND_NS = 1_000_000_000
 MOVER = 7
-"""Lease of the client that moves the mask."""
+"""Identity of the lease of the client that moves the mask."""
 
 
 def under(action: Action, test: str = "equal", value: Value = True, *, acts_when_old: bool = True) -> Settings:

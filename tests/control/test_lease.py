@@ -19,7 +19,7 @@ from tests.support.toy import GRID, NOLL, SOME, check_reply, feed, frame, frame_
 DEFAULTS = settings(rate_hz=1000.0)
 HOLDER = "lowfc calibrate (anna, pid 7)"
 MINE = 11
-"""Lease of the holder."""
+"""Identity of the holder's lease."""
 SECOND_NS = 1_000_000_000
 
 
@@ -176,7 +176,7 @@ def test_a_lease_lasts_its_seconds_at_any_frame_rate(period_ns: int, ahead_ns: i
 
 
 @pytest.mark.parametrize("time_ns", [0, frame(3).time_ns + 10 * SECOND_NS])
-def test_frames_count_after_a_silence_and_without_times(time_ns: int) -> None:
+def test_each_frame_counts_as_one_period_after_a_silence_and_if_frame_times_do_not_increase(time_ns: int) -> None:
     *lasting, last = (frame(count, SOME, time_ns=time_ns) for count in range(4, 1005))
     state, all_outputs = feed(DEFAULTS, held(1.0), *lasting)
     assert "LEASE_ENDED" not in names(all_outputs)

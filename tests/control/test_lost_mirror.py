@@ -102,7 +102,7 @@ def test_a_mirror_gets_no_command_before_it_reports_and_does_not_jump() -> None:
     assert in_safe_mode.command.safe
 
 
-@pytest.mark.parametrize("first_frames", [(), frames(1)], ids=["never", "no more"])
+@pytest.mark.parametrize("first_frames", [(), frames(1)], ids=["no frame yet", "frames have stopped"])
 def test_without_a_camera_the_loop_is_not_closed(first_frames: list[Frame]) -> None:
     setup = settings(start_mode=LoopMode.OPEN)
     state, _ = feed(setup, loaded(setup), *first_frames, Tick(0, DEFAULTS.frame_timeout_ns + 1))

@@ -321,8 +321,8 @@ def test_poorly_measured_combinations_can_be_truncated_or_damped() -> None:
     one_nm, noll = np.ones(4, np.float32), (2, 3, 4, 5)
     assert "Z4 and Z5" in advice(whole, noll, one_nm) or "Z5 and Z4" in advice(whole, noll, one_nm)
     assert "no regularisation" in advice(whole, noll, 1e6 * one_nm)
-    assert "no regularisation" in advice(whole, noll, np.array([1, 1, 1e6, 1e6]))  # that of its largest mode counts
-    assert "--truncate" not in advice(whole, noll, 1e-9 * one_nm)  # which would leave no combination
+    assert "no regularisation" in advice(whole, noll, np.array([1, 1, 1e6, 1e6]))  # small limits of other modes
+    assert "--truncate" not in advice(whole, noll, 1e-9 * one_nm)  # truncation would leave no combination
     for cut in np.linspace(0.01, 0.02, 20):
         with_smallest = whole._replace(singular_values=np.array([1, 0.5, 0.3, cut]))
         advised = float(advice(with_smallest, noll, 0.9 / cut * one_nm).split()[-1])

@@ -167,7 +167,7 @@ def test_a_mode_with_only_tilt_cross_talk_gets_no_gain(closed: bool) -> None:
 
 
 def test_the_reported_change_excludes_the_cross_talk_margin() -> None:
-    """Of a true 20 nm with 2.7 nm of cross-talk, the loop leaves the cross-talk."""
+    """The mode has a true 20 nm and 2.7 nm of cross-talk: a loop would leave a true residual of 2.7 nm."""
     tilt_nm, modes_nm = _vibrating(1000, 19)
     modes_nm[:, 4] += 20
     [verdict] = verdicts(bank(), modes_nm, np.full(MODES, 0.1, np.float32), 1.0, tilt_nm)
@@ -196,7 +196,7 @@ def test_a_gain_due_to_tilt_cross_talk_is_removed_before_the_window_ends() -> No
 
 
 def test_tilt_cross_talk_does_not_favour_a_gain() -> None:
-    """A true -2.72 nm hides behind 2.7 nm of cross-talk: no loop measures it."""
+    """A true aberration of -2.72 nm and 2.7 nm of cross-talk cancel in the measurement: a gain corrects nothing."""
     tilt_nm, modes_nm = _vibrating(1000, 23)
     modes_nm[:, 4] -= 2.72
     assert verdicts(bank(), modes_nm, ZEROS, 1.0, tilt_nm)[0].gain[4] == 0

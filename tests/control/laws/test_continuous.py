@@ -173,7 +173,8 @@ def test_the_held_residual_is_recovered_from_noisy_measurements() -> None:
     assert squares[0] / counted == pytest.approx(theory, rel=0.03)
 
 
-def states_over(model: Model, start: float, length: float) -> Array:
+def mean_by_sum(model: Model, start: float, length: float) -> Array:
+    """As `Model.mean_over`, by a sum over fine time steps."""
     A = model.states()[0]
     values, vectors = np.linalg.eig(A)
     u = start + (np.arange(4000) + 0.5) / 4000 * length
@@ -184,6 +185,6 @@ def states_over(model: Model, start: float, length: float) -> Array:
 def test_predicted_means_of_the_states_agree_with_a_fine_sum() -> None:
     model = Model(1e-3, 40.0, (Line(37.0, 2.0, 9.0), Line(120.0, 1.0, 1.0)), 1.0, RATE_HZ)
     for start, length in ((1.0, 1.0), (0.0, 0.5), (2.4, 1.0)):
-        np.testing.assert_allclose(model.mean_over(start, length), states_over(model, start, length), atol=1e-6)
+        np.testing.assert_allclose(model.mean_over(start, length), mean_by_sum(model, start, length), atol=1e-6)
     np.testing.assert_allclose(model.mean_over(1.0, 0.0), model.states()[0], atol=1e-12)
     np.testing.assert_array_equal(model.mean_over(0.0, 0.0), np.eye(6))

@@ -1,4 +1,4 @@
-"""The ideal wheel, lines without width: continuous residual of laws, and what one instant per frame hides."""
+"""Laws on the ideal reaction wheel, whose lines have no width: their residual in continuous time and at instants."""
 
 from typing import Any
 

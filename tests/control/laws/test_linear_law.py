@@ -254,7 +254,7 @@ def test_a_stable_loop_settles(gain: float, true_frames: float, signal: Signal) 
     """A loop that `margins` calls stable settles after a step, also if the true delay is not the law's."""
     law = integrators([(gain, 0.0)], signal, 1.0)
     margins_ = margins(law, true_frames)
-    if abs(margins_.radius[0] - 1) > 0.03:  # nearer to 1, 400 frames do not show which it is
+    if abs(margins_.radius[0] - 1) > 0.03:  # nearer to 1, 400 frames do not show whether the loop is stable
         residual = run(law, np.ones((400, 1)), true_frames, limit_nm=1e6)[0][-1, 0]
         assert margins_.stable == (abs(residual) < 0.01)
 
