@@ -46,7 +46,7 @@ from tests.support.toy import (
     settings,
 )
 
-COMMANDS = 40
+REQUEST_COUNT = 40
 """Number of requests in each run."""
 TIGHT: dict[str, object] = {"limit_nm": (40.0, 15.0), "max_saturated_pixels": 0}
 CALIBRATION = identified(calibration())
@@ -329,8 +329,8 @@ def test_random_inputs_are_handled_purely_and_within_the_limits(seeds: int) -> N
     rng = np.random.default_rng(6)
     counts: Counter[tuple[str, bool]] = Counter()
     for seed in range(seeds):
-        requests: list[str] = rng.choice([*NAMES, *NAMES, "safe"], COMMANDS).tolist()
-        pauses: list[int] = rng.choice([0, 1, 2, 5, 12], COMMANDS).tolist()
+        requests: list[str] = rng.choice([*NAMES, *NAMES, "safe"], REQUEST_COUNT).tolist()
+        pauses: list[int] = rng.choice([0, 1, 2, 5, 12], REQUEST_COUNT).tolist()
         delay_frames, on_frame_timeout = float(rng.choice([1.0, 1.5, 3.0])), str(rng.choice(["hold", "flat"]))
         tight = TIGHT if seed % 2 else {}
         setup = settings(delay_frames=delay_frames, on_frame_timeout=on_frame_timeout, **tight)

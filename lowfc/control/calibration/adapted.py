@@ -26,7 +26,7 @@ def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_
 
 
 def on_pixels(calibration: Calibration, good: Array) -> Calibration:
-    """The calibration with fewer good pixels, 1 where `good` (pixels,) keeps them, and an R that leaves R H unchanged.
+    """The calibration on fewer pixels (`good` (pixels,) is 1 where one stays), with an R that leaves R H unchanged.
 
     Pixels that were bad stay bad. I0 and H are normalised to the flux on the remaining pixels. `operator_hash` and `id`
     of the result are empty.

@@ -21,7 +21,7 @@ _ANGLES = 72
 _ALIKE, _EXACT = 2.0, 0.01
 """The other parity is possible, too, if its residual is below this multiple of the better one's or below this value."""
 _CIRCULAR = 0.05
-"""Relative change by a rotation below which an image counts as circular; a circle's, due to its pixels, is 0.01."""
+"""Relative change by a rotation below which an image counts as circular; that of a circle on pixels is 0.01."""
 
 
 @dataclass(frozen=True, slots=True)

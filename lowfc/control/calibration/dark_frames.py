@@ -12,7 +12,7 @@ _SIGMAS = 8.0
 _ROUNDING_DN = 0.6
 """Largest noise that rounding to whole DN may add to a pixel, or remove from it, in many frames."""
 _MAX_LIGHT = 0.02
-"""Largest fraction of the star's light in dark frames."""
+"""Largest allowed fraction of the star's light in dark frames."""
 _TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 

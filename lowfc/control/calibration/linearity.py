@@ -72,9 +72,9 @@ def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Integers, frames
 def captured(error_nm: Array, command_nm: Array, mode: int, level_nm: float, before: slice, after: slice) -> bool:
     """Whether a closed loop corrected a step of one mode.
 
-    No mode may have an error left, and the command of that mode must have moved against the step, because a loop that
-    settled at another point has no error either. Commands of other modes may follow a drift. Errors and commands are
-    (frames, modes), nm rms; `before` are frames before the step, `after` those in which the loop has settled again.
+    No mode may have an error left, and the command of that mode must have moved against the step: a loop that settled
+    at another zero of the sensor has no error either. Commands of other modes may follow a drift. Errors and commands
+    are (frames, modes), nm rms; `before` are frames before the step, `after` those in which the loop has settled again.
     """
     moved_nm = command_nm[after, mode].mean() - command_nm[before, mode].mean()
     residual_nm = error_nm[after].mean(axis=0)

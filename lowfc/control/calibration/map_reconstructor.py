@@ -9,7 +9,7 @@ from lowfc.control.calibration.calibration import Calibration, noise_nm2
 from lowfc.control.loop.camera import CameraSettings
 
 
-@lru_cache(maxsize=2)  # a verdict on the gains, the request for them and their use need the same one
+@lru_cache(maxsize=2)  # a verdict on the gains, the request for them and their use need the same covariance
 def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: CameraSettings | None) -> Array | None:
     """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront rms, with the flux normalisation.
 

@@ -115,7 +115,7 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
 
 
 def usable(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: int) -> Mask:
-    """Whether each exposure (exposures,) sees a usable row, and each frame since the row before that led to a command.
+    """Whether each exposure (exposures,) sees a usable row, and all frames from the row before it on led to commands.
 
     Args:
         plan: The plan that was played.

@@ -384,7 +384,7 @@ def _better(blocks: Array) -> tuple[Array, Mask]:
 
 
 def injected(gain: Single) -> Single:
-    """Fraction (modes,) of a frame's noise variance that an integrator of this gain puts on the mirror, delay 1."""
+    """Fraction (modes,) of a frame's noise variance that an integrator puts on the mirror, for a delay of one frame."""
     return gain / (2 - gain)
 
 

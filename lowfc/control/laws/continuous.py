@@ -53,8 +53,8 @@ class Timing(NamedTuple):
     def measured(cls, delay: float, exposure: float, waited: float) -> "Timing":
         """Timing in which a command is in force `waited` periods after the end of its frame's exposure.
 
-        Only the fraction of a period is taken from `waited`, the whole periods from `delay`. For a fractional delay, or
-        if the command would be in force before the end of the exposure or after the delay, the result is that of `of`.
+        The whole periods follow from `delay`, the fraction of a period from `exposure + waited`. The result is that of
+        `of` for a fractional delay, or if the command would be in force by the end of the exposure or after the delay.
         """
         after = exposure + waited
         if delay != round(delay) or not exposure < after <= delay:

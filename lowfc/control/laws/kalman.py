@@ -13,7 +13,7 @@ from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import Block, LinearLaw, law_from_blocks
 from lowfc.control.laws.vibration import Model
 
-_DOUBLINGS = 40  # most iterations
+_DOUBLINGS = 40  # largest number of iterations
 
 
 def lqg(models: Sequence[Model], noll: tuple[int, ...], timing: Timing) -> LinearLaw:

@@ -10,15 +10,17 @@ from lowfc.arrays import Array
 from lowfc.control.laws.linear_law import Block, LinearLaw, law_from_blocks
 from lowfc.control.laws.stability import delay_weights
 
-_EXACT = 1e-6  # variance of limited commands relative to the states'; the Riccati equation needs one above 0
-_UNKNOWN = 1e-3  # variance of the unknown part: more delays the return from a limit, less keeps wrong states longer
+_EXACT = 1e-6  # noise variance of the limited commands in `_correction`; the Riccati equation needs one above 0
+_UNKNOWN = 1e-3
+"""Variance of unknown changes of the states in `_correction`: a larger one delays the return from a limit, with a
+smaller one wrong states last longer."""
 
 
 class Notch(NamedTuple):
-    """A notch of the rejection: at `frequency_hz` it is divided by `depth`.
+    """A notch: at `frequency_hz`, the rejection is divided by `depth`.
 
-    `width_hz` is the width between its -3 dB points if it is deep (at a depth of 4, 6 % less). Neighbours deepen each
-    other.
+    `width_hz` is the width between its -3 dB points if it is deep (at a depth of 4, 6 % less). Neighbouring notches
+    deepen each other.
     """
 
     frequency_hz: float
@@ -109,7 +111,7 @@ def _correction(P: Array, B: Array, C: Array) -> Array:
     """M (states,): share of each state in the correction by a limit.
 
     C (s + M (c - C s)) = c for the limited command c. Without notches the integral takes all of it. Otherwise M is the
-    steady Kalman gain of a law's states from its limited commands, for errors of variance 1 and a small unknown part.
+    steady Kalman gain of a law's states from its limited commands, for errors of variance 1 and small unknown changes.
     """
     if len(C) == 2:
         return np.array([1.0, 0.0])

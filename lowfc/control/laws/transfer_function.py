@@ -11,7 +11,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Complex, Integers, Mask
 
-_FAINTEST = 1e-3  # relative to the mode's highest line; below is rounding to single precision
+_FAINTEST = 1e-3  # amplitude of a line, relative to the mode's highest; fainter ones are rounding to single precision
 _ADJACENT = np.array([*range(-16, -1), *range(2, 17)])  # bins from which a line's noise is measured
 _OF_FLANKS = 12 / 7  # white noise power of a bin under Hann's window, over that of `flanks`, which lack the line
 _DB = 20 / np.log(10)

@@ -24,7 +24,7 @@ from lowfc.control.laws.what_if import counterfactual, driven_by
 _NARROWER = (0.1, 0.01, 1e-3)  # factors tried on the fitted width of a line that a log cannot resolve
 _WIDER = (10.0,)  # likewise, for lines that move
 _SETTLING_FRAMES = 5000
-_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # overestimates of the noise variance, until the margins suffice
+_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # overestimates of the noise variance, tried until the margins suffice
 _NEAR_ENOUGH = 0.25
 """Octaves between a filter with sufficient margins and one without at which the search between them ends: their
 residuals agree within half a percent."""

@@ -27,7 +27,7 @@ _LOBE = 12  # frequencies on either side of a line into which the window spreads
 _FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
 _PER_DECADE = 48  # groups of averaged frequencies
 _MIN_DRIFT = 1e-8  # variance of the drift's step per variance of noise: a constant is followed in 10^4 frames
-_MIN_NOISE = 1e-3  # of the level at high frequencies, which drift may explain entirely: a filter needs some noise
+_MIN_NOISE = 1e-3  # least noise over the level at high frequencies, which drift may explain: a filter needs some noise
 
 
 @dataclass(frozen=True, slots=True)

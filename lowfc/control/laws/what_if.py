@@ -28,7 +28,7 @@ _NOT_NEW = sum(1 << reason for reason in NOT_NEW)
 
 
 def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
-    """A linear law from rest and a flat mirror; `limit_nm` (modes,) clips its commands, as in the live loop."""
+    """A linear law as a controller, at first at rest with a flat mirror; `limit_nm` (modes,) clips its commands."""
 
     def step(before: tuple[Single, Single] | None, error_nm: Single, pol_nm: Single) -> tuple[Any, Single]:
         x, held_nm = before or (at_rest(law), np.zeros_like(error_nm))
@@ -42,7 +42,7 @@ def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
 
 
 def limited_integrator(law: Integrator) -> Controller:
-    """The live loop's integrator with its limits."""
+    """The live loop's integrator, with its limits, as a controller."""
     noll = tuple(range(2, 2 + law.gain.size))  # these, delay and rate are not used
     return driven_by(integrator(law.gain, law.leak, noll, 1.0, 1.0), law.limit_nm)
 
@@ -112,8 +112,8 @@ def counterfactual(controller: Controller, weights: Single, pol_nm: Single, miss
 def delay_from_truth(true_nm: Single, command_nm: Single, missing: Integers) -> float | None:
     """Delay in frames at which the commands (steps, modes) best match the mirror's true motion (steps, modes).
 
-    The least-squares fit of `delay_weights`; `true_nm` may have rows of NaN. None if the commands hardly move, or if
-    fewer than 20 rows are finite.
+    It follows from a least-squares fit of `delay_weights`; `true_nm` may have rows of NaN. None if the commands hardly
+    move, or if fewer than 20 rows are finite.
     """
     rows = np.isfinite(true_nm).all(axis=1)
     if rows.sum() < _FEWEST:

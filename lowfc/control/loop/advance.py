@@ -154,7 +154,7 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
 
 
 def _camera_started(state: State, frame: Frame) -> State:
-    """The state at the first frame after a start of the camera: settings from an earlier start are not used further."""
+    """The state at the first frame of a camera start: settings are awaited if those known are of another start."""
     camera = state.conditions.camera
     if camera is None or camera.start_s in (0, frame.sequence >> COUNT_BITS):
         return state
@@ -210,7 +210,7 @@ def _limit_cause(limits: tuple[Reason, ...]) -> str:
 def _refuse(
     settings: Settings, state: State, frame: Frame, reason: Rejection, events: list[PendingEvent]
 ) -> tuple[State, Outputs]:
-    """State and outputs after a refused frame: except in safe mode and as at `UNMEASURED`, the command is held."""
+    """State and outputs after a refused frame: the command is held, except in safe mode and as `UNMEASURED` allows."""
     if reason is not state.refused:
         events.append(PendingEvent("FRAMES_REFUSED", {"reason": reason.name}))
     loop, returning_to_zero, limits_hit = state.loop, state.returning_to_zero, state.limits_hit

@@ -79,7 +79,7 @@ class PlayTable(NamedTuple):
 
 
 class Play(NamedTuple):
-    """A table that is being played: its first row for the frame `first_sequence`, and `frames` rows in all."""
+    """A table that is being played: `frames` of its rows (fewer once stopped), the first for frame `first_sequence`."""
 
     table: PlayTable
     first_sequence: int

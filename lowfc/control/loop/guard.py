@@ -1,7 +1,7 @@
 """The guard of a linear law: an integrator on the same frames, which takes over if the law does worse.
 
 Tip and tilt are judged apart from the other modes, as the larger group would hide the smaller. While the law drives a
-group, the integrator's commands and errors are computed only (virtual) there, and vice versa.
+group, the integrator is virtual there (its commands and errors are only computed), and vice versa.
 
 Squared errors are compared in blocks of frames, and several blocks in a row decide: a step of the disturbance, from
 which a law may recover more slowly than the integrator, affects one or two blocks; shifted vibration lines affect all.
@@ -29,12 +29,12 @@ BETTER_S = 10.0
 MAX_TAKEOVERS = 4
 """Number of takeovers after which only an operator can let the law drive again."""
 WORSE, BETTER = 1.2, 0.25
-"""Ratio of the law's mean squared error to the integrator's above which the law is worse, and below which better."""
+"""The law is worse if its mean squared error is above `WORSE` times the integrator's, and better if below `BETTER`."""
 LONG_TERM_S = 10.0
 """Time constant of the long-term mean square of the pseudo-open-loop modes."""
 AMPLIFIED = 2.5
-"""Ratio of the mean squared error to the long-term mean square of the pseudo-open-loop modes above which the loop
-amplifies; not if the ratio to their mean square in the block is below `BETTER`: then the disturbance has grown."""
+"""The loop amplifies if its mean squared error is above this multiple of the long-term mean square of the pseudo-open-
+loop modes, unless it is below `BETTER` times their mean square in the block: then the disturbance has grown."""
 
 NAMES = ("tip and tilt", "the other modes")  # of the groups
 LAW_RETURNS = "law returns"
@@ -112,15 +112,15 @@ class LawGuard(NamedTuple):
     """The guard's state, from one frame to the next.
 
     Attributes:
-        spans: at the law's frame rate.
+        spans: durations at the law's frame rate.
         members: (modes, groups) 1 where a mode belongs to the group.
         groups: in the order of `members`.
-        frames: frames of the current block.
+        frames: number of frames in the current block so far.
         sums_nm2: (3, groups) sums of squares: errors, virtual errors, pseudo-open-loop modes.
         void: whether the virtual loop was interrupted during the block.
         virtual_nm: virtual commands (modes,), newest first: for each mode, of the controller that does not drive it;
             empty until the virtual loop starts from the loop's commands.
-        x: (states,) of the law as if it drove the overruled modes too; None while no mode is overruled.
+        x: state (states,) of the law as if it drove the overruled modes too; None while no mode is overruled.
     """
 
     spans: Spans
@@ -155,7 +155,7 @@ class LawGuard(NamedTuple):
         return LawGuard(self.spans, self.members, tuple(groups), 0, np.zeros_like(self.sums_nm2))
 
     def reset(self) -> "LawGuard":
-        """Reset for a law that takes over from the integrator; the long-term mean squares are kept."""
+        """A copy for a law that begins to take over from the integrator: only the long-term mean squares are kept."""
         return self.with_groups([Group(usual_nm2=group.usual_nm2) for group in self.groups])
 
     def at_rest(self) -> "LawGuard":

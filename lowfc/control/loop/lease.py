@@ -1,9 +1,10 @@
 """A lease: the loop is reserved for one client, and other clients' requests that would change it are refused.
 
-It separates cooperating programs and is no access control: its identity is in the controller's state, open to all.
+A lease separates cooperating programs. It is no access control: its identity is in the controller's state, which every
+client can read.
 
-It ends when its holder releases it or does not renew it in time, on `safe` from any client, and on `open`, `pause` or
-`stop` from another client.
+A lease ends when its holder releases it or does not renew it in time, on `safe` from any client, and on `open`, `pause`
+or `stop` from another client.
 """
 
 from math import ceil

@@ -319,7 +319,7 @@ def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
 
 
 def _changed(state: State, mode: LoopMode, time_ns: int, cause: str, events: list[PendingEvent]) -> State:
-    """Change the loop mode, and add its events if it differs."""
+    """Change the loop mode and add the events of the change, unless the loop is in this mode already."""
     if mode is state.mode:
         return state
     events.append(mode_event(state.mode, mode, cause))

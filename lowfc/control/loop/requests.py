@@ -62,7 +62,7 @@ def _handler(request: Request, lease_before: Lease | None) -> "Handler":
 
 
 def prepared(settings: Settings, request: Request) -> Request:
-    """Do the slow checks of a request that need no state; the process calls it where no frame waits for it.
+    """Do the slow checks of a request that need no state; the process calls this where no frame has to wait.
 
     A fault becomes its `refusal`. A prepared request is returned unchanged.
     """
@@ -93,10 +93,10 @@ def _status(settings: Settings, state: State, request: Request) -> Handled:
 
 
 def _mode(settings: Settings, state: State, request: Request) -> Handled:
-    """open, close, safe, clear, pause; a paused loop is open and holds its command until it is closed again."""
+    """Requests open, close, safe, clear and pause; a paused loop is open, and holds its command until closed again."""
     name = "open" if request.name == "pause" else request.name
     after = _granted(state, name)
-    if request.name == "clear":  # the sequences of the camera and the mirror may restart, too
+    if request.name == "clear":  # resets the newest frame's sequence, and by its `clear_id` the mirror's
         conditions = state.conditions._replace(clear_id=request.time_ns)
         state = state._replace(frame_sequence=0, conditions=conditions)
     reply, paused = _REPLIES[request.name], state.conditions.mode_cause == PAUSED
@@ -179,7 +179,7 @@ def _reset(settings: Settings, state: State, request: Request) -> Handled:
 
 
 def _integrator(settings: Settings, state: State, request: Request) -> Handled:
-    """gain, leak and limit of the integrator."""
+    """Requests gain, leak and limit."""
     loop, text, *events = change_integrator(settings, _calibrated_loop(state), request)
     return state._replace(loop=loop), text, *events
 
@@ -229,7 +229,7 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
     if channels.play is not None and not channels.play.over(state.frame_sequence + 1):
         raise ValueError("a probe sequence is being played already: `lowfc ctl stop` ends it")
     table = request.played
-    assert table is not None  # noqa: S101  # prepared
+    assert table is not None  # noqa: S101  # `prepared` has made it
     if table.target == MIRROR:
         grid = loop.calibration.grid
         if table.basis.shape[1] != grid[0] * grid[1]:

@@ -83,7 +83,7 @@ def lease_ended(state: State, why: str) -> tuple[State, list[PendingEvent]]:
 
 
 def permit(settings: Settings, state: State, request: Request) -> tuple[State, str, *tuple[PendingEvent, ...]]:
-    """Permit a move on the bench; with a duration, the loop is reserved and a closed one holds its command.
+    """Permit a move on the bench; with a duration, the loop is reserved, and a closed loop holds its command.
 
     Raises:
         ValueError: the move is refused, with the reason; or the request is invalid.

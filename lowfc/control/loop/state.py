@@ -87,7 +87,7 @@ class Settings:
 
 
 class LawRunner(NamedTuple):
-    """A running linear law: its state x (states,), and the frames that it has processed since it began to observe.
+    """A running linear law: its state x (states,), and the number of frames processed since it began to observe.
 
     It observes for `SETTLING_FRAMES`; over the next `FADING_FRAMES` it takes over from the integrator in a cross-fade,
     so that the mirror does not jump. When the loop closes, `frames` is set back to at most `SETTLING_FRAMES`. Once
@@ -220,7 +220,7 @@ class ActiveLoop(NamedTuple):
         return self._replace(integrator=replace(integrator, uncorrected=self.automatic & (integrator.gain == 0)))
 
     def with_weighting(self, weighting: Weighting | None) -> "ActiveLoop":
-        """A copy with R and `to_modes` for these uncorrected modes and this flux; None for those of the calibration."""
+        """A copy with R and `to_modes` for this weighting; with None, they are those of the calibration."""
         calibration, channels = self.calibration, self.command_channels
         to_modes = _own_to_modes(calibration, self.inverse)
         if weighting is not None:
@@ -336,7 +336,7 @@ class State(NamedTuple):
 
     @property
     def may_command(self) -> bool:
-        """Whether commands may be sent; at the first one, a faulty mirror might jump, so that needs safe mode."""
+        """Whether commands may be sent; to a faulty mirror, which might jump, the first one only in safe mode."""
         return self.commanded or not self.conditions.mirror_fault or self.mode is LoopMode.SAFE
 
     @property

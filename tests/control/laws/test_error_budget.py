@@ -33,7 +33,7 @@ def test_the_noise_of_a_loop_with_one_frame_of_delay_has_a_closed_form() -> None
 
 @pytest.mark.parametrize(("delay", "gain", "leak"), [(1.5, 0.5, 0.0), (2.3, 0.2, 0.02), (2.0, 0.3, 0.0)])
 def test_over_all_time_the_noise_is_that_of_the_commands(delay: float, gain: float, leak: float) -> None:
-    """With a fractional delay an exposure sees a mean of two commands, with less noise; from a single frame's noise."""
+    """The expected values follow from the noise of one frame; an exposure may see a mean of two commands."""
     weights, commands, seen = delay_weights(delay), [0.0] * 5, [0.0]
     for frame in range(2000):
         seen.append(float(weights @ commands[: -1 - len(weights) : -1]))
