@@ -20,7 +20,7 @@ def due_ns(warmup: CacheWarmup, now_ns: int) -> int:
     return now_ns + warmup.wait_ns(START_NS + now_ns)
 
 
-def test_one_warm_up_before_each_frame_after_the_first() -> None:
+def test_there_is_one_warm_up_before_each_frame_after_the_first() -> None:
     warmup = CacheWarmup(PERIOD_NS)
     assert warmup.wait_ns(START_NS) is None
     assert not warmup.due(START_NS)
@@ -33,7 +33,7 @@ def test_one_warm_up_before_each_frame_after_the_first() -> None:
     assert warmup.wait_ns(start_ns) is None
 
 
-def test_no_warm_up_that_would_delay_the_frame() -> None:
+def test_a_warm_up_that_would_delay_the_frame_is_omitted() -> None:
     late_ns = START_NS + PERIOD_NS - MIN_LEAD_NS + 1
     warmup = after(0)
     assert not warmup.due(late_ns)
@@ -58,5 +58,5 @@ def test_the_schedule_follows_a_camera_with_a_different_clock_rate(scale: float)
     assert next_ns == pytest.approx(arrivals_ns[-1] + PERIOD_NS * scale - LEAD_NS, abs=30_000)
 
 
-def test_no_warm_up_at_short_frame_periods() -> None:
+def test_there_is_no_warm_up_at_short_frame_periods() -> None:
     assert after(0, period_ns=MIN_PERIOD_NS).wait_ns(START_NS) is None

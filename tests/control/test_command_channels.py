@@ -105,7 +105,7 @@ def test_the_shift_of_the_zero_point_is_delayed_like_the_mirror(delay_frames: fl
 
 
 def test_an_external_shape_is_neither_undone_nor_commanded() -> None:
-    """It does not count for the loop's limits and does not end with safe mode, since others applied it."""
+    """The loop's limits do not apply to the external shape and safe mode does not end it, since others applied it."""
     loop, external = ToyLoop(), dark_hole(60.0)
     unseen = dark_hole(2 * DEFAULTS.limits.stroke_nm, seed=6)  # beyond the loop's limits
     external += unseen - (TOY.modes_to_actuators @ (loop.to_modes @ unseen.reshape(-1))).reshape(GRID)
@@ -158,7 +158,7 @@ def test_a_probe_sequence_plays_one_row_per_frame_and_ends(mode: LoopMode) -> No
     assert np.allclose(loop.outputs[-3].step.command_nm, 0)  # the modal command excludes the played shapes
 
 
-def test_a_probe_sequence_larger_than_the_slew_limit_leaves_no_offset() -> None:
+def test_a_probe_sequence_larger_than_the_slew_limit_leaves_nothing_on_the_mirror() -> None:
     loop = ToyLoop(mode=LoopMode.OPEN)
     loop.run(2)
     held = loop.surfaces[-1]
@@ -192,7 +192,7 @@ def test_channels_whose_sum_exceeds_the_stroke_are_refused() -> None:
 
 
 @pytest.mark.parametrize("end", ["stop", "safe", "close", "limit", "restart", "load"])
-def test_a_probe_sequence_ends_with_a_request_a_limit_a_restart_or_another_calibration(end: str) -> None:
+def test_a_request_a_limit_a_camera_restart_or_another_calibration_ends_a_probe_sequence(end: str) -> None:
     loop = ToyLoop(mode=LoopMode.OPEN)
     loop.run(2)
     table = np.ones((50, 1), np.float32)

@@ -246,7 +246,7 @@ def short_settling(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_modal_noise_agrees_with_images() -> None:
-    """Modes of an open loop without a disturbance, and the residual tilt of the integrator on the reaction wheel."""
+    """For an open loop without a disturbance, and for the residual tilt of the integrator on the reaction wheel."""
     config = configured(**{"disturbance.preset": "quiet"}, **SMALL_MIRROR)
     calibration_ = calibrated(config)
     bench = Bench(config, calibration_)

@@ -1,4 +1,4 @@
-"""The limits of the mirror hold exactly, in float64, for any request; tests catch each mutation of their source."""
+"""The limits of the mirror hold exactly, in float64, for any requested shape; tests catch mutations of the source."""
 
 import importlib.util
 import pkgutil

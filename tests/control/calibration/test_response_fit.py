@@ -80,7 +80,7 @@ def test_a_dither_depends_on_its_seed() -> None:
     assert first.per_column == 100
 
 
-def test_frames_grow_with_the_square_of_the_signal_to_noise() -> None:
+def test_the_number_of_frames_grows_with_the_square_of_the_signal_to_noise_ratio() -> None:
     assert frames_for(100, 2.0, 4.0) == 2500
     assert frames_for(200, 2.0, 4.0) == 10_000
 

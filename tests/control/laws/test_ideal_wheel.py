@@ -30,7 +30,7 @@ def wheel(**keys: Any) -> tuple[Configuration, Bench]:
 
 
 def residual_mas(bench: Bench, run: TimeSeries, timing: Timing, *, continuous: bool = True) -> float:
-    """Continuous residual, or at the starts of exposures, with the law tuned from a run for a timing, mas."""
+    """Residual in mas, over all time or only at the starts of exposures, with the law tuned from a run for a timing."""
     rate_hz, no_leak = bench.config.camera.rate_hz, np.zeros(2)
     gains = best_gains(run, rate_hz, timing, no_leak)
     bench.load(tune_lqg(run, identify_modes(run, rate_hz), gains, (2, 3), no_leak, timing).law)
@@ -40,7 +40,7 @@ def residual_mas(bench: Bench, run: TimeSeries, timing: Timing, *, continuous: b
 
 
 def residual_between_instants_mas(bench: Bench) -> float:
-    """Continuous residual of the last frames from the commands, for a camera with one instant per frame, mas."""
+    """Residual in mas over all time in the last frames, from the commands of a loop whose camera images an instant."""
     sampler = Sampler(disturbance_of(bench.config), (np.arange(8) + 0.5) / 8, bench.config.camera.rate_hz)
     counts = [count_of(step.frame_sequence) for step in bench.steps[-MEASURE:]]
     disturbance_nm = np.array([sampler.at(count) for count in counts[1:]], float)

@@ -125,7 +125,7 @@ def law(gain: tuple[float, float] = GAIN) -> Integrator:
 
 
 def run_probe(setup: Settings, request: Request) -> tuple[Array, Array, State]:
-    """Errors and commands (frames, modes) of the toy's loop during a probe sequence, and its state afterwards.
+    """Errors and commands (frames, modes) of `run_toy` during a probe sequence, and the state afterwards.
 
     The disturbance is white noise and a slow sine that is not a line of the multisine.
     """

@@ -102,7 +102,7 @@ def test_the_drift_is_identified_down_to_the_lowest_frequencies(
 
 
 def test_drift_is_not_identified_as_a_line() -> None:
-    """A bright star: above its band of up to 1 Hz, the drift hardly exceeds the noise."""
+    """With a bright star, and a drift up to 1 Hz that hardly exceeds the noise above this band."""
     simulated = preset_disturbance("thermal", tuple(range(2, 16)), 1, NM_PER_MAS, 550.0)
     drift = modes_nm(simulated, 0, 15_000, 250.0)
     noise = 0.2 * np.random.default_rng(1).standard_normal(drift.shape)
