@@ -33,8 +33,8 @@ WORSE, BETTER = 1.2, 0.25
 LONG_TERM_S = 10.0
 """Time constant of the long-term mean square of the pseudo-open-loop modes."""
 AMPLIFIED = 2.5
-"""The loop amplifies if its mean squared error is above this multiple of the long-term mean square of the pseudo-open-
-loop modes, unless it is below `BETTER` times their mean square in the block: then the disturbance has grown."""
+"""The loop amplifies if its mean squared error is above this multiple of the long-term mean square of the
+pseudo-open-loop modes, unless it is below `BETTER` times their mean square in the block: the disturbance has grown."""
 
 NAMES = ("tip and tilt", "the other modes")  # of the groups
 LAW_RETURNS = "law returns"
