@@ -10,7 +10,7 @@ import numpy.typing as npt
 from lowfc.arrays import Array, Integers, Single
 
 FEWEST_CYCLES = 3
-"""Least cycles of the lowest line in a period; with fewer, it cannot be told from a drift of the mean."""
+"""Least cycles of the lowest line in a period; with fewer, the line cannot be told from a drift of the mean."""
 _APART = 3  # least distance of the lines of a mode, in odd bins: the noise is measured between them
 _DRAWS = 32  # random sets of phases; the one with the lowest peak is used
 

@@ -1,6 +1,6 @@
 """The fused step: the arithmetic of a normal frame in plain functions, to be compiled.
 
-They are written for a compiler: loops over existing arrays, without allocations, that call only simple functions of
+The functions suit a compiler: loops over existing arrays, without allocations, that call only simple functions of
 Python and numpy, and each other. Rows of R are processed ten at a time and the rest five at a time, so that each frame
 is read once for many rows and several sums run in parallel. `lowfc.adapters` compiles them.
 """

@@ -31,8 +31,8 @@ MAX_INJECTED = 0.1
 SURE = 4.0
 """Standard errors above which the cross-talk of tip and tilt into another mode counts as certain."""
 SUSPECTED = 2.0
-"""Standard errors above which cross-talk counts as suspected, so that a gain must tolerate it: on a faint star, it may
-add ten times what the gain removes."""
+"""Standard errors above which cross-talk counts as suspected, so that a gain must tolerate it: on a faint star, even
+uncertain cross-talk may add ten times what the gain removes."""
 MARGIN = 5.0
 """Multiple of the measured cross-talk that a gain must tolerate: a sensor underestimates tilt beyond its range."""
 TOGETHER = 16
@@ -391,7 +391,7 @@ def injected(gain: Single) -> Single:
 def uncorrected_prior_nm2(verdict: Verdict, uncorrected: Mask, noise_nm2: Array) -> Single:
     """Mean square (modes,) of the uncorrected modes (modes,), nm^2, as `Weighting.prior_nm2`: 0 for the others.
 
-    It is the measured power less the noise, plus two standard errors of that noise.
+    The mean square is the measured power less the noise, plus two standard errors of that noise.
     """
     if verdict.noise_nm2 is not None:
         noise_nm2 = np.maximum(noise_nm2, verdict.noise_nm2)

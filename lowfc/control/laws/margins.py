@@ -101,7 +101,7 @@ def check_law(law: LinearLaw, delay_frames: float, rate_hz: float) -> None:
 def check_stable(law: LinearLaw, delay_frames: float) -> None:
     """Refuse a law that is unstable when closed, when open, or when frames are missing.
 
-    It only needs poles, and takes a fraction of the time of `margins`.
+    The check needs only poles, and takes a fraction of the time of `margins`.
 
     Raises:
         ValueError: it is unstable (the message has the pole), or more than `MAX_COUPLED_STATES` states are coupled.

@@ -13,7 +13,7 @@ from lowfc.arrays import Array, Complex, Single
 MIN_GAIN_MARGIN = 1.8
 MIN_PHASE_MARGIN_DEG = 45.0
 LOWEST_GAIN = 0.01
-"""Least gain that `lowfc tune` chooses: it corrects even a mode whose drift is hidden by the noise of a log."""
+"""Least gain that `lowfc tune` chooses, so that even a mode whose drift is hidden by a log's noise is corrected."""
 SETTLING = 5.0
 """Time constants of the slowest mode after which a loop counts as settled."""
 

@@ -203,7 +203,7 @@ def test_tilt_cross_talk_does_not_favour_a_gain() -> None:
 
 
 def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
-    """With another R, mode 7 contains minus twice mode 4, and so its cross-talk of tilt; before, it had none."""
+    """With another R, mode 7 contains minus twice mode 4, and so the cross-talk of tilt, which it lacked before."""
     tilt_nm, modes_nm = _vibrating(5200, 22)
     from_own = np.eye(MODES)
     from_own[7, 4] = -2
