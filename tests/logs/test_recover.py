@@ -134,7 +134,7 @@ def test_an_intact_log_is_not_recovered(tmp_path: Path) -> None:
     assert json_of("recover", path)["recovered"] is None
     assert [path.name for path in tmp_path.iterdir()] == ["night.mcap"]
     part = path.rename(tmp_path / "night.mcap.part")  # its recorder died before renaming it
-    assert lowfc("recover", part).stdout == f"{part} is intact; only rename it to night.mcap\n"
+    assert lowfc("recover", part).stdout == f"{part} is intact; rename it to night.mcap\n"
 
 
 def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:

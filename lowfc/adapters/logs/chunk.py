@@ -16,9 +16,9 @@ CHUNK_HERE = re.compile(
     rb"\x06(?=.{36}(?:\x03\x00{3}lz4.{8}\x04\x22\x4d\x18|\x04\x00{3}zstd.{8}\x28\xb5\x2f\xfd|\x00{4}.{8}[\x03-\x05].{4}\x00{4}))",
     re.DOTALL,
 )
-"""Pattern of a chunk's opcode and head with a supported compression, and of the start of its content."""
+"""Pattern that finds a chunk: its opcode, its head with a supported compression, and the start of its content."""
 
-_FIXED = struct.Struct("<QQQII")  # times of first and last message, size, CRC, length of the compression's name
+_FIXED = struct.Struct("<QQQII")  # times of first and last message, decompressed size, its CRC, length of the name
 _COMPRESSED = struct.Struct("<Q")
 _RECORD_HEAD_BYTES = 9  # opcode and length
 _MAX_NAME_LENGTH = 40
@@ -37,7 +37,7 @@ class CompressionError(UnsoundError):
 
 
 class Chunk(NamedTuple):
-    """Decompressed messages and declarations.
+    """A decompressed chunk: messages, and declarations of schemas and channels.
 
     Attributes:
         position: first byte of the chunk in the file.
@@ -69,7 +69,7 @@ def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
     """Decompress and check a chunk.
 
     Args:
-        body: body of its record, after opcode and length.
+        body: record of the chunk, without opcode and length.
         at: position of the record in the file.
         may_lack_crc: whether to accept a chunk without a checksum.
 

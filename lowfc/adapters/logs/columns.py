@@ -20,18 +20,18 @@ STAGES = ("transport", "wakeup", "compute", "publish", "frame_to_command")
 
 # Type code of `array` for each column that is not float32 ("f").
 _KINDS = {"sequence": "Q", "time_ns": "q", "mode": "B", "reasons": "q", "saturated_pixels": "q", "instants": "q"}
-_BITS = 63  # of an integer column, without the sign
+_BITS = 63  # an integer column has 63 bits besides the sign
 
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Steps of the control law, one row per step in recorded order; (steps,) or (steps, modes).
+    """Steps of the control law in recorded order; every array is (steps,) or (steps, modes).
 
     Attributes:
         sequence: sequence of the step's frame.
         time_ns: time of that frame, ns since the epoch.
         mode: loop mode, as `LoopMode`.
-        reasons: bits `1 << reason` of the step's reasons.
+        reasons: bits `1 << reason`: why the frame was refused, or the limits that acted.
         error_nm: measured modal error, nm rms of wavefront; NaN if the frame was refused.
         pol_nm: pseudo-open-loop modes, nm rms of wavefront; NaN if the frame was refused.
         command_nm: modal command after the step, nm rms of wavefront.
@@ -58,8 +58,8 @@ class Steps:
 class Truths:
     """Truth of a simulation, one row per frame; empty for a log of real devices.
 
-    Rms values are over the frame's whole period if `instants` is not 0: the star moves while the mirror holds. In older
-    logs, and if the simulation does not compute them, they are values at the start of the exposure.
+    If `instants` is not 0, rms values are over the frame's whole period: the star moves in it while the mirror holds.
+    If it is 0 (older logs, and simulations without such rms values), all values are those at the start of the exposure.
 
     Attributes:
         sequence: sequence of the frame.
@@ -93,7 +93,7 @@ class Truths:
 
     @property
     def continuous(self) -> bool:
-        """Whether the rms are over whole periods."""
+        """Whether rms values are over whole periods."""
         return bool(self.instants.any())
 
 
@@ -101,7 +101,7 @@ class Columns:
     """Columns that grow row by row, each with a number or a vector per row."""
 
     def __init__(self, widths: Mapping[str, int] = MappingProxyType({}), /, **kinds: str) -> None:
-        """Make columns by name, with type codes of `array`; `widths` has the vector lengths."""
+        """Make a column for each of `kinds`, names with type codes of `array`; `widths` has the vector lengths."""
         self._columns: dict[str, array[Any]] = {name: array(kind) for name, kind in kinds.items()}
         self._widths = widths
         self._rows = 0
@@ -148,7 +148,7 @@ T = TypeVar("T")
 
 
 class _Rows(Generic[T]):
-    """Columns of `T` from messages with a fixed number of modes; `T` and message use the same names of fields."""
+    """Collects messages with a fixed number of modes as columns of `T`, named as the message's fields."""
 
     def __init__(self, result_type: type[T], per_mode: Iterable[str], modes: int) -> None:
         self.modes = modes
@@ -171,7 +171,7 @@ class _Rows(Generic[T]):
         return self._columns.add(sequence=message.frame_sequence, time_ns=from_timestamp(message.timestamp), **row)
 
     def _special(self, message: Any) -> dict[str, Any]:
-        """Values that differ from the message's fields."""
+        """Values of the columns that are not simply the message's field of the same name."""
         return {}
 
     def values(self) -> T:
@@ -184,7 +184,7 @@ class _Rows(Generic[T]):
 
 
 class StepRows(_Rows[Steps]):
-    """Steps with one number of modes."""
+    """Collects steps with a fixed number of modes."""
 
     def __init__(self, modes: int) -> None:
         super().__init__(Steps, ("error_nm", "pol_nm", "command_nm"), modes)
@@ -196,7 +196,7 @@ class StepRows(_Rows[Steps]):
 
 
 class TruthRows(_Rows[Truths]):
-    """Truth of a simulation, with one number of modes."""
+    """Collects the truth of a simulation with a fixed number of modes."""
 
     def __init__(self, modes: int) -> None:
         per_mode = ("disturbance_nm", "residual_nm", "sensed_nm", "modes_disturbance_rms_nm", "modes_residual_rms_nm")
@@ -221,7 +221,7 @@ class TruthRows(_Rows[Truths]):
 
 
 def steps_as_columns(steps: Iterable[Step], modes: int) -> Steps:
-    """Columns of steps from a running loop, as from a log."""
+    """Convert the steps of a running loop to the columns that a log's steps have."""
     rows = StepRows(modes)
     for step in steps:
         rows.add(wire.ControlStep.FromString(encode_step(step, 0)))
@@ -235,7 +235,7 @@ def count_reasons(bits: Long) -> dict[Reason, int]:
 
 
 class TimingRows:
-    """Durations of the controller's stages."""
+    """Collects the durations of the controller's stages."""
 
     def __init__(self) -> None:
         self._columns = Columns(sequence="Q", **dict.fromkeys(STAGES, "q"))
@@ -249,7 +249,7 @@ class TimingRows:
         return self._columns.add(sequence=timing.frame_sequence, **stages)
 
     def values(self) -> tuple[Sequences, dict[str, Long]]:
-        """Sequence (frames,) of each frame, and each of `STAGES` in ns."""
+        """Sequences of the frames, and for each of `STAGES` its duration in every frame, ns."""
         return self._columns.values("sequence"), {stage: self._columns.values(stage) for stage in STAGES}
 
 
@@ -258,7 +258,7 @@ def bits_of(reasons: Iterable[int]) -> int:
     bits = 0
     for reason in reasons:
         if not 0 <= reason < _BITS:
-            raise OverflowError(f"a reason is a bit below {_BITS}; got {reason}")
+            raise OverflowError(f"a reason must be at least 0 and below {_BITS}; got {reason}")
         bits |= 1 << reason
     return bits
 

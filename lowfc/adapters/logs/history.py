@@ -1,6 +1,6 @@
 """History of a run for reports, exports and what-ifs: columns of its frequent messages, and its rare messages.
 
-It omits control inputs, bench values, offloads, images and shapes of commands; `History.reader` reads these.
+A history omits control inputs, bench values, offloads, images and commands' shapes; `History.reader` reads these.
 """
 
 import contextlib
@@ -62,7 +62,7 @@ from lowfc.control.laws.continuous import Timing
 from lowfc.control.loop.safety import LoopMode
 
 LAST_NS = (1 << 63) - 1
-"""Latest time of a message that is read, in the year 2262; a later one does not fit an array of times."""
+"""Latest time of a message that is read, in the year 2262; int64 columns of times cannot hold a later one."""
 REORDERING_NS = 2_000_000_000
 """Time by which messages in a log may be out of order."""
 _CAMERA_SETTINGS = ("period_ns", "exposure_ns", "gain_e_per_dn", "bias_dn", "read_noise_e", "em_gain")
@@ -100,18 +100,18 @@ class History:
     """History of a run, read from its log.
 
     Attributes:
-        log: reader, read to its end: metadata, attachments, whether the log is complete.
+        log: the log's reader, which has read to the end: metadata, attachments, whether the log is complete.
         configuration: configuration of the recorded loop; None if there is no readable one.
         remarks: sentences on parts of the configuration that this version cannot use, and on the calibration if its
             message is lost; each names the log.
-        calibration: the last one; if its message is lost, the attached one, if a controller reported to use it.
+        calibration: the last one recorded; if all its messages are lost, the attached one that the last state names.
         controllers: states of the controllers, in order.
-        camera: state of the camera in most steps under `calibration`, of those in closed loop if there are any.
-        under_camera: whether each step (steps,) has the settings of `camera`.
+        camera: state with the most frequent settings among the steps under `calibration` (in closed loop, if any are).
+        under_camera: (steps,) whether the camera had the settings of `camera` in each step.
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
         command_sequence, command_publish_ns: the same of every mirror command (the message's own sequence).
         stepped_sequence: frame sequence of every step in the log, also of those that `steps` leaves out.
-        steps, truths: those with the number of modes of the last calibration.
+        steps, truths: steps and truths with the number of modes of the last calibration.
         stages_ns: (timed steps,) durations of each of `STAGES`, for the frames of `timed_sequence`.
         excluded_messages: number of steps with another number of modes than the last calibration, and of messages with
             impossible values.
@@ -122,7 +122,7 @@ class History:
             included; None if it sent fewer than two.
         counts: number of messages, by topic key.
         published: calibrations, laws and played tables, by identity.
-        span_ns: log times of the first message that is not retained, and of the last message; (0, 0) without one.
+        span_ns: log times of the first message that is not retained, and of the last message; (0, 0) if all are.
     """
 
     log: LogReader
@@ -158,16 +158,16 @@ class History:
 
     @property
     def rate_hz(self) -> float:
-        """See `frame_rate_hz`."""
+        """Frame rate, Hz; see `frame_rate_hz`."""
         return frame_rate_hz(self.camera, self.steps)
 
     def camera_lag_ns(self, process: str) -> int:
-        """Time to add to a frame's time for another process's clock; publish times are on the recorder's clock."""
+        """Time to add to a frame's time to convert it from the camera's clock to that of another process, ns."""
         camera, other = (self.health.get(name, wire.Health()) for name in (Role.CAMERA, process))
         return camera.router_offset_ns - other.router_offset_ns
 
     def timing(self, delay_frames: float) -> Timing:
-        """Times of exposures and of the mirror's moves; a lockstep log has none of the latter, see `Timing.of`."""
+        """Timing of the loop from the mirror's reports; in lockstep, which has no such times, that of `Timing.of`."""
         if (exposure := exposure_fraction(self.camera)) is None:
             exposure = (self.configuration or Configuration()).camera.exposure_fraction
         applied = self.mirror.sequence, self.mirror.publish_time_ns - self.camera_lag_ns(Role.RECORDER)
@@ -181,7 +181,7 @@ class History:
         if not (others := [number for number, state in enumerate(states) if state.calibration_id not in own]):
             return np.ones(steps.sequence.shape, np.bool_) & self.under_camera
         last, *later = (state.frame_sequence for state in states[others[-1] :])  # a change publishes a state
-        change = max(last, next(filter(None, later), 0))  # the state of a start or a `clear` has no frame
+        change = max(last, next(filter(None, later), 0))  # a state published at a start or by `clear` has no frame
         return (steps.sequence > change) & self.under_camera
 
     @cached_property
@@ -237,7 +237,7 @@ def attached_configuration(log: LogReader) -> tuple[Configuration | None, list[s
 
 def attached_calibration(log: LogReader, calibration_id: str) -> Calibration | None:
     """The calibration of this identity, if it is attached to a log and can be read."""
-    from lowfc.adapters.files import calibration_file  # its astropy takes 0.15 s to import
+    from lowfc.adapters.files import calibration_file  # imports astropy, which takes 0.15 s
 
     for name, content in log.attachments.items():
         if name.endswith(".fits"):
@@ -254,7 +254,7 @@ class _HistoryBuilder:
     def __init__(self, history: History) -> None:
         self._history = history
         self._calibration: wire.Calibration | None = None
-        self._cameras: list[tuple[Array, wire.CameraState]] = []  # whenever its settings changed
+        self._cameras: list[tuple[Array, wire.CameraState]] = []  # settings and state at each change of the settings
         self._frames, self._commands = (Columns(sequence="Q", publish_ns="q") for _ in range(2))
         self._stepped, self._timings = Columns(sequence="Q"), TimingRows()
         self._mirror = Columns(sequence="Q", publish_time_ns="q", stroke_nm="f", limits="q")
@@ -279,7 +279,7 @@ class _HistoryBuilder:
     def _decode(self, message: Sample) -> None:
         topic, history = topic_of(message.key), self._history
         first_ns, last_ns = history.span_ns
-        if first_ns or not topic.queryable:  # retained messages at the log's start may be hours old
+        if first_ns or not topic.queryable:  # retained messages (states, calibration) at the start may be hours old
             history.span_ns = (first_ns or message.receive_time_ns, max(last_ns, message.receive_time_ns))
         if topic is FRAME:
             self._frames.add(sequence=message.sequence, publish_ns=message.publish_time_ns)
@@ -301,7 +301,7 @@ class _HistoryBuilder:
             self._mirror_state(body, message.publish_time_ns)
         elif isinstance(body, wire.ControlTiming):
             self._timings.add(body)
-        elif isinstance(body, wire.Calibration) and body.noll:  # a former controller wrote one without modes
+        elif isinstance(body, wire.Calibration) and body.noll:  # former versions also wrote a calibration without modes
             self._calibration = body
             self._set_modes(len(body.noll))
         elif isinstance(body, wire.ControllerState):
@@ -338,7 +338,7 @@ class _HistoryBuilder:
         np.minimum(extremes.lowest_nm, surface, out=extremes.lowest_nm)
 
     def _set_modes(self, modes: int) -> None:
-        """Continue the rows of this number of modes; the others are kept, in case this calibration was refused."""
+        """Add further steps and truths to the rows with this number of modes; all other rows remain as they are."""
         self._steps, self._truths = self._rows.setdefault(modes, (StepRows(modes), TruthRows(modes)))
 
     def _count_late(self, start_s: int, count: int) -> None:
@@ -392,7 +392,7 @@ class _HistoryBuilder:
 
 
 def measured_timing(timing: Timing, steps: Steps, applied: Sequences, applied_ns: Integers, rate_hz: float) -> Timing:
-    """Timing from the mirror's reports: frame and time, on the camera's clock, of each applied command."""
+    """Timing by the mirror's reports: the frame of each command (`applied`), and `applied_ns` on the camera's clock."""
     rows = rows_of(applied, steps.sequence)
     if not (rows >= 0).any():
         return timing

@@ -21,7 +21,8 @@ class LogCopy:
     """A new log to which files are copied in turn.
 
     Attributes:
-        messages, read: numbers of messages written so far, and of those read from the files.
+        messages: number of messages written so far.
+        read: number of messages read from the files so far.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -79,10 +80,10 @@ class LogCopy:
             schema_id = 0  # a channel of another tool may have no schema
             if channel.schema_id:
                 schema = reader.schemas[channel.schema_id]
-                known = schema.name, schema.data
-                if known not in self._schemas:
-                    self._schemas[known] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
-                schema_id = self._schemas[known]
+                identity = schema.name, schema.data
+                if identity not in self._schemas:
+                    self._schemas[identity] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+                schema_id = self._schemas[identity]
             self._channels[publisher] = self._writer.register_channel(
                 channel.topic, channel.message_encoding, schema_id, channel.metadata
             )
@@ -97,7 +98,7 @@ class LogCopy:
 
 
 def refuse_existing(path: Path) -> None:
-    """Raise DataFileError if the file, to which a log is to be written, exists."""
+    """Raise DataFileError if the file to which a log is to be written exists already."""
     if os.access(path, os.F_OK):
         raise DataFileError(f"{path} already exists; a log is never overwritten; name another one with --out")
 

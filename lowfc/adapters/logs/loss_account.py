@@ -29,7 +29,8 @@ class _Tally:
         recorded: number recorded.
         duplicates: number of those recorded that were duplicates.
         never_sent: frames that a camera lost and never sent, according to its Health, less `lost_before`.
-        lost_before: frames that it had lost at its first Health, assumed to precede the first message; None until then.
+        lost_before: frames that the camera had lost by its first Health, assumed to precede the first message; None
+            until then.
         last_lost: `lost` at the last call of `newly_lost`.
         flushed: `recorded` and `duplicates` at the last flush.
         reported: number reported as lost by `newly_lost`.
@@ -51,9 +52,9 @@ class _Tally:
 
     @property
     def confirmed(self) -> int:
-        """Number lost; once the camera has lost frames, at most as many as at the last call of `newly_lost`.
+        """Number lost; if the camera has lost frames before sending, at most `lost` at the last call of `newly_lost`.
 
-        The newest gap may be of frames that the camera never sent: its next Health reports them.
+        The newest gap may consist of further frames that the camera never sent; its next Health reports them.
         """
         return min(self.lost, self.last_lost) if self.never_sent else self.lost
 
@@ -81,7 +82,8 @@ class LossAccount:
     """Account of all messages, from the sequences of those that arrived and from the publishers' own counts.
 
     Attributes:
-        names: names on the topics; the caller admits a message's name before it enters the message.
+        names: names (of mirrors, processes, ...) received on each topic; the caller admits a message's name before it
+            calls `enter`.
         starts: number of publishers' starts counted so far, over all topics.
     """
 
@@ -120,7 +122,7 @@ class LossAccount:
                     tally.lost_before = count.missing if tally.gaps.first else 0
                 tally.never_sent = count.missing - tally.lost_before
                 if health.state == "stopped":
-                    tally.published = min(count.published, 1 << COUNT_BITS)  # the next start counts further ones
+                    tally.published = min(count.published, 1 << COUNT_BITS)  # further ones belong to the next start
 
     def mark_flushed(self) -> None:
         """Note that everything recorded so far has been flushed."""
@@ -141,7 +143,7 @@ class LossAccount:
         return +self._sum(lambda tally: tally.lost)
 
     def newly_lost(self) -> dict[str, int]:
-        """Number of messages lost since the last call, by key; one that still arrives offsets a later loss."""
+        """Number of messages lost since the last call, by key; the late arrival of a lost one offsets a later loss."""
         lost = +self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():
             tally.reported = max(tally.reported, tally.confirmed)
@@ -149,7 +151,7 @@ class LossAccount:
         return lost
 
     def _tally(self, key: str, author: str, start_s: int, first: int) -> _Tally:
-        """Tally of a publisher's start; a new one begins with the message `first`."""
+        """Tally of a publisher's start; a new tally begins with the count `first`."""
         tallies = self._tallies.setdefault((key, author), {})
         tally = tallies.get(start_s)
         if tally is None:

@@ -62,7 +62,8 @@ class WholeLog(LogReader):
     """Reads the files of a log as one; messages repeated at the start of a file are delivered once.
 
     Attributes:
-        path: path of the first file; `schemas` and `channels` are those of the present file, other attributes of all.
+        path: path of the first file.
+        schemas, channels: those of the present file; all other attributes cover all files.
         parts: readers of the files so far.
     """
 
@@ -75,7 +76,7 @@ class WholeLog(LogReader):
         self._options = options
 
     def __iter__(self) -> Generator[Sample, None, None]:
-        """Messages in the order they were recorded; a reader reads once.
+        """Messages in recorded order; to be called once.
 
         Raises:
             DataFileError: a file is no log, or a part of it is damaged.
@@ -170,7 +171,7 @@ def titled(paths: Parts) -> str:
 
 
 def missing_between(paths: Sequence[Path]) -> int:
-    """Number of files missing between the first and the last file of each recording."""
+    """Number of missing files, summed over the recordings, each between its first and its last file."""
     numbers: dict[tuple[str, ...], list[int]] = {}
     for recording, number in map(_recording_and_number, paths):
         numbers.setdefault(recording, []).append(number)
@@ -222,7 +223,7 @@ def _newest(folder: Path) -> list[Path]:
     for path, match in files.items():
         time, repeat, suffix, part = match.groups()
         order[path] = time, int(repeat or 1), not (suffix or part), suffix == "-recovered", bool(part)
-    # Of several files of one time prefer the recorded finished one, then a recovered one, then an unfinished one.
+    # Of several files with the same time and number, prefer a finished recording, then a recovered, then an unfinished.
     best = {order[path][:2]: path for path in sorted(files, key=order.__getitem__)}
     newest = best.pop(max(best))
     recording, number = _recording_and_number(newest)

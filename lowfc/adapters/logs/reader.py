@@ -60,9 +60,9 @@ class LogReader:
             topics: topics whose messages are delivered; None: all.
             skip_damaged: whether to leave out damaged stretches instead of raising an error.
             from_ns: log time; chunks known to end before it are skipped.
-            always: topics that keep a chunk, with all its messages, from being skipped for `from_ns`.
+            always: topics for which no chunk is skipped because of `from_ns`; such a chunk is read with all messages.
             sparse: whether to skip chunks without messages of `topics`, by their indexes: for topics with few messages
-                in a long log. After a skipped chunk, its checksum and that of all chunks together are not checked.
+                in a long log. The checksum of a skipped chunk is not checked, nor then that of the data section.
         """
         self.path = path
         self.paths: tuple[Path, ...] = (path,)
@@ -81,8 +81,8 @@ class LogReader:
         self._always = always
         self._sparse = sparse
         self._declared: dict[int, Channel] = {}
-        self._delivered: dict[int, tuple[str, int] | None] = {}  # key and first sequence of selected channels, by id
-        self._chunks: set[int] = set()  # identities of the intact ones
+        self._delivered: dict[int, tuple[str, int] | None] = {}  # by channel id: key and first sequence; None: excluded
+        self._chunks: set[int] = set()  # identities of the intact chunks
         self._last_ns: int | None = None
         self._dated_damage = 0  # number of `damage` with `before_ns`
         self._has_chunks = False
@@ -103,7 +103,7 @@ class LogReader:
         return Selection.of(self.metadata)
 
     def __iter__(self) -> Iterator[Sample]:
-        """Messages in recorded order; a reader reads once.
+        """Messages in recorded order; to be called once.
 
         Raises:
             DataFileError: the file is not a log, or a part of it is damaged.
@@ -161,7 +161,7 @@ class LogReader:
         return messages
 
     def _messages(self, content: bytes) -> list[Sample]:
-        """Decode the messages of a chunk to deliver, and store its declarations; UnsoundError if inconsistent."""
+        """Decode a chunk's messages of the selected topics, store its declarations; UnsoundError if inconsistent."""
         samples: list[Sample] = []
         delivered, at, end = self._delivered, 0, len(content)
         read_head, read_message, make_sample = HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, Sample._make
@@ -186,16 +186,16 @@ class LogReader:
                 elif opcode == Opcode.CHANNEL:
                     self._declare_channel(parsed(Channel, content[begin + head_bytes : at]))
         except struct.error as fault:
-            raise UnsoundError("a record in a chunk is longer than the chunk") from fault
+            raise UnsoundError("a record in a chunk extends beyond the chunk") from fault
         if at > end:
-            raise UnsoundError("a record in a chunk is longer than the chunk")
+            raise UnsoundError("a record in a chunk extends beyond the chunk")
         return samples
 
     def _declare_channel(self, channel: Channel) -> None:
         if self._declared.setdefault(channel.id, channel) != channel:
             raise UnsoundError(f"channel {channel.id} is declared a second time, differently")
         if channel.schema_id and channel.schema_id not in self.schemas:
-            return  # the schema's declaration was in a damaged chunk: its messages are unreadable
+            return  # the schema's declaration was in a damaged chunk: the channel's messages are unreadable
         start = channel.metadata.get(START_KEY, "0")
         start_s = int(start) if re.fullmatch("[0-9]{1,10}", start) else -1
         if not 0 <= start_s < 1 << COUNT_BITS:

@@ -1,6 +1,6 @@
 """Records of a log file: intact ones, damaged stretches, and the end of a truncated file.
 
-Everything is checked by checksums. In a finished log they cover every byte: chunks and attachments have their own,
+Everything is checked by checksums. In a finished log they cover every byte: each chunk and attachment has its own,
 DataEnd has that of the data section, the footer that of the summary. A log rewritten by another tool may lack checksums
 and chunks; one written by lowfc may lack only the checksum of the data section.
 """
@@ -37,7 +37,7 @@ _CHANGED = "its parts are intact, but some are missing or out of order, or bytes
 _BEGIN = MAGIC + bytes([Opcode.HEADER])
 _OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _FIRST_BLOCK_BYTES = 1 << 12
-_TRIES = 4  # most bytes read in search of chunks, per byte of the file: a malicious file must not occupy the reader
+_TRIES = 4  # the search for chunks reads at most this times the file's size: no file may occupy the reader for long
 
 
 @dataclass(slots=True)
@@ -66,8 +66,8 @@ class LogFile:
         path: path of the file.
         size: size of the file when opened, bytes.
         finished: whether it ends as a finished log.
-        complete: whether it is finished and was read up to a valid summary; known at the end of `parts`.
-        unsupported_compression: name of an unsupported compression of a chunk; empty for none.
+        complete: whether the file is finished and was read up to a valid summary; known at the end of `parts`.
+        unsupported_compression: name of the compression of an unsupported chunk; empty if there is none.
     """
 
     def __init__(self, path: Path) -> None:

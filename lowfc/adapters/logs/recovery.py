@@ -49,7 +49,7 @@ class Recovery:
         """The result as text."""
         if self.recovered is None:
             name = self.log.name.removesuffix(UNFINISHED)
-            advice = "there is nothing to recover" if name == self.log.name else f"only rename it to {name}"
+            advice = "there is nothing to recover" if name == self.log.name else f"rename it to {name}"
             return f"{self.log} is intact; {advice}"
         lines = [f"left out {in_words(damage)}" for damage in self.damage]
         if self.unreadable:
@@ -65,7 +65,7 @@ def recovered_path(source: Path) -> Path:
 
 
 def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None = None) -> Recovery:
-    """Write the intact parts of `source` to `out`; nothing if `source` is intact.
+    """Write the intact parts of `source` to `out`; if `source` is wholly intact, write nothing.
 
     Messages with their channels and schemas, attachments and metadata are copied; metadata "recovery" are added.
 

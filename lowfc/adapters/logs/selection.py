@@ -36,7 +36,7 @@ class Selection:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Mapping[str, str]]) -> "Selection":
-        """Selection of a log from the metadata at its start; everything if they cannot be read."""
+        """Selection of a log, from the metadata at its start; everything if these have no readable selection."""
         entries = metadata.get(SELECTION, {})
         interval, keys = entries.get("every", ""), entries.get("left_out", "").split()
         return cls(
@@ -108,7 +108,7 @@ def selection(interval_frames: int = 1, patterns: Iterable[str] = ()) -> Selecti
     """
     chosen: set[Topic] = set()
     for pattern in (text.removeprefix("/") for text in patterns):
-        name = (pattern.split("/")[2:3] or [""])[0]  # the place of a mirror's name, as in lowfc/mirror/dm/*
+        name = (pattern.split("/")[2:3] or [""])[0]  # a mirror's name is third, as in lowfc/mirror/dm/*
         matching = {topic for topic in TOPICS if topic.matches(pattern) or fnmatchcase(topic.at(name), pattern)}
         if not matching:
             keys = [topic.key for topic in TOPICS]

@@ -8,16 +8,16 @@ REMEMBERED = 4096
 
 
 class Gaps:
-    """Counts of the messages from one start of a publisher, from the first received one.
+    """Finds gaps in the counts of the messages from one start of a publisher, from the first received message on.
 
     Attributes:
         first: count of the first message.
         next: highest count plus 1.
-        missing: number of missing messages between the two, and of former starts.
+        missing: number of missing messages between `first` and `next`, plus that of former starts.
     """
 
     def __init__(self, first: int, missing: int = 0) -> None:
-        """Begin with the count of the first message; `missing` is the number from former starts."""
+        """Begin with the count of the first message; `missing` is the number of missing ones of former starts."""
         self.first = self.next = first
         self.missing = missing
         self._open: set[int] = set()

@@ -31,14 +31,14 @@ class LogLimits:
 
 
 STANDARD = LogLimits()
-_STEADY_S = 10.0  # in a shorter time, the metadata and attachments at the log's start falsify its growth
+_STEADY_S = 10.0  # over a shorter time, the metadata and attachments at a file's start falsify its rate of growth
 
 
 class LogSeries:
     """Writes the log files of recordings to a folder.
 
-    A full file is finished on a separate thread, as the disk may need seconds to store it. If the disk refuses, methods
-    raise DataFileError; see `give_up`.
+    A full file is finished on a separate thread, as the disk may need seconds to store it. If the disk refuses a write,
+    methods raise DataFileError; the caller then calls `give_up`.
 
     Attributes:
         files: paths of the files so far: final names, or names with ".part" of those that could not be finished.
@@ -77,7 +77,7 @@ class LogSeries:
 
     @property
     def longest_write_ns(self) -> int:
-        """Longest duration of a write."""
+        """Longest duration of a write, ns."""
         return max(self._longest_write_ns, self._log.longest_write_ns if self._log else 0)
 
     @property
@@ -139,7 +139,7 @@ class LogSeries:
             self._await_finished()
 
     def remove(self) -> None:
-        """Remove the files, all finished; the caller knows that they hold no messages of other processes."""
+        """Remove the files, which must all be finished; the caller knows that they hold no other process's messages."""
         while self.files:
             with raised_as(DataFileError, OSError, f"{self.files[-1]} is empty and cannot be removed"):
                 self.files[-1].unlink(missing_ok=True)
@@ -147,7 +147,7 @@ class LogSeries:
         self._messages = self._bytes = 0
 
     def give_up(self) -> None:
-        """Close the file unfinished, as at the last flush."""
+        """Close the file unfinished, truncated to its last flush."""
         if self._log is not None:
             log = self._detach()
             log.abandon()
@@ -181,11 +181,11 @@ def _finish(log: LogWriter, totals: Mapping[str, str]) -> int:
     """Finish a file; return its growth in bytes."""
     before_bytes = log.bytes_written
     log.finish({"recording": totals})
-    return log.bytes_written - before_bytes  # another program may have moved the finished file
+    return log.bytes_written - before_bytes  # not from the file, which another program may have moved already
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str:
-    """Sentence if a folder's disk has too little space; else empty. DataFileError if it is no accessible folder."""
+    """Sentence on a disk with too little space for logs in `folder`, else empty; DataFileError if it is no folder."""
     if not (parent := existing(folder)).is_dir():
         raise DataFileError(
             f"no log can be recorded in {folder}: {parent} is no folder; name another (recorder.folder)"

@@ -22,7 +22,7 @@ def thin(
 ) -> dict[str, Any]:
     """Write a thinned log from all files of a log, with its selection in the metadata; return the results for JSON.
 
-    By default it is written next to the log.
+    By default the thinned log is written next to the original.
 
     Raises:
         DataFileError: a file is not a log, none has messages, `out` exists already, or it cannot be written.
@@ -30,7 +30,7 @@ def thin(
     combined = requested.within(Selection.of(metadata_at_start(log[0])))
     reader = WholeLog(log, skip_damaged=True)
     reader.progress = progress
-    copied_names = {PART, SELECTION}  # the copy has its own
+    copied_names = {PART, SELECTION}  # not copied: the thinned log has a selection of its own and is a single file
 
     def include(message: Sample) -> bool:
         with contextlib.suppress(KeyError):  # a topic unknown to this version
@@ -38,7 +38,7 @@ def thin(
         return True
 
     def include_record(record: Metadata | Attachment) -> bool:
-        """Whether to copy a record: the first of its name; each "recording" and "recovery", as the last one counts."""
+        """Whether to copy a record: the first of each name, but every "recording" and "recovery": their last counts."""
         known = record.name in copied_names and record.name not in ("recording", RECOVERY)
         copied_names.add(record.name)
         return not known

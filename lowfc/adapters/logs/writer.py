@@ -40,9 +40,9 @@ UNFINISHED = ".part"
 FILE_MODE = 0o640
 """Default permissions of a log, further reduced by the umask: notes and frames are not public."""
 
-CHUNK_BYTES = 240 * 1024  # closes a chunk once exceeded: below 256 KiB with a further frame of up to 15 KiB
+CHUNK_BYTES = 240 * 1024  # the message that exceeds it closes a chunk: below 256 KiB if it is at most 15 KiB
 PART = "part"
-"""Name of the metadata with a log's recording and its number in it."""
+"""Name of the metadata with the recording that a file belongs to, and the file's number in it."""
 
 START_KEY = "start_s"
 """Key in a channel's metadata: upper half of its sequences."""
@@ -79,11 +79,13 @@ class _File(FileIO):
 
 
 class LogWriter:
-    """Writes one log; if the disk refuses, methods raise DataFileError, and the log is closed as at the last flush.
+    """Writes one log.
+
+    If the disk refuses a write, methods raise DataFileError, and the log is closed, truncated to its last flush.
 
     Attributes:
         path: final name of the log.
-        part: name until it is finished.
+        part: name of the log until it is finished.
         messages: number of messages written.
         messages_written: number of messages written up to the last flush.
         bytes_written: size of the file up to the last flush.
@@ -100,7 +102,7 @@ class LogWriter:
         """Create `path` + ".part" with these permissions, and write metadata and attachments, dated `time_ns`.
 
         Raises:
-            DataFileError: a log of that name exists, or the disk refuses.
+            DataFileError: a log of that name exists, or the disk refuses a write.
         """
         self.path = path
         self.part = path.with_name(path.name + UNFINISHED)
@@ -226,7 +228,7 @@ class LogWriter:
 
 
 def begun_writer(file: IO[bytes]) -> Writer:
-    """MCAP's writer of a log with all checksums, after its header."""
+    """Writer of an MCAP file with all checksums, which has written the file's header."""
     writer = Writer(
         file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4, enable_crcs=True, enable_data_crcs=True
     )
