@@ -161,11 +161,12 @@ def test_the_longest_stretch_under_one_law_is_analysed(eventful: dict[str, Any])
     assert stretch["steps_settling"] == 25
     assert stretch["from_s"] == pytest.approx(0.325)
     assert stretch["to_s"] == pytest.approx(1.799)
-    assert (stretch["pieces"], stretch["frames_bridged"]) == (2, 2)  # one lost, one dark; five lost are too many
+    # One lost and one dark frame are bridged; five lost in a row divide the stretch.
+    assert (stretch["pieces"], stretch["frames_bridged"]) == (2, 2)
     assert stretch["frames"] == 1475 - 5
 
 
-def test_the_error_budget_agrees_with_the_toy(eventful: dict[str, Any]) -> None:
+def test_the_error_budget_agrees_with_the_known_noise_and_disturbance(eventful: dict[str, Any]) -> None:
     used, dn_noise = SyntheticLog().calibration, np.hypot(READ_NOISE_E, 12**-0.5)  # with rounding to whole DN
     noise = sensor_noise(used.reconstructor.astype(float), used.reference.astype(float), used.flux_dn, dn_noise)
     terms = {term["name"]: term for term in eventful["error_budget"]["terms"]}
@@ -419,13 +420,15 @@ def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
     assert check_of(results, "commands")["level"] == "unknown"
     night.start_controller()
     log = check_of(results_of(night.frames(10).write(tmp_path / "y.mcap")), "log")
-    assert log["text"] == "300 messages without the calibration's modes or with impossible values, left out"
+    text = "300 messages with another number of modes than the calibration or with impossible values, left out"
+    assert log["text"] == text
 
 
-def test_frames_before_other_modes_led_to_commands_and_a_refused_calibration_loses_none(tmp_path: Path) -> None:
+def test_a_calibration_of_other_modes_leaves_out_former_steps_only_if_it_is_the_last(tmp_path: Path) -> None:
+    """Frames of steps that are left out still led to commands."""
     night = SyntheticLog().frames(100)
     two = encode_calibration(identified(calibration(NOLL[:2])), night.now_ns)
-    night.put(CALIBRATION, two)  # refused, so that the one in use is published again
+    night.put(CALIBRATION, two)  # refused: the controller publishes the one in use again
     night.put(CALIBRATION, encode_calibration(night.calibration, night.now_ns))
     night.frames(100)
     for steps in (200, 0):
@@ -445,14 +448,14 @@ def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
     stretch = results_of(night.write(tmp_path / "x.mcap"))["closed_stretch"]
     assert stretch["from_s"] > 0.549
     assert stretch["frames"] + stretch["steps_settling"] == 300
-    assert results_of(tmp_path / "x.mcap")["residual"]["steps_open"] == 0, "those of the earlier calibration"
-    night.start_controller()  # with the first calibration; its first state with a frame follows after 50 frames
+    assert results_of(tmp_path / "x.mcap")["residual"]["steps_open"] == 0, "the earlier calibration's do not count"
+    night.start_controller()  # with the first calibration; the first state that has a frame follows after 50 frames
     results = results_of(night.request("gain", (0.2,)).frames(300).write(tmp_path / "restarted.mcap"))
     assert results["requests"][-1]["time_s"] == pytest.approx(0.85)
     assert results["closed_stretch"]["frames"] + results["closed_stretch"]["steps_settling"] == 250
 
 
-def test_gains_of_the_page_are_rounded_and_one_for_each_mode(tmp_path: Path) -> None:
+def test_the_page_has_the_rounded_gain_of_each_mode_or_one_for_all(tmp_path: Path) -> None:
     night = SyntheticLog(gain=(1 / 0.9, 1 / 57.6)).frames(50).request("gain", (0.2,)).frames(50)
     text = page(report_of(read_run(night.write(tmp_path / "x.mcap"))))
     assert re.findall(r'<td class="text">([\d., ]+(?: for all)?)</td>', text)[:4] == [
@@ -463,7 +466,7 @@ def test_gains_of_the_page_are_rounded_and_one_for_each_mode(tmp_path: Path) -> 
     ]
 
 
-def test_a_camera_ahead_and_a_clear_for_a_lower_start_move_no_law_and_no_request(tmp_path: Path) -> None:
+def test_a_frame_ahead_or_an_earlier_camera_start_after_clear_shifts_no_law_and_no_request(tmp_path: Path) -> None:
     night = SyntheticLog()
     step = wire.ControlStep(frame_sequence=2 * report_log.START << 32, command_nm=[0] * 3, reasons=[wire.REASON_AHEAD])
     step.timestamp.seconds = report_log.START + 3600
@@ -476,8 +479,8 @@ def test_a_camera_ahead_and_a_clear_for_a_lower_start_move_no_law_and_no_request
     assert (results["run"]["steps_s"], results["light"]["refused"]) == (pytest.approx(0.119), {"ahead": 1})
 
 
-def test_frames_refused_as_out_of_order_or_saturated_change_no_time_and_are_no_used_frames() -> None:
-    run = read_run((GOLDEN,))  # it has one of each, that out of order with the time 0
+def test_frames_refused_as_out_of_order_or_saturated_shift_no_times_and_do_not_count_as_used() -> None:
+    run = read_run((GOLDEN,))  # the log has one of each; the frame out of order has the time 0
     report = report_of(run)
     assert np.diff(run.step_s).min() >= 0
     assert min(one["time_s"] for one in report.results["requests"] + report.results["events"]) > -1
@@ -485,7 +488,7 @@ def test_frames_refused_as_out_of_order_or_saturated_change_no_time_and_are_no_u
     assert "used frames with saturated pixels</th><td>0</td>" in page(report)
 
 
-def test_a_law_whose_step_is_lost_is_found_also_with_another_clock_of_the_camera(tmp_path: Path) -> None:
+def test_the_start_of_a_law_is_found_if_its_step_is_lost_and_the_cameras_clock_differs(tmp_path: Path) -> None:
     night = SyntheticLog().frames(50).request("gain", (0.2,)).frames(50)
     del night.samples[night.places(STEP)[49]]
     for number in range(len(night.places(STEP))):
@@ -563,7 +566,9 @@ def test_theory_is_that_of_the_linear_law_in_use(tmp_path: Path, logged: bool) -
         assert "linear law pi" in page(report)
 
 
-def test_the_lag_of_a_live_log_is_for_the_times_of_its_mirror(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_timing_of_a_live_log_is_that_of_the_mirrors_reports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(report_log, "DELAY_NS", 0)
     night = SyntheticLog()
     night.instants = 8
@@ -598,7 +603,7 @@ def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> Non
     log = night.write(tmp_path / "night.mcap")
     results = json_of("report", str(log))
     assert results["run"]["steps"] == 3
-    assert results["requests"][-1]["values"] == [None, None, 0.5], "JSON has no number for some"
+    assert results["requests"][-1]["values"] == [None, None, 0.5], "JSON has no NaN and no infinity"
     assert "has 3 frames" in results["spectra"]["why_not"]
     assert [term["missing"] for term in results["error_budget"]["terms"]] == [False, False, True, True, True]
     assert not log.with_name("night.html").exists()
@@ -672,7 +677,7 @@ def test_missing_packages_are_reported_before_the_log_is_read(
     assert re.search(r"-m pip install .*'jinja2", refusal("report", good, kind=ConfigurationError))
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, module, None)
-    assert json_of("report", good)["log"]["file"] == "x.mcap", "the results need neither"
+    assert json_of("report", good)["log"]["file"] == "x.mcap", "--json needs neither package"
 
 
 @pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part", "link.html", "other.fits"])

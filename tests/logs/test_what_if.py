@@ -89,7 +89,7 @@ BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}
             for delay in (1, 1.4, 2, 3)
             for overrides in ({}, BENCH)
         ),
-        # Without noise, tilt near 5 mas appears as 0.1 nm of other modes, which is all that some of them have.
+        # Without noise, tilt near 5 mas appears as 0.1 nm of other modes, some of which have no other error.
         *(
             pytest.param(2000, pair, 1, 0.1, {"camera__noise": False}, marks=pytest.mark.slow)
             for pair in ((HARD, SOFT), (SOFT, LEAKY))
@@ -99,7 +99,7 @@ BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}
 def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_those_gains(
     frames: int, pair: tuple[Gains, Gains], delay: float, within_nm: float, overrides: dict[str, Any]
 ) -> None:
-    """From each run to the other law, every mode is within 10 %; a run's own law reproduces it to rounding."""
+    """A what-if of one run with the law of the other predicts each mode within 10 %, with its own law to rounding."""
     configs = [configured(gains, delay, **overrides) for gains in pair]
     calibration = calibrated(configs[0])  # independent of the gains
     runs = [run_loop(config, frames, calibration) for config in configs]
@@ -115,7 +115,7 @@ def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_those_gains(
 
 
 FRAMES = 1200
-SETTLING = 599  # frames left out at the start: half of the log, the most allowed; settling takes longer
+SETTLING = 599  # frames left out at the start: half of the log, because settling takes even longer
 OTHER = "gain=0.3,tilt_gain=0.2,leak=0.01"
 
 
@@ -262,7 +262,7 @@ def test_automatic_gains_of_a_configuration_file_are_the_logged_ones(
 
 
 def test_another_reconstructor_measures_the_same_frames(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
-    """pinv by name and as a file are the same; `weighted` of that file is the logged one."""
+    """pinv by name and from a file agree; `weighted`, computed from that file, is the logged reconstructor."""
     by_name = results_of(runs["default"], requested("estimator=pinv"))
     assert by_name["estimator"] == "pinv"
     assert by_name["what_if_nm"] != pytest.approx(by_name["was_nm"], rel=1e-3)
@@ -372,7 +372,7 @@ def test_a_users_controller_is_run_like_the_integrator(
 
 
 def history(frames: int = 40, **columns: Any) -> History:
-    """The toy's history: a closed loop that measures 4 nm of each mode in every frame and whose command is zero."""
+    """History of a closed loop that measures 4 nm of each mode in every frame and whose command is zero."""
     values = np.full((frames, 3), 4.0, np.float32)
     default: dict[str, Any] = {
         "sequence": np.array([toy.frame_sequence(count) for count in range(frames)], np.uint64),
@@ -403,7 +403,7 @@ def rows_compared(run: LoggedRun) -> list[int]:
 
 
 def test_an_offset_is_not_reported_as_a_missing_command() -> None:
-    """With an offset the error is smaller by the target, which is in the logged state; its frames are compared."""
+    """An offset is the loop's target, which the logged states contain: it reduces the error without a command."""
     logged = history(error_nm=np.r_[np.full((20, 3), 4, np.float32), np.full((20, 3), 1, np.float32)])
     [last] = logged.controllers
     states = [wire.ControllerState(), wire.ControllerState(), wire.ControllerState(offset_nm=[3] * 3), last]
@@ -438,7 +438,7 @@ def test_a_probe_sequence_of_the_target_is_not_reported_as_a_missing_command() -
     assert rows_compared(run) == list(range(10, 40))
 
 
-def test_a_frame_ahead_and_a_clear_for_a_lower_start_do_not_cut_the_run() -> None:
+def test_neither_a_frame_ahead_nor_an_earlier_camera_start_after_clear_cuts_the_run() -> None:
     sequence, reasons = history().steps.sequence, np.zeros(40, np.int64)
     sequence[10], reasons[10] = toy.frame_sequence(0, 2 * toy.START), 1 << Rejection.AHEAD
     sequence[30:] -= np.uint64(1 << 32)
@@ -532,7 +532,8 @@ def test_an_open_loop_beyond_the_linear_range_gives_warnings() -> None:
     assert "12.1 nm rms" in linear
     assert "tilt x with " in linear
     assert "focus" not in linear
-    assert unstable.endswith("unstable with a delay of 1 frame: tilt x from 2.00 on, tilt y from 2.00 on")
+    tilts = ", ".join(f"tilt {axis} from a gain of 2.00 on" for axis in "xy")
+    assert unstable.endswith(f"unstable with a delay of 1 frame: {tilts}")
     assert "tilt x at" in limits
 
 

@@ -21,7 +21,7 @@ _STATES = {
 def info(
     logs: Logs,
     digest: Annotated[
-        bool, typer.Option("--digest", help="SHA-256 of the deterministic topics: equal for lockstep runs of one seed.")
+        bool, typer.Option("--digest", help="SHA-256 of the deterministic topics: equal in lockstep with equal seeds.")
     ] = False,
     as_json: Json = False,
 ) -> None:

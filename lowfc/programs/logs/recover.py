@@ -1,4 +1,4 @@
-"""The command `lowfc recover`: a complete log from the intact part of a truncated or damaged one."""
+"""The command `lowfc recover`: write the intact parts of a truncated or damaged log to a new, complete log."""
 
 from functools import partial
 from pathlib import Path
@@ -13,11 +13,11 @@ from lowfc.programs.cli.output import print_result
 def recover(
     logs: Logs,
     out: Annotated[
-        Path | None, typer.Option(help="The new log; default: NAME-recovered.mcap next to it.", show_default=False)
+        Path | None, typer.Option(help="The new log; default: NAME-recovered.mcap next to NAME.", show_default=False)
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Make a complete, indexed log from the intact part of a truncated or damaged one, which is not changed.
+    """Write the intact parts of a truncated or damaged log to a new, complete, indexed log; the original is unchanged.
 
     Each file of a recording is recovered separately; intact files are skipped.
 

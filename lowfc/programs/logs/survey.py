@@ -93,7 +93,7 @@ def _time_ns(kind: Any, payload: bytes) -> int:
 
 @dataclass(slots=True)
 class _Line:
-    """Messages of one key; `starts` holds their publishers and start times."""
+    """Row of the table of topics: the messages of one key; `starts` holds their publishers and start times."""
 
     schema: str
     first_ns: int
@@ -138,10 +138,10 @@ class _Account:
             return
         self._end_ns = max(self._end_ns, now_ns)
         if not topic.queryable and (self._begin_ns is None or now_ns < self._begin_ns):
-            self._begin_ns = now_ns  # messages requested at the log's start may be hours old
+            self._begin_ns = now_ns  # states and calibration, queried at the log's start, may be hours old
         self._losses.enter(topic, message, recorded=True)
         author = ""
-        with contextlib.suppress(BadMessageError, DecodeError):  # the log holds it as received
+        with contextlib.suppress(BadMessageError, DecodeError):  # a log holds unreadable messages, too
             if topic is HEALTH:
                 self._losses.reconcile(message, wire.Health.FromString(message.payload))
             elif topic is CONTROLLER_STATE:
@@ -218,7 +218,7 @@ def _state(reader: WholeLog) -> str:
 
 
 def recovery_in_words(metadata: Mapping[str, Mapping[str, str]]) -> str:
-    """Text of the source of a recovered log and what was left out; empty for another log."""
+    """Text on the source of a recovered log and on what was left out; empty for any other log."""
     account = metadata.get(RECOVERY)
     if account is None:
         return ""

@@ -189,7 +189,7 @@ class _System:
         closed = float(np.mean(history.steps.mode == LoopMode.CLOSED))
         recorded = history.log.metadata.get("lowfc", {})
         cards: dict[str, tuple[Any, str | None]] = {
-            "LOG": (history.log.path.name, None),  # no comments: a card has 80 characters
+            "LOG": (history.log.path.name, None),  # no comment beside a long text: a card has 80 characters
             "RUN": (recorded.get("run", ""), None),
             "CALID": (calibration.id, None),
             "NOLL": (" ".join(map(str, calibration.noll)), None),
@@ -229,8 +229,8 @@ def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibrati
         except DecodeError:
             continue
         surface_nm = actuators(command)
-        if surface_nm is not None and surface_nm.size == shape[1]:  # otherwise it is of another mirror
-            row = row_of.pop(command.frame_sequence, None)  # later commands of this frame only repeat it
+        if surface_nm is not None and surface_nm.size == shape[1]:  # of another size: a command of another mirror
+            row = row_of.pop(command.frame_sequence, None)  # later commands of this frame only repeat the first
             if row is not None:
                 rows[row] = surface_nm.ravel() * np.float32(_NM)
 

@@ -46,7 +46,7 @@ def export(
     ] = None,
     topics: Annotated[
         list[str] | None,
-        typer.Option(help="With --decimate: keep only these optional topics (keys or patterns); repeat. Default: all."),
+        typer.Option(help="With --decimate: keep only this optional topic (key or pattern); repeat for several."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Output file; default: the log's name, next to the log.")] = None,
     frames: Annotated[
@@ -139,7 +139,7 @@ def render(results: dict[str, Any]) -> str:
     lines = [f"recorded           {results['selection']}"] if results["selection"] else []
     lines += [f"{', '.join(results['files'])}: {results['steps']} steps of {results['modes']} modes{frames}"]
     if results["steps_left_out"]:
-        what = "without the calibration's modes or with impossible values"
+        what = "with another number of modes than the calibration or with impossible values"
         lines.append(f"left out           {counted(results['steps_left_out'], 'message')} {what}")
     lines += faults(results["damaged"], results["no_end"])
     lines += [f"configuration      {remark}" for remark in results["remarks"]]

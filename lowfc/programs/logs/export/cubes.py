@@ -78,7 +78,10 @@ def _copy_frames(
     """Copy the frames of a log, encoded by `encode`, after the header for the shape (frames, rows, columns).
 
     Returns:
-        Sequence and time, ns, of each frame in the order of recording. DataFileError if one cannot be copied.
+        Sequence and time, ns, of each frame in the order of recording.
+
+    Raises:
+        DataFileError: a frame cannot be copied.
     """
     path, count = history.log.path, history.frame_sequence.size
     sequence, time_ns = np.zeros(count, np.uint64), np.zeros(count, np.int64)

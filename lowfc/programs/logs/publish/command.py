@@ -12,11 +12,15 @@ def publish(
     logs: Logs,
     run: RunId = DEFAULT_RUN,
     speed: Annotated[float, typer.Option(help="Speed relative to the recorded run.")] = 1.0,
-    topics: Annotated[list[str] | None, typer.Option(help="Publish only these keys or patterns; repeat.")] = None,
+    topics: Annotated[
+        list[str] | None, typer.Option(help="Publish only this key or pattern; repeat for several.")
+    ] = None,
     allow_commands: Annotated[
         bool, typer.Option("--allow-commands", help="Publish commands, too: a live mirror will follow them.")
     ] = False,
-    wait_for: Annotated[list[str] | None, typer.Option(help="Wait for this role before starting; repeat.")] = None,
+    wait_for: Annotated[
+        list[str] | None, typer.Option(help="Wait for this role before starting; repeat for several.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Republish recorded messages on the bus, for a viewer or a controller under test.

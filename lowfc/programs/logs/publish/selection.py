@@ -17,8 +17,8 @@ class PublishedKeys:
     """Decides for every key of a log whether it is published.
 
     Attributes:
-        roles: roles to take over, in the order of the topics; if frames are selected also those of all mirrors,
-            unless a live mirror may be moved.
+        roles: roles to take over, in the order of the topics; if frames are selected and no live mirror may be moved,
+            also those of all mirrors, so that none can join.
         live: roles of live processes.
     """
 

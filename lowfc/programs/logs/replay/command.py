@@ -19,7 +19,7 @@ _HOST = ("lowfc", "git", "python", "numpy", "numba", "scipy", "blas", "processor
 """Versions and processor features on which bit-exact results may depend."""
 
 
-def _host_differs(there: dict[str, str]) -> dict[str, tuple[str, str]]:
+def _host_differences(there: dict[str, str]) -> dict[str, tuple[str, str]]:
     """Differences in versions and processor between the log's host and this one."""
     here = provenance()
     both = {key: (there[key], here.get(key, "")) for key in _HOST if key in there}
@@ -43,7 +43,7 @@ def replay_log(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Replay the recorded inputs through the controller, and compare every step and command with the log, bit by bit.
+    """Replay the recorded inputs through the controller, and compare every step and command with the log, bit for bit.
 
     Exit status 0 only if they are identical, or within --tolerance; never with another kernel. Logs may be complete,
     rotated, truncated or damaged.
@@ -61,7 +61,7 @@ def replay_log(
     account.log_s = round(account.log_s, 3)
     account.version, account.tolerance_nm = account.recorded_on.get("lowfc", ""), tolerance
     account.no_end = missing_end_text(files, finished=account.finished)
-    account.host_differs = _host_differs(account.recorded_on)
+    account.host_differs = _host_differences(account.recorded_on)
     print_result(account, as_json=as_json)
     if not account.identical:
         raise typer.Exit(1)

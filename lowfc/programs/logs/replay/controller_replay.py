@@ -42,7 +42,7 @@ class _Entry:
 
     @property
     def leads_to_command(self) -> bool:
-        """Whether a controller with a calibration sends a command for it."""
+        """Whether a controller with a calibration sends a command after this input."""
         logged = self.logged
         return isinstance(logged, wire.ControlStep) or (
             isinstance(logged, wire.ControlInput) and logged.HasField("tick")
@@ -83,7 +83,7 @@ class Context:
 
 
 class ControllerReplay:
-    """Replay of a controller since one of its starts: `advance` folded over its inputs in their order.
+    """Replay of a controller from one of its starts on: `advance` folded over its inputs in their order.
 
     Attributes:
         done: whether the state at the start of the next segment has been reached.
@@ -97,7 +97,7 @@ class ControllerReplay:
         self._context, self._account = context, context.account
         self._end: int | None = None  # input number of the first state of the next segment
         self._lost_number: int | None = None  # input number at which the state was lost
-        self._dropped = 0  # inputs since then
+        self._dropped = 0  # number of inputs dropped since then
         self._start_number = 0  # input number of the adopted state
         self._first_number: int | None = None  # lowest input number in the log
         self._command_form: tuple[int, str] | None = None  # validity, ns, and channel of the log's commands
@@ -133,7 +133,7 @@ class ControllerReplay:
             entry = self._entries.get(number)
             if entry is None:
                 entry = self._entries[number] = _Entry(message.receive_time_ns)
-            if isinstance(body, wire.MirrorCommand):  # its input is published after it
+            if isinstance(body, wire.MirrorCommand):  # the controller publishes its input after it
                 entry.command, entry.command_bytes = body, message.payload
                 return
             entry.logged, entry.logged_bytes = body, message.payload  # type: ignore[assignment]  # one of the three
@@ -149,7 +149,7 @@ class ControllerReplay:
         elif not isinstance(body, wire.MirrorCommand) and self._state is not None:
             name = body.DESCRIPTOR.name
             duplicate = Difference(name, number, self._state.frame_sequence, [f"a second message of input {number}"])
-            duplicate.otherwise = True
+            duplicate.otherwise = True  # no tolerance applies
             self._account.enter(duplicate, self._context.tolerance_nm)
             self._account.frames += isinstance(body, wire.ControlStep)
 
@@ -175,7 +175,7 @@ class ControllerReplay:
                 return
             rule = changed_rule(entry.logged) if self._context.former is not None else ""
             if rule and number not in self._states and not overdue:
-                return  # the replay may have to continue from the state after it
+                return  # the replay may have to continue from the logged state after this input
             input_ = self._input(entry, overdue=overdue)
             if input_ is not None and rule and number in self._states:
                 del self._entries[number]
@@ -231,7 +231,7 @@ class ControllerReplay:
         return decode_state(message, calibration, known.laws, known.plays, self._kernel)
 
     def _kernel(self, name: str) -> Kernel:
-        """The kernel to replay with, under the log's name for it."""
+        """The kernel to replay with, renamed to the log's kernel, so that states can be compared."""
         found = compiled.kernel(self._context.kernel or name)
         if found.name != name:
             self._account.other_kernel = found.name
@@ -277,7 +277,7 @@ class ControllerReplay:
                 with contextlib.suppress(ValueError):
                     time_ns, known = from_timestamp(request.timestamp), self._context.published
                     decoded = codec.request(request, request.name, time_ns, known.calibrations, known.laws, known.plays)
-                    if self._context.former is not None and not request.accepted:  # also if it would be accepted now
+                    if self._context.former is not None and not request.accepted:  # this version might accept it
                         decoded = replace(decoded, refusal=request.reply or "refused in the log")
                     return decoded if self._settings is None else prepared(self._settings, decoded)
             case wire.ControlInput() as other:
@@ -369,7 +369,8 @@ class ControllerReplay:
         if found is None:
             return
         self._account.enter(found, self._context.tolerance_nm)
-        if self._state is state and not self.done:  # otherwise the difference would persist for the rest of the log
+        if self._state is state and not self.done:
+            # Continue from the logged state, or the difference would persist for the rest of the log.
             self._states[state.input_number] = logged
             self._reset("")
             self._adopt()

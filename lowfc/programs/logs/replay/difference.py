@@ -10,9 +10,9 @@ from google.protobuf.message import Message
 from lowfc.arrays import Array
 
 _FLOAT32_FIELD = "actuators"
-"""Field whose bytes hold little-endian float32, nm; those of channels, a repeated message, are compared exactly."""
+"""Field whose bytes hold little-endian float32, nm; that of channels (a repeated message) is compared exactly."""
 _IN_NM = ("_nm", "actuators", "law_state")
-"""Endings of the names of fields in nm; a law's state has the unit of its author, nm for lowfc's own laws."""
+"""Endings of the names of fields in nm; the state of a user's linear law, whatever its unit, is treated like nm."""
 _MAX_SHOWN = 4
 
 
@@ -37,7 +37,7 @@ class Difference:
     otherwise: bool = False
 
     def within(self, tolerance_nm: float) -> bool:
-        """Whether only numbers in nm differ, by no more than this; False for 0."""
+        """Whether only numbers in nm differ, by no more than a tolerance; False without tolerance (0)."""
         return tolerance_nm > 0 and not self.otherwise and self.largest_nm <= tolerance_nm
 
 

@@ -59,7 +59,7 @@ class Replay:
                 controller.retry_pending = True
         elif topic in TOPICS:
             context.account.steps += topic is STEP and inside
-            with contextlib.suppress(DecodeError):  # its input number is then found to be missing
+            with contextlib.suppress(DecodeError):  # the input of an unreadable message counts as missing
                 self._controller(message).take(message, topic.message)
 
     @property

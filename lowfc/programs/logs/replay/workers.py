@@ -42,7 +42,7 @@ def replay_files(
     previous one ends, DataFileError if one cannot be replayed.
     """
     chunk_ends_ns = [_chunk_ends_ns(path) for path in paths]
-    ends_ns = sorted(end_ns for ends in chunk_ends_ns for end_ns in ends)  # a repeated calibration may be an old chunk
+    ends_ns = sorted(end_ns for ends in chunk_ends_ns for end_ns in ends)  # a chunk may hold only an old calibration
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigurationError("a log is named twice; name each once, in the order they were recorded")
     if len(paths) > 1:
@@ -87,7 +87,7 @@ def _refuse_disorder(paths: Sequence[Path], chunk_ends_ns: Sequence[Sequence[int
         if begin_ns is not None and begin_ns < end_ns - PATIENCE_NS:
             raise ConfigurationError(
                 f"{path} begins {(end_ns - begin_ns) / 1e9:.1f} s before {previous} ends; "
-                "name the logs in the order they were recorded, and replay those of one time one by one"
+                "name the logs in the order they were recorded, and replay logs of the same time separately"
             )
         end_ns, previous = max([end_ns, begin_ns or 0, *ends_ns]), path
 

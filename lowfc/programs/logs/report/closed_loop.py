@@ -150,7 +150,7 @@ def groups_of(noll: tuple[int, ...]) -> dict[str, Mask]:
 
 
 Spectra = list[Spectrum]
-"""Signals of a stretch: error, pseudo-open-loop and, if the log has truth, disturbance and residual."""
+"""Spectra of a stretch's signals: error, pseudo-open-loop and, if the log has truth, disturbance and residual."""
 
 
 def spectra_of(stretch: Stretch | None) -> Spectra | None:

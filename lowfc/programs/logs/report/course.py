@@ -128,6 +128,6 @@ def _limits(reasons: Long) -> dict[str, int]:
 
 
 def _request_time_s(run: Run, request: wire.Request) -> float:
-    """Time of the first step with a request in force, or of the last step before it."""
+    """Time of the first step with a request in force; if none follows the request, of the last step."""
     row = row_after(run.history, max(request.frame_sequence - 1, 0), request.timestamp)
     return float(run.step_s[min(row, run.history.steps.sequence.size - 1)])

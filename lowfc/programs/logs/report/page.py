@@ -66,6 +66,6 @@ def _environment() -> Any:
     with package_required("the HTML page, unlike --json, requires jinja2", "plots"):
         from jinja2 import Environment, StrictUndefined
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.finalize = lambda value: printable(value, keep=LINES) if type(value) is str else value  # not Markup
+    environment.finalize = lambda value: printable(value, keep=LINES) if type(value) is str else value  # keeps Markup
     environment.filters |= {"n": number, "fixed": fixed, "per_mode": per_mode}
     return environment

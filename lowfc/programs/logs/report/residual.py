@@ -109,7 +109,7 @@ def _shaped_in(run: Run, rows: slice) -> bool:
 def _contrast(true: Truths, rows: Integers, config: Configuration | None) -> Results | None:
     """Contrast added to the dark zone by the disturbance (open) and by the residual (closed) of these steps.
 
-    None without truth or configuration, or if the file of the coronagraph's pupil is not here.
+    None without truth or configuration, or if this host lacks the file of the coronagraph's pupil.
     """
     covariances = {}
     for name, rms_nm, sampled_nm in (

@@ -31,7 +31,8 @@ class InForce:
 
     Attributes:
         first: step from which on it is in force; comparisons ignore it and `linear`.
-        law_id, law_name: identity, or "unknown", and name of the linear law; without one, empty and "integrator".
+        law_id: identity of the linear law, "unknown" if not in the log; empty without a linear law.
+        law_name: name of the linear law; "integrator" without one.
         overruled: groups of modes that the integrator drives instead of the law.
         linear: the linear law; None without one, or if it is not in the log, is overruled or has other modes.
     """
@@ -97,7 +98,8 @@ def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None
     history.true  # noqa: B018  # joined and cached now, by the sequences that the frames have in the log
     steps, known = history.steps, np.flatnonzero(exposed(history.steps.reasons))
     if 0 < known.size < steps.sequence.size:
-        # A step whose frame is ahead of the clock gets sequence and time of the step before; an old frame its time.
+        # A step with a frame ahead of the clock gets sequence and time of the step before; one with an old frame only
+        # that time.
         rows = known[np.maximum(np.searchsorted(known, np.arange(steps.sequence.size), "right") - 1, 0)]
         ahead = steps.reasons >> Rejection.AHEAD & 1 == 1
         time_ns = np.maximum(np.where(ahead, 0, steps.time_ns), steps.time_ns[rows])
@@ -110,11 +112,11 @@ def row_after(history: History, frame_sequence: int, time: Timestamp) -> int:
     """Row of the first step after those of a frame.
 
     If the frame has no step: row of the first later frame since the same start of the camera or, without one, of the
-    first step after `time`. That is a time of the controller's clock; the camera may have another one.
+    first step after `time`, which is on the controller's clock; the camera's clock may differ.
     """
     sequence = history.steps.sequence
     rows = np.flatnonzero(sequence == frame_sequence)
-    if not rows.size:  # a lost one, or none since the controller's start or a `clear`
+    if not rows.size:  # the frame was lost, or the controller had none since its start or a `clear`
         later = (sequence > frame_sequence) & (sequence >> COUNT_BITS == frame_sequence >> COUNT_BITS)
         if later.any():
             return int(np.argmax(later))

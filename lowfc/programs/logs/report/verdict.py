@@ -50,7 +50,7 @@ def _record(results: Results) -> Results:
     if log["messages_lost"]:
         faults.append(f"{counted(log['messages_lost'], 'message')} lost")
     if log["steps_left_out"]:
-        what = "without the calibration's modes or with impossible values"
+        what = "with another number of modes than the calibration or with impossible values"
         faults.append(f"{counted(log['steps_left_out'], 'message')} {what}, left out")
     if faults:
         return _check("log", BAD if log["stopped"] else LOOK, "; ".join(faults))
@@ -82,7 +82,7 @@ def _why_no_loop(messages: Mapping[str, int]) -> str:
 def _residual(results: Results) -> Results:
     """Wavefront before and after: true over the open pupil if the log has truth, otherwise the measured modes.
 
-    Also the measured modes if the true residual contains the shapes of offset or channels, which the error does not.
+    The measured modes also if the true residual contains the shapes of offset or channels, which the error does not.
     """
     totals, tilts = results["residual"]["total_rms_nm"], results["residual"]["tilt_mas"]
     shaped = totals["residual"] is not None and results["residual"]["shaped"]
@@ -169,7 +169,7 @@ def _events(results: Results) -> Results:
 
 
 def _of_end(events: list[Results]) -> bool:
-    """Whether the first of these events is that frames ceased because the camera stopped, for good."""
+    """Whether the first of these events only reports that frames ceased, because the camera stopped for good."""
     names = [event["name"] for event in events if event["name"] != "STOPPED" or event["process"] == Role.CAMERA]
     return names[0] == "NO_FRAMES" and "STOPPED" in names and "FRAMES_BACK" not in names
 

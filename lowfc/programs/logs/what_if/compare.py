@@ -47,9 +47,10 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
 
     The what-if loop is closed throughout, starts from a flat mirror, and corrects the pseudo-open-loop modes of every
     used frame; it holds on a refused or missing frame, as the live loop does. Its modal limits act, actuator limits do
-    not. All results are over the same frames: those with the logged loop closed and both loops settled (if none with a
-    closed loop is usable, all), without saturated pixels. If the log has truth, the true residual is given too, because
-    the measured one is mostly noise for a faint star. For another reconstructor the frames are read in a second pass.
+    not. All results are over the same frames: those without saturated pixels in which both loops have settled and the
+    logged loop is closed (if no such frame is usable, in any loop mode). If the log has truth, the true residual is
+    given too, because the measured one is mostly noise for a faint star. For another reconstructor the frames are read
+    in a second pass.
     """
     user_step, noll = what.step, run.calibration.noll
     new_law = law(what, noll, run.law)
@@ -117,7 +118,7 @@ def _true(
     `moved_nm` (steps, modes) is the what-if's command minus the logged one, as seen by each exposure, `command_nm` the
     what-if's command. The second value is the contrast added to the dark zone by the continuous residual, if known.
     """
-    assert run.true_nm is not None  # noqa: S101  # the caller knows
+    assert run.true_nm is not None  # noqa: S101  # the caller has checked it
     disturbance_nm, residual_nm = (values.astype(np.float64) for values in run.true_nm)
     found, covariances = dict[str, Array](), dict[str, Array | None]()
     known = rows & np.isfinite(residual_nm).all(axis=1)
@@ -336,7 +337,7 @@ def _law_warnings(run: LoggedRun, law: Integrator, command_nm: Single) -> list[s
     delay_frames = run.delay_frames if run.delay_frames == run.controller_delay else np.ceil(run.delay_frames)
     highest = {leak: limiting_gain(delay_frames, leak) for leak in set(law.leak.tolist())}
     unstable = [
-        f"{mode_name(index)} from {highest[leak]:.2f} on"
+        f"{mode_name(index)} from a gain of {highest[leak]:.2f} on"
         for index, gain, leak in zip(noll, law.gain.tolist(), law.leak.tolist(), strict=True)
         if gain >= highest[leak]
     ]

@@ -100,7 +100,7 @@ def law(what: WhatIf, noll: tuple[int, ...], logged: Integrator) -> Integrator:
 
 
 def logged_gains(what: WhatIf, noll: tuple[int, ...]) -> Mask:
-    """Modes (modes,) that keep the logged gain, because it is automatic in the file and no option sets it."""
+    """Modes (modes,) that keep the logged gain, because `config` makes it automatic and no override sets it."""
     if what.config is None or "gain" in what.overrides:
         return np.zeros(len(noll), np.bool_)
     automatic = settings(what.config).automatic(noll)

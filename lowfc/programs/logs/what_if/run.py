@@ -35,18 +35,18 @@ from lowfc.control.loop.safety import LoopMode
 
 DELAY_DIFFERS = 0.05
 """Difference in frames beyond which a measured delay is not the controller's, or not a whole number."""
-_COMMAND_LOST_NM = 0.01  # difference between the command seen and the logged ones that shows that one is missing
+_COMMAND_LOST_NM = 0.01  # an exposure that saw a command so far from the logged ones saw one that the log lacks
 
 
 class SeenCommands(NamedTuple):
     """Commands seen by the exposures of consecutive steps.
 
     Attributes:
-        delay_frames: the measured delay, rounded if it is nearly whole, where it differs from the controller's;
-            otherwise the controller's. `weights` are its `delay_weights`.
-        seen_nm: (steps, modes); NaN where a frame was not used and the delay is the controller's.
+        delay_frames: the measured delay (rounded if it is nearly whole) if it differs from the controller's, otherwise
+            the controller's. `weights` are its `delay_weights`.
+        seen_nm: (steps, modes) commands seen; with the controller's delay, NaN where a frame was not used.
         command_lost: (steps,) True where the exposure saw a command that no step has: the log lacks it.
-        target_nm: (steps, modes) of the loop, which the steps' errors exclude.
+        target_nm: (steps, modes) target of the loop, which has been subtracted from the steps' errors.
     """
 
     delay_frames: float
@@ -67,7 +67,8 @@ class SeenCommands(NamedTuple):
     ) -> "SeenCommands":
         """Commands seen by these steps, of which the first has a used frame; the states give the loop's target.
 
-        A probe sequence (`played`) may change the target, too: there the commands seen are computed from the steps'.
+        A probe sequence may change the target, too: in its steps (`played`) the commands seen are computed from the
+        commands of the steps.
         """
         weights = delay_weights(controller_delay).astype(np.float32)
         target_nm = _target_nm(states, steps.sequence, steps.error_nm.shape[1])
@@ -110,7 +111,7 @@ class LoggedRun:
         used = rows & np.isfinite(history.steps.error_nm).all(axis=1)
         if history.calibration is None or not used.any() or not history.rate_hz:
             raise DataFileError(f"{history.log.path}: it has too few frames used by a calibrated controller")
-        rows[: int(np.argmax(used))] = False  # before it, the disturbance is unknown
+        rows[: int(np.argmax(used))] = False  # before the first used frame, the disturbance is unknown
         self.calibration = history.calibration
         self.steps = history.steps.at(rows)
         true = history.true
