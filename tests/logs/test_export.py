@@ -64,7 +64,7 @@ def a_night() -> SyntheticLog:
         del night.samples[night.places(topic)[number]]
     held = night.messages(COMMAND)[0]
     held.actuators = bytes(4 * ACTUATORS)
-    night.put(COMMAND, held)  # repeated without a new frame
+    night.put(COMMAND, held)  # a later command of the first frame
     return night
 
 
@@ -204,7 +204,7 @@ def test_an_aot_file_describes_the_system_to_aotpy(log: Path, tmp_path: Path) ->
     assert json.loads(system.config) == Configuration().model_dump()
 
 
-def test_aot_has_the_weighted_reconstructor_and_no_gains_that_a_linear_law_replaces(tmp_path: Path) -> None:
+def test_aot_has_the_weighted_reconstructor_and_under_a_linear_law_no_integrator(tmp_path: Path) -> None:
     night = a_night()
     night.law(0.1)
     state = night.messages(CONTROLLER_STATE)[-1]
@@ -269,7 +269,7 @@ def test_a_log_without_steps_or_calibration_is_refused(tmp_path: Path, topic: To
     ],
 )
 def test_a_failed_export_leaves_no_file(tmp_path: Path, to: Format, frame: Message | None, reason: str) -> None:
-    """Frames of several sizes, an image of another kind, or no frames at all."""
+    """Frames of several sizes, an image of another kind, an impossible time, or no frames at all."""
     night = a_night()
     if frame is None:
         night.without(FRAME)

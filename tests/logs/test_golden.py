@@ -102,7 +102,7 @@ def test_a_log_of_0_1_is_drawn(tmp_path: Path) -> None:
         (["acceptance", "linearity", NIGHT], "no `lowfc acceptance"),
     ],
 )
-def test_commands_that_need_another_log_say_so(words: list[object], message: str) -> None:
+def test_a_command_for_which_the_log_is_unsuitable_refuses_it(words: list[object], message: str) -> None:
     assert message in refusal(*words)
 
 

@@ -185,7 +185,7 @@ def test_archives_and_damaged_compressed_files_are_refused(tmp_path: Path, conte
     assert expected in error_of(lambda: check_files(load(None, {"mirror.flat": str(path)})))
 
 
-def test_a_shape_in_another_unit_is_refused_and_a_map_without_units_is_not(tmp_path: Path) -> None:
+def test_the_unit_of_a_shape_is_checked_and_that_of_a_map_of_active_actuators_is_ignored(tmp_path: Path) -> None:
     path, image = tmp_path / "map.fits", fits.PrimaryHDU(np.ones((34, 34)))
     image.header["BUNIT"] = "um"
     image.writeto(path)
@@ -237,7 +237,7 @@ def test_a_file_is_read_up_to_the_size_limit(tmp_path: Path) -> None:
     assert input_file.read_whole(path, 5) == b"12345"
     with pytest.raises(OSError, match="larger than 4 bytes"):
         input_file.read_whole(path, 4)
-    with pytest.raises(OSError, match="larger than 4 bytes"):  # its reported size is 0
+    with pytest.raises(OSError, match="larger than 4 bytes"):  # although the reported size of this file is 0
         input_file.read_whole(Path("/proc/self/status"), 4)
     before = set(Path("/proc/self/fd").iterdir())
     with pytest.raises(OSError, match="not a regular file"):

@@ -95,8 +95,8 @@ def test_a_log_of_a_killed_recorder_is_the_last_until_it_is_recovered(folder: Pa
     assert named_files([Path(LAST)]) == [files[0], saved]
 
 
-def test_logs_without_the_name_of_their_series_are_separate(folder: Path) -> None:
-    """Logs of 0.1 have no such name."""
+def test_logs_that_do_not_name_their_recording_are_separate(folder: Path) -> None:
+    """Logs of version 0.1 do not name it."""
     logs = [LogWriter(folder / f"20260101T00000{n}Z.mcap", 0, METADATA).finish({}) for n in range(3)]
     assert named_logs(logs) == [(log,) for log in logs]
     assert named_files([Path(LAST)]) == logs[-1:]
@@ -152,7 +152,7 @@ def without_files(results: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def ten_files_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sample]) -> Callable[[bool], Path]:
-    """Folder with a log in ten files and in one: all of it, or the first quarter."""
+    """Folder with the same log in ten files and in one: with all samples (True) or with the first quarter of them."""
 
     @cache
     def recorded_folder(all_of_it: bool) -> Path:
@@ -188,7 +188,7 @@ def test_a_report_says_that_a_file_between_two_others_is_missing(folder: Path, s
 
 
 def test_acceptance_reads_several_files(folder: Path, samples: list[Sample]) -> None:
-    """The log has no such test; the error is about the log and not about one of its files."""
+    """The log contains no acceptance test; the error is about the whole log and not about one of its files."""
     files = recorded(folder, samples[:1500], 3)
     for words in ([LAST], [str(path) for path in files]):
         assert "contains no `lowfc acceptance rejection`" in refusal("acceptance", "rejection", *words)

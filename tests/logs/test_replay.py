@@ -409,7 +409,7 @@ def test_the_smallest_difference_is_found_and_reported(topic: Topic, change: str
     assert any(line.startswith(expected) for line in account.first_difference.fields), account.first_difference.fields
     if change == "actuators":
         assert 0 < account.largest_difference_nm < 1e-5
-        difference = account.first_difference
+        difference = account.first_difference  # input 1 is the calibration, frame 0 is input 2
         assert (account.different, difference.taken, difference.frame_sequence & 0xFF) == (1, 4, 2)
 
 
