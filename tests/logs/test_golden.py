@@ -152,7 +152,7 @@ def test_former_keys_of_a_configuration_give_a_remark() -> None:
     assert set(former_names.KEYS.values()) <= set(configuration.keys())
 
 
-def test_a_key_under_both_names_is_refused(tmp_path: Path) -> None:
+def test_a_key_under_its_former_and_its_present_name_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "lowfc.toml"
     path.write_text(f"[control]\n{FORMER_KEY} = 50\nframe_timeout_ms = 60\n")
     with pytest.raises(ConfigurationError, match=r"former name of control\.frame_timeout_ms, and both are present"):

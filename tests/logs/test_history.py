@@ -66,7 +66,7 @@ def test_late_commands_after_a_restart_of_the_camera_are_counted(tmp_path: Path)
     assert history_of(night, tmp_path / "x.mcap").commands_late == 3 + 6  # 40 precede the log
 
 
-def test_the_camera_is_that_of_most_steps_and_steps_under_another_are_marked(tmp_path: Path) -> None:
+def test_the_camera_state_is_that_of_most_steps_and_steps_with_other_settings_are_marked(tmp_path: Path) -> None:
     night = SyntheticLog().frames(STEPS)
     settings = night.messages(CAMERA_STATE)[0]
     for factor, frames in ((2, 5), (1, 5)):

@@ -27,7 +27,7 @@ from lowfc.programs.design.sam_files import read_state
 from lowfc.programs.logs.replay.workers import replay_files
 
 MAX_CHARACTERS = 500
-"""Longest error, with the path of its file."""
+"""Longest error message, including the path of its file."""
 
 
 def error_of(call: Callable[[], object]) -> str:
@@ -216,7 +216,7 @@ def test_fits_images_and_pupils_with_a_huge_header_are_refused(tmp_path: Path) -
         *(("sensor.sam", "x.json"), ("sensor.pupil", "x.npz")),
     ],
 )
-def test_a_file_of_an_unknown_user_does_not_exist(key: str, file: str) -> None:
+def test_a_file_in_the_home_of_an_unknown_user_is_reported_as_missing(key: str, file: str) -> None:
     path = f"~no-such-user/{file}"
     text = error_of(lambda: check_files(load(None, {key: path})))
     assert path in text

@@ -160,7 +160,7 @@ def night_of(input_list: list[Input], **changes: object) -> Night:
 
 
 @pytest.mark.skipif(not compiled.available(), reason="needs the extra `fast`")
-def test_a_log_of_the_fused_kernel_is_replayed_bit_for_bit_with_it_and_with_a_difference_by_numpy() -> None:
+def test_a_log_of_the_fused_kernel_is_replayed_bit_for_bit_by_that_kernel_but_not_by_numpy() -> None:
     channel = Request(0, "channel", text="dark-hole", actuators_nm=SHAPE)
     law = Request(0, "law", law=integrator([0.3] * 3, [0.0] * 3, NOLL, 2.5, 1000.0))
     input_list = [*frames(60, 1), channel, *frames(100, 61), law, *frames(400, 161)]

@@ -329,7 +329,7 @@ def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> N
 
 
 @pytest.mark.usefixtures("without_drawings")
-def test_a_report_says_that_the_calibration_of_its_steps_is_missing(tmp_path: Path) -> None:
+def test_a_report_of_a_log_without_calibration_says_that_the_steps_cannot_be_read(tmp_path: Path) -> None:
     night = SyntheticLog().frames(20).without(CALIBRATION)
     report = report_of(read_run(night.write(tmp_path / "x.mcap")))
     texts = {check["name"]: check["text"] for check in report.results["verdict"]["checks"]}
@@ -539,7 +539,7 @@ def test_a_true_residual_with_an_offset_is_no_measure_of_the_loop(
 
 
 @pytest.mark.usefixtures("without_drawings")
-def test_without_truth_no_true_residual_includes_an_offset(tmp_path: Path) -> None:
+def test_without_truth_a_report_mentions_no_offset_in_the_true_residual(tmp_path: Path) -> None:
     night = SyntheticLog(truth=False).request("offset", (20.0, 0.0, 0.0)).frames(400)
     report = report_of(read_run(night.write(tmp_path / "x.mcap")))
     assert not report.results["residual"]["shaped"]
@@ -681,7 +681,7 @@ def test_missing_packages_are_reported_before_the_log_is_read(
 
 
 @pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part", "link.html", "other.fits"])
-def test_a_report_overwrites_no_log_and_has_the_name_of_a_page(tmp_path: Path, name: str) -> None:
+def test_a_report_overwrites_no_log_and_must_have_the_suffix_of_a_page(tmp_path: Path, name: str) -> None:
     log = uneventful(SyntheticLog(), 3).write(tmp_path / "night.mcap")
     before = log.read_bytes()
     (tmp_path / "link.html").hardlink_to(log)

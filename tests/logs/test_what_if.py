@@ -299,7 +299,7 @@ def test_another_reconstructor_is_weighted_like_the_logged_one(
 def test_frames_that_are_not_in_the_log_are_counted(
     runs: dict[str, LoggedRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another reconstructor cannot measure them, and the what-if holds, as it would without those frames."""
+    """Another reconstructor cannot measure frames that the log lacks: there the what-if holds its command."""
     run = runs["default"]
     found = run.measured_again(run.calibration)
     np.testing.assert_allclose(found, run.steps.error_nm, atol=1e-4)

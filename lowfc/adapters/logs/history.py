@@ -104,9 +104,9 @@ class History:
         configuration: configuration of the recorded loop; None if there is no readable one.
         remarks: sentences on parts of the configuration that this version cannot use, and on the calibration if its
             message is lost; each names the log.
-        calibration: the last one recorded; if all its messages are lost, the attached one that the last state names.
+        calibration: the last one recorded; if the log has no message of it, the attached one that `controller` names.
         controllers: states of the controllers, in order.
-        camera: state with the most frequent settings among the steps under `calibration` (in closed loop, if any are).
+        camera: state with the camera's settings in most steps under `calibration` (closed-loop ones, if there are any).
         under_camera: (steps,) whether the camera had the settings of `camera` in each step.
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
         command_sequence, command_publish_ns: the same of every mirror command (the message's own sequence).
@@ -118,8 +118,8 @@ class History:
         requests: operators' requests, with the answers.
         events: (publish time in ns, message) of each event.
         health: last Health of each process, by name.
-        commands_late: commands that the camera counted as late between its first and last Health in the log, restarts
-            included; None if it sent fewer than two.
+        commands_late: commands that the camera counted as late between its first and last Health in the log, also
+            across restarts; None if it sent fewer than two.
         counts: number of messages, by topic key.
         published: calibrations, laws and played tables, by identity.
         span_ns: log times of the first message that is not retained, and of the last message; (0, 0) if all are.
@@ -162,7 +162,7 @@ class History:
         return frame_rate_hz(self.camera, self.steps)
 
     def camera_lag_ns(self, process: str) -> int:
-        """Time to add to a frame's time to convert it from the camera's clock to that of another process, ns."""
+        """Time to add to a frame's time for the clock of another process, ns; publish times are on the recorder's."""
         camera, other = (self.health.get(name, wire.Health()) for name in (Role.CAMERA, process))
         return camera.router_offset_ns - other.router_offset_ns
 

@@ -25,7 +25,8 @@ class _Tally:
 
     Attributes:
         gaps: gaps in the received sequences.
-        published: number published, once the publisher has reported that it stopped; a message sent twice counts twice.
+        published: number published, by the publisher's own count, 0 until it reports that it has stopped; a message
+            sent twice counts twice.
         recorded: number recorded.
         duplicates: number of those recorded that were duplicates.
         never_sent: frames that a camera lost and never sent, according to its Health, less `lost_before`.

@@ -237,7 +237,7 @@ def _newest(folder: Path) -> list[Path]:
 
 
 def _recording_and_number(path: Path) -> tuple[tuple[str, ...], int]:
-    """Recording of a file, and the file's number in it; () and 1 if it is unreadable or of version 0.1."""
+    """Recording of a file, and the file's number in it; () and 1 for a file that is unreadable or of version 0.1."""
     try:
         metadata = metadata_at_start(path)
     except DataFileError:

@@ -17,7 +17,7 @@ from lowfc.contract.envelope import COUNT_BITS, sequence_of, start_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Topic
 
-_PREFIX_BYTES = 64  # of a chunk, compared besides its CRC: among a night's chunks, two may have the same 32-bit CRC
+_PREFIX_BYTES = 64  # identifies a chunk together with its 32-bit CRC, which two of a night's chunks may share
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, count, log time, publish time
 
 
@@ -60,7 +60,7 @@ class LogReader:
             topics: topics whose messages are delivered; None: all.
             skip_damaged: whether to leave out damaged stretches instead of raising an error.
             from_ns: log time; chunks known to end before it are skipped.
-            always: topics for which no chunk is skipped because of `from_ns`; such a chunk is read with all messages.
+            always: topics whose messages keep their chunk, with all its messages, from being skipped by `from_ns`.
             sparse: whether to skip chunks without messages of `topics`, by their indexes: for topics with few messages
                 in a long log. The checksum of a skipped chunk is not checked, nor then that of the data section.
         """

@@ -16,7 +16,7 @@ from lowfc.contract.errors import ConfigurationError, nearest
 from lowfc.contract.messages import FRAME, MIRROR_STATE, TOPICS, Topic, wire
 
 SELECTION = "selection"
-"""Name of the metadata with the selection; a log without it is complete."""
+"""Name of the metadata with the selection; in a log without this metadata, everything is selected."""
 
 _DECIMATED = {FRAME: "frames", MIRROR_STATE: "mirror states"}
 """Topics of which every Nth message is recorded."""

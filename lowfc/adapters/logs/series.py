@@ -185,7 +185,7 @@ def _finish(log: LogWriter, totals: Mapping[str, str]) -> int:
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str:
-    """Sentence on a disk with too little space for logs in `folder`, else empty; DataFileError if it is no folder."""
+    """Sentence on too little space on the disk of `folder`, else empty; DataFileError if the folder is inaccessible."""
     if not (parent := existing(folder)).is_dir():
         raise DataFileError(
             f"no log can be recorded in {folder}: {parent} is no folder; name another (recorder.folder)"

@@ -40,7 +40,7 @@ UNFINISHED = ".part"
 FILE_MODE = 0o640
 """Default permissions of a log, further reduced by the umask: notes and frames are not public."""
 
-CHUNK_BYTES = 240 * 1024  # the message that exceeds it closes a chunk: below 256 KiB if it is at most 15 KiB
+CHUNK_BYTES = 240 * 1024  # the message that exceeds this closes the chunk; below 256 KiB with frames up to 15 KiB
 PART = "part"
 """Name of the metadata with the recording that a file belongs to, and the file's number in it."""
 
@@ -267,7 +267,7 @@ def log_path(folder: Path, time_ns: int) -> Path:
 
 
 def declaration(message: type[ProtobufMessage]) -> FileDescriptorSet:
-    """Descriptor of a message and its imports, in the order required by readers."""
+    """Descriptors of a message's file and its imports, imports first, as readers require."""
     declared = FileDescriptorSet()
     added: set[str] = set()
 

@@ -116,7 +116,7 @@ class _Line:
 
 
 class _Account:
-    """Counts of the messages of a log with this selection of topics."""
+    """Counts of the messages of a log that was recorded with `selection`."""
 
     def __init__(self, selection: Selection = EVERYTHING) -> None:
         self._selection = selection

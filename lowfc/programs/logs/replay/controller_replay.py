@@ -118,7 +118,7 @@ class ControllerReplay:
         if isinstance(body, wire.ControllerState):
             self._take_state(body, message.receive_time_ns)
         else:
-            number: int = body.input_number  # type: ignore[attr-defined]  # all its other messages have one
+            number: int = body.input_number  # type: ignore[attr-defined]  # all other messages have one
             if not number:  # an unreadable request, or a command of another program
                 if kind is wire.ControlStep:
                     raise DataFileError(
@@ -133,7 +133,7 @@ class ControllerReplay:
             entry = self._entries.get(number)
             if entry is None:
                 entry = self._entries[number] = _Entry(message.receive_time_ns)
-            if isinstance(body, wire.MirrorCommand):  # the controller publishes its input after it
+            if isinstance(body, wire.MirrorCommand):  # the input that led to the command is published later
                 entry.command, entry.command_bytes = body, message.payload
                 return
             entry.logged, entry.logged_bytes = body, message.payload  # type: ignore[assignment]  # one of the three
@@ -241,7 +241,7 @@ class ControllerReplay:
         for number in [number for number in self._entries if number <= upto]:
             logged = self._entries.pop(number).logged
             self._dropped += logged is not None
-            if self._unchecked_because:  # otherwise they belong to another segment
+            if self._unchecked_because:  # otherwise the step belongs to another segment
                 self._account.leave_out(self._unchecked_because, int(isinstance(logged, wire.ControlStep)))
 
     def _drop_old(self, now_ns: int, *, ended: bool) -> None:

@@ -12,12 +12,12 @@ from lowfc.contract.messages import wire
 
 M = TypeVar("M", bound=Message)
 
-CAMERA_RULE = "the camera's settings are compared with the calibration's, not its bias with the dark"
+CAMERA_RULE = "the camera's settings are compared with the calibration's, instead of its bias with the dark frame"
 CHANNEL_RULE = "only a channel that exists is removed"
 CLOSE_RULE = "the loop is not closed while frames are refused, or on a camera that does not fit the calibration"
 CLEAR_RULE = "clear forgets the newest frame sequence"
 GAIN_RULE = "gain and leak of a mode are checked together, and only controlled modes have automatic gains"
-LOAD_RULE = "a calibration loaded in safe mode adopts no shape, one loaded during a probe sequence none of its shapes"
+LOAD_RULE = "loading a calibration adopts no shape in safe mode, and no shape of a running probe sequence"
 
 _REQUEST_RULES = {
     **dict.fromkeys(("close", "step", "law"), CLOSE_RULE),

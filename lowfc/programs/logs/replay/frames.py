@@ -38,7 +38,7 @@ class Frames:
         self._steps.append((step.frame_sequence, from_timestamp(step.timestamp)))
 
     def frame(self, sequence: int, time_ns: int, age_ns: int, *, any_time: bool = False) -> Frame | None:
-        """The frame of this sequence and time; else, if `any_time`, the newest of this sequence without a step."""
+        """The frame of this sequence and time; else, if `any_time`, the newest of this sequence that has no step."""
         found = []
         for payload in self._payloads.get(sequence, ()):
             with contextlib.suppress(BadMessageError):  # the controller skipped it, too

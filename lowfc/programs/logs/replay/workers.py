@@ -26,7 +26,7 @@ from lowfc.programs.logs.replay.fold import TOPICS, Replay
 from lowfc.programs.logs.replay.former import FormerVersion
 
 _WORTH_BYTES = 50_000_000
-"""Size of log that justifies another process; for less, its start takes longer than it saves."""
+"""Size of log that justifies another process; for less, starting the process takes longer than it saves."""
 _SEGMENTS_PER_JOB = 4  # for steady progress, and short idle times at the end
 _PROGRESS_EVERY = 5000
 
@@ -81,7 +81,7 @@ def _refuse_disorder(paths: Sequence[Path], chunk_ends_ns: Sequence[Sequence[int
     """Raise ConfigurationError if a log's first frame is more than `PATIENCE_NS` before the end of the previous log."""
     end_ns, previous = 0, paths[0]
     for path, ends_ns in zip(paths, chunk_ends_ns, strict=True):
-        frames = WholeLog(path, topics=(FRAME,), skip_damaged=True)  # the states at its start may be old
+        frames = WholeLog(path, topics=(FRAME,), skip_damaged=True)  # the states at a log's start may be old
         with contextlib.closing(iter(frames)) as messages:
             begin_ns = next((frame.receive_time_ns for frame in messages), None)
         if begin_ns is not None and begin_ns < end_ns - PATIENCE_NS:

@@ -111,7 +111,7 @@ def _measurement_terms(stretch: Stretch, noise: SensorNoise | None, *, shaped: b
 
 
 def _columns(term: Term | None, masks: Masks) -> Results:
-    """Rms of each group in nm; `upper_limit` names the groups in which it was not detected."""
+    """Rms of a term in each group, nm; `upper_limit` names the groups in which the term was not detected."""
     if term is None:
         return {"rms_nm": dict.fromkeys(masks), "upper_limit": []}
     totals = {name: term.total(mask) for name, mask in masks.items()}

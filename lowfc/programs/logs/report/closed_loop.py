@@ -97,7 +97,7 @@ def longest_stretch(run: Run) -> Stretch | None:
         if true.continuous and exposure_fraction(history.camera) is not None:
             timing = history.timing(in_force.delay_frames)
     frames = time_series(steps.sequence[rows], np.hstack(signals))
-    noll = tuple(range(2, 2 + gain.size))  # only their number is used
+    noll = tuple(range(2, 2 + gain.size))  # only the number of modes is used
     rate_hz = history.rate_hz or 1.0  # unknown, and unused, for a single step
     if in_force.linear is None:
         law = integrator(gain, leak, noll, in_force.delay_frames, rate_hz)
@@ -107,7 +107,7 @@ def longest_stretch(run: Run) -> Stretch | None:
 
 
 def why_none(run: Run) -> str:
-    """The reason if there is no stretch."""
+    """Reason why there is no stretch."""
     closed = run.history.steps.mode == LoopMode.CLOSED
     if (closed & run.history.under_calibration).any():
         return (
@@ -237,7 +237,7 @@ def _band_rms(frequency_hz: Array, power: Array, low_hz: float, high_hz: float) 
 
 
 def noise_of(history: History, rows: slice) -> SensorNoise | None:
-    """Sensor noise of one frame at the flux of these steps, through the reconstructor in use at their end.
+    """Sensor noise of one frame at the flux of these steps, through the reconstructor in use at the last of them.
 
     None if the log lacks calibration, flux, or the camera's gain.
     """

@@ -30,7 +30,7 @@ class InForce:
     """A control law in force: gain and leak (modes,) of the integrator, delay, and the linear law used instead.
 
     Attributes:
-        first: step from which on it is in force; comparisons ignore it and `linear`.
+        first: first step under the law; comparisons of laws ignore `first` and `linear`.
         law_id: identity of the linear law, "unknown" if not in the log; empty without a linear law.
         law_name: name of the linear law; "integrator" without one.
         overruled: groups of modes that the integrator drives instead of the law.
@@ -144,7 +144,7 @@ def _laws_in_force(history: History) -> tuple[InForce, ...]:
 
 def _with_linear_law(found: InForce, state: wire.ControllerState, laws: Mapping[str, LinearLaw]) -> InForce:
     groups, linear = tuple(overruled(state)), None
-    with contextlib.suppress(ValueError):  # the log does not contain it
+    with contextlib.suppress(ValueError):  # the log does not contain the law
         linear = driving(state, laws)
     law_id = state.law.id if linear is None else linear.id
     if linear is not None and (groups or len(linear.noll) != len(found.gain)):

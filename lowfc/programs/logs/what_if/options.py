@@ -142,6 +142,6 @@ def _number(key: str, value: str) -> float:
         number = float(value)
     except ValueError:
         raise ConfigurationError(f"--set: {key} must be a number, got {value!r}") from None
-    if abs(number) > MAX_LIMIT_NM:  # it may overflow in single precision
+    if abs(number) > MAX_LIMIT_NM:  # larger numbers may overflow in single precision
         raise ConfigurationError(f"--set: {key} must be at most {MAX_LIMIT_NM:g}, got {value}")
     return number

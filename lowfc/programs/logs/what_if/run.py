@@ -34,8 +34,8 @@ from lowfc.control.loop.estimator import Estimator
 from lowfc.control.loop.safety import LoopMode
 
 DELAY_DIFFERS = 0.05
-"""Difference in frames beyond which a measured delay is not the controller's, or not a whole number."""
-_COMMAND_LOST_NM = 0.01  # an exposure that saw a command so far from the logged ones saw one that the log lacks
+"""Difference in frames beyond which a measured delay counts as different from the controller's, or as fractional."""
+_COMMAND_LOST_NM = 0.01  # if the command seen differs by more from the logged ones, the log lacks it
 
 
 class SeenCommands(NamedTuple):
@@ -90,18 +90,21 @@ class LoggedRun:
     """Steps of a log with distinct exposures, from the first step whose frame was used.
 
     Attributes:
-        steps: these steps; `missing`: (steps,) number of exposures without a step before each.
+        steps: these steps.
+        missing: (steps,) number of exposures without a step before each.
         true_nm: disturbance and residual (steps, modes) at the start of each exposure, NaN where unknown; None without
             any.
         continuous_rms_nm: rms of the true residual (steps, modes) over each period; None if the log does not have it.
         calibration: calibration of the log.
-        used: (steps,) whether the frame was used; `under_calibration`: see `History`.
-        law: last law of the run.
-        controller_delay: delay assumed by the controller, frames; `measured_delay`, from `measured_from`, is None if
-            it cannot be measured; the comparison uses `delay_frames`, with `weights`.
+        used: (steps,) whether the frame was used.
+        under_calibration: (steps,) see `History`.
+        law: last integrator of the run.
+        controller_delay: delay assumed by the controller, frames.
+        measured_delay: delay measured from the log, frames; None if it cannot be measured.
+        measured_from: what the delay was measured from, in words.
         played: (steps,) True during a probe sequence, which moves the mirror or the loop's target.
-        seen: commands seen by the exposures; `delay_frames`, `weights`, `seen_nm` and `command_lost` are those of
-            `seen`.
+        seen: commands seen by the exposures.
+        delay_frames, weights, seen_nm, command_lost: those of `seen`; the comparison uses this delay.
     """
 
     def __init__(self, history: History) -> None:
