@@ -101,7 +101,7 @@ class Columns:
     """Columns that grow row by row, each with a number or a vector per row."""
 
     def __init__(self, widths: Mapping[str, int] = MappingProxyType({}), /, **kinds: str) -> None:
-        """Make a column for each of `kinds`, names with type codes of `array`; `widths` has the vector lengths."""
+        """Make a column for each name in `kinds`, with this type code of `array`; `widths` has the vector lengths."""
         self._columns: dict[str, array[Any]] = {name: array(kind) for name, kind in kinds.items()}
         self._widths = widths
         self._rows = 0

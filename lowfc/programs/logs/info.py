@@ -21,7 +21,8 @@ _STATES = {
 def info(
     logs: Logs,
     digest: Annotated[
-        bool, typer.Option("--digest", help="SHA-256 of the deterministic topics: equal in lockstep with equal seeds.")
+        bool,
+        typer.Option("--digest", help="SHA-256 of the deterministic topics: equal for lockstep runs of the same seed."),
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -86,7 +87,7 @@ def _summary(contents: Mapping[str, Any]) -> dict[str, str]:
         "recovery": recovery_in_words(metadata),
         "damage": "\n".join(damage),
         "start": "" if contents["start"] is None else f"{contents['start']}, {contents['duration_s']:.3f} s",
-        "lockstep": "simulated time in the messages; start, duration and rates are the host's"
+        "lockstep": "messages have simulated time; start, duration and rates are in host time"
         if contents["lockstep"]
         else "",
         "messages": f"{contents['messages']}; {', '.join(lost)}",

@@ -178,7 +178,7 @@ class _System:
         if state is not None and len(state.gain) == len(calibration.noll):
             exposure = exposure_fraction(self._history.camera)
             loop.delay = state.delay_frames + (0.0 if exposure is None else (1 - exposure) / 2)
-            if not state.HasField("law"):  # a linear law is not a filter of each mode
+            if not state.HasField("law"):  # a linear law cannot be given as one filter for each mode
                 gain, leak = np.array(state.gain, np.float32), np.array(state.leak, np.float32)
                 loop.time_filter_num = aotpy.Image("TIME FILTER NUM", gain[:, None])
                 loop.time_filter_den = aotpy.Image("TIME FILTER DEN", np.stack([leak - 1, np.ones_like(leak)], axis=1))

@@ -33,7 +33,7 @@ from lowfc.programs.logs.publish.selection import PublishedKeys, role_of
 BEHIND_NS = 1_000_000
 """Delay after which a message is counted as behind."""
 LONG_WAIT_NS = 10_000_000_000
-"""Time to the next message above which it is announced."""
+"""Time to the next message above which the wait is announced."""
 
 _MAX_SLEEP_NS = 100_000_000
 _PROGRESS_NS = 200_000_000
@@ -240,7 +240,7 @@ def _wait_for_receivers(service: Service, live: Collection[str], wait_for: Colle
     while missing and service.running:
         missing = service.wait_for(missing, _WAIT_FOR_S)
     begun_s = time.monotonic()
-    service.wait_for(live, _WAIT_FOR_S)  # a user's own program may not send Health
+    service.wait_for(live, _WAIT_FOR_S)  # no longer, because a user's own program may not send Health
     while service.running and time.monotonic() - begun_s < _SETTLE_S:
         time.sleep(0.02)
     return service.running

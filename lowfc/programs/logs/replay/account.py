@@ -26,7 +26,8 @@ class Account(Result):
             `largest_difference_nm` the largest difference of a number in nm.
         other_kernel: kernel of the replay if it differs from the log's; otherwise empty.
         rules_changed: number of inputs that this version handles differently on purpose, by rule.
-        version: lowfc version of the first log; `host_differs` has the versions and processor features that differ.
+        version: lowfc version of the first log.
+        host_differs: versions and processor features that differ between the first log's host and this one.
         log_s: time from the first frame to the last; `speed` is `log_s` over the time of the replay.
         complete: whether every log has its end and summary.
         finished: whether the recorder ended every log; `no_end` is the reason if not.

@@ -9,7 +9,7 @@ from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.loop.inputs import Frame
 
 FRAMES_BYTES = 64 << 20  # limit of memory
-_STEPS_KEPT = 10_000  # steps whose frame is remembered
+_STEPS_KEPT = 10_000  # number of steps whose frame is remembered
 
 
 class Frames:

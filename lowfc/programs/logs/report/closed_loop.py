@@ -34,7 +34,10 @@ class Stretch:
 
     Attributes:
         rows: steps of the stretch, after settling.
-        settling: number of steps left out for settling; `earlier`: further steps left out after these, see `MAX_STEPS`.
+        settling: number of steps left out for settling.
+        earlier: number of further steps left out after these, see `MAX_STEPS`.
+        in_force: the law as it was in force.
+        law: the same law at the stretch's rate and delay; the integrator, too, as a linear law.
         timing: timing of the loop; sampled if the log's truth is sampled.
         frames: columns of error, pseudo-open-loop and, if the log has truth, disturbance, residual and the residual's
             mean over the exposure.
@@ -98,7 +101,7 @@ def longest_stretch(run: Run) -> Stretch | None:
             timing = history.timing(in_force.delay_frames)
     frames = time_series(steps.sequence[rows], np.hstack(signals))
     noll = tuple(range(2, 2 + gain.size))  # only the number of modes is used
-    rate_hz = history.rate_hz or 1.0  # unknown, and unused, for a single step
+    rate_hz = history.rate_hz or 1.0  # with a single step the rate is unknown, and unused
     if in_force.linear is None:
         law = integrator(gain, leak, noll, in_force.delay_frames, rate_hz)
     else:

@@ -97,7 +97,7 @@ def _intervals(figure: "Figure", report: Report) -> bool:
         for (name, values), colour, style in zip(found.items(), (INK, COLOURS["other"]), ("-", "--"), strict=False):
             counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
             left.stairs(counts, edges, label=name, color=colour, linestyle=style, linewidth=1.2)
-        left.set(yscale="log", xlabel="interval, µs (first and last bin: with all beyond)", ylabel="number")
+        left.set(yscale="log", xlabel="interval, µs (the outer bins include all beyond)", ylabel="number")
         left.legend()
     colours = (COLOURS["other"], COLOURS["another"], FAINT, COLOURS["error"], INK, INK)
     styles = ("-", "--", "-.", ":", "-", "--")

@@ -33,7 +33,7 @@ def page(report: Report, progress: Callable[[str], None] = lambda name: None) ->
 
 
 def require_page() -> None:
-    """Check that the page can be made; called before the work."""
+    """Raise an error if the page cannot be made for lack of a package; called before the log is read."""
     _environment()
     figure_class()
 

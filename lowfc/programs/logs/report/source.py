@@ -95,11 +95,11 @@ def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None
     log = WholeLog(files, skip_damaged=True)
     log.progress = progress
     history = read_history(log)
-    history.true  # noqa: B018  # joined and cached now, by the sequences that the frames have in the log
+    history.true  # noqa: B018  # joined and cached now, while the steps have their sequences of the log
     steps, known = history.steps, np.flatnonzero(exposed(history.steps.reasons))
     if 0 < known.size < steps.sequence.size:
-        # A step with a frame ahead of the clock gets sequence and time of the step before; one with an old frame only
-        # that time.
+        # A step whose frame is ahead of the clock gets the sequence and the time of the step before; a step with an
+        # old frame gets only that time.
         rows = known[np.maximum(np.searchsorted(known, np.arange(steps.sequence.size), "right") - 1, 0)]
         ahead = steps.reasons >> Rejection.AHEAD & 1 == 1
         time_ns = np.maximum(np.where(ahead, 0, steps.time_ns), steps.time_ns[rows])

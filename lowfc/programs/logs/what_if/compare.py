@@ -174,7 +174,7 @@ def render(results: dict[str, Any]) -> str:
         *table(["residual, nm rms", *(_TITLES[name] for name in columns), "gain"], rows),
         "",
         "measured values include sensor noise; true: at the start of each exposure; continuous: also between these "
-        "instants, while the mirror holds; assumes a linear sensor and no actuator limits",
+        "instants, while the mirror holds; the what-if assumes a linear sensor and no actuator limits",
         *([] if results["added_contrast"] is None else [added_contrast_in_words(results["added_contrast"])]),
         *(f"warning: {warning}" for warning in results["warnings"]),
     ]
@@ -207,7 +207,7 @@ def _calibration(what: WhatIf, run: LoggedRun) -> Calibration:
 def _reconstructed(calibration: Calibration, estimator: str, run: LoggedRun) -> Calibration:
     path, configuration = run.history.log.path, run.history.configuration
     if configuration is None:
-        raise ConfigurationError(f"{path}: has no configuration, so the noise of a pixel is unknown")
+        raise ConfigurationError(f"{path} has no configuration, so the noise of a pixel is unknown")
     camera = detector(configuration)
     with raised_as(CalibrationError, ValueError, f"{path}: {estimator} reconstructor"):
         R = reconstructor(
@@ -259,7 +259,7 @@ def _log_warnings(run: LoggedRun) -> list[str]:
         found.append(
             f"the controller assumed a delay of {counted(float(run.controller_delay), 'frame')}, but the mean measured "
             f"from {run.measured_from} is {run.measured_delay:.2f}: pseudo-open-loop modes were recomputed with the "
-            "measured delay of every frame"
+            "measured delay"
         )
     counts = count_reasons(run.steps.reasons).items()
     acted = [f"{reason.name.lower()} at {counted(count, 'frame')}" for reason, count in counts if reason in _LIMITS]
@@ -275,7 +275,7 @@ def _log_warnings(run: LoggedRun) -> list[str]:
         true = "" if run.true_nm is None else ", and true values include the shapes of both"
         found.append(f"an offset or channels were in force: the open loop is relative to the offset{true}")
     if changes := sum(one.accepted and one.name in LAW_KEYS for one in run.history.requests):
-        found.append(f"gain or leak was changed {counted(changes, 'time')} in the logged run; the last ones are shown")
+        found.append(f"gain or leak changed {counted(changes, 'time')} in the logged run; the last values are shown")
     if laws := sorted({state.law.name for state in run.history.controllers if state.HasField("law")}):
         found.append(
             f"a linear law ({', '.join(laws)}) was in use in the logged run: gains and settling time as logged are "
@@ -288,8 +288,8 @@ def _log_warnings(run: LoggedRun) -> list[str]:
         )
     if lost := np.count_nonzero(run.command_lost):
         found.append(
-            f"the log lacks some commands: {counted(int(lost), 'frame')} exposed with a missing one, and the settling "
-            "time after each, are left out"
+            f"the log lacks some commands: {counted(int(lost), 'frame')} exposed with a missing command, and the "
+            "settling time after each, are left out"
         )
     return found
 

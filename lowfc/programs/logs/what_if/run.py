@@ -136,7 +136,7 @@ class LoggedRun:
     def uncorrected(self) -> Mask:
         """Modes (modes,) that automatic gains did not correct at the end of the run.
 
-        They weighted the reconstructor for these modes.
+        Automatic gains weighted the reconstructor for these modes.
         """
         state = self.history.controller
         modes = len(self.calibration.noll)
@@ -186,7 +186,7 @@ class LoggedRun:
     def measured_again(self, calibration: Calibration) -> Single:
         """Errors (steps, modes) measured in the used frames with another calibration, in a second pass.
 
-        Its reconstructor is weighted like that of the logged run at its end, see `uncorrected`.
+        The reconstructor of `calibration` is weighted like the logged one at the end of the run, see `uncorrected`.
         """
         steps, log = self.steps, self.history.log
         if not log.selection.has_every_frame:
