@@ -448,7 +448,7 @@ def test_neither_a_frame_ahead_nor_an_earlier_camera_start_after_clear_cuts_the_
 
 
 def test_rows_of_settling_open_loop_and_refused_or_saturated_frames_are_not_compared() -> None:
-    """Five time constants of a gain of 0.5 are 10 frames to settle."""
+    """With a gain of 0.5 the loop settles in 10 frames, which are five time constants."""
     error, saturated = np.full((40, 3), 4, np.float32), np.zeros(40, np.int64)
     error[[10, 11]], saturated[[20, 21]] = np.nan, 3
     run = LoggedRun(history(error_nm=error, pol_nm=error.copy(), saturated_pixels=saturated))

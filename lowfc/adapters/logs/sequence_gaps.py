@@ -62,7 +62,7 @@ class Arrivals:
 
     @property
     def skipped(self) -> int:
-        """Number of received messages that were not processed."""
+        """Number of received messages that were not processed; 0 unless a subclass skips messages."""
         return 0
 
     def count(self, sample: Sample) -> None:

@@ -38,7 +38,7 @@ def thin(
         return True
 
     def include_record(record: Metadata | Attachment) -> bool:
-        """Whether to copy a record: the first of each name, but every "recording" and "recovery": their last counts."""
+        """Whether to copy a record: the first of each name; all "recording" and "recovery", as readers use the last."""
         known = record.name in copied_names and record.name not in ("recording", RECOVERY)
         copied_names.add(record.name)
         return not known
