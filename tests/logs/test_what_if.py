@@ -185,7 +185,7 @@ class BetweenFramesLog(SyntheticLog):
 
 
 def test_the_continuous_residual_of_a_fractional_delay_is_that_of_the_moving_mirror(tmp_path: Path) -> None:
-    """Compared with the true disturbance, the commands and a mirror that moves a quarter of a period after t_k."""
+    """Expected: true disturbance and commands; the mirror moves a quarter of a period after an exposure's start."""
     toml = load(None, {"sensor.modes": 10, "camera.delay_frames": 1.5}).to_toml()
     log = BetweenFramesLog(delay_frames=1.5, gain=(0.6, 0.6)).frames(FRAMES)
     run = LoggedRun(read_history(LogReader(log.write(tmp_path / "x.mcap", toml=toml))))

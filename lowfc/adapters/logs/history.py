@@ -109,7 +109,7 @@ class History:
         camera: state with the camera's settings in most steps under `calibration` (closed-loop ones, if there are any).
         under_camera: (steps,) whether the camera had the settings of `camera` in each step.
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
-        command_sequence, command_publish_ns: the same of every mirror command (the message's own sequence).
+        command_sequence, command_publish_ns: message sequence and publish time of every mirror command in the log.
         stepped_sequence: frame sequence of every step in the log, also of those that `steps` leaves out.
         steps, truths: steps and truths with the number of modes of the last calibration.
         stages_ns: (timed steps,) durations of each of `STAGES`, for the frames of `timed_sequence`.

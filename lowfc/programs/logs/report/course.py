@@ -37,7 +37,7 @@ def mode_steps(history: History) -> dict[str, int]:
 
 
 def events(run: Run) -> list[Results]:
-    """Events in the order of their sending, with level, process, name and sentence."""
+    """Events in the order in which they were sent, with level, process, name and sentence."""
     found = sorted(run.history.events, key=itemgetter(0))
     times_s = run.seconds([time_ns for time_ns, _ in found])
     return [

@@ -28,9 +28,9 @@ def timing_results(run: Run) -> Results:
 
 
 def intervals_ns(run: Run) -> dict[str, Long]:
-    """Intervals between frames and between commands, by their send times; only between consecutive messages.
+    """Intervals between the send times of consecutive frames, and of consecutive commands.
 
-    A message that the log does not have would appear as a pause of its sender.
+    Intervals around a message that the log lacks are left out: they would appear as a pause of the sender.
     """
     history = run.history
     messages = {

@@ -132,7 +132,7 @@ def _true(
         squares = np.full(after_nm.shape, np.nan)
         for piece in np.split(np.arange(len(rows)), np.flatnonzero(run.missing)):
             mirror_nm, next_nm = (after_nm - disturbance_nm)[piece], None
-            if fraction:  # the instant has a mean of the two commands that the exposure sees
+            if fraction:  # the sampled residual has the weighted mean of the two commands that the exposure sees
                 move_nm = _move_nm(law_nm[piece], run.simulated_delay)
                 mirror_nm, next_nm = mirror_nm - (1 - fraction) * move_nm, mirror_nm + fraction * move_nm
             squares[piece] = continuous_residual_nm2(disturbance_nm[piece], mirror_nm, run.moves_at, next_nm)

@@ -151,14 +151,14 @@ class LoggedRun:
 
     @property
     def simulated_delay(self) -> float:
-        """Delay of the simulated camera, frames; the true wavefront comes only from it."""
+        """Delay of the simulated camera, frames; every log with a true wavefront is of that camera."""
         return (self.history.configuration or Configuration()).camera.delay_frames
 
     @property
     def moves_at(self) -> float:
         """Time at which the mirror moves, periods after the start of an exposure: 1 in a lockstep log.
 
-        With a fractional delay of the simulated camera it moves during the exposure.
+        With a fractional delay of the simulated camera, the mirror moves during the exposure.
         """
         if self.simulated_delay % 1:
             return self.history.timing(self.simulated_delay).applied % 1
