@@ -57,7 +57,7 @@ def test_a_tolerated_line_is_stated_by_its_rms():
     assert lines
     assert {row["assumption"] for row in lines} == {f"{tolerance.LOOP}\n{tolerance.LINE}"}
     assert tolerance.LINE.startswith("Rms of a line")
-    assert "rms of a line in it" in " ".join(tolerance.ABOUT.split())
+    assert "rms of a vibration line in it" in " ".join(tolerance.ABOUT.split())
 
 
 def test_every_published_value_has_a_verdict_and_no_noise_is_below_the_quantum_limit():
