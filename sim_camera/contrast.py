@@ -27,10 +27,9 @@ class Contrast:
         self._frames += 1
 
     def quadratic(self, modes_nm: Single) -> Single:
-        """Mean contrast added by each mode (modes,) of wavefronts (many, modes), from the quadratic form."""
-        return np.asarray(
-            np.einsum("nj,nj->j", modes_nm @ self._form, modes_nm) / np.float32(len(modes_nm)), np.float32
-        )
+        """Mean contrast added by each mode (..., modes) of wavefronts (..., many, modes), from the quadratic form."""
+        added = np.einsum("...nj,...nj->...j", modes_nm @ self._form, modes_nm)
+        return np.asarray(added / np.float32(modes_nm.shape[-2]), np.float32)
 
     def measure(self) -> dict[str, float]:
         """Means at up to `IMAGES` instants of the run's second half, by field of `WavefrontFigures`; empty at first.

@@ -31,9 +31,9 @@ from sim_camera.contrast import Contrast
 from sim_camera.disturbance import Disturbance, preset_disturbance, with_sources
 from sim_camera.faulty import FaultyFrames, read_fault
 from sim_camera.lateness import Lateness
-from sim_camera.path import MirrorPath
+from sim_camera.path import MirrorMotion, MirrorPath
 from sim_camera.pixels import pixel_errors
-from sim_camera.scene import Scene
+from sim_camera.scene import MAX_TRUTHS, Scene, Truth
 from sim_camera.wavefront_statistics import WavefrontAccumulator
 from sim_camera.wheel import wheels
 
@@ -41,6 +41,8 @@ PATIENCE_S = 5.0
 """In lockstep, the run ends after this much real time without progress."""
 RECENT_S = 2.0
 """Averaging time of the wavefront statistics reported while the loop runs."""
+TRUTHS_S = 0.01
+"""Longest time for which the truths of frames are kept, to be computed together, unless the loop is in lockstep."""
 MAX_WAIT_NS = 500_000_000
 """Longest wait in a call of `expose`: half a second, as for every driver (see `Camera.expose`)."""
 _REMEMBERED = 256  # largest number of waiting mirror states, and of stored publication times of frames
@@ -158,6 +160,10 @@ class SimulatedCamera:
         self._path = MirrorPath(flat, applied - 1, settling)
         self._index, self._origin_ns = 0, 0
         self._exposing = self._exposed = _Exposed(-1, 0, 0, 0, flat)
+        self._untold: list[
+            tuple[_Exposed, MirrorMotion]
+        ] = []  # frames without a truth so far, and the mirror in their periods
+        self._truths_at_once = 1 if config.lockstep else min(max(1, int(TRUTHS_S * config.camera.rate_hz)), MAX_TRUTHS)
         self._newest_state = self._last_frame = 0  # sequences
         self._published_ns = [(0, 0)] * _REMEMBERED  # (sequence, time) of the last frames
         self._lateness = Lateness()
@@ -222,10 +228,12 @@ class SimulatedCamera:
         return Exposure(frame, end_ns)
 
     def sent(self, envelope: Envelope) -> None:
-        """Store the frame's publication time, and publish the truth of the frame before."""
+        """Store the frame's publication time, and publish the truth of the frames before if enough wait for it."""
         self._published_ns[envelope.sequence % _REMEMBERED] = (envelope.sequence, envelope.publish_time_ns)
         self._last_frame = envelope.sequence
-        self._publish_truth()
+        self._end_period()
+        if len(self._untold) >= self._truths_at_once:
+            self._publish_truths()
         self._exposed = self._exposing._replace(sequence=envelope.sequence)
 
     def step(self) -> None:
@@ -240,9 +248,10 @@ class SimulatedCamera:
             self._drain()
 
     def finish(self) -> None:
-        """Publish the last truth and compute the contrast of the run, for the last Health."""
+        """Publish the last truths and compute the contrast of the run, for the last Health."""
         self._drain()
-        self._publish_truth()
+        self._end_period()
+        self._publish_truths()
         self._measured = self._contrast.measure() if self._contrast is not None else {}
 
     def close(self) -> None:
@@ -262,24 +271,33 @@ class SimulatedCamera:
         """Start of the next exposure."""
         return self._origin_ns + self._index * self._config.period_ns
 
-    def _publish_truth(self) -> None:
-        """Publish the truth of the last exposed frame; its period is over, so the mirror's motion in it is known."""
-        index, _, end_ns, sequence, actuators_nm = self._exposed
-        if index < 0:
-            return
-        truth = self._scene.truth(index, actuators_nm, self._path.over(index, self._scene.instants))
-        added_flat, added = 0.0, None
-        if self._contrast is not None:
-            disturbance_nm, residual_nm = truth.instants_nm
-            middle = len(residual_nm) // 2
-            self._contrast.add(disturbance_nm[middle], residual_nm[middle])
-            added_flat = float(self._contrast.quadratic(disturbance_nm).sum())
-            added = self._contrast.quadratic(residual_nm)
-        self._statistics.add(truth, added_flat, added)
+    def _end_period(self) -> None:
+        """Keep the last exposed frame for its truth; its period is over, so the mirror's motion in it is known."""
+        if (index := self._exposed.frame) >= 0:
+            self._untold.append((self._exposed, self._path.over(index, self._scene.instants)))
+
+    def _publish_truths(self) -> None:
+        """Publish the truth of the frames that wait for it."""
+        exposed = [one for one, _ in self._untold]
+        truths = self._scene.truths([(one.frame, one.actuators_nm, path) for one, path in self._untold])
+        self._untold.clear()
+        added: list[tuple[float, Single | None]] = [(0.0, None)] * len(truths)
+        if self._contrast is not None and truths:
+            instants_nm = np.array([truth.instants_nm for truth in truths])
+            middle = instants_nm.shape[2] // 2
+            for disturbance_nm, residual_nm in instants_nm[:, :, middle]:
+                self._contrast.add(disturbance_nm, residual_nm)
+            quadratic = self._contrast.quadratic(instants_nm)
+            added = list(zip(quadratic[:, 0].sum(axis=1).tolist(), quadratic[:, 1], strict=True))
+        for one, truth, (added_flat, added_now) in zip(exposed, truths, added, strict=True):
+            self._statistics.add(truth, added_flat, added_now)
+            self._publish_truth(one, truth, added_flat, added_now)
+
+    def _publish_truth(self, exposed: _Exposed, truth: Truth, added_flat: float, added: Single | None) -> None:
         sampled, continuous = truth.sampled, truth.continuous
         message = wire.Truth(
-            timestamp=timestamp(end_ns),
-            frame_sequence=sequence,
+            timestamp=timestamp(exposed.end_ns),
+            frame_sequence=exposed.sequence,
             disturbance_nm=sampled.disturbance_nm.tolist(),
             residual_nm=sampled.residual_nm.tolist(),
             disturbance_rms_nm=sampled.disturbance_rms_nm,

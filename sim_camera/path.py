@@ -6,6 +6,9 @@ import numpy as np
 
 from lowfc.arrays import Array, Single
 
+MirrorMotion = tuple[list[Single], Single]
+"""Shapes (rows, columns) of the mirror in a period, and weights (instants, shapes) of each at instants in it."""
+
 
 class MirrorPath:
     """Shapes of the mirror in the order of their application; times are in frame periods."""
@@ -26,7 +29,7 @@ class MirrorPath:
         """Add a shape (rows, columns) applied at `moment`, but at most `latest` and not before the previous shape."""
         self._moves.append((max(min(moment, latest) + self._delay, self._moves[-1][0]), shape_nm))
 
-    def over(self, start: float, instants: Array) -> tuple[list[Single], Single]:
+    def over(self, start: float, instants: Array) -> MirrorMotion:
         """Shapes (rows, columns) in effect in the period from `start`, and the weight of each (instants, shapes).
 
         `instants` (instants,) are relative to `start`. Earlier shapes are dropped once the mirror has settled; those of

@@ -4,6 +4,8 @@ Time is continuous: the star moves while the mirror holds. An image is the mean 
 is given at the start of the exposure, and as the root mean square over the period.
 """
 
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,10 +17,13 @@ from lowfc.optics.detector.detector import Detector, expose, noise_table_of, sat
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, wavefront_rms_nm
 from lowfc.optics.twin.twin_mirror import TwinMirror, poke_wavefronts_nm, wavefront_nm
 from sim_camera.disturbance import Disturbance, Sampler, highest_hz, screen, shear_at, speeds_hz
+from sim_camera.path import MirrorMotion
 from sim_camera.pixels import PixelErrors
 
 GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 """The two Gauss-Legendre nodes in [0, 1], in exposure times: their mean is exact to third order in time."""
+MAX_TRUTHS = 10
+"""Largest number of frames for which the truth is computed together."""
 _MAX_NODES = 256
 """Largest number of nodes, which bounds the time to compute them and a frame; reached at frame rates below 1 Hz."""
 
@@ -116,7 +121,6 @@ class Scene:
         self._rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, 3])))  # stream 3: noise
         self._noise = noise
         self._pixels = pixels
-        self._area = optics.area_weights.astype(np.float32)
         self._basis = zernikes(disturbance.noll, *node_radii(optics)).astype(np.float32)
         self._screen = self._static_screen(disturbance.screen_nm, seed)
         self._screen_modes = np.asarray(self._project(self._screen), dtype=np.float32)
@@ -126,7 +130,11 @@ class Scene:
         if instants > 1:
             nodes, weights = exposure_nodes(highest_hz(disturbance) * exposure / rate_hz)
         self._image_weights = weights.astype(np.float32)
-        self._wavefronts: list[tuple[Single, Single]] = []
+        fields_nm = np.vstack([self._basis, self._screen]).astype(np.float64)
+        fields_nm -= (fields_nm @ optics.area_weights)[:, None]
+        self._weighted = np.ascontiguousarray((fields_nm * optics.area_weights).T)
+        self._products_nm2 = fields_nm @ self._weighted  # of modes and screen, integrated over the open pupil
+        self._wavefronts: deque[tuple[Single, Single]] = deque(maxlen=2 * MAX_TRUTHS)
         self._sampler = Sampler(disturbance, np.concatenate([[0.0], exposure * nodes, self.instants]), rate_hz)
         self._disturbance, self._rate_hz, self._exposure = disturbance, rate_hz, exposure
         self._shear_slopes = None if shear_slopes is None else shear_slopes.astype(np.float32)
@@ -157,58 +165,97 @@ class Scene:
         frame = expose(self._detector, electrons, self._rng) if self._noise else self._noiseless(electrons)
         return frame if self._pixels is None else self._pixels.response_dn[frame]
 
-    def truth(self, index: int, actuators_nm: Single, path: tuple[list[Single], Single] | None = None) -> Truth:
-        """The true wavefront of a frame and of its period.
+    def truth(self, index: int, actuators_nm: Single, path: MirrorMotion | None = None) -> Truth:
+        """The true wavefront of a frame and of its period; arguments as for `truths`."""
+        return self.truths([(index, actuators_nm, path)])[0]
+
+    def truths(self, frames: Sequence[tuple[int, Single, MirrorMotion | None]]) -> list[Truth]:
+        """The true wavefronts of frames and of their periods; many together take less time than one by one.
 
         Args:
-            index: index of the frame.
-            actuators_nm: (rows, columns) shape of the mirror at the start of its exposure.
-            path: shapes (rows, columns) of the mirror in the period, and the weight of each at each of the
-                instants (instants, shapes); the mirror does not move if None.
+            frames: for each frame its index; the shape (rows, columns) of the mirror at the start of its exposure; and
+                the shapes (rows, columns) of the mirror in its period with the weight of each at each of the instants
+                (instants, shapes), or None if the mirror does not move.
         """
-        modes = self._sampler.at(index)
-        shapes_nm, weights = [actuators_nm], np.ones((len(self.instants), 1), np.float32)
-        if path is not None and len(self.instants):
-            shapes_nm, weights = [actuators_nm, *path[0]], np.hstack([0 * weights, path[1]])
-        # Modes (1 + instants, modes): row 0 at the start of the exposure, then a row per instant; likewise `residual`.
-        disturbance = np.concatenate([modes[:1], modes[len(modes) - len(self.instants) :]])
-        shape_weights = np.vstack([np.eye(1, len(shapes_nm), dtype=np.float32), weights])
-        opd_nm = disturbance @ self._basis
-        opd_nm += self._screen
-        mirror_nm = shape_weights @ np.array([self._mirror_nm(shape) for shape in shapes_nm])
-        disturbance = disturbance + self._screen_modes
-        residual = disturbance + shape_weights @ (
-            np.array(shapes_nm).reshape(len(shapes_nm), -1) @ self._mirror_to_modes.T
-        )
-        mean_squares_nm2 = self._mean_squares_nm2(opd_nm), self._mean_squares_nm2(opd_nm + mirror_nm)
-        disturbance_rms_nm, residual_rms_nm = (float(np.sqrt(each[0])) for each in mean_squares_nm2)
-        sampled = Wavefront(disturbance[0], residual[0], disturbance_rms_nm, residual_rms_nm)
-        speeds_and_shear = speeds_hz(self._disturbance, index / self._rate_hz), self._shear(index)
-        if not len(self.instants):
-            return Truth(sampled, None, sampled.residual_nm, np.array([disturbance, residual]), *speeds_and_shear)
-        sensed_nm = self._image_weights @ modes[1 : 1 + self._image_weights.size] - modes[0] + residual[0]
-        modes_rms = (np.sqrt(np.square(each[1:]).mean(axis=0)) for each in (disturbance, residual))
-        pupil_rms = (float(np.sqrt(each[1:].mean())) for each in mean_squares_nm2)
-        continuous = Wavefront(*modes_rms, *pupil_rms)
-        return Truth(sampled, continuous, sensed_nm, np.array([disturbance[1:], residual[1:]]), *speeds_and_shear)
+        modes, count = np.array([self._sampler.at(index) for index, *_ in frames]), len(self.instants)
+        # Axes of these: frames, times (the start of the exposure, then the instants), modes or shapes.
+        disturbance_nm = np.concatenate([modes[:, :1], modes[:, modes.shape[1] - count :]], axis=1)
+        shapes_nm, weights = self._weighted_shapes(frames)
+        mean_squares_nm2 = self._mean_squares_nm2(disturbance_nm, shapes_nm, weights)
+        mirror_nm = weights @ (np.array(shapes_nm).reshape(len(shapes_nm), -1) @ self._mirror_to_modes.T)
+        disturbance_nm += self._screen_modes
+        both_nm = np.array([disturbance_nm, disturbance_nm + mirror_nm])
+        start_rms_nm = np.sqrt(mean_squares_nm2[:, :, 0]).T.tolist()
+        if count:
+            image_nm = np.tensordot(modes[:, 1 : 1 + self._image_weights.size], self._image_weights, (1, 0))
+            sensed_nm = image_nm - modes[:, 0] + both_nm[1, :, 0]
+            modes_rms_nm = np.sqrt(np.square(both_nm[:, :, 1:]).mean(axis=2))
+            pupil_rms_nm = np.sqrt(mean_squares_nm2[:, :, 1:].mean(axis=2)).T.tolist()
+        found = []
+        for row, (index, *_) in enumerate(frames):
+            sampled = Wavefront(*both_nm[:, row, 0], *start_rms_nm[row])
+            continuous, sensed, at_nm = None, sampled.residual_nm, both_nm[:, row]
+            if count:
+                continuous = Wavefront(*modes_rms_nm[:, row], *pupil_rms_nm[row])
+                sensed, at_nm = sensed_nm[row], at_nm[:, 1:]
+            speeds = speeds_hz(self._disturbance, index / self._rate_hz)
+            found.append(Truth(sampled, continuous, sensed, at_nm, speeds, self._shear(index)))
+        return found
+
+    def _weighted_shapes(
+        self, frames: Sequence[tuple[int, Single, MirrorMotion | None]]
+    ) -> tuple[list[Single], Single]:
+        """The shapes (rows, columns) of the mirror in these frames, and weights (frames, times, shapes) of each."""
+        count, still = len(self.instants), np.ones((len(self.instants), 1), np.float32)
+        in_frames = [
+            (actuators_nm, *(motion if motion is not None and count else ([actuators_nm], still)))
+            for _, actuators_nm, motion in frames
+        ]
+        shapes = {id(shape): shape for start, moved, _ in in_frames for shape in (start, *moved)}
+        columns = {identity: column for column, identity in enumerate(shapes)}
+        weights = np.zeros((len(frames), 1 + count, len(shapes)), np.float32)
+        for row, (start, moved, moved_weights) in enumerate(in_frames):
+            weights[row, 0, columns[id(start)]] = 1
+            for shape, weight in zip(moved, moved_weights.T, strict=True):
+                weights[row, 1:, columns[id(shape)]] += weight
+        return list(shapes.values()), weights
 
     def _shear(self, index: int) -> Array:
         """Shear of the beam (2,) at mid-exposure, pupil diameters; empty without shear."""
         return shear_at(self._disturbance, (index + self._exposure / 2) / self._rate_hz)
 
     def _mirror_nm(self, actuators_nm: Single) -> Single:
-        """Wavefront (used,) of a shape; the last three are cached."""
+        """Wavefront (used,) of a shape; the last ones are cached."""
         for shape_nm, opd_nm in self._wavefronts:
             if shape_nm is actuators_nm:
                 return opd_nm
         new_nm = wavefront_nm(self._mirror, actuators_nm)
-        self._wavefronts = [(actuators_nm, new_nm), *self._wavefronts[:2]]
+        self._wavefronts.appendleft((actuators_nm, new_nm))
         return new_nm
 
-    def _mean_squares_nm2(self, opd_nm: Single) -> Single:
-        """Mean square over the open pupil, piston removed, of wavefronts (many, used)."""
-        from_mean = opd_nm - (opd_nm @ self._area)[:, None]
-        return np.maximum(np.square(from_mean) @ self._area, 0)  # guard nodes of the interpolation have weights < 0
+    def _mean_squares_nm2(self, disturbance_nm: Single, shapes_nm: list[Single], weights: Single) -> Array:
+        """Mean squares (2, frames, times) over the open pupil, piston removed: without the mirror, and with it.
+
+        They are quadratic forms of the integrated products of modes, screen and shapes. In double precision, as the
+        mirror cancels most of the disturbance.
+
+        Args:
+            disturbance_nm: (frames, times, modes) modes without the screen's.
+            shapes_nm: shapes (rows, columns) of the mirror.
+            weights: (frames, times, shapes) weight of each shape.
+        """
+        mirror_nm = np.array([self._mirror_nm(shape) for shape in shapes_nm], dtype=np.float64)
+        fixed, area = len(self._products_nm2), self._optics.area_weights
+        products_nm2 = np.empty((fixed + len(mirror_nm),) * 2)
+        products_nm2[:fixed, :fixed] = self._products_nm2
+        products_nm2[fixed:, :fixed] = mirror_nm @ self._weighted
+        products_nm2[:fixed, fixed:] = products_nm2[fixed:, :fixed].T
+        mirror_nm -= (mirror_nm @ area)[:, None]
+        products_nm2[fixed:, fixed:] = (mirror_nm * area) @ mirror_nm.T
+        amounts = np.zeros((2, *weights.shape[:2], len(products_nm2)))
+        amounts[..., : fixed - 1], amounts[..., fixed - 1], amounts[1, ..., fixed:] = disturbance_nm, 1, weights
+        # Guard nodes of the interpolation have weights below zero, and so may a sum.
+        return np.asarray(np.maximum((amounts @ products_nm2 * amounts).sum(axis=-1), 0))
 
     def _noiseless(self, electrons: Single) -> npt.NDArray[np.uint16]:
         """A frame (rows, columns) in DN, as by `expose` but without noise."""
