@@ -32,7 +32,7 @@ class Goal:
         merit: One of `MERITS`. "paper": the largest of `paper_ratios`, those of Table 3 to the power 2 x weight, that
             of Table 4 to the power 2 x (1 - weight). "pareto": table3^(1 - weight) table4^weight.
             "contrast": contrast added to the dark zone by the noise of 14 modes in one exposure of Table 4's star.
-        estimator: "pinv", or "weighted" for the Cramer-Rao bound.
+        estimator: "pinv", or "weighted", whose noise is the Cramer-Rao bound.
         modes: Number of modes in "table3", "pareto" and "condition".
         weight: As in "pareto" and "paper" above, 0 to 1. None: 1/2 in "paper"; in a "pareto" search each chain
             has its own weight.
@@ -67,7 +67,7 @@ def merit(candidate: Candidate, goal: Goal) -> float:
 
 
 def paper_ratios(candidate: Candidate, estimator: str = "pinv") -> dict[str, float]:
-    """Ratio of the predicted value to the paper's, by row of Table 3, and of Table 4 (1 mas); below 1 is better."""
+    """Ratios of predicted values to the paper's: rows of Table 3, and that of 1 mas in Table 4; below 1 is better."""
     ratios = {}
     for name in candidate.paper_rows:
         for modes in MODES:

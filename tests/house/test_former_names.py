@@ -1,4 +1,4 @@
-"""Former names occur only in the table of former names."""
+"""Former names of identifiers, fields, enum values, keys and extensions are no longer used as such."""
 
 import ast
 import re

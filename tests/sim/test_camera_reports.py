@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.messages import MIRROR_STATE, wire
+from lowfc.contract.messages import MIRROR_STATE, TRUTH, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
 from sim_camera.driver import SimulatedCamera
@@ -131,6 +132,23 @@ def test_a_call_of_a_slow_camera_waits_half_a_second_at_most() -> None:
     camera.join(Listener(FakeClock()).service("camera"))
     camera.start()
     assert [camera.expose() is None for _ in range(5)] == [False, True, True, True, False]
+
+
+@pytest.mark.parametrize(("lockstep", "at_once"), [(True, 1), (False, 10)])
+def test_every_frame_has_its_truth_in_order_and_at_once_in_lockstep(lockstep: bool, at_once: int) -> None:
+    """At 1 kHz the truths of ten frames are computed together; the end of the run publishes the rest."""
+    config = load(None, {"camera.rate_hz": 1000.0, "lockstep": lockstep})
+    camera, listener = SimulatedCamera(SimulatedCamera.Options(), config), Listener(FakeClock())
+    sequences = list[int]()
+    listener.bus.subscribe(TRUTH, lambda sample: sequences.append(wire.Truth.FromString(sample.payload).frame_sequence))
+    camera.join(listener.service("camera"))
+    camera.start()
+    for sequence in range(1, 26):
+        assert camera.expose() is not None
+        camera.sent(Envelope(sequence, 0))
+        assert len(sequences) == (sequence - 1) // at_once * at_once
+    camera.finish()
+    assert sequences == list(range(1, 26))
 
 
 def test_region_is_read_at_the_centre_of_the_sensor() -> None:

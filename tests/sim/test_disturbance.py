@@ -53,7 +53,7 @@ def rms_nm(disturbance: Disturbance) -> np.ndarray:
 
 
 def check_order_and_block(name: str, first: int, count: int, cut: int) -> None:
-    """Check that frames are the same if computed from `first` on, from `cut` later on, alone, or by a second object."""
+    """Check that frames are the same if computed from `first`, from `first + cut`, alone, or by a second object."""
     disturbance = preset(name, static_nm={4: 3.0})
     expected = modes_nm(disturbance, first, count, RATE_HZ)
     cut = min(cut, count - 1)

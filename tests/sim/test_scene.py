@@ -1,5 +1,6 @@
 """The simulated scene: the reported true wavefront equals the injected modes, and frames match the calibration."""
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 from runpy import run_path
@@ -197,6 +198,26 @@ def test_continuous_truth_is_the_rms_over_the_period_with_a_moving_mirror(calibr
     assert found.continuous.residual_nm == pytest.approx(np.sqrt(np.mean(squares, axis=0)), abs=2e-3)
     both = (found.continuous.disturbance_rms_nm, found.continuous.residual_rms_nm)
     assert both == pytest.approx(np.sqrt(np.mean(pupil, axis=0)), rel=1e-3)
+
+
+@pytest.mark.parametrize("instants", [1, 4])
+def test_truths_of_several_frames_are_those_of_each_frame(calibration: Calibration, instants: int) -> None:
+    """Shapes recur within a frame and between frames, as those of a mirror that moves once per frame or not at all."""
+    scene = scene_of(configured(disturbance__preset="kolmogorov", camera__instants=instants))
+    first, second, third = (shape_of(calibration, nm * np.eye(MODES)[2]) for nm in (5.0, -8.0, 3.0))
+    weights = np.random.default_rng(1).random((instants, 3)).astype(np.float32)
+    frames = [(6, first, ([first, second, second], weights)), (7, second, ([second, third], weights[:, :2]))]
+    found = scene.truths([*frames, (8, third, None)])
+    for one, frame in zip(found, [*frames, (8, third, None)], strict=True):
+        alone = scene.truth(*frame)
+        for name in ("sampled", "continuous"):
+            pair = getattr(one, name), getattr(alone, name)
+            assert (pair[0] is None) == (pair[1] is None) == (name == "continuous" and instants == 1)
+            if pair[0] is not None:
+                for field in dataclasses.fields(pair[0]):
+                    np.testing.assert_allclose(*(getattr(each, field.name) for each in pair), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(one.instants_nm, alone.instants_nm, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(one.sensed_nm, alone.sensed_nm, rtol=1e-5, atol=1e-5)
 
 
 def test_with_one_instant_image_and_truth_are_at_the_start_of_the_exposure() -> None:

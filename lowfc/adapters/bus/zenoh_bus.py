@@ -21,8 +21,8 @@ from lowfc.adapters.bus.routed import RouterWatch, open_by_router, require_certi
 from lowfc.adapters.bus.run import Links, mirror_role
 from lowfc.adapters.bus.zenoh_fault import plain, usable
 from lowfc.adapters.bus.zenoh_session import (
-    close_links_at_once,
     keep_thread_state,
+    prevent_slow_closing,
     receive_in_one_thread,
     session_config,
 )
@@ -153,8 +153,8 @@ class ZenohBus:
             links: links of the run.
             role: role of this process.
             clock: clock of the run.
-            monitor: whether this process is a monitor; set it in a process's first bus. A monitor polls `Ring`s, and at
-                half the cost: `latest_only` topics at display rate, a pool of receive buffers, one receive thread.
+            monitor: whether this process is a monitor; set it in a process's first bus. A monitor polls `Ring`s;
+                it needs half the processor time: display rate for `latest_only` topics, one receive thread, a pool.
             beside: bus of another role in this process, already subscribed: the direct link to it is a function call.
 
         Raises:
@@ -180,7 +180,7 @@ class ZenohBus:
         config = zenoh.Config.from_json5(json.dumps(session_config(links, role, monitor=monitor)))
         if links.network.router and role != ROUTER:
             self._session = open_by_router(config, links.network, role)
-            close_links_at_once(self._session)
+            prevent_slow_closing(self._session)
             self._join_hosts()
             return
         try:
@@ -193,7 +193,7 @@ class ZenohBus:
                 advice = "is one running already? Stop that process, or start another run"
                 what = f"{role} of run {links.run_id!r} cannot listen on {address}; {advice}"
             raise BusError(f"{what} ({plain(fault)})") from None
-        close_links_at_once(self._session)
+        prevent_slow_closing(self._session)
         if role == ROUTER:
             self.queryable(CLOCK_KEY, lambda query: query.reply(b""))
 

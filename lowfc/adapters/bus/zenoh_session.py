@@ -40,7 +40,7 @@ def keep_thread_state() -> None:
         _kept.thread = True
 
 
-def close_links_at_once(session: zenoh.Session) -> None:
+def prevent_slow_closing(session: zenoh.Session) -> None:
     """Set options of this process's TCP sockets after each new link of a session, so that no dead link delays it.
 
     SO_LINGER is turned off. With zenoh's 10 s, closing the link of a process that is stopped blocks the thread that

@@ -25,7 +25,7 @@ _EXTENSIONS = (
 
 
 def to_bytes(law: LinearLaw) -> bytes:
-    """Encode a law as a FITS file; DataFileError for a name that a header does not hold."""
+    """Encode a law as a FITS file; DataFileError if the law's name cannot be stored in a header."""
     if not (law.name.isascii() and law.name.isprintable()) or law.name.endswith(" "):
         raise DataFileError(f"a law's name in a file is printable ASCII, without a space at its end; got {law.name!r}")
     primary = fits_file.primary_hdu(KIND)

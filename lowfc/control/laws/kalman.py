@@ -17,7 +17,7 @@ _DOUBLINGS = 40  # largest number of iterations
 
 
 def lqg(models: Sequence[Model], noll: tuple[int, ...], timing: Timing) -> LinearLaw:
-    """The law for modes with these models, one for each, measured as means over an exposure.
+    """The law for modes of which an exposure measures the mean; there is one model for each.
 
     Raises:
         ValueError: the numbers of models and modes differ, models have different rates, or a filter does not converge.

@@ -35,7 +35,7 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
         after, text, *events = _handler(request, lease_before)(settings, now, request)
     except ValueError as error:
         refused = Reply(False, _short(str(error)), state.frame_sequence + 1)
-        return state._replace(), Outputs(reply=refused)  # a copy of the state, so that the request is counted
+        return state._replace(), Outputs(reply=refused)  # a copy: an unchanged state counts no input
     by_another = lease_before is not None and lease_before.id != request.lease_id
     if request.name == "safe" or (request.name in ENDED_BY and by_another):
         after, lease_events = lease_ended(after, asked_by(lease_before, request))

@@ -141,7 +141,7 @@ def response(twin: Twin, basis: NDArray[np.floating], opd_nm: Array | None = Non
 
 
 def projected_response(twin: Twin, projections: Array, opd_nm: Array | None = None) -> Array:
-    """Products (projections, used) of projections of the image with its slope per nm of wavefront at each node.
+    """Projections (projections, used) of the image's slope per nm of wavefront at each node.
 
     They are `projections @ response(twin, eye)`, computed from the pixels back to the nodes: the cost depends on the
     number of projections, not on that of nodes.

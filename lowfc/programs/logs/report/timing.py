@@ -1,4 +1,4 @@
-"""Rates, jitter and latency of a run, and the frames without a command."""
+"""Rates, jitter and latency of a run, and the frames without a step."""
 
 import numpy as np
 
@@ -61,7 +61,7 @@ def percentiles_us(durations_ns: Long) -> Results:
 
 
 def frame_counts(history: History) -> Results:
-    """Frames in the log, frames without a command, and the counts of camera and controller.
+    """Frames in the log, frames without a step and thus a command, and the counts of camera and controller.
 
     Every frame that reaches the controller leads to a step and, with a calibration, to a command; frames that the
     controller skipped (a newer one arrived first) or missed (never arrived) have neither. The last frames, whose

@@ -171,7 +171,7 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
 
 
 def _children(options: LatencyOptions, run: Run) -> list[Child]:
-    """The loop's processes in the order in which they are stopped; the first one ends by itself."""
+    """The loop's processes: the camera, which ends by itself, then the others in the order in which they stop."""
     config, seconds = options.config, WARM_UP_S + options.duration_s
     children = children_of(config, run, seconds, options.record)
     if options.view:
