@@ -74,7 +74,7 @@ def test_existing_certificates_are_kept_unless_renewed(tmp_path: Path) -> None:
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
     make(tmp_path, ("camera",), [], renew=True)
     changed = {name for name in before if (tmp_path / name).read_bytes() != before[name]}
-    assert changed == {"camera.pem"}  # the key is kept, so that hosts with the old key accept the new certificate
+    assert changed == {"camera.pem"}  # the key is kept: the new certificate fits the key that the host already has
     handshake(tmp_path, tmp_path, "camera")
     handshake(tmp_path, tmp_path, "viewer")
 
