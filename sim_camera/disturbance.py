@@ -278,8 +278,8 @@ class Sampler:
         """Modes (instants, modes) in the period of a frame, nm of wavefront rms."""
         first = index - index % BLOCK  # so that a frame does not depend on the order of the calls
         if first not in self._blocks:
-            # Keep the block before: a frame's truth is computed after the next frame's exposure.
-            self._blocks = {before: block for before, block in self._blocks.items() if before == first - BLOCK}
+            # Keep two blocks before: a frame's truth is computed after the exposure of up to ten later frames.
+            self._blocks = {before: block for before, block in self._blocks.items() if 0 < first - before <= 2 * BLOCK}
             self._blocks[first] = self._block(first)
         row: Single = self._blocks[first][index - first]
         return row

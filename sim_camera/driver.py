@@ -278,11 +278,13 @@ class SimulatedCamera:
 
     def _publish_truths(self) -> None:
         """Publish the truth of the frames that wait for it."""
+        if not self._untold:
+            return
         exposed = [one for one, _ in self._untold]
         truths = self._scene.truths([(one.frame, one.actuators_nm, path) for one, path in self._untold])
         self._untold.clear()
         added: list[tuple[float, Single | None]] = [(0.0, None)] * len(truths)
-        if self._contrast is not None and truths:
+        if self._contrast is not None:
             instants_nm = np.array([truth.instants_nm for truth in truths])
             middle = instants_nm.shape[2] // 2
             for disturbance_nm, residual_nm in instants_nm[:, :, middle]:

@@ -119,7 +119,9 @@ def test_commissioning_closes_a_loop_with_another_frame_size(commissioned: tuple
     assert list(state.automatic) == [True, True, False]
     calibration = calibration_file.load(bench.out)
     assert calibration.shape == (64, 64)
-    modelled = computed(DISTURBED.to_toml()).actuators_to_modes  # for every shape of the mirror, not only for those of the modes
+    modelled = computed(
+        DISTURBED.to_toml()
+    ).actuators_to_modes  # for every shape of the mirror, not only for those of the modes
     assert np.linalg.norm(calibration.actuators_to_modes - modelled) < 0.2 * np.linalg.norm(modelled)
     assert calibration.saturation_dn == 2**14 - 1
     assert not provisional_path(bench.out).exists()

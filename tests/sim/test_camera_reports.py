@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 from typing import cast
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -135,20 +136,27 @@ def test_a_call_of_a_slow_camera_waits_half_a_second_at_most() -> None:
 
 
 @pytest.mark.parametrize(("lockstep", "at_once"), [(True, 1), (False, 10)])
-def test_every_frame_has_its_truth_in_order_and_at_once_in_lockstep(lockstep: bool, at_once: int) -> None:
+def test_every_frame_has_its_truth_in_order_and_at_once_in_lockstep(
+    monkeypatch: pytest.MonkeyPatch, lockstep: bool, at_once: int
+) -> None:
     """At 1 kHz the truths of ten frames are computed together; the end of the run publishes the rest."""
     config = load(None, {"camera.rate_hz": 1000.0, "lockstep": lockstep})
     camera, listener = SimulatedCamera(SimulatedCamera.Options(), config), Listener(FakeClock())
     sequences = list[int]()
     listener.bus.subscribe(TRUTH, lambda sample: sequences.append(wire.Truth.FromString(sample.payload).frame_sequence))
     camera.join(listener.service("camera"))
+    camera.finish()
+    assert sequences == [], "a run without a frame"
     camera.start()
+    blocks = Mock(wraps=camera._scene._sampler._block)
+    monkeypatch.setattr(camera._scene._sampler, "_block", blocks)
     for sequence in range(1, 26):
         assert camera.expose() is not None
         camera.sent(Envelope(sequence, 0))
         assert len(sequences) == (sequence - 1) // at_once * at_once
     camera.finish()
     assert sequences == list(range(1, 26))
+    assert blocks.call_count == 4, "no disturbance is computed twice"
 
 
 def test_region_is_read_at_the_centre_of_the_sensor() -> None:
