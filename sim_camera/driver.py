@@ -160,9 +160,8 @@ class SimulatedCamera:
         self._path = MirrorPath(flat, applied - 1, settling)
         self._index, self._origin_ns = 0, 0
         self._exposing = self._exposed = _Exposed(-1, 0, 0, 0, flat)
-        self._untold: list[
-            tuple[_Exposed, MirrorMotion]
-        ] = []  # frames without a truth so far, and the mirror in their periods
+        # Frames whose truth is not computed yet, and the mirror in their periods.
+        self._waiting: list[tuple[_Exposed, MirrorMotion]] = []
         self._truths_at_once = 1 if config.lockstep else min(max(1, int(TRUTHS_S * config.camera.rate_hz)), MAX_TRUTHS)
         self._newest_state = self._last_frame = 0  # sequences
         self._published_ns = [(0, 0)] * _REMEMBERED  # (sequence, time) of the last frames
@@ -232,7 +231,7 @@ class SimulatedCamera:
         self._published_ns[envelope.sequence % _REMEMBERED] = (envelope.sequence, envelope.publish_time_ns)
         self._last_frame = envelope.sequence
         self._end_period()
-        if len(self._untold) >= self._truths_at_once:
+        if len(self._waiting) >= self._truths_at_once:
             self._publish_truths()
         self._exposed = self._exposing._replace(sequence=envelope.sequence)
 
@@ -274,15 +273,14 @@ class SimulatedCamera:
     def _end_period(self) -> None:
         """Keep the last exposed frame for its truth; its period is over, so the mirror's motion in it is known."""
         if (index := self._exposed.frame) >= 0:
-            self._untold.append((self._exposed, self._path.over(index, self._scene.instants)))
+            self._waiting.append((self._exposed, self._path.over(index, self._scene.instants)))
 
     def _publish_truths(self) -> None:
         """Publish the truth of the frames that wait for it."""
-        if not self._untold:
+        if not self._waiting:
             return
-        exposed = [one for one, _ in self._untold]
-        truths = self._scene.truths([(one.frame, one.actuators_nm, path) for one, path in self._untold])
-        self._untold.clear()
+        waiting, self._waiting = self._waiting, []
+        truths = self._scene.truths([(exposed.frame, exposed.actuators_nm, motion) for exposed, motion in waiting])
         added: list[tuple[float, Single | None]] = [(0.0, None)] * len(truths)
         if self._contrast is not None:
             instants_nm = np.array([truth.instants_nm for truth in truths])
@@ -291,11 +289,12 @@ class SimulatedCamera:
                 self._contrast.add(disturbance_nm, residual_nm)
             quadratic = self._contrast.quadratic(instants_nm)
             added = list(zip(quadratic[:, 0].sum(axis=1).tolist(), quadratic[:, 1], strict=True))
-        for one, truth, (added_flat, added_now) in zip(exposed, truths, added, strict=True):
-            self._statistics.add(truth, added_flat, added_now)
-            self._publish_truth(one, truth, added_flat, added_now)
+        for (exposed, _), truth, contrast in zip(waiting, truths, added, strict=True):
+            self._statistics.add(truth, *contrast)
+            self._publish_truth(exposed, truth, *contrast)
 
     def _publish_truth(self, exposed: _Exposed, truth: Truth, added_flat: float, added: Single | None) -> None:
+        """Publish the truth of a frame, with the contrast that it adds; arguments as for `WavefrontAccumulator.add`."""
         sampled, continuous = truth.sampled, truth.continuous
         message = wire.Truth(
             timestamp=timestamp(exposed.end_ns),

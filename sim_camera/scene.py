@@ -207,10 +207,7 @@ class Scene:
     ) -> tuple[list[Single], Single]:
         """The shapes (rows, columns) of the mirror in these frames, and weights (frames, times, shapes) of each."""
         count, still = len(self.instants), np.ones((len(self.instants), 1), np.float32)
-        in_frames = [
-            (actuators_nm, *(motion if motion is not None and count else ([actuators_nm], still)))
-            for _, actuators_nm, motion in frames
-        ]
+        in_frames = [(actuators_nm, *(motion or ([actuators_nm], still))) for _, actuators_nm, motion in frames]
         shapes = {id(shape): shape for start, moved, _ in in_frames for shape in (start, *moved)}
         columns = {identity: column for column, identity in enumerate(shapes)}
         weights = np.zeros((len(frames), 1 + count, len(shapes)), np.float32)

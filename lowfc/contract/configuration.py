@@ -264,6 +264,11 @@ class Configuration(Section):
         return round(1e9 / self.camera.rate_hz)
 
     @property
+    def lockstep_hz(self) -> float | None:
+        """Frame rate in simulated time; None unless the run is in lockstep."""
+        return self.camera.rate_hz if self.lockstep else None
+
+    @property
     def exposure_ns(self) -> int:
         """Exposure time."""
         return round(self.period_ns * self.camera.exposure_fraction)

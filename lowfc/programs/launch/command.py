@@ -65,7 +65,6 @@ def sim_loop(
         typer.echo("to view the run: lowfc view", err=True)
     show = Show.NATIVE if view_ else Show.WEB if web else None
     results = run(settings, duration, not no_record, show, name)
-    lockstep_hz = settings.camera.rate_hz if settings.lockstep else None
-    print_result(results, summary_text(results, lockstep_hz), as_json=as_json)
+    print_result(results, summary_text(results, settings.lockstep_hz), as_json=as_json)
     if results["recording_failure"]:
         raise typer.Exit(1)

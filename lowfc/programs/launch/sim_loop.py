@@ -84,7 +84,7 @@ def sim_loop(
         raise ProcessDiedError(f"{fault}\nrecorded until then: {log}" if log else str(fault)) from fault
     finally:
         cleanup.close()
-    return {"run": run.run_id} | summary(watch, record, config.camera.rate_hz if config.lockstep else None)
+    return {"run": run.run_id} | summary(watch, record, config.lockstep_hz)
 
 
 def _new_run(config: Configuration, name: str | None) -> Run:
@@ -224,7 +224,6 @@ def _display(console: Console) -> Iterator[Callable[..., None]]:
             nonlocal due_s
             if elapsed_s >= due_s:
                 due_s += LINE_PERIOD_S
-                lockstep_hz = config.camera.rate_hz if config.lockstep else None
-                sys.stderr.write(status_line(watch, elapsed_s, lockstep_hz) + "\n")
+                sys.stderr.write(status_line(watch, elapsed_s, config.lockstep_hz) + "\n")
 
         yield line

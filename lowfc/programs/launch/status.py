@@ -36,9 +36,8 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     table.add_column(style="dim", justify="right")
     table.add_column()
     silent = _silence_notice(watch)
-    nominal_hz = config.camera.rate_hz
-    live = f"{hertz(camera.rate_hz)} of {nominal_hz:g} Hz"
-    rate = silent or _rate(live, camera.rate_hz, nominal_hz if config.lockstep else None)
+    live = f"{hertz(camera.rate_hz)} of {config.camera.rate_hz:g} Hz"
+    rate = silent or _rate(live, camera.rate_hz, config.lockstep_hz)
     table.add_row("loop", Text(f"{mode(controller)}, {rate}"))  # a string would be read as rich's markup
     table.add_row("wavefront", silent or _wavefront_in_words(camera))
     table.add_row("frame to command", latency(controller.frame_to_command))

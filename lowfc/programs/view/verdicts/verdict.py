@@ -127,7 +127,7 @@ def _since(state: wire.ControllerState | None) -> str:
 
 def _open(state: RunState) -> Tile:
     shape, rms = "mirror holds its last shape", state.wavefront
-    if rms is not None and correction(*rms[:2]) is Correction.HARM:
+    if rms is not None and correction(rms.residual_nm, rms.open_nm) is Correction.HARM:
         shape += ", worse than a flat mirror: `lowfc ctl safe` flattens it"
     level, advice = Level.NEUTRAL, "The loop is open: nothing is corrected, `lowfc ctl close` closes it."
     if state.why.startswith(CAMERA_MISFIT):

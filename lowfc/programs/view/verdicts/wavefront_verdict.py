@@ -42,7 +42,7 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
         why = f"The wavefront is {value}, including the shapes of offset and channels; {flat}."
         return tile(value, f"with offset and channels; {flat}; {remarks}", advice=why)
     raw, latest = rms.open_nm / rms.residual_nm if rms.residual_nm else 1.0, state.latest
-    if latest is not None and {correction(*one[:2]) for one in (rms, latest)} == {Correction.HARM}:
+    if latest is not None and {correction(one.residual_nm, one.open_nm) for one in (rms, latest)} == {Correction.HARM}:
         level = Level.BAD if raw < 1 / DIVERGING else Level.WARNING
         advice = f"The loop does harm: {residual} nm rms, {flat}. Lower the gain or open the loop."
         return tile(value, f"worse than {flat}; {remarks}", level, advice)
