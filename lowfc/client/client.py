@@ -3,6 +3,7 @@
 import contextlib
 import math
 import time
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from operator import index
@@ -208,6 +209,7 @@ class Client:
             lambda name, lease_id, seconds, holder: self.ask(name, values=seconds, text=holder, lease_id=lease_id),
             purpose,
             duration_s,
+            lockstep=bool(tomllib.loads(self.configuration()).get("lockstep")),
         )
         self._lease = lease
         try:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from lowfc.adapters.process.host import by_this_process
 from lowfc.contract.errors import BusError, CalibrationError, LowfcError, RequestRefusedError
-from lowfc.control.loop.lease import LEASE_OVER, REMAINING_TIME_SEPARATOR
+from lowfc.control.loop.lease import LEASE_OVER, MAX_S, REMAINING_TIME_SEPARATOR
 
 if TYPE_CHECKING:
     from lowfc.adapters.process.progress import Counted
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 DURATION_S = 10.0
 """Time in force without renewal: after the holder's death, other clients are refused for this long."""
 RENEWAL_S = 0.5
-"""Time between renewals; `DURATION_S` is in the loop's time, which in lockstep may run twenty times faster."""
+"""Time between renewals, by this host's clock."""
 
 Ask = Callable[[str, int, float, str], object]
 """Function that sends `lease`, `renew` or `release`: name of the request, lease id, seconds, holder."""
@@ -31,8 +31,11 @@ def new_identity() -> int:
 class Lease:
     """A reservation of the loop, from its construction to `release`; the holder's requests carry its `id`."""
 
-    def __init__(self, ask: Ask, purpose: str, duration_s: float | None = None) -> None:
+    def __init__(self, ask: Ask, purpose: str, duration_s: float | None = None, *, lockstep: bool = False) -> None:
         """Reserve the loop for a purpose such as "lowfc calibrate", with its duration if known.
+
+        In lockstep the loop's time, in which a reservation ends, may run a hundred times faster than the host's clock:
+        without renewal the reservation then stays in force for as long as the controller allows.
 
         Raises:
             RequestRefusedError: another client has reserved it, or it is in safe mode.
@@ -41,11 +44,12 @@ class Lease:
         self.id = new_identity()
         self._ask = ask
         self._purpose = by_this_process(purpose)
+        self._in_force_s = MAX_S if lockstep else DURATION_S
         self._end_s = None if duration_s is None else time.monotonic() + duration_s
         self._ended = ""
         self._lock = threading.Lock()
         self._done = threading.Event()
-        self._ask("lease", self.id, DURATION_S, self._holder())
+        self._ask("lease", self.id, self._in_force_s, self._holder())
         self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
         self._thread.start()
 
@@ -67,7 +71,7 @@ class Lease:
         with self._lock:
             if not self._ended:
                 try:
-                    self._ask("renew", self.id, DURATION_S, self._holder())
+                    self._ask("renew", self.id, self._in_force_s, self._holder())
                 except RequestRefusedError as fault:
                     self._ended = str(fault).removeprefix("renew refused: ").removeprefix(LEASE_OVER)
             if self._ended:

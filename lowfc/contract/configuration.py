@@ -173,7 +173,7 @@ class Realtime(Section):
     """Real-time measures requested from the host; each process applies them before its first bus session."""
 
     priority: int = Field(50, ge=0, le=98)
-    """SCHED_FIFO priority of camera, controller and mirror; 0 for normal scheduling."""
+    """SCHED_FIFO priority of camera, controller and mirror; 0 for normal scheduling, which lockstep always has."""
     recorder_priority: int = Field(10, ge=0, le=98)
     """SCHED_FIFO priority of the recorder, below `priority`; normal scheduling if either is 0."""
     lock_memory: bool = True

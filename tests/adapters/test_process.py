@@ -15,11 +15,14 @@ import pytest
 import zenoh
 
 from lowfc.adapters.bus.zenoh_fault import plain
+from lowfc.adapters.process import join
 from lowfc.adapters.process.child import Child
 from lowfc.adapters.process.clock import SIMULATED_START_NS, HostClock, SimulatedClock, boot_offset_ns
 from lowfc.adapters.process.extras import install_advice
 from lowfc.adapters.process.realtime import spread
+from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import Role
 from tests.support.loops import until
 
 
@@ -255,6 +258,15 @@ def test_the_recorder_does_not_keep_the_real_time_class_of_its_parent() -> None:
     reported = report(f"set_up_below_loop(None, {{{cpu}}})", limits)
     assert (reported["policy"], reported["cpus"]) == (os.SCHED_OTHER if real_time else os.sched_getscheduler(0), [cpu])
     assert reported["granted"] == ["normal scheduling class", f"processors [{cpu}]"]
+
+
+def test_processes_in_lockstep_request_no_real_time_priority(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_up = Mock()
+    monkeypatch.setattr(join, "set_up", set_up)
+    for lockstep in (True, False):
+        config = Configuration.model_validate({"lockstep": lockstep, "realtime": {"priority": 50}})
+        join.prepare(config, Role.CAMERA, [])
+    assert [call.args[0] for call in set_up.mock_calls] == [None, 50]
 
 
 def test_processes_are_spread_over_the_available_processors() -> None:

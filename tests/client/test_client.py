@@ -79,12 +79,14 @@ class FakeController:
         self.states.put(wire.ControllerState(calibration_id=KNOWN.id).SerializeToString())
         self.requests: list[Request] = []
         self.reply = Reply(True, "done", 77)
+        self.configuration = ""
         self.silent = False
 
     def _answer(self, query: Query) -> None:
         self.requests.append(codec.decode_request(query.payload, query.name, 0))
         if not self.silent:
-            query.reply(codec.encode_request(self.requests[-1], self.reply, 1, None))
+            reply = self.reply._replace(text=self.configuration) if query.name == "configuration" else self.reply
+            query.reply(codec.encode_request(self.requests[-1], reply, 1, None))
 
     def join(self) -> Client:
         return Client(bus=MemoryBus(self.hub, "operator", HostClock()))
@@ -139,7 +141,7 @@ def test_the_controller_decodes_each_request(
     answer = ask(loop)
     assert controller.requests == [expected]
     expected_answer = (True, "done", 77, expected.text, None, "default")
-    assert answer == ("done" if expected.name == "configuration" else expected_answer)
+    assert answer == ("" if expected.name == "configuration" else expected_answer)
 
 
 def test_every_request_is_tested() -> None:
@@ -165,7 +167,7 @@ def test_a_reservation_is_renewed_and_its_id_is_in_the_holders_requests(controll
         loop.gain(0.1)
         loop.check_lease()
     loop.gain(0.2)
-    first, gain, *renewals, release, after = controller.requests
+    _, first, gain, *renewals, release, after = controller.requests
     assert (first.name, first.lease_id, first.values) == ("lease", lease.id, (10.0,))
     assert first.text.startswith("a test by ")
     assert f"(process {os.getpid()}), about 30 s to go" in first.text
@@ -174,6 +176,15 @@ def test_a_reservation_is_renewed_and_its_id_is_in_the_holders_requests(controll
     assert {(renewal.name, renewal.lease_id) for renewal in renewals} == {("renew", lease.id)}
     assert (release.name, release.lease_id) == ("release", lease.id)
     assert after.lease_id == 0
+
+
+def test_in_lockstep_a_reservation_lasts_as_long_as_the_controller_allows(controller: FakeController) -> None:
+    controller.configuration = "lockstep = true"
+    loop = controller.join()
+    with loop.reserved("a test"):
+        loop.check_lease()
+    _, *reservations, _ = controller.requests
+    assert {request.values for request in reservations} == {(60.0,)}
 
 
 def test_an_ended_reservation_gives_the_reason(controller: FakeController) -> None:
@@ -275,9 +286,9 @@ def test_the_configuration_of_a_loop_is_read_and_another_versions_is_refused(
     controller: FakeController, loop: Client
 ) -> None:
     for toml, rate_hz in ((Configuration().to_toml(), 250.0), ("[camera]\nrate_hz = 500.0\n", 500.0)):
-        controller.reply = Reply(True, toml, 77)
+        controller.configuration = toml
         assert configuration_of(loop).camera.rate_hz == rate_hz
-    controller.reply = Reply(True, "[camera]\nspeed = 3\n", 77)
+    controller.configuration = "[camera]\nspeed = 3\n"
     with pytest.raises(
         ConfigurationError, match=r"another version of lowfc: unknown key .*camera\.speed.*; use the "
     ) as caught:

@@ -18,6 +18,11 @@ def clock_of(config: Configuration) -> Clock:
     return SimulatedClock() if config.lockstep else HostClock()
 
 
+def fifo_priority(config: Configuration) -> int:
+    """Priority of SCHED_FIFO, 0 for none; in lockstep the processes never idle, and would starve all other programs."""
+    return 0 if config.lockstep else config.realtime.priority
+
+
 def prepare(config: Configuration, role: str, cpus: list[int]) -> Granted:
     """Set this process up for the loop, before its first zenoh session, whose threads inherit the scheduling.
 
@@ -28,7 +33,7 @@ def prepare(config: Configuration, role: str, cpus: list[int]) -> Granted:
         receive_in_one_thread()
     realtime = config.realtime
     return set_up(
-        realtime.priority or None,
+        fifo_priority(config) or None,
         set(cpus) or None,
         lock_memory=realtime.lock_memory,
         disable_cpu_idle=realtime.disable_cpu_idle,

@@ -10,7 +10,7 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.logs.series import LogLimits
 from lowfc.adapters.logs.writer import Attachment
-from lowfc.adapters.process.join import clock_of
+from lowfc.adapters.process.join import clock_of, fifo_priority
 from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.realtime import set_up_below_loop
 from lowfc.contract.codecs import input_file
@@ -47,7 +47,7 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
     attachments = [Attachment("config.toml", "application/toml", config.to_toml().encode())]
     attachments += [] if calibration is None else [_attachment(calibration, "application/fits")]
     granted = set_up_below_loop(
-        (realtime.priority and realtime.recorder_priority) or None, set(realtime.recorder_cpus) or None
+        (fifo_priority(config) and realtime.recorder_priority) or None, set(realtime.recorder_cpus) or None
     )
     clock = clock_of(config)
     origin = {**provenance(run.run_id, config.seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}
