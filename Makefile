@@ -77,8 +77,8 @@ release: $(VENV)/.installed  ## build sdist and wheel, check them, run the wheel
 	$(BIN)/python -m build --outdir build/dist .
 	$(BIN)/twine check --strict build/dist/*
 	$(BIN)/python -m venv build/empty/venv
-	build/empty/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt build/dist/*.whl
-	cd build/empty && venv/bin/lowfc sim-loop --duration 5
+	env -u PYTHONPATH build/empty/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt build/dist/*.whl
+	cd build/empty && env -u PYTHONPATH venv/bin/lowfc sim-loop --duration 5
 	ls -l build/dist
 
 docs: $(VENV)/.installed  ## build the site: build/docs/index.html
