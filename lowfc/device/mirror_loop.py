@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.start_check import StartCheck
@@ -18,7 +17,7 @@ from lowfc.adapters.process.service import Service
 from lowfc.arrays import Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import BadMessageError, ConfigurationError
+from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import (
     COMMAND,
     MIRROR_STATE,
@@ -156,12 +155,7 @@ class MirrorLoop:
                 self._next_command(sample)
 
     def _next_command(self, sample: Sample) -> None:
-        clock = self._service.clock
-        try:
-            command = command_of(sample.payload, self._start_check)
-        except (DecodeError, BadMessageError) as error:
-            self._service.unreadable(sample.key, error)
-            return
+        clock, command = self._service.clock, command_of(sample.payload, self._start_check)
         if isinstance(clock, SimulatedClock):
             clock.set_ns(command.time_ns)
         before, refused_before = self._status, self._refused
