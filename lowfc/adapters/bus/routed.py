@@ -41,7 +41,6 @@ def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict
 
     `sending` is zenoh's `transport/link/tx`, as on one host.
     """
-    ca, certificate, key = certificate_files(network, role)
     return {
         "mode": "client",
         "listen": {"endpoints": []},
@@ -52,16 +51,7 @@ def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict
             "exit_on_failure": True,
             "retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 2},
         },
-        "transport": _transport(
-            {
-                "root_ca_certificate": str(ca),
-                "enable_mtls": True,
-                "connect_certificate": str(certificate),
-                "connect_private_key": str(key),
-                "verify_name_on_connect": True,
-            },
-            sending,
-        ),
+        "transport": _transport(network, role, "connect", sending, verify_name_on_connect=True),
     }
 
 
@@ -70,20 +60,11 @@ def router_session(network: Network, mirrors: Iterable[str], sending: dict[str, 
 
     `mirrors` are roles such as "mirror-dm"; `sending` is zenoh's `transport/link/tx`, as on one host.
     """
-    ca, certificate, key = certificate_files(network, ROUTER)
     return {
         "mode": "router",
         "listen": {"endpoints": [network.listen or network.router], "exit_on_failure": True, "timeout_ms": 0},
         "connect": {"endpoints": []},
-        "transport": _transport(
-            {
-                "root_ca_certificate": str(ca),
-                "enable_mtls": True,
-                "listen_certificate": str(certificate),
-                "listen_private_key": str(key),
-            },
-            sending,
-        ),
+        "transport": _transport(network, ROUTER, "listen", sending),
         "access_control": access_control(mirrors),
     }
 
@@ -228,11 +209,19 @@ def certificate_warnings(network: Network, now: datetime.datetime) -> list[str]:
     return warnings
 
 
-def _transport(tls: dict[str, object], sending: dict[str, Any]) -> dict[str, Any]:
+def _transport(network: Network, role: str, end: str, sending: dict[str, Any], **more: object) -> dict[str, Any]:
+    """TLS links of a role whose certificate is used at the `end` "connect" or "listen"; `more` are keys of `tls`."""
+    ca, certificate, key = certificate_files(network, role)
     return {
         "link": {
             "protocols": ["tls"],  # the only permitted protocol
-            "tls": tls,
+            "tls": {
+                "root_ca_certificate": str(ca),
+                "enable_mtls": True,
+                f"{end}_certificate": str(certificate),
+                f"{end}_private_key": str(key),
+                **more,
+            },
             # A link that is silent for the lease is closed, and restored as soon as possible. Messages sent while it is
             # silent wait, and arrive stale if it recovers before it is closed.
             "tx": {**sending, "lease": LEASE_MS, "keep_alive": 4},
