@@ -7,6 +7,7 @@ ROLE.pem and ROLE.key of each of its roles.
 import contextlib
 import datetime
 import ipaddress
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -165,12 +166,9 @@ def _name(common: str) -> x509.Name:
 def _general_name(address: str) -> x509.GeneralName:
     with contextlib.suppress(ValueError):
         return x509.IPAddress(ipaddress.ip_address(address))
-    if not address or not address.isascii() or not set(address) <= _NAME_CHARACTERS:
+    if not re.fullmatch(r"[A-Za-z0-9.-]+", address):
         raise ConfigurationError(f"the router's address is a host's name or IP address, without port; got {address!r}")
     return x509.DNSName(address)
-
-
-_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789.-")
 
 
 def _pem(key: EllipticCurvePrivateKey) -> bytes:
