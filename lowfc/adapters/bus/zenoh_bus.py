@@ -69,14 +69,12 @@ class ZenohPublisher:
         self.published = self.skipped = 0
         self.handed_ns = 0
         self.last: tuple[bytes, Envelope] | None = None
-        self._keeps_last = topic.queryable
         self._host_ns = bus.clock.host_ns
         self._bus = bus
         self._encode = bus.encode
-        self._replying = bus.replying
         self._publisher = declare_publisher(session, topic, key, lockstep=bus.clock.lockstep)
         self._direct_link = direct_link
-        if self._keeps_last:
+        if topic.queryable:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
@@ -86,7 +84,7 @@ class ZenohPublisher:
             self._host_ns() if publish_time_ns is None else publish_time_ns,
         )
         self.published += 1
-        if self._keeps_last:
+        if self.topic.queryable:
             self.last = (payload, envelope)
         handed = self._direct_link is not None and self._direct_link.send(envelope.encode(), payload)
         if handed:
@@ -102,7 +100,7 @@ class ZenohPublisher:
             self._direct_link.close()
 
     def _answer(self, query: zenoh.Query) -> None:
-        with self._replying(query):
+        with self._bus.replying(query):
             if self.last is not None:
                 payload, envelope = self.last
                 query.reply(self.key, payload, attachment=self._encode(envelope))
