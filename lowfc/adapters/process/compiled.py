@@ -85,7 +85,10 @@ class Pool:
         if tiles.nbytes < SHARED_BYTES:
             return self._measure(*scanned, *rest)
         if self._scratch[0].size != scratch.size or self._shares[-1][1] != len(totals):
-            self._divide(scratch.size, len(totals))
+            threads = len(self._turns) + 1
+            edges = [len(totals) * number // threads for number in range(threads + 1)]
+            self._shares = list(pairwise(edges))
+            self._scratch = [np.empty(scratch.size, np.float32) for _ in self._turns]
         self._work = scanned
         for go, _ in self._turns:
             go.release()
@@ -94,12 +97,6 @@ class Pool:
         for _, done in self._turns:
             done.acquire()
         return self._measure(pixels[:0], *scanned[1:], *rest)  # no pixels: it uses the sums computed above
-
-    def _divide(self, block: int, blocks: int) -> None:
-        """Divide the blocks among the threads, and allocate their arrays."""
-        edges = [blocks * number // (len(self._turns) + 1) for number in range(len(self._turns) + 2)]
-        self._shares = list(pairwise(edges))
-        self._scratch = [np.empty(block, np.float32) for _ in self._turns]
 
     def _help(self, number: int, go: threading.Lock, done: threading.Lock) -> None:
         while go.acquire():
