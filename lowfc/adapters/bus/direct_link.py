@@ -115,7 +115,7 @@ class DirectReader:
         now_ns: Callable[[], int],
         failed: Callable[[Exception], None],
         *,
-        shared: bool = False,
+        shared: bool,
     ) -> None:
         """Start listening.
 

@@ -50,15 +50,15 @@ def try_out(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
             raise OSError(f"the trial's process ended: {fault}") from fault
 
 
-def lateness_ns(wake_ups: int, period_ns: int = 1_000_000_000 // RATE_HZ) -> list[int]:
-    """Sleep until times a period apart; return the lateness of each wake-up, ns.
+def lateness_ns(wake_ups: int) -> list[int]:
+    """Sleep until times a period of `RATE_HZ` apart; return the lateness of each wake-up, ns.
 
     The times are fixed beforehand: one that passes during a late wake-up also counts as late.
     """
     late_ns = [0] * wake_ups
     due_ns = time.monotonic_ns()
     for number in range(wake_ups):
-        due_ns += period_ns
+        due_ns += 1_000_000_000 // RATE_HZ
         while (left_ns := due_ns - time.monotonic_ns()) > 0:
             time.sleep(left_ns * 1e-9)
         late_ns[number] = time.monotonic_ns() - due_ns
