@@ -40,10 +40,6 @@ class Granted:
 NOTHING = Granted((), ())
 
 
-class _RefusedError(Exception):
-    """The host does not allow a measure."""
-
-
 def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, disable_cpu_idle: bool) -> Granted:
     """Prepare this process for the loop.
 
@@ -112,7 +108,7 @@ def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int
     }
 
 
-def set_up_below_loop(priority: int | None, cpus: set[int] | None = None) -> Granted:
+def set_up_below_loop(priority: int | None, cpus: set[int] | None) -> Granted:
     """Set up a process that must keep up with the loop but never delay it, such as the recorder.
 
     Its SCHED_FIFO priority, if granted, is below the loop's and above everything else: in the normal class on a busy
@@ -155,7 +151,7 @@ def _request(in_force: list[str], measures: Iterable[_Measure]) -> Granted:
     for name, measure, cost in measures:
         try:
             measure()
-        except (_RefusedError, OSError, ValueError) as fault:
+        except (OSError, ValueError) as fault:
             refused.append((f"{name} ({getattr(fault, 'strerror', None) or fault})", cost))
         else:
             in_force.append(name)
@@ -192,11 +188,12 @@ def _lock_memory() -> None:
     Under a memory-lock limit nothing is locked, as later allocations would fail.
     """
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
-    if limit != resource.RLIM_INFINITY and not _capabilities() & _CAP_IPC_LOCK:
-        raise _RefusedError(f"the limit is {limit // 1024} kB; set LimitMEMLOCK=infinity")
+    capabilities = Path("/proc/self/status").read_text().partition("CapEff:")[2].split()[0]
+    if limit != resource.RLIM_INFINITY and not int(capabilities, 16) & _CAP_IPC_LOCK:
+        raise OSError(f"the limit is {limit // 1024} kB; set LimitMEMLOCK=infinity")
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
-        raise _RefusedError(os.strerror(ctypes.get_errno()))
+        raise OSError(os.strerror(ctypes.get_errno()))
     for line in Path("/proc/self/maps").read_text().splitlines():
         pages, rights, *_, name = line.split(maxsplit=5)
         if name.startswith("/") and rights.startswith("r") and _COMPILER not in name:
@@ -209,7 +206,7 @@ def _collapse_memory() -> None:
     try:
         size = int(Path(_HUGE_PAGE_BYTES).read_text())
     except FileNotFoundError as fault:
-        raise _RefusedError("not in this kernel") from fault
+        raise OSError("not in this kernel") from fault
     libc, collapsed, why = ctypes.CDLL(None, use_errno=True), False, "no memory fills one"
     for line in Path("/proc/self/maps").read_text().splitlines():
         pages, rights, _, _, inode, *name = line.split(maxsplit=5)
@@ -221,11 +218,4 @@ def _collapse_memory() -> None:
                 else:
                     why = os.strerror(ctypes.get_errno())
     if not collapsed:
-        raise _RefusedError(why)
-
-
-def _capabilities() -> int:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("CapEff:"):
-            return int(line.split()[1], 16)
-    return 0
+        raise OSError(why)
