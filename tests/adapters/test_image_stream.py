@@ -13,11 +13,10 @@ import pytest
 
 from lowfc.adapters.image_stream.reader import StreamImage, StreamReader
 from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, StreamError, stream_path
-from tests.support.image_streams.plain import NUMPY_TYPES, PlainStream
+from tests.support.image_streams.plain import FLOAT32, NUMPY_TYPES, UINT16, PlainStream
 
 ROWS, COLUMNS = 6, 9
-UINT16, FLOAT32 = 3, 9
-"""Numbers of pixel types; other numbers in `get` and `pack` are byte offsets in the published layout."""
+"""Size of the images; numbers in `get` and `pack` are byte offsets in the published layout."""
 
 
 @pytest.fixture

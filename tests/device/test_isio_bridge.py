@@ -16,11 +16,10 @@ from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, REQUEST_KEY, 
 from lowfc.programs.bridge import isio as bridge
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from tests.support.image_streams.plain import PlainStream
+from tests.support.image_streams.plain import FLOAT32, PlainStream, file_of
 from tests.support.loops import lowfc, refusal
 from tests.support.toy import GRID, calibration
 
-FLOAT32 = 9  # code of ImageStreamIO
 AT_NS = 1_700_000_000_000_000_000
 
 
@@ -32,7 +31,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def stream(folder: Path, name: str, columns: int, rows: int = 1, *, make: bool = False) -> PlainStream:
     create_or_open = PlainStream.make if make else PlainStream
-    return create_or_open(folder / f"{name}.im.shm", columns, rows, FLOAT32)
+    return create_or_open(file_of(folder, name), columns, rows, FLOAT32)
 
 
 class Run:

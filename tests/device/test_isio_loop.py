@@ -20,15 +20,14 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.realtime import spread
 from lowfc.client import Client
 from lowfc.contract.messages import EVENT, STEP, Log, Role, wire
-from tests.support.image_streams.cacao import CAMERA, TOTAL, file_of
-from tests.support.image_streams.plain import PlainStream
+from tests.support.image_streams.cacao import CAMERA, TOTAL
+from tests.support.image_streams.plain import FLOAT32, UINT16, PlainStream, file_of
 from tests.support.loops import in_background, loop, run, until
 
 pytestmark = [pytest.mark.exclusive, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 GRID = (34, 34)
-UINT16, FLOAT32 = 3, 9  # codes of ImageStreamIO
 CHANNEL = f"{TOTAL}03"
 BENCH = """{cpus}
 [camera]
@@ -80,14 +79,12 @@ class Bench:
         until(lambda: file_of(self.folder, CAMERA).exists())
 
     def send(self, word: str) -> None:
-        assert self.process.stdin is not None
         self.process.stdin.write(f"{word}\n")
         self.process.stdin.flush()
 
     def stop(self) -> dict[str, float]:
         """Stop the bench; return its number of frames and its residual."""
-        results: dict[str, float] = json.loads(self.process.communicate("stop\n", timeout=60)[0])
-        return results
+        return json.loads(self.process.communicate("stop\n", timeout=60)[0])
 
     def close(self) -> None:
         self.process.kill()

@@ -25,16 +25,11 @@ from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.messages import MIRROR_STATE, timestamp, wire
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.driver import SimulatedCamera
-from tests.support.image_streams.plain import PlainStream
+from tests.support.image_streams.plain import FLOAT32, UINT16, PlainStream, file_of
 
-UINT16, FLOAT32 = 3, 9
 CAMERA, TOTAL = "camnsv", "dm00disp"
 REGION = 2
 """Number of rows omitted by the smaller region."""
-
-
-def file_of(folder: Path, name: str) -> Path:
-    return folder / f"{name}.im.shm"
 
 
 class Comb:
