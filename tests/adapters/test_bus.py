@@ -382,8 +382,6 @@ def test_a_session_ends_soon_beside_a_process_that_is_stopped(run: Run) -> None:
         begun_s = time.monotonic()
         operator.close()
     assert time.monotonic() - begun_s < 6.0
-    with pytest.raises(BusError, match="lowfc/request/safe cannot be used: session closed"):
-        operator.get(REQUEST_KEY.format(name="safe"))
 
 
 def test_each_use_of_a_key_on_a_closed_bus_raises_a_bus_error(run: Run) -> None:
@@ -397,7 +395,7 @@ def test_each_use_of_a_key_on_a_closed_bus_raises_a_bus_error(run: Run) -> None:
         lambda: bus.queryable(REQUEST_KEY.format(name="*"), Mailbox().put),
         lambda: bus.get(FRAME.key),
     ):
-        with pytest.raises(BusError, match="cannot be used: session closed"):
+        with pytest.raises(BusError, match=r"^lowfc/\S+ cannot be used: session closed"):
             use()
 
 

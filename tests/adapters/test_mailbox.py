@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -113,27 +114,19 @@ class TimedDispatch:
         self.dispatch.put(Sample(FRAME.key, b"", sequence_of(7, count), put_ns, self.now_ns))
 
 
-def test_only_the_newest_of_the_queued_messages_is_handled() -> None:
+@pytest.mark.parametrize("handle_superseded", [True, False])
+def test_only_the_newest_of_the_queued_messages_is_handled(handle_superseded: bool) -> None:
     """The process was stopped for ten periods, in which ten messages arrived."""
-    timed = TimedDispatch(handle_superseded=True)
+    timed = TimedDispatch(handle_superseded=handle_superseded)
     timed.work_ns = 20_000
     begun_ns = timed.now_ns + 10**8
     timed.arrive(0, begun_ns)
     timed.now_ns = begun_ns + 10 * PERIOD_NS + 1000
     for count in range(1, 11):
         timed.arrive(count, begun_ns + count * PERIOD_NS)
-    assert (timed.handled, timed.superseded) == ([0, 10], list(range(1, 10)))
-    assert (timed.dispatch.received, timed.dispatch.skipped, timed.dispatch.missing) == (11, 0, 0)
-
-
-def test_superseded_messages_are_skipped_without_their_own_handler() -> None:
-    timed = TimedDispatch()
-    begun_ns = timed.now_ns + 10**8
-    timed.now_ns = begun_ns + 9 * PERIOD_NS + PERIOD_NS // 2
-    for count in range(10):
-        timed.arrive(count, begun_ns + count * PERIOD_NS)
-    assert len(timed.handled) + timed.dispatch.skipped == 10
-    assert timed.handled == [9]
+    superseded, skipped = (list(range(1, 10)), 0) if handle_superseded else ([], 9)
+    assert (timed.handled, timed.superseded) == ([0, 10], superseded)
+    assert (timed.dispatch.received, timed.dispatch.skipped, timed.dispatch.missing) == (11, skipped, 0)
 
 
 def test_a_single_old_message_counts_as_superseded() -> None:

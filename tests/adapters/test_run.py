@@ -12,7 +12,7 @@ from unittest.mock import Mock
 import pytest
 
 from lowfc.adapters.bus.bus import ALL, Query
-from lowfc.adapters.bus.run import free_ports, mirror_role, new_run_id, open_run, own_directory, runtime_base
+from lowfc.adapters.bus.run import mirror_role, new_run_id, open_run, own_directory, runtime_base
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.adapters.process import latch as latch_module
@@ -26,12 +26,18 @@ pytestmark = pytest.mark.usefixtures("own_runtime")
 FULL_DISK = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
 
 
-def test_a_run_has_ports_a_secret_and_private_files(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_has_free_ports_below_those_of_outgoing_connections_a_secret_and_private_files(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     lowest_outgoing = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
     monkeypatch.setattr("lowfc.adapters.bus.run._LOWEST_PORT", lowest_outgoing - 12)  # 12 ports to choose from
     run = open_run("night", mirrors=("dm", "tip"))
     assert set(run.links.ports) == {"camera", "controller", "mirror-dm", "mirror-tip", "recorder"}
     assert len(set(run.links.ports.values())) == 5
+    assert all(port < lowest_outgoing for port in run.links.ports.values())
+    for port in run.links.ports.values():
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", port))
     assert len(run.links.secret) == 64
     assert run.path.stat().st_mode & 0o777 == 0o700
     assert {path.stat().st_mode & 0o7777 for path in run.path.iterdir()} == {0o1600}, "kept by systemd-tmpfiles"
@@ -138,16 +144,6 @@ def test_an_invalid_runtime_directory_is_an_error(own_runtime: Path, monkeypatch
             runtime_base()
     finally:
         shared.rmdir()
-
-
-def test_ports_are_free_and_outside_the_range_of_outgoing_connections() -> None:
-    ports = free_ports(8)
-    lowest_outgoing = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
-    assert len(set(ports)) == 8
-    assert all(port < lowest_outgoing for port in ports)
-    for port in ports:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", port))
 
 
 def test_a_start_is_claimed_once() -> None:
