@@ -155,11 +155,17 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, own_runtime: Path) -> Iterator[Bench]:
+def folder(tmp_path: Path, own_runtime: Path) -> Path:
+    """Folder with the drivers and the configuration."""
     (tmp_path / "faulty.py").write_text(FAULTY)
     (tmp_path / "bench.toml").write_text(STILL)
-    bench = Bench(tmp_path)
-    with bench.listening(), in_background(tmp_path, CONTROLLER, CAMERA):
+    return tmp_path
+
+
+@pytest.fixture
+def bench(folder: Path) -> Iterator[Bench]:
+    bench = Bench(folder)
+    with bench.listening(), in_background(folder, CONTROLLER, CAMERA):
         yield bench
 
 
@@ -198,14 +204,10 @@ def test_a_mirror_hang_of_five_seconds_blocks_commands_and_the_mirror_goes_flat_
 
 
 @pytest.mark.exclusive
-def test_a_hanging_camera_in_the_controllers_process_does_not_block_the_controller(
-    tmp_path: Path, own_runtime: Path
-) -> None:
-    (tmp_path / "faulty.py").write_text(FAULTY)
-    (tmp_path / "bench.toml").write_text(STILL)
-    bench = Bench(tmp_path)
+def test_a_hanging_camera_in_the_controllers_process_does_not_block_the_controller(folder: Path) -> None:
+    bench = Bench(folder)
     both = f"{CONTROLLER} --camera faulty.py:Camera"
-    with bench.listening(), in_background(tmp_path, MIRROR, both), ExitStack() as stack:
+    with bench.listening(), in_background(folder, MIRROR, both), ExitStack() as stack:
         bench.wait_until_settled()
         client = stack.enter_context(Client("bench"))
         processes = client.processes()
@@ -218,11 +220,9 @@ def test_a_hanging_camera_in_the_controllers_process_does_not_block_the_controll
     assert time.monotonic() - ending_s < HANGS_S - PATIENCE_S, "the controller did not wait for its camera"
 
 
-def test_a_fault_of_the_controllers_camera_gives_an_error_message(tmp_path: Path, own_runtime: Path) -> None:
-    (tmp_path / "faulty.py").write_text(FAULTY)
-    (tmp_path / "camera").write_text("refuse")
-    (tmp_path / "bench.toml").write_text(STILL)
-    refused = run(tmp_path, *CONTROLLER.split()[1:], "--camera", "faulty.py:Camera")
+def test_a_fault_of_the_controllers_camera_gives_an_error_message(folder: Path) -> None:
+    (folder / "camera").write_text("refuse")
+    refused = run(folder, *CONTROLLER.split()[1:], "--camera", "faulty.py:Camera")
     assert refused.returncode == 2
     assert "error: its lens cap is on" in refused.stderr
     assert "Traceback" not in refused.stderr
