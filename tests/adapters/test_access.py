@@ -184,7 +184,6 @@ def test_message_times_are_converted_to_the_receiving_hosts_clock(hosts: Hosts) 
     frames = camera.publisher(FRAME)
     until(lambda: len(arrived) > 3, each=lambda: frames.put(b"frame"))
     for bus, shift_ns in ((camera, 3 * second_ns), (recorder, -7 * second_ns)):
-        assert bus.offset.best is not None
         assert abs(bus.offset.offset_ns + shift_ns) < second_ns  # accuracy: tests/e2e/test_hosts.py
     assert all(abs(sample.receive_time_ns - sample.publish_time_ns) < second_ns for sample in arrived)
     assert Service("camera", "hosts", camera.clock, camera).health().router_round_trip_ns > 0

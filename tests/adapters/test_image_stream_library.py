@@ -68,7 +68,6 @@ def test_images_of_the_c_library_are_read(path: Path) -> None:
     for number in range(1, 100):
         library.write(image(number, "u2"))
         received = reader.next(1)
-        assert received is not None
         assert received.number == number
         assert abs(received.acquired_ns - time.time_ns()) < 10**9
         assert np.array_equal(received.pixels, image(number, "u2"))

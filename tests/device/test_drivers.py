@@ -241,7 +241,7 @@ def test_doctor_reports_a_fault_in_the_requirements_of_a_users_driver(monkeypatc
 
 
 def test_doctor_shows_what_a_driver_found_as_text(monkeypatch: pytest.MonkeyPatch) -> None:
-    needs = [Need("a device", Path("/dev/mirror"), ""), ("a fan", 2, ""), Need("a licence", None, "buy it")]  # type: ignore[arg-type]
+    needs = [Need("a device", Path("/dev/mirror"), ""), ("a fan", 2, ""), Need("a licence", None, "buy it")]
     monkeypatch.setattr(IdleMirror, "needs", lambda options: needs, raising=False)
     _, *checks = device_checks(f"{__name__}:IdleMirror", CONFIG)
     assert [check.got for check in checks] == ["/dev/mirror", "2", "not found"]
@@ -309,7 +309,7 @@ def test_a_fault_in_the_first_settings_gives_one_sentence() -> None:
 
 def test_a_camera_that_cannot_be_started_gives_one_sentence_and_is_closed() -> None:
     camera = Ramp(Ramp.Options(), CONFIG)
-    camera.start = lambda: 1 / 0  # type: ignore[attr-defined]
+    camera.start = lambda: 1 / 0
     loop = CameraLoop(camera, Listener(FakeClock()).service("camera"))
     with pytest.raises(ConfigurationError, match=r"cannot be started: ZeroDivisionError: .* \(test_drivers.py, line"):
         loop.run()
@@ -320,7 +320,7 @@ def test_a_camera_finishes_before_its_last_health_and_is_closed_after_it() -> No
     camera, calls = Ramp(Ramp.Options(), CONFIG), list[str]()
     for name in ("finish", "close"):
         setattr(camera, name, partial(calls.append, name))
-    camera.fill = lambda _: calls.append("fill")  # type: ignore[attr-defined]
+    camera.fill = lambda _: calls.append("fill")
     CameraLoop(camera, Listener(FakeClock()).service("camera"), frames=3).run()
     assert calls[-3:] == ["finish", "fill", "close"]
     assert calls.count("finish") == 1
@@ -328,8 +328,8 @@ def test_a_camera_finishes_before_its_last_health_and_is_closed_after_it() -> No
 
 def test_a_fault_in_an_optional_method_is_counted_and_reported_and_stops_nothing() -> None:
     camera, listener = Ramp(Ramp.Options(), CONFIG), Listener(FakeClock(), FRAME)
-    camera.sent = lambda _: 1 / 0  # type: ignore[attr-defined]
-    camera.fill = lambda _: {}["temperature"]  # type: ignore[attr-defined]
+    camera.sent = lambda _: 1 / 0
+    camera.fill = lambda _: {}["temperature"]
     loop = CameraLoop(camera, listener.service("camera"), frames=3)
     loop.run()
     assert len(listener.messages(FRAME)) == 3
