@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import termios
-import threading
 from unittest.mock import Mock
 
 import pytest
@@ -239,16 +238,6 @@ def test_an_unreadable_message_gives_an_event_without_traceback_or_stop(
     assert listener.event_texts("BAD_MESSAGE 1 message on lowfc/health/*")
     assert not mirror.bus.faults.counts
     assert "Traceback" not in capsys.readouterr().err
-
-
-def test_stop_wakes_the_loop(listener: Listener) -> None:
-    camera = listener.service("camera")
-    box = camera.mailbox(FRAME)
-    timer = threading.Timer(0.01, camera.stop, ["stopped by test"])
-    timer.start()
-    assert box.take(PATIENCE_S) is None
-    timer.join()
-    assert (camera.running, camera.why) == (False, "stopped by test")
 
 
 LOOP = """
