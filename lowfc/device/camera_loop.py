@@ -196,5 +196,4 @@ class CameraLoop:
     def _fill(self, health: wire.Health) -> None:
         if (elapsed_ns := self._last_put_ns - self._first_put_ns) > 0:
             health.mean_rate_hz = (self._service.work - 1) * 1e9 / elapsed_ns
-        health.driver_failures = self.watch.failures
         self.watch.fill(self._fill_extra, health)

@@ -273,7 +273,6 @@ class MirrorLoop:
         health.command_refused = self._refused.value if self._refused is not None else 0  # type: ignore[assignment]
         health.command_expired = bool(status.received_ns) and not status.following
         health.limits_hit.extend(reason.value for reason in status.limits_hit)  # type: ignore[misc]
-        health.driver_failures = self.watch.failures
         self.watch.fill(self._fill_extra, health)
 
 

@@ -138,7 +138,8 @@ class DriverWatch:
             self._report(fault)
 
     def fill(self, fill: Callable[[wire.Health], None], health: wire.Health) -> None:
-        """Add the driver's fields to a Health; once the driver is closed, the last ones."""
+        """Add the number of failures and the driver's fields to a Health; once the driver is closed, the last ones."""
+        health.driver_failures = self.failures
         if not self._closed.is_set():
             self._fields.Clear()
             self.call(fill, self._fields)
