@@ -14,12 +14,15 @@ CONTRACT = Path(__file__).parent
 SOURCE = "lowfc/v1/lowfc.proto"
 
 
-def compile_into(target: Path) -> list[Path]:
-    """Write lowfc_pb2.py, its stub and the descriptor with comments into the folder `target`; return their paths."""
+def main() -> None:
+    """Write lowfc_pb2.py, its stub and the descriptor with comments into a folder."""
     from importlib.resources import files
 
     from grpc_tools import protoc
 
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--into", type=Path, default=CONTRACT / "wire")
+    target = parser.parse_args().into
     with tempfile.TemporaryDirectory() as work:
         arguments = [
             "protoc",
@@ -34,15 +37,8 @@ def compile_into(target: Path) -> list[Path]:
         ]
         if protoc.main(arguments) != 0:
             raise SystemExit(f"protoc refused {SOURCE}")
-        generated = [Path(work) / "lowfc.desc", *sorted((Path(work) / "lowfc/v1").iterdir())]
-        return [Path(shutil.copy(path, target / path.name)) for path in generated]
-
-
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--into", type=Path, default=CONTRACT / "wire")
-    compile_into(parser.parse_args().into)
+        for path in (Path(work) / "lowfc.desc", *(Path(work) / "lowfc/v1").iterdir()):
+            shutil.copy(path, target)
 
 
 if __name__ == "__main__":
