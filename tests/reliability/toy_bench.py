@@ -185,7 +185,7 @@ class ToyBench(ChaosBench):
         self._frames.put(image(pixels, self.clock.now_ns(), "toy").SerializeToString())
         self._mirror._idle()
         if Role.CONTROLLER in self._services:
-            self._controller._between_frames(self._controller._camera.wait(0))
+            self._controller._between_frames(self._controller._camera.mailbox.take(0))
             while self._controller._gain_requests:
                 self._controller._carry_out_internal(self._controller._gain_requests.popleft())
         for service in self._services.values():

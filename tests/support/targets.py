@@ -156,7 +156,7 @@ class Processes:
     def _run_once(self) -> None:
         self.clock.advance(1_000_000)
         self.mirror._idle()
-        self.controller._between_frames(self.controller._camera.wait(0))
+        self.controller._between_frames(self.controller._camera.mailbox.take(0))
         self.controller._publish_state(self.clock.now_ns())
         for service in self.services:
             assert service.running, service.why

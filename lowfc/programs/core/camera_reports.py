@@ -18,20 +18,12 @@ QUERY_PERIOD_NS = 500_000_000
 
 
 class CameraReports:
-    """Receives the camera's settings and passes them to a callback."""
+    """Receives the camera's settings, in `mailbox`, and passes them to a callback."""
 
     def __init__(self, service: Service, apply: Callable[[CameraSettings], None]) -> None:
         self._service, self._apply = service, apply
-        self._mailbox = service.mailbox(CAMERA_STATE)
+        self.mailbox = service.mailbox(CAMERA_STATE)
         self._due_ns = 0
-
-    def wait(self, timeout_s: float) -> Sample | None:
-        """The next message of the camera; None after the timeout or `wake`."""
-        return self._mailbox.take(timeout_s)
-
-    def wake(self) -> None:
-        """End a `wait`; may be called from any thread."""
-        self._mailbox.wake()
 
     def apply(self, sample: Sample) -> None:
         """Decode the settings in a message and pass them to the callback."""

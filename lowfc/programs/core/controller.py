@@ -131,7 +131,7 @@ class Controller:
                 self._frame(self._first_frame)
         while self._service.running:
             wait_ns = None if self._warmup is None else self._warmup.wait_ns(self._service.clock.host_ns())
-            camera = self._camera.wait((TICK_NS if wait_ns is None else min(wait_ns, TICK_NS)) * 1e-9)
+            camera = self._camera.mailbox.take((TICK_NS if wait_ns is None else min(wait_ns, TICK_NS)) * 1e-9)
             if camera is None and self._warmup is not None and self._warmup.due(self._service.clock.host_ns()):
                 self._warm_up()
                 continue  # everything else waits until after the frame
@@ -217,7 +217,7 @@ class Controller:
         if self._warmup is not None:
             self._last_sample = sample
             self._warmup.frame_received(sample.receive_time_ns)
-            self._camera.wake()  # `run` does its other work now, then waits until the next warm-up is due
+            self._camera.mailbox.wake()  # `run` does its other work now, then waits until the next warm-up is due
 
     def _warm_up(self) -> None:
         """Repeat the last step and discard the result: other work evicts its code and data from the caches."""
@@ -288,7 +288,7 @@ class Controller:
                 self._carry_out_internal(request)
             else:
                 self._gain_requests.append(request)
-                self._camera.wake()
+                self._camera.mailbox.wake()
 
     def _carry_out_internal(self, request: Request) -> Reply:
         """Carry out an internal request, dated by the controller's clock, and publish it like an operator's."""
@@ -301,7 +301,7 @@ class Controller:
     def safe_by_signal(self) -> None:
         """Request safe mode from a signal handler; the main thread carries it out."""
         self._safe_signalled = True
-        self._camera.wake()
+        self._camera.mailbox.wake()
 
     def _update_latch(self) -> None:
         """Set or clear the latch if safe mode has changed; called after the reply, and the latch has its own thread."""
@@ -397,4 +397,4 @@ class Controller:
     def _queue_query(self, query: Query) -> None:
         """Queue a request for the main thread and wake it; runs on the bus's thread."""
         self._queries.append(query)
-        self._camera.wake()
+        self._camera.mailbox.wake()
