@@ -1,9 +1,9 @@
 """Chaos cases of the bus and the operator: junk, forged messages and malformed requests from within the run."""
 
 import itertools
-import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 
 import numpy as np
@@ -138,9 +138,9 @@ def _huge_requests(bench: ChaosBench) -> None:
 @case("concurrent-requests", "eight operators at once")
 def _concurrent_requests(bench: ChaosBench) -> None:
     """Each operator has its own connection, and every request is answered."""
-    failed: list[str] = []
 
-    def operate(number: int) -> None:
+    def operate(number: int) -> str:
+        """Make the requests of one operator; return why they failed, or an empty text."""
         bus = ZenohBus(bench.run.links, Role.OPERATOR, HostClock())
         try:
             client = Client(bench.run.run_id, bus=bus)
@@ -151,14 +151,12 @@ def _concurrent_requests(bench: ChaosBench) -> None:
                 else:
                     client.note(f"operator {number}, {turn}")
         except LowfcError as fault:
-            failed.append(str(fault))
+            return str(fault)
         finally:
             bus.close()
+        return ""
 
-    operators = [threading.Thread(target=operate, args=(number,)) for number in range(OPERATORS)]
-    for operator in operators:
-        operator.start()
-    for operator in operators:
-        operator.join()
+    with ThreadPoolExecutor(OPERATORS) as operators:
+        failed = list(filter(None, operators.map(operate, range(OPERATORS))))
     if failed:
         raise CaseFailedError(f"{len(failed)} of {OPERATORS} operators failed: {failed[0]}")
