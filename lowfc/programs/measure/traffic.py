@@ -107,9 +107,9 @@ class Traffic:
                 service.beat()
 
 
-def frame_payloads(seed: int = 1) -> list[list[bytes]]:
+def frame_payloads() -> list[list[bytes]]:
     """Payloads of different frames: frame, command, step, mirror state and truth, with the sizes of a loop's."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     return [[message.SerializeToString() for message in _messages(rng)] for _ in range(_VARIETY)]
 
 
@@ -131,8 +131,8 @@ def _messages(rng: np.random.Generator) -> tuple[Message, ...]:
     )
 
 
-def _timing(frames: int, seed: int = 2) -> bytes:
-    rng = np.random.default_rng(seed)
+def _timing(frames: int) -> bytes:
+    rng = np.random.default_rng(2)
     stages = ("transport_ns", "wakeup_ns", "compute_ns", "publish_ns", "frame_to_command_ns")
     durations: dict[str, Any] = {stage: rng.integers(50_000, 400_000, frames).tolist() for stage in stages}
     sequences = [(_TIME_NS // 1_000_000_000 << 32) + number for number in range(frames)]

@@ -13,7 +13,7 @@ import psutil
 import typer
 
 from lowfc.adapters.process.terminal import Json
-from lowfc.contract.errors import BusError, DataFileError
+from lowfc.contract.errors import BusError, DataFileError, raised_as
 from lowfc.programs.cli.output import print_result
 
 RATES_HZ = (1000.0, 2000.0, 5000.0)
@@ -47,11 +47,8 @@ def bench_record(
 
     Example: lowfc bench record --seconds 5 --json
     """
-    try:
+    with raised_as(DataFileError, OSError, f"{folder or tempfile.gettempdir()} cannot be written"):
         results = measure(tuple(rate or RATES_HZ), seconds, folder)
-    except OSError as fault:
-        where = folder or tempfile.gettempdir()
-        raise DataFileError(f"{where} cannot be written: {fault.strerror or fault}") from fault
     print_result(results, render(results), as_json=as_json)
 
 

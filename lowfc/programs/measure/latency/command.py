@@ -15,7 +15,7 @@ import typer
 from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.adapters.process.terminal import ConfigFile, Json, LogsOrMeasure, configuration, options_set
 from lowfc.contract.codecs import input_file
-from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError, raised_as
 from lowfc.programs.cli.output import print_result
 
 if TYPE_CHECKING:
@@ -178,12 +178,11 @@ def _compare(files: tuple[Path, Path]) -> dict[str, Any]:
 
 def _result(file: Path) -> dict[str, Any]:
     """The result of `lowfc latency --json` in a file; DataFileError if it has none."""
-    try:
-        result = json.loads(input_file.read_whole(file, 1 << 28))
-    except OSError as fault:
-        raise DataFileError(f"{file} cannot be read: {fault.strerror}") from None
-    except (ValueError, RecursionError) as fault:  # not UTF-8, or not JSON
-        raise DataFileError(f"{file} must be a result of `lowfc latency --json`, but is not JSON: {fault}") from None
+    expected = f"{file} must be a result of `lowfc latency --json`"
+    with raised_as(DataFileError, OSError, f"{file} cannot be read"):
+        content = input_file.read_whole(file, 1 << 28)
+    with raised_as(DataFileError, (ValueError, RecursionError), f"{expected}, but is not JSON"):  # or not UTF-8
+        result = json.loads(content)
     if not isinstance(result, dict) or "latency_us" not in result:
-        raise DataFileError(f"{file} must be a result of `lowfc latency --json`, but has no latency_us")
+        raise DataFileError(f"{expected}, but has no latency_us")
     return result
