@@ -88,9 +88,6 @@ class FakeController:
             reply = self.reply._replace(text=self.configuration) if query.name == "configuration" else self.reply
             query.reply(codec.encode_request(self.requests[-1], reply, 1, None))
 
-    def join(self) -> Client:
-        return Client(bus=MemoryBus(self.hub, "operator", HostClock()))
-
 
 @pytest.fixture
 def controller() -> FakeController:
@@ -99,7 +96,7 @@ def controller() -> FakeController:
 
 @pytest.fixture
 def loop(controller: FakeController) -> Client:
-    return controller.join()
+    return Client(bus=MemoryBus(controller.hub, "operator", HostClock()))
 
 
 @pytest.fixture(autouse=True)
@@ -161,8 +158,9 @@ def test_every_request_has_its_requester(controller: FakeController, loop: Clien
     assert codec.decode_request(long, "open", 0).requester == "a\\n" * 50
 
 
-def test_a_reservation_is_renewed_and_its_id_is_in_the_holders_requests(controller: FakeController) -> None:
-    loop = controller.join()
+def test_a_reservation_is_renewed_and_its_id_is_in_the_holders_requests(
+    controller: FakeController, loop: Client
+) -> None:
     with loop.reserved("a test", 30.0) as lease:
         loop.gain(0.1)
         loop.check_lease()
@@ -178,17 +176,17 @@ def test_a_reservation_is_renewed_and_its_id_is_in_the_holders_requests(controll
     assert after.lease_id == 0
 
 
-def test_in_lockstep_a_reservation_lasts_as_long_as_the_controller_allows(controller: FakeController) -> None:
+def test_in_lockstep_a_reservation_lasts_as_long_as_the_controller_allows(
+    controller: FakeController, loop: Client
+) -> None:
     controller.configuration = "lockstep = true"
-    loop = controller.join()
     with loop.reserved("a test"):
         loop.check_lease()
     _, *reservations, _ = controller.requests
     assert {request.values for request in reservations} == {(60.0,)}
 
 
-def test_an_ended_reservation_gives_the_reason(controller: FakeController) -> None:
-    loop = controller.join()
+def test_an_ended_reservation_gives_the_reason(controller: FakeController, loop: Client) -> None:
     with loop.reserved("a test"):
         controller.reply = Reply(False, "the lease ended: operator asked to open", 77)
         for _ in range(2):
@@ -270,9 +268,10 @@ def test_an_absent_and_a_silent_controller_give_different_errors(controller: Fak
             ask()
 
 
-def test_a_controller_without_a_calibration_accepts_a_channel_of_the_mirrors_grid(controller: FakeController) -> None:
+def test_a_controller_without_a_calibration_accepts_a_channel_of_the_mirrors_grid(
+    controller: FakeController, loop: Client
+) -> None:
     controller.states.put(wire.ControllerState(mirror_rows=4, mirror_columns=5).SerializeToString())
-    loop = controller.join()
     assert loop.mirror_grid() == (4, 5)
     loop.channel("flat", SHAPE)
     assert [request.text for request in controller.requests] == ["flat"]
