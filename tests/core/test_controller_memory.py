@@ -155,6 +155,12 @@ def alone(calibration: Calibration | None, latch: Latch, config: Configuration) 
     return listener, service, Controller(config, service, calibration, "a test", latch)
 
 
+def report_shape(listener: Listener, rows: int = GRID[0], columns: int = GRID[1]) -> None:
+    """Publish the state of a flat mirror, as its process does."""
+    state = wire.MirrorState(rows=rows, columns=columns, actuators=bytes(4 * rows * columns))
+    listener.service("mirror-dm").publisher(MIRROR_STATE, "dm").put(state.SerializeToString())
+
+
 def mode_of(controller: Controller) -> LoopMode:
     health = wire.Health()
     controller.fill(health)
@@ -380,8 +386,7 @@ def test_safe_mode_outlives_the_controller(calibration: Calibration, tmp_path: P
 
 def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration: Calibration, tmp_path: Path) -> None:
     listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
-    small = wire.MirrorState(rows=20, columns=20, actuators=np.zeros(400, np.float32).tobytes())
-    listener.service("mirror-dm").publisher(MIRROR_STATE, "dm").put(small.SerializeToString())
+    report_shape(listener, 20, 20)
     with pytest.raises(CalibrationError, match="20, 20"):
         controller.run()
 
@@ -394,8 +399,7 @@ def test_start_requests_wait_for_the_mirror_and_the_cameras_settings(calibration
         controller._report_mirror()
         controller._send_start_requests()
         assert controller._start_pending
-        shape = wire.MirrorState(rows=GRID[0], columns=GRID[1], actuators=bytes(4 * GRID[0] * GRID[1]))
-        listener.service("mirror-dm").publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
+        report_shape(listener)
         controller._report_mirror()
         for awaited in (True, False):
             conditions = controller._state.conditions._replace(camera_awaited=awaited)
@@ -411,8 +415,7 @@ def test_without_a_calibration_the_configured_law_is_not_in_force(tmp_path: Path
     law_file.save(integrator([0.3] * len(noll), [0.0] * len(noll), noll, 1.0, CONFIG.camera.rate_hz), tmp_path / "law")
     config = configured(lockstep=False, control__law=str(tmp_path / "law"))
     listener, _, controller = alone(None, Latch([tmp_path / "safe"]), config)
-    shape = wire.MirrorState(rows=GRID[0], columns=GRID[1], actuators=bytes(4 * GRID[0] * GRID[1]))
-    listener.service("mirror-dm").publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
+    report_shape(listener)
     controller._report_mirror()
     controller._between_frames(None)
     until(lambda: "LAW_NOT_IN_FORCE" in listener.events())
@@ -443,10 +446,9 @@ def test_an_automatic_gain_request_dated_by_the_cameras_clock_ends_no_reservatio
 
 def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: Calibration, tmp_path: Path) -> None:
     listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
-    mirror, shape = listener.service("mirror-dm").bus, wire.MirrorState(rows=1, columns=1, actuators=bytes(4))
-    mirror.publisher(MIRROR_STATE, "dm").put(shape.SerializeToString())
+    report_shape(listener)
     assert controller._mirror.first() is not None
-    healths = mirror.publisher(HEALTH, "mirror-dm")
+    healths = listener.bus.publisher(HEALTH, "mirror-dm")
     for reason, fault in ((99, ""), (99, "refuses commands: 99"), (98, "refuses commands: 98"), (0, "")):
         healths.put(wire.Health(command_refused=reason).SerializeToString())
         assert controller._mirror.fault(State(commanded=True)) == fault
