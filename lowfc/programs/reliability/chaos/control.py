@@ -129,7 +129,7 @@ def _damaged_calibration(bench: ChaosBench) -> None:
 def _restart_in_safe_mode(bench: ChaosBench) -> None:
     bench.client().safe()
     bench.await_steps(WHILE_FRAMES)
-    kill_and_restart(Role.CONTROLLER)(bench)
+    kill_and_restart(bench, Role.CONTROLLER)
 
 
 INTERLOCK = {"name": "mask", "value": True, "action": "hold", "max_age_s": 1.0, "when_old": "passes"}

@@ -10,7 +10,7 @@ import numpy as np
 from lowfc.adapters.bus.bus import Sample
 from lowfc.contract.messages import TIMING, Role, wire
 from lowfc.programs.reliability.chaos.bench import ChaosBench
-from lowfc.programs.reliability.chaos.case import LOST, Act, case
+from lowfc.programs.reliability.chaos.case import LOST, case
 
 process_case = partial(case, allowed=LOST)
 
@@ -31,59 +31,53 @@ _EVENTS: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-def kill_and_restart(role: Role, after_s: tuple[float, float] = (0.1, 1.0)) -> Act:
-    """Act of a case: kill a process, and restart it after a random time in this range."""
-
-    def act(bench: ChaosBench) -> None:
-        name = bench.process(role)
-        bench.pause(0.0, 0.5)
-        bench.kill(name)
-        bench.pause(*after_s)
-        bench.restart(name)
-
-    return act
+def kill_and_restart(bench: ChaosBench, role: Role, after_s: tuple[float, float] = (0.1, 1.0)) -> None:
+    """Kill a process, and restart it after a random time in this range."""
+    name = bench.process(role)
+    bench.pause(0.0, 0.5)
+    bench.kill(name)
+    bench.pause(*after_s)
+    bench.restart(name)
 
 
-def stop_and_continue(role: Role, for_s: tuple[float, float] = (0.5, 2.0)) -> Act:
-    """Act of a case: stop a process (SIGSTOP), and continue it after a random time in this range."""
-
-    def act(bench: ChaosBench) -> None:
-        name = bench.process(role)
-        bench.pause(0.0, 0.5)
-        with bench.stopped(name):
-            bench.pause(*for_s)
-
-    return act
+def stop_and_continue(bench: ChaosBench, role: Role, for_s: tuple[float, float] = (0.5, 2.0)) -> None:
+    """Stop a process (SIGSTOP), and continue it after a random time in this range."""
+    name = bench.process(role)
+    bench.pause(0.0, 0.5)
+    with bench.stopped(name):
+        bench.pause(*for_s)
 
 
 for _role, (_names, _) in _EVENTS.items():
     process_case(f"kill-{_role}", f"kill -9 of the {_role}, restarted up to 1 s later", expected=_names)(
-        kill_and_restart(_role)
+        partial(kill_and_restart, role=_role)
     )
 for _role, (_, _names) in _EVENTS.items():
     process_case(f"freeze-{_role}", f"SIGSTOP of the {_role}, SIGCONT 0.5 to 2 s later", expected=_names)(
-        stop_and_continue(_role)
+        partial(stop_and_continue, role=_role)
     )
 process_case(
     "silent-camera",
     'kill -9 of the camera with `on_frame_timeout = "flat"` and 40 nm of static focus; restarted after 1 s',
     config={"control.on_frame_timeout": "flat", **_STATIC},
     expected=("NO_FRAMES", "CAMERA_RESTARTED"),
-)(kill_and_restart(Role.CAMERA, (1.0, 1.0)))
+)(partial(kill_and_restart, role=Role.CAMERA, after_s=(1.0, 1.0)))
 process_case(
     "lost-mirror",
     "kill -9 of the mirror with 40 nm of static focus; restarted after 3 s",
     config=_STATIC,
     expected=("MIRROR_LOST", "MIRROR_BACK"),
-)(kill_and_restart(Role.MIRROR, (3.0, 3.0)))
+)(partial(kill_and_restart, role=Role.MIRROR, after_s=(3.0, 3.0)))
 
 
 @process_case("random", "six kill -9 or SIGSTOP of random processes, at random times")
 def _at_random(bench: ChaosBench) -> None:
     for _ in range(RANDOM_FAULTS):
         role = bench.rng.choice((Role.CAMERA, Role.CONTROLLER, Role.MIRROR, Role.RECORDER))
-        act = kill_and_restart(role) if bench.rng.random() < 0.5 else stop_and_continue(role, (0.1, 1.0))
-        act(bench)
+        if bench.rng.random() < 0.5:
+            kill_and_restart(bench, role)
+        else:
+            stop_and_continue(bench, role, (0.1, 1.0))
         bench.pause(0.0, 1.0)
 
 
