@@ -6,6 +6,7 @@ from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import psutil
@@ -45,6 +46,18 @@ COUNTS = {
     "logs": 2,
     "gaps": 0,
 }
+
+
+@pytest.fixture
+def stub(tmp_path: Path) -> Any:
+    """A bench of a closed loop without processes."""
+    return SimpleNamespace(
+        bus=MemoryBus(MemoryHub(), "launcher", HostClock()),
+        outcome=SimpleNamespace(mode=wire.LOOP_MODE_CLOSED, measurements={}),
+        folder=tmp_path,
+        health={},
+        children={},
+    )
 
 
 def usage(leak_mb_per_hour: float, seed: int = 1, handles_per_hour: float = 0.0) -> list[Usage]:
@@ -98,19 +111,15 @@ def test_too_few_samples_are_reported_as_too_short_to_judge() -> None:
     assert text.endswith("FAILED: growth of the camera's memory")
 
 
-def test_latencies_are_those_of_the_controllers_timing_messages() -> None:
-    bus = MemoryBus(MemoryHub(), "launcher", HostClock())
-    times = CommandTimes(SimpleNamespace(bus=bus, outcome=SimpleNamespace(measurements={})))
-    bus.publisher(TRUTH).put(wire.Truth(residual_rms_nm=9).SerializeToString())
-    bus.publisher(TIMING).put(wire.ControlTiming(frame_to_command_ns=[100_000, 300_000]).SerializeToString())
+def test_latencies_are_those_of_the_controllers_timing_messages(stub: Any) -> None:
+    times = CommandTimes(stub)
+    stub.bus.publisher(TRUTH).put(wire.Truth(residual_rms_nm=9).SerializeToString())
+    stub.bus.publisher(TIMING).put(wire.ControlTiming(frame_to_command_ns=[100_000, 300_000]).SerializeToString())
     assert times.drain() == {"frames": 2, "p50_us": 200.0, "p99_us": 298.0}
     assert times.drain() == {}
 
 
-def test_a_loop_that_is_not_closed_or_not_recorded_at_the_end_fails(tmp_path: Path) -> None:
-    outcome = SimpleNamespace(mode=wire.LOOP_MODE_CLOSED, measurements={})
-    bus = MemoryBus(MemoryHub(), "launcher", HostClock())
-    stub: Any = SimpleNamespace(bus=bus, outcome=outcome, folder=tmp_path, health={}, children={})
+def test_a_loop_that_is_not_closed_or_not_recorded_at_the_end_fails(stub: Any) -> None:
     soak = run._Soak(stub)
     assert soak.results(60.0, 1.0, [])["why"] == []
     soak.mode = wire.LOOP_MODE_OPEN
@@ -121,11 +130,9 @@ def test_a_loop_that_is_not_closed_or_not_recorded_at_the_end_fails(tmp_path: Pa
 
 def test_a_slow_loop_has_time_to_settle() -> None:
     """250 frames at 2 Hz need 125 s, more than the minute that a fast loop has."""
-    waited_s: list[float] = []
-    config = load(None, {"camera.rate_hz": 2.0})
-    bench: Any = SimpleNamespace(config=config, wait=lambda _, __, timeout_s: waited_s.append(timeout_s))
+    bench = Mock(config=load(None, {"camera.rate_hz": 2.0}))
     ChaosBench.await_settled(bench, 250)
-    assert waited_s == [185.0]
+    assert bench.wait.call_args.args[-1] == 185.0
 
 
 def test_a_soak_closes_the_loop_whatever_the_start_mode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,23 +149,14 @@ def test_a_soak_closes_the_loop_whatever_the_start_mode(tmp_path: Path, monkeypa
     assert used[0].control.start_mode == "closed"
 
 
-def test_an_interrupted_soak_has_the_results_so_far(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ended: list[float] = []
-    stub: Any = SimpleNamespace(
-        bus=MemoryBus(MemoryHub(), "launcher", HostClock()),
-        outcome=SimpleNamespace(mode=wire.LOOP_MODE_CLOSED, measurements={}),
-        folder=tmp_path,
-        health={},
-        children={},
-        begin=lambda: None,
-        end=ended.append,
-    )
+def test_an_interrupted_soak_has_the_results_so_far(stub: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    stub.begin, stub.end = Mock(), Mock()
     monkeypatch.setattr(run, "ChaosBench", lambda *_: stub)
     monkeypatch.setattr(run, "SAMPLE_S", 0.01)
     found = run.soak_loop(load(None), 3600.0, lambda _: signal.raise_signal(signal.SIGINT))
     assert found["interrupted"]
     assert found["hours"] < 0.01
-    assert len(ended) == 1
+    stub.end.assert_called_once()
 
 
 def log(folder: Path, name: str, counts: dict[str, list[int]], selection: Selection = EVERYTHING) -> None:
