@@ -74,9 +74,8 @@ def test_steps_and_commands_are_never_left_out() -> None:
         selection(1, ["lowfc/camera/frames"])
 
 
-def test_every_tenth_frame_is_recorded_and_the_others_do_not_count_as_lost(tmp_path: Path) -> None:
+def test_every_tenth_frame_is_recorded_and_the_others_do_not_count_as_lost(bench: Bench) -> None:
     """The frame number selects mirror states too; a message not received counts as lost, selected or not."""
-    bench = Bench(tmp_path / "logs")
     frames, commands = bench.camera.publisher(FRAME), bench.controller.publisher(COMMAND, "dm")
     mirror = bench.service("mirror-dm")
     states, surfaces = mirror.publisher(MIRROR_STATE, "dm"), mirror.publisher(SURFACE, "dm")
@@ -229,8 +228,7 @@ def test_record_with_the_word_start_is_refused_and_names_the_request() -> None:
     assert "`lowfc ctl record start`" in refusal("record", "start", kind=ConfigurationError)
 
 
-def test_the_answer_to_record_start_contains_the_estimate_of_disk_space(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "logs")
+def test_the_answer_to_record_start_contains_the_estimate_of_disk_space(bench: Bench) -> None:
     bench.start(bytes_per_s=1e6)
     answers = []
     for name in ("stop", "start"):

@@ -32,11 +32,6 @@ from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put
 pytestmark = pytest.mark.usefixtures("own_runtime")
 
 
-@pytest.fixture
-def bench(tmp_path: Path) -> Bench:
-    return Bench(tmp_path / "logs")
-
-
 def test_everything_is_recorded_verbatim(bench: Bench) -> None:
     frames, steps = bench.camera.publisher(FRAME), bench.controller.publisher(STEP)
     bench.start()

@@ -27,11 +27,6 @@ from tests.support.recording import PATIENCE_S, Bench, bodies_of, logged, put
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Bench:
-    return Bench(tmp_path / "logs")
-
-
-@pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of 4 MB."""
     folder = tmp_path / "disk"
