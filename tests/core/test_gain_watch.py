@@ -280,29 +280,23 @@ def test_manual_gains_are_kept_and_harm_is_reported_before_and_after_closing() -
     assert residual_nm > open_nm
 
 
-def test_a_harmful_loop_opens_if_configured() -> None:
-    loop = bench(6.5, **FIXED_GAINS | {"control.on_harm": "open"})
-    loop.run(1149, record=False)
-    loop.run(1)
-    assert loop.steps[-1].mode is LoopMode.OPEN
-    assert details_of(loop, "MODE_CHANGED")[-1]["why"] == "auto: the loop increased the residual"
-
-
-def harmful() -> ModalBench:
+def harmful(on_harm: str) -> ModalBench:
     """A closed loop that increases the residual; three windows end after 1000 frames."""
-    config = configuration(6.5, **FIXED_GAINS | {"control.on_harm": "integrator"})
+    config = configuration(6.5, **FIXED_GAINS | {"control.on_harm": on_harm})
     return ModalBench(config, factory.frame_noise_nm2(config, calibration(6.5, "sam")))
 
 
-def test_a_harmful_loop_without_a_law_opens_if_the_integrator_should_take_over() -> None:
-    loop = harmful()
+@pytest.mark.parametrize("on_harm", ["open", "integrator"])
+def test_a_harmful_loop_without_a_law_opens_if_configured(on_harm: str) -> None:
+    loop = harmful(on_harm)
     loop.run(1150)
     assert [event["action"] for event in details_of(loop, "LOOP_HARMS")] == ["the loop opens"]
     assert loop.state.mode is LoopMode.OPEN
+    assert details_of(loop, "MODE_CHANGED")[-1]["why"] == "auto: the loop increased the residual"
 
 
 def test_the_integrator_takes_over_from_a_harmful_law_once_the_loop_is_not_reserved() -> None:
-    loop = harmful()
+    loop = harmful("integrator")
     law = loop.settings.integrator(loop.config.noll)
     loop.load(integrator(law.gain, law.leak, loop.config.noll, loop.settings.delay_frames, 250.0))
     loop.run(100)
