@@ -7,7 +7,7 @@ import pytest
 from tests.support.fuzzing import MAX_GROWTH_BYTES, fuzz, shares
 from tests.support.targets import Target, targets
 
-FEW, MANY = 8_000, 1_000_000
+MANY = pytest.param(1_000_000, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])
 
 
 @pytest.fixture(scope="module")
@@ -55,20 +55,11 @@ def test_crashes_and_hangs_of_a_reader_are_found(monkeypatch: pytest.MonkeyPatch
     assert results["hangs"]
 
 
-def _check_readers(all_targets: list[Target], inputs: int) -> None:
+@pytest.mark.parametrize("inputs", [8_000, MANY])
+def test_damaged_inputs_neither_crash_nor_hang_a_reader(all_targets: list[Target], inputs: int) -> None:
     counts = shares(all_targets, inputs)
     for target in all_targets:
         results = fuzz(target, range(counts[target.name]))
         assert results["crashes"] == [], target.name
         assert results["hangs"] == [], target.name
         assert results["grown_bytes"] < MAX_GROWTH_BYTES, target.name
-
-
-def test_damaged_inputs_neither_crash_nor_hang_a_reader(all_targets: list[Target]) -> None:
-    _check_readers(all_targets, FEW)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_a_million_damaged_inputs_neither_crash_nor_hang_a_reader(all_targets: list[Target]) -> None:
-    _check_readers(all_targets, MANY)
