@@ -31,7 +31,8 @@ def recorded(content: bytes) -> tuple[Configuration, list[str]]:
         renamed_keys(data)
     remarks: list[str] = []
     while faults := _faults(data):
-        of_keys = [detail for detail in faults if _is_of_key(detail)]
+        # The others are contradictions between several keys, which a validator of sections reports.
+        of_keys = [detail for detail in faults if len(detail["loc"]) > 1 or detail["type"] != "value_error"]
         if not of_keys:
             remarks += [f"{explain(detail)}; used as recorded" for detail in faults]
             return _constructed(data, {str(detail["loc"][0]) for detail in faults if detail["loc"]}), remarks
@@ -50,11 +51,6 @@ def _faults(data: dict[str, Any]) -> list[Any]:
     except ValidationError as error:
         return list(error.errors())
     return []
-
-
-def _is_of_key(detail: Any) -> bool:
-    """Whether one key is at fault, and not a contradiction between several, which a validator of sections reports."""
-    return len(detail["loc"]) > 1 or detail["type"] != "value_error"
 
 
 def _mend(data: dict[str, Any], detail: Any) -> str:

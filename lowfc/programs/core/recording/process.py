@@ -2,7 +2,6 @@
 
 import contextlib
 import sys
-from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 from lowfc.adapters.bus.run import MODE, Run
@@ -45,11 +44,15 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
 
     # Every value, also the defaults that a user's file omits.
     attachments = [Attachment("config.toml", "application/toml", config.to_toml().encode())]
-    attachments += [] if calibration is None else [_attachment(calibration, "application/fits")]
+    if calibration is not None:
+        with raised_as(DataFileError, OSError, f"{calibration} cannot be read for the log"):
+            content = input_file.read_whole(calibration, _MAX_ATTACHMENT_BYTES)
+        attachments.append(Attachment(calibration.name, "application/fits", content))
     granted = set_up_below_loop(
         (fifo_priority(config) and realtime.recorder_priority) or None, set(realtime.recorder_cpus) or None
     )
     clock = clock_of(config)
+    launched = run.links.ports.keys()  # by a launcher, which itself sends no Health
     origin = {**provenance(run.run_id, config.seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}
     with contextlib.closing(ZenohBus(run.links, Role.RECORDER, clock)) as bus, contextlib.ExitStack() as held:
         recorder = Recorder(
@@ -63,7 +66,7 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
             granted=granted,
             selection=selection,
             expected_bytes_per_s=announced_bytes_per_s,
-            awaited=_launched_processes(run),
+            awaited=launched - {Role.LAUNCHER, Role.RECORDER} if Role.LAUNCHER in launched else frozenset(),
         )
         if shared is not None:
             write_whole(run.path / "config.toml", shared, mode=MODE)
@@ -80,14 +83,3 @@ def log_limits(config: Configuration) -> LogLimits:
     """Size and duration of a log file, free disk space to leave, and file mode."""
     log = config.recorder
     return LogLimits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6), int(log.file_mode, 8))
-
-
-def _launched_processes(run: Run) -> AbstractSet[str]:
-    """The processes that a launcher starts besides the recorder; the launcher itself sends no Health."""
-    ports = run.links.ports.keys()
-    return ports - {Role.LAUNCHER, Role.RECORDER} if Role.LAUNCHER in ports else frozenset()
-
-
-def _attachment(path: Path, media_type: str) -> Attachment:
-    with raised_as(DataFileError, OSError, f"{path} cannot be read for the log"):
-        return Attachment(path.name, media_type, input_file.read_whole(path, _MAX_ATTACHMENT_BYTES))
