@@ -27,7 +27,7 @@ from lowfc.contract.messages import COMMAND, EVENT, REQUEST, Log, wire
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limits
-from tests.support.loops import FIXED, children, interrupt, json_of, lowfc, payloads, refusal, start, until
+from tests.support.loops import FIXED, background, children, interrupt, json_of, lowfc, payloads, refusal, until
 from tests.support.safety_checks import violations
 
 pytestmark = pytest.mark.exclusive
@@ -68,11 +68,9 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
     folder = tmp_path_factory.mktemp("night")
     before = set(running())
     (folder / "test.toml").write_text(FIXED)
-    process = start(
-        folder, "sim-loop", "--config", "test.toml", "--rate", "100", "--json", "--disturbance", "bench", "--seed", "4"
-    )
-    night = Night(folder, process)
-    try:
+    words = ("--config", "test.toml", "--rate", "100", "--json", "--disturbance", "bench", "--seed", "4")
+    with background(folder, "sim-loop", *words) as process:
+        night = Night(folder, process)
         until(lambda: "controller" in children(process.pid) and set(running()) - before)
         (night.name,) = set(running()) - before
         _prepare(night)
@@ -83,10 +81,6 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
         _make_requests_beyond_the_document(night)
         night.end()
         yield night
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
 
 
 def _prepare(night: Night) -> None:
@@ -209,12 +203,8 @@ def test_the_commands_print_what_they_did(night: Night) -> None:
     paused, stopped = json.loads(outputs["while paused"]), json.loads(outputs["while stopped"])
     assert (paused["mode"], paused["paused"], stopped["recording"]) == ("open", True, "stopped")
     (listed,) = json.loads(outputs["runs"])["runs"]
-    assert (listed["run"], listed["mode"], listed["holding"], listed["recording"]) == (
-        night.name,
-        "closed",
-        None,
-        "recording",
-    )
+    expected = {"run": night.name, "mode": "closed", "holding": None, "recording": "recording"}
+    assert {name: listed[name] for name in expected} == expected
     assert listed.keys() == {"run", "mode", "holding", "rate_hz", "uptime_s", "processes", "recording", "log"}
     names = ["camera", "controller", "mirror-dm", "recorder"]
     assert [one["process"] for one in listed["processes"]] == names
@@ -286,8 +276,7 @@ def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
 @pytest.mark.slow
 def test_requests_are_answered_while_a_process_is_stopped_beyond_the_timeout_of_its_links(tmp_path: Path) -> None:
     """A link that has timed out is closed without blocking the controller's receiving thread (formerly for 10 s)."""
-    process = start(tmp_path, "sim-loop", "--run", "stopped", "--rate", "50", "--no-record")
-    try:
+    with background(tmp_path, "sim-loop", "--run", "stopped", "--rate", "50", "--no-record") as process:
         until(lambda: "sim_dm" in children(process.pid) and "stopped" in running())
         with Client("stopped") as loop:
             until(lambda: loop.status().state.frames_used)  # type: ignore[union-attr]
@@ -299,6 +288,3 @@ def test_requests_are_answered_while_a_process_is_stopped_beyond_the_timeout_of_
                     time.sleep(0.2)
             finally:
                 os.kill(mirror, signal.SIGCONT)
-    finally:
-        process.kill()
-        process.communicate()

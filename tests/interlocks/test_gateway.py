@@ -24,7 +24,7 @@ from lowfc.programs.gateway.variables import Kind, variables
 from lowfc.programs.gateway.watch import Watch
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from tests.support.loops import interrupt, refusal, start, until
+from tests.support.loops import background, interrupt, refusal, until
 
 Process = subprocess.Popen[str]
 IOC = """
@@ -217,15 +217,11 @@ def test_ioc_drives_an_interlock_and_scan_changes_a_gain(tmp_path: Path, ioc: tu
     process, search = ioc
     (port,) = free_ports(1)
     (tmp_path / "bench.toml").write_text(CONFIG.format(port=port, search=search))
-    loop = start(tmp_path, "sim-loop", "--config", "bench.toml", "--run", "epics", "--duration", "600", "--no-record")
-    until(lambda: "epics" in running(), 60)
-    gateway = start(tmp_path, "gateway", "epics", "--run", "epics", "--config", "bench.toml")
-    try:
-        run_scan(loop, gateway, process, f"127.0.0.1:{port + 1} 127.0.0.1:{search}")
-    finally:
-        for one in (loop, gateway):
-            one.kill()
-            one.communicate()
+    words = ("--run", "epics", "--config", "bench.toml")
+    with background(tmp_path, "sim-loop", *words, "--duration", "600", "--no-record") as loop:
+        until(lambda: "epics" in running(), 60)
+        with background(tmp_path, "gateway", "epics", *words) as gateway:
+            run_scan(loop, gateway, process, f"127.0.0.1:{port + 1} 127.0.0.1:{search}")
 
 
 def run_scan(loop: Process, gateway: Process, ioc: Process, addresses: str) -> None:

@@ -133,6 +133,16 @@ def start(folder: Path, *arguments: object) -> "subprocess.Popen[str]":
     )
 
 
+@contextlib.contextmanager
+def background(folder: Path, *arguments: object) -> Iterator["subprocess.Popen[str]"]:
+    """Run `lowfc` in the background; at the end of the block it is killed, unless it has ended."""
+    with start(folder, *arguments) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
 def command(folder: Path, line: str, timeout_s: float = 120, statuses: tuple[int, ...] = (0,)) -> str:
     """Output of a documented command, which must end with one of the statuses; a redirection is also carried out."""
     words, _, output = line.partition(" > ")
