@@ -90,12 +90,8 @@ class Bench:
         self.lab.middle.start("observer", str(SUPPORT / "host_observer.py"), RUN, config, "viewer")
 
     def begin(self, host: Host, name: str) -> None:
-        host.start(name, *self.arguments(host, name))
-
-    def arguments(self, host: Host, name: str) -> list[str]:
-        """Arguments of Python for a process on a host."""
         words = [word.format(folder=host.folder) for word in self.words[name]]
-        return [*words, "--run", RUN, "--config", str(host.folder / "lowfc.toml")]
+        host.start(name, *words, "--run", RUN, "--config", str(host.folder / "lowfc.toml"))
 
     def reports(self) -> list[dict[str, Any]]:
         """Every report of the observer so far, one each tenth of a second."""

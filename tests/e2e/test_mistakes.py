@@ -112,19 +112,15 @@ def _refused(folder: Path, *words: str, expected: str, config: str = "") -> str:
         assert (done.returncode, done.stdout) == (2, ""), done.stderr
         complaint = done.stderr.removeprefix("error: ").rstrip("\n")
     else:
-        complaint = _refused_here(folder, *words)
+        with contextlib.chdir(folder):
+            here = lowfc(*words)
+        assert not here.stdout
+        assert isinstance(here.exception, LowfcError | SystemExit), here.exception
+        assert getattr(here.exception, "exit_status", 2) == 2
+        complaint = str(here.exception) if isinstance(here.exception, LowfcError) else here.stderr
     assert expected in complaint
     assert not (folder / "logs").exists()
     return complaint
-
-
-def _refused_here(folder: Path, *words: str) -> str:
-    with contextlib.chdir(folder):
-        done = lowfc(*words)
-    assert not done.stdout
-    assert isinstance(done.exception, LowfcError | SystemExit), done.exception
-    assert getattr(done.exception, "exit_status", 2) == 2
-    return str(done.exception) if isinstance(done.exception, LowfcError) else done.stderr
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from typing import Any
 from urllib.request import urlopen
 
 import numpy as np
+import psutil
 import pytest
 import rerun as rr
 from rerun.chunk import McapReader
@@ -88,7 +89,7 @@ def test_a_viewer_that_hangs_or_dies_is_noticed(web: RerunViewer) -> None:
     assert web.answers()
     assert web.resident_bytes() > 1 << 20
     os.kill(web.pid, signal.SIGSTOP)
-    until(lambda: _state(web.pid) == "T")
+    until(lambda: psutil.Process(web.pid).status() == psutil.STATUS_STOPPED)
     assert web.alive
     assert not web.answers(0.3)
     os.kill(web.pid, signal.SIGCONT)
@@ -173,12 +174,8 @@ def _mean_row(shown: Any, colour: tuple[int, int, int]) -> float:
     return float(np.nonzero(np.all(np.abs(shown.astype(int) - colour) <= 12, axis=2))[0].mean())
 
 
-def _state(pid: int) -> str:
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-
-
 def _is_running(pid: int) -> bool:
-    return Path(f"/proc/{pid}").exists() and _state(pid) != "Z"
+    return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
 
 
 @pytest.fixture(scope="module")
