@@ -97,7 +97,7 @@ def evidence(good_entries: dict[Topic, tuple[Entry, ...]]) -> Evidence:
 
 @pytest.fixture
 def outcome(tmp_path: Path) -> Outcome:
-    outcome = Outcome(tmp_path, CONFIG, marks={"settled": ns(300), "end": ns(FRAMES)}, mode=wire.LOOP_MODE_CLOSED)
+    outcome = Outcome(tmp_path, CONFIG, settled_ns=ns(300), end_ns=ns(FRAMES), mode=wire.LOOP_MODE_CLOSED)
     outcome.ended = [ProcessEnd("camera", 0, 0.1, True), ProcessEnd("controller", 0, 0.1, True)]
     return outcome
 

@@ -119,10 +119,7 @@ class ToyBench(ChaosBench):
         self._mirror = MirrorLoop(SimulatedMirror(DriverOptions(), self.config), mirror, self.config)
         self.restart(Role.CONTROLLER)
         self.await_settled()
-        self.mark("settled")
-
-    def mark(self, name: str) -> None:
-        self.outcome.marks[name] = self.clock.host_ns()
+        self.outcome.settled_ns = self.clock.host_ns()
 
     def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = 0.0) -> None:
         for _ in range(PATIENCE_FRAMES):
@@ -165,7 +162,7 @@ class ToyBench(ChaosBench):
         return self._start_error
 
     def end(self, timeout_s: float = 0.0) -> None:
-        self.mark("end")
+        self.outcome.end_ns = self.clock.host_ns()
         for name, service in self._services.items():
             service.finish()
             self.outcome.ended.append(ProcessEnd(name, 0, 0.0, True))

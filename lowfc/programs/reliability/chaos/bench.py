@@ -70,7 +70,8 @@ class Outcome:
     Attributes:
         folder: folder with the logs and the standard error of the processes.
         config: configuration of the loop.
-        marks: times by name, host clock, ns.
+        settled_ns: time at which the loop had settled, host clock; 0 if it did not.
+        end_ns: time at which the processes were stopped.
         ended: processes that ended.
         alive: processes that still exist after the end of the case.
         killed_ns: times at which a recorder was killed, host clock.
@@ -84,7 +85,8 @@ class Outcome:
 
     folder: Path
     config: Configuration
-    marks: dict[str, int] = field(default_factory=dict)
+    settled_ns: int = 0
+    end_ns: int = 0
     ended: list[ProcessEnd] = field(default_factory=list)
     alive: list[str] = field(default_factory=list)
     killed_ns: list[int] = field(default_factory=list)
@@ -133,15 +135,11 @@ class ChaosBench:
             self.bus.subscribe(topic, self._receive)
         self.wait(lambda: self._steps > 0, "the first frame", START_S)
         self.await_settled(_QUIET_FRAMES)
-        self.mark("settled")
+        self.outcome.settled_ns = HostClock().host_ns()
 
     def client(self) -> Client:
         """A client in the role of an operator, on this process's connection."""
         return Client(self.run.run_id, bus=self.bus)
-
-    def mark(self, name: str) -> None:
-        """Record the present time under a name."""
-        self.outcome.marks[name] = HostClock().host_ns()
 
     def await_steps(self, count: int) -> None:
         """Wait for this many more steps of the controller."""
@@ -213,7 +211,7 @@ class ChaosBench:
 
     def end(self, timeout_s: float = PATIENCE_S) -> None:
         """Stop all processes; afterwards the outcome is complete."""
-        self.mark("end")
+        self.outcome.end_ns = HostClock().host_ns()
         try:
             order = (Role.CAMERA, Role.CONTROLLER, self.mirror, Role.VIEWER, Role.RECORDER)
             rank = {str(name): number for number, name in enumerate(order)}

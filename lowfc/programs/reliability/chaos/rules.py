@@ -117,9 +117,9 @@ def recovered_s(outcome: Outcome, evidence: Evidence) -> float | None:
     """
     steps = evidence.entries[STEP]
     started = [step for step in steps if step.message.error_nm and step.start_s > steps[0].start_s]
-    if not started or "settled" not in outcome.marks:
+    if not started or not outcome.settled_ns:
         return None
-    begun_ns, settled_ns = started[0].log_time_ns, outcome.marks["settled"]
+    begun_ns, settled_ns = started[0].log_time_ns, outcome.settled_ns
     limit_nm = MAX_RATIO * evidence.residual_nm(settled_ns - SPAN_NS, settled_ns) + FLOOR_NM
     times_ns, residuals_nm = evidence.residuals_nm()
     later = times_ns >= begun_ns
@@ -160,9 +160,8 @@ def _bad_frames(case: Case, evidence: Evidence) -> Finding:
 
 def _recovery(case: Case, outcome: Outcome, evidence: Evidence) -> Finding:
     """At the end the loop is closed with the former residual; or, if the case requires it, safe with a flat mirror."""
-    settled_ns, end_ns = outcome.marks.get("settled", 0), outcome.marks["end"]
-    before = evidence.residual_nm(settled_ns - SPAN_NS, settled_ns)
-    after = evidence.residual_nm(end_ns - SPAN_NS, end_ns)
+    before = evidence.residual_nm(outcome.settled_ns - SPAN_NS, outcome.settled_ns)
+    after = evidence.residual_nm(outcome.end_ns - SPAN_NS, outcome.end_ns)
     if np.isnan(after) and outcome.failure and outcome.residuals_nm:  # the recording ended before the loop did
         after = float(np.sqrt(np.mean(np.square(outcome.residuals_nm))))
     mode = mode_name(outcome.mode)
