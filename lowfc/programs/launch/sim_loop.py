@@ -142,18 +142,24 @@ def _supervise(
 ) -> None:
     camera = children[0]
     view = next((child for child in children if child.name == Role.VIEWER), None)
-    with deferred_signals() as interrupted, _display(console) as show:
+    display = (
+        Live(console=console, refresh_per_second=4, transient=True) if console.is_terminal else contextlib.nullcontext()
+    )
+    due_s = period_s = SHOW_S if console.is_terminal else LINE_PERIOD_S
+    with deferred_signals() as interrupted, display as live:
         begun_s = time.monotonic()
-        shown_s = 0.0
         while camera.status is None and watch.health_of(Role.CAMERA).state != "stopped" and not interrupted():
             check(children[1:])
             if view is not None and view.status is not None:
                 _report_view_ended(view, console)
                 view = None
             elapsed_s = time.monotonic() - begun_s
-            if elapsed_s > shown_s + SHOW_S:
-                shown_s = elapsed_s
-                show(watch, config, duration_s, elapsed_s)
+            if elapsed_s >= due_s:
+                due_s += period_s
+                if live is not None:
+                    live.update(screen(watch, config, duration_s, elapsed_s))
+                else:
+                    sys.stderr.write(status_line(watch, elapsed_s, config.lockstep_hz) + "\n")
             time.sleep(POLL_S)
         if not interrupted():
             check(children)
@@ -210,20 +216,3 @@ def deferred_signals() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in previous_handlers.items():
             signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def _display(console: Console) -> Iterator[Callable[..., None]]:
-    if console.is_terminal:
-        with Live(console=console, refresh_per_second=4, transient=True) as live:
-            yield lambda *status: live.update(screen(*status))
-    else:
-        due_s = LINE_PERIOD_S
-
-        def line(watch: Watch, config: Configuration, duration_s: float | None, elapsed_s: float) -> None:
-            nonlocal due_s
-            if elapsed_s >= due_s:
-                due_s += LINE_PERIOD_S
-                sys.stderr.write(status_line(watch, elapsed_s, config.lockstep_hz) + "\n")
-
-        yield line
