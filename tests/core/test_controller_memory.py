@@ -38,7 +38,6 @@ from lowfc.contract.messages import (
     REQUEST,
     STEP,
     TIMING,
-    Log,
     Message,
     image,
     timestamp,
@@ -141,7 +140,7 @@ class Rig(ThreadedRun):
         return self.received[STEP.key][-count:]
 
     def events(self) -> list[str]:
-        return [log.message.split()[0] for log in self.received.get(EVENT.key, []) if isinstance(log, Log)]
+        return [log.message.split()[0] for log in self.received.get(EVENT.key, [])]
 
     def stop(self) -> None:
         super().stop()
