@@ -138,7 +138,7 @@ class Bench:
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+def started(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     bench = Bench(tmp_path_factory.mktemp("hosts"))
     try:
         bench.start()
@@ -146,6 +146,13 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         yield bench
     finally:
         bench.lab.close()
+
+
+@pytest.fixture
+def bench(started: Bench) -> Bench:
+    """The bench, once its loop has settled after the test before."""
+    started.wait_until_settled()
+    return started
 
 
 def test_a_host_has_its_own_network_from_the_start(tmp_path: Path) -> None:
@@ -162,7 +169,6 @@ def clock_offset_ns(host: Host) -> int:
 
 
 def test_clock_offsets_are_measured_and_requests_and_a_view_work_from_another_host(bench: Bench) -> None:
-    bench.wait_until_settled()
     desk = bench.lab["desk"]
     done = desk.run("-m", "lowfc", "hosts", "--run", RUN, "--json")
     assert done.returncode == 0, done.stderr
@@ -183,7 +189,6 @@ def test_clock_offsets_are_measured_and_requests_and_a_view_work_from_another_ho
 
 
 def test_a_log_of_several_hosts_states_the_clock_error_of_its_latencies(bench: Bench) -> None:
-    bench.wait_until_settled()
     desk = bench.lab["desk"]
     done = desk.run("-m", "lowfc", "ctl", "record", "stop", "--run", RUN)
     assert done.returncode == 0, done.stderr
@@ -202,7 +207,6 @@ def test_a_log_of_several_hosts_states_the_clock_error_of_its_latencies(bench: B
 
 
 def test_without_the_cameras_link_the_command_is_held_and_repeated(bench: Bench) -> None:
-    bench.wait_until_settled()
     before = bench.events("controller NO_FRAMES")
     with bench.lab.cut("camera"):
         bench.wait(lambda: bench.events("controller NO_FRAMES") > before, "NO_FRAMES")
@@ -219,7 +223,6 @@ def test_without_the_cameras_link_the_command_is_held_and_repeated(bench: Bench)
 
 
 def test_without_the_mirrors_link_its_command_timeout_acts(bench: Bench) -> None:
-    bench.wait_until_settled()
     mirror = bench.lab["mirror"]
     before = mirror.stderr("mirror-dm").count("COMMAND_EXPIRED")
     with bench.lab.cut("mirror"):
@@ -232,7 +235,6 @@ def test_without_the_mirrors_link_its_command_timeout_acts(bench: Bench) -> None
 
 
 def test_without_the_controllers_link_the_mirror_relaxes_and_the_controller_holds(bench: Bench) -> None:
-    bench.wait_until_settled()
     controller = bench.lab["controller"]
     before = controller.stderr("controller").count("NO_FRAMES"), bench.events("mirror-dm COMMAND_EXPIRED")
     with bench.lab.cut("controller"):
@@ -244,7 +246,6 @@ def test_without_the_controllers_link_the_mirror_relaxes_and_the_controller_hold
 
 
 def test_without_the_desks_link_the_loop_continues(bench: Bench) -> None:
-    bench.wait_until_settled()
     events = ("controller NO_FRAMES", "mirror-dm COMMAND_EXPIRED")
     before, lost = [bench.events(name) for name in events], bench.events("recorder MESSAGES_LOST")
     start = len(bench.reports())
@@ -259,7 +260,6 @@ def test_without_the_desks_link_the_loop_continues(bench: Bench) -> None:
 
 
 def test_the_loop_recovers_after_a_restart_of_the_router(bench: Bench) -> None:
-    bench.wait_until_settled()
     router = bench.lab.middle.children.pop("router")
     router.process.kill()
     router.stop(5.0)
@@ -322,7 +322,6 @@ def forge(host: Host, certificate: Path | None, protocol: str = "tls") -> str:
 
 def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(bench: Bench) -> None:
     """The router lets this role's commands through, so the next test would detect a forged command that passes."""
-    bench.wait_until_settled()
     copy_certificates(bench.lab["desk"], bench.authority, "controller")
     before = bench.events("mirror-dm COMMAND_REFUSED")
     forge(bench.lab["desk"], bench.lab["desk"].folder / "certs" / "controller")
@@ -341,7 +340,6 @@ def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(be
 
 def test_a_forger_gets_nothing_and_moves_nothing(bench: Bench, tmp_path: Path) -> None:
     """A forger has a certificate of another role, of no known role or of a foreign authority, or none, or no TLS."""
-    bench.wait_until_settled()
     camera, desk = bench.lab["camera"], bench.lab["desk"]
     make_certificates(bench.authority, ["stranger"], [])
     make_certificates(tmp_path, ROLES, [])

@@ -45,7 +45,7 @@ class ManualRun:
         shared = ["--run", self.run_id, "--config", str(folder / "test.toml")]
         self.commands = {
             "camera": ["-m", "sim_camera", *shared],
-            "mirror": ["-m", "sim_dm", *shared],
+            "mirror-dm": ["-m", "sim_dm", *shared],
             "controller": ["-m", "lowfc", "controller", *shared, "--calibration", str(folder / "calibration.fits")],
         }
         self.bus = ZenohBus(self.run.links, "operator", HostClock())
@@ -93,7 +93,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-ORDERS = list(itertools.permutations(["camera", "controller", "mirror"]))
+ORDERS = list(itertools.permutations(["camera", "controller", "mirror-dm"]))
 
 
 @pytest.fixture(scope="module", params=[ORDERS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in ORDERS[1:])])
@@ -102,7 +102,7 @@ def bench(folder: Path, request: pytest.FixtureRequest) -> Iterator[ManualRun]:
     bench = ManualRun(folder)
     for name in request.param:
         bench.start(name)
-        until(lambda: all(_alive(bench, process) for process in bench.running))
+        until(lambda: all(bench.bus.get(f"lowfc/health/{process}", timeout_s=0.1) for process in bench.running))
     yield bench
     bench.stop()
 
@@ -113,7 +113,7 @@ def test_the_loop_closes_in_any_start_order(bench: ManualRun) -> None:
 
 def test_the_loop_recovers_from_kill_and_restart_of_each_process(bench: ManualRun) -> None:
     bench.wait_until_settled()
-    for name in ("camera", "controller", "mirror"):
+    for name in ("camera", "controller", "mirror-dm"):
         before = bench.shapes[-1]
         bench.kill(name)
         bench.shapes.clear()
@@ -128,22 +128,17 @@ def test_the_loop_recovers_from_kill_and_restart_of_each_process(bench: ManualRu
             assert np.abs(shapes - before).max() < 12
 
 
-def _alive(bench: ManualRun, name: str) -> bool:
-    process = {"mirror": "mirror-dm"}.get(name, name)
-    return bool(bench.bus.get(f"lowfc/health/{process}", timeout_s=0.1))
-
-
 def test_the_controller_holds_while_the_mirror_is_dead_and_can_close_when_the_mirror_is_back(bench: ManualRun) -> None:
     bench.wait_until_settled()
     before = bench.shapes[-1]
-    bench.kill("mirror")
+    bench.kill("mirror-dm")
     with Client(bench.run_id) as loop:
         until(lambda: loop.processes()[Role.CONTROLLER].holding == "the mirror does not answer")
         until(lambda: bench.reasons == [wire.REASON_NO_MIRROR])
         loop.ask("open")
         with pytest.raises(RequestRefusedError, match="the mirror does not answer"):
             loop.ask("close")
-        bench.start("mirror")
+        bench.start("mirror-dm")
         until(lambda: not loop.ask("status").state.mirror_fault)
         loop.ask("close")
     bench.wait_until_settled()
