@@ -205,13 +205,8 @@ class Client:
 
         `safe` from anyone, and `open`, `pause` or `stop` from another client, end the reservation: see `check_lease`.
         """
-        lease = Lease(
-            lambda name, lease_id, seconds, holder: self.ask(name, values=seconds, text=holder, lease_id=lease_id),
-            purpose,
-            duration_s,
-            lockstep=bool(tomllib.loads(self.configuration()).get("lockstep")),
-        )
-        self._lease = lease
+        lockstep = bool(tomllib.loads(self.configuration()).get("lockstep"))
+        self._lease = lease = Lease(self.ask, purpose, duration_s, lockstep=lockstep)
         try:
             yield lease
         finally:

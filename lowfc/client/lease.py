@@ -19,9 +19,6 @@ DURATION_S = 10.0
 RENEWAL_S = 0.5
 """Time between renewals, by this host's clock."""
 
-Ask = Callable[[str, int, float, str], object]
-"""Function that sends `lease`, `renew` or `release`: name of the request, lease id, seconds, holder."""
-
 
 def new_identity() -> int:
     """Make the identity of a reservation: a random number above 0."""
@@ -31,8 +28,8 @@ def new_identity() -> int:
 class Lease:
     """A reservation of the loop, from its construction to `release`; the holder's requests carry its `id`."""
 
-    def __init__(self, ask: Ask, purpose: str, duration_s: float | None = None, *, lockstep: bool = False) -> None:
-        """Reserve the loop for a purpose such as "lowfc calibrate", with its duration if known.
+    def __init__(self, ask: Callable[..., object], purpose: str, duration_s: float | None, *, lockstep: bool) -> None:
+        """Reserve the loop, by the client's `ask`, for a purpose such as "lowfc calibrate", with its duration if known.
 
         In lockstep the loop's time, in which a reservation ends, may run a hundred times faster than the host's clock:
         without renewal the reservation then stays in force for as long as the controller allows.
@@ -49,7 +46,7 @@ class Lease:
         self._ended = ""
         self._lock = threading.Lock()
         self._done = threading.Event()
-        self._ask("lease", self.id, self._in_force_s, self._holder())
+        self._reserve("lease")
         self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
         self._thread.start()
 
@@ -71,7 +68,7 @@ class Lease:
         with self._lock:
             if not self._ended:
                 try:
-                    self._ask("renew", self.id, self._in_force_s, self._holder())
+                    self._reserve("renew")
                 except RequestRefusedError as fault:
                     self._ended = str(fault).removeprefix("renew refused: ").removeprefix(LEASE_OVER)
             if self._ended:
@@ -82,7 +79,7 @@ class Lease:
         self._done.set()
         self._thread.join()
         with contextlib.suppress(LowfcError):
-            self._ask("release", self.id, 0.0, "")
+            self._ask("release", values=0.0, lease_id=self.id)
 
     def _renew(self) -> None:
         while not self._done.wait(RENEWAL_S):
@@ -93,7 +90,8 @@ class Lease:
             except CalibrationError:
                 return
 
-    def _holder(self) -> str:
-        if self._end_s is None:
-            return self._purpose
-        return f"{self._purpose}{REMAINING_TIME_SEPARATOR}{max(0.0, self._end_s - time.monotonic()):.0f} s to go"
+    def _reserve(self, request: str) -> None:
+        holder = self._purpose
+        if self._end_s is not None:
+            holder += f"{REMAINING_TIME_SEPARATOR}{max(0.0, self._end_s - time.monotonic()):.0f} s to go"
+        self._ask(request, values=self._in_force_s, text=holder, lease_id=self.id)
