@@ -16,6 +16,7 @@ from lowfc.contract.messages import (
     RawImage,
     checked_sequence,
     checked_time_ns,
+    fields_of,
     floats,
     from_timestamp,
     timestamp,
@@ -201,6 +202,8 @@ def _mirror_shape(state: wire.MirrorState) -> MirrorShape | None:
 
 MAX_REQUESTER_LENGTH = 100
 """Largest number of characters kept of a requester."""
+_REQUEST = ("name", "modes", "values", "text", "lease_id", "requester", "prior_nm2", "flux_dn")
+"""Fields of the same name in requests and messages."""
 _BYTES_WITHOUT_ARRAYS = 8_000
 _BYTES_WITH_ARRAYS = 16_000_000  # the bus loses a far larger message
 _MAX_BYTES = {
@@ -286,25 +289,18 @@ def encode_request(request: Request, reply: Reply, input_number: int, state: wir
     played = request.played
     message = wire.Request(
         timestamp=timestamp(request.time_ns),
-        name=request.name,
-        modes=request.modes,
-        values=request.values,
         accepted=reply.accepted,
         reply=reply.text,
         frame_sequence=reply.frame_sequence,
         state=state,
         input_number=input_number,
-        text=request.text,
         actuators=b"" if played is not None else request.actuators_nm.tobytes(),
         table=b"" if played is not None else request.table.tobytes(),
         columns=request.table.shape[1] if request.table.size else 0,
         law=None if request.law is None else (law_header if request.prepared else wire_law)(request.law),
         play_id="" if played is None else played.id,
-        lease_id=request.lease_id,
-        requester=request.requester,
-        prior_nm2=request.prior_nm2,
-        flux_dn=request.flux_dn,
         calibration=None if request.calibration is None else wire.Calibration(id=request.calibration.id),
+        **fields_of(request, _REQUEST),
     )
     return message.SerializeToString()
 
