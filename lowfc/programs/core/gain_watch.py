@@ -1,5 +1,6 @@
 """Automatic gains: requests optimal gains from measurements; reports a closed loop that does harm, and reacts to it."""
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -228,18 +229,14 @@ class GainWatch:
                 group.cautious = False
                 group.bank.begin_first_window()
             events += self._harm_events(group, verdict, loop)
-        requests = []
+        requests, request = [], partial(Request, step.time_ns, requester=REQUESTER)
         if loop.automatic.any() and (initial or not np.array_equal(gain, loop.integrator.gain)):
             requests.append(self._gain_request(step, loop, gain))
         self.closing_harm = "" if state.mode is LoopMode.CLOSED else self._closing_harm(gain, loop)
         if state.waits_for_gains and all(group.verdict is not None for group in self._groups):
-            requests.append(
-                Request(step.time_ns, "close", text=f"{AUTO}: the gains were measured", requester=REQUESTER)
-            )
+            requests.append(request("close", text=f"{AUTO}: the gains were measured"))
         if events and (reaction := self._reaction(loop)):
-            requests.append(
-                Request(step.time_ns, reaction, text=f"{AUTO}: the loop increased the residual", requester=REQUESTER)
-            )
+            requests.append(request(reaction, text=f"{AUTO}: the loop increased the residual"))
         return Actions(tuple(requests), tuple(events))
 
     def _closing_harm(self, gain: Single, loop: ActiveLoop) -> str:

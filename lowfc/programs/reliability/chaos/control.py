@@ -205,16 +205,11 @@ def _other_clock(bench: ChaosBench, shift_s: int) -> None:
             bench.await_steps(WHILE_FRAMES)
 
 
-case(
-    "clock-ahead",
-    "a camera whose clock is an hour ahead replaces the camera for a while",
-    expected=("CAMERA_RESTARTED",),
-    allowed=LOST,
-    lacks=partial(no_other_clock, 3600),
-)(partial(_other_clock, shift_s=3600))
-case(
-    "clock-behind",
-    "a camera whose clock is an hour behind replaces the camera for a while",
-    allowed=LOST,
-    lacks=partial(no_other_clock, -3600),
-)(partial(_other_clock, shift_s=-3600))
+for _kind, _shift_s, _expected in (("ahead", 3600, ("CAMERA_RESTARTED",)), ("behind", -3600, ())):
+    case(
+        f"clock-{_kind}",
+        f"a camera whose clock is an hour {_kind} replaces the camera for a while",
+        expected=_expected,
+        allowed=LOST,
+        lacks=partial(no_other_clock, _shift_s),
+    )(partial(_other_clock, shift_s=_shift_s))
