@@ -228,11 +228,7 @@ def test_statistics_of_the_last_second_exclude_older_and_refused_frames() -> Non
     for quarter, error_nm in enumerate((9.0, 9.0, 9.0, 9.0, 9.0, 1.0, 1.0, None, 1.0, 1.0)):
         last.add(step(error_nm), quarter * SECOND // 4)
     figures = last.statistics(state, 9 * SECOND // 4)
-    assert (figures.frames, figures.residual_rms_nm, figures.flux_fraction) == (
-        3,
-        pytest.approx(2.0),
-        pytest.approx(0.5),
-    )
+    assert (figures.frames, figures.residual_rms_nm, figures.flux_fraction) == pytest.approx((3, 2.0, 0.5))
     assert last.statistics(state, 20 * SECOND).frames == 0
 
 

@@ -148,12 +148,9 @@ def test_modes_not_corrected_reduce_the_noise_of_the_others(faint: Bench) -> Non
     measured_modes = active_loop.to_modes @ active_loop.calibration.modes_to_actuators  # of the shape of each mode
     np.testing.assert_allclose(measured_modes, in_use @ active_loop.calibration.response, atol=0.02)
     assert np.abs(measured_modes - np.eye(len(measured_modes))).max() > 0.1
+    flux_dn, camera = faint.steps[-1].flux_dn, active_loop.camera
     original, reweighted = (
-        np.diag(
-            noise_covariance_nm2(
-                replace(active_loop.calibration, reconstructor=rows), faint.steps[-1].flux_dn, active_loop.camera
-            )
-        )
+        np.diag(noise_covariance_nm2(replace(active_loop.calibration, reconstructor=rows), flux_dn, camera))
         for rows in (active_loop.calibration.reconstructor, active_loop.estimator.rows[:-1])
     )
     np.testing.assert_array_equal(reweighted[uncorrected], original[uncorrected])

@@ -153,12 +153,8 @@ def repeat(command_us: float, echo_us: float = 100, **changes: Any) -> dict[str,
     """A repeat with constant latencies."""
     names = ("p50", "p90", "p99", "p99_9", "max")
     results = repeat_statistics(frames(command_us=float(command_us)))
-    alone = {
-        "echo_us": dict.fromkeys(names, echo_us),
-        "step_us": dict.fromkeys(names, 50.0),
-        "hot_step_us": dict.fromkeys(names, 25.0),
-        "timer_us": dict.fromkeys(names, 5.0),
-    }
+    alone_us = {"echo_us": echo_us, "step_us": 50.0, "hot_step_us": 25.0, "timer_us": 5.0}
+    alone = {name: dict.fromkeys(names, us) for name, us in alone_us.items()}
     counts = {"echo_lost": 1, "frames_skipped": 2, "frames_missing": 0, "reasons": {"LATE": 1}}
     return results | alone | counts | changes
 
