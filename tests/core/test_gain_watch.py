@@ -225,21 +225,14 @@ def test_a_state_decoded_before_gains_are_measured_has_the_same_law() -> None:
     np.testing.assert_array_equal(again.integrator.rows, active_loop.integrator.rows)
 
 
-def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset() -> None:
     """The square of a tilt offset is in the image, but the loop's error excludes the offset."""
-    tilts_nm: list[Single] = []
-    add_frames = TiltCrossTalk.add_frames
-
-    def spied(self: TiltCrossTalk, tilt_nm: Single, open_nm: Array | Single) -> Array:
-        tilts_nm.append(tilt_nm[-1].copy())
-        return add_frames(self, tilt_nm, open_nm)
-
-    monkeypatch.setattr(TiltCrossTalk, "add_frames", spied)
-    loop = bench(2.0)
-    loop.ask("offset", modes=(2,), values=(40.0,))
-    loop.run(2 * TOGETHER)
-    error_nm = loop.steps[-1].error_nm
-    np.testing.assert_allclose(tilts_nm[-1], error_nm[:2] + np.float32([40, 0]), atol=1e-3)
+    with patch.object(TiltCrossTalk, "add_frames", autospec=True, side_effect=TiltCrossTalk.add_frames) as added:
+        loop = bench(2.0)
+        loop.ask("offset", modes=(2,), values=(40.0,))
+        loop.run(2 * TOGETHER)
+    _, tilt_nm, _ = added.call_args.args
+    np.testing.assert_allclose(tilt_nm[-1], loop.steps[-1].error_nm[:2] + np.float32([40, 0]), atol=1e-3)
 
 
 def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:

@@ -16,7 +16,7 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.selection import EVERYTHING, Selection
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.clock import HostClock
-from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
+from lowfc.contract.configuration import FIXED_GAINS, load
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import FRAME, STEP, TIMING, TRUTH, wire
 from lowfc.programs.reliability.chaos.bench import ChaosBench
@@ -136,17 +136,14 @@ def test_a_slow_loop_has_time_to_settle() -> None:
 
 
 def test_a_soak_closes_the_loop_whatever_the_start_mode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    used: list[Configuration] = []
-    monkeypatch.setattr(
-        "lowfc.programs.reliability.soak.run.soak_loop",
-        lambda settings, *_: used.append(settings) or {"passed": True, "interrupted": False},
-    )
+    soak_loop = Mock(return_value={"passed": True, "interrupted": False})
+    monkeypatch.setattr("lowfc.programs.reliability.soak.run.soak_loop", soak_loop)
     monkeypatch.setattr("lowfc.programs.reliability.soak.evaluation.render", lambda _: "passed")
     file = tmp_path / "open.toml"
     file.write_text('[control]\nstart_mode = "open"\n')
     done = lowfc("soak", "--hours", "0.01", "--config", file)
     assert done.exit_code == 0, done.output
-    assert used[0].control.start_mode == "closed"
+    assert soak_loop.call_args.args[0].control.start_mode == "closed"
 
 
 def test_an_interrupted_soak_has_the_results_so_far(stub: Any, monkeypatch: pytest.MonkeyPatch) -> None:
