@@ -731,12 +731,13 @@ def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
         assert log.metadata["recording"] == account, "of this recording, not of the recorder"
 
 
-def test_a_log_that_cannot_be_created_is_refused_and_can_be_requested_again(
+def test_a_log_that_cannot_be_created_is_refused_and_the_answer_for_the_next_one_estimates_its_growth(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.start(bytes_per_s=1e6)
     operator = Client(bus=bench.bus)
-    first = operator.record(False).text
+    stopped = operator.record(False)
+    assert stopped.reply == f"recording stopped: {stopped.text}"
     with monkeypatch.context() as patch:
         patch.setattr("shutil.disk_usage", lambda folder: Path(os.devnull, "x").stat())
         with pytest.raises(RequestRefusedError, match="cannot be accessed: Not a directory"):
@@ -748,7 +749,9 @@ def test_a_log_that_cannot_be_created_is_refused_and_can_be_requested_again(
         operator.record(True)
     bench.folder.unlink()
     moved.rename(bench.folder)
-    assert operator.record(True).text != first
+    second = operator.record(True)
+    assert second.text != stopped.text
+    assert second.reply.startswith(f"recording into {second.text}; about 3.6 GB an hour; ")
     shutil.rmtree(bench.folder)  # a recording that failed can be followed by another
     until(lambda: bench.camera.last_health["recorder"].recording.failure)
     third = operator.record(True).text

@@ -226,16 +226,3 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
 
 def test_record_with_the_word_start_is_refused_and_names_the_request() -> None:
     assert "`lowfc ctl record start`" in refusal("record", "start", kind=ConfigurationError)
-
-
-def test_the_answer_to_record_start_contains_the_estimate_of_disk_space(bench: Bench) -> None:
-    bench.start(bytes_per_s=1e6)
-    answers = []
-    for name in ("stop", "start"):
-        (sample,) = bench.bus.get(f"lowfc/record/{name}", b"", 20.0)
-        answers.append(wire.Request.FromString(sample.payload))
-    bench.stop()
-    assert [answer.accepted for answer in answers] == [True, True]
-    assert answers[0].reply == f"recording stopped: {answers[0].text}"
-    assert answers[1].reply.startswith(f"recording into {answers[1].text}; about ")
-    assert "about 3.6 GB an hour; " in answers[1].reply
