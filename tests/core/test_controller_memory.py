@@ -16,7 +16,7 @@ import pytest
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files import factory, law_file
-from lowfc.adapters.process.clock import HostClock, SimulatedClock
+from lowfc.adapters.process.clock import SIMULATED_START_NS, HostClock, SimulatedClock
 from lowfc.adapters.process.latch import Latch
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels
@@ -59,11 +59,10 @@ from tests.support.in_process_loop import PATIENCE_S, SMALL_MIRROR, ThreadedRun,
 from tests.support.loops import until
 from tools.law_bench import calibrated
 
-START_NS = 1_767_225_600_000_000_000
 BRIGHT = {"disturbance.preset": "quiet", "star.magnitude": -2.0, "lockstep": True, "mirror.settling_us": 0.0}
 configured = partial(configuration, FIXED_GAINS | SMALL_MIRROR | BRIGHT)
 CHANGED_CAMERA = wire.CameraState(
-    timestamp=timestamp(START_NS), rows=5, columns=5, bias_dn=100, saturation_dn=65535
+    timestamp=timestamp(SIMULATED_START_NS), rows=5, columns=5, bias_dn=100, saturation_dn=65535
 ).SerializeToString()
 CONFIG, CLOSED = configured(), configured(control__start_mode="closed")
 GRID = CONFIG.mirror.rows, CONFIG.mirror.columns
@@ -73,7 +72,7 @@ class Rig(ThreadedRun):
     """A run in one process, and the messages that its controller and mirror published."""
 
     def __init__(self, config: Configuration, calibration: Calibration, scene: Scene) -> None:
-        super().__init__("test", config, lambda: SimulatedClock(START_NS) if config.lockstep else HostClock())
+        super().__init__("test", config, lambda: SimulatedClock() if config.lockstep else HostClock())
         self.calibration, self.scene = calibration, scene
         self.received: dict[str, list[Any]] = {}
         self.offset_nm = np.zeros(GRID, np.float32)
@@ -84,7 +83,7 @@ class Rig(ThreadedRun):
             self.operator.subscribe(topic, self._appender(topic.message, topic.key))
         camera = self.bus("camera")
         self.frames, self.settings = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
-        state = camera_state(CameraSettings.configured(config, *scene.shape), START_NS)
+        state = camera_state(CameraSettings.configured(config, *scene.shape), SIMULATED_START_NS)
         self.settings.put(state.SerializeToString())
         self.latch = Path(tempfile.mkdtemp()) / "safe"
         self.start(calibration, "a test", self.latch)
@@ -103,7 +102,7 @@ class Rig(ThreadedRun):
 
     def put(self, pixels: Pixels, publish_time_ns: int | None = None) -> int:
         """Publish a frame, and wait until the mirror has answered the command of this frame."""
-        time_ns = START_NS + (self._index + 1) * self.config.period_ns
+        time_ns = SIMULATED_START_NS + (self._index + 1) * self.config.period_ns
         self._index += 1
         payload = image(pixels, time_ns, "camera").SerializeToString()
         sequence = self.frames.put(payload, publish_time_ns).sequence
@@ -149,7 +148,7 @@ class Rig(ThreadedRun):
 
 def alone(calibration: Calibration | None, latch: Latch, config: Configuration) -> tuple[Listener, Service, Controller]:
     """A controller without camera and mirror."""
-    listener = Listener(SimulatedClock(START_NS) if config.lockstep else HostClock())
+    listener = Listener(SimulatedClock() if config.lockstep else HostClock())
     service = listener.service("controller")
     return listener, service, Controller(config, service, calibration, "a test", latch)
 
@@ -372,7 +371,7 @@ def test_safe_mode_outlives_the_controller(calibration: Calibration, tmp_path: P
         controller._update_latch()
         latch.close()  # otherwise it would write the file again
         if first is None:
-            controller._carry_out_internal(Request(START_NS, "load", calibration=calibration))
+            controller._carry_out_internal(Request(SIMULATED_START_NS, "load", calibration=calibration))
         return mode_of(controller)
 
     assert mode() is LoopMode.CLOSED
