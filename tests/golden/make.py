@@ -36,7 +36,6 @@ from tests.support.loops import until
 from tools.law_bench import calibrated
 
 ROOT = Path(__file__).parents[2]
-START_NS = 1_767_225_600_000_000_000
 CONFIGURATION = {
     "sensor.modes": 2,
     "mirror.rows": 12,
@@ -58,7 +57,7 @@ class Night(ThreadedRun):
     """A run in one process: a camera that exposes on request; controller, mirror and recorder in their own threads."""
 
     def __init__(self, config: Configuration, calibration: Calibration, folder: Path) -> None:
-        self.clock = FakeClock(START_NS)
+        self.clock = FakeClock()
         super().__init__("golden", config, lambda: self.clock)
         self.index = self.last_step = 0
         self.shape_nm = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
@@ -190,7 +189,7 @@ def main(folder: Path) -> None:
     loop.stop()
     loop.channel("dark-hole")
     loop.offset()
-    night.frames.put(b"", sequence=night.frames.last[1].sequence + 2)  # unreadable; the one before it is missing
+    night.frames.put(b"", sequence=night.last_step + 2)  # unreadable; the one before it is missing
     night.expose(1, lambda pixels: pixels[:3])  # of the wrong size
     night.expose(1, lambda pixels: np.full_like(pixels, 100))  # dark
     night.expose(1, lambda pixels: np.full_like(pixels, 65_535))  # saturated

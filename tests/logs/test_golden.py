@@ -20,6 +20,7 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Load, Request
 from lowfc.control.loop.state import State
 from lowfc.programs.logs.replay.former import CAMERA_RULE, CLEAR_RULE
+from tests.golden import make
 from tests.support.loops import json_of, refusal, run
 
 WIRE = Path(__file__).parents[2] / "lowfc" / "contract" / "wire"
@@ -48,6 +49,13 @@ def test_a_replay_is_identical_except_for_rules_that_changed_on_purpose(
     complete = json_of("replay", log, "--tolerance", 1e-3) if lost_bytes else results  # the complete log names its host
     if not {"blas", "cpu_features", "numpy"} & complete["host_differs"].keys():
         assert (results["identical"], results["largest_difference_nm"]) == (True, 0.0)
+
+
+def test_the_golden_files_of_the_present_version_can_be_made_and_replayed(tmp_path: Path) -> None:
+    folder = tmp_path / "golden"
+    make.main(folder)
+    assert {path.name for path in folder.iterdir()} == {path.name for path in FOLDER.iterdir()}
+    assert json_of("replay", folder / "night.mcap")["identical"]
 
 
 def test_another_blas_kernel_differs_only_by_rounding() -> None:
