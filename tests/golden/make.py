@@ -9,7 +9,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -106,14 +106,7 @@ class Night(ThreadedRun):
             sequence = self.frames.put(
                 image(change(pixels), time_ns, "camera").SerializeToString(), time_ns - late_ns
             ).sequence
-            message = wire.Truth(
-                timestamp=timestamp(time_ns),
-                frame_sequence=sequence,
-                disturbance_nm=truth.disturbance_nm.tolist(),
-                residual_nm=truth.residual_nm.tolist(),
-                disturbance_rms_nm=truth.disturbance_rms_nm,
-                residual_rms_nm=truth.residual_rms_nm,
-            )
+            message = wire.Truth(timestamp=timestamp(time_ns), frame_sequence=sequence, **asdict(truth))
             self.truths.put(message.SerializeToString())
             until(lambda: self.last_step == sequence)  # noqa: B023  # called immediately
 
