@@ -113,7 +113,7 @@ def test_the_files_of_a_log_are_read_as_one(folder: Path, samples: list[Sample])
     assert (log.size, log.position) == (sum(path.stat().st_size for path in files),) * 2
     assert log.metadata["recording"]["messages"] == str(len(samples))
     os.truncate(files[3], files[3].stat().st_size - 50)
-    log = WholeLog(files, topics=[FRAME], skip_damaged=True)
+    log = WholeLog(files, topics=[FRAME])
     assert len(list(log)) == FRAMES
     assert not log.complete
 

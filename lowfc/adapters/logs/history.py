@@ -200,9 +200,7 @@ class History:
 
     def reader(self, topic: Topic) -> WholeLog:
         """New reader of the log for one topic, such as the images, which the history does not hold."""
-        log = WholeLog(self.log.paths, topics=(topic,), skip_damaged=True)
-        log.progress = self.log.progress
-        return log
+        return WholeLog(self.log.paths, self.log.progress, topics=(topic,))
 
 
 def read_history(log: LogReader) -> History:

@@ -3,7 +3,7 @@
 import contextlib
 import os
 import re
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -59,7 +59,9 @@ class Repeated:
 
 
 class WholeLog(LogReader):
-    """Reads the files of a log as one; messages repeated at the start of a file are delivered once.
+    """Reads the files of a log as one and leaves out damaged stretches.
+
+    Messages repeated at the start of a file are delivered once.
 
     Attributes:
         path: path of the first file.
@@ -67,10 +69,10 @@ class WholeLog(LogReader):
         parts: readers of the files so far.
     """
 
-    def __init__(self, log: LogFiles, *, skip_damaged: bool = False, **options: Any) -> None:
-        """Read a log; `options` as for `LogReader`."""
+    def __init__(self, log: LogFiles, progress: Callable[[int, int], None] | None = None, **options: Any) -> None:
+        """Read a log; `progress` and `options` as for `LogReader`."""
         paths = (log,) if isinstance(log, Path) else tuple(log)
-        super().__init__(paths[0], skip_damaged=skip_damaged, **options)
+        super().__init__(paths[0], progress, skip_damaged=True, **options)
         self.paths = paths
         self.parts: list[LogReader] = []
         self._options = options
@@ -79,7 +81,7 @@ class WholeLog(LogReader):
         """Messages in recorded order; to be called once.
 
         Raises:
-            DataFileError: a file is no log, or a part of it is damaged.
+            DataFileError: a file is no log.
         """
         if len(self.paths) == 1:
             self.parts.append(self)
@@ -92,7 +94,7 @@ class WholeLog(LogReader):
         repeated = Repeated()
         earlier_bytes = 0
         for path, file in zip(self.paths, files, strict=True):
-            part = LogReader(path, skip_damaged=self._skip_damaged, **self._options)
+            part = LogReader(path, skip_damaged=True, **self._options)
             self.parts.append(part)
             self.schemas, self.channels = part.schemas, part.channels
             repeated.next_file()

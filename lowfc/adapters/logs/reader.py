@@ -38,14 +38,13 @@ class LogReader:
         unreadable: number of messages left out because their declaration was damaged.
         finished: whether the log ends as a finished one; False during recording, or if its recorder died.
         complete: whether the end was reached with a valid summary; False while reading.
-        progress: function called at intervals with the bytes read and their total.
+        progress: function called with the progress of reading, see `__init__`.
     """
-
-    progress: Callable[[int, int], None] | None = None
 
     def __init__(
         self,
         path: Path,
+        progress: Callable[[int, int], None] | None = None,
         *,
         topics: Collection[Topic] | None = None,
         skip_damaged: bool = False,
@@ -57,6 +56,7 @@ class LogReader:
 
         Args:
             path: path of the log, with any name.
+            progress: called at intervals with the bytes read and their total.
             topics: topics whose messages are delivered; None: all.
             skip_damaged: whether to leave out damaged stretches instead of raising an error.
             from_ns: log time; chunks known to end before it are skipped.
@@ -66,6 +66,7 @@ class LogReader:
         """
         self.path = path
         self.paths: tuple[Path, ...] = (path,)
+        self.progress = progress
         self.size = 0
         self.position = 0
         self.records: list[Metadata | Attachment] = []

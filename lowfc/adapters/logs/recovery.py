@@ -87,8 +87,7 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
         pass
     if reader.complete and not reader.damage and not reader.unreadable:
         return Recovery(source, reader.size)
-    reader = LogReader(source, skip_damaged=True)
-    reader.progress = progress
+    reader = LogReader(source, progress, skip_damaged=True)
     with new_log(out, source) as file:
         copy = LogCopy(file)
         copy.add_file(reader)

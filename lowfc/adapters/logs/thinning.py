@@ -28,8 +28,7 @@ def thin(
         DataFileError: a file is not a log, none has messages, `out` exists already, or it cannot be written.
     """
     combined = requested.within(Selection.of(metadata_at_start(log[0])))
-    reader = WholeLog(log, skip_damaged=True)
-    reader.progress = progress
+    reader = WholeLog(log, progress)
     copied_names = {PART, SELECTION}  # not copied: the thinned log has a selection of its own and is a single file
 
     def include(message: Sample) -> bool:

@@ -179,8 +179,7 @@ def survey(
     log: LogFiles, progress: Callable[[int, int], None] | None = None, *, digest: bool = False
 ) -> dict[str, Any]:
     """Summary of a log, complete or not, from all of its messages; `digest` adds digests of the log and of each key."""
-    reader, account, digests = WholeLog(log, skip_damaged=True), _Account(), Digest()
-    reader.progress = progress
+    reader, account, digests = WholeLog(log, progress), _Account(), Digest()
     for number, message in enumerate(reader):
         if not number:
             account = _Account(reader.selection)  # known from the first message on

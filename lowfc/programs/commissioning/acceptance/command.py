@@ -145,7 +145,7 @@ def _carry_out(
     # if matplotlib is missing, the error comes before the test, not after it
     figure = None if plot is None else figure_class()(figsize=(10, 5), layout="constrained")
     if logs:
-        log = WholeLog(named_log(logs), skip_damaged=True)
+        log = WholeLog(named_log(logs))
         history = read_history(log)
         for remark in history.remarks:
             sys.stderr.write(f"warning: {remark}\n")

@@ -52,10 +52,9 @@ def tune(
     if plot is not None:
         figure_class()  # the same if matplotlib is missing
     if logs:
-        reader = WholeLog(named_log(logs), skip_damaged=True)
+        log = named_log(logs)
         with reading_bar(console) as count:
-            reader.progress = partial(count, "reading")
-            telemetry = telemetry_from_log(reader)
+            telemetry = telemetry_from_log(WholeLog(log, partial(count, "reading")))
     else:
         with Client(run) as loop, passing_bar(console) as bar:
             task = bar.add_task("observing", total=live)

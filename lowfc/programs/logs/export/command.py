@@ -103,7 +103,7 @@ def export_log(
     if frames and to is Format.CSV:
         raise ConfigurationError("a CSV file cannot hold frames: use --to npz, fits or aot, or omit --frames")
     write = _writer(to, with_frames=frames)
-    reader = WholeLog(log, skip_damaged=True)
+    reader = WholeLog(log)
     out = out if out is not None else reader.path.parent / (stem_of(reader.path) + _ENDINGS[to])
     files = [out] + ([out.parent / f"{out.stem}.frames.npy"] if frames and to is Format.NPZ else [])
     require_folder(*files)

@@ -109,7 +109,7 @@ class Player:
 
     def play(self, logs: Sequence[Path]) -> dict[str, Any]:
         """Publish logs one after the other; return what was published, and the timing errors."""
-        log, progress_due_ns = WholeLog(logs, skip_damaged=True), 0
+        log, progress_due_ns = WholeLog(logs), 0
         with passing_bar(self._console, TextColumn("{task.description}", markup=False), BarColumn()) as bar:
             task = bar.add_task(titled(log.paths))
             for message in log:

@@ -81,7 +81,7 @@ def _refuse_disorder(paths: Sequence[Path], chunk_ends_ns: Sequence[Sequence[int
     """Raise ConfigurationError if a log's first frame is more than `PATIENCE_NS` before the end of the previous log."""
     end_ns, previous = 0, paths[0]
     for path, ends_ns in zip(paths, chunk_ends_ns, strict=True):
-        frames = WholeLog(path, topics=(FRAME,), skip_damaged=True)  # the states at a log's start may be old
+        frames = WholeLog(path, topics=(FRAME,))  # the states at a log's start may be old
         with contextlib.closing(iter(frames)) as messages:
             begin_ns = next((frame.receive_time_ns for frame in messages), None)
         if begin_ns is not None and begin_ns < end_ns - PATIENCE_NS:
@@ -97,9 +97,7 @@ def _replay_segment(
 ) -> Account:
     """Replay a segment, on one thread like the live loop: several threads sum in another order."""
     run = Replay(tolerance_nm, segment, kernel)
-    log = WholeLog(
-        paths, skip_damaged=True, topics=TOPICS, from_ns=max(0, segment.from_ns - PATIENCE_NS), always=published.TOPICS
-    )
+    log = WholeLog(paths, topics=TOPICS, from_ns=max(0, segment.from_ns - PATIENCE_NS), always=published.TOPICS)
     part = None
     gc.disable()
     try:

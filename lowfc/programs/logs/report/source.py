@@ -92,9 +92,7 @@ class Run:
 
 def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None) -> Run:
     """Read a log, complete or not, to its end; damaged parts are skipped and listed by the history's reader."""
-    log = WholeLog(files, skip_damaged=True)
-    log.progress = progress
-    history = read_history(log)
+    history = read_history(WholeLog(files, progress))
     history.true  # noqa: B018  # joined and cached now, while the steps have their sequences of the log
     steps, known = history.steps, np.flatnonzero(exposed(history.steps.reasons))
     if 0 < known.size < steps.sequence.size:

@@ -38,8 +38,8 @@ def what_if(
     from lowfc.programs.logs.what_if.run import LoggedRun
 
     what = requested(changes, config, calibration, controller)
-    reader = WholeLog(log := named_log(logs), skip_damaged=True)
+    log = named_log(logs)
     with reading_bar(Console(stderr=True)) as count:
-        reader.progress = partial(count, f"reading {titled(log)}")
-        results = compared(LoggedRun(read_history(reader)), what)
+        history = read_history(WholeLog(log, partial(count, f"reading {titled(log)}")))
+        results = compared(LoggedRun(history), what)
     print_result(results, render(results), as_json=as_json)

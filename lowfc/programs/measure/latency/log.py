@@ -23,8 +23,7 @@ def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tup
     Raises:
         DataFileError: no frame after the warm-up was timed.
     """
-    log = WholeLog(files, skip_damaged=True)
-    log.progress = progress
+    log = WholeLog(files, progress)
     history = read_history(log)
     mirror = history.mirror.sequence, history.mirror.publish_time_ns
     timing = history.timed_sequence, history.stages_ns
