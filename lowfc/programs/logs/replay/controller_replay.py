@@ -103,7 +103,7 @@ class ControllerReplay:
         self._command_form: tuple[int, str] | None = None  # validity, ns, and channel of the log's commands
         self._entries: dict[int, _Entry] = {}
         self._states: dict[int, wire.ControllerState] = {}
-        self._settings: Settings | None = None
+        self._settings: Settings  # set with each adopted state
         self._state: State | None = None
         self._recent_states: deque[State] = deque(maxlen=_STATES_KEPT)
         # Empty: the steps before the next state belong to another segment, which counts them.
@@ -264,8 +264,7 @@ class ControllerReplay:
         """The controller's input; None if the log does not have it (yet). If `overdue`, nothing more will arrive."""
         match entry.logged:
             case wire.ControlStep() as step:
-                late_ns = 0 if self._settings is None else self._settings.max_frame_age_ns + 1
-                age_ns = late_ns if wire.REASON_LATE in step.reasons else 0
+                age_ns = self._settings.max_frame_age_ns + 1 if wire.REASON_LATE in step.reasons else 0
                 # If overdue, a frame with another time is used: the step then differs, which the comparison reports.
                 frame = self._context.frames.frame(
                     step.frame_sequence, from_timestamp(step.timestamp), age_ns, any_time=overdue
@@ -279,7 +278,7 @@ class ControllerReplay:
                     decoded = codec.request(request, request.name, time_ns, known.calibrations, known.laws, known.plays)
                     if self._context.former is not None and not request.accepted:  # this version might accept it
                         decoded = replace(decoded, refusal=request.reply or "refused in the log")
-                    return decoded if self._settings is None else prepared(self._settings, decoded)
+                    return prepared(self._settings, decoded)
             case wire.ControlInput() as other:
                 with contextlib.suppress(ValueError):
                     return codec.decode_input(other, self._context.published.calibrations)
@@ -287,8 +286,7 @@ class ControllerReplay:
 
     def _apply_changed_rule(self, rule: str, input_: Input, logged: wire.ControllerState) -> None:
         """Apply an input whose rule has changed since the log. If the result differs, continue from the log's state."""
-        assert self._settings is not None  # noqa: S101  # there is a state
-        assert self._state is not None  # noqa: S101
+        assert self._state is not None  # noqa: S101  # adopted before
         state, _ = advance(self._settings, self._state, input_)
         replayed = controller_state(state, self._settings, from_timestamp(logged.timestamp))
         found = self._difference(state, logged, replayed)
@@ -327,8 +325,7 @@ class ControllerReplay:
         return logged
 
     def _check(self, entry: _Entry, input_: Input) -> None:
-        assert self._settings is not None  # noqa: S101  # there is a state
-        assert self._state is not None  # noqa: S101
+        assert self._state is not None  # noqa: S101  # adopted before
         state, outputs = advance(self._settings, self._state, input_)
         self._state = state
         self._recent_states.append(state)
@@ -354,14 +351,12 @@ class ControllerReplay:
             self._compare_state(state, logged)
 
     def _answer(self, logged: wire.Request, request: Request, outputs: Outputs, state: State) -> bytes | None:
-        assert self._settings is not None  # noqa: S101
         if outputs.reply is None:
             return None
         shown = controller_state(state, self._settings, request.time_ns) if logged.HasField("state") else None
         return codec.encode_request(request, outputs.reply, state.input_number, shown)
 
     def _compare_state(self, state: State, logged: wire.ControllerState) -> None:
-        assert self._settings is not None  # noqa: S101
         self._account.states += 1
         self.done = state.input_number == self._end
         replayed = controller_state(state, self._settings, from_timestamp(logged.timestamp))
