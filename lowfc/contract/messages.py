@@ -279,6 +279,14 @@ def topic_of(key: str) -> Topic:
     raise KeyError(key)
 
 
+def known_topic(key: str) -> Topic | None:
+    """Topic of a key on the bus; None if there is none, as for a key of another version or tool."""
+    try:
+        return topic_of(key)
+    except KeyError:
+        return None
+
+
 def timestamp(time_ns: int) -> Timestamp:
     """Message form of nanoseconds since the epoch."""
     seconds, nanos = divmod(time_ns, 1_000_000_000)

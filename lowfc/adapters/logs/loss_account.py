@@ -11,7 +11,7 @@ from lowfc.adapters.bus.names import MAX_NAME_LENGTH, MAX_NAMES, Names
 from lowfc.adapters.logs.selection import EVERYTHING, Selection
 from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.contract.envelope import COUNT_BITS, count_of, start_of
-from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, topic_of, wire
+from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, known_topic, wire
 
 MAX_STARTS = 8
 """Number of a publisher's newest starts with separate counts; earlier ones are summed."""
@@ -190,9 +190,8 @@ class LossAccount:
 
 def _published(process: str, key: str) -> Topic | None:
     """Topic of a count in a process's Health if the process publishes it; None otherwise, and for an unknown topic."""
-    try:
-        topic = topic_of(key)
-    except KeyError:
+    topic = known_topic(key)
+    if topic is None:
         return None
     publishes = key == HEALTH.at(process) if topic is HEALTH else process.partition("-")[0] in topic.publishers
     return topic if publishes else None

@@ -1,6 +1,5 @@
 """Thinned copies of logs, with the same selection rules as in a recorder."""
 
-import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from lowfc.adapters.logs.recovery import RECOVERY, missing_parts, origin
 from lowfc.adapters.logs.selection import SELECTION, Selection
 from lowfc.adapters.logs.writer import PART, stem_of
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import topic_of
+from lowfc.contract.messages import known_topic
 
 
 def thin(
@@ -32,9 +31,8 @@ def thin(
     copied_names = {PART, SELECTION}  # not copied: the thinned log has a selection of its own and is a single file
 
     def include(message: Sample) -> bool:
-        with contextlib.suppress(KeyError):  # a topic unknown to this version
-            return combined.keeps(topic_of(message.key), message.sequence, message.payload)
-        return True
+        topic = known_topic(message.key)
+        return topic is None or combined.keeps(topic, message.sequence, message.payload)
 
     def include_record(record: Metadata | Attachment) -> bool:
         """Whether to copy a record: the first of each name; all "recording" and "recovery", as readers use the last."""

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import cache
 from typing import Any
 
 from google.protobuf.message import DecodeError
@@ -32,7 +31,7 @@ from lowfc.contract.messages import (
     RawImage,
     Topic,
     from_timestamp,
-    topic_of,
+    known_topic,
     wire,
 )
 from lowfc.control.loop.safety import mode_name
@@ -161,7 +160,7 @@ class _Account:
         begin = None if self._begin_ns is None else datetime.fromtimestamp(self._begin_ns / 1e9, UTC)
         topics = {}
         for key, line in sorted(self._lines.items()):
-            counted = (topic := _topic(key)) is None or self._selection.records_all(topic)
+            counted = (topic := known_topic(key)) is None or self._selection.records_all(topic)
             topics[key] = line.json_object(topic, missing.get(key, 0) if counted else None)
         return {
             "start": None if begin is None else begin.isoformat(timespec="milliseconds"),
@@ -183,7 +182,7 @@ def survey(
     for number, message in enumerate(reader):
         if not number:
             account = _Account(reader.selection)  # known from the first message on
-        topic = _topic(message.key)
+        topic = known_topic(message.key)
         account.enter(topic, message, reader.schema_of(message))
         if digest and topic is not None:
             digests.enter(topic, message)
@@ -227,12 +226,3 @@ def recovery_in_words(metadata: Mapping[str, Mapping[str, str]]) -> str:
         f"recovered from {account.get('source', '?')}{unfinished}; "
         f"left out: damaged parts {parts}, unreadable messages {unreadable}"
     )
-
-
-@cache
-def _topic(key: str) -> Topic | None:
-    """Topic of a key; None if this version does not know it."""
-    try:
-        return topic_of(key)
-    except KeyError:
-        return None

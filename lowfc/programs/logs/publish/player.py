@@ -25,7 +25,7 @@ from lowfc.adapters.process.progress import passing_bar
 from lowfc.adapters.process.realtime import Granted, set_up
 from lowfc.adapters.process.service import Service
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
-from lowfc.contract.messages import COMMAND, HEALTH, MIRROR_STATE, Role, topic_of
+from lowfc.contract.messages import COMMAND, HEALTH, MIRROR_STATE, Role, known_topic
 from lowfc.control.durations import Durations
 from lowfc.control.loop.wording import counted
 from lowfc.programs.logs.publish.selection import PublishedKeys, role_of
@@ -184,9 +184,8 @@ class Player:
 
     def _publisher(self, key: str) -> Publisher | None:
         """Publisher of a key, in its role; None if the key is not published."""
-        try:
-            topic = topic_of(key)
-        except KeyError:
+        topic = known_topic(key)
+        if topic is None:
             self._excluded[key] = "unknown to this version"
             return None
         if not self._keys.matches(key):
