@@ -85,13 +85,9 @@ def sent(topic: Topic, name: str, width: int = MODES) -> Array:
     return rows
 
 
-def written(path: Path, *without: Topic, finish: bool = True) -> Path:
-    return a_night().without(*without).write(path, finish=finish)
-
-
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return written(tmp_path_factory.mktemp("night") / "night.mcap")
+    return NIGHT.write(tmp_path_factory.mktemp("night") / "night.mcap")
 
 
 def test_a_csv_row_has_the_values_of_its_step(log: Path, tmp_path: Path) -> None:
@@ -222,7 +218,7 @@ def test_aot_has_the_weighted_reconstructor_and_under_a_linear_law_no_integrator
 
 @pytest.mark.parametrize("to", list(Format))
 def test_a_truncated_log_without_truth_and_with_an_accent_in_its_name_is_exported(tmp_path: Path, to: Format) -> None:
-    part = written(tmp_path / "coupé.mcap", TRUTH, finish=False)
+    part = a_night().without(TRUTH).write(tmp_path / "coupé.mcap", finish=False)
     part.write_bytes(part.read_bytes()[:-2000])
     results = export_log(part, to, console=QUIET)
     assert results["files"] == [str(tmp_path / f"coupé.{'aot.fits' if to is Format.AOT else to}")]
@@ -236,8 +232,7 @@ def test_a_truncated_log_without_truth_and_with_an_accent_in_its_name_is_exporte
 
 
 def test_damage_is_reported_with_its_place_and_reason(tmp_path: Path) -> None:
-    night = SyntheticLog().frames(1500)
-    log = night.write(tmp_path / "night.mcap")
+    log = SyntheticLog().frames(1500).write(tmp_path / "night.mcap")
     flipped(log, log.stat().st_size // 3)
     results = export_log(log, Format.NPZ, tmp_path / "out.npz", console=QUIET)
     reader = LogReader(log, skip_damaged=True)
@@ -251,7 +246,7 @@ def test_damage_is_reported_with_its_place_and_reason(tmp_path: Path) -> None:
     [(STEP, "has no steps: there is nothing"), (CALIBRATION, f"has no calibration.* its {STEPS} steps")],
 )
 def test_a_log_without_steps_or_calibration_is_refused(tmp_path: Path, topic: Topic, reason: str) -> None:
-    log = written(tmp_path / "night.mcap", topic)
+    log = a_night().without(topic).write(tmp_path / "night.mcap")
     for to in Format:
         with pytest.raises(DataFileError, match=reason):
             export_log(log, to, console=QUIET)
@@ -340,8 +335,6 @@ def test_frames_are_not_held_in_memory(tmp_path: Path, to: Format) -> None:
 
 def test_a_loop_mode_of_a_newer_version_is_exported_by_its_number(tmp_path: Path) -> None:
     night = a_night()
-    step = night.messages(STEP)[-1]
-    step.mode = 9
-    night.put(STEP, step)
+    night.change(STEP, -1, lambda step: setattr(step, "mode", 9))
     export_log(night.write(tmp_path / "night.mcap"), Format.CSV, tmp_path / "out.csv", console=QUIET)
     assert "mode 9" in (tmp_path / "out.csv").read_text().splitlines()[-1]

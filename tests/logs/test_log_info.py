@@ -13,11 +13,9 @@ from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, Message, wire
 from lowfc.programs.logs import info, survey
 from tests.support.loops import json_of, lowfc
-from tests.support.mutated_logs import flipped
+from tests.support.mutated_logs import START_NS, START_S, flipped
 from tests.support.report_log import SyntheticLog
 
-START_S = 1_767_225_600  # 2026-01-01T00:00:00Z
-START_NS = START_S * 10**9
 SECOND = 10**9
 
 

@@ -17,7 +17,7 @@ from lowfc.adapters.logs.writer import Attachment, LogWriter
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import EVENT, FRAME, HEALTH, STEP, SURFACE, image, timestamp, wire
 
-START_S = 1_767_225_600
+START_S = 1_767_225_600  # 2026-01-01T00:00:00Z
 START_NS = START_S * 10**9
 METADATA = {"lowfc": {"run": "night", "seed": "3"}}
 ATTACHMENTS = (
