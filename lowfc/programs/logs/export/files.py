@@ -28,7 +28,7 @@ def write_csv(files: list[Path], history: History) -> None:
     Numbers have the fewest digits that reproduce the log's value in the log's precision.
     """
     columns = step_columns(history)
-    noll = _noll(history)
+    noll = history.calibration.noll if history.calibration is not None else ()
     with files[0].open("w", newline="", encoding="utf-8") as stream:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow([heading for column in columns for heading in column.headings(noll)])
@@ -84,10 +84,6 @@ def write_fits(files: list[Path], history: History, *, with_frames: bool) -> Non
         file.append(_table("FRAME_TIMES", identity))
 
 
-def _noll(history: History) -> tuple[int, ...]:
-    return history.calibration.noll if history.calibration is not None else ()
-
-
 def _cells(values: npt.NDArray[Any]) -> npt.NDArray[np.str_]:
     text = values.astype(str).reshape(len(values), -1)
     if values.dtype.kind == "f":
@@ -102,7 +98,7 @@ def _primary(history: History) -> fits.PrimaryHDU:
     header["RATE"] = (history.rate_hz, "[Hz] frame rate")
     if history.calibration is not None:
         header["CALID"] = history.calibration.id
-        header["NOLL"] = " ".join(map(str, _noll(history)))
+        header["NOLL"] = " ".join(map(str, history.calibration.noll))
         header["WAVELEN"] = (history.calibration.wavelength_nm, "[nm] wavelength")
         header["FLUX"] = (history.calibration.flux_dn, "[adu] expected sum of the good pixels")
     lines = [f"{name}: {key} = {value}" for name, group in history.log.metadata.items() for key, value in group.items()]

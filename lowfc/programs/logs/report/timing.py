@@ -13,7 +13,6 @@ _END_NS = 50_000_000
 """Time before the last frame in which commands may be missing because the log ends."""
 
 PERCENTILES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99_9": 99.9}
-FRAME_TO_MIRROR = "frame_to_mirror"
 
 
 def timing_results(run: Run) -> Results:
@@ -45,7 +44,7 @@ def latencies_ns(history: History) -> dict[str, Long]:
     rows = rows_of(history.frame_sequence, history.mirror.sequence)
     applied = rows >= 0
     to_mirror = history.mirror.publish_time_ns[rows[applied]] - history.frame_publish_ns[applied]
-    return history.stages_ns | {FRAME_TO_MIRROR: to_mirror}
+    return history.stages_ns | {"frame_to_mirror": to_mirror}
 
 
 def percentiles_us(durations_ns: Long) -> Results:
