@@ -240,9 +240,6 @@ class TimingRows:
     def __init__(self) -> None:
         self._columns = Columns(sequence="Q", **dict.fromkeys(STAGES, "q"))
 
-    def __len__(self) -> int:
-        return len(self._columns)
-
     def add(self, timing: wire.ControlTiming) -> bool:
         """Add the frames of a message; False if its columns differ in length."""
         stages = {stage: getattr(timing, f"{stage}_ns") for stage in STAGES}
