@@ -16,7 +16,7 @@ from lowfc.contract.messages import from_timestamp, wire
 from lowfc.contract.published import Published
 from lowfc.control.kernel.tables import Kernel
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import Input, Outputs, Request
+from lowfc.control.loop.inputs import Input, Request
 from lowfc.control.loop.requests import prepared
 from lowfc.control.loop.state import Settings, State
 from lowfc.programs.logs.replay.account import Account
@@ -345,16 +345,13 @@ class ControllerReplay:
         if isinstance(entry.logged, wire.Request):
             account.requests += 1
             assert isinstance(input_, Request)  # noqa: S101
-            self._compare(entry.logged, entry.logged_bytes, self._answer(entry.logged, input_, outputs, state))
+            assert outputs.reply is not None  # noqa: S101  # every request has one
+            shown = controller_state(state, self._settings, input_.time_ns) if entry.logged.HasField("state") else None
+            answer = codec.encode_request(input_, outputs.reply, state.input_number, shown)
+            self._compare(entry.logged, entry.logged_bytes, answer)
         logged = self._states.pop(state.input_number, None)
         if logged is not None:
             self._compare_state(state, logged)
-
-    def _answer(self, logged: wire.Request, request: Request, outputs: Outputs, state: State) -> bytes | None:
-        if outputs.reply is None:
-            return None
-        shown = controller_state(state, self._settings, request.time_ns) if logged.HasField("state") else None
-        return codec.encode_request(request, outputs.reply, state.input_number, shown)
 
     def _compare_state(self, state: State, logged: wire.ControllerState) -> None:
         self._account.states += 1
