@@ -227,10 +227,7 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
 
 
 def uneventful(night: SyntheticLog, number: int = 300) -> SyntheticLog:
-    night.health("camera", state="ready")
-    night.frames(number)
-    night.health("camera", state="stopped")
-    return night
+    return night.health("camera", state="ready").frames(number).health("camera", state="stopped")
 
 
 @pytest.fixture(scope="module")

@@ -73,13 +73,13 @@ def residual_results(run: Run, stretch: Stretch | None) -> Results:
     }
 
 
-def binned_rms(run: Run, max_bins: int = 300) -> dict[str, Array]:
-    """Rms of all modes in nm before and after correction, in at most `max_bins` bins; `time_s` is the start of each."""
+def binned_rms(run: Run) -> dict[str, Array]:
+    """Rms of all modes in nm before and after correction, in at most 300 bins; `time_s` is the start of each."""
     steps, true = run.history.steps, run.history.true
     columns = {"pseudo_open_loop": steps.pol_nm, "error": steps.error_nm}
     if true is not None:
         columns |= {"disturbance": true.modes_disturbance_rms_nm, "residual": true.modes_residual_rms_nm}
-    starts = bin_starts(steps.sequence.size, max_bins)
+    starts = bin_starts(steps.sequence.size, 300)
     found = {"time_s": run.step_s[starts]}
     for name, column in columns.items():
         if column.size:
