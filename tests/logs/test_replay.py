@@ -86,7 +86,11 @@ class Night:
         """Apply an input and log it, or log `logged` in its place, as a version with another rule would."""
         self.now_ns += 1_000_000
         if isinstance(input_, Frame):
-            self._frame(input_)
+            message = RawImage(timestamp=timestamp(input_.time_ns))
+            if input_.pixels is not None:
+                message = image(input_.pixels, input_.time_ns, "sensor")
+            payload = message.SerializeToString()
+            self.messages.append(Sample(FRAME.key, payload, input_.sequence, self.now_ns, self.now_ns))
         if isinstance(input_, Request):
             input_ = prepared(self.loop_settings, input_)
             if input_.law is not None:
@@ -108,7 +112,8 @@ class Night:
         elif not isinstance(input_, Frame) and number > self._last_number:
             self.put(CONTROL_INPUT, codec.encode_input(input_, number))
         if outputs.changed or (number > self._last_number and number % STATE_EVERY == 0):
-            self._put_state()
+            state = controller_state(self.state, self.loop_settings, self.now_ns)
+            self.put(CONTROLLER_STATE, state.SerializeToString())
         self._last_number = number
 
     def places(self, topic: Topic) -> list[int]:
@@ -119,17 +124,6 @@ class Night:
         self.state, self._last_number = State(), 0
         self.put(CALIBRATION, encode_calibration(controller_inputs.CALIBRATION, self.now_ns))
         self.apply(Load(self.now_ns, controller_inputs.CALIBRATION, "a test"))
-
-    def _put_state(self) -> None:
-        message = controller_state(self.state, self.loop_settings, self.now_ns)
-        self.put(CONTROLLER_STATE, message.SerializeToString())
-
-    def _frame(self, input_: Frame) -> None:
-        message = RawImage(timestamp=timestamp(input_.time_ns))
-        if input_.pixels is not None:
-            message = image(input_.pixels, input_.time_ns, "sensor")
-        payload = message.SerializeToString()
-        self.messages.append(Sample(FRAME.key, payload, input_.sequence, self.now_ns, self.now_ns))
 
     def put(self, topic: Topic, payload: bytes, name: str = "") -> None:
         key = topic.at(name)
