@@ -16,9 +16,7 @@ Entry = tuple[Term | None, str]
 
 _THROUGH = "times the loop's noise transfer"
 _NO_CAMERA = "a calibration, light, and the camera's gain"
-_NO_TRUTH = "the true wavefront, known only in simulation"
 _TOO_SHORT = "a longer stretch with the loop closed"
-_SHAPED = "a stretch without offset and channels, whose shapes are in the true residual"
 
 
 def budget_results(
@@ -93,9 +91,9 @@ def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None,
 def _measurement_terms(stretch: Stretch, noise: SensorNoise | None, *, shaped: bool) -> tuple[Entry, Entry]:
     split, missing = None, _TOO_SHORT
     if not stretch.true:
-        missing = _NO_TRUTH
+        missing = "the true wavefront, known only in simulation"
     elif shaped:
-        missing = _SHAPED
+        missing = "a stretch without offset and channels, whose shapes are in the true residual"
     elif noise is None:
         missing = _NO_CAMERA
     else:

@@ -13,7 +13,6 @@ from lowfc.contract.messages import wire
 from lowfc.control.loop.safety import Limit, mode_name
 from lowfc.programs.logs.report.source import Results, Run, row_after
 
-_FIRST_LIMIT = Limit.MODAL_LIMIT
 _LEVELS = {level.value: level.name.lower() for level in Level}
 
 
@@ -89,7 +88,7 @@ def light_results(history: History) -> Results:
     steps = history.steps
     flux = steps.flux_dn[steps.flux_dn > 0]
     counts = count_reasons(steps.reasons).items()
-    refused = {reason.name.lower(): count for reason, count in counts if reason < _FIRST_LIMIT}
+    refused = {reason.name.lower(): count for reason, count in counts if reason < Limit.MODAL_LIMIT}
     return {
         "flux_expected_dn": history.calibration.flux_dn if history.calibration is not None else None,
         "flux_mean_dn": float(flux.mean()) if flux.size else None,
@@ -123,7 +122,7 @@ def _limits(reasons: Long) -> dict[str, int]:
     return {
         reason.name.lower(): count
         for reason, count in counts
-        if reason >= _FIRST_LIMIT and reason is not Limit.LAW_OVERRULED
+        if reason >= Limit.MODAL_LIMIT and reason is not Limit.LAW_OVERRULED
     }
 
 
