@@ -126,7 +126,7 @@ class LogWriter:
                     media_type=attachment.media_type,
                     data=attachment.data,
                 )
-            self._flush()
+            self.flush()
         except OSError as fault:
             raise self._refused(fault) from fault
 
@@ -152,14 +152,17 @@ class LogWriter:
     def flush(self) -> None:
         """Pass everything to the operating system; flushed data survive a kill -9 of this process."""
         try:
-            self._flush()
+            self._writer.flush()  # type: ignore[no-untyped-call]
+            self.part.stat()  # detects a removed file, which still accepts data
+            self.bytes_written = self._raw.size
+            self.messages_written = self.messages
         except OSError as fault:
             raise self._refused(fault) from fault
 
     def finish(self, metadata: Mapping[str, Mapping[str, str]]) -> Path:
         """Write the final metadata, close the log, and rename it once it is on the disk."""
         try:
-            self._flush()
+            self.flush()
             self._add_metadata(metadata)
             self._writer.finish()  # type: ignore[no-untyped-call]
             self._file.flush()
@@ -185,12 +188,6 @@ class LogWriter:
     def _add_metadata(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
         for name, entries in metadata.items():
             self._writer.add_metadata(name, {key: encodable(value) for key, value in entries.items()})
-
-    def _flush(self) -> None:
-        self._writer.flush()  # type: ignore[no-untyped-call]
-        self.part.stat()  # detects a removed file, which still accepts data
-        self.bytes_written = self._raw.size
-        self.messages_written = self.messages
 
     def _refused(self, fault: OSError) -> DataFileError:
         """Convert an error of the disk, and truncate the file to complete records."""
