@@ -21,7 +21,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import recover
 from lowfc.contract.codecs import input_file
 from lowfc.contract.configuration import MAX_FAULTS, load
-from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
+from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.programs.core.start_up import check_files
 from lowfc.programs.design.sam_files import read_state
 from lowfc.programs.logs.replay.workers import replay_files
@@ -243,9 +243,3 @@ def test_a_file_is_read_up_to_the_size_limit(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="not a regular file"):
         input_file.opened(tmp_path, 5)
     assert set(Path("/proc/self/fd").iterdir()) == before
-
-
-def test_a_missing_file_is_reported_as_missing(tmp_path: Path) -> None:
-    for kind in ("calibration.fits", "law.fits", "npy", "fits"):
-        with pytest.raises(DataFileError, match="there is no such "):
-            READERS[kind](tmp_path / f"none.{kind}")
