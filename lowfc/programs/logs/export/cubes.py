@@ -3,19 +3,21 @@
 import itertools
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.adapters.logs.columns import Columns
 from lowfc.adapters.logs.history import LAST_NS, History
 from lowfc.arrays import Pixels
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import BadMessageError, DataFileError
 from lowfc.contract.messages import FRAME
+from lowfc.control.loop.inputs import Frame
 
 if TYPE_CHECKING:
     from astropy.io import fits
@@ -39,28 +41,33 @@ def fits_cube(path: Path, image: "fits.ImageHDU", shape: tuple[int, ...]) -> npt
     return np.memmap(path, ">f4", "r+", offset, shape)
 
 
-def copy_frames_to_fits(path: Path, image: "fits.ImageHDU", history: History) -> tuple[npt.NDArray[Any], ...]:
-    """Copy the frames of a run into a new extension with the header of `image`; see `_copy_frames`."""
+def copy_frames_to_fits(path: Path, image: "fits.ImageHDU", history: History) -> Columns:
+    """Copy the frames of a run into a new extension with the header of `image`; see `_frames`.
 
-    def write_header(shape: tuple[int, ...]) -> None:
-        stream.write(_header(image, shape, BITPIX=16, BSCALE=1, BZERO=_FITS_ZERO))
-
+    Returns:
+        `sequence` and `time_ns` of each frame in the order of recording.
+    """
+    copied = Columns(sequence="Q", time_ns="q")
     with path.open("ab") as stream:
-        copied = _copy_frames(
-            history, stream, write_header, lambda pixels: (pixels ^ np.uint16(_FITS_ZERO)).astype(">u2")
-        )
+        for frame, pixels in _frames(history):
+            if not copied:
+                shape = (history.frame_sequence.size, *pixels.shape)
+                stream.write(_header(image, shape, BITPIX=16, BSCALE=1, BZERO=_FITS_ZERO))
+            stream.write((pixels ^ np.uint16(_FITS_ZERO)).astype(">u2").tobytes())
+            copied.add(sequence=frame.sequence, time_ns=frame.time_ns)
         stream.write(bytes(-stream.tell() % _FITS_BLOCK))
     return copied
 
 
-def copy_frames_to_npy(path: Path, history: History) -> tuple[npt.NDArray[Any], ...]:
-    """Copy the frames of a run into a .npy file, which `numpy.load` maps with `mmap_mode="r"`; see `_copy_frames`."""
-
-    def write_header(shape: tuple[int, ...]) -> None:
-        np.lib.format.write_array_header_1_0(stream, {"descr": "<u2", "fortran_order": False, "shape": shape})
-
+def copy_frames_to_npy(path: Path, history: History) -> None:
+    """Copy the frames of a run into a .npy file, which `numpy.load` maps with `mmap_mode="r"`; see `_frames`."""
     with path.open("wb") as stream:
-        return _copy_frames(history, stream, write_header, lambda pixels: pixels.astype("<u2"))
+        for _, pixels in _frames(history):
+            if not stream.tell():
+                shape = (history.frame_sequence.size, *pixels.shape)
+                header = {"descr": "<u2", "fortran_order": False, "shape": shape}
+                np.lib.format.write_array_header_1_0(stream, header)
+            stream.write(pixels.astype("<u2").tobytes())
 
 
 def _header(image: "fits.ImageHDU", shape: tuple[int, ...], **cards: int) -> bytes:
@@ -69,26 +76,17 @@ def _header(image: "fits.ImageHDU", shape: tuple[int, ...], **cards: int) -> byt
     return bytes(header.tostring().encode("ascii"))
 
 
-def _copy_frames(
-    history: History,
-    stream: IO[bytes],
-    write_header: Callable[[tuple[int, ...]], None],
-    encode: Callable[[Pixels], npt.NDArray[Any]],
-) -> tuple[npt.NDArray[Any], ...]:
-    """Copy the frames of a log, encoded by `encode`, after the header for the shape (frames, rows, columns).
-
-    Returns:
-        Sequence and time, ns, of each frame in the order of recording.
+def _frames(history: History) -> Iterator[tuple[Frame, Pixels]]:
+    """The frames of a log in the order of recording, with their pixels (rows, columns), all of one shape.
 
     Raises:
         DataFileError: a frame cannot be copied.
     """
     path, count = history.log.path, history.frame_sequence.size
-    sequence, time_ns = np.zeros(count, np.uint64), np.zeros(count, np.int64)
     shape: tuple[int, ...] | None = None
-    row = -1
+    copied = 0
     kept = (one for one in history.reader(FRAME) if max(one.receive_time_ns, one.publish_time_ns) <= LAST_NS)
-    for row, message in enumerate(itertools.islice(kept, count)):
+    for message in itertools.islice(kept, count):
         number = count_of(message.sequence)
         try:
             frame = decode_frame(message.payload, message.sequence, 0)
@@ -98,16 +96,13 @@ def _copy_frames(
             raise DataFileError(
                 f"{path}: frame {number} is not a complete image of 16-bit pixels; export without --frames"
             )
-        if shape is None:
-            shape = frame.pixels.shape
-            write_header((count, *shape))
+        shape = shape or frame.pixels.shape
         if frame.pixels.shape != shape:
             raise DataFileError(
                 f"{path}: frame {number} has shape {frame.pixels.shape}, but earlier frames have {shape}; "
                 "export without --frames"
             )
-        stream.write(encode(frame.pixels).tobytes())
-        sequence[row], time_ns[row] = frame.sequence, frame.time_ns
-    if row + 1 < count:
-        raise DataFileError(f"{path} changed while it was read: it has {row + 1} frames now, and had {count}")
-    return sequence, time_ns
+        copied += 1
+        yield frame, frame.pixels
+    if copied < count:
+        raise DataFileError(f"{path} changed while it was read: it has {copied} frames now, and had {count}")

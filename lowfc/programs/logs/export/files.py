@@ -75,10 +75,10 @@ def write_fits(files: list[Path], history: History, *, with_frames: bool) -> Non
         return
     cube = fits.ImageHDU(np.zeros((1, 1, 1), np.float32), name="FRAMES")
     cube.header["BUNIT"] = "adu"
-    sequence, time_ns = copy_frames_to_fits(files[0], cube, history)
+    copied = copy_frames_to_fits(files[0], cube, history)
     identity = [
-        Column("sequence", sequence, "", "frame sequence"),
-        Column("time_ns", time_ns, "ns", "end of the exposure, since 1970-01-01 UTC"),
+        Column("sequence", copied.values("sequence"), "", "frame sequence"),
+        Column("time_ns", copied.values("time_ns"), "ns", "end of the exposure, since 1970-01-01 UTC"),
     ]
     with fits.open(files[0], mode="append") as file:
         file.append(_table("FRAME_TIMES", identity))
