@@ -7,7 +7,7 @@ for each list of nested results; fields declared as columns have the same length
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from pydantic.fields import FieldInfo
 
 from lowfc.programs.cli import output
@@ -27,11 +27,9 @@ def result_field(label: str = "", unit: str = "", form: str = "", *, column: boo
 class Result(BaseModel):
     """A typed result, or a part of one."""
 
-    model_config = ConfigDict(arbitrary_types_allowed=True, populate_by_name=True)
-
     def json_object(self) -> dict[str, Any]:
         """Object for `--json`; fields that were not set are omitted."""
-        return self.model_dump(by_alias=True, exclude_unset=True)
+        return self.model_dump(exclude_unset=True)
 
     def text(self) -> str:
         """Text for a person."""
