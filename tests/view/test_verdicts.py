@@ -14,7 +14,6 @@ from lowfc.programs.view.panels.tiles import FILL, GROUND, HEIGHT, TILES, WIDTH,
 from lowfc.programs.view.snapshot import Accumulator
 from lowfc.programs.view.verdicts.camera_verdict import REFUSED
 from lowfc.programs.view.verdicts.facts import facts
-from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.steady import ResidualComparison
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict
 from lowfc.programs.view.verdicts.verdict import judge
@@ -407,7 +406,7 @@ def test_the_facts_are_run_host_law_offset_channels_and_note() -> None:
     found = stage.run(1).facts
     assert found["CONTROL LAW"] == "lqg; delay 1 frame"
     assert found["OFFSET AND CHANNELS"] == "no offset; dark-hole 2 nm rms of surface, zero point not shifted"
-    assert set(facts(RunState()).values()) == {"not known", "none known"}
+    assert set(facts(Watcher().state()).values()) == {"not known", "none known"}
 
 
 NOON_NS = 43_200 * 10**9

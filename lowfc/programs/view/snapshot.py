@@ -70,10 +70,6 @@ class Wavefronts(NamedTuple):
     open_rms_nm: Single
     rms_nm: Single
 
-    def at(self, rows: Mask) -> "Wavefronts":
-        """Wavefronts of these rows."""
-        return Wavefronts(*(getattr(self, name)[rows] for name in self._fields))
-
 
 class LastHealth(NamedTuple):
     """A process's last Health, sent at `time_ns` (host clock), and the first since its start, `start_s` (Unix time)."""

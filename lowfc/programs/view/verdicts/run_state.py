@@ -1,13 +1,13 @@
 """State of a run in the last seconds, the input of the verdict."""
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum, auto
 from typing import NamedTuple
 
 from lowfc.contract.messages import Log, wire
 from lowfc.control.loop.safety import LoopMode, Reason
-from lowfc.programs.view.snapshot import Accumulator, Snapshot
+from lowfc.programs.view.snapshot import Snapshot
 from lowfc.programs.view.verdicts.steady import ResidualComparison
 
 NOW_S = 1.0
@@ -39,10 +39,6 @@ class Process(NamedTuple):
 
     life: Liveness = Liveness.NEVER
     silent_s: float = 0.0
-
-
-_NEVER = Process()
-_NOTHING = Accumulator().snapshot(0)
 
 
 class Rms(NamedTuple):
@@ -77,29 +73,29 @@ class RunState:
         note: last note of the operator.
     """
 
-    snapshot: Snapshot = _NOTHING
-    mode: LoopMode | None = None
-    why: str = ""
-    running_s: float = 0.0
-    rate_hz: float | None = None
-    controller: Process = _NEVER
-    camera: Process = _NEVER
-    mirror: Process = _NEVER
-    recorder: Process = _NEVER
-    frame_silent_s: float | None = None
-    step_silent_s: float | None = None
-    recent: Counts = field(default_factory=Counter)
-    now: Counts = field(default_factory=Counter)
-    totals: Counts = field(default_factory=Counter)
-    flux: float | None = None
-    saturated: int = 0
-    wavefront: Rms | None = None
-    latest: Rms | None = None
-    true: bool = False
-    comparison: ResidualComparison | None = None
-    latency_us: tuple[float, float] | None = None
-    mirror_state: wire.MirrorState | None = None
-    note: Log | None = None
+    snapshot: Snapshot
+    mode: LoopMode | None
+    why: str
+    running_s: float
+    rate_hz: float | None
+    controller: Process
+    camera: Process
+    mirror: Process
+    recorder: Process
+    frame_silent_s: float | None
+    step_silent_s: float | None
+    recent: Counts
+    now: Counts
+    totals: Counts
+    flux: float | None
+    saturated: int
+    wavefront: Rms | None
+    latest: Rms | None
+    true: bool
+    comparison: ResidualComparison | None
+    latency_us: tuple[float, float] | None
+    mirror_state: wire.MirrorState | None
+    note: Log | None
 
     @property
     def lately(self) -> str:
