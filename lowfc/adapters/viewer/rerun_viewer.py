@@ -24,7 +24,7 @@ import socket
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -43,10 +43,8 @@ if TYPE_CHECKING:
     from rerun.experimental import ViewerClient, ViewerState
 
 HOST = "127.0.0.1"
-DEFAULT_MEMORY = "512MB"
 _DRIVER_FOLDERS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")
 _DRIVER_VARIABLES = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES")
-_SCREEN_VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY")
 _START_S = 20.0
 _POLL_S = 0.05
 _CALL_S = 20.0
@@ -80,7 +78,7 @@ class RerunViewer:
         self,
         show: Show,
         *,
-        memory_limit: str = DEFAULT_MEMORY,
+        memory_limit: str = "512MB",
         size_px: tuple[int, int] = (1600, 1000),
         port: int | None = None,
         web_port: int | None = None,
@@ -293,14 +291,14 @@ def web_address(url: str, web_port: int) -> str:
     return f"http://{HOST}:{web_port}/?url={quote(url, safe='')}&hide_welcome_screen&persist=0&theme=dark"
 
 
-def has_screen(environment: Mapping[str, str] = os.environ) -> bool:
+def has_screen() -> bool:
     """Whether there is a screen for a window."""
-    return any(environment.get(name) for name in _SCREEN_VARIABLES)
+    return any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
-def require_screen(show: Show | None, environment: Mapping[str, str] = os.environ) -> None:
+def require_screen(show: Show | None) -> None:
     """Raise ViewerError if a window is requested and there is no screen."""
-    if show is Show.NATIVE and not has_screen(environment):
+    if show is Show.NATIVE and not has_screen():
         raise ViewerError(f"there is no screen for a window (neither DISPLAY nor WAYLAND_DISPLAY is set); {_NO_SCREEN}")
 
 
@@ -330,7 +328,7 @@ def _arguments(show: Show, memory_limit: str, size_px: tuple[int, int], source_p
 def _environment(show: Show) -> dict[str, str]:
     """Environment of the viewer: no usage statistics, no network access, warnings only."""
     environment = {name: value for name, value in os.environ.items() if name.lower() != "no_proxy"}
-    require_screen(show, environment)
+    require_screen(show)
     if show is Show.HEADLESS and not any(environment.get(name) for name in _DRIVER_VARIABLES):
         drivers = vulkan_drivers()
         if not drivers:
