@@ -8,7 +8,7 @@ import pytest
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files.sensors import load_pupil
-from lowfc.adapters.logs.columns import STAGES, Steps, Truths
+from lowfc.adapters.logs.columns import STAGES, StepRows, Steps, TruthRows, Truths
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import (
@@ -282,37 +282,19 @@ TICK_NS = 33_333_333  # between two snapshots at 30 Hz
 
 
 def steps(first: int, error_nm: Any, pol_nm: Any, mode: int = LoopMode.CLOSED) -> Steps:
-    rows = len(error_nm)
-    sequence = np.arange(first, first + rows, dtype=np.uint64)
-    zeros = np.zeros(rows, np.int64)
-    return Steps(
-        sequence=sequence,
-        time_ns=START_NS + (sequence * 1e9 / RATE_HZ).astype(np.int64),
-        mode=np.full(rows, mode, np.uint8),
-        reasons=zeros,
-        error_nm=np.asarray(error_nm, np.float32),
-        pol_nm=np.asarray(pol_nm, np.float32),
-        command_nm=np.zeros((rows, MODES), np.float32),
-        flux_dn=np.ones(rows, np.float32),
-        saturated_pixels=zeros,
-    )
+    rows = StepRows(MODES)
+    for number, (error, pol) in enumerate(zip(error_nm, pol_nm, strict=True), first):
+        time = timestamp(START_NS + round(number * 1e9 / RATE_HZ))
+        measured = {"error_nm": error, "pol_nm": pol, "command_nm": [0.0] * MODES}
+        rows.add(wire.ControlStep(timestamp=time, frame_sequence=number, mode=mode, **measured))
+    return rows.values()
 
 
 def truths(residual_nm: Any, disturbance_nm: Any) -> Truths:
-    rows = len(residual_nm)
-    disturbance, residual = (np.asarray(one, np.float32) for one in (disturbance_nm, residual_nm))
-    rms = ("disturbance_rms_nm", "residual_rms_nm", "sampled_residual_rms_nm")
-    return Truths(
-        sequence=np.arange(rows, dtype=np.uint64),
-        time_ns=np.full(rows, START_NS),
-        disturbance_nm=disturbance,
-        residual_nm=residual,
-        sensed_nm=residual,
-        modes_disturbance_rms_nm=np.abs(disturbance),
-        modes_residual_rms_nm=np.abs(residual),
-        instants=np.zeros(rows, np.int64),
-        **dict.fromkeys((*rms, "added_contrast", "added_contrast_flat"), np.zeros(rows, np.float32)),
-    )
+    rows = TruthRows(MODES)
+    for residual, disturbance in zip(residual_nm, disturbance_nm, strict=True):
+        rows.add(wire.Truth(timestamp=timestamp(START_NS), residual_nm=residual, disturbance_nm=disturbance))
+    return rows.values()
 
 
 def drawn(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:
