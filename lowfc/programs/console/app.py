@@ -30,7 +30,7 @@ from lowfc.programs.console.keys import IMMEDIATE_KEY, OrderedKeys
 from lowfc.programs.console.lines import Lines
 from lowfc.programs.console.phrases import phrased
 from lowfc.programs.console.task import Task
-from lowfc.programs.view.verdicts.tile import FILL, INK
+from lowfc.programs.view.verdicts.tile import FILL, INK, clock
 
 READ_PERIOD_S = 0.2
 """Time between two readings."""
@@ -287,7 +287,7 @@ class Console(OrderedKeys):
             styles = self._static(name).styles
             styles.background, styles.color = Color(*FILL[level]), Color(*INK[level])
         self._show_text("verdict", Text(headline))
-        self._show_text("clock", Text(f"{panels.clock(reading.state.snapshot.host_ns)}\nUTC"))
+        self._show_text("clock", Text(f"{clock(reading.state.snapshot.host_ns)}\nUTC"))
         self.screen_stack[0].query_one("#readings").set_class(not reading.connected, "disconnected")
         if reading.connected:
             self._lines("tiles").show(panels.tiles(reading))

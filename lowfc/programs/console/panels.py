@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from functools import lru_cache
 
 import numpy as np
@@ -20,7 +19,7 @@ from lowfc.programs.console.feed import TREND_S, Reading
 from lowfc.programs.console.phrases import phrased
 from lowfc.programs.view.draw.colours import GREY, ORANGE, RED, YELLOW, Colour, Rgb, diverging, sequential
 from lowfc.programs.view.verdicts.run_state import Liveness
-from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, duration, numbers, rounded
+from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, clock, duration, numbers, rounded
 from lowfc.programs.view.verdicts.watcher import SILENT_S
 
 _PIXELS = 12
@@ -54,11 +53,6 @@ def verdict(reading: Reading, run: str) -> tuple[Level, str]:
             "killed, or this console is disconnected; a running loop goes on by itself."
         )
     return reading.verdict.level, f"{WORD[reading.verdict.level]}  {phrased(reading.verdict.headline)}".strip()
-
-
-def clock(host_ns: int) -> str:
-    """Wall clock of a time, UTC."""
-    return f"{datetime.fromtimestamp(host_ns * 1e-9, UTC):%H:%M:%S}"
 
 
 def tiles(reading: Reading) -> list[Text]:

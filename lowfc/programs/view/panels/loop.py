@@ -1,7 +1,5 @@
 """Loop panel: loop mode as a band, flux, saturated pixels, and the events of all processes."""
 
-from datetime import UTC, datetime
-
 import numpy as np
 import rerun as rr
 
@@ -13,6 +11,7 @@ from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, ORANGE, RED, Col
 from lowfc.programs.view.draw.plots import Plot, at
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
+from lowfc.programs.view.verdicts.tile import clock
 
 MODE, LOG = "loop/mode", "log"
 FLUX = Plot("loop/flux", "Light, % of expected", {"light on the sensor, % of expected": ORANGE}, legend=None)
@@ -68,11 +67,11 @@ class Loop(Panel):
                 plot.add(stream, steps.time_ns, np.where(used, values, np.nan))
         for event in snapshot.events:
             time_ns = from_timestamp(event.timestamp)
-            clock = f"{datetime.fromtimestamp(time_ns * 1e-9, UTC):%H:%M:%S}"  # rerun truncates its own time column
             at(stream, time_ns)
             level = _LEVELS.get(event.level, rr.TextLogLevel.INFO)
             name, message = printable(event.name), printable(event.message)
-            stream.log(f"{LOG}/{name}", rr.TextLog(f"{clock}  {name}: {message}", level=level))
+            text = f"{clock(time_ns)}  {name}: {message}"  # rerun truncates its own time column
+            stream.log(f"{LOG}/{name}", rr.TextLog(text, level=level))
 
     def _change(self, stream: rr.RecordingStream, mode: int, time_ns: int) -> None:
         self._mode = mode

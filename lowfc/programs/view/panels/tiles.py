@@ -3,7 +3,6 @@
 import io
 import re
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from functools import lru_cache
 from itertools import pairwise
 
@@ -17,7 +16,7 @@ from lowfc.programs.view.draw.plots import at
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
 from lowfc.programs.view.verdicts.log_verdict import LogVerdict
-from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, Tile, Verdict
+from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, Tile, Verdict, clock
 from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
 
@@ -104,9 +103,8 @@ def _parts(verdict: Verdict, time_ns: int) -> Iterator[tuple[Box, Level, tuple[T
     left = _INSET + round(_width(word, 30)) + (_INSET if word else 0)
     summary = ((left, top, WIDTH - _CLOCK - _INSET, bottom), verdict.headline, 27)
     yield headline, verdict.level, (((_INSET, top, left, bottom), word, 30), summary)
-    clock = f"{datetime.fromtimestamp(time_ns // 10**9, UTC):%H:%M:%S} UTC"
     clock_box = (WIDTH - _CLOCK, 0, WIDTH, _BAND)
-    yield clock_box, verdict.level, (((_INSET, top, _CLOCK - _INSET, bottom), clock, 27),)
+    yield clock_box, verdict.level, (((_INSET, top, _CLOCK - _INSET, bottom), f"{clock(time_ns)} UTC", 27),)
     for box, tile in zip(boxes, verdict.tiles, strict=True):
         yield box, tile.level, _tile(tile, box[2] - box[0] - _INSET, box[3] - box[1])
     edges = [(WIDTH + _GAP) * sum(_FACTS[:number]) // sum(_FACTS) for number in range(len(_FACTS) + 1)]

@@ -1,7 +1,5 @@
 """Facts of a run as text: run and host, control law and gains, offset and channels, last note."""
 
-from datetime import UTC, datetime
-
 import numpy as np
 
 from lowfc.contract.messages import Role, from_timestamp, wire
@@ -11,7 +9,7 @@ from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.status import channels_in_words, json_object, law_in_words
 from lowfc.programs.view.snapshot import Snapshot
 from lowfc.programs.view.verdicts.run_state import RunState
-from lowfc.programs.view.verdicts.tile import numbers, short
+from lowfc.programs.view.verdicts.tile import clock, numbers, short
 
 _MAX_NAMED = 3
 """Largest number of modes of an offset that are named one by one."""
@@ -21,17 +19,17 @@ def facts(state: RunState) -> dict[str, str]:
     """The facts of a run by title, as far as they are known."""
     snapshot, note = state.snapshot, "none known"
     if state.note is not None:
-        clock = datetime.fromtimestamp(from_timestamp(state.note.timestamp) * 1e-9, UTC)
-        note = f"{clock:%H:%M} {short(printable(state.note.message.partition(' ')[2]))}"
+        at = clock(from_timestamp(state.note.timestamp), "%H:%M")
+        note = f"{at} {short(state.note.message.partition(' ')[2])}"
     law = shapes = "not known"
     if snapshot.controller is not None:
         known = json_object(snapshot.controller)
-        law = short(printable(law_in_words(known)))
+        law = short(law_in_words(known))
         if not snapshot.controller.HasField("law"):
             leak = f", leak {numbers(known['leak'])}" if any(known["leak"]) else ""
             law += f", gain {numbers(known['gain'])}{leak}" if known["gain"] else ", no calibration"
         law += f"; delay {counted(snapshot.controller.delay_frames, 'frame')}"
-        shapes = f"{_offset(known['offset_nm'], snapshot.noll)}; {short(printable(channels_in_words(known)))}"
+        shapes = f"{_offset(known['offset_nm'], snapshot.noll)}; {short(channels_in_words(known))}"
         if known["playing"]:
             shapes += f"; probe sequence on the {printable(known['playing']['target'])}"
     return {"RUN": _run(snapshot), "CONTROL LAW": law, "OFFSET AND CHANNELS": shapes, "LAST NOTE": note}

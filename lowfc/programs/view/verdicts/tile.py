@@ -2,8 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from enum import IntEnum
 
+from lowfc.contract.printable import printable
 from lowfc.programs.view.draw.colours import Colour
 from lowfc.programs.view.verdicts.run_state import GRACE_S, Liveness, Process
 
@@ -83,8 +85,14 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
 
 
+def clock(time_ns: int, form: str = "%H:%M:%S") -> str:
+    """Text of the time of day, UTC."""
+    return f"{datetime.fromtimestamp(time_ns // 10**9, UTC):{form}}"
+
+
 def short(text: str) -> str:
-    """Text from a message, truncated to the length of a tile."""
+    """Text from a message, with its control characters escaped, truncated to the length of a tile."""
+    text = printable(text)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 

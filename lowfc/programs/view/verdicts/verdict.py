@@ -3,7 +3,6 @@
 `judge` is a pure function from the state of the last seconds to tiles.
 """
 
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import PurePath
 
@@ -11,14 +10,13 @@ import numpy as np
 
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.messages import Role, from_timestamp, wire
-from lowfc.contract.printable import printable
 from lowfc.control.loop.safety import Limit, LoopMode, Reason, reason_name
 from lowfc.control.loop.wording import CAMERA_MISFIT, counted
 from lowfc.programs.cli.correction import Correction, correction
 from lowfc.programs.view.verdicts.camera_verdict import all_refused, frames, star
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import Liveness, RunState
-from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, absent, duration, rounded, short, worst_of
+from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, absent, clock, duration, rounded, short, worst_of
 from lowfc.programs.view.verdicts.wavefront_verdict import contrast, wavefront
 
 NEAR_STROKE = 0.9
@@ -112,17 +110,17 @@ def _held(state: wire.ControllerState | None) -> str:
     if state is None:
         return ""
     if state.mirror_fault:
-        return f"the mirror {short(printable(state.mirror_fault))}"
+        return f"the mirror {short(state.mirror_fault)}"
     if state.lease.holds and not state.lease.ended:
-        return f"reserved for {short(printable(state.lease.holder))}"
-    return next((short(printable(one.why)) for one in state.interlocks_acting if one.action == "hold"), "")
+        return f"reserved for {short(state.lease.holder)}"
+    return next((short(one.why) for one in state.interlocks_acting if one.action == "hold"), "")
 
 
 def _since(state: wire.ControllerState | None) -> str:
     if state is None or not state.HasField("mode_timestamp") or state.mode != wire.LOOP_MODE_CLOSED:
         return ""
-    since = datetime.fromtimestamp(from_timestamp(state.mode_timestamp) * 1e-9, UTC)
-    return f" since {since:%H:%M:%S}" + (f" ({short(printable(state.mode_cause))})" if state.mode_cause else "")
+    since = clock(from_timestamp(state.mode_timestamp))
+    return f" since {since}" + (f" ({short(state.mode_cause)})" if state.mode_cause else "")
 
 
 def _open(state: RunState) -> Tile:
@@ -214,7 +212,7 @@ def _recorder(state: RunState) -> Tile:
     if last is None:
         return tile("NONE", "there is no recorder: nothing is recorded")
     done = last.health.recording
-    log, failure = (short(printable(text)) for text in (PurePath(done.file).stem, done.failure))
+    log, failure = map(short, (PurePath(done.file).stem, done.failure))
     if failure:
         advice = f"Recording failed, the loop goes on: {failure}. Free disk space, then `lowfc ctl record start`."
         return tile("FAILED", failure, Level.BAD, advice)

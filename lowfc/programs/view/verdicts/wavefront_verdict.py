@@ -4,7 +4,6 @@ from functools import partial
 from math import hypot, sqrt
 
 from lowfc.contract.messages import wire
-from lowfc.contract.printable import printable
 from lowfc.programs.cli.contrast import QUADRATIC
 from lowfc.programs.cli.correction import Correction, correction
 from lowfc.programs.cli.status import holds_shape
@@ -57,7 +56,7 @@ def contrast(known: wire.WavefrontFigures, *, now: bool) -> Tile:
     """Tile CONTRAST: what the wavefront adds to the contrast of the dark zone; it has no threshold."""
     if not now:
         return Tile("CONTRAST", "?", "not measured now")
-    share = f"most from {short(printable(known.costliest_modes))} ({100 * known.costliest_share:.0f} %)"
+    share = f"most from {short(known.costliest_modes)} ({100 * known.costliest_share:.0f} %)"
     flat = f"added to the dark zone; {known.added_contrast_flat:.1e} with a flat mirror"
     return Tile("CONTRAST", f"{known.added_contrast:+.1e}", f"{flat}; {share}{QUADRATIC}")
 
