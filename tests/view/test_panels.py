@@ -300,8 +300,7 @@ def truths(residual_nm: Any, disturbance_nm: Any) -> Truths:
 def drawn(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:
     """Draw a snapshot with nothing new but the changes."""
     empty = Accumulator().snapshot(0)
-    no_rows = {"steps": steps(0, *np.zeros((2, 0, MODES))), "truths": truths(*np.zeros((2, 0, MODES)))}
-    fields = {"time_ns": START_NS + after_ns, "calibration": CALIBRATION} | no_rows | changes
+    fields = {"time_ns": START_NS + after_ns, "calibration": CALIBRATION} | changes
     panel.draw(tape, dataclasses.replace(empty, **fields))
 
 
@@ -457,7 +456,8 @@ def test_latencies_are_those_of_the_last_second() -> None:
     ]
     controller = wire.Health(topics=[wire.TopicCount(topic=FRAME.key, received=90, skipped=7, missing=3)])
     recorder = wire.Health(recording=wire.Recording(lost=5))
-    health = {Role.CONTROLLER: LastHealth(0, controller, controller), Role.RECORDER: LastHealth(0, recorder, recorder)}
+    reported = {Role.CONTROLLER: controller, Role.RECORDER: recorder}
+    health = {role: LastHealth(0, one, one, 0) for role, one in reported.items()}
     for number, timings in enumerate(batches):
         drawn(panel, tape, number * 100_000_000, timings=timings, health=health)
     times_ns, found = tape.column(latency.TOTAL.path)

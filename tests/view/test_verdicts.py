@@ -420,7 +420,7 @@ def picture_of(verdict: Verdict, time_ns: int = NOON_NS) -> Pixels:
 @pytest.mark.parametrize("tiles", [7, 8])
 @pytest.mark.parametrize("level", Level)
 def test_text_stays_inside_its_tile_and_off_its_border(level: Level, tiles: int) -> None:
-    verdict = Verdict(LONG, level, tuple(Tile("RECORDER", "NO MESSAGES FROM IT", LONG, level) for _ in range(tiles)))
+    verdict = Verdict(LONG, level, (Tile("RECORDER", "NO MESSAGES FROM IT", LONG, level),) * tiles, {})
     shown = picture_of(verdict)
     outside = np.ones((HEIGHT, WIDTH), bool)
     for x0, y0, x1, y1 in tile_boxes(tiles):
@@ -435,7 +435,7 @@ def test_text_stays_inside_its_tile_and_off_its_border(level: Level, tiles: int)
 
 def test_the_picture_shows_the_whole_text_and_the_time_of_day_at_its_right_edge() -> None:
     noon, longer, second = (
-        picture_of(Verdict(LONG, Level.GOOD, (Tile("A", "B", LONG + end, Level.BAD),) * 7), at_ns)
+        picture_of(Verdict(LONG, Level.GOOD, (Tile("A", "B", LONG + end, Level.BAD),) * 7, {}), at_ns)
         for end, at_ns in (("a", NOON_NS), ("ab", NOON_NS), ("a", NOON_NS + 86_401 * 10**9))
     )
     assert (noon != longer).any(), "a longer text is drawn smaller and not truncated"

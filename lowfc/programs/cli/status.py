@@ -18,11 +18,10 @@ from lowfc.programs.launch.watch import mode_name, topic_count, wavefront
 
 NO_HEALTH = wire.Health()
 """Health of an absent process."""
-_NO_PROCESSES: Mapping[str, wire.Health] = MappingProxyType({})
 
 
 def json_object(
-    state: wire.ControllerState, processes: Mapping[str, wire.Health] = _NO_PROCESSES, run: str = ""
+    state: wire.ControllerState, processes: Mapping[str, wire.Health] = MappingProxyType({}), run: str = ""
 ) -> dict[str, Any]:
     """The state as `lowfc ctl status --json` prints it; modes in the calibration's order, nm rms of wavefront."""
     playing = None

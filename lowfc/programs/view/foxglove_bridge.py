@@ -45,7 +45,7 @@ class FoxgloveBridge:
     `subscriptions`: client and topic of each current subscription; `last_states`: the states in force by key.
     """
 
-    def __init__(self, bus: Bus, clock: Clock, run_id: str, port: int = DEFAULT_PORT) -> None:
+    def __init__(self, bus: Bus, clock: Clock, run_id: str, port: int) -> None:
         """Serve at `port`, or at a free one if it is 0, and subscribe.
 
         Raises:
@@ -140,7 +140,7 @@ class FoxgloveBridge:
             return self._channels[key]
 
 
-def serve_foxglove(run_id: str, clock: Clock, port: int = DEFAULT_PORT) -> None:
+def serve_foxglove(run_id: str, clock: Clock, port: int) -> None:
     """Serve a run, and each later one of its name, until SIGTERM or SIGINT; see `FoxgloveBridge`."""
     bridge: FoxgloveBridge | None = None
     while bridge is None or bridge.service.running:

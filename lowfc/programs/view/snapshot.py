@@ -77,7 +77,7 @@ class LastHealth(NamedTuple):
     time_ns: int
     health: wire.Health
     first: wire.Health
-    start_s: int = 0
+    start_s: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,9 +139,9 @@ class Snapshot:
     controller: wire.ControllerState | None
     health: Mapping[str, LastHealth]
     sent_ns: Mapping[Topic, int]
-    complete: bool = True
-    behind_s: float = 0.0
-    ended: LogEnd | None = None
+    complete: bool
+    behind_s: float
+    ended: LogEnd | None
 
     @property
     def period_ns(self) -> int:

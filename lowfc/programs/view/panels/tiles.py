@@ -45,8 +45,8 @@ Shades = npt.NDArray[np.uint8]
 class Tiles(Panel):
     """Draws the verdict on the run when its words change and once a second; at the log's end, that on the whole log."""
 
-    def __init__(self, nm_per_mas: float | None = None) -> None:
-        """`nm_per_mas`: wavefront rms of a tilt of 1 mas, if the telescope is known."""
+    def __init__(self, nm_per_mas: float) -> None:
+        """`nm_per_mas`: wavefront rms of a tilt of 1 mas."""
         self._nm_per_mas = nm_per_mas
         self._watcher = Watcher()
         self._log_verdict = LogVerdict()

@@ -1,7 +1,7 @@
 """Tiles of the verdict, and the format of the numbers on them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import IntEnum
 
@@ -56,7 +56,7 @@ class Verdict:
     headline: str
     level: Level
     tiles: tuple[Tile, ...]
-    facts: Mapping[str, str] = field(default_factory=dict)
+    facts: Mapping[str, str]
 
 
 def worst_of(tiles: Sequence[Tile]) -> Tile:
