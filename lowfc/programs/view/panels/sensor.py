@@ -12,13 +12,13 @@ from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
 
 FRAME, DIFFERENCE, REFERENCE, RAW = "sensor/frame", "sensor/difference", "sensor/reference", "sensor/raw"
-_RAW_PERIOD_NS = 500_000_000
 
 
 class Sensor(Panel):
     """Pictures of the newest frame and its difference from the reference, and of the reference of a new calibration."""
 
     pictures = True
+    period_ns = 500_000_000  # of the raw frame
 
     def __init__(self) -> None:
         self._calibration: Calibration | None = None
@@ -26,7 +26,6 @@ class Sensor(Panel):
         self._frame, self._reference = Picture(FRAME), Picture(REFERENCE)
         self._change = SignedPicture(DIFFERENCE, "DN")
         self._brightest = Scale(10.0)
-        self._raw_due_ns = 0
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
         """Show the newest frame."""
@@ -51,8 +50,7 @@ class Sensor(Panel):
         limit_dn = self._brightest.limit
         caption = f"0 to {limit_dn:g} DN, logarithmic"
         self._frame.show(stream, time_ns, _log_stretched(light_dn, limit_dn), caption)
-        if time_ns >= self._raw_due_ns:
-            self._raw_due_ns = time_ns + _RAW_PERIOD_NS
+        if self.due(snapshot):
             stream.log(RAW, rr.Image(frame, color_model="L"))
 
 
