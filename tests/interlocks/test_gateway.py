@@ -171,7 +171,7 @@ def test_an_unreadable_step_does_not_replace_the_previous_one() -> None:
     error = {one.name: one for one in variables()}["error"].read
     assert error is not None
     assert error(watch.update(), {}).tolist() == []
-    steps.put(wire.ControlStep(mode=wire.LOOP_MODE_CLOSED, error_nm=[1, 2]).SerializeToString())
+    steps.put(wire.ControlStep(mode=wire.LOOP_MODE_CLOSED, error_nm=[1, 2], command_nm=[0, 0]).SerializeToString())
     assert error(watch.update(), {}).tolist() == [1, 2]
     steps.put(b"\xff")
     assert error(watch.update(), {}).tolist() == [1, 2]

@@ -7,7 +7,6 @@ from collections import deque
 from math import nan
 from typing import NamedTuple
 
-import numpy as np
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Bus, Sample
@@ -79,7 +78,6 @@ class Feed(Monitor):
         self._config: Configuration | None = None
         self._configured: set[tuple[str, int]] = set()  # role and start, Unix s, of the controller that sent `_config`
         self._frame: Pixels | None = None
-        self._command_nm = np.zeros(0, np.float32)
         self._trend: deque[tuple[float, float]] = deque(maxlen=TREND_S)
         self._point_ns = 0
         self._read_s = time.monotonic()
@@ -96,8 +94,6 @@ class Feed(Monitor):
         snapshot = self.snapshot(host_ns, behind_s)
         state = self.watcher.state()
         self._frame = self._frame if snapshot.frame is None else snapshot.frame
-        if snapshot.steps.mode.size:
-            self._command_nm = snapshot.steps.command_nm[-1]
         self._extend_trend(state, host_ns)
         newest_ns = max(snapshot.sent_ns.values(), default=0)
         per_mas = None if self._config is None else tilt_nm_per_mas(self._config.star.diameter_m)
@@ -106,7 +102,7 @@ class Feed(Monitor):
             state,
             judge(state, per_mas),
             self._frame,
-            self._command_nm,
+            self.steps.command_nm[-1:].ravel(),
             [request for request in requests if request is not None],
             [residual for residual, _ in self._trend],
             [light for _, light in self._trend],

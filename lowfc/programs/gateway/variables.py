@@ -59,8 +59,8 @@ def _latency(percentile: str) -> Callable[[RunView, dict[str, Any]], Any]:
 
 def _step(field: str) -> Callable[[RunView, dict[str, Any]], Any]:
     def read(view: RunView, status: dict[str, Any]) -> Any:
-        values = getattr(view.step, field, None)
-        return np.zeros(0) if values is None else np.array(values, float)
+        values = getattr(view.steps, field)[-1:].ravel().astype(float)
+        return values[np.isfinite(values)]  # a refused frame has no error
 
     return read
 

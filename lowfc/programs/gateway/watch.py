@@ -2,10 +2,9 @@
 
 from typing import NamedTuple
 
+from lowfc.adapters.logs.columns import Steps
 from lowfc.arrays import Pixels
-from lowfc.client.stream import step_of
-from lowfc.contract.messages import STEP, Role, wire
-from lowfc.control.loop.inputs import Step
+from lowfc.contract.messages import Role, wire
 from lowfc.programs.view.monitor import Monitor
 from lowfc.programs.view.verdicts.tile import Verdict
 from lowfc.programs.view.verdicts.verdict import judge
@@ -21,27 +20,23 @@ class RunView(NamedTuple):
     state: wire.ControllerState
     processes: dict[str, wire.Health]
     verdict: Verdict
-    step: Step | None
+    steps: Steps
     frame: Pixels | None
 
 
 class Watch(Monitor):
     """Receives as a monitor, through ring buffers that do not burden the loop."""
 
-    _step: Step | None = None
-
     def update(self) -> RunView:
         """Process the messages since the last call."""
         now_ns = self._clock.host_ns()
         snapshot = self.snapshot(now_ns)
-        if (sample := self.newest.get(STEP)) is not None:
-            self._step = step_of(sample) or self._step
         alive = {name for name, one in snapshot.health.items() if now_ns - one.time_ns < SILENT_NS}
         return RunView(
             Role.CONTROLLER in alive,
             snapshot.controller or wire.ControllerState(),
             {name: one.health for name, one in snapshot.health.items() if name in alive | {Role.CONTROLLER}},
             judge(self.watcher.state()),
-            self._step,
+            self.steps,
             snapshot.frame,
         )

@@ -4,8 +4,9 @@ from collections import deque
 from importlib import import_module
 
 from lowfc.adapters.bus.bus import Bus, Sample, last_messages
+from lowfc.adapters.logs.columns import StepRows
 from lowfc.adapters.process.clock import Clock
-from lowfc.contract.messages import EVENT, STEP, SURFACE, TRUTH, Role, Topic
+from lowfc.contract.messages import EVENT, STEP, SURFACE, TRUTH, Role
 from lowfc.programs.view.snapshot import SHOWN, Accumulator, Snapshot
 from lowfc.programs.view.verdicts.watcher import Watcher
 
@@ -22,9 +23,7 @@ def import_late_modules() -> None:
 class Monitor:
     """Receives as a monitor: messages wait in rings that keep the newest, so that the loop never waits for it.
 
-    Attributes:
-        watcher: state of the run, from which the verdict is made.
-        newest: newest message of each topic.
+    `watcher`: state of the run, from which the verdict is made. `steps`: the newest ones; none before the first.
     """
 
     _patience_s = 0.2
@@ -32,7 +31,7 @@ class Monitor:
 
     def __init__(self, bus: Bus, clock: Clock) -> None:
         """Subscribe."""
-        self.watcher, self.newest = Watcher(), dict[Topic, Sample]()
+        self.watcher, self.steps = Watcher(), StepRows(0).values()
         self._bus, self._clock = bus, clock
         self._rings = {
             topic: bus.ring(topic, 1 if topic.latest_only else _RING_SIZES.get(topic, 100))
@@ -48,10 +47,9 @@ class Monitor:
         """Return the messages since the last call; states published by new processes are queried, for the next call."""
         while self._answers:
             self._accumulator.add(self._answers.popleft())
-        for topic, ring in self._rings.items():
+        for ring in self._rings.values():
             for sample in ring.drain():
                 self._accumulator.add(sample)
-                self.newest[topic] = sample
         snapshot = self._accumulator.snapshot(now_ns, behind_s=behind_s)
         processes = {(name, last.start_s) for name, last in snapshot.health.items()}
         incomplete = Role.CONTROLLER in snapshot.health and not self._complete(snapshot)
@@ -59,6 +57,8 @@ class Monitor:
             self._known, self._queried_ns = processes, now_ns
             self._query()
         self.watcher.feed(snapshot)
+        if snapshot.steps.mode.size:
+            self.steps = snapshot.steps
         return snapshot
 
     def _complete(self, snapshot: Snapshot) -> bool:
