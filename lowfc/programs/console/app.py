@@ -95,8 +95,7 @@ class Console(OrderedKeys):
     ENABLE_COMMAND_PALETTE = False
     AUTO_FOCUS = None
     BINDINGS: ClassVar[list[BindingType]] = [
-        *(Binding(f"{action.key},{action.key.upper()}", f"press({action.name!r})") for action in ACTIONS),
-        Binding("s,S", f"press({SAFE.name!r})"),
+        *(Binding(f"{one.key},{one.key.upper()}", f"press({name!r})") for name, one in ALL_ACTIONS.items()),
         Binding(IMMEDIATE_KEY, f"press({SAFE.name!r})", priority=True),
         *(Binding(key, f"choose({by})") for key, by in (("up", -1), ("down", 1))),
         *(Binding(key, f"turn({by})") for key, by in (("left", -1), ("right", 1), ("minus", -1), ("plus", 1))),
@@ -153,8 +152,8 @@ class Console(OrderedKeys):
         with Horizontal(id="keys"):
             with Grid(id="buttons"):
                 for action in ACTIONS:
-                    yield Button(Text(f"{action.key} {action.name}"), id=_id(action), compact=True)
-            yield Button("SAFE\nkey s or F12", id=_id(SAFE))
+                    yield Button(Text(f"{action.key} {action.name}"), id=_id(action), name=action.name, compact=True)
+            yield Button("SAFE\nkey s or F12", id=_id(SAFE), name=SAFE.name)
         yield Lines("peers")
 
     def on_mount(self) -> None:
@@ -201,10 +200,9 @@ class Console(OrderedKeys):
 
     @on(Button.Pressed)
     def _pressed(self, event: Button.Pressed) -> None:
-        name = next((action.name for action in ALL_ACTIONS.values() if _id(action) == event.button.id), None)
-        if name is not None:
+        if event.button.name is not None:  # a form's buttons have no name
             self.set_focus(None)
-            self.action_press(name)
+            self.action_press(event.button.name)
 
     @on(Form.Filled)
     def _filled(self, event: Form.Filled) -> None:

@@ -115,16 +115,16 @@ def sparks(reading: Reading) -> list[Text]:
     light = "?" if np.isnan(flux) else f"{100 * flux:.0f} %"
     rows = ("residual", reading.residual_nm, residual), ("light", reading.light, light)
     return [
-        Text.assemble((f"{name:10}", DIM), (f"{sparkline(values, TREND_S):>{TREND_S}}", style(ORANGE)), f" {last}")
+        Text.assemble((f"{name:10}", DIM), (f"{sparkline(values):>{TREND_S}}", style(ORANGE)), f" {last}")
         for name, values, last in rows
     ]
 
 
-def sparkline(values: Sequence[float], width: int) -> str:
-    """The last values as bars from zero to the largest; a negative value has the lowest bar, NaN a space."""
-    last = np.minimum(values[-width:], np.finfo(float).max)  # the share of infinity would be NaN
-    largest = max(np.nanmax(last, initial=0.0), 1e-9) if last.size else 1.0
-    return "".join(" " if np.isnan(one) else _SPARKS[min(int(max(one, 0.0) / largest * 8), 7)] for one in last)
+def sparkline(values: Sequence[float]) -> str:
+    """Values as bars from zero to the largest; a negative value has the lowest bar, NaN a space."""
+    bounded = np.minimum(values, np.finfo(float).max)  # the share of infinity would be NaN
+    largest = max(np.nanmax(bounded, initial=0.0), 1e-9)
+    return "".join(" " if np.isnan(one) else _SPARKS[min(int(max(one, 0.0) / largest * 8), 7)] for one in bounded)
 
 
 def modes(reading: Reading, width: int) -> list[Text]:

@@ -2,10 +2,10 @@
 
 import re
 
-from lowfc.programs.console.actions import ACTIONS, SAFE
+from lowfc.programs.console.actions import ALL_ACTIONS
 from lowfc.programs.view.verdicts.tile import numbers
 
-_KEYS = {action.name: action.key for action in (*ACTIONS, SAFE)} | {
+_KEYS = {name: action.key for name, action in ALL_ACTIONS.items()} | {
     "law integrator": "i",
     "record start": "r",
     "record stop": "v",
