@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lowfc.adapters.process.terminal import ConfigFile, LogsIfAny, configuration
+from lowfc.adapters.process.terminal import AnyRun, ConfigFile, LogsIfAny, configuration
 from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.view.draw.tabs import Tab
 
@@ -27,7 +27,7 @@ def view(
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="Show a running loop for this long; default for a picture: 8 s.")
     ] = None,
-    run: Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")] = None,
+    run: AnyRun = None,
     config: ConfigFile = None,
     memory_mb: Annotated[float, typer.Option(min=16, max=1e6, help="Viewer's memory for past data, MB.")] = _MEMORY_MB,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port of the viewer, or for Foxglove.")] = None,
