@@ -10,8 +10,6 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.color import Color
 from textual.containers import Grid, Horizontal, Vertical
-from textual.message import Message
-from textual.screen import Screen
 from textual.widgets import Button, Static
 
 from lowfc.adapters.bus.bus import Bus
@@ -40,20 +38,6 @@ RESTARTED = "restarted"
 """Result of the application if the run restarted and must be joined again."""
 _LEFT = 62  # columns of the left half
 _RESTART_CHECK_EVERY = 10  # readings
-_OTHER_KEYS = (
-    ("↑↓ ←→", "knobs", "Choose a gain knob and turn it (the gains of its modes keep their ratios)"),
-    ("u", "auto", "Set the gains of the chosen knob to automatic"),
-    ("m", "mute", "Switch the terminal's bell for errors on or off"),
-    ("? q", "help, quit", "This help, or leave the console (the loop goes on)"),
-)
-
-
-class Answered(Message):
-    """The answer to an action, or the reason why it failed, and the form that was sent for it, if any."""
-
-    def __init__(self, action: Action, form: Form | None, text: str, *, ok: bool) -> None:
-        super().__init__()
-        self.action, self.form, self.text, self.ok = action, form, text, ok
 
 
 class Console(OrderedKeys):
@@ -160,10 +144,6 @@ class Console(OrderedKeys):
         """Start the readings."""
         self.set_interval(READ_PERIOD_S, self._read)
 
-    def awaits_focus(self, screen: Screen[object]) -> bool:
-        """Whether a form is open that does not have the focus yet."""
-        return isinstance(screen, Form) and screen.focused is None
-
     def action_press(self, name: str) -> None:
         """Carry out the action of a button: at once, or after its form."""
         action = ALL_ACTIONS[name]
@@ -191,12 +171,7 @@ class Console(OrderedKeys):
 
     def action_help(self) -> None:
         """Show the keys."""
-        rows = [
-            ("s F12", "SAFE", f"At once (with a form open, only F12): {SAFE.description}"),
-            *((action.key, action.name, action.description) for action in ACTIONS),
-            *_OTHER_KEYS,
-        ]
-        self.push_screen(Help(rows))
+        self.push_screen(Help())
 
     @on(Button.Pressed)
     def _pressed(self, event: Button.Pressed) -> None:
@@ -234,27 +209,27 @@ class Console(OrderedKeys):
                     since = f", from frame {answer.frame} on" if answer.frame else ""
                     text = f"{action.name}: {answer.reply}{since}"
             except (LowfcError, OSError, ValueError) as fault:
-                self.post_message(Answered(action, form, phrased(str(fault)), ok=False))
+                self.call_later(self._answered, action, form, phrased(str(fault)), ok=False)
             else:
-                self.post_message(Answered(action, form, phrased(text), ok=True))
+                self.call_later(self._answered, action, form, phrased(text), ok=True)
                 self.call_later(self._tasks.extend, tasks)  # "started" is shown before "done"
 
         self._requesting[action.name] = threading.Thread(target=ask, name=action.name, daemon=True)
         self._requesting[action.name].start()
 
-    @on(Answered)
-    def _answered(self, event: Answered) -> None:
+    def _answered(self, action: Action, form: Form | None, text: str, *, ok: bool) -> None:
+        """Show the answer to an action, or why it failed, also in the form that was sent for it, if any."""
         if self._torn_down:
             return
-        self._answer(event.text, ok=event.ok)
-        self.query_one(f"#{_id(event.action)}").set_class(not event.ok, "refused")
-        if event.action.name == "gain" and not event.ok:
+        self._answer(text, ok=ok)
+        self.query_one(f"#{_id(action)}").set_class(not ok, "refused")
+        if action.name == "gain" and not ok:
             self.query_one(Gains).discard_pending()
-        if event.form is self.screen:  # otherwise the operator left it
-            if event.ok:
-                event.form.dismiss()
+        if form is self.screen:  # otherwise the operator left it
+            if ok:
+                form.dismiss()
             else:
-                event.form.show_answer(event.text)
+                form.show_answer(text)
 
     def _answer(self, text: str, *, ok: bool) -> None:
         answer = self._static("answer")

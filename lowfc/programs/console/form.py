@@ -1,7 +1,6 @@
 """Overlays of the screen: the form of a button, and the help."""
 
 import re
-from collections.abc import Iterable
 from typing import ClassVar
 
 from rich.text import Text
@@ -13,14 +12,22 @@ from textual.message import Message
 from textual.screen import ModalScreen
 from textual.widgets import Button, Input, Label, Static
 
-from lowfc.programs.console.actions import SAFE, Action
+from lowfc.programs.console.actions import ACTIONS, SAFE, Action
 
 HELP = (
     "Top line: verdict, with the reason below it. Bars: command of each mode, nm, between its limits. Press a key or "
     "click a button. In a form: Tab next line, Enter send, Escape cancel. The answer is above the buttons; red: "
     "refused. When the console ends, the loop and commands started here go on."
 )
-
+_ROWS = (
+    ("s F12", "SAFE", f"At once (with a form open, only F12): {SAFE.description}"),
+    *((action.key, action.name, action.description) for action in ACTIONS),
+    ("↑↓ ←→", "knobs", "Choose a gain knob and turn it (the gains of its modes keep their ratios)"),
+    ("u", "auto", "Set the gains of the chosen knob to automatic"),
+    ("m", "mute", "Switch the terminal's bell for errors on or off"),
+    ("? q", "help, quit", "This help, or leave the console (the loop goes on)"),
+)
+"""Keys, names and descriptions of the help."""
 _CLAUSE_END = re.compile(r"\. |; |, (?:and|whatever)|: it ")
 """Where the help cuts off a description."""
 
@@ -77,10 +84,6 @@ class Help(ModalScreen[None]):
         *((key, "safe", "safe") for key in ("s", "S")),
     ]
 
-    def __init__(self, rows: Iterable[tuple[str, str, str]]) -> None:
-        super().__init__()
-        self._rows = list(rows)
-
     async def action_safe(self) -> None:
         """Leave the help, and do what the button SAFE does."""
         self.dismiss()
@@ -90,7 +93,7 @@ class Help(ModalScreen[None]):
         """Lay out the help."""
         lines = [
             Text.assemble((f"{key:6}", "bold"), f"{name:11}", _CLAUSE_END.split(description, maxsplit=1)[0].rstrip("."))
-            for key, name, description in self._rows
+            for key, name, description in _ROWS
         ]
         with Vertical():
             yield Static(HELP, markup=False)

@@ -6,7 +6,6 @@ from functools import partial
 from textual import events
 from textual.app import App
 from textual.dom import DOMNode
-from textual.screen import Screen
 
 IMMEDIATE_KEY = "f12"
 """Key that does not wait for the others."""
@@ -27,10 +26,6 @@ class OrderedKeys(App[str]):
         self._waiting: deque[events.Key] = deque()
         self._turn = 0  # number of the key in progress
         self._busy = False
-
-    def awaits_focus(self, screen: Screen[object]) -> bool:
-        """Whether a new screen is about to take the focus."""
-        return False
 
     async def on_event(self, event: events.Event) -> None:
         """Queue keys, except `IMMEDIATE_KEY`."""
@@ -60,7 +55,7 @@ class OrderedKeys(App[str]):
 
     async def _settle(self, turn: int) -> None:
         """Send the next key once the form opened by the last one has the focus."""
-        if turn == self._turn and self.awaits_focus(self.screen):
+        if turn == self._turn and self.screen.AUTO_FOCUS is not None and self.screen.focused is None:
             self.set_timer(_POLL_S, partial(self._settle, turn))
         else:
             await self._next_key(turn)
