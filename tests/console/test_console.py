@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -292,9 +292,8 @@ def test_a_gain_knob_scales_the_gains_of_all_modes_or_of_one_radial_order(screen
 
 
 def test_a_knob_is_chosen_and_shown_whatever_the_number_of_modes(monkeypatch: pytest.MonkeyPatch) -> None:
-    turned: list[Gains.Turned] = []
-    knobs = Gains()
-    monkeypatch.setattr(knobs, "post_message", turned.append)
+    turned: list[tuple[Sequence[int], Sequence[float]]] = []
+    knobs = Gains(lambda modes, values: turned.append((modes, values)))
 
     def update(*noll: int, gain: float = 0.5, automatic: tuple[bool, ...] = ()) -> None:
         controller = wire.ControllerState(gain=[gain] * len(noll), automatic=automatic)
@@ -306,11 +305,11 @@ def test_a_knob_is_chosen_and_shown_whatever_the_number_of_modes(monkeypatch: py
     update(2, 3)
     knobs.turn(1)
     knobs.automatic()
-    assert [turn.modes for turn in turned] == [(2, 3), (2, 3)]
+    assert [modes for modes, _ in turned] == [(2, 3), (2, 3)]
     knobs.discard_pending()
     update(2, 3, gain=1.8)
     knobs.turn(1)
-    assert turned[-1].values == [1.8, 1.8], "a gain beyond the bar, entered as a number, is not lowered"
+    assert turned[-1][1] == [1.8, 1.8], "a gain beyond the bar, entered as a number, is not lowered"
     for gain, automatic in ((np.inf, ()), (np.nan, ()), (0.5, (True,))):  # another program's messages
         update(2, 3, gain=gain, automatic=automatic)
         assert [line.plain for line in knobs._lines] == ["gains are not known yet"]

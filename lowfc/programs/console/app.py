@@ -1,7 +1,7 @@
 """The console's screen: state of the run, updated five times a second, and buttons."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 from rich.text import Text
@@ -128,7 +128,7 @@ class Console(OrderedKeys):
                     yield Lines(name)
             with Vertical(id="right"):
                 yield Lines("pictures")
-                yield Gains()
+                yield Gains(self._set_gains)
                 yield Static(id="facts")
         yield Static(id="log")
         yield Static("? shows the keys", id="answer", markup=False)
@@ -148,7 +148,7 @@ class Console(OrderedKeys):
         """Carry out the action of a button: at once, or after its form."""
         action = ALL_ACTIONS[name]
         if action.fields or action.confirm:
-            self.push_screen(Form(action))
+            self.push_screen(Form(action, self._do))
         else:
             self._do(action, {})
 
@@ -179,14 +179,9 @@ class Console(OrderedKeys):
             self.set_focus(None)
             self.action_press(event.button.name)
 
-    @on(Form.Filled)
-    def _filled(self, event: Form.Filled) -> None:
-        self._do(event.form.action, event.values, event.form)
-
-    @on(Gains.Turned)
-    def _turned(self, event: Gains.Turned) -> None:
-        modes, values = ",".join(map(str, event.modes)), " ".join(map(str, event.values))
-        self._do(ALL_ACTIONS["gain"], {"modes": modes, "values": values or AUTO})
+    def _set_gains(self, modes: Sequence[int], gains: Sequence[float]) -> None:
+        values = {"modes": ",".join(map(str, modes)), "values": " ".join(map(str, gains)) or AUTO}
+        self._do(ALL_ACTIONS["gain"], values)
 
     def _do(self, action: Action, values: Values, form: Form | None = None) -> None:
         """Start a task, or send a request, in a new thread.

@@ -1,6 +1,7 @@
 """Overlays of the screen: the form of a button, and the help."""
 
 import re
+from collections.abc import Callable
 from typing import ClassVar
 
 from rich.text import Text
@@ -8,11 +9,10 @@ from textual import on
 from textual.app import ComposeResult
 from textual.binding import BindingType
 from textual.containers import Horizontal, Vertical
-from textual.message import Message
 from textual.screen import ModalScreen
 from textual.widgets import Button, Input, Label, Static
 
-from lowfc.programs.console.actions import ACTIONS, SAFE, Action
+from lowfc.programs.console.actions import ACTIONS, SAFE, Action, Values
 
 HELP = (
     "Top line: verdict, with the reason below it. Bars: command of each mode, nm, between its limits. Press a key or "
@@ -38,22 +38,16 @@ class Form(ModalScreen[None]):
     AUTO_FOCUS = "Input, #ok"
     BINDINGS: ClassVar[list[BindingType]] = [("escape", "dismiss", "leave")]
 
-    class Filled(Message):
-        """The operator sent the form, by OK or Enter."""
-
-        def __init__(self, form: "Form", values: dict[str, str]) -> None:
-            super().__init__()
-            self.form, self.values = form, values
-
-    def __init__(self, action: Action) -> None:
+    def __init__(self, action: Action, send: "Callable[[Action, Values, Form], None]") -> None:
+        """Make the form of an action; `send` is called with its values when the operator presses OK or Enter."""
         super().__init__()
-        self.action = action
+        self._action, self._send = action, send
 
     def compose(self) -> ComposeResult:
         """Lay out the form."""
         with Vertical():
-            yield Static(self.action.confirm or f"{self.action.name}: {self.action.description}", markup=False)
-            for field in self.action.fields:
+            yield Static(self._action.confirm or f"{self._action.name}: {self._action.description}", markup=False)
+            for field in self._action.fields:
                 yield Label(field.label, markup=False)
                 yield Input(field.default(), name=field.name, compact=True)
             yield Static("", id="refusal", markup=False)
@@ -69,7 +63,7 @@ class Form(ModalScreen[None]):
     @on(Button.Pressed, "#ok")
     def _filled(self) -> None:
         self.show_answer("requested, waiting for the answer")
-        self.post_message(self.Filled(self, {field.name or "": field.value.strip() for field in self.query(Input)}))
+        self._send(self._action, {field.name or "": field.value.strip() for field in self.query(Input)}, self)
 
     @on(Button.Pressed, "#leave")
     def _leave(self) -> None:

@@ -2,12 +2,11 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from rich.text import Text
 from textual import events
-from textual.message import Message
 
 from lowfc.arrays import Mask
 from lowfc.programs.console.feed import Reading
@@ -27,15 +26,10 @@ _PENDING_S = 1.0  # time for which a knob shows the requested gain: by then the 
 class Gains(Lines):
     """The knobs, scrolled to the chosen one. Keys or a click turn a knob; the gains of its modes keep their ratios."""
 
-    class Turned(Message):
-        """A knob was turned: gains requested for these modes, automatic ones if `values` is empty."""
-
-        def __init__(self, modes: tuple[int, ...], values: list[float]) -> None:
-            super().__init__()
-            self.modes, self.values = modes, values
-
-    def __init__(self) -> None:
+    def __init__(self, send: Callable[[Sequence[int], Sequence[float]], None]) -> None:
+        """Make the knobs; `send` is called with the modes of a turned knob and their gains, none for automatic ones."""
         super().__init__("gains")
+        self._send = send
         self._chosen = self._top = 0  # index of the chosen knob, and of the first one shown
         self._noll: tuple[int, ...] = ()
         self._gain = np.zeros(0, np.float32)
@@ -69,7 +63,7 @@ class Gains(Lines):
     def automatic(self) -> None:
         """Request automatic gains for the chosen knob."""
         if self._noll:
-            self.post_message(self.Turned(groups(self._noll)[self._chosen][1], []))
+            self._send(groups(self._noll)[self._chosen][1], [])
 
     def discard_pending(self) -> None:
         """Discard refused requests: the knobs return to the controller's gains."""
@@ -88,8 +82,7 @@ class Gains(Lines):
         present = self._gain[self._indices(number)]
         gains = np.full(len(present), gain) if not present.any() else present / present.max() * gain
         self._pending[number] = gain, time.monotonic() + _PENDING_S
-        values = [float(f"{value:.4g}") for value in gains.tolist()]
-        self.post_message(self.Turned(groups(self._noll)[number][1], values))
+        self._send(groups(self._noll)[number][1], [float(f"{value:.4g}") for value in gains.tolist()])
 
     def _indices(self, number: int) -> list[int]:
         return [self._noll.index(mode) for mode in groups(self._noll)[number][1]]
