@@ -14,7 +14,6 @@ from lowfc.contract.printable import LINES, printable
 from lowfc.programs.cli.output import print_result
 from lowfc.programs.view.panels.loop import LOG
 from lowfc.programs.view.recorded import draw_logs
-from lowfc.programs.view.renderer import Renderer
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
 from tests.support import report_log
@@ -96,7 +95,7 @@ def test_readers_of_a_log_escape_their_output(log: Path, command: str) -> None:
 
 def test_a_view_escapes_events(log: Path) -> None:
     tape = Tape()
-    draw_logs([log], None, lambda config: Renderer(config, tape))  # type: ignore[arg-type]
+    draw_logs([log], None, tape)  # type: ignore[arg-type]
     paths = [path for path in tape.paths if path.startswith(LOG)]
     assert any("clouds" in path for path in paths)
     texts = [text for path in paths for text in tape.last(path).text.as_arrow_array().to_pylist()]

@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -169,12 +170,12 @@ def test_a_replay_does_not_depend_on_the_configuration(log: Path) -> None:
 
 @pytest.mark.parametrize(("toml", "rate_hz"), [(OTHER, 300.0), ("[camera", Configuration().camera.rate_hz)])
 def test_a_view_uses_the_recorded_or_the_default_configuration(
-    log_with: Callable[[str], Path], toml: str, rate_hz: float
+    log_with: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch, toml: str, rate_hz: float
 ) -> None:
-    log, tape = log_with(toml), Tape()
-    used: list[Configuration] = []
-    drawn = draw_logs([log], None, lambda config: used.append(config) or Renderer(config, tape))  # type: ignore[arg-type]
-    assert [config.camera.rate_hz for config in used] == [rate_hz]
+    log, renderer = log_with(toml), Mock(wraps=Renderer)
+    monkeypatch.setattr("lowfc.programs.view.recorded.Renderer", renderer)
+    drawn = draw_logs([log], None, Tape())  # type: ignore[arg-type]
+    assert [call.args[0].camera.rate_hz for call in renderer.call_args_list] == [rate_hz]
     assert str(log) in drawn.remarks[0]
     assert toml != OTHER or drawn.remarks == remarks_on(log)
 

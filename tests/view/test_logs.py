@@ -32,7 +32,6 @@ from lowfc.programs.view.layout import layout
 from lowfc.programs.view.live_view import earlier_events
 from lowfc.programs.view.panels import mirror, pointing, sensor, tiles, trend, wavefront
 from lowfc.programs.view.recorded import Drawn, draw_logs
-from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.session import memory_remarks, show_logs
 from lowfc.programs.view.snapshot import Accumulator
 from lowfc.programs.view.target import Target
@@ -65,7 +64,7 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
 
 def drawn(*logs: Path, config: Configuration | None = None) -> tuple[Drawn, Tape]:
     tape = Tape()
-    return draw_logs(logs, config or Configuration(), lambda used: Renderer(used, tape)), tape
+    return draw_logs(logs, config or Configuration(), tape), tape
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from lowfc.adapters.bus.bus import Bus, Sample, last_messages
@@ -117,8 +118,8 @@ class LiveView:
         return self._drawn + (self._render.snapshots if self._render is not None else 0)
 
     def _begin(self) -> None:
-        self.viewer = viewer = self._target.viewer()
-        make_stream = lambda: self._target.stream(viewer, self.service.run_id, LIVE_WINDOW_S)  # noqa: E731
+        self.viewer = self._target.viewer()
+        make_stream = partial(self._target.stream, self.viewer, self.service.run_id, LIVE_WINDOW_S)
         self._render = RenderThread(self._config, self._clock, self._rings, make_stream)
         self._render.start()
         self._began_s = time.monotonic()

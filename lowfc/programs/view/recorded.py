@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import rerun as rr
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.logs.history import LAST_NS, REORDERING_NS, attached_configuration
@@ -43,10 +44,10 @@ class Drawn:
 def draw_logs(
     logs: Sequence[Path],
     config: Configuration | None,
-    make_renderer: Callable[[Configuration], Renderer],
+    stream: rr.RecordingStream,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Drawn:
-    """Draw consecutive logs.
+    """Draw consecutive logs on a stream.
 
     Raises:
         DataFileError: a file is not a log, the logs are of several runs or not in order, or they have nothing to show.
@@ -63,7 +64,7 @@ def draw_logs(
         for number, message in enumerate(reader):
             if renderer is None:
                 used_config = config or _configuration_of(reader, drawn.remarks)
-                renderer = make_renderer(used_config)
+                renderer = Renderer(used_config, stream)
                 accumulator = Accumulator(SIMULATED_START_NS if used_config.lockstep else None)
             if number == 0:
                 recorded = reader.metadata.get("lowfc", {})

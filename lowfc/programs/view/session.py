@@ -21,7 +21,6 @@ from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Role
 from lowfc.programs.view.live_view import LiveView, ViewError
 from lowfc.programs.view.recorded import Drawn, draw_logs
-from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.target import Target
 
 PICTURE_AFTER_S = 8.0
@@ -129,7 +128,7 @@ def memory_remarks(log_bytes: int, target: Target) -> list[str]:
 def _draw(logs: list[Path], config: Configuration | None, stream: rr.RecordingStream, target: Target) -> Drawn:
     total = sum(log.stat().st_size for log in logs if log.exists())
     with reading_bar(Console(stderr=True)) as count:
-        drawn = draw_logs(logs, config, lambda used: Renderer(used, stream), lambda done: count("drawing", done, total))
+        drawn = draw_logs(logs, config, stream, lambda done: count("drawing", done, total))
     target.show_all(stream, drawn.span_ns)
     drawn.remarks += memory_remarks(total, target)
     for remark in drawn.remarks:
