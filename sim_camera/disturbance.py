@@ -286,12 +286,13 @@ class Sampler:
 
     def _block(self, first: int) -> Single:
         """Modes (frames, instants, modes) of the block that begins with frame `first`."""
-        start_s = first / self._rate_hz
-        rotated = _rotated(self._disturbance, start_s)
-        total_nm = self._waves @ np.vstack([rotated.real, rotated.imag]).astype(np.float32)
-        square = _square(start_s + self._time_s)[:, None] * self._disturbance.step_nm
-        total_nm += (square + self._disturbance.static_nm).astype(np.float32)
-        for wheel in self._disturbance.wheels:
+        start_s, disturbance = first / self._rate_hz, self._disturbance
+        turned = disturbance.amplitude_nm * np.exp(2j * np.pi * disturbance.frequency_hz * start_s)[:, None]
+        total_nm = self._waves @ np.vstack([turned.real, turned.imag]).astype(np.float32)
+        in_first_half = np.mod(start_s + self._time_s, _STEP_PERIOD_S) < _STEP_PERIOD_S / 2
+        square = np.where(in_first_half, -1.0, 1.0)[:, None] * disturbance.step_nm
+        total_nm += (square + disturbance.static_nm).astype(np.float32)
+        for wheel in disturbance.wheels:
             total_nm += wheel.modes_nm(start_s + self._time_s).astype(np.float32)
         block = total_nm.reshape(self._shape)
         if self._lines is not None:
@@ -318,16 +319,6 @@ def _end_weights(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) 
     before = sinh_ratio(period_s - time_s) * np.exp(omega * time_s)
     after = sinh_ratio(time_s) * np.exp(omega * (time_s - period_s))
     return np.array([before, after])
-
-
-def _rotated(disturbance: Disturbance, time_s: float) -> Complex:
-    """Complex amplitudes (waves, modes) rotated to the phases at a time."""
-    return np.asarray(disturbance.amplitude_nm * np.exp(2j * np.pi * disturbance.frequency_hz * time_s)[:, None])
-
-
-def _square(time_s: Array) -> Array:
-    """The square wave, -1 or 1, at these times."""
-    return np.where(np.mod(time_s, _STEP_PERIOD_S) < _STEP_PERIOD_S / 2, -1.0, 1.0)
 
 
 def screen(seed: int, samples: int, spacing: float) -> Array:

@@ -144,7 +144,6 @@ class SimulatedCamera:
         row, rows = _centred_region("rows", options.rows, self._scene.shape[0])
         column, columns = _centred_region("columns", options.columns, self._scene.shape[1])
         self._region = np.s_[row : row + rows, column : column + columns]
-        self._contrast: Contrast | None = None
         self._fault = read_fault(Path(options.fault)) if options.fault else None
         configured = CameraSettings.configured(config, rows, columns)
         self._settings = replace(configured, clock="run", region_row=row, region_column=column)
@@ -175,8 +174,8 @@ class SimulatedCamera:
     def join(self, service: Service) -> None:
         """Declare the publisher of the truth and subscribe to the mirror."""
         self._service = service
-        modal = factory.contrast_of(self._config)  # here, where the process is already limited to one BLAS thread
-        self._contrast = Contrast(modal)
+        # Here, where the process is already limited to one BLAS thread.
+        self._contrast = Contrast(factory.contrast_of(self._config))
         self._truths = service.publisher(TRUTH)
         service.bus.subscribe(MIRROR_STATE, self._on_mirror_state, self._config.mirror.name)
         service.on_stop(self._arrived.wake)
@@ -251,7 +250,7 @@ class SimulatedCamera:
         self._drain()
         self._end_period()
         self._publish_truths()
-        self._measured = self._contrast.measure() if self._contrast is not None else {}
+        self._measured = self._contrast.measure()
 
     def close(self) -> None:
         """Do nothing: there is no hardware."""
@@ -281,19 +280,17 @@ class SimulatedCamera:
             return
         waiting, self._waiting = self._waiting, []
         truths = self._scene.truths([(exposed.frame, exposed.actuators_nm, motion) for exposed, motion in waiting])
-        added: list[tuple[float, Single | None]] = [(0.0, None)] * len(truths)
-        if self._contrast is not None:
-            instants_nm = np.array([truth.instants_nm for truth in truths])
-            middle = instants_nm.shape[2] // 2
-            for disturbance_nm, residual_nm in instants_nm[:, :, middle]:
-                self._contrast.add(disturbance_nm, residual_nm)
-            quadratic = self._contrast.quadratic(instants_nm)
-            added = list(zip(quadratic[:, 0].sum(axis=1).tolist(), quadratic[:, 1], strict=True))
-        for (exposed, _), truth, contrast in zip(waiting, truths, added, strict=True):
+        instants_nm = np.array([truth.instants_nm for truth in truths])
+        middle = instants_nm.shape[2] // 2
+        for disturbance_nm, residual_nm in instants_nm[:, :, middle]:
+            self._contrast.add(disturbance_nm, residual_nm)
+        added = self._contrast.quadratic(instants_nm)
+        flat = added[:, 0].sum(axis=1).tolist()
+        for (exposed, _), truth, *contrast in zip(waiting, truths, flat, added[:, 1], strict=True):
             self._statistics.add(truth, *contrast)
             self._publish_truth(exposed, truth, *contrast)
 
-    def _publish_truth(self, exposed: _Exposed, truth: Truth, added_flat: float, added: Single | None) -> None:
+    def _publish_truth(self, exposed: _Exposed, truth: Truth, added_flat: float, added: Single) -> None:
         """Publish the truth of a frame, with the contrast that it adds; arguments as for `WavefrontAccumulator.add`."""
         sampled, continuous = truth.sampled, truth.continuous
         message = wire.Truth(
@@ -304,7 +301,7 @@ class SimulatedCamera:
             disturbance_rms_nm=sampled.disturbance_rms_nm,
             residual_rms_nm=sampled.residual_rms_nm,
             added_contrast_flat=added_flat,
-            added_contrast=0.0 if added is None else float(added.sum()),
+            added_contrast=float(added.sum()),
             wheel_speed_hz=truth.wheel_speed_hz.tolist(),
             shear_diameters=truth.shear.tolist(),
         )
@@ -343,7 +340,9 @@ class SimulatedCamera:
                 self._newest_state = state.frame_sequence
                 sequence, published_ns = self._published_ns[state.frame_sequence % _REMEMBERED]
                 if sequence == state.frame_sequence:  # otherwise the command is not from a frame, as in a mirror test
-                    self._count_late(state.frame_sequence < self._last_frame)
+                    if self._lateness.add(state.frame_sequence < self._last_frame):
+                        event = "COMMANDS_LATE" if self._lateness.habitual else "COMMANDS_IN_TIME"
+                        self._service.event(event, percent=self._lateness.percent)
                     self._frame_to_mirror.add(sample.publish_time_ns - published_ns)
 
     def _moment(self, publish_time_ns: int) -> float:
@@ -355,12 +354,6 @@ class SimulatedCamera:
         if self._service.clock.lockstep or index < 0 or self._config.camera.delay_frames % 1:
             return index + 1
         return index + (publish_time_ns - start_ns) / self._config.period_ns
-
-    def _count_late(self, late: bool) -> None:
-        """Count a command; report when commands become habitually late, and when they no longer are."""
-        if self._lateness.add(late):
-            event = "COMMANDS_LATE" if self._lateness.habitual else "COMMANDS_IN_TIME"
-            self._service.event(event, percent=self._lateness.percent)
 
     def _no_progress(self) -> str:
         """Text of the error of a run in lockstep without progress."""

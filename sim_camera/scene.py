@@ -90,11 +90,11 @@ class Scene:
         disturbance: Disturbance,
         rate_hz: float,
         seed: int,
-        noise: bool = True,
-        exposure: float = 0.0,
-        instants: int = 1,
-        pixels: PixelErrors | None = None,
-        shear_slopes: Array | None = None,
+        noise: bool,
+        exposure: float,
+        instants: int,
+        pixels: PixelErrors | None,
+        shear_slopes: Array | None,
     ) -> None:
         """Prepare everything that does not change from frame to frame.
 

@@ -27,7 +27,7 @@ class WavefrontAccumulator:
     samples of each; they are absent if not computed.
     """
 
-    def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int = 1, instants: int = 0) -> None:
+    def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int, instants: int = 0) -> None:
         """Start without frames.
 
         Args:
@@ -37,23 +37,22 @@ class WavefrontAccumulator:
             instants: samples of each period in the continuous truth; 0 if it is not computed.
         """
         self._noll, self._instants = noll, instants
-        self._value_count = 1 + len(noll) + (8 if instants else 4)
+        value_count = 1 + len(noll) + (8 if instants else 4)
         self._tilts = slice(0, sum(index in TIP_TILT for index in noll))  # tip and tilt are the first modes
         self._nm_per_mas = nm_per_mas
-        self._blocks = np.zeros((MAX_BLOCKS, self._value_count))
+        self._blocks = np.zeros((MAX_BLOCKS, value_count))
         self._frames, self._block_frames = 0, 1
-        self._recent = np.zeros((recent, self._value_count))
+        self._recent = np.zeros((recent, value_count))
 
-    def add(self, truth: Truth, added_flat: float = 0.0, added: Single | None = None) -> None:
+    def add(self, truth: Truth, added_flat: float, added: Single) -> None:
         """Add a frame.
 
         Args:
             truth: its true wavefront.
             added_flat: contrast that its disturbance adds with a flat mirror.
-            added: (modes,) contrast that each mode of its residual adds; None for zeros.
+            added: (modes,) contrast that each mode of its residual adds.
         """
-        contrasts = [added_flat, *([0.0] * len(self._noll) if added is None else added.tolist())]
-        values = (*contrasts, *self._squares(truth.sampled))
+        values = (added_flat, *added.tolist(), *self._squares(truth.sampled))
         if truth.continuous is not None:
             values += self._squares(truth.continuous)
         if self._frames == len(self._blocks) * self._block_frames:

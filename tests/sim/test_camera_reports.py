@@ -1,7 +1,6 @@
 """Reports of the simulated camera: statistics of the wavefront, habitually late commands, and the readout region."""
 
 from types import SimpleNamespace
-from typing import cast
 from unittest.mock import Mock
 
 import numpy as np
@@ -15,10 +14,17 @@ from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
 from sim_camera.driver import SimulatedCamera
 from sim_camera.lateness import WINDOW, Lateness
-from sim_camera.scene import Scene, Truth, Wavefront
+from sim_camera.scene import Truth, Wavefront
 from sim_camera.wavefront_statistics import MAX_BLOCKS, WavefrontAccumulator
 
 NOLL = (2, 3, 4)
+PIXELS = np.arange(80 * 80, dtype=np.uint16).reshape(80, 80)
+
+
+def camera_of(config: Configuration, **options: int) -> SimulatedCamera:
+    """A camera whose optics always give the same image."""
+    scene = SimpleNamespace(shape=PIXELS.shape, instants=(), expose=lambda index, shape: PIXELS)
+    return SimulatedCamera(SimulatedCamera.Options(**options), config, scene)
 
 
 def truth(residual_nm: float, noll: tuple[int, ...] = NOLL) -> Truth:
@@ -33,7 +39,7 @@ def statistics(
 ) -> WavefrontAccumulator:
     accumulator = WavefrontAccumulator(noll, nm_per_mas, recent)
     for residual_nm in residuals_nm:
-        accumulator.add(truth(residual_nm, noll))
+        accumulator.add(truth(residual_nm, noll), 0.0, np.zeros(len(noll)))
     return accumulator
 
 
@@ -97,8 +103,7 @@ def test_occasional_late_commands_are_not_habitual() -> None:
 def test_camera_reports_each_change_of_habitual_lateness() -> None:
     clock, config = FakeClock(), Configuration()
     listener = Listener(clock)
-    scene = cast("Scene", SimpleNamespace(shape=(80, 80), instants=()))
-    camera = SimulatedCamera(SimulatedCamera.Options(), config, scene)
+    camera = camera_of(config)
     camera.join(listener.service("camera"))
     states = listener.bus.publisher(MIRROR_STATE, config.mirror.name)
     shape = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
@@ -128,8 +133,7 @@ def test_camera_reports_each_change_of_habitual_lateness() -> None:
 
 
 def test_a_call_of_a_slow_camera_waits_half_a_second_at_most() -> None:
-    scene = cast("Scene", SimpleNamespace(shape=(80, 80), instants=(), expose=lambda index, shape: np.zeros((80, 80))))
-    camera = SimulatedCamera(SimulatedCamera.Options(), load(None, {"camera.rate_hz": 0.5}), scene)
+    camera = camera_of(load(None, {"camera.rate_hz": 0.5}))
     camera.join(Listener(FakeClock()).service("camera"))
     camera.start()
     assert [camera.expose() is None for _ in range(5)] == [False, True, True, True, False]
@@ -160,17 +164,13 @@ def test_every_frame_has_its_truth_in_order_and_at_once_in_lockstep(
 
 
 def test_region_is_read_at_the_centre_of_the_sensor() -> None:
-    pixels = np.arange(80 * 80, dtype=np.uint16).reshape(80, 80)
-    scene = cast("Scene", SimpleNamespace(shape=(80, 80), instants=(), expose=lambda index, shape: pixels))
-    options = SimulatedCamera.Options(rows=64, columns=50)
-    camera, clock = SimulatedCamera(options, Configuration(), scene), FakeClock()
+    camera = camera_of(Configuration(), rows=64, columns=50)
     settings = camera.settings()
     region = settings.region_row, settings.rows, settings.region_column, settings.columns
     assert region == (8, 64, 15, 50)
-    camera.join(Listener(clock).service("camera"))
+    camera.join(Listener(FakeClock()).service("camera"))
     camera.start()
     exposure = camera.expose()
-    assert exposure is not None
-    assert np.array_equal(exposure.pixels, pixels[8:72, 15:65])
+    assert np.array_equal(exposure.pixels, PIXELS[8:72, 15:65])
     with pytest.raises(ConfigurationError, match="rows is 81, the sensor has 80"):
-        SimulatedCamera(SimulatedCamera.Options(rows=81), Configuration(), scene)
+        camera_of(Configuration(), rows=81)

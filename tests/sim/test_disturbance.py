@@ -48,8 +48,7 @@ def preset(name: str, seed: int = 1, **more: object) -> Disturbance:
 
 def rms_nm(disturbance: Disturbance) -> np.ndarray:
     """Rms of each mode over all time, from the amplitudes of its sine waves."""
-    result: np.ndarray = np.sqrt(np.sum(np.abs(disturbance.amplitude_nm) ** 2, axis=0) / 2)
-    return result
+    return np.sqrt(np.sum(np.abs(disturbance.amplitude_nm) ** 2, axis=0) / 2)
 
 
 def check_order_and_block(name: str, first: int, count: int, cut: int) -> None:
@@ -313,7 +312,6 @@ def test_faulty_publisher_sends_the_configured_frames(kind: Kind) -> None:
         if kind is Kind.TRUNCATED and faulty_range:
             assert frame.pixels is None
         else:
-            assert frame.pixels is not None
             np.testing.assert_array_equal(frame.pixels, IMAGE + np.uint16(index))
     counts = Counter(count_of(sample.sequence) for sample in received)
     assert set(counts) == set(range(90))

@@ -12,8 +12,7 @@ INSTANTS = np.array([0.1, 0.5, 0.9])
 
 def heights(path: MirrorPath, start: float) -> list[float]:
     shapes, weights = path.over(start, INSTANTS)
-    found: list[float] = (weights @ np.array(shapes)[:, 0, 0]).tolist()
-    return found
+    return (weights @ np.array(shapes)[:, 0, 0]).tolist()
 
 
 def test_shape_applies_from_its_time_on() -> None:

@@ -38,7 +38,6 @@ def test_dark_current_raises_the_mean_of_frames() -> None:
 
 def test_hot_pixels_and_gains_have_the_configured_statistics() -> None:
     found = pixel_errors(DETECTOR, (300, 400), 1, 0.02, 0.0, 0.01, 50.0)
-    assert found is not None
     assert found.gain.std() == pytest.approx(0.02, rel=0.02)
     hot = found.hot_e[found.hot_e > 0]
     assert hot.size == pytest.approx(1200, abs=4 * np.sqrt(1200))
