@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 from lowfc.contract.configuration import load
-from tools.prediction import tilt_residual_mas
+from tools.laws import tilt_residual_mas
 from tools.shared import Results, formatted_table, json_of
 
 LOOP = "lowfc sim-loop --disturbance reaction-wheel --star-magnitude 2 --sensor sam27d10_bal14 --duration 20"

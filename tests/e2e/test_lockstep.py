@@ -15,8 +15,8 @@ from lowfc.contract.messages import topic_of, wire
 from lowfc.contract.sections import SENSORS
 from lowfc.optics.chain.sensor import light_budget
 from tests.support.loops import children, loop, lowfc, output_of, payloads, recorded_bytes, start, until
+from tools.laws import tilt_residual_mas
 from tools.measure import measured
-from tools.prediction import tilt_residual_mas
 
 GENTLE = """
 [camera]

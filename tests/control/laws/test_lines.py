@@ -5,17 +5,33 @@ import pytest
 import scipy
 
 from lowfc.adapters.files.factory import frame_noise_nm
+from lowfc.arrays import Array
+from lowfc.contract.configuration import Configuration
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.kalman import lqg_block
 from lowfc.control.laws.linear_law import LinearLaw, law_from_blocks
 from lowfc.control.laws.margins import margins
+from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG
 from lowfc.control.laws.tuning import within_margins
 from lowfc.control.laws.vibration import Line, Model
-from sim_camera.disturbance import LINES_HZ, LINES_MAS
+from sim_camera.disturbance import LINES_HZ, LINES_MAS, Sampler
+from sim_camera.driver import disturbance_of
+from sim_camera.scene import GAUSS_LEGENDRE
 from tests.support.theory import one_piece
-from tools import laws, lines
+from tools import laws
 from tools.law_bench import RATE_HZ, Bench, calibrated, configured, tuned
+
+WIDTHS, DELAYS, FRAMES = (0.001, 0.005, 0.02), (1.0, 2.0), 16_000
+
+
+def tilts_of(config: Configuration, noise_nm: Array, frames: int = FRAMES) -> TimeSeries:
+    """Pseudo-open-loop tilts (frames, 2) as the sensor would measure them: means over exposures, with white noise."""
+    instants = config.camera.exposure_fraction * GAUSS_LEGENDRE
+    sampler = Sampler(disturbance_of(config), instants, RATE_HZ)
+    exposure_nm = np.array([sampler.at(index)[:, :2].mean(axis=0) for index in range(frames)], np.float64)
+    noise = np.random.default_rng([config.seed, 5]).standard_normal((frames, 2))
+    return one_piece(exposure_nm + noise_nm * noise)
 
 
 @pytest.mark.slow
@@ -23,23 +39,30 @@ def test_an_identified_law_is_nearly_optimal() -> None:
     """At a noise level at which the margins are no constraint."""
     config = configured()
     calibration = calibrated(config)
-    law = tuned(lines.tilts_of(config, frame_noise_nm(config, calibration)[:2], 8000), config)["lqg"].law
+    law = tuned(tilts_of(config, frame_noise_nm(config, calibration)[:2], 8000), config)["lqg"].law
     assert np.hypot(*laws.theory_mas(config, calibration, law)) < 1.05 * laws.optimum_mas(config, calibration)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("delay", lines.DELAYS)
-@pytest.mark.parametrize("magnitude", lines.MAGNITUDES)
-@pytest.mark.parametrize("width", lines.WIDTHS)
+@pytest.mark.parametrize("delay", DELAYS)
+@pytest.mark.parametrize("magnitude", [0.0, 2.0, 5.0])
+@pytest.mark.parametrize("width", WIDTHS)
 def test_laws_are_nearly_optimal_within_the_margins(width: float, magnitude: float, delay: float) -> None:
-    residuals = lines.case(width, magnitude, delay)
-    assert max(residuals["identified_mas"]) < 1.06 * residuals["best_within_margins_mas"]
-    assert residuals["optimum_mas"] <= 1.001 * residuals["best_within_margins_mas"]
+    """Laws are identified without images; `test_modal_simulation_agrees_with_images` compares both."""
+    keys = {"star.magnitude": magnitude, "disturbance.line_width": width}
+    config = configured(delay_frames=delay, **keys)
+    calibration = calibrated(config)
+    best_mas = laws.optimum_mas(config, calibration, robust=True)
+    assert laws.optimum_mas(config, calibration) <= 1.001 * best_mas
+    for seed in range(1, 11):
+        own = configured(delay_frames=delay, seed=seed, **keys)
+        law = tuned(tilts_of(own, frame_noise_nm(own, calibration)[:2]), own)["lqg"].law
+        assert np.hypot(*laws.theory_mas(own, calibration, law)) < 1.06 * best_mas
 
 
 @pytest.mark.parametrize("noise_nm", [0.05, 2.0])
-@pytest.mark.parametrize("width", lines.WIDTHS)
-@pytest.mark.parametrize("delay", lines.DELAYS)
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("delay", DELAYS)
 def test_a_filter_keeps_the_margins_at_any_noise(noise_nm: float, width: float, delay: float) -> None:
     """With less noise a filter has more gain and smaller margins, so the tuning overestimates the noise as needed."""
     timing = Timing.of(delay, 0.5)
@@ -69,10 +92,10 @@ def test_modal_simulation_agrees_with_images() -> None:
     calibration = calibrated(config)
     bench = Bench(config, calibration)
     bench.settle(1000)
-    bench.run(lines.FRAMES)
+    bench.run(FRAMES)
     noise_nm = frame_noise_nm(config, calibration)[:2]
     tuned_laws = []
-    for pol in (one_piece(bench.pol().values[0][:, :2]), lines.tilts_of(config, noise_nm, lines.FRAMES)):
+    for pol in (one_piece(bench.pol().values[0][:, :2]), tilts_of(config, noise_nm)):
         frequency_hz, density = scipy.signal.welch(pol.values[0], RATE_HZ, nperseg=2000, axis=0)
         level_nm = np.sqrt(density[(frequency_hz > 400) & (frequency_hz < 490)].mean(axis=0) * RATE_HZ / 2)
         np.testing.assert_allclose(level_nm, noise_nm, rtol=0.1)
