@@ -71,7 +71,7 @@ class Case:
         bench = ModalBench(config, self.covariance_nm2, replace(disturbance, step_nm=step_nm), watch=False)
         bench.ask("gain", modes=config.noll, values=tuple(self.gains.tolist()))
         if law is not None:
-            bench.load(law)
+            bench.ask("law", law=law)
         bench.run(_SETTLE, record=False)
         bench.ask("close")
         return bench

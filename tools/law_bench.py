@@ -12,7 +12,6 @@ from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.sections import sensor_keys
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
-from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.tuning import Tuned, best_gains, identify_modes, tune_integrator, tune_lqg, tune_pi_notch
@@ -134,10 +133,6 @@ class Bench:
         self.ask("close")
         self.run(frames, record=False)
         self.new_record()
-
-    def load(self, law: LinearLaw) -> None:
-        """Let a law drive the mirror."""
-        self.ask("law", law=law)
 
     def expose(self) -> tuple[Single, Pixels]:
         """Expose; the mirror's shape (rows, columns) in the exposure, and the frame."""

@@ -281,7 +281,7 @@ def test_a_wrong_delay_is_detected_as_amplification() -> None:
     config = wheel.configured(1, **{"control.delay_frames": 1.0, "camera.delay_frames": 2.0})
     bench = ModalBench(config, wheel.covariance_nm2, watch=False)
     bench.settle(1000)
-    bench.load(wheel.law)
+    bench.ask("law", law=wheel.law)
     bench.run(2500)
     event = next(event for _, event in bench.events if event.name == "LAW_OVERRULED")
     assert "without correction there would be" in event.details["why"]

@@ -288,7 +288,7 @@ def test_a_harmful_loop_without_a_law_opens_if_configured(on_harm: str) -> None:
 def test_the_integrator_takes_over_from_a_harmful_law_once_the_loop_is_not_reserved() -> None:
     loop = harmful("integrator")
     law = loop.settings.integrator(loop.config.noll)
-    loop.load(integrator(law.gain, law.leak, loop.config.noll, loop.settings.delay_frames, 250.0))
+    loop.ask("law", law=integrator(law.gain, law.leak, loop.config.noll, loop.settings.delay_frames, 250.0))
     loop.run(100)
     loop.process_input(Request(loop.steps[-1].time_ns, "lease", (), (60.0,), "another client", lease_id=1))
     loop.run(1000)

@@ -33,7 +33,7 @@ def residual_mas(bench: Bench, run: TimeSeries, timing: Timing, *, continuous: b
     """Residual in mas, over all time or only at the starts of exposures, with the law tuned from a run for a timing."""
     rate_hz, no_leak = bench.config.camera.rate_hz, np.zeros(2)
     gains = best_gains(run, rate_hz, timing, no_leak)
-    bench.load(tune_lqg(run, identify_modes(run, rate_hz), gains, (2, 3), no_leak, timing).law)
+    bench.ask("law", law=tune_lqg(run, identify_modes(run, rate_hz), gains, (2, 3), no_leak, timing).law)
     bench.new_record()
     bench.run(SETTLE + MEASURE)
     return bench.tilt_mas(MEASURE, continuous=continuous)

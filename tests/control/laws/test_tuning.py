@@ -148,17 +148,17 @@ def test_lqg_agrees_with_theory_and_adapts_to_shifted_lines(delay: float) -> Non
     bench.settle(1000)
     bench.run(20_000)
     law = tuned(bench.pol(), config)["lqg"].law
-    bench.load(law)
+    bench.ask("law", law=law)
     bench.run(10_000)
     measured_mas = bench.tilt_mas(5000)
     assert measured_mas < 1.15 * float(np.hypot(*laws.theory_mas(config, calibration, law)))
     assert measured_mas < 1.15 * laws.optimum_mas(config, calibration)
 
     moved = Bench(config, calibration, with_lines_moved(disturbance_of(config), 1.02))
-    moved.load(law)
+    moved.ask("law", law=law)
     moved.settle(2000)
     moved.run(20_000)
-    moved.load(tuned(moved.pol(), config)["lqg"].law)
+    moved.ask("law", law=tuned(moved.pol(), config)["lqg"].law)
     moved.run(10_000)
     assert moved.tilt_mas(5000) < 1.15 * measured_mas
 
@@ -174,7 +174,7 @@ def test_a_tuned_law_captures_jitter_of_14_mas_and_leaves_less_than_1_3_mas_for_
     residual = {}
     for seed in range(20):
         fresh = Bench(configured(seed=seed + 100), calibration)
-        fresh.load(law)
+        fresh.ask("law", law=law)
         fresh.run(300)
         fresh.ask("close")
         fresh.run(3500)
