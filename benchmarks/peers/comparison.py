@@ -272,7 +272,7 @@ def tables(result: Result) -> list[Lines]:
         if one.name in runs
     ]
     latencies = [HEADINGS, *(_cells(name, each, name in result["missing"]) for name, each in runs.items())]
-    others = [name for name in runs if name != FUSED and _pairs(runs, name)]
+    others = [name for name in runs if name != FUSED and pairs(runs, name)]
     return [
         latencies,
         [
@@ -297,15 +297,16 @@ def _spans(turns: Sequence[Result], span: str, names: Iterable[str]) -> list[str
     return [ranged([one[at] for one in known], "{:.0f}".format) if known else "" for at in names]
 
 
-def _pairs(runs: Result, other: str) -> list[tuple[Result, Result]]:
+def pairs(runs: Result, other: str) -> list[tuple[Result, Result]]:
+    """Percentiles from frame to command of lowfc's fused step and of another implementation, by turn."""
     turns = zip(runs.get(FUSED, ()), runs[other], strict=False)
     return [(mine["frame_to_command"], its["frame_to_command"]) for mine, its in turns if mine and its]
 
 
 def _difference(runs: Result, other: str) -> list[str]:
-    pairs = _pairs(runs, other)
-    each = [[mine[at] - its[at] for mine, its in pairs] for at in ("p50", "p99")]
-    ahead = [f"{sum(one < 0 for one in differences)} of {len(pairs)}" for differences in each]
+    both = pairs(runs, other)
+    each = [[mine[at] - its[at] for mine, its in both] for at in ("p50", "p99")]
+    ahead = [f"{sum(one < 0 for one in differences)} of {len(both)}" for differences in each]
     return [other, *(ranged(differences, "{:+.0f}".format) for differences in each), *ahead]
 
 
