@@ -93,10 +93,15 @@ def offered(package: str) -> str:
     if hasattr(root, "__all__"):
         documented = [(name, _about(getattr(root, name))) for name in root.__all__]
     else:
-        modules = [module.name for module in walk_packages(root.__path__, f"{package}.") if not module.ispkg]
-        documented = [(name, import_module(name).__doc__) for name in modules]
+        documented = [(name, import_module(name).__doc__) for name in modules(package)]
     rows = ((f"`{name}`", one_line((text or "").split("\n\n")[0])) for name, text in documented)
     return markdown(("name", ""), rows)
+
+
+def modules(package: str) -> list[str]:
+    """Dotted names of the modules of a package and of the packages in it."""
+    found = walk_packages(import_module(package).__path__, f"{package}.")
+    return [module.name for module in found if not module.ispkg]
 
 
 def _about(value: Any) -> str | None:
@@ -132,12 +137,16 @@ def topics(role: Role, *own: Topic) -> str:
     """Topics that a role publishes and subscribes to."""
     rows = []
     for topic in (*own, EVENT, HEALTH):
-        when = f"{topic.rate:g} Hz" if isinstance(topic.rate, float) else str(topic.rate)
         does = "publish" if role in topic.publishers else "subscribe"
         answers = "; the last one is returned on query" if topic.queryable else ""
         name = topic.message.DESCRIPTOR.full_name
-        rows.append((f"`{topic.key}`", f"`{name}`", when, does, topic.description.rstrip(".") + answers))
+        rows.append((f"`{topic.key}`", f"`{name}`", when(topic), does, topic.description.rstrip(".") + answers))
     return markdown(("topic", "message", "when", "you", ""), rows)
+
+
+def when(topic: Topic) -> str:
+    """Rate or occasion at which a topic is published."""
+    return f"{topic.rate:g} Hz" if isinstance(topic.rate, float) else str(topic.rate)
 
 
 def fields(message: str) -> str:

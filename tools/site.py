@@ -7,14 +7,12 @@ import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib import import_module
-from pkgutil import walk_packages
 from types import ModuleType
 from typing import Any, get_args
 
 import typer
 from typer.main import get_command
 
-import lowfc.programs
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.former_names import FIELDS, KEYS, LAW_EXTENSIONS, VALUES
 from lowfc.contract.messages import EVERYBODY, TOPICS
@@ -23,7 +21,7 @@ from lowfc.contract.sections import InterlockSection
 from lowfc.contract.wire import lowfc_pb2
 from lowfc.programs.cli.main import app
 from lowfc.programs.cli.result import Result
-from tools.declared import API, fields, one_line
+from tools.declared import API, fields, modules, one_line, when
 from tools.shared import markdown
 
 _BUILT = re.compile(r"^<!-- built: (.+?) -->$", re.MULTILINE)
@@ -90,7 +88,6 @@ def topics() -> str:
     """Every topic."""
     rows = []
     for topic in TOPICS:
-        when = f"{topic.rate:g} Hz" if isinstance(topic.rate, float) else str(topic.rate)
         full = topic.message.DESCRIPTOR.full_name
         own = full.startswith("lowfc.")
         message = f"[`{full}`](messages.md#{full.rpartition('.')[2].lower()})" if own else f"`{full}`"
@@ -98,7 +95,7 @@ def topics() -> str:
             "any" if roles == EVERYBODY else ", ".join(sorted(roles)) for roles in (topic.publishers, topic.subscribers)
         ]
         about = f"{topic.description}{' The last one is returned on query.' if topic.queryable else ''}"
-        rows.append((f"`{topic.key}`", message, when, *who, about))
+        rows.append((f"`{topic.key}`", message, when(topic), *who, about))
     return markdown(("topic", "message", "when", "published by", "received by", ""), rows)
 
 
@@ -115,8 +112,11 @@ def messages() -> str:
 
 def json_objects() -> str:
     """Every typed `--json` object."""
+    for module in modules("lowfc.programs"):
+        import_module(module)
+    printed = {one for one in _subclasses(Result) if one.model_fields and one.__module__.startswith("lowfc.")}
     rows = []
-    for result in sorted(_subclasses(Result), key=lambda each: f"{each.__module__}.{each.__name__}"):
+    for result in sorted(printed, key=lambda each: f"{each.__module__}.{each.__name__}"):
         *_, package, module = result.__module__.split(".")
         command = module if package == "cli" else package  # every other command is a package
         about = f"{one_line(result.__doc__)}. Printed by `lowfc {command}`."
@@ -140,14 +140,7 @@ def _type(annotation: Any) -> str:
 
 
 def _subclasses(kind: type[Result]) -> set[type[Result]]:
-    for module in walk_packages(lowfc.programs.__path__, "lowfc.programs."):
-        import_module(module.name)
-    below: set[type[Result]] = set()
-    new = {kind}
-    while new:
-        new = {child for one in new for child in one.__subclasses__()} - below
-        below |= new
-    return {one for one in below if one.model_fields and one.__module__.startswith("lowfc.")}
+    return {one for child in kind.__subclasses__() for one in (child, *_subclasses(child))}
 
 
 def former_names() -> str:
@@ -167,8 +160,7 @@ def api(package: str) -> str:
     top = import_module(package)
     if hasattr(top, "__all__"):
         return _module(top)
-    names = [found.name for found in walk_packages(top.__path__, f"{package}.") if not found.ispkg]
-    return "\n".join(_module(import_module(name)) for name in names)
+    return "\n".join(_module(import_module(name)) for name in modules(package))
 
 
 def _module(module: ModuleType) -> str:
