@@ -1,6 +1,5 @@
 """Automatic gains for stars of all magnitudes: effect of closing the loop, and comparison with the best fixed gains."""
 
-from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 from typing import Any
@@ -137,12 +136,10 @@ def harms(row: Results) -> bool:
     return bool(row["change"] > errors * row["error"] + TOLERATED * row["own"])
 
 
-def measure(
-    sensors: Sequence[str] = MODAL, magnitudes: Sequence[float] = MAGNITUDES, imaged: Sequence[str] = IMAGED
-) -> Results:
+def measure() -> Results:
     """All cases."""
-    modal_cases = [(one, preset, star) for one in sensors for preset in PRESETS for star in magnitudes]
-    imaged_cases = [(one, preset, star) for one in imaged for preset in PRESETS for star in IMAGED_MAGNITUDES]
+    modal_cases = [(one, preset, star) for one in MODAL for preset in PRESETS for star in MAGNITUDES]
+    imaged_cases = [(one, preset, star) for one in IMAGED for preset in PRESETS for star in IMAGED_MAGNITUDES]
     with threadpool_limits(1), ProcessPoolExecutor(initializer=threadpool_limits, initargs=(1,)) as pool:
         rows = list(track(pool.map(modal_case, modal_cases), "modes", total=len(modal_cases)))
         rows += list(track(pool.map(imaged_case, imaged_cases), "images", total=len(imaged_cases)))

@@ -46,16 +46,16 @@ CALIBRATED = ("hot pixels", "nonlinear pixel response", "pixel gain errors")
 """Cases that are repeated with dark and reference image measured on that detector."""
 
 
-def measure(sensors: tuple[str, ...] = SENSORS, seconds: float = SECONDS) -> Results:
+def measure() -> Results:
     """Measure every case with each sensor and star."""
     rows = []
     with threadpool_limits(1):
         for name, keys in track(CASES.items(), "cases"):
             for calibrate_detector in (False, True) if name in CALIBRATED else (False,):
-                pairs = [(sensor, magnitude) for sensor in sensors for magnitude in MAGNITUDES]
-                figures = [_residual(*pair, keys, seconds, calibrate_detector) | {"of": pair} for pair in pairs]
+                pairs = [(sensor, magnitude) for sensor in SENSORS for magnitude in MAGNITUDES]
+                figures = [_residual(*pair, keys, calibrate_detector) | {"of": pair} for pair in pairs]
                 rows.append({"name": name, "keys": keys, "calibrated": calibrate_detector, "figures": figures})
-    return {"rows": rows, "seconds": seconds}
+    return {"rows": rows, "seconds": SECONDS}
 
 
 def _configured(sensor: str, magnitude: float, keys: dict[str, Any]) -> Configuration:
@@ -74,7 +74,7 @@ def _gains(sensor: str, magnitude: float) -> tuple[float, ...]:
     return tuple(bench.state.loop.integrator.gain.tolist())
 
 
-def _residual(sensor: str, magnitude: float, keys: dict[str, Any], seconds: float, calibrate_detector: bool) -> Results:
+def _residual(sensor: str, magnitude: float, keys: dict[str, Any], calibrate_detector: bool) -> Results:
     """Residual wavefront over the open pupil and added contrast, continuous, over the second half of the run.
 
     With `calibrate_detector`, dark and reference image are measured on the detector of the case.
@@ -83,7 +83,7 @@ def _residual(sensor: str, magnitude: float, keys: dict[str, Any], seconds: floa
     calibration = calibrated(config)
     bench = Bench(config, _calibrated_on_detector(config, calibration) if calibrate_detector else calibration)
     bench.ask("gain", modes=config.noll, values=_gains(sensor, magnitude))
-    frames = round(seconds * RATE_HZ)
+    frames = round(SECONDS * RATE_HZ)
     bench.run(frames)
     truths = bench.truths[-frames // 2 :]
     modes_nm = np.concatenate([truth.instants_nm[1] for truth in truths]).astype(float)
