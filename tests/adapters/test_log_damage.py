@@ -33,25 +33,23 @@ from tests.support.mutated_logs import (
     boundaries,
     changed,
     chunks_of,
-    contents,
     flipped,
-    mutations,
+    mutated,
     small_log,
     small_samples,
 )
 
-Message = tuple[str, bytes, int, int, int]
-SENT: list[Message] = contents(small_samples())
+SENT = small_samples()
 
 
-def read_of(reader: LogReader) -> tuple[list[Message], str]:
+def read_of(reader: LogReader) -> tuple[list[Sample], str]:
     """Messages that a reader delivers, and its error."""
     read: list[Sample] = []
     try:
         read.extend(reader)
     except DataFileError as error:
-        return contents(read), str(error)
-    return contents(read), ""
+        return read, str(error)
+    return read, ""
 
 
 @pytest.mark.parametrize("finished", [True, False])
@@ -59,7 +57,8 @@ def test_a_damaged_log_yields_no_false_message_and_no_silent_loss(tmp_path: Path
     data = small_log(tmp_path / "whole.mcap", finished=finished).read_bytes()
     assert len(boundaries(data)) > 50
     path, delivered = tmp_path / "mutated.mcap", 0
-    for number, kind, content in mutations(data, range(finished, MUTATIONS, 2)):
+    for number in range(finished, MUTATIONS, 2):
+        kind, content = mutated(data, number)
         path.write_bytes(content)
         case = f"mutation {number}: {kind}"
         read_strictly, strict_error = read_of(LogReader(path))
@@ -163,7 +162,7 @@ NO_CHUNKS = {"use_chunking": False}
 def test_a_rewritten_log_is_read_as_the_original(tmp_path: Path, source: Path, options: dict[str, Any]) -> None:
     path = rewritten(source, tmp_path / "rewritten.mcap", options)
     reader = LogReader(path)
-    assert sorted(contents(list(reader))) == sorted(SENT)
+    assert sorted(reader) == sorted(SENT)
     assert (reader.damage, reader.unreadable, reader.finished, reader.complete) == ([], 0, True, True)
     assert reader.metadata == METADATA | {"recording": {"messages": str(len(SENT))}}
     assert reader.attachments == {attachment.name: attachment.data for attachment in ATTACHMENTS}
@@ -212,13 +211,13 @@ def test_only_the_damaged_chunk_of_a_rewritten_log_is_lost(
         os.truncate(path, chunks[-1][1])
     changed(path, chunks[5][0] + at, b"\xff")
     reader = LogReader(path, skip_damaged=True)
-    read = contents(list(reader))
+    read = list(reader)
     assert set(SENT).issuperset(read)
     assert len(SENT) / 2 < len(read) < len(SENT)
     assert reader.damage[0].position == chunks[5][0]
     assert sum(damage.length for damage in reader.damage) < chunks[6][0] - chunks[5][0] + 1
     recovered = recover(path, tmp_path / "recovered.mcap").recovered
-    assert contents(list(LogReader(recovered))) == read
+    assert list(LogReader(recovered)) == read
 
 
 @pytest.mark.parametrize(
@@ -236,7 +235,7 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
     path = rewritten(source, tmp_path / "rewritten.mcap", NO_CRCS)
     data = path.read_bytes()
     changed(path, next(start for start in boundaries(data) if data[start] == opcode) + at, new)
-    assert sorted(contents(list(LogReader(path)))) == sorted(SENT)
+    assert sorted(LogReader(path)) == sorted(SENT)
     with LogFile(path) as file:
         assert list(file.index()) == []
 
@@ -250,10 +249,10 @@ def test_of_two_logs_in_one_file_the_first_is_read_and_the_second_reported(
     second = rewritten(source, tmp_path / "second.mcap", {}).read_bytes()
     second = second[: len(second) - cuts[1]]
     source.write_bytes(first)
-    expected = contents(list(LogReader(source)))
+    expected = list(LogReader(source))
     source.write_bytes(first + second)
     reader = LogReader(source, skip_damaged=True)
-    assert contents(list(reader)) == expected
+    assert list(reader) == expected
     damage = reader.damage[-1]
     assert len(reader.damage) == 1 + bool(cuts[0])
     assert (damage.position, damage.length) == (len(first), len(second))
@@ -265,7 +264,7 @@ def test_another_file_after_a_log_is_damage(source: Path) -> None:
     log = source.read_bytes()
     source.write_bytes(log + b"no log" + log[-8:])
     reader = LogReader(source, skip_damaged=True)
-    assert contents(list(reader)) == SENT
+    assert list(reader) == SENT
     assert [damage.why for damage in reader.damage] == ["the summary is damaged, or another file was appended"]
 
 
@@ -288,7 +287,7 @@ def test_unchunked_messages_are_covered_by_the_data_checksum_and_read_up_to_a_tr
     assert [damage.why.partition(",")[0] for damage in reader.damage] == ["its parts are intact"]
     os.truncate(path, middle)
     reader = LogReader(path)
-    read = contents(list(reader))
+    read = list(reader)
     assert len(SENT) / 4 < len(read) < len(SENT)
     assert set(SENT).issuperset(read)
     assert not reader.complete

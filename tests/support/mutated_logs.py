@@ -1,7 +1,7 @@
 """Randomly damaged bytes, messages and logs, reproducible from a generator or from a number."""
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from random import Random
@@ -59,11 +59,6 @@ def small_log(path: Path, *, finished: bool = True) -> Path:
     log.flush()
     log.abandon()
     return log.part
-
-
-def contents(messages: list[Sample]) -> list[tuple[str, bytes, int, int, int]]:
-    """Fields of messages as tuples, to compare sent and read ones."""
-    return [(m.key, m.payload, m.sequence, m.publish_time_ns, m.receive_time_ns) for m in messages]
 
 
 def boundaries(data: bytes) -> list[int]:
@@ -132,11 +127,6 @@ def mutated(data: bytes, number: int) -> tuple[str, bytes]:
     if bytes(changed) == data:
         changed[number % len(data)] ^= 1
     return kind, bytes(changed)
-
-
-def mutations(data: bytes, numbers: range) -> Iterator[tuple[int, str, bytes]]:
-    for number in numbers:
-        yield number, *mutated(data, number)
 
 
 ODD_BYTES = (b"", b"\0", b"\xff" * 8, b"\x80" + b"\xff" * 9, b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", b"\n")
