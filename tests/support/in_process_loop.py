@@ -62,8 +62,7 @@ def configuration(keys: dict[str, Any], **changes: Any) -> Configuration:
 
 @lru_cache(maxsize=4)
 def computed(toml: str) -> Calibration:
-    config = Configuration.model_validate(tomllib.loads(toml))
-    return calibrated(config)
+    return calibrated(Configuration.model_validate(tomllib.loads(toml)))
 
 
 class Reservation:

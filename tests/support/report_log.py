@@ -68,7 +68,6 @@ class SyntheticLog:
         self._count = self._frames = 0
         self._to_modes = np.linalg.pinv(self.calibration.modes_to_actuators)
         self._moved_nm = np.zeros(len(NOLL), np.float32)
-        self._state = State()
         self.start_controller()
         camera = wire.CameraState(
             period_ns=PERIOD_NS,
@@ -83,12 +82,11 @@ class SyntheticLog:
     def start_controller(self) -> None:
         """Start a new controller, without the state of the previous one."""
         self.event("STARTED", process="controller", version="0.1.0")
-        self.put(CALIBRATION, encode_calibration(self.calibration, self.now_ns))
         self._state = State()
-        self._publish(advance(self.settings, self._state, Load(self.now_ns, self.calibration, "test")))
+        self.load(self.calibration)
 
     def load(self, calibration: Calibration) -> None:
-        """Load another calibration; the pixels remain those of the first one."""
+        """Load a calibration; the pixels remain those of the first one."""
         self.put(CALIBRATION, encode_calibration(calibration, self.now_ns))
         self._publish(advance(self.settings, self._state, Load(self.now_ns, calibration, "test")))
 
@@ -101,7 +99,8 @@ class SyntheticLog:
         for index in range(number):
             self.now_ns += PERIOD_NS
             sequence = sequence_of(self._camera_start, self._count)
-            wave_nm = self._disturbance_nm()
+            time_s = self._frames * PERIOD_NS * 1e-9
+            wave_nm = np.array([12 * np.sin(2 * np.pi * 7 * time_s), 3.0, -2.0], np.float32)
             residual_nm = wave_nm + self._moved_nm
             frame = self._pixels(residual_nm, 0.0 if index in dark else FLUX_DN)
             self._count, self._frames = self._count + 1, self._frames + 1
@@ -131,7 +130,6 @@ class SyntheticLog:
         request = Request(self.now_ns, name, modes, values, **fields)
         before = self._state
         after, outputs = advance(self.settings, before, request)
-        assert outputs.reply is not None
         self.put(REQUEST, codec.encode_request(request, outputs.reply, after.input_number, None))
         self._publish((after, outputs))
         return self
@@ -236,10 +234,6 @@ class SyntheticLog:
         if outputs.changed or self._frames % 100 == 0:
             state_now = controller_state(self._state, self.settings, self.now_ns)
             self.put(CONTROLLER_STATE, state_now, late_ns=late_ns)
-
-    def _disturbance_nm(self) -> Single:
-        time_s = self._frames * PERIOD_NS * 1e-9
-        return np.array([12 * np.sin(2 * np.pi * 7 * time_s), 3.0, -2.0], np.float32)
 
     def _pixels(self, residual_nm: Single, flux_dn: float) -> Pixels:
         """Draw photon and read noise."""

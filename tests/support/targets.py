@@ -116,6 +116,15 @@ class Loop:
         self.count += 1
         self.process_input(frame(self.count))
 
+    def mirror_state(self, data: bytes) -> None:
+        shape = codec.decode_mirror(data)
+        if shape is not None:
+            self.process_input(shape)
+            advance(NORMAL, loaded(NORMAL), shape)  # a controller that has sent no command adopts the shape
+
+    def camera_state(self, data: bytes) -> None:
+        self.process_input(codec.decode_camera(data, 3))
+
 
 def targets(folder: Path) -> list[Target]:
     """All targets; files are written to `folder`."""
@@ -130,7 +139,8 @@ class Processes:
 
     def __init__(self) -> None:
         self.hub, self.clock, self.number = MemoryHub(), FakeClock(), 0
-        self.services = [Service(name, "fuzz", self.clock, MemoryBus(self.hub, name, self.clock)) for name in ROLES]
+        roles = ("controller", "mirror-dm")
+        self.services = [Service(name, "fuzz", self.clock, MemoryBus(self.hub, name, self.clock)) for name in roles]
         self.mirror = MirrorLoop(SimulatedMirror(DriverOptions(), CONFIG), self.services[1], CONFIG)
         self.controller = Controller(CONFIG, self.services[0], CALIBRATION, "a test", Latch(()))
         self.controller._mirror_adopted = True
@@ -166,14 +176,11 @@ class Processes:
         assert violations(self.mirror._protection.limits, driven_nm, driven_nm) == []
 
 
-ROLES = ("controller", "mirror-dm")
 EXTREMES = (0, 1, 5, 1 << 31, 1 << 32, 1_800_000_000 << 32, 1 << 62, (1 << 62) + 1, 1 << 63, (1 << 64) - 1)
 
 
 def _messages() -> list[Target]:
     loop, processes = Loop(), Processes()
-    pixels = frame(1).pixels
-    assert pixels is not None
     state = loaded(NORMAL)
     shape = np.ones(GRID, np.float32)
     modes = np.ones(len(NOLL), np.float32)
@@ -183,7 +190,7 @@ def _messages() -> list[Target]:
     command.actuators, command.command_nm[:] = shape.tobytes(), modes.tolist()
     mirror_state = wire.MirrorState(rows=4, columns=5, actuators=shape.tobytes(), command_nm=modes.tolist())
     camera = wire.CameraState(rows=6, columns=7, bias_dn=100, saturation_dn=6e4)
-    frame_bytes = image(pixels, 5, "sensor").SerializeToString()
+    frame_bytes = image(frame(1).pixels, 5, "sensor").SerializeToString()
     command_bytes, mirror_bytes, camera_bytes = (one.SerializeToString() for one in (command, mirror_state, camera))
     return [
         Target("envelope", (ENVELOPE,), Envelope.decode, (LowfcError,)),
@@ -191,8 +198,8 @@ def _messages() -> list[Target]:
         Target("camera to controller", (frame_bytes,), processes.frame, message=codec.RawImage, cost=10),
         Target("controller to mirror", (command_bytes,), processes.command, message=wire.MirrorCommand, cost=10),
         Target("camera's settings", (camera_bytes,), processes.settings, message=wire.CameraState, cost=10),
-        Target("mirror state", (mirror_bytes,), partial(_process_mirror_state, loop), (LowfcError,), wire.MirrorState),
-        Target("camera state", (camera_bytes,), partial(_process_camera_state, loop), (LowfcError,), wire.CameraState),
+        Target("mirror state", (mirror_bytes,), loop.mirror_state, (LowfcError,), wire.MirrorState),
+        Target("camera state", (camera_bytes,), loop.camera_state, (LowfcError,), wire.CameraState),
         Target(
             "bench value",
             tuple(encode_bench_value(value, 5) for value in (True, 2.5, "parked")),
@@ -229,17 +236,6 @@ def _messages() -> list[Target]:
         ),
         Target("a view's messages", (command_bytes,), _show, cost=10),
     ]
-
-
-def _process_mirror_state(loop: Loop, data: bytes) -> None:
-    shape = codec.decode_mirror(data)
-    if shape is not None:
-        loop.process_input(shape)
-        advance(NORMAL, loaded(NORMAL), shape)  # a controller that has sent no command adopts the shape
-
-
-def _process_camera_state(loop: Loop, data: bytes) -> None:
-    loop.process_input(codec.decode_camera(data, 3))
 
 
 @cache
@@ -298,22 +294,21 @@ def _valid_requests() -> list[wire.Request]:
 
 
 def _requests() -> list[Target]:
-    request_targets = []
-    for request in _valid_requests():
-        read = partial(Loop().request, request.name)
-        name, corpus = f"request {request.name}", (request.SerializeToString(),)
-        request_targets.append(Target(name, corpus, read, (ValueError,), wire.Request, 10))
-    return request_targets
+    requests = {one.name: one.SerializeToString() for one in _valid_requests()}
+    return [
+        Target(f"request {name}", (data,), partial(Loop().request, name), (ValueError,), wire.Request, 10)
+        for name, data in requests.items()
+    ]
 
 
-def _through_file(read: Callable[[Path], object], path: Path) -> Callable[[bytes], object]:
-    """Function that writes bytes to a file and reads the file."""
+def _of_file(name: str, corpus: tuple[bytes, ...], read: Callable[[Path], object], path: Path, cost: int) -> Target:
+    """Target whose inputs are written to a file, which is then read."""
 
     def run(data: bytes) -> object:
         path.write_bytes(data)
         return read(path)
 
-    return run
+    return Target(name, corpus, run, (LowfcError,), cost=cost)
 
 
 def _bytes_of(save: Callable[[Path], object], path: Path) -> tuple[bytes]:
@@ -329,16 +324,12 @@ def _files(folder: Path) -> list[Target]:
     sam = json.loads(layouts.SHIPPED.read_text(encoding="utf-8"))["layouts"]["sam27d07"]
     sams = tuple(json.dumps(one).encode() for one in (sam, {"layouts": {"a": sam}}))
     toml = Configuration().to_toml().encode()
-    readers: dict[str, tuple[tuple[bytes, ...], Callable[[Path], object], str, int]] = {
-        "calibration file": (fits, calibration_file.load, "input.fits", 300),
-        "law file": (laws, law_file.load, "input.fits", 300),
-        "configuration file": ((toml,), configuration.load, "input.toml", 60),
-        "layout file": (sams, lambda path: layouts.load_layout(f"{path}"), "input.json", 20),
-        "pupil file": (pupils, lambda path: load_pupil(256, path), "input.npz", 30),
-    }
     return [
-        Target(name, corpus, _through_file(read, folder / file), (LowfcError,), cost=cost)
-        for name, (corpus, read, file, cost) in readers.items()
+        _of_file("calibration file", fits, calibration_file.load, folder / "input.fits", 300),
+        _of_file("law file", laws, law_file.load, folder / "input.fits", 300),
+        _of_file("configuration file", (toml,), configuration.load, folder / "input.toml", 60),
+        _of_file("layout file", sams, lambda path: layouts.load_layout(f"{path}"), folder / "input.json", 20),
+        _of_file("pupil file", pupils, lambda path: load_pupil(256, path), folder / "input.npz", 30),
     ]
 
 
@@ -353,21 +344,9 @@ def _logs(folder: Path) -> list[Target]:
         with tempfile.TemporaryDirectory(dir=folder) as out:
             recover(path, Path(out) / "out.mcap")
 
-    path, errors = folder / "input.mcap", (LowfcError,)
+    path = folder / "input.mcap"
     return [
-        Target(
-            "log, read",
-            small_logs,
-            _through_file(lambda path: list(LogReader(path, skip_damaged=True)), path),
-            errors,
-            cost=300,
-        ),
-        Target(
-            "log, its history",
-            loop_log,
-            _through_file(lambda path: read_history(LogReader(path)), path),
-            errors,
-            cost=300,
-        ),
-        Target("log, recovered", small_logs, _through_file(recovered, path), errors, cost=600),
+        _of_file("log, read", small_logs, lambda path: list(LogReader(path, skip_damaged=True)), path, 300),
+        _of_file("log, its history", loop_log, lambda path: read_history(LogReader(path)), path, 300),
+        _of_file("log, recovered", small_logs, recovered, path, 600),
     ]
