@@ -83,7 +83,6 @@ def _private_runtime(tmp_path_factory: pytest.TempPathFactory) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def _private_cache(pytestconfig: pytest.Config) -> None:
     """Cache optical models separately from the user's, in a folder shared by all workers and later sessions."""
-    assert pytestconfig.cache is not None
     os.environ["XDG_CACHE_HOME"] = str(pytestconfig.cache.mkdir("home"))
 
 

@@ -97,7 +97,7 @@ def analyze(folder: Path, *words: str) -> "subprocess.CompletedProcess[str]":
 def exposure_score(folder: Path, name: str) -> float:
     """Score of a unit in `systemd-analyze security`, 0 (safe) to 10."""
     done = analyze(folder, "security", "--offline=yes", "--no-pager", name)
-    return float(re.search(rf"exposure level for {name}: ([\d.]+)", done.stdout)[1])  # type: ignore[index]
+    return float(re.search(rf"exposure level for {name}: ([\d.]+)", done.stdout)[1])
 
 
 @needs_systemd

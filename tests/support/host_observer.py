@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
@@ -24,8 +25,8 @@ def main(run: str, config: str, role: str) -> None:
     bus = ZenohBus(links, role, HostClock())
     events = Counter[str]()
 
-    def count_event(sample: object) -> None:
-        log = Log.FromString(sample.payload)  # type: ignore[attr-defined]
+    def count_event(sample: Sample) -> None:
+        log = Log.FromString(sample.payload)
         events[f"{log.name} {log.message.split(' ')[0]}"] += 1
 
     bus.subscribe(EVENT, count_event)
