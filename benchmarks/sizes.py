@@ -1,9 +1,8 @@
 """Loops of any size: random calibrations with matching frames, run by the real processes."""
 
-import contextlib
 import os
 import warnings
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,8 +99,7 @@ def random_calibration(size: Size, config: Configuration) -> tuple[Calibration, 
     return identified(calibration), frames.astype(np.uint16).reshape(FRAMES, size.side, size.side)
 
 
-@contextlib.contextmanager
-def prepared_run(size: Size, config: Configuration) -> Iterator[Run]:
+def prepared_run(size: Size, config: Configuration) -> AbstractContextManager[Run]:
     """A run of that size with the files of its processes; the run is removed afterwards."""
 
     def fill(config: Configuration, run: Run) -> None:
@@ -112,8 +110,7 @@ def prepared_run(size: Size, config: Configuration) -> Iterator[Run]:
         (run.path / "config.toml").write_text(config.to_toml(), encoding="utf-8")
         np.save(run.path / FRAMES_FILE, frames)
 
-    with prepared(config, fill) as run:
-        yield run
+    return prepared(config, fill)
 
 
 def _random(rng: np.random.Generator, shape: tuple[int, int], scale: float) -> Single:

@@ -12,8 +12,9 @@ import argparse
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -135,14 +136,11 @@ def _timed(
 
 @contextmanager
 def _clocked(durations: dict[str, list[int]]) -> Iterator[None]:
-    originals = [(owner, name, getattr(owner, name)) for owner, name in STAGES.values()]
-    for stage, (owner, name, original) in zip(STAGES, originals, strict=True):
-        setattr(owner, name, _clock(original, durations[stage]))
-    try:
+    with ExitStack() as stack:
+        for stage, (owner, name) in STAGES.items():
+            clocked = _clock(getattr(owner, name), durations[stage])
+            stack.enter_context(patch.object(owner, name, clocked))
         yield
-    finally:
-        for owner, name, original in originals:
-            setattr(owner, name, original)
 
 
 def _clock(original: Callable[..., Any], durations: list[int]) -> Callable[..., Any]:

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from lowfc.arrays import Array
 from lowfc.control.laws.continuous import Timing, hold_floor, residual_power
 from lowfc.control.laws.kalman import lqg
 from lowfc.control.laws.linear_law import LinearLaw, integrator
@@ -14,6 +13,7 @@ from sim_camera.disturbance import LINES_HZ, LINES_MAS
 from tools.shared import markdown
 
 RATE_HZ = 1000.0
+_OMEGA = 2 * np.pi * np.array(LINES_HZ) / RATE_HZ
 _NO_WIDTH_HZ, _NO_NOISE_NM2, _NO_DRIFT_NM2 = 1e-6, 1e-6, 1e-9
 _CASES = (Timing.of(1, 0.5), Timing.of(1, 0.9), Timing.of(2, 0.5))
 
@@ -21,7 +21,9 @@ _CASES = (Timing.of(1, 0.5), Timing.of(1, 0.9), Timing.of(2, 0.5))
 def table() -> str:
     """A row for each law, a column for each timing; mas rms per axis."""
     laws = {
-        "integrator, highest gain": [_integrator(timing) for timing in _CASES],
+        "integrator, highest gain": [
+            integrator([highest_gain(timing.delay)], [0.0], (2,), timing.delay, RATE_HZ) for timing in _CASES
+        ],
         "Kalman filter that nulls one instant": [_kalman(timing, timing.applied, 0.0) for timing in _CASES],
         "Kalman filter that nulls the mean of the next exposure": [
             _kalman(timing, timing.applied, timing.exposure) for timing in _CASES
@@ -34,18 +36,10 @@ def table() -> str:
         (name, *(f"{_residual_mas(law, t):.3f}" for law, t in zip(by_timing, _CASES, strict=True)))
         for name, by_timing in laws.items()
     ]
-    floor = float(np.sqrt(np.square(LINES_MAS) @ hold_floor(_omega())))
+    floor = float(np.sqrt(np.square(LINES_MAS) @ hold_floor(_OMEGA)))
     rows.append(("lower bound for a command held for a period", *(f"{floor:.3f}" for _ in _CASES)))
     head = f"continuous-time residual of {np.linalg.norm(LINES_MAS):.3g} mas, mas rms per axis"
     return markdown((head, *(f"delay {t.delay:g}, exposure {t.exposure:g}" for t in _CASES)), rows)
-
-
-def _omega() -> Array:
-    return 2 * np.pi * np.array(LINES_HZ) / RATE_HZ
-
-
-def _integrator(timing: Timing) -> LinearLaw:
-    return integrator([highest_gain(timing.delay)], [0.0], (2,), timing.delay, RATE_HZ)
 
 
 def _kalman(timing: Timing, start: float, length: float) -> LinearLaw:
@@ -57,4 +51,4 @@ def _kalman(timing: Timing, start: float, length: float) -> LinearLaw:
 
 
 def _residual_mas(law: LinearLaw, timing: Timing) -> float:
-    return float(np.sqrt(np.square(LINES_MAS) @ residual_power(law, _omega(), timing)[:, 0]))
+    return float(np.sqrt(np.square(LINES_MAS) @ residual_power(law, _OMEGA, timing)[:, 0]))
