@@ -65,13 +65,6 @@ def computed(toml: str) -> Calibration:
     return calibrated(Configuration.model_validate(tomllib.loads(toml)))
 
 
-class Reservation:
-    """Stand-in for `lowfc.client.lease.Lease` that does not report the remaining time."""
-
-    def expecting(self, progress: Callable[[str, int, int], None], rate_hz: float) -> Callable[[str, int, int], None]:
-        return progress
-
-
 class ReportingBus(MemoryBus):
     """Connection of an operator's program; `report` is called at each subscription of a ring."""
 
@@ -181,11 +174,12 @@ class InProcessLoop(Client):
         """Do nothing."""
 
     @contextlib.contextmanager
-    def reserved(self, purpose: str, duration_s: float | None = None) -> Iterator[Reservation]:
+    def reserved(self, purpose: str, duration_s: float | None = None) -> Iterator[SimpleNamespace]:
         self.lease_id = 1
         self.ask("lease", values=60.0, text=purpose)
         try:
-            yield Reservation()
+            # As `lowfc.client.lease.Lease`, without a report of the remaining time.
+            yield SimpleNamespace(expecting=lambda progress, rate_hz: progress)
         finally:
             self.ask("release")
             self.lease_id = 0
