@@ -1,7 +1,6 @@
 """A small, exactly linear sensor and mirror without diffraction, for tests of the control law."""
 
 from collections.abc import Container
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -28,13 +27,17 @@ def frame_sequence(count: int, start: int = START) -> int:
     return start << 32 | count
 
 
-@dataclass(frozen=True)
 class Toy:
     """I0 (pixels,) and H (pixels, modes) before normalisation, and the modes' shapes on the mirror."""
 
-    reference: Array
-    response: Array
-    modes_to_actuators: Array
+    def __init__(self) -> None:
+        rng = np.random.default_rng(11)
+        count = SHAPE[0] * SHAPE[1]
+        self.reference = rng.uniform(0.5, 1.5, count)
+        self.response = 0.002 * rng.standard_normal((count, len(NOLL)))
+        self.response -= self.response.mean(axis=0)  # the flux stays the same, so that the sensor is linear
+        y, x = np.meshgrid(np.linspace(-1, 1, GRID[0]), np.linspace(-1, 1, GRID[1]), indexing="ij")
+        self.modes_to_actuators = np.stack([x, y, x**2 + y**2 - 1]).reshape(len(NOLL), -1).T / 2
 
     def pixels(self, modes_nm: npt.ArrayLike, flux_dn: float = FLUX_DN) -> Pixels:
         """Frame (rows, columns) of a wavefront, exactly linear up to the rounding to DN."""
@@ -42,18 +45,7 @@ class Toy:
         return np.rint(DARK_DN + flux_dn * image.reshape(SHAPE) / self.reference.sum()).astype(np.uint16)
 
 
-def toy() -> Toy:
-    rng = np.random.default_rng(11)
-    count = SHAPE[0] * SHAPE[1]
-    reference = rng.uniform(0.5, 1.5, count)
-    response = 0.002 * rng.standard_normal((count, len(NOLL)))
-    response -= response.mean(axis=0)  # the flux stays the same, so that the sensor is linear
-    y, x = np.meshgrid(np.linspace(-1, 1, GRID[0]), np.linspace(-1, 1, GRID[1]), indexing="ij")
-    shapes = np.stack([x, y, x**2 + y**2 - 1]).reshape(len(NOLL), -1).T
-    return Toy(reference, response, shapes / 2)
-
-
-TOY = toy()
+TOY = Toy()
 
 
 def calibration(noll: tuple[int, ...] = NOLL, scale: float = 1.0) -> Calibration:
