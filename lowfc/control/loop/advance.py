@@ -36,7 +36,7 @@ from lowfc.control.loop.loading import (
     loaded,
     mirror_fault_reported,
     mirror_shape_reported,
-    mode_event,
+    mode_events,
 )
 from lowfc.control.loop.requests import answer
 from lowfc.control.loop.reservation import counted_to_frame, lease_checked
@@ -99,7 +99,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     mode, command_nm, commanded = state.mode, loop.history_nm[0], state.may_command
     steps_left, stepped = max(state.steps_left - 1, 0), state.steps_left == 1
     if stepped:
-        events += [PendingEvent("LOOP_STEPPED", {}), mode_event(mode, LoopMode.OPEN, STEPPED)]
+        events += [PendingEvent("LOOP_STEPPED", {}), *mode_events(mode, LoopMode.OPEN, STEPPED)]
     state = State(  # constructed: `_replace` takes four times as long
         mode,
         loop,
@@ -150,15 +150,10 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
         events.append(PendingEvent("CAMERA_RESTARTED", {}))
         if loop is not None:  # a probe sequence's rows are numbered from the previous start
             loop = end_probe(loop, state.frame_sequence, "the camera restarted", events)
-    return _camera_started(state, frame), loop
-
-
-def _camera_started(state: State, frame: Frame) -> State:
-    """The state at the first frame of a camera start: settings are awaited if those known are of another start."""
     camera = state.conditions.camera
-    if camera is None or camera.start_s in (0, frame.sequence >> COUNT_BITS):
-        return state
-    return state._replace(conditions=state.conditions._replace(camera_awaited=True))
+    if camera is not None and camera.start_s not in (0, frame.sequence >> COUNT_BITS):  # of another start
+        state = state._replace(conditions=state.conditions._replace(camera_awaited=True))
+    return state, loop
 
 
 def _with_newest_frame(state: State, loop: ActiveLoop | None, frame: Frame) -> State:

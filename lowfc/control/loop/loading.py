@@ -87,11 +87,16 @@ def safe_pending(settings: Settings, state: State) -> bool:
 
 
 def misfit(state: State) -> str:
-    """Why the camera's last received settings do not fit the calibration; empty if they do."""
+    """Why the camera's last received settings do not fit the calibration; empty if they do.
+
+    A calibration that has no settings yet fits any with its shape and saturation.
+    """
     camera, loop = state.conditions.camera, state.loop
     if camera is None or loop is None or not loop.calibration.noll:
         return ""
-    return "; ".join(changes(camera, _expected(loop, camera)))
+    calibration = loop.calibration
+    calibrated = loop.camera or replace(camera, shape=calibration.shape, saturation_dn=calibration.saturation_dn)
+    return "; ".join(changes(camera, calibrated))
 
 
 def uncalibrated(state: State) -> str:
@@ -275,14 +280,6 @@ def _with_camera(state: State, camera: CameraSettings) -> State:
     return state
 
 
-def _expected(loop: ActiveLoop, camera: CameraSettings) -> CameraSettings:
-    """Settings of the calibration; if it has none yet, the camera's with the calibration's shape and saturation."""
-    if loop.camera is not None:
-        return loop.camera
-    calibration = loop.calibration
-    return replace(camera, shape=calibration.shape, saturation_dn=calibration.saturation_dn)
-
-
 def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[PendingEvent]]:
     """Make a shape's deviation (rows, columns) from the modal command a channel, unless it is the driver's rounding."""
     deviation_nm = shape_nm.copy()
@@ -322,12 +319,11 @@ def _changed(state: State, mode: LoopMode, time_ns: int, cause: str, events: lis
     """Change the loop mode and add the events of the change, unless the loop is in this mode already."""
     if mode is state.mode:
         return state
-    events.append(mode_event(state.mode, mode, cause))
-    if mode is LoopMode.SAFE:
-        events.append(PendingEvent("SAFED", {"why": cause}))
+    events += mode_events(state.mode, mode, cause)
     return in_mode(state, mode, time_ns, cause)
 
 
-def mode_event(before: LoopMode, after: LoopMode, why: str) -> PendingEvent:
-    """The event of a loop mode that changed."""
-    return PendingEvent("MODE_CHANGED", {"before": before.in_words, "after": after.in_words, "why": why})
+def mode_events(before: LoopMode, after: LoopMode, why: str) -> list[PendingEvent]:
+    """The events of a loop mode that changed."""
+    changed = PendingEvent("MODE_CHANGED", {"before": before.in_words, "after": after.in_words, "why": why})
+    return [changed, PendingEvent("SAFED", {"why": why})] if after is LoopMode.SAFE else [changed]

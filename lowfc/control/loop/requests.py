@@ -15,7 +15,7 @@ from lowfc.control.loop.command_channels import EXTERNAL, FLAT, MIRROR, CommandC
 from lowfc.control.loop.gains import change_integrator, check_offset, offset_remark, per_mode, prepare_gains
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
-from lowfc.control.loop.loading import holding_cause, in_mode, loaded, misfit, mode_event, safe_pending, uncalibrated
+from lowfc.control.loop.loading import holding_cause, in_mode, loaded, misfit, mode_events, safe_pending, uncalibrated
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, permit, release, renew
 from lowfc.control.loop.safety import MAX_LIMIT_NM, Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
@@ -34,7 +34,9 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
     try:
         after, text, *events = _handler(request, lease_before)(settings, now, request)
     except ValueError as error:
-        refused = Reply(False, _short(str(error)), state.frame_sequence + 1)
+        why = str(error)
+        why = why if len(why) <= MAX_REPLY_LENGTH else f"{why[: MAX_REPLY_LENGTH - 3]}..."
+        refused = Reply(False, why, state.frame_sequence + 1)
         return state._replace(), Outputs(reply=refused)  # a copy: an unchanged state counts no input
     by_another = lease_before is not None and lease_before.id != request.lease_id
     if request.name == "safe" or (request.name in ENDED_BY and by_another):
@@ -42,10 +44,7 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
         events += lease_events
         text += "".join(f"; this ended the reservation for {event.details['holder']}" for event in lease_events)
     if after.mode is not state.mode:
-        why = after.conditions.mode_cause
-        events.append(mode_event(state.mode, after.mode, why))
-        if after.mode is LoopMode.SAFE:
-            events.append(PendingEvent("SAFED", {"why": why}))
+        events += mode_events(state.mode, after.mode, after.conditions.mode_cause)
     changed, reply = after is not state, Reply(True, text, state.frame_sequence + 1)
     outputs = Outputs(reply=reply, events=(*expiry_events, *events), changed=changed)
     return (after if changed else state._replace()), outputs
@@ -78,10 +77,6 @@ def prepared(settings: Settings, request: Request) -> Request:
     except ValueError as error:
         request = replace(request, refusal=str(error))
     return replace(request, prepared=True)
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= MAX_REPLY_LENGTH else f"{text[: MAX_REPLY_LENGTH - 3]}..."
 
 
 Handled = tuple[State, str, *tuple[PendingEvent, ...]]  # the state after a request, its reply, events
