@@ -15,6 +15,9 @@ from tools.shared import markdown
 RATE_HZ = 1000.0
 _OMEGA = 2 * np.pi * np.array(LINES_HZ) / RATE_HZ
 _NO_WIDTH_HZ, _NO_NOISE_NM2, _NO_DRIFT_NM2 = 1e-6, 1e-6, 1e-9
+_LINES = tuple(Line(hz, _NO_WIDTH_HZ, mas**2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
+WHEEL = Model(_NO_DRIFT_NM2, np.inf, _LINES, _NO_NOISE_NM2, RATE_HZ)
+"""The five lines alone; its nm are mas."""
 _CASES = (Timing.of(1, 0.5), Timing.of(1, 0.9), Timing.of(2, 0.5))
 
 
@@ -24,31 +27,34 @@ def table() -> str:
         "integrator, highest gain": [
             integrator([highest_gain(timing.delay)], [0.0], (2,), timing.delay, RATE_HZ) for timing in _CASES
         ],
-        "Kalman filter that nulls one instant": [_kalman(timing, timing.applied, 0.0) for timing in _CASES],
+        "Kalman filter that nulls one instant": [kalman(timing, timing.applied, 0.0) for timing in _CASES],
         "Kalman filter that nulls the mean of the next exposure": [
-            _kalman(timing, timing.applied, timing.exposure) for timing in _CASES
+            kalman(timing, timing.applied, timing.exposure) for timing in _CASES
         ],
         "Kalman filter that nulls the mean over the command's period (`lqg`)": [
-            _kalman(timing, timing.applied, timing.held) for timing in _CASES
+            kalman(timing, timing.applied, timing.held) for timing in _CASES
         ],
     }
     rows = [
-        (name, *(f"{_residual_mas(law, t):.3f}" for law, t in zip(by_timing, _CASES, strict=True)))
+        (name, *(f"{residual_mas(law, t):.3f}" for law, t in zip(by_timing, _CASES, strict=True)))
         for name, by_timing in laws.items()
     ]
-    floor = float(np.sqrt(np.square(LINES_MAS) @ hold_floor(_OMEGA)))
-    rows.append(("lower bound for a command held for a period", *(f"{floor:.3f}" for _ in _CASES)))
+    rows.append(("lower bound for a command held for a period", *(f"{floor_mas():.3f}" for _ in _CASES)))
     head = f"continuous-time residual of {np.linalg.norm(LINES_MAS):.3g} mas, mas rms per axis"
     return markdown((head, *(f"delay {t.delay:g}, exposure {t.exposure:g}" for t in _CASES)), rows)
 
 
-def _kalman(timing: Timing, start: float, length: float) -> LinearLaw:
+def kalman(timing: Timing, start: float, length: float) -> LinearLaw:
     """Kalman filter of the exact lines; its command nulls the mean over [start, start + length] periods."""
-    lines = tuple(Line(hz, _NO_WIDTH_HZ, mas**2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
-    model = Model(_NO_DRIFT_NM2, np.inf, lines, _NO_NOISE_NM2, RATE_HZ)
-    predicted_mean = model.mean_over(start, length) @ np.linalg.inv(model.mean_over(0.0, timing.exposure))
-    return replace(lqg([model], (2,), timing), output=(-model.states()[2] @ predicted_mean)[None].astype(np.float32))
+    predicted_mean = WHEEL.mean_over(start, length) @ np.linalg.inv(WHEEL.mean_over(0.0, timing.exposure))
+    return replace(lqg([WHEEL], (2,), timing), output=(-WHEEL.states()[2] @ predicted_mean)[None].astype(np.float32))
 
 
-def _residual_mas(law: LinearLaw, timing: Timing) -> float:
+def floor_mas() -> float:
+    """Least residual of a command that is held for a period, mas rms."""
+    return float(np.sqrt(np.square(LINES_MAS) @ hold_floor(_OMEGA)))
+
+
+def residual_mas(law: LinearLaw, timing: Timing) -> float:
+    """Residual of the lines under a law, mas rms."""
     return float(np.sqrt(np.square(LINES_MAS) @ residual_power(law, _OMEGA, timing)[:, 0]))

@@ -215,11 +215,13 @@ def timing_of(config: Configuration) -> Timing:
     return Timing.of(config.camera.delay_frames, exposure)
 
 
-def tuned(run: TimeSeries, config: Configuration, kinds: Sequence[str] = ("lqg",)) -> dict[str, Tuned]:
+def tuned(
+    run: TimeSeries, config: Configuration, kinds: Sequence[str] = ("lqg",), timing: Timing | None = None
+) -> dict[str, Tuned]:
     """Laws of these kinds for pseudo-open-loop modes (frames, modes): all modes of the loop, or the first few."""
     noll = config.noll[: run.values[0].shape[1]]
     rate_hz, leak = config.camera.rate_hz, np.zeros(len(noll))
-    timing = timing_of(config)
+    timing = timing_of(config) if timing is None else timing
     gains, models = best_gains(run, rate_hz, timing, leak), identify_modes(run, rate_hz)
     makers: dict[str, Callable[[], Tuned]] = {
         "integrator": lambda: tune_integrator(models, gains, noll, leak, timing),

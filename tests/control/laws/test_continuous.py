@@ -1,8 +1,5 @@
 """Continuous-time residual of a loop: theory against simulations with fine time steps."""
 
-from collections.abc import Callable
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -21,21 +18,14 @@ from lowfc.control.laws.kalman import lqg
 from lowfc.control.laws.linear_law import LinearLaw, at_rest, integrator, predict_and_update, respond
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.vibration import Line, Model
+from tools.continuous import RATE_HZ, WHEEL, floor_mas, kalman, residual_mas
 
 FINE = 200
 """Time steps of a period."""
-RATE_HZ = 1000.0
-LINES_HZ, LINES_MAS = (6.0, 18.0, 37.0, 71.0, 117.0), (9.0, 8.3, 5.0, 3.0, 2.0)
-OMEGA = 2 * np.pi * np.array(LINES_HZ) / RATE_HZ
 
 
 def integrator_of_tip(gain: float, delay: float) -> LinearLaw:
     return integrator([gain], [0.0], (2,), delay, RATE_HZ)
-
-
-def wheel() -> Model:
-    lines = tuple(Line(hz, 1e-6, mas**2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
-    return Model(1e-9, np.inf, lines, 1e-6, RATE_HZ)
 
 
 def simulated_residual(law: LinearLaw, omega: float, timing: Timing) -> float:
@@ -90,35 +80,21 @@ def test_the_floor_is_the_residual_of_the_best_held_value() -> None:
     assert mean_over(np.zeros(1), 1.0)[0] == 1
 
 
-def wheel_residual_mas(law: LinearLaw, timing: Timing) -> float:
-    return float(np.sqrt(np.square(LINES_MAS) @ residual_power(law, OMEGA, timing)[:, 0]))
-
-
 def test_the_residuals_on_the_ideal_wheel_are_known_and_the_best_law_reaches_the_floor() -> None:
     """Mas per axis, without noise; at one instant of each frame the integrator leaves 2.26 and the best law nothing."""
     instant, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
-    assert wheel_residual_mas(integrator_of_tip(1.11, 1), instant) == pytest.approx(3.528, abs=0.002)
-    assert wheel_residual_mas(integrator_of_tip(1.11, 1), blurred) == pytest.approx(2.944, abs=0.002)
-    assert wheel_residual_mas(integrator_of_tip(0.518, 2), Timing(2, 2, 0.5)) == pytest.approx(6.547, abs=0.002)
-    floor = float(np.sqrt(np.square(LINES_MAS) @ hold_floor(OMEGA)))
-    assert floor == pytest.approx(0.7215, abs=1e-4)
+    assert residual_mas(integrator_of_tip(1.11, 1), instant) == pytest.approx(3.528, abs=0.002)
+    assert residual_mas(integrator_of_tip(1.11, 1), blurred) == pytest.approx(2.944, abs=0.002)
+    assert residual_mas(integrator_of_tip(0.518, 2), Timing(2, 2, 0.5)) == pytest.approx(6.547, abs=0.002)
+    assert floor_mas() == pytest.approx(0.7215, abs=1e-4)
     for timing in (instant, blurred, Timing(1, 1, 0.9), Timing(2, 2, 0.5), Timing(1, 0.8, 0.5), Timing(1.5, 1.5, 0.5)):
-        assert wheel_residual_mas(lqg([wheel()], (2,), timing), timing) == pytest.approx(floor, rel=0.02), timing
+        assert residual_mas(lqg([WHEEL], (2,), timing), timing) == pytest.approx(floor_mas(), rel=0.02), timing
 
 
 def test_a_law_that_nulls_another_mean_has_a_larger_residual() -> None:
     instant, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
-    at_instant = law_nulling(lambda model: model.mean_over(1.0, 0.0))
-    in_exposure = law_nulling(lambda model: model.mean_over(1.0, 0.5) @ np.linalg.inv(model.mean_over(0.0, 0.5)))
-    assert wheel_residual_mas(at_instant, instant) == pytest.approx(1.44, abs=0.01)
-    assert wheel_residual_mas(in_exposure, blurred) == pytest.approx(0.954, abs=0.01)
-
-
-def law_nulling(prediction: Callable[[Model], Array]) -> LinearLaw:
-    """A law whose command nulls another mean than that over the period in which it is in force."""
-    law, model = lqg([wheel()], (2,), Timing(1, 1, 0.5)), wheel()
-    C = model.states()[2]
-    return replace(law, output=(-C @ prediction(model))[None].astype(np.float32))
+    assert residual_mas(kalman(instant, 1.0, 0.0), instant) == pytest.approx(1.44, abs=0.01)
+    assert residual_mas(kalman(blurred, 1.0, 0.5), blurred) == pytest.approx(0.954, abs=0.01)
 
 
 def test_the_noise_of_the_command_has_a_closed_form() -> None:

@@ -10,10 +10,9 @@ from lowfc.contract.envelope import count_of
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import highest_gain
-from lowfc.control.laws.tuning import best_gains, identify_modes, tune_lqg
 from sim_camera.disturbance import Sampler
 from sim_camera.driver import disturbance_of
-from tools.law_bench import Bench, calibrated, configured
+from tools.law_bench import Bench, calibrated, configured, tuned
 
 IDENTIFY, SETTLE, MEASURE = 16_000, 8_000, 8_000
 
@@ -31,9 +30,7 @@ def wheel(**keys: Any) -> tuple[Configuration, Bench]:
 
 def residual_mas(bench: Bench, run: TimeSeries, timing: Timing, *, continuous: bool = True) -> float:
     """Residual in mas, over all time or only at the starts of exposures, with the law tuned from a run for a timing."""
-    rate_hz, no_leak = bench.config.camera.rate_hz, np.zeros(2)
-    gains = best_gains(run, rate_hz, timing, no_leak)
-    bench.ask("law", law=tune_lqg(run, identify_modes(run, rate_hz), gains, (2, 3), no_leak, timing).law)
+    bench.ask("law", law=tuned(run, bench.config, timing=timing)["lqg"].law)
     bench.new_record()
     bench.run(SETTLE + MEASURE)
     return bench.tilt_mas(MEASURE, continuous=continuous)

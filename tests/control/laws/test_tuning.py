@@ -8,14 +8,7 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import margins
 from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG, highest_gain
-from lowfc.control.laws.tuning import (
-    best_gains,
-    identify_modes,
-    simulated_residual_nm2,
-    tune_integrator,
-    tune_lqg,
-    tune_pi_notch,
-)
+from lowfc.control.laws.tuning import best_gains, identify_modes, simulated_residual_nm2, tune_integrator
 from lowfc.control.laws.vibration import Model
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import preset_disturbance
@@ -96,15 +89,8 @@ def test_laws_on_the_reaction_wheel_leave_the_predicted_residual(
     """LQG leaves less than a notch filter, which leaves less than the integrator."""
     pol, truth = wheel(10_000)
     later = one_piece(truth + 0.8 * np.random.default_rng(99).standard_normal(truth.shape))
-    models = identify_modes(pol, RATE_HZ)
-    timing = Timing.sampled(delay)
-    gains = best_gains(pol, RATE_HZ, timing, NO_LEAK)
     residual_mas: dict[str, float] = {}
-    for best in (
-        tune_integrator(models, gains, NOLL, NO_LEAK, timing),
-        tune_pi_notch(models, gains, NOLL, NO_LEAK, timing),
-        tune_lqg(pol, models, gains, NOLL, NO_LEAK, timing),
-    ):
+    for best in tuned(pol, configured(), laws.KINDS, Timing.sampled(delay)).values():
         residual_mas[best.law.name] = true_mas(best.law, later, truth, delay)
         predicted_mas = float(np.sqrt(np.mean(best.predicted_nm**2)) / NM_PER_MAS)
         assert residual_mas[best.law.name] == pytest.approx(predicted_mas, rel=0.05), best.law.name
@@ -120,8 +106,7 @@ def test_white_noise_gets_a_law_with_a_small_residual() -> None:
     """White noise cannot be predicted: any choice between LQG and integrator leaves a small residual."""
     noise = np.random.default_rng(5).standard_normal((4096, 2))
     pol = one_piece(noise)
-    gains = best_gains(pol, RATE_HZ, Timing.sampled(1.0), NO_LEAK)
-    best = tune_lqg(pol, identify_modes(pol, RATE_HZ), gains, NOLL, NO_LEAK, Timing.sampled(1.0))
+    best = tuned(pol, configured(), timing=Timing.sampled(1.0))["lqg"]
     assert set(best.kinds) <= {"integrator", "lqg"}
     residual_nm2 = simulated_residual_nm2(best.law, pol, noise.var(axis=0), Timing.sampled(1.0))
     assert (residual_nm2 < 0.05 * noise.var(axis=0)).all()
