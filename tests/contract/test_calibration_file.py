@@ -101,6 +101,8 @@ def test_the_identity_depends_on_every_field() -> None:
         value = added.get(name, getattr(original, name))
         changed = value if name in added else value[::-1] if isinstance(value, str | tuple) else value + 1
         assert calibration_codec.identified(replace(original, **{name: changed})).id != original.id, name
+    cameras = toy.CAMERA, replace(toy.CAMERA, time_ns=77, start_s=8)  # another start of the same camera
+    assert len({calibration_codec.identified(replace(original, camera=camera)).id for camera in cameras}) == 1
 
 
 def test_actuators_to_modes_are_stored_and_optional(tmp_path: Path) -> None:

@@ -69,12 +69,13 @@ def test_inputs_round_trip(input_: Report) -> None:
 
 
 def test_a_calibration_round_trips() -> None:
-    message = wire.Calibration.FromString(encode_calibration(CALIBRATION, 5_000_000_001))
+    calibration = identified(replace(CALIBRATION, camera=CAMERA))
+    message = wire.Calibration.FromString(encode_calibration(calibration, 5_000_000_001))
     assert message.timestamp.ToNanoseconds() == 5_000_000_001
     assert list(message.mode_names) == ["tilt x", "tilt y", "focus"]
     decoded = decode_calibration(message)
-    for field in fields(CALIBRATION):
-        assert np.array_equal(getattr(decoded, field.name), getattr(CALIBRATION, field.name)), field.name
+    for field in fields(calibration):
+        assert np.array_equal(getattr(decoded, field.name), getattr(calibration, field.name)), field.name
     message.flux_dn += 1
     with pytest.raises(ValueError, match="is damaged: its content has another identity"):
         decode_calibration(message)

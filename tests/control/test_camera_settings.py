@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from lowfc.arrays import Single
-from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_calibration, identified
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
-from lowfc.contract.messages import wire
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings, changes
 from lowfc.control.loop.command_channels import MIRROR
@@ -79,20 +77,12 @@ def test_the_loop_is_not_closed_with_changed_camera_settings(name: str) -> None:
 
 
 def test_the_camera_is_compared_with_the_calibrations_settings() -> None:
-    measured = identified(replace(calibration(), camera=CAMERA))
+    measured = replace(calibration(), camera=CAMERA)
     state, _ = feed(DEFAULTS, State(), Load(0, measured, "test"), WRONG)
     assert state.mode is LoopMode.OPEN
     state, _ = feed(DEFAULTS, State(), WRONG, Load(0, measured, "test"))
     assert state.mode is LoopMode.OPEN
     assert "bias_dn" in state.conditions.mode_cause
-
-
-def test_camera_settings_are_part_of_a_calibrations_identity() -> None:
-    plain, measured = identified(calibration()), identified(replace(calibration(), camera=CAMERA))
-    assert plain.id != measured.id
-    decoded = decode_calibration(wire.Calibration.FromString(encode_calibration(measured, 7)))
-    assert decoded.camera == replace(CAMERA, time_ns=decoded.camera.time_ns)
-    assert identified(replace(measured, camera=replace(CAMERA, time_ns=77, start_s=8))).id == measured.id
 
 
 @pytest.mark.parametrize(

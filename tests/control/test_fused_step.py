@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from unittest.mock import Mock
+from unittest.mock import ANY, Mock
 
 import numpy as np
 import pytest
@@ -207,34 +207,33 @@ def compared(frames: int, frames_per_bench: int, monkeypatch: pytest.MonkeyPatch
     return counts, largest_nm
 
 
-def test_the_kernel_in_use_is_reported_by_an_event_and_is_numpy_without_numba(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+@pytest.mark.parametrize(
+    ("installed", "fault", "advice"),
+    [
+        (True, None, None),
+        (False, None, "the fused step needs numba"),
+        (True, PermissionError(13, "no executable memory"), "this host forbids compiling"),
+        (True, ImportError("it needs NumPy 2.2"), "numba cannot be imported (it needs NumPy 2.2)"),
+    ],
+)
+def test_the_kernel_in_use_is_reported_by_an_event_and_is_numpy_if_the_fused_step_cannot_be_compiled(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, installed: bool, fault: Exception | None, advice: str | None
 ) -> None:
-    config, latch, events = load(None, {"realtime.kernel": "fused"}), Latch([tmp_path / "latch"]), []
-    latch.set(False)
-    for available, name, event in ((True, FUSED, "KERNEL"), (False, "numpy", "KERNEL_MISSING")):
-        monkeypatch.setattr(compiled, "available", lambda available=available: available)
-        monkeypatch.setattr(compiled, "kernel", getattr(compiled.kernel, "__wrapped__", compiled.kernel))
-        monkeypatch.setattr(compiled, "_compiled", lambda: [functions.measure, functions.respond, None])
-        result = settings_under(latch, config, lambda *arguments, **details: events.append((arguments, details)))
-        assert result.kernel.name == name
-        assert events[-1][0] == (event,)
-    assert "numba" in events[-1][1]["advice"]
-
-
-@pytest.mark.parametrize("fault", [PermissionError(13, "no executable memory"), ImportError("it needs NumPy 2.2")])
-def test_numpy_is_used_if_the_fused_step_cannot_be_compiled(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fault: Exception
-) -> None:
-    monkeypatch.setattr(compiled, "kernel", getattr(compiled.kernel, "__wrapped__", compiled.kernel))
-    monkeypatch.setattr(compiled, "_compiled", Mock(side_effect=fault))
-    broken = isinstance(fault, ImportError)
-    monkeypatch.setattr("importlib.import_module", Mock(side_effect=fault if broken else None))
-    events: list[tuple[str, str]] = []
-    config = load(None, {"realtime.kernel": "fused"})
-    result = settings_under(Latch([tmp_path / "latch"]), config, lambda name, advice: events.append((name, advice)))
-    assert (result.kernel.name, events[0][0]) == ("numpy", "KERNEL_MISSING")
-    assert events[0][1].startswith(f"numba cannot be imported ({fault})" if broken else "this host forbids compiling")
+    functions_ = Mock(return_value=[functions.measure, functions.respond, None], side_effect=fault)
+    monkeypatch.setattr(compiled, "_compiled", functions_)
+    monkeypatch.setattr(compiled, "available", lambda: installed)
+    monkeypatch.setattr(compiled, "kernel", compiled.kernel.__wrapped__)
+    if isinstance(fault, ImportError):
+        monkeypatch.setattr("importlib.import_module", Mock(side_effect=fault))
+    event, config = Mock(), load(None, {"realtime.kernel": "fused"})
+    kernel = settings_under(Latch([tmp_path / "latch"]), config, event).kernel
+    if advice is None:
+        assert kernel.name == FUSED
+        event.assert_called_once_with("KERNEL", kernel=FUSED)
+    else:
+        assert kernel.name == "numpy"
+        event.assert_called_once_with("KERNEL_MISSING", advice=ANY)
+        assert event.call_args.kwargs["advice"].startswith(advice)
 
 
 def test_several_threads_give_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:

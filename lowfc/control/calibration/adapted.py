@@ -39,11 +39,7 @@ def on_pixels(calibration: Calibration, good: Array) -> Calibration:
     share = float(I0 @ kept)
     I0, H = normalise_flux(I0, H, kept)
     changed = replace(
-        calibration,
-        reference=single(I0),
-        response=single(H),
-        good=single(kept),
-        flux_dn=calibration.flux_dn * share,
+        calibration, reference=single(I0), response=single(H), good=single(kept), flux_dn=calibration.flux_dn * share
     )
     return replace(changed, reconstructor=single(_same_response(calibration, changed)), operator_hash="", id="")
 

@@ -237,7 +237,7 @@ def test_drifts_and_common_noise_are_not_tilt_cross_talk() -> None:
     assert np.count_nonzero(np.abs(mean_nm) > SURE * error_nm) <= 1
 
 
-def _calibration(measured: bool) -> tuple[Calibration, CameraSettings]:
+def _calibration() -> tuple[Calibration, CameraSettings]:
     rng = np.random.default_rng(7)
     pixels, modes = 400, 5
     reference = rng.random(pixels)
@@ -249,15 +249,13 @@ def _calibration(measured: bool) -> tuple[Calibration, CameraSettings]:
     R = reconstruct(reference, response, None, good, 1e5, 2.0).matrix
     camera = CameraSettings(0, (20, 20), 0.0, 65535.0, 2.0, 1.0, 2.0)
     arrays = [array.astype(np.float32) for array in (reference, response, R, good, np.zeros(pixels))]
-    shapes = np.zeros((4, modes), np.float32)
-    name = "poke" if measured else "weighted"
-    other_fields = (shapes, (20, 20), (2, 2), 5e4, 65535.0, name, 550.0, "", "id")
-    return Calibration((2, 3, 4, 5, 6), *arrays, *other_fields), camera
+    others = np.zeros((4, modes), np.float32), (20, 20), (2, 2), 5e4, 65535.0, "weighted", 550.0, "", "id"
+    return Calibration((2, 3, 4, 5, 6), *arrays, *others), camera
 
 
 def test_rows_of_corrected_modes_are_the_map_estimate() -> None:
     """Rows of (H'WH + P^-1)^-1 H'W without a prior for corrected modes; the other rows are unchanged."""
-    calibration, camera = _calibration(measured=False)
+    calibration, camera = _calibration()
     prior = np.array([0, 0, 1e-3, 1e-4, 0])
     (rows,) = map_rows(calibration, prior, 5e4, camera, calibration.reconstructor)
     H, I0 = calibration.response.astype(float), calibration.reference.astype(float)
@@ -273,7 +271,7 @@ def test_rows_of_corrected_modes_are_the_map_estimate() -> None:
 
 
 def test_r_is_unchanged_if_all_or_no_modes_are_corrected_or_the_camera_is_unknown() -> None:
-    calibration, camera = _calibration(measured=True)
+    calibration, camera = _calibration()
     for prior, seen_by in ((np.zeros(5), camera), (np.ones(5), camera), (np.array([1.0, 0, 0, 0, 0]), None)):
         assert map_rows(calibration, prior, 5e4, seen_by, calibration.reconstructor)[0] is calibration.reconstructor
 

@@ -8,14 +8,7 @@ import pytest
 from lowfc.arrays import Array
 from lowfc.control.laws.integrator import integrate
 from lowfc.control.laws.linear_law import LinearLaw, Signal, at_rest, predict, predict_and_update, respond
-from lowfc.control.laws.margins import (
-    MAX_COUPLED_STATES,
-    check_stable,
-    margins,
-    noise_gain,
-    noise_transfer,
-    rejection,
-)
+from lowfc.control.laws.margins import MAX_COUPLED_STATES, check_stable, margins, noise_gain, noise_transfer, rejection
 from lowfc.control.laws.pi_notch import Notch, pi_notch
 from lowfc.control.laws.stability import delay_weights, limiting_gain
 from tests.support import theory
