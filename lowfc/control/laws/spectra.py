@@ -139,12 +139,12 @@ def floor_nm2_hz(found: Spectrum) -> Array:
     return np.asarray(np.median(upper, axis=0) / (1 - 2 / (9 * freedom)) ** 3)
 
 
-def in_bins(frequency_hz: Array, columns: Sequence[Array], per_decade: int = 20) -> tuple[Array, list[Array]]:
-    """Means of the frequencies and of each column over bins of even width in the logarithm of frequency, without 0 Hz.
+def in_bins(frequency_hz: Array, columns: Sequence[Array]) -> tuple[Array, list[Array]]:
+    """Means of the frequencies and of each column over twenty bins per decade of frequency, without 0 Hz.
 
     Columns are (frequencies,), and their means (bins,).
     """
-    places = np.floor(per_decade * np.log10(frequency_hz[1:])).astype(int)
+    places = np.floor(20 * np.log10(frequency_hz[1:])).astype(int)
     starts = np.flatnonzero(np.diff(places, prepend=places[0] - 1))
     counts = np.diff(starts, append=places.size)
     means = [np.add.reduceat(column[1:], starts) / counts for column in (frequency_hz, *columns)]

@@ -98,8 +98,6 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     reported = (*reasons, Limit.LAW_OVERRULED) if _overruled(state, loop) else reasons
     mode, command_nm, commanded = state.mode, loop.history_nm[0], state.may_command
     steps_left, stepped = max(state.steps_left - 1, 0), state.steps_left == 1
-    if stepped:
-        events += [PendingEvent("LOOP_STEPPED", {}), *mode_events(mode, LoopMode.OPEN, STEPPED)]
     state = State(  # constructed: `_replace` takes four times as long
         mode,
         loop,
@@ -117,7 +115,8 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         conditions=state.conditions,
     )
     if stepped:
-        state = in_mode(state, LoopMode.OPEN, frame.time_ns, STEPPED)
+        before, state = state, in_mode(state, LoopMode.OPEN, frame.time_ns, STEPPED)
+        events += [PendingEvent("LOOP_STEPPED", {}), *mode_events(before, state)]
     step = Step(
         frame.sequence, frame.time_ns, mode, command_nm, reported, error_nm, pol_nm, estimate.flux_dn, saturated
     )
@@ -269,8 +268,8 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
 
 
 def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]:
-    state, events = loaded(settings, state, load.calibration, load.source, load.time_ns)
-    return state, Outputs(events=events, changed=True)
+    after, events = loaded(settings, state, load.calibration, load.source, load.time_ns)
+    return after, Outputs(events=[*events, *mode_events(state, after)], changed=True)
 
 
 def _limit_events(before: tuple[Reason, ...], now: tuple[Reason, ...], events: list[PendingEvent]) -> None:

@@ -25,7 +25,7 @@ MIRROR_WAS_SAFE = "the mirror's last command was sent in safe mode"
 def loaded(
     settings: Settings, state: State, calibration: Calibration, source: str, time_ns: int
 ) -> tuple[State, list[PendingEvent]]:
-    """The state with another calibration, and the events.
+    """The state with another calibration, and the events other than those of a change of the loop mode.
 
     If the mirror has the same grid, it keeps its shape: the channels stay, the rest becomes a command of the new modes,
     and the part outside the modes becomes a channel (not in safe mode). A probe sequence ends, and the next command
@@ -78,7 +78,7 @@ def loaded(
         mode, cause = LoopMode.OPEN, wrong
     elif before_mode is LoopMode.IDLE and mode is LoopMode.CLOSED and loop.automatic.any():
         mode, cause = LoopMode.OPEN, MEASURED_FIRST
-    return _changed(state, mode, time_ns, cause, events), events
+    return (state if mode is before_mode else in_mode(state, mode, time_ns, cause)), events
 
 
 def safe_pending(settings: Settings, state: State) -> bool:
@@ -319,11 +319,15 @@ def _changed(state: State, mode: LoopMode, time_ns: int, cause: str, events: lis
     """Change the loop mode and add the events of the change, unless the loop is in this mode already."""
     if mode is state.mode:
         return state
-    events += mode_events(state.mode, mode, cause)
-    return in_mode(state, mode, time_ns, cause)
+    after = in_mode(state, mode, time_ns, cause)
+    events += mode_events(state, after)
+    return after
 
 
-def mode_events(before: LoopMode, after: LoopMode, why: str) -> list[PendingEvent]:
-    """The events of a loop mode that changed."""
-    changed = PendingEvent("MODE_CHANGED", {"before": before.in_words, "after": after.in_words, "why": why})
-    return [changed, PendingEvent("SAFED", {"why": why})] if after is LoopMode.SAFE else [changed]
+def mode_events(before: State, after: State) -> list[PendingEvent]:
+    """The events of a change of the loop mode; none if it is unchanged."""
+    if after.mode is before.mode:
+        return []
+    why = after.conditions.mode_cause
+    changed = PendingEvent("MODE_CHANGED", {"before": before.mode.in_words, "after": after.mode.in_words, "why": why})
+    return [changed, PendingEvent("SAFED", {"why": why})] if after.mode is LoopMode.SAFE else [changed]

@@ -43,8 +43,7 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
         after, lease_events = lease_ended(after, asked_by(lease_before, request))
         events += lease_events
         text += "".join(f"; this ended the reservation for {event.details['holder']}" for event in lease_events)
-    if after.mode is not state.mode:
-        events += mode_events(state.mode, after.mode, after.conditions.mode_cause)
+    events += mode_events(state, after)
     changed, reply = after is not state, Reply(True, text, state.frame_sequence + 1)
     outputs = Outputs(reply=reply, events=(*expiry_events, *events), changed=changed)
     return (after if changed else state._replace()), outputs
@@ -282,8 +281,7 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
     after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
     loop = _active_loop(after)  # an offset beyond its limit, which may have been lowered, is no reason to refuse
     check_offset(loop, np.minimum(np.abs(loop.channels_or_empty().offset_nm), loop.integrator.limit_nm))
-    others = (event for event in events if event.name not in ("MODE_CHANGED", "SAFED"))  # `answer` adds these
-    return after, f"calibration {request.calibration.id[:12]}", *others
+    return after, f"calibration {request.calibration.id[:12]}", *events
 
 
 def _note(settings: Settings, state: State, request: Request) -> Handled:

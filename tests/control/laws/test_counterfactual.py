@@ -14,7 +14,6 @@ from lowfc.control.laws.what_if import (
     missing_before,
     seen_nm,
 )
-from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import Limits, Rejection
 from lowfc.control.loop.state import Settings
 from tests.support.theory import law_of
@@ -36,13 +35,9 @@ def weights(delay_frames: float) -> np.ndarray:
     return delay_weights(delay_frames).astype(np.float32)
 
 
-def live_steps(setup: Settings) -> list[Step]:
-    """Steps of the live loop on a random walk, with missing and dark frames."""
-    return run_toy(setup, WALK, missing=MISSING, dark=DARK)[0]
-
-
-def columns(steps: list[Step]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Errors, pseudo-open-loop modes and commands (steps, modes), and missing exposures."""
+def live(setup: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Errors, pseudo-open-loop modes and commands (steps, modes) of the live loop on a walk, and missing exposures."""
+    steps, _, _ = run_toy(setup, WALK, missing=MISSING, dark=DARK)
     nothing = np.full(3, np.nan, np.float32)
     error = np.array([nothing if step.error_nm is None else step.error_nm for step in steps])
     pol = np.array([nothing if step.pol_nm is None else step.pol_nm for step in steps])
@@ -54,7 +49,7 @@ def columns(steps: list[Step]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
 def test_the_logged_gains_reproduce_the_logged_run(delay: float) -> None:
     """Up to float32 rounding in pol = error - seen, with missing and refused frames and acting modal limits."""
     setup = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0), limit_nm=(12.0, 50.0))
-    error, pol, command, missing = columns(live_steps(setup))
+    error, pol, command, missing = live(setup)
     assert missing.sum() == 9
     assert np.isnan(error).any(axis=1).sum() == len(DARK)
     assert (np.abs(command[:, 0]) == 12.0).any()
@@ -69,8 +64,8 @@ def test_other_gains_reproduce_a_run_with_these_gains(delay: float) -> None:
     """For a sensor that is linear up to the rounding to DN, here 0.01 nm."""
     before = settings(delay_frames=delay, gain=(0.3, 0.1), **WIDE)
     after = settings(delay_frames=delay, gain=(0.1, 0.25), leak=(0.02, 0.01), **WIDE)
-    _, pol, _, missing = columns(live_steps(before))
-    error, _, command, _ = columns(live_steps(after))
+    _, pol, _, missing = live(before)
+    error, _, command, _ = live(after)
     law = limited_integrator(after.integrator((2, 3, 4)))
     other_error, other_command = counterfactual(law, weights(delay), pol, missing)
     np.testing.assert_allclose(other_error, error, atol=0.05)
