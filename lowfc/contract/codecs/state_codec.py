@@ -14,11 +14,10 @@ from lowfc.contract.codecs.law_codec import command_channels_of, integrator_of, 
 from lowfc.contract.messages import fields_of, floats, from_timestamp, timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import map_rows
-from lowfc.control.kernel.tables import NUMPY, Kernel
+from lowfc.control.kernel.tables import NUMPY, Estimate, Kernel
 from lowfc.control.laws import linear_law
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.command_channels import PlayTable
-from lowfc.control.loop.estimator import Estimate
 from lowfc.control.loop.guard import Group, LawGuard
 from lowfc.control.loop.interlocks import Acting, Action
 from lowfc.control.loop.lease import Lease

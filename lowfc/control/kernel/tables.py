@@ -33,6 +33,17 @@ class Kernel(NamedTuple):
 NUMPY = Kernel("numpy")
 
 
+class Estimate(NamedTuple):
+    """Modal errors of a frame (modes,), nm of wavefront rms, and the sum of its good pixels, dark subtracted, DN."""
+
+    error_nm: Single
+    flux_dn: float
+
+    def same(self, other: "Estimate | None") -> bool:
+        """Whether both come from identical images, as from a stuck camera; photon noise makes real ones differ."""
+        return other is not None and self.flux_dn == other.flux_dn and np.array_equal(self.error_nm, other.error_nm)
+
+
 class Tables(NamedTuple):
     """Arrays of a calibration for the compiled functions; most are as in `lowfc.control.kernel.functions`.
 
@@ -91,13 +102,13 @@ class Tables(NamedTuple):
             no_channels=np.zeros(calibration.grid, np.float32),
         )
 
-    def estimate(self, pixels: Pixels, min_flux_dn: float) -> tuple[Single, float] | None:
-        """Modal errors (modes,), nm, and flux, DN, of a frame (pixels,), DN.
+    def estimate(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
+        """Estimate of a frame (pixels,), DN, by the fused step; None if the frame needs the reference step.
 
-        None if a good pixel is saturated, or the flux is not above `min_flux_dn` plus the margin.
+        It does if a good pixel is saturated, or the flux is not above `min_flux_dn` plus the margin.
         """
         error_nm = np.empty_like(self.reference_nm)
         least_dn = min_flux_dn + self.margin_dn
         scanned = pixels, self.good, self.dark, self.tiles, self.scratch, self.sums_nm, self.totals
         flux_dn = self.measure(*scanned, self.reference_nm, self.full_well, self.dark_sum_dn, least_dn, error_nm)
-        return (error_nm, flux_dn) if flux_dn else None
+        return Estimate(error_nm, flux_dn) if flux_dn else None

@@ -42,23 +42,15 @@ def lqg_block(model: Model, timing: Timing) -> Block:
 def covariance_nm2(model: Model) -> Array:
     """Covariance (states, states) of the steady filter's prediction error before a frame.
 
+    Per variance of noise it is X = A (X - X C' C X / (1 + C X C')) A' + Q, solved by doubling: each iteration of this
+    structure-preserving algorithm doubles the number of filtered frames, from zero covariance. Nearly undamped lines
+    put poles next to the unit circle, which scipy's `solve_discrete_are` cannot separate.
+
     Raises:
         ValueError: the iteration does not converge.
     """
     A, Q, C = model.states()
-    return model.noise_nm2 * _riccati(A, Q / model.noise_nm2, C)
-
-
-def _riccati(A: Array, Q: Array, C: Array) -> Array:
-    """Covariance X = A (X - X C' C X / (1 + C X C')) A' + Q of the states before a frame, by doubling.
-
-    Each iteration of this structure-preserving algorithm doubles the number of filtered frames, from zero covariance.
-    Nearly undamped lines put poles next to the unit circle, which scipy's `solve_discrete_are` cannot separate.
-
-    Raises:
-        ValueError: it does not converge.
-    """
-    seen, passed, X = np.outer(C, C), A.T, Q
+    seen, passed, X = np.outer(C, C), A.T, Q / model.noise_nm2
     identity = np.eye(len(A))
     for _ in range(_DOUBLINGS):
         inside = np.linalg.solve(identity + seen @ X, np.hstack([passed, seen]))
@@ -69,7 +61,7 @@ def _riccati(A: Array, Q: Array, C: Array) -> Array:
         X = X + (grown + grown.T) / 2
         seen = (seen + seen.T) / 2
         if np.abs(grown).max() <= 1e-12 * np.abs(X).max():
-            return np.asarray(X)
+            return model.noise_nm2 * np.asarray(X)
     raise ValueError(
         f"no Kalman filter settles within {2**_DOUBLINGS} frames: drift or line far below the noise, or no noise"
     )

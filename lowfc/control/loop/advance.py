@@ -10,8 +10,9 @@ import numpy as np
 
 from lowfc.arrays import Single
 from lowfc.control.kernel.stepping import next_command, respond, step_to_flat
+from lowfc.control.kernel.tables import Estimate
 from lowfc.control.loop.camera import CameraSettings
-from lowfc.control.loop.estimator import Estimate, fill_saturated, saturated_pixels
+from lowfc.control.loop.estimator import fill_saturated, saturated_pixels
 from lowfc.control.loop.inputs import (
     COUNT_BITS,
     Command,
@@ -178,7 +179,8 @@ def _measure(
     if frame.age_ns > settings.max_frame_age_ns:
         return Rejection.LATE
     pixels, min_flux_dn = frame.pixels.ravel(), settings.min_flux_fraction * calibration.flux_dn
-    fused = loop.estimator.estimate_fused(pixels, min_flux_dn)
+    tables = loop.estimator.tables
+    fused = None if tables is None else tables.estimate(pixels, min_flux_dn)
     if fused is not None:
         return fused, 0, True
     saturated = saturated_pixels(calibration, pixels)

@@ -6,18 +6,7 @@ import numpy as np
 
 from lowfc.arrays import Pixels, Single, aligned
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.kernel.tables import NUMPY, Kernel, Tables
-
-
-class Estimate(NamedTuple):
-    """Modal errors of a frame (modes,), nm of wavefront rms, and the sum of its good pixels, dark subtracted, DN."""
-
-    error_nm: Single
-    flux_dn: float
-
-    def same(self, other: "Estimate | None") -> bool:
-        """Whether both come from identical images, as from a stuck camera; photon noise makes real ones differ."""
-        return other is not None and self.flux_dn == other.flux_dn and np.array_equal(self.error_nm, other.error_nm)
+from lowfc.control.kernel.tables import NUMPY, Estimate, Kernel, Tables
 
 
 class Estimator(NamedTuple):
@@ -50,11 +39,6 @@ class Estimator(NamedTuple):
         tables = Tables.of(kernel, calibration, reference_nm)
         rows, dark = aligned(np.vstack([R, calibration.good])), aligned(calibration.dark)
         return cls(rows, reference_nm, dark, scratch=aligned(dark), kernel=kernel, tables=tables)
-
-    def estimate_fused(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
-        """Estimate of a frame (pixels,) by the fused step; None if the frame needs the reference step."""
-        measured = None if self.tables is None else self.tables.estimate(pixels, min_flux_dn)
-        return None if measured is None else Estimate(*measured)
 
     def estimate(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
         """Estimate of a frame (pixels,) by the reference step; None if its flux is at most `min_flux_dn`."""

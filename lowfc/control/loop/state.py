@@ -10,14 +10,14 @@ import numpy as np
 from lowfc.arrays import Mask, Single
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import map_rows
-from lowfc.control.kernel.tables import NUMPY, Kernel
+from lowfc.control.kernel.tables import NUMPY, Estimate, Kernel
 from lowfc.control.laws import linear_law
 from lowfc.control.laws.integrator import TIP_TILT, Integrator
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.command_channels import CommandChannels, Play, seen_nm
-from lowfc.control.loop.estimator import Estimate, Estimator
+from lowfc.control.loop.estimator import Estimator
 from lowfc.control.loop.guard import LawGuard
 from lowfc.control.loop.interlocks import Acting, Interlock
 from lowfc.control.loop.lease import Lease

@@ -243,8 +243,7 @@ def test_the_delay_is_measured(delay: float) -> None:
     poke = dither(1, 8.0, 600, 1, 3).table[:, 0]
     weights = np.concatenate([[0.0], delay_weights(delay)])
     seen_nm = np.convolve(poke, weights)[: len(poke)]
-    frames = exposed(np.outer(seen_nm, [0, 1, 0, 0]), 5)
-    fractions, _ = fractions_of(frames)
+    fractions, _ = fractions_of(exposed(np.outer(seen_nm, [0, 1, 0, 0]), 5))
     measured_delay = measure_delay(fractions, I0, poke)
     assert abs(measured_delay.delay_frames - delay) < min(0.05, 5 * measured_delay.error_frames + 1e-3)
     assert measured_delay.response @ H[:, 1] > 0.9 * np.linalg.norm(measured_delay.response) * np.linalg.norm(H[:, 1])
@@ -345,8 +344,7 @@ def test_poorly_measured_combinations_can_be_truncated_or_damped() -> None:
 
 def test_too_few_usable_frames_are_an_error() -> None:
     plan = cycle(poke_patterns(MODES, 8.0), hold=1, settle=0, rest=0)
-    frames = exposed(plan.table, 1)
-    fractions, flux = fractions_of(frames)
+    fractions, flux = fractions_of(exposed(plan.table, 1))
     with pytest.raises(ValueError, match="do not tell the 4 modes apart"):
         cycle_response(fractions, flux, plan.table, plan.table, (np.arange(len(plan)) < 2 * SIGNS.size).astype(float))
     with pytest.raises(ValueError, match="no frame with a poke"):
