@@ -74,16 +74,13 @@ class Settings:
 
     def integrator(self, noll: tuple[int, ...]) -> Integrator:
         """The integrator for these modes: the first value of each pair for tip and tilt, the second for the others."""
-
-        def per_mode(pair: tuple[float, float]) -> Single:
-            return np.array([pair[0] if index in TIP_TILT else pair[1] for index in noll], dtype=np.float32)
-
-        return Integrator(per_mode(self.gain), per_mode(self.leak), per_mode(self.limit_nm))
+        tilt, pairs = np.isin(noll, TIP_TILT), (self.gain, self.leak, self.limit_nm)
+        gain, leak, limit_nm = (np.where(tilt, *pair).astype(np.float32) for pair in pairs)
+        return Integrator(gain, leak, limit_nm)
 
     def automatic(self, noll: tuple[int, ...]) -> Mask:
         """The modes (modes,) whose gain is automatic at the start."""
-        tilt, others = self.auto_gain
-        return np.array([tilt if index in TIP_TILT else others for index in noll], dtype=bool)
+        return np.where(np.isin(noll, TIP_TILT), *self.auto_gain)
 
 
 class LawRunner(NamedTuple):
