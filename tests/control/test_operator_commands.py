@@ -16,35 +16,14 @@ from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import wire
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import (
-    CameraSettings,
-    Frame,
-    Input,
-    Load,
-    MirrorReport,
-    MirrorShape,
-    Outputs,
-    Reply,
-    Request,
-    Tick,
-)
+from lowfc.control.loop.camera import CameraSettings
+from lowfc.control.loop.inputs import Frame, Input, Load, MirrorReport, MirrorShape, Outputs, Reply, Request, Tick
 from lowfc.control.loop.requests import REQUESTS, prepared
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import Settings, State
 from tests.support.safety_checks import violations
 from tests.support.theory import integrators, law_of, linear
-from tests.support.toy import (
-    DARK_DN,
-    GRID,
-    NOLL,
-    SATURATION_DN,
-    SHAPE,
-    START,
-    calibration,
-    frame,
-    frame_sequence,
-    settings,
-)
+from tests.support.toy import DARK_DN, NOLL, SATURATION_DN, SHAPE, START, calibration, frame, frame_sequence, settings
 
 REQUEST_COUNT = 40
 """Number of requests in each run."""
@@ -173,7 +152,7 @@ class Script:
                 self.start, self.count = self.start + 9, 0
                 return frame(0, sequence=frame_sequence(0, self.start))
             case 4:
-                shape = np.full(GRID, rng.choice([0.0, 30.0, 650.0, np.nan]), np.float32)
+                shape = np.full(CALIBRATION.grid, rng.choice([0.0, 30.0, 650.0, np.nan]), np.float32)
                 reported = MirrorShape(0, shape, rng.choice([0.0, 20.0, -1e30, np.nan], 3).astype(np.float32))
                 fault = rng.choice(["", "", "", "does not answer"])
                 return reported if rng.random() < 0.5 else MirrorReport(0, str(fault), reported)

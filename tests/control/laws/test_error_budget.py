@@ -117,15 +117,12 @@ def run(
     """Error, residual and seen command of a loop with `law_of_two_modes()` and a sensor `measure(residual, frame)`."""
     time_s = np.arange(frames) / RATE_HZ
     waves = np.stack([9 * np.sin(2 * np.pi * 11 * time_s), 4 * np.sin(2 * np.pi * 3 * time_s)], axis=1)
-    command = np.zeros(2)
-    rows: list[list[np.ndarray]] = [[], [], []]
-    for index in range(frames):
-        residual = waves[index] + command
-        error = measure(residual, index)
-        for row, value in zip(rows, (error, residual, command), strict=True):
-            row.append(value)
-        command = command - (0.5, 0.1) * error
-    error, residual, seen = (one_piece(np.array(row)[500:]) for row in rows)
+    command, rows = np.zeros(2), np.empty((3, frames, 2))
+    for index, wave in enumerate(waves):
+        residual = wave + command
+        rows[:, index] = measure(residual, index), residual, command
+        command = command - (0.5, 0.1) * rows[0, index]
+    error, residual, seen = (one_piece(row[500:]) for row in rows)
     return error, residual, seen
 
 
