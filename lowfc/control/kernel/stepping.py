@@ -18,17 +18,15 @@ def respond(
     measured_nm: Single,
     sequence: int,
     events: list[PendingEvent],
-    *,
-    fused: bool,
+    tables: Tables | None,
 ) -> tuple[Single, Single, ActiveLoop, tuple[Reason, ...], bool]:
-    """Respond to the modal errors (modes,) of a frame; `fused` if the fused step computed them.
+    """Respond to the modal errors (modes,) of a frame; `tables` if the fused step computed the errors with them.
 
     Returns:
         Error and pseudo-open-loop modes (modes,), nm of wavefront rms; the loop after the frame; the limits that acted
         on the command; and whether the modal command is still returning to zero.
     """
-    tables = loop.estimator.tables
-    results = _fused(settings, state, loop, tables, measured_nm) if fused and tables is not None else None
+    results = None if tables is None else _fused(settings, state, loop, tables, measured_nm)
     if results is None:
         error_nm, pol_nm, loop = _pseudo_open_loop(state, loop, measured_nm, sequence, events)
         return error_nm, pol_nm, *next_command(settings, state, loop, error_nm, sequence)

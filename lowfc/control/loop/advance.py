@@ -10,7 +10,7 @@ import numpy as np
 
 from lowfc.arrays import Single
 from lowfc.control.kernel.stepping import next_command, respond, step_to_flat
-from lowfc.control.kernel.tables import Estimate
+from lowfc.control.kernel.tables import Estimate, Tables
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.estimator import fill_saturated, saturated_pixels
 from lowfc.control.loop.inputs import (
@@ -81,13 +81,13 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     measured = _measure(settings, state, loop, frame)
     if isinstance(measured, Rejection):
         return _refuse(settings, _with_newest_frame(state, loop, frame), frame, measured, events)
-    estimate, saturated, fused = measured
+    estimate, saturated, tables = measured
     identical = state.identical_frames + 1 if estimate.same(state.estimate) else 0
     if 0 < settings.max_identical_frames < identical:
         stuck = _with_newest_frame(state, loop, frame)._replace(identical_frames=identical)
         return _refuse(settings, stuck, frame, Rejection.STUCK, events)
     error_nm, pol_nm, loop, reasons, returning_to_zero = respond(
-        settings, state, loop, estimate.error_nm, frame.sequence, events, fused=fused
+        settings, state, loop, estimate.error_nm, frame.sequence, events, tables
     )
     if reasons:
         loop = end_probe(loop, frame.sequence, _limit_cause(reasons), events)
@@ -163,8 +163,8 @@ def _with_newest_frame(state: State, loop: ActiveLoop | None, frame: Frame) -> S
 
 def _measure(
     settings: Settings, state: State, loop: ActiveLoop, frame: Frame
-) -> tuple[Estimate, int, bool] | Rejection:
-    """Estimate of a frame, number of saturated pixels, whether the fused step was used; or why the frame is refused."""
+) -> tuple[Estimate, int, Tables | None] | Rejection:
+    """Estimate of a frame, number of saturated pixels, tables if the fused step was used; or why it is refused."""
     calibration = loop.calibration
     if not calibration.noll:
         return Rejection.NO_CALIBRATION
@@ -182,14 +182,14 @@ def _measure(
     tables = loop.estimator.tables
     fused = None if tables is None else tables.estimate(pixels, min_flux_dn)
     if fused is not None:
-        return fused, 0, True
+        return fused, 0, tables
     saturated = saturated_pixels(calibration, pixels)
     if saturated > settings.max_saturated_pixels:
         return Rejection.SATURATED
     if saturated:
         pixels = fill_saturated(calibration, pixels)
     estimate = loop.estimator.estimate(pixels, min_flux_dn)
-    return Rejection.DARK if estimate is None else (estimate, saturated, False)
+    return Rejection.DARK if estimate is None else (estimate, saturated, None)
 
 
 def _overruled(state: State, loop: ActiveLoop) -> bool:
