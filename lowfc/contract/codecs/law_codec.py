@@ -82,7 +82,7 @@ def put_command_channels(message: wire.ControllerState, command_channels: Comman
         message.channels.add(name=channel.name, actuators=shape, shifts=channel.shifts, reached=reached)
     play = command_channels.play
     if play is not None:
-        message.play.target = play.target
+        message.play.target = play.table.target
         message.play.first_sequence = play.first_sequence
         message.play.columns = play.table.rows.shape[1]
         message.play.frames = play.frames

@@ -85,11 +85,6 @@ class Play(NamedTuple):
     first_sequence: int
     frames: int
 
-    @property
-    def target(self) -> str:
-        """`MIRROR` or `OFFSET`."""
-        return self.table.target
-
     def row(self, sequence: int) -> Single | None:
         """Row for a frame; None before the first and after the last."""
         index = sequence - self.first_sequence
@@ -140,12 +135,12 @@ class CommandChannels(NamedTuple):
 
     def target_nm(self, sequence: int) -> Single:
         """The loop's target (modes,) for a frame."""
-        row = self.play.row(sequence) if self.play is not None and self.play.target == OFFSET else None
+        row = self.play.row(sequence) if self.play is not None and self.play.table.target == OFFSET else None
         return self.offset_nm if row is None else self.offset_nm + row
 
     def played_nm(self, sequence: int) -> Single | None:
         """The shape (rows, columns) played for a frame, nm of surface; None if none is."""
-        if self.play is None or self.play.target != MIRROR:
+        if self.play is None or self.play.table.target != MIRROR:
             return None
         row = self.play.row(sequence)
         return None if row is None else (row @ self.play.table.basis).reshape(self.sum_nm.shape)

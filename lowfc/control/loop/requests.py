@@ -245,11 +245,11 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
 
 
 def _stop(settings: Settings, state: State, request: Request) -> Handled:
-    loop = state.loop
-    if loop is None or loop.play is None or loop.play.over(state.frame_sequence + 1):
+    loop, play = state.loop, None if state.loop is None else state.loop.play
+    if loop is None or play is None or play.over(state.frame_sequence + 1):
         return state, "no probe sequence is being played"
-    remaining = loop.play.remaining(state.frame_sequence + 1)
-    text = f"probe sequence stopped on the {loop.play.target}: {remaining} of {loop.play.frames} frames were left"
+    remaining = play.remaining(state.frame_sequence + 1)
+    text = f"probe sequence stopped on the {play.table.target}: {remaining} of {play.frames} frames were left"
     return state._replace(loop=loop.stopped(state.frame_sequence)), text
 
 
