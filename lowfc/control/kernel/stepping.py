@@ -6,6 +6,7 @@ from lowfc.arrays import Single
 from lowfc.control.kernel.tables import Tables
 from lowfc.control.laws import linear_law
 from lowfc.control.laws.integrator import integrate
+from lowfc.control.loop.command_channels import seen_nm
 from lowfc.control.loop.inputs import PendingEvent
 from lowfc.control.loop.safety import Limit, LoopMode, Reason, limit
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, ActiveLoop, LawRunner, Settings, State
@@ -62,11 +63,12 @@ def _fused(
     shift_nm = target_nm = tables.no_modes
     channels_nm = tables.no_channels
     if channels is not None:
-        shift_nm, target_nm, channels_nm = channels.seen_nm(loop.delay_weights), channels.offset_nm, channels.sum_nm
+        shift_nm = seen_nm(loop.delay_weights, channels.shifts_nm)
+        target_nm, channels_nm = channels.offset_nm, channels.sum_nm
     modes, limits = measured_nm.size, settings.limits
     results = np.empty(3 * modes + x.size, np.float32)
     actuators_nm = np.empty_like(loop.actuators_nm)
-    signals = measured_nm, loop.seen_nm(), shift_nm, target_nm, loop.history_nm[0]
+    signals = measured_nm, seen_nm(loop.delay_weights, loop.history_nm), shift_nm, target_nm, loop.history_nm[0]
     integrator = loop.integrator.rows
     mirror = tables.shapes, channels_nm, loop.actuators_nm
     # limits less the margin, which is half as large between neighbours
@@ -86,8 +88,8 @@ def _pseudo_open_loop(
     """
     channels, error_nm = loop.command_channels, measured_nm
     if channels is not None:
-        error_nm = measured_nm - channels.seen_nm(loop.delay_weights)
-    pol_nm = pol_from_target_nm = error_nm - loop.seen_nm()
+        error_nm = measured_nm - seen_nm(loop.delay_weights, channels.shifts_nm)
+    pol_nm = pol_from_target_nm = error_nm - seen_nm(loop.delay_weights, loop.history_nm)
     if channels is not None:
         target_nm = channels.target_nm(sequence)
         error_nm, pol_from_target_nm = error_nm - target_nm, pol_nm - target_nm

@@ -129,10 +129,6 @@ class CommandChannels(NamedTuple):
         """Whether the command changes with the next frame even in an open loop."""
         return self.play is not None or any(channel.moving for channel in self.channels)
 
-    def seen_nm(self, weights: tuple[tuple[int, np.float32], ...]) -> Single:
-        """The shift (modes,) in the last exposure."""
-        return seen_nm(weights, self.shifts_nm)
-
     def target_nm(self, sequence: int) -> Single:
         """The loop's target (modes,) for a frame."""
         row = self.play.row(sequence) if self.play is not None and self.play.table.target == OFFSET else None

@@ -16,7 +16,7 @@ from lowfc.control.laws.integrator import TIP_TILT, Integrator
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.camera import CameraSettings
-from lowfc.control.loop.command_channels import CommandChannels, Play, seen_nm
+from lowfc.control.loop.command_channels import CommandChannels, Play
 from lowfc.control.loop.estimator import Estimator
 from lowfc.control.loop.guard import LawGuard
 from lowfc.control.loop.interlocks import Acting, Interlock
@@ -207,10 +207,6 @@ class ActiveLoop(NamedTuple):
             actuators_nm=np.zeros(calibration.grid, np.float32),
         )
         return loop.with_gains(integrator)
-
-    def seen_nm(self) -> Single:
-        """The modal command (modes,) that the last exposure saw."""
-        return seen_nm(self.delay_weights, self.history_nm)
 
     def with_gains(self, integrator: Integrator) -> "ActiveLoop":
         """A copy with these gains; the command of a mode whose automatic gain is 0 relaxes to zero."""
