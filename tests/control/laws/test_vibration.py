@@ -121,17 +121,6 @@ def test_a_model_without_noise_still_gives_a_stable_filter(lines: tuple[float, .
 MODEL = Model(0.02, 5.0, (Line(18, 0.3, 60.0), Line(71, 0.5, 20.0)), 0.7, RATE_HZ)
 
 
-def residual_nm2(model: Model, whole_frames: int) -> float:
-    """Residual variance of LQG for a true model and a delay of whole frames, from the Riccati equation."""
-    A, Q, C = model.states()
-    covariance = covariance_nm2(model)
-    L = covariance @ C / (C @ covariance @ C + model.noise_nm2)
-    covariance = covariance - np.outer(L, C @ covariance)
-    for _ in range(whole_frames):
-        covariance = A @ covariance @ A.T + Q
-    return float(C @ covariance @ C)
-
-
 def minimum_variance_nm2(spectrum_nm2: Array, noise_nm2: float, whole_frames: int) -> float:
     """Least residual variance of any linear law, for a known spectrum of the disturbance and a delay of whole frames.
 
@@ -150,7 +139,10 @@ def minimum_variance_nm2(spectrum_nm2: Array, noise_nm2: float, whole_frames: in
 @pytest.mark.parametrize("delay", [1, 2, 3])
 def test_three_predictions_of_the_residual_agree(delay: int) -> None:
     """Riccati's covariance, the law's own transfer functions, and the factor of the spectrum."""
-    riccati, timing = residual_nm2(MODEL, delay), Timing.sampled(delay)
+    (A, Q, C), covariance, timing = MODEL.states(), covariance_nm2(MODEL), Timing.sampled(delay)
+    for _ in range(delay - 1):  # further frames without a measurement
+        covariance = A @ covariance @ A.T + Q
+    riccati = C @ covariance @ C
     assert predicted_nm(lqg([MODEL], (2,), timing), [MODEL], timing)[0] ** 2 == pytest.approx(riccati, rel=0.01)
     omega = np.linspace(0, np.pi, (1 << 18) + 1)
     spectrum = MODEL.spectrum_nm2(np.maximum(omega, omega[1] / 2))
