@@ -29,7 +29,7 @@ def verdicts(
     bank_: GainBank,
     open_nm: Array,
     gain: Array,
-    noise_nm2: float,
+    noise_nm2: float | None,
     tilt_nm: Array | None = None,
     *,
     closed: bool = False,
@@ -39,7 +39,8 @@ def verdicts(
     for index, modes_nm in enumerate(open_nm.astype(np.float32)):
         tilt_of_frame = None if tilt_nm is None else single(tilt_nm[index])
         if bank_.add_frame(modes_nm, modes_nm, tilt_of_frame, closed=closed) and bank_.complete:
-            all_verdicts.append(bank_.verdict(gain, noise_nm2 * np.ones(modes_nm.size)))
+            noise = None if noise_nm2 is None else noise_nm2 * np.ones(modes_nm.size)
+            all_verdicts.append(bank_.verdict(gain, noise))
             gain = all_verdicts[-1].gain
     return all_verdicts
 
@@ -128,11 +129,8 @@ def test_a_static_aberration_and_a_jump_across_lost_frames_are_not_noise() -> No
 
 
 def test_a_window_without_a_decision_grows() -> None:
-    bank_, rng, lengths = bank(windows=(100, 100)), np.random.default_rng(6), []
-    for _ in range(2000):
-        modes_nm = rng.normal(0, 1, MODES).astype(np.float32)
-        if bank_.add_frame(modes_nm, modes_nm, closed=True) and bank_.complete:
-            lengths.append(bank_.verdict(ZEROS, None).frames)  # the chosen gains are not applied
+    noise = np.random.default_rng(6).normal(0, 1, (2000, MODES))
+    lengths = [verdict.frames for verdict in verdicts(bank(windows=(100, 100)), noise, ZEROS, None, closed=True)]
     assert lengths[0] == 100
     assert max(lengths) >= 200
 
