@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Array, Integers
+from lowfc.arrays import Array, Integers, Mask
 
 MIN_CYCLES = 4
 """Least number of cycles for a useful scatter."""
@@ -140,7 +140,7 @@ def normalised(frames: npt.NDArray[np.number], dark: Array, good: Array) -> tupl
 
 
 def cycle_response(
-    fractions: Array, flux_dn: Array, seen: Array, instruments: Array, used: Array, slowest: float = 0.0
+    fractions: Array, flux_dn: Array, seen: Array, instruments: Array, used: Mask, slowest: float = 0.0
 ) -> Cycle:
     """Response from one cycle.
 
@@ -149,19 +149,18 @@ def cycle_response(
         flux_dn: (frames,) flux of each frame.
         seen: (frames, modes) modes of the mirror in each exposure, nm of wavefront.
         instruments: (frames, modes) instrumental variables: the poke alone in each exposure; `seen` in open loop.
-        used: (frames,) 1 for a usable frame, else 0.
+        used: (frames,) whether a frame is usable.
         slowest: Lowest frequency of the pokes that is used, cycles per frame: most of the disturbance is below.
 
     Raises:
         ValueError: the pokes in the usable frames do not tell the modes apart.
     """
-    kept = used > 0
-    x, z = seen[kept], instruments[kept]
+    x, z = seen[used], instruments[used]
     poked = z.any(axis=1)
     if not poked.any():
         raise ValueError("no frame with a poke is usable: all were lost or refused")
-    y, x, z = fractions[kept][poked], x[poked], z[poked]
-    slow = _slow(np.flatnonzero(kept)[poked], len(used), slowest)
+    y, x, z = fractions[used][poked], x[poked], z[poked]
+    slow = _slow(np.flatnonzero(used)[poked], len(used), slowest)
     z = z - slow @ (slow.T @ z)
     covariance = (x - x.mean(axis=0)).T @ z
     if not np.linalg.cond(covariance) < _WORST_INSTRUMENT:
@@ -169,9 +168,9 @@ def cycle_response(
             f"the {len(z)} usable frames do not tell the {x.shape[1]} modes apart: too many frames were lost or refused"
         )
     response = np.linalg.solve(covariance.T, z.T @ y).T
-    at_rest = fractions[kept][~poked]
+    at_rest = fractions[used][~poked]
     reference = at_rest.mean(axis=0) if len(at_rest) else None
-    return Cycle(response, reference, float(flux_dn[kept].mean()))
+    return Cycle(response, reference, float(flux_dn[used].mean()))
 
 
 def _slow(times: Integers, frames: int, slowest: float) -> Array:

@@ -149,7 +149,7 @@ def measured(patterns: np.ndarray, cycles: int) -> Measured:
     for number in range(cycles):
         plan = cycle(patterns, hold=4, settle=1, rest=16, backwards=number % 2 == 1)
         fractions, flux = fractions_of(exposed(plan.table, 100 + number))
-        sums = sums.plus(cycle_response(fractions, flux, plan.table, plan.table, plan.used.astype(float)))
+        sums = sums.plus(cycle_response(fractions, flux, plan.table, plan.table, plan.used))
     return fit_response(sums)
 
 
@@ -346,9 +346,9 @@ def test_too_few_usable_frames_are_an_error() -> None:
     plan = cycle(poke_patterns(MODES, 8.0), hold=1, settle=0, rest=0)
     fractions, flux = fractions_of(exposed(plan.table, 1))
     with pytest.raises(ValueError, match="do not tell the 4 modes apart"):
-        cycle_response(fractions, flux, plan.table, plan.table, (np.arange(len(plan)) < 2 * SIGNS.size).astype(float))
+        cycle_response(fractions, flux, plan.table, plan.table, np.arange(len(plan)) < 2 * SIGNS.size)
     with pytest.raises(ValueError, match="no frame with a poke"):
-        cycle_response(fractions, flux, plan.table, plan.table, np.zeros(len(plan)))
+        cycle_response(fractions, flux, plan.table, plan.table, np.zeros(len(plan), bool))
     with pytest.raises(ValueError, match="no light"):
         fractions_of(np.zeros((3, PIXELS)))
 

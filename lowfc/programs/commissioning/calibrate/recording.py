@@ -286,7 +286,7 @@ class Player:
             fractions, flux = self._normalised(recording)
             poked = recording.played(plan.table, delay_frames)
             moved = poked + recording.commands(delay_frames) if self.closed else poked
-            used = recording.usable(plan, delay_frames).astype(np.float64)
+            used = recording.usable(plan, delay_frames)
             return cycle_response(fractions, flux, moved, poked, used, DITHER_SLOWEST if self.closed else 0.0)
 
         return self._repeated(attempt, "a cycle is repeated", "no cycle was usable")
