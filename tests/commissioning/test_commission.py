@@ -228,11 +228,11 @@ def test_tilt_is_poked_to_find_a_reflection_unless_the_sensor_is_another_one(noi
     H = onto(first.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
     image = onto(first.reference.astype(float).reshape(80, 80), geometry, (80, 80)).reshape(-1)
     image *= 1 + noise * np.random.default_rng(1).standard_normal(image.size)
-    first_poke = Mock(side_effect=lambda mode, plan: Delay(1.0, 0.1, np.ones(1), H[:, mode], 9.0))
+    first_poke = Mock(side_effect=lambda mode, plan: Delay(1.0, 0.1, H[:, mode]))
     before = replace(first, reference=single(image))
     player: Any = SimpleNamespace(before=before, report=lambda text: None, first_poke=first_poke)
     results: dict[str, Any] = {}
-    aligned(player, config, first, Delay(1.0, 0.1, np.ones(1), H[:, 0], 9.0), results)
+    aligned(player, config, first, Delay(1.0, 0.1, H[:, 0]), results)
     assert [call.args[0] for call in first_poke.call_args_list] == poked
     assert results.get("parity") == (-1 if poked else None)
 

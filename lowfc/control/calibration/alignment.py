@@ -49,12 +49,11 @@ class Geometry:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Result of a fit: geometry, flux and uniform background of the real image, and the residual.
+    """Result of a fit: geometry and uniform background of the real image, and the residual.
 
     Attributes:
         geometry: Geometry of the better parity; its rotation may be off by 180 degrees.
-        flux: Flux of the real image, in its unit.
-        background: Background of each real pixel, in the same unit.
+        background: Background of each real pixel, in the unit of the image.
         residual: Rms of real minus fitted image, relative to the rms of the real image.
         other_parity: The same residual for the other parity.
         orientations: Geometries that the image does not distinguish.
@@ -62,7 +61,6 @@ class Alignment:
     """
 
     geometry: Geometry
-    flux: float
     background: float
     residual: float
     other_parity: float
@@ -120,12 +118,12 @@ def align(real: Array, computed: Array, good: Mask | None = None) -> Alignment:
             f"the image does not resemble the computed reference: {residual:.0%} of it remains after the best fit; is "
             "this the sensor and the mask of the configuration?"
         )
-    _, flux, background = _residual(_sample(spline, best, real.shape)[used], real[used])
+    _, _, background = _residual(_sample(spline, best, real.shape)[used], real[used])
     circular = _circular(spline, computed)
     possible = [best, reflected] if circular or other < max(_ALIKE * residual, _EXACT) else [best]
     possible = [replace(each, rotation_deg=(each.rotation_deg + 90) % 180 - 90) for each in possible]
     orientations = [orientation for each in possible for orientation in (each, each.rotated(180))]
-    return Alignment(possible[0], flux, background, residual, other, orientations, circular)
+    return Alignment(possible[0], background, residual, other, orientations, circular)
 
 
 def _circular(spline: Array, computed: Array) -> bool:

@@ -24,16 +24,12 @@ class Delay(NamedTuple):
     Attributes:
         delay_frames: a command computed from frame n first acts on the whole exposure of frame n + delay_frames.
         error_frames: standard error of the delay.
-        weights: (lags,) fraction of the response at each lag, in frames after the poke's own.
         response: (pixels,) image of the response to one unit of the poke, flux fractions.
-        snr: signal-to-noise ratio of the response.
     """
 
     delay_frames: float
     error_frames: float
-    weights: Array
     response: Array
-    snr: float
 
 
 class NotSeenError(ValueError):
@@ -76,7 +72,6 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
         response += direction * light * abs(left[:, 0].sum()) * values[0] / 2
         power += float(((half_factors[:, 0] / errors[:, 0]) ** 2).sum())
     snr = float(np.sqrt(power))
-    total = factors.sum()
     if snr < MIN_SNR:
         raise NotSeenError(
             "the pokes are not seen in the frames: is the light on the sensor, does the mirror follow the commands, is "
@@ -84,14 +79,14 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
         )
     pairs = factors[:-1] + factors[1:]
     whole = int(pairs.argmax())
-    if pairs[whole] < 0.5 * np.abs(factors).sum() or factors[-1] > 0.5 * total:
+    if pairs[whole] < 0.5 * np.abs(factors).sum() or factors[-1] > 0.5 * factors.sum():
         raise ValueError(
             f"the response to a poke is spread over several frames, or later than {LAGS - 1.5:g} frames: the delay "
             "cannot be measured; are frames lost, or commands late?"
         )
     fraction = float(np.clip(factors[whole + 1] / pairs[whole], 0, 1))
     error = np.hypot(fraction * np.sqrt(variances[whole]), (1 - fraction) * np.sqrt(variances[whole + 1]))
-    return Delay(whole + fraction, float(error / pairs[whole]), factors / total, response, snr)
+    return Delay(whole + fraction, float(error / pairs[whole]), response)
 
 
 def _lagged(row: Array) -> Array:
