@@ -101,25 +101,33 @@ class Comparison(Result):
     same_commands: bool = result_field("same commands")
 
 
-def finish_calibration(
-    calibrator: Calibrator, request: CalibrationRequest, data: CalibrationData, computed: Calibration
-) -> tuple[Calibration, CalibrationResult]:
+def finish_calibration(calibrator: Calibrator, data: CalibrationData) -> tuple[Calibration, CalibrationResult]:
     """Compute R, check it on separate frames, write the file, under another name if it is not recommended."""
-    config = calibrator.config
-    calibration, quality = measured_calibration(config, calibrator.before, data.measured, request)
+    config, request, computed, measured = calibrator.config, calibrator.request, calibrator.computed, data.measured
+    calibration, quality = measured_calibration(config, calibrator.before, measured, request)
     check = calibrator.check(calibration, data)
-    noise = computed_noise_nm(config, calibration, computed)
-    ratio = None if noise is None else factory.frame_noise_nm(config, calibration) / noise
-    verdict = judge(request.snr, data.measured.cycles, data.measured.error, check, ratio, calibration.noll)
+    delay_frames, delay_error_frames = data.delay[:2]
+    fields: dict[str, Any] = {
+        "delay_frames": delay_frames,
+        "delay_error_frames": delay_error_frames,
+        "cycles": measured.cycles,
+    }
+    noise_nm, ratio = computed_noise_nm(config, calibration, computed), None
+    if noise_nm is not None:
+        ratio = factory.frame_noise_nm(config, calibration) / noise_nm
+        fields["cross_talk"] = float(np.abs(cross_talk(calibration.reconstructor, computed.response)).max())
+        fields["cross_talk_error"] = float(measured.error.max())
+        fields["computed_noise_nm"] = noise_nm.tolist()
+    verdict = judge(request.snr, measured.cycles, measured.error, check, ratio, calibration.noll)
     out = request.out  # a calibration that is not recommended does not replace it
     file = out.with_name(f"{out.stem}.rejected{out.suffix}") if verdict.faults else out
-    result = result_of(config, calibration, quality, request.method, file, data, computed, verdict)
+    result = result_of(config, calibration, quality, request.method, file, **fields, **verdict.json_object())
     calibration_file.save(calibration, file)
     configured = configured_delay(config)
-    if abs(data.delay.delay_frames - configured) > DELAY_TOLERANCE_FRAMES:
+    if abs(delay_frames - configured) > DELAY_TOLERANCE_FRAMES:
         result.advice.append(
             f"warning: the configured delay is {counted(float(configured), 'frame')}: set control.delay_frames = "
-            f"{max(data.delay.delay_frames, 1):.2f}"
+            f"{max(delay_frames, 1):.2f}"
         )
     return calibration, result
 
@@ -170,22 +178,12 @@ def result_of(
     reconstruction: Reconstruction,
     method: str,
     file: Path,
-    data: CalibrationData | None = None,
-    computed: Calibration | None = None,
-    verdict: Verdict | None = None,
+    **measured: Any,
 ) -> CalibrationResult:
-    """The result of a measured or computed calibration."""
+    """The result of a calibration; `measured`: the fields of a measured one, with its delay and its verdict."""
     limit_nm = factory.settings(config).integrator(calibration.noll).limit_nm
-    delay_frames = configured_delay(config)
-    optional: dict[str, Any] = {"delay_error_frames": None, "cycles": None}  # set, so that --json always has them
-    if data is not None:
-        delay_frames, optional["delay_error_frames"] = data.delay[:2]
-        optional["cycles"] = data.measured.cycles
-    noise = None if computed is None else computed_noise_nm(config, calibration, computed)
-    if data is not None and computed is not None and noise is not None:
-        optional["cross_talk"] = float(np.abs(cross_talk(calibration.reconstructor, computed.response)).max())
-        optional["cross_talk_error"] = float(data.measured.error.max())
-        optional["computed_noise_nm"] = noise.tolist()
+    # set, so that --json always has them
+    fields = {"delay_frames": configured_delay(config), "delay_error_frames": None, "cycles": None, **measured}
     return CalibrationResult.model_construct(
         method=method,
         modes=len(calibration.noll),
@@ -193,15 +191,13 @@ def result_of(
         condition_number=reconstruction.condition_number,
         singular_values=reconstruction.singular_values.tolist(),
         kept=reconstruction.kept.tolist(),
-        delay_frames=delay_frames,
-        frame_to_effect_ms=delay_frames * config.period_ns * 1e-6,
+        frame_to_effect_ms=fields["delay_frames"] * config.period_ns * 1e-6,
         noise_gain_nm=factory.frame_noise_nm(config, calibration).tolist(),
         bad_pixels=int(np.count_nonzero(calibration.good == 0)),
         flux_dn=calibration.flux_dn,
         file=str(file),
         advice=[advice(reconstruction, calibration.noll, limit_nm)],
-        **optional,
-        **({} if verdict is None else verdict.json_object()),
+        **fields,
     )
 
 

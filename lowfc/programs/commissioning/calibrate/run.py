@@ -54,6 +54,8 @@ class Calibrator:
     """One calibration of a running loop; afterwards the mirror returns to its former shape.
 
     Attributes:
+        request: the requested calibration.
+        computed: the computed calibration.
         config: configuration of the loop.
         before: calibration in use.
         noise_nm: noise of one frame with that calibration (modes,), nm rms.
@@ -74,13 +76,13 @@ class Calibrator:
             computed: The computed calibration; its R may start the fit, if it has the loop's frame size and modes.
         """
         self._loop = loop
-        self._request = request
+        self.request = request
         self._report = report
         self.config = configuration_of(loop)
         self.before = replace(loop.calibration(), camera=loop.camera())
         if self.before.camera is not None:
             check_size(self.before.camera.shape, self.before)
-        self._computed = computed
+        self.computed = computed
         self.noise_nm = factory.frame_noise_nm(self.config, self.before)
         self._closed = request.method == "in-loop"
         if not self._closed:  # the in-loop method keeps the reference image
@@ -184,7 +186,7 @@ class Calibrator:
             )
 
     def _cycles(self, delay: Delay) -> Measured:
-        pokes, request = self.pokes, self._request
+        pokes, request = self.pokes, self.request
         path = partial_of(request.out)
         if self._resumed is None:
             sums = Sums.none(self._initial(delay))
@@ -223,7 +225,7 @@ class Calibrator:
     def _initial(self, delay: Delay) -> Initial:
         """The initial R of the fit: the computed one, unless the one in use measures pokes with less noise."""
         before = self.before
-        known = [each for each in (self._computed, before) if comparable(each, before)]
+        known = [each for each in (self.computed, before) if comparable(each, before)]
         candidates = [Initial(each.reconstructor.astype(np.float64) * before.good, each.estimator) for each in known]
         full_rank = [each for each in candidates if np.linalg.matrix_rank(each.matrix) == len(before.noll)]
         if not full_rank:

@@ -80,7 +80,7 @@ def calibrate_with_pokes(request: CalibrationRequest, run: str | None, *, load: 
         calibrator = Calibrator(loop, request, report, progress, computed)
         try:
             with calibrator.required_mode():
-                calibration, result = finish_calibration(calibrator, request, calibrator.run(), computed)
+                calibration, result = finish_calibration(calibrator, calibrator.run())
                 if result.recommended:
                     if load:
                         with calibrator.opened("to load the calibration"):

@@ -169,7 +169,7 @@ class Commissioning:
         calibrator = Calibrator(self._loop, request, self._report, self._progress, self._computed)
         data = calibrator.run(delay)
         self._announce("verdict")
-        calibration, result = finish_calibration(calibrator, request, data, self._computed)
+        calibration, result = finish_calibration(calibrator, data)
         self._results |= result.json_object()
         if not result.recommended:
             raise CalibrationError(
