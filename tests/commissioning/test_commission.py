@@ -1,8 +1,8 @@
 """`lowfc commission` on a loop in one process, and the agreement of camera and configuration."""
 
-import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +17,7 @@ from lowfc.contract.codecs.calibration_codec import camera_settings, identified
 from lowfc.contract.configuration import Configuration, Control
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
-from lowfc.contract.sections import Camera, Disturbance, SensorSection
+from lowfc.contract.sections import Camera
 from lowfc.control.calibration.alignment import Geometry, onto
 from lowfc.control.calibration.delay_fit import Delay
 from lowfc.device.driver import CameraSettings, camera_state
@@ -29,29 +29,17 @@ from lowfc.programs.commissioning.commission.commissioning import Commissioning,
 from lowfc.programs.commissioning.commission.first_calibration import aligned, linear_nm
 from lowfc.programs.commissioning.commission.first_light import Sensor, calibration_with_reference
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, Agreement, agreement_checks
-from tests.support.in_process_loop import InProcessLoop, computed
+from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop, computed, configuration
 from tests.support.loops import refusal
 from tests.support.theory import LAWS
 
-TOML = """
-[star]
-magnitude = 0
-[camera]
-rate_hz = 100
-instants = 1
-bit_depth = 14
-[control]
-gain = 0.2
-[mirror]
-rows = 12
-columns = 12
-pitches_per_pupil = 10
-"""
-CONFIG = Configuration.model_validate(tomllib.loads(TOML))
-DISTURBED = CONFIG.model_copy(update={"sensor": SensorSection(modes=3)})
+KEYS = {"star.magnitude": 0.0, "camera.rate_hz": 100, "camera.instants": 1, "camera.bit_depth": 14, "control.gain": 0.2}
+configured = partial(configuration, SMALL_MIRROR | KEYS)
+CONFIG = configured()
+DISTURBED = configured(sensor__modes=3)
 """Few modes, so that a cycle is short; default disturbance."""
-QUIET = DISTURBED.model_copy(update={"disturbance": Disturbance(preset="quiet")})
-NOISELESS = QUIET.model_copy(update={"camera": QUIET.camera.model_copy(update={"noise": False})})
+QUIET = configured(sensor__modes=3, disturbance__preset="quiet")
+NOISELESS = configured(sensor__modes=3, disturbance__preset="quiet", camera__noise=False)
 """For tests that do not depend on noise: a frame takes half the time."""
 
 
@@ -62,6 +50,7 @@ class Bench:
         self.config, self.out = config, folder / "calibration.fits"
         self.loop = InProcessLoop(config, cut=8)
         self.loop.run(5)
+        self.results: dict[str, Any] = {}
         self.reports: list[str] = []
         self.questions: list[str] = []
         self.actions: dict[str, Callable[[], None]] = {}
@@ -104,15 +93,16 @@ def _few_frames() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def commissioned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Bench, dict[str, Any]]:
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """A commissioned bench with the results of its commissioning."""
     bench = Bench(tmp_path_factory.mktemp("bench"), DISTURBED)
-    return bench, bench.commission(cycles=6)
+    bench.results = bench.commission(cycles=6)
+    return bench
 
 
-def test_commissioning_closes_a_loop_with_another_frame_size(commissioned: tuple[Bench, dict[str, Any]]) -> None:
-    bench, results = commissioned
-    assert results["recommended"]
-    assert results["measured_error_nm"] == pytest.approx(results["predicted_error_nm"], rel=0.15)
+def test_commissioning_closes_a_loop_with_another_frame_size(bench: Bench) -> None:
+    assert bench.results["recommended"]
+    assert bench.results["measured_error_nm"] == pytest.approx(bench.results["predicted_error_nm"], rel=0.15)
     state = bench.loop.status().state
     assert state.mode == wire.LOOP_MODE_CLOSED
     assert list(state.gain) == pytest.approx([0.1, 0.1, 0.2])
@@ -143,15 +133,13 @@ def test_disturbance_of_a_mode_is_not_mistaken_for_nonlinearity(scatter: float, 
     assert linear_nm(player, CONFIG, delay, 3.0) == chosen_nm
 
 
-def test_the_loop_holds_the_wavefront_of_the_reference_image(commissioned: tuple[Bench, dict[str, Any]]) -> None:
-    bench, results = commissioned
+def test_the_loop_holds_the_wavefront_of_the_reference_image(bench: Bench) -> None:
     bench.loop.run(200)
     true = bench.loop.residual_nm(-200)
-    assert float(np.sqrt(true.var(axis=0).sum())) < results["measured_error_nm"]  # which includes noise
+    assert float(np.sqrt(true.var(axis=0).sum())) < bench.results["measured_error_nm"]  # which includes noise
 
 
-def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench, dict[str, Any]]) -> None:
-    bench, results = commissioned
+def test_without_close_the_residual_is_only_predicted(bench: Bench) -> None:
     bench.loop.open_loop()
     before = bench.loop.status().state
     text = bench.commissioning(close=False)._predict_and_close(1.0)
@@ -160,7 +148,7 @@ def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench,
     after = bench.loop.status().state
     assert (after.mode, after.gain, after.automatic) == (wire.LOOP_MODE_OPEN, before.gain, before.automatic)
     open_nm = np.array([step.pol_nm for step in bench.loop.steps(300)])
-    assert results["predicted_error_nm"] < 0.7 * np.sqrt(np.square(open_nm).sum(axis=1).mean())
+    assert bench.results["predicted_error_nm"] < 0.7 * np.sqrt(np.square(open_nm).sum(axis=1).mean())
     bench.actions = {"observing": bench.loop.open_loop}
     with pytest.raises(CalibrationError, match="the loop went from closed to open"):
         bench.commissioning()._measured_nm(10, 1, 1.0)
@@ -170,10 +158,7 @@ def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench,
 
 
 @pytest.mark.parametrize("reversed_modes", [[0], [0, 1, 2]])
-def test_a_wrong_sign_fails_the_check_with_automatic_gains(
-    commissioned: tuple[Bench, dict[str, Any]], reversed_modes: list[int]
-) -> None:
-    bench, _ = commissioned
+def test_a_wrong_sign_fails_the_check_with_automatic_gains(bench: Bench, reversed_modes: list[int]) -> None:
     bench.loop.open_loop()
     good = bench.loop.calibration()
     R = good.reconstructor.copy()
@@ -193,8 +178,7 @@ def test_a_wrong_sign_fails_the_check_with_automatic_gains(
     bench.loop.run(20)
 
 
-def test_with_a_linear_law_its_own_residual_is_predicted(commissioned: tuple[Bench, dict[str, Any]]) -> None:
-    bench, results = commissioned
+def test_with_a_linear_law_its_own_residual_is_predicted(bench: Bench) -> None:
     bench.loop.open_loop()
     law = replace(LAWS["pi"], rate_hz=100.0)
     bench.loop.law(law)
@@ -203,7 +187,7 @@ def test_with_a_linear_law_its_own_residual_is_predicted(commissioned: tuple[Ben
     with bench.loop.reserved("a test"):
         attempt._predict_and_close(1.0)
     assert attempt._results["measured_error_nm"] == pytest.approx(attempt._results["predicted_error_nm"], rel=0.15)
-    assert attempt._results["predicted_error_nm"] < 0.9 * results["predicted_error_nm"]
+    assert attempt._results["predicted_error_nm"] < 0.9 * bench.results["predicted_error_nm"]
     after = bench.loop.status().state
     assert (after.law.id, after.gain, after.automatic) == (law.id, before.gain, before.automatic)
     bench.loop.open_loop()
@@ -214,16 +198,15 @@ def test_with_a_linear_law_its_own_residual_is_predicted(commissioned: tuple[Ben
     ("snr", "cycles", "required"), [(None, None, 50.0), (None, 6, 20.0), (40.0, None, 40.0), (40.0, 6, 40.0)]
 )
 def test_a_given_number_of_cycles_changes_only_the_default_signal_to_noise_ratio(
-    commissioned: tuple[Bench, dict[str, Any]], snr: float | None, cycles: int | None, required: float
+    bench: Bench, snr: float | None, cycles: int | None, required: float
 ) -> None:
-    bench, _ = commissioned
     request = bench.commissioning(snr=snr, cycles=cycles)._request()
     assert (request.snr, request.cycles) == (required, cycles)
 
 
 @pytest.mark.parametrize(("noise", "poked"), [(0.0, [1]), (0.3, [])], ids=["the configured sensor", "another"])
 def test_tilt_is_poked_to_find_a_reflection_unless_the_sensor_is_another_one(noise: float, poked: list[int]) -> None:
-    config = Configuration.model_validate({**tomllib.loads(TOML), "sensor": {"kind": "clowfs", "modes": 3}})
+    config = configured(sensor__kind="clowfs", sensor__modes=3)
     first, geometry = computed(config.to_toml()), Geometry(1.0, 40.2, 39.5, 12.0, -1)
     H = onto(first.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
     image = onto(first.reference.astype(float).reshape(80, 80), geometry, (80, 80)).reshape(-1)
@@ -240,9 +223,8 @@ def test_tilt_is_poked_to_find_a_reflection_unless_the_sensor_is_another_one(noi
 @pytest.mark.slow
 def test_a_sensor_unlike_the_configured_one_is_measured_without_the_model(tmp_path: Path) -> None:
     """The optical model of another sensor provides only the modes and the mirror's commands."""
-    other = Configuration.model_validate({**tomllib.loads(TOML), "sensor": {"kind": "clowfs"}})
     bench = Bench(tmp_path, CONFIG)
-    results = bench.commission(model=other, close=False, snr=30.0, cycles=None)
+    results = bench.commission(model=configured(sensor__kind="clowfs"), close=False, snr=30.0, cycles=None)
     assert "without the optical model" in bench.shown or "cannot be compared" in bench.shown
     assert results["recommended"]
 
@@ -292,8 +274,7 @@ def test_a_commissioning_is_not_resumed_with_other_modes_or_commands(tmp_path: P
             bench.commission(resume=True)
 
 
-def test_a_failed_commissioning_restores_the_previous_calibration(commissioned: tuple[Bench, dict[str, Any]]) -> None:
-    bench, _ = commissioned
+def test_a_failed_commissioning_restores_the_previous_calibration(bench: Bench) -> None:
     before = bench.loop.calibration().id
     partial_of(bench.out).touch()
     for step, why in ("[6/10] poke", "the previous calibration is in use again"), ("[3/10]", "no calibration was"):
@@ -306,8 +287,7 @@ def test_a_failed_commissioning_restores_the_previous_calibration(commissioned: 
     assert not partial_of(bench.out).exists(), "a new commissioning removes the cycles of a former one"
 
 
-def test_a_finished_commissioning_cannot_be_resumed(commissioned: tuple[Bench, dict[str, Any]]) -> None:
-    bench, _ = commissioned
+def test_a_finished_commissioning_cannot_be_resumed(bench: Bench) -> None:
     provisional_path(bench.out).unlink(missing_ok=True)
     with pytest.raises(CalibrationError, match="nothing to resume"):
         bench.commission(resume=True)
@@ -337,8 +317,7 @@ def test_a_hot_pixel_at_full_well_is_not_the_star() -> None:
 
 def test_a_camera_that_differs_from_the_configuration_is_refused(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    wrong = {"camera": Camera(rate_hz=250.0, gain_e_per_dn=3.0), "control": Control(frame_timeout_ms=12.0)}
-    bench.config = CONFIG.model_copy(update=wrong)
+    bench.config = configured(camera__rate_hz=250.0, camera__gain_e_per_dn=3.0, control__frame_timeout_ms=12.0)
     with pytest.raises(CalibrationError) as caught:
         bench.commission()
     for key in ("camera.rate_hz", "camera.gain_e_per_dn", "control.frame_timeout_ms"):
@@ -357,13 +336,6 @@ def configured_camera(config: Configuration) -> wire.CameraState:
     return camera_state(CameraSettings.configured(config, 80, 80), 1)
 
 
-def changed(**fields: float) -> wire.CameraState:
-    state = configured_camera(Configuration())
-    for name, value in fields.items():
-        setattr(state, name, value)
-    return state
-
-
 def faults(config: Configuration, state: wire.CameraState) -> dict[str, Status]:
     """Statuses of the checks that are not ok, by field or key."""
     checks = agreement_checks(config, state)
@@ -379,9 +351,10 @@ def test_the_simulated_camera_agrees_with_its_configuration(em_gain: float, bits
 
 @pytest.mark.parametrize("agreement", AGREEMENTS, ids=lambda agreement: agreement.field)
 def test_a_difference_of_camera_and_configuration_is_found(agreement: Agreement) -> None:
-    field = agreement.field
-    statuses = faults(Configuration(), changed(**{field: getattr(changed(), field) * 2}))
-    assert statuses[field] is (Status.WRONG if agreement.needed else Status.WARNING)
+    state = configured_camera(Configuration())
+    setattr(state, agreement.field, 2 * getattr(state, agreement.field))
+    status = faults(Configuration(), state)[agreement.field]
+    assert status is (Status.WRONG if agreement.needed else Status.WARNING)
 
 
 def test_an_existing_calibration_is_replaced_only_with_force(own_runtime: Path) -> None:
