@@ -3,13 +3,13 @@
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -219,44 +219,59 @@ def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
     assert "above 10: the optical gain of the sensor is low" in warned
 
 
-class StepStream:
-    """Steps of a loop as a client receives them; one in a thousand is missing, one in a hundred was refused."""
-
-    lost = 4
-
-    def __init__(self, frames: int) -> None:
-        noise = np.random.default_rng(3).standard_normal((frames, 3)).astype(np.float32)
-        tip = 10 * np.sin(2 * np.pi * 20 * np.arange(frames) * PERIOD_NS * 1e-9)
-        noise[:, 0] += tip.astype(np.float32)
-        self.steps = iter(
-            Step(
-                frame_sequence(index),
-                index * PERIOD_NS,
-                LoopMode.CLOSED,
-                np.zeros(3, np.float32),
-                (),
-                None if index % 100 == 99 else pol,
-                None if index % 100 == 99 else pol,
-            )
-            for index, pol in enumerate(noise)
-            if index % 1000 != 500
-        )
-
-    def __iter__(self) -> Iterator[Step]:
-        return self.steps
-
-    def close(self) -> None:
-        self.steps = iter(())
+PROBE = wire.Play(first_sequence=frame_sequence(3050), frames=100, id="probe")
 
 
-class StreamedLoop(InProcessLoop):
-    def steps(self, count: int | None = None, patience_s: float = 0.0) -> StepStream:
-        return StepStream(6000)
+class SteppedLoop(InProcessLoop):
+    """A loop with these steps, whose mirror reports each command `report_periods` after the end of the exposure.
+
+    With a `later_gain`, the state has the probe sequence only at the request after 3100 steps, and this gain from then.
+    """
+
+    lost, offset = 0, None  # number of steps that the client lost, and offset of the clock of the mirror's host
+
+    def __init__(self, steps: list[Step], report_periods: float = 0.2, *, later_gain: float = 0.0) -> None:
+        super().__init__(CONFIG)
+        self.recorded, self.report_ns, self.later_gain = steps, round(report_periods * PERIOD_NS), later_gain
+        self.requested = 0
+
+    def steps(self, count: int | None = None, patience_s: float = 0.0) -> Any:
+        stream = MagicMock(lost=self.lost)
+        stream.__iter__.return_value = iter(self.recorded)
+        return stream
+
+    def status(self) -> Answer:
+        answer = super().status()
+        self.requested += 1
+        if self.later_gain and self.requested == 1 + 31:  # once at the start, and then every 100 steps
+            answer.state.play.CopyFrom(PROBE)
+        if self.later_gain and self.requested > 31:
+            answer.state.gain[:] = [self.later_gain] * 3
+        return answer
+
+    def mirror_watch(self) -> Any:
+        applied = [(step.frame_sequence, step.time_ns + self.report_ns) for step in self.recorded[-1024:]]
+        return SimpleNamespace(applied=applied, read=lambda: None, offset=self.offset)
+
+
+def noisy_steps() -> list[Step]:
+    """Noise, and 20 Hz in tip; one step in a thousand is missing, one frame in a hundred was refused."""
+    noise = np.random.default_rng(3).standard_normal((6000, 3)).astype(np.float32)
+    noise[:, 0] += (10 * np.sin(2 * np.pi * 20 * np.arange(6000) * PERIOD_NS * 1e-9)).astype(np.float32)
+    measured_nm = [None if index % 100 == 99 else row for index, row in enumerate(noise)]
+    return [
+        Step(frame_sequence(index), index * PERIOD_NS, LoopMode.CLOSED, np.zeros(3, np.float32), (), each, each)
+        for index, each in enumerate(measured_nm)
+        if index % 1000 != 500
+    ]
 
 
 def test_tuning_uses_the_steps_of_a_running_loop() -> None:
     """Missing and refused frames are bridged; the first half second after closing is excluded."""
-    run = telemetry_from_run(StreamedLoop(CONFIG), 60.0)
+    loop = SteppedLoop(noisy_steps())
+    loop.lost = 4
+    loop.mirror_watch = Mock(side_effect=BusError("the mirror does not report"))
+    run = telemetry_from_run(loop, 60.0)
     assert run.closed
     assert (run.source, run.noll, run.timing) == ("folded", NOLL, Timing.of(1.0, 0.5))
     assert run.rate_hz == pytest.approx(1000)
@@ -275,52 +290,13 @@ def test_tuning_uses_the_steps_of_a_running_loop() -> None:
     assert f"closed {added['closed']:+.1e}, predicted {added['predicted']:+.1e}; tilt contributes most (" in text
 
 
-class ReportingLoop(StreamedLoop):
-    """A loop whose mirror reports commands 0.2 periods after the exposure; the camera's clock is 7 periods behind."""
-
-    processes = Mock(return_value={"camera": wire.Health(router_offset_ns=9 * PERIOD_NS)})
-
-    def mirror_watch(self) -> Any:
-        applied = [(frame_sequence(index), (index + 7) * PERIOD_NS + PERIOD_NS // 5) for index in range(4000, 5000)]
-        return SimpleNamespace(applied=applied, read=lambda: None, offset=SimpleNamespace(offset_ns=2 * PERIOD_NS))
-
-
 def test_the_mirrors_reports_give_the_time_of_application() -> None:
-    run = telemetry_from_run(ReportingLoop(CONFIG), 60.0)
+    """Here the mirror's clock is 2 periods behind that of the router, the camera's 9."""
+    loop = SteppedLoop(noisy_steps(), 7.2)
+    loop.offset = SimpleNamespace(offset_ns=2 * PERIOD_NS)
+    loop.processes = lambda: {"camera": wire.Health(router_offset_ns=9 * PERIOD_NS)}
+    run = telemetry_from_run(loop, 60.0)
     assert (run.timing.delay, run.timing.applied) == (1.0, pytest.approx(0.7, abs=1e-3))
-
-
-PROBE = wire.Play(first_sequence=frame_sequence(3050), frames=100, id="probe")
-
-
-class SteppedLoop(StreamedLoop):
-    """A loop with these steps, whose mirror reports each command `report_periods` after the end of the exposure.
-
-    With a `later_gain`, the state has the probe sequence only at the request after 3100 steps, and this gain from then.
-    """
-
-    def __init__(self, steps: list[Step], report_periods: float = 0.2, *, later_gain: float = 0.0) -> None:
-        super().__init__(CONFIG)
-        self.recorded, self.report_ns, self.later_gain = steps, round(report_periods * PERIOD_NS), later_gain
-        self.requested = 0
-
-    def steps(self, count: int | None = None, patience_s: float = 0.0) -> StepStream:
-        stream = StepStream(0)
-        stream.lost, stream.steps = 0, iter(self.recorded)
-        return stream
-
-    def status(self) -> Answer:
-        answer = super().status()
-        self.requested += 1
-        if self.later_gain and self.requested == 1 + 31:  # once at the start, and then every 100 steps
-            answer.state.play.CopyFrom(PROBE)
-        if self.later_gain and self.requested > 31:
-            answer.state.gain[:] = [self.later_gain] * 3
-        return answer
-
-    def mirror_watch(self) -> Any:
-        applied = [(step.frame_sequence, step.time_ns + self.report_ns) for step in self.recorded[-1024:]]
-        return SimpleNamespace(applied=applied, read=lambda: None, offset=None)
 
 
 def closed_loop(disturbance_nm: np.ndarray, delay_frames: int) -> list[Step]:
@@ -363,7 +339,7 @@ def test_a_closed_loop_with_few_frames_after_half_a_second_is_not_called_open() 
 
 def test_a_too_short_live_time_is_refused_at_once() -> None:
     with pytest.raises(DataFileError, match=r"2048 consecutive frames, 2.05 s at 1000 Hz, but got 2 s: use --live 3"):
-        telemetry_from_run(StreamedLoop(CONFIG), 2.0)
+        telemetry_from_run(SteppedLoop([]), 2.0)
 
 
 class RequestedLoop(InProcessLoop):
