@@ -308,8 +308,8 @@ def test_the_computed_calibration_is_resampled_to_a_scaled_and_rotated_sensor(lo
     aligned = align(light + 3e4 * bad, model, ~bad)
     zeros = np.zeros((90 * 96, len(before.noll)), np.float32)
     blank = {"dark": zeros[:, 0], "reference": zeros[:, 0], "response": zeros, "reconstructor": zeros.T}
-    real = replace(before, shape=shape, good=zeros[:, 0] + 1, **blank)
-    calibration = on_sensor(loop.config, before, aligned.geometry, float(light.sum()), real)
+    real = replace(before, shape=shape, good=zeros[:, 0] + 1, flux_dn=float(light.sum()), **blank)
+    calibration = on_sensor(loop.config, before, aligned.geometry, real)
     H = onto(before.response.astype(float).reshape(80, 80, -1), geometry, shape).reshape(90 * 96, -1)
     assert np.abs(cross_talk(calibration.reconstructor, H)).max() < 0.03
 
@@ -346,7 +346,7 @@ def test_pokes_resolve_a_reflection_or_rotation_that_does_not_change_the_image(
     alignment = align(onto(image, geometry, (80, 80)), image)
     H = onto(computed.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
     alignment = replace(alignment, residual=0.1, other_parity=0.2)  # the better parity may be the wrong one
-    found, calibration, correlation = oriented(config, computed, alignment, 1e5, computed, lambda mode: H[:, mode])
+    found, calibration, correlation = oriented(config, computed, alignment, computed, lambda mode: H[:, mode])
     assert (found.geometry.rotation_deg, found.geometry.parity) == (pytest.approx(-168, abs=0.1), geometry.parity)
     assert found.residual == (0.1 if alignment.geometry.parity == geometry.parity else 0.2)
     assert correlation > 0.99

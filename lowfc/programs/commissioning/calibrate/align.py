@@ -57,18 +57,18 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
         pixels = next_frames(loop, frames)
         check_size(pixels.shape[1:], before)
         light_dn = pixels.mean(axis=0) - before.dark.reshape(before.shape).astype(np.float64)
-        flux_dn = float(light_dn.reshape(-1) @ before.good)
         computed = analytic(config, console)
         with raised_as(CalibrationError, ValueError):
             model = computed.reference.astype(np.float64).reshape(computed.shape)
             alignment = align(light_dn, model, before.good.reshape(before.shape) > 0)
-        player = Player(loop, on_sensor(config, computed, alignment.geometry, flux_dn, before), reporter(console))
+            before = replace(before, flux_dn=float(light_dn.reshape(-1) @ before.good))
+        player = Player(loop, on_sensor(config, computed, alignment.geometry, before), reporter(console))
 
         def poke(mode: int) -> Array:
             amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_nm(config, player.before)[mode]))
             return player.first_poke(mode, first_poke_plan(amplitude_nm)).response
 
-        alignment, calibration, likeness = oriented(config, computed, alignment, flux_dn, before, poke)
+        alignment, calibration, likeness = oriented(config, computed, alignment, before, poke)
         if likeness < MIN_CORRELATION:
             raise CalibrationError(
                 f"the images of pokes do not resemble the computed ones: their correlation is {likeness:.2f}, expected "
@@ -79,7 +79,7 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
     return AlignResult(
         **asdict(alignment.geometry),
         pixels_per_lambda_d=alignment.geometry.scale * computed_scale(config),
-        flux_dn=flux_dn,
+        flux_dn=before.flux_dn,
         background_dn=alignment.background,
         residual=alignment.residual,
         other_parity_residual=alignment.other_parity,
@@ -87,12 +87,10 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
     )
 
 
-def on_sensor(
-    config: Configuration, computed: Calibration, geometry: Geometry, flux_dn: float, before: Calibration
-) -> Calibration:
-    """The computed calibration on the pixels of a real sensor, with the dark and mask of the calibration in use.
+def on_sensor(config: Configuration, computed: Calibration, geometry: Geometry, before: Calibration) -> Calibration:
+    """The computed calibration on the pixels of a real sensor, with flux, dark and mask of the calibration `before`.
 
-    `flux_dn` is the sum of the good pixels without the dark, DN. CalibrationError if they see too little of the image.
+    CalibrationError if the good pixels see too little of the image.
     """
     shape, pixels = (*computed.shape, -1), before.good.size  # shape: rows, columns, modes
     I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, before.shape).reshape(-1)
@@ -108,7 +106,7 @@ def on_sensor(
             good=before.good,
             dark=before.dark,
             shape=before.shape,
-            flux_dn=flux_dn,
+            flux_dn=before.flux_dn,
             saturation_dn=before.saturation_dn,
             estimator=f"{config.control.estimator}+aligned",
             operator_hash="",
@@ -122,7 +120,6 @@ def oriented(
     config: Configuration,
     computed: Calibration,
     alignment: Alignment,
-    flux_dn: float,
     before: Calibration,
     poke: Callable[[int], Array],
 ) -> tuple[Alignment, Calibration, float]:
@@ -138,7 +135,7 @@ def oriented(
     responses = [poke(mode) for mode in modes]
 
     def scored(geometry: Geometry) -> tuple[float, Calibration]:
-        calibration = on_sensor(config, computed, geometry, flux_dn, before)
+        calibration = on_sensor(config, computed, geometry, before)
         return float(np.mean([correlation(responses[k], calibration.response[:, k]) for k in modes])), calibration
 
     if alignment.circular:  # the responses' correlation is a cosine of the rotation: two values give its maximum

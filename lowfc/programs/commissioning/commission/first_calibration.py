@@ -63,7 +63,7 @@ def aligned(
     model = computed.reference.astype(np.float64).reshape(computed.shape)
     try:
         alignment = align(image, model, before.good.reshape(before.shape) > 0)
-        calibration = on_sensor(config, computed, alignment.geometry, before.flux_dn, before)
+        calibration = on_sensor(config, computed, alignment.geometry, before)
     except (ValueError, CalibrationError) as error:
         report(f"the image cannot be compared with the computed one: {error}")
         return None
@@ -73,7 +73,7 @@ def aligned(
         def poke(mode: int) -> Array:
             return (first_delay(player, config, mode) if mode else first_poke).response
 
-        alignment, calibration, poke_correlation = oriented(config, computed, alignment, before.flux_dn, before, poke)
+        alignment, calibration, poke_correlation = oriented(config, computed, alignment, before, poke)
     scale = alignment.geometry.scale * computed_scale(config)
     report(
         f"{in_words(alignment, scale)}; correlation of the poke's image with the computed one: {poke_correlation:.2f}"
