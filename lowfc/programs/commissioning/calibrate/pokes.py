@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.arrays import Array
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
@@ -72,14 +73,17 @@ class CalibrationRequest:
 
 
 class Pokes:
-    """The poke plans of one calibration; `amplitude_nm` is the amplitude of a mode, nm rms of wavefront."""
+    """The poke plans of one calibration.
 
-    def __init__(
-        self, config: Configuration, calibration: Calibration, noise_nm: Array, request: CalibrationRequest
-    ) -> None:
-        """Choose the amplitude, CalibrationError if too much is requested; `noise_nm` (modes,): noise of one frame."""
+    Attributes:
+        noise_nm: noise of one frame with the calibration in use (modes,), nm rms of wavefront.
+        amplitude_nm: amplitude of a mode, nm rms of wavefront.
+    """
+
+    def __init__(self, config: Configuration, calibration: Calibration, request: CalibrationRequest) -> None:
+        """Choose the amplitude; CalibrationError if too much is requested."""
         self._request = request
-        self._noise_nm = noise_nm
+        self.noise_nm = frame_noise_nm(config, calibration)
         self._modes = len(calibration.noll)
         self._basis = calibration.modes_to_actuators.T
         self._largest_nm = largest_nm(config, calibration)
@@ -101,7 +105,7 @@ class Pokes:
         request = self._request
         if request.cycles is not None:
             return request.cycles
-        frames = poke_plan.frames_for(request.snr / MARGIN, float(self._noise_nm.max()), self.amplitude_nm)
+        frames = poke_plan.frames_for(request.snr / MARGIN, float(self.noise_nm.max()), self.amplitude_nm)
         return max(ceil(frames / self.cycle(0).per_column), MIN_CYCLES)
 
     def more_cycles(self, cycles: int, error: float) -> int:

@@ -58,7 +58,6 @@ class Calibrator:
         computed: the computed calibration.
         config: configuration of the loop.
         before: calibration in use.
-        noise_nm: noise of one frame with that calibration (modes,), nm rms.
         pokes: the probe sequences.
         completed: number of completed cycles stored for --resume.
     """
@@ -83,11 +82,10 @@ class Calibrator:
         if self.before.camera is not None:
             check_size(self.before.camera.shape, self.before)
         self.computed = computed
-        self.noise_nm = factory.frame_noise_nm(self.config, self.before)
         self._closed = request.method == "in-loop"
         if not self._closed:  # the in-loop method keeps the reference image
             warn_of_additions(loop, report)
-        self.pokes = Pokes(self.config, self.before, self.noise_nm, request)
+        self.pokes = Pokes(self.config, self.before, request)
         self._progress = progress
         self._player = Player(loop, self.before, report, self._closed)
         self._conditions: dict[str, Any] = {
@@ -155,7 +153,7 @@ class Calibrator:
     def _quietest_mode(self) -> int:
         """Index of the mode with the lowest noise; tip and tilt, the most disturbed, only if there is no other."""
         tilt = np.isin(self.before.noll, TIP_TILT)
-        return int(np.where(tilt & ~tilt.all(), np.inf, self.noise_nm).argmin())
+        return int(np.where(tilt & ~tilt.all(), np.inf, self.pokes.noise_nm).argmin())
 
     def delay(self) -> Delay:
         """Measure the delay from a poke of the quietest mode to its image; warn if the image is unexpected."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.columns import Steps, steps_as_columns
 from lowfc.adapters.process.progress import Counted
 from lowfc.arrays import Single
@@ -162,7 +162,7 @@ class Commissioning:
             amplitude_nm = float(stored_cycles(partial_of(options.out))[0]["amplitude_nm"])
         else:
             self._announce("poke amplitude")
-            default_nm = Pokes(config, first, factory.frame_noise_nm(config, first), self._request()).amplitude_nm
+            default_nm = Pokes(config, first, self._request()).amplitude_nm
             amplitude_nm = linear_nm(player, config, delay, default_nm)
         self._announce("response")
         request = self._request(amplitude_nm, resume=has_cycles)
