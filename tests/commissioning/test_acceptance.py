@@ -25,7 +25,6 @@ from lowfc.programs.commissioning.acceptance.probe import (
     ProbeResponse,
     _announced,
     logged_responses,
-    selected_modes,
 )
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop, configuration
 from tests.support.loops import refusal
@@ -102,6 +101,8 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, Prob
         responses_of(loop, rejection, **MULTISINE | {"duration_s": 0.1})
     with pytest.raises(AcceptanceError, match="of 3 columns is too long: shorten it to 5333 s"):
         responses_of(loop, rejection, **MULTISINE | {"duration_s": 6000.0})
+    with pytest.raises(AcceptanceError, match=r"\[99\] are not controlled; the loop controls 2, 3, 4"):
+        responses_of(loop, rejection, **MULTISINE | {"modes": (2, 99)})
     opened = response.mode.copy()
     opened[50] = LoopMode.OPEN
     limited = response.reasons.copy()
@@ -281,12 +282,6 @@ def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_of_its_
     night.load(identified(replace(TOY_CALIBRATION, flux_dn=1.0)))
     (response,) = responses_in(night.frames(5).write(tmp_path / "night.mcap"))
     assert (response.loop.law.gain[0], response.loop.calibration.id) == (np.float32(0.4), TOY_CALIBRATION.id)
-
-
-def test_modes_default_to_all_and_must_be_controlled() -> None:
-    assert selected_modes((), (2, 3)) == (2, 3)
-    with pytest.raises(AcceptanceError, match="99"):
-        selected_modes((99,), (2, 3))
 
 
 def test_malformed_modes_and_options_without_effect_on_a_log_are_refused() -> None:

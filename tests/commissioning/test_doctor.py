@@ -28,7 +28,7 @@ from lowfc.contract.configuration import Configuration, Realtime, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.commissioning.checks import Check, note, ok
 from lowfc.programs.commissioning.doctor import command, permissions, resources, timing
-from lowfc.programs.commissioning.doctor.facts import Facts, gather, ranges
+from lowfc.programs.commissioning.doctor.facts import Facts, gather
 from lowfc.programs.core.recording.volume import bytes_per_s
 from tests.support.loops import LOWFC, lowfc, refusal, until
 
@@ -153,6 +153,7 @@ def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
         ("isolation", "warning", "isolcpus=5-7 nohz_full=5-7", {f"{CPUS}/isolated": "\n"}),
         ("isolation", "note", "none of the 2 can be spared", {f"{CPUS}/isolated": "\n", f"{CPUS}/online": "0-1"}),
         ("isolation", "warning", "the configuration names 4-6", {f"{CPUS}/isolated": "4-5"}),
+        ("isolation", "warning", "0-1,3,8; of these", {f"{CPUS}/isolated": "8,0-1,3\n"}),
         ("isolation", "ok", "without a timer tick: none", {f"{CPUS}/nohz_full": "(null)\n"}),
         ("quota", "warning", "1.5 processors", {"sys/fs/cgroup/user.slice/cpu.max": "150000 100000\n"}),
         ("quota", "ok", "none", {"sys/fs/cgroup/user.slice/cpu.max": "max 100000\n"}),
@@ -349,10 +350,6 @@ def test_busy_finds_a_process_that_uses_the_cpu() -> None:
         finally:
             process.kill()
     assert not any(name.endswith(here) for name, _ in host.busy())
-
-
-def test_processors_are_written_as_ranges() -> None:
-    assert ranges({3, 0, 1, 8}) == "0-1,3,8"
 
 
 def test_doctor_checks_this_host(briefly: None) -> None:
