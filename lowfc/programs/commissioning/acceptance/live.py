@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
-
 from lowfc.adapters.logs.columns import steps_as_columns
 from lowfc.arrays import Single
 from lowfc.client import Client, Step, configuration_of
@@ -100,9 +98,9 @@ class Live:
         A table without columns adds no probe: only the steps are recorded. AcceptanceError if the table is too large
         for a request, gains or law changed, or the mirror or the camera interrupted `ATTEMPTS` plays.
         """
-        basis = np.zeros((len(self.calibration.noll), 0), np.float32) if basis is None else basis
         frames, columns = table.shape
-        most_frames = (max_bytes("play") - _OTHER_BYTES - basis.nbytes) // (table.itemsize * max(columns, 1))
+        shape_bytes = 0 if basis is None else basis.nbytes
+        most_frames = (max_bytes("play") - _OTHER_BYTES - shape_bytes) // (table.itemsize * max(columns, 1))
         if columns and frames > most_frames:
             longest_s = most_frames / self.loop.rate_hz
             raise AcceptanceError(f"a probe sequence of {columns} columns is too long: shorten it to {longest_s:.0f} s")
@@ -120,7 +118,7 @@ class Live:
         raise AcceptanceError(f"in {ATTEMPTS} attempts no probe sequence was undisturbed; the last: {interruption}")
 
     def _played(
-        self, kind: Kind, parameters: dict[str, Any], mode: LoopMode, table: Single, basis: Single
+        self, kind: Kind, parameters: dict[str, Any], mode: LoopMode, table: Single, basis: Single | None
     ) -> tuple[ProbeResponse, str]:
         """The response to a table played once, and what interrupted it; empty if nothing did."""
         frames, columns = table.shape
@@ -128,7 +126,7 @@ class Live:
         steps, watch = self.client.steps(), self.client.mirror_watch()
         answer = self.client.note(ANNOUNCEMENT + json.dumps({"test": kind, **parameters, "frames": frames}))
         target = ""
-        if columns and basis.size:
+        if basis is not None:
             target, answer = MIRROR, self.client.play(basis, table)
         elif columns:
             target, answer = OFFSET, self.client.play_offset(table)
@@ -151,9 +149,7 @@ class Live:
             raise AcceptanceError("gains or control law changed during the measurement: measure again")
         watch.read()
         loop = loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws())
-        response = probe_response(
-            parameters, loop, target, table, basis, first, steps_as_columns(recorded, len(loop.noll))
-        )
+        response = probe_response(parameters, loop, target, table, first, steps_as_columns(recorded, len(loop.noll)))
         return response, watch.interruption if columns else ""
 
     def _state(self) -> wire.ControllerState:

@@ -119,7 +119,6 @@ class ProbeResponse:
         parameters: parameters of the test, from the announcing note.
         target: `mirror` or `offset`, which the probe was added to; empty without a probe.
         table: probe amplitudes (frames, columns); (frames, 0) without a probe.
-        basis: probe shapes (columns, actuators), nm of surface.
         error_nm: modal error (frames, modes), NaN where a frame is missing or was refused; pol_nm likewise.
         command_nm: modal command (frames, modes) after each frame; NaN where the frame is missing.
         mode: loop mode (frames,), 0 where a frame is missing.
@@ -130,7 +129,6 @@ class ProbeResponse:
     loop: Loop
     target: str
     table: Single
-    basis: Single
     error_nm: Array
     pol_nm: Array
     command_nm: Array
@@ -206,13 +204,12 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
         before = [state for state in states if from_timestamp(state.timestamp) <= request_ns]
         if not before:
             raise DataFileError(f"{path}: does not contain the state of the controller before the test")
-        decoded = codec.request(request, request.name, 0, plays=history.published.plays)
-        basis = decoded.actuators_nm.reshape(-1, calibration.grid[0] * calibration.grid[1])
         in_use = history.published.calibrations.get(before[-1].calibration_id, calibration)
         loop = loop_of(before[-1], in_use, history.rate_hz, history.published.laws)
-        table = decoded.table if play else np.zeros((frames, 0), np.float32)
-        target = request.text if play else ""
-        responses.append(probe_response(parameters, loop, target, table, basis, first, history.steps))
+        target, table = "", np.zeros((frames, 0), np.float32)
+        if play:
+            target, table = request.text, codec.request(request, "play", 0, plays=history.published.plays).table
+        responses.append(probe_response(parameters, loop, target, table, first, history.steps))
     return responses
 
 
@@ -264,7 +261,7 @@ def _types(value: object) -> object:
 
 
 def probe_response(
-    parameters: dict[str, Any], loop: Loop, target: str, table: Single, basis: Single, first: int, steps: Steps
+    parameters: dict[str, Any], loop: Loop, target: str, table: Single, first: int, steps: Steps
 ) -> ProbeResponse:
     """The steps of a probe sequence from frame `first` on, one row per frame; the rate is measured from these steps."""
     frames = len(table)
@@ -278,7 +275,7 @@ def probe_response(
     mode, reasons = np.zeros(frames, np.uint8), np.zeros(frames, np.int64)
     error_nm[rows], pol_nm[rows], command_nm[rows] = steps.error_nm, steps.pol_nm, steps.command_nm
     mode[rows], reasons[rows] = steps.mode, steps.reasons
-    return ProbeResponse(parameters, loop, target, table, basis, error_nm, pol_nm, command_nm, mode, reasons)
+    return ProbeResponse(parameters, loop, target, table, error_nm, pol_nm, command_nm, mode, reasons)
 
 
 def loop_of(
