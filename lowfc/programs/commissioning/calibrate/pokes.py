@@ -85,10 +85,8 @@ class Pokes:
         self._request = request
         self.noise_nm = frame_noise_nm(config, calibration)
         self._modes = len(calibration.noll)
-        self._basis = calibration.modes_to_actuators.T
         self._largest_nm = largest_nm(config, calibration)
-        self._largest_move_nm = _largest_move_nm(config)
-        self.amplitude_nm = self._amplitude()
+        self.amplitude_nm = self._amplitude(config, calibration)
 
     def cycle(self, number: int) -> poke_plan.Plan:
         """The plan of cycle `number`."""
@@ -130,7 +128,7 @@ class Pokes:
         shapes = np.random.default_rng([SEED, number // 2]).permutation(shapes)
         return poke_plan.cycle(shapes, HOLD, SETTLE, len(poke_plan.SIGNS) * HOLD, backwards=number % 2 == 1)
 
-    def _amplitude(self) -> float:
+    def _amplitude(self, config: Configuration, calibration: Calibration) -> float:
         """The requested or default amplitude, within the mirror's slew limit."""
         requested, method = self._request.amplitude_nm, self._request.method
         if method == "hadamard" and requested is not None and requested > MAX_HADAMARD_NM:
@@ -138,9 +136,9 @@ class Pokes:
                 f"--amplitude {requested:g} nm is too large for hadamard, which pokes all modes at once: at most "
                 f"{MAX_HADAMARD_NM:g} nm of each"
             )
-        shapes = self._cycle(0, 1.0).table @ self._basis
+        shapes = self._cycle(0, 1.0).table @ calibration.modes_to_actuators.T
         steepest = float(np.abs(np.diff(shapes, axis=0)).max())
-        largest = self._largest_move_nm / max(steepest, 1e-9)
+        largest = _largest_move_nm(config) / max(steepest, 1e-9)
         if requested is None:
             return min(default_nm(method, self._request.snr), largest)
         if requested > largest:
