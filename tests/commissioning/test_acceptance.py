@@ -14,7 +14,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import FIXED_GAINS
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.contract.messages import wire
+from lowfc.contract.messages import REQUEST, wire
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.programs.commissioning.acceptance import capture, linearity, noise, rejection
@@ -274,6 +274,19 @@ def test_a_log_that_ends_within_a_test_is_refused_with_what_is_missing(tmp_path:
     cut = r"ends 10 of 50 frames before the end of a measurement \(noise-floor, loop closed\): give all files"
     with pytest.raises(DataFileError, match=cut):
         responses_in(log)
+
+
+def test_a_log_without_the_law_or_the_table_of_a_probe_sequence_is_refused(tmp_path: Path) -> None:
+    night = SyntheticLog()
+    night.law(0.3, logged=False)
+    with pytest.raises(DataFileError, match=r"lawless\.mcap: the law \w+ is missing"):
+        responses_in(night.frames(20).request("note", text=OPEN).frames(60).write(tmp_path / "lawless.mcap"))
+    note = 'acceptance {"test": "rejection", "period_frames": 10, "frames": 50}'
+    night = SyntheticLog().request("close").frames(20).request("note", text=note)
+    night.request("play", text="offset", table=np.zeros((50, 3), np.float32)).frames(60)
+    night.change(REQUEST, -1, lambda request: setattr(request, "play_id", "lost"))
+    with pytest.raises(DataFileError, match=r"night\.mcap: the table lost of a probe sequence is missing"):
+        logged_responses(read_history(LogReader(night.write(tmp_path / "night.mcap"))), rejection.KIND)
 
 
 def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_of_its_time(tmp_path: Path) -> None:

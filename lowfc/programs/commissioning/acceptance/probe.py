@@ -18,7 +18,7 @@ from lowfc.client.mirror_watch import INTERRUPTIONS
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.law_codec import driving, integrator_of
 from lowfc.contract.codecs.state_codec import calibration_in_use
-from lowfc.contract.errors import DataFileError, LowfcError
+from lowfc.contract.errors import DataFileError, LowfcError, raised_as
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws import margins
@@ -205,10 +205,11 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
         if not before:
             raise DataFileError(f"{path}: does not contain the state of the controller before the test")
         in_use = history.published.calibrations.get(before[-1].calibration_id, calibration)
-        loop = loop_of(before[-1], in_use, history.rate_hz, history.published.laws)
         target, table = "", np.zeros((frames, 0), np.float32)
-        if play:
-            target, table = request.text, codec.request(request, "play", 0, plays=history.published.plays).table
+        with raised_as(DataFileError, ValueError, path):
+            loop = loop_of(before[-1], in_use, history.rate_hz, history.published.laws)
+            if play:
+                target, table = request.text, codec.request(request, "play", 0, plays=history.published.plays).table
         responses.append(probe_response(parameters, loop, target, table, first, history.steps))
     return responses
 
