@@ -13,10 +13,10 @@ from scipy.optimize import minimize_scalar
 
 from lowfc.arrays import Array, Complex
 from lowfc.control.calibration.calibration import reconstructor
-from lowfc.design.merit import WAVELENGTH_NM, PupilForms, Signal
+from lowfc.design.merit import BAND, WAVELENGTH_NM, PupilForms, Signal
 from lowfc.design.paper import MODES, TABLE3_INPUT_WAVES
 from lowfc.design.trials import LITERAL_WAVES, bounds_waves, input_rms, random_wavefronts, residual_rms
-from lowfc.optics.chain.band import Band, monochromatic, uniform
+from lowfc.optics.chain.band import Band, monochromatic
 from lowfc.optics.chain.fourier import to_image
 from lowfc.optics.chain.sensor import Sensor, from_focus, pixel_sums, pupil_radii
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
@@ -30,14 +30,12 @@ class FocalLight:
     """Light on a focal-plane mask.
 
     Attributes:
-        band: Passband of Table 4.
         forms: Quadratic forms of the pupil.
         fields: By wavelength in nm, (1 + modes, k, k) fields of the pupil, and of the pupil times each of the 20 modes.
         wavefronts_nm: By the number of modes, (wavefronts, modes) random wavefronts matched to Table 3's input.
         aberrated: By the number of modes, (wavefronts, k, k) fields of these wavefronts at the central wavelength.
     """
 
-    band: Band
     forms: PupilForms
     fields: dict[float, Complex]
     wavefronts_nm: dict[int, Array]
@@ -47,16 +45,15 @@ class FocalLight:
     def of(cls, sensor: Sensor) -> "FocalLight":
         """Propagate from the pupil of a sensor to its focal-plane mask."""
         modes = zernikes(NOLLS_20, *pupil_radii(sensor))
-        forms, band = PupilForms.of(sensor.pupil, modes), uniform(WAVELENGTH_NM)
 
         def focal(pupil_field: Array | Complex, wavelength_nm: float = WAVELENGTH_NM) -> Complex:
             size = len(sensor.focal_mask)
             field = np.asarray(pupil_field, np.complex128)
             return to_image(field, size, sensor.samples_per, WAVELENGTH_NM / wavelength_nm)
 
-        all_nm = {WAVELENGTH_NM, *band.wavelengths_nm}
+        all_nm = {WAVELENGTH_NM, *BAND.wavelengths_nm}
         fields = {nm: np.array([focal(sensor.pupil * shape, nm) for shape in (1.0, *modes)]) for nm in all_nm}
-        drawn, aberrated = {}, {}
+        forms, drawn, aberrated = PupilForms.of(sensor.pupil, modes), {}, {}
         for count in MODES:
             nolls, (low, high) = NOLLS_20[:count], LITERAL_WAVES
             scale = TABLE3_INPUT_WAVES[count] / input_rms(forms.gram[:count, :count], bounds_waves(nolls, low, high))
@@ -64,7 +61,7 @@ class FocalLight:
             phases = (np.tensordot(wavefront, modes[:count], 1) for wavefront in waves)
             drawn[count] = waves * WAVELENGTH_NM
             aberrated[count] = np.array([focal(sensor.pupil * np.exp(2j * np.pi * phase)) for phase in phases])
-        return cls(band, forms, fields, drawn, aberrated)
+        return cls(forms, fields, drawn, aberrated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,17 +89,14 @@ class FullLight:
         """I0 and H at the central wavelength, the same for every row."""
         return self._central
 
-    def in_band(self) -> Signal:
-        """I0 and H in the band of Table 4."""
-        return self._in_band
-
     @cached_property
     def _central(self) -> Signal:
         return self._signal(monochromatic(WAVELENGTH_NM))
 
     @cached_property
-    def _in_band(self) -> Signal:
-        return self._signal(self.focal_light.band)
+    def in_band(self) -> Signal:
+        """I0 and H in the band of Table 4."""
+        return self._signal(BAND)
 
     def nonlinearity_waves(self, modes: int) -> float:
         """Mean residual rms over the open pupil of random wavefronts without noise, by the plain pseudo-inverse."""

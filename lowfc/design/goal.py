@@ -102,7 +102,7 @@ def _merit(candidate: Candidate, goal: Goal) -> float:
 
 
 def _tilt_mas(candidate: Candidate, estimator: str) -> float:
-    return max(table4_mas(candidate.in_band(), TABLE4_MODES, estimator))
+    return max(table4_mas(candidate.in_band, TABLE4_MODES, estimator))
 
 
 def predictions(candidate: Candidate) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def predictions(candidate: Candidate) -> dict[str, Any]:
 
     "bound" is the Cramer-Rao bound of Table 3, without second-order errors; in Table 4 "weighted" attains the bound.
     """
-    first, in_band = candidate.paper_rows[0], candidate.in_band()
+    first, in_band = candidate.paper_rows[0], candidate.in_band
     central, forms = candidate.central(first), candidate.forms
     table3 = {name: {str(m): table3_waves(candidate, first, m, name) for m in MODES} for name in ESTIMATORS}
     table3["bound"] = {str(m): table3_noise_waves(forms, central, m, "weighted") for m in MODES}

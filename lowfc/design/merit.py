@@ -10,16 +10,19 @@ from typing import Protocol
 import numpy as np
 
 from lowfc.arrays import Array
-from lowfc.control.calibration.calibration import ESTIMATORS, condition_number
+from lowfc.control.calibration.calibration import condition_number
 from lowfc.design.fisher import quantum_information
 from lowfc.design.paper import PEAK_E, STAR, TABLE3_READ_NOISE_E, TABLE4_EXPOSURE_S, TABLE4_READ_NOISE_E
 from lowfc.design.trials import expected_rms, gram
 from lowfc.optics.chain.added_contrast import contrast_form, without_negative
+from lowfc.optics.chain.band import uniform
 from lowfc.optics.chain.coronagraph import Coronagraph
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
 
 WAVELENGTH_NM = 550.0  # central wavelength, Table 1 of the paper
+BAND = uniform(WAVELENGTH_NM)
+"""Passband of Table 4."""
 CONTROLLED = len(NOLLS_14)
 """Number of controlled modes, for the noise, the added contrast and the share of the quantum limit."""
 
@@ -83,6 +86,7 @@ class Candidate(Protocol):
     def central(self, row: str) -> Signal:
         """I0 and H of 20 modes at the central wavelength, for a row of Table 3."""
 
+    @property
     def in_band(self) -> Signal:
         """I0 and H of tip, tilt and possibly more modes in the band of Table 4."""
 
@@ -101,7 +105,6 @@ def covariance_nm2(signal: Signal, light_e: float, read_noise_e: float, modes: i
         estimator: "pinv", or "weighted", which attains the Cramer-Rao bound.
 
     Raises:
-        ValueError: The estimator is not known.
         numpy.linalg.LinAlgError: A mode has no signal.
     """
     H = signal.H[:, :modes] * light_e
@@ -109,8 +112,6 @@ def covariance_nm2(signal: Signal, light_e: float, read_noise_e: float, modes: i
     if estimator == "weighted":
         weighted = np.divide(H, variance_e2, out=np.zeros_like(H), where=variance_e2 > 0)
         return np.asarray(np.linalg.inv(H.T @ weighted) / signal.pixels_per_sample)
-    if estimator != "pinv":
-        raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
     inverse = np.linalg.inv(H.T @ H)
     return np.asarray(inverse @ (H.T @ (variance_e2 * H)) @ inverse / signal.pixels_per_sample)
 

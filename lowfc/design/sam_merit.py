@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lowfc.arrays import Array, Complex, SingleComplex
-from lowfc.design.merit import WAVELENGTH_NM, PupilForms, Signal
-from lowfc.optics.chain.band import Band, uniform
+from lowfc.design.merit import BAND, WAVELENGTH_NM, PupilForms, Signal
 from lowfc.optics.chain.focal_mask import bowtie, disk
 from lowfc.optics.chain.fourier import kernel, to_image, to_pupil
 from lowfc.optics.chain.grid import OPEN_AREA, pupil_axis
@@ -46,6 +45,7 @@ RELAY_SAMPLES = 128
 """Samples across the relay pupil."""
 SAMPLES_PER = 2
 """Samples at the sensor per lambda0 / D: half as many as pixels, which still sample the image completely."""
+_PIXELS_PER_SAMPLE = (PIXELS_PER / SAMPLES_PER) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,71 +67,54 @@ class Optics:
 
     Attributes:
         focal_masks: Names of the focal-plane masks in Table 3. Table 4 is predicted for the first.
-        band: Passband of Table 4.
         groups: Fields at the central wavelength (flat wavefront and 20 modes, for each focal-plane mask), then at the
             other wavelengths of the band (flat wavefront and `band_modes` modes, for the first focal-plane mask).
         band_modes: Number of modes, tilts first, that can be fitted in Table 4.
         forms: Quadratic forms of the shaped pupil.
-        samples_per: Samples at the sensor per lambda0 / D.
         at_pixels: (pixels, samples) interpolation of a field from its samples to the pixel centres, along one axis.
     """
 
     focal_masks: tuple[str, ...]
-    band: Band
     groups: tuple[RelayFields, ...]
     band_modes: int
     forms: PupilForms
-    samples_per: int
     at_pixels: SingleComplex
 
 
-def build_optics(
-    pupil: Array,
-    focal_masks: tuple[str, ...] = ("disk",),
-    band_modes: int = 2,
-    band: Band | None = None,
-    relay_samples: int = RELAY_SAMPLES,
-    samples_per: int = SAMPLES_PER,
-) -> Optics:
+def build_optics(pupil: Array, focal_masks: tuple[str, ...] = ("disk",), band_modes: int = 2) -> Optics:
     """Propagate the flat wavefront and the modes to the relay pupil, eq. (4).
 
-    With the default sampling every predicted value of a mask is within 2 % of that with the paper's sampling (Table 1),
+    With this sampling every predicted value of a mask is within 2 % of that with the paper's sampling (Table 1),
     but the share of the quantum limit is up to 8 % too large: pixels lose information near the zeros of the image.
 
     Args:
         pupil: (n, n) amplitude transmission of the shaped pupil.
         focal_masks: Names in `FOCAL_MASKS`.
         band_modes: Number of modes, tilts first, that can be fitted in Table 4; a search needs the two tilts.
-        band: Passband of Table 4; the paper's five wavelengths when None.
-        relay_samples: Samples across the relay pupil.
-        samples_per: Samples at the sensor per lambda0 / D; at least 2.
     """
-    band = uniform(WAVELENGTH_NM) if band is None else band
     u = 2.0 * pupil_axis(len(pupil))
     modes = zernikes(NOLLS_20, u, u[:, None])
     amplitudes = [pupil.astype(np.complex128), *(pupil * modes).astype(np.complex128)]
-    samples = IMAGE_WIDTH * samples_per
+    samples = IMAGE_WIDTH * SAMPLES_PER
 
     def group(scale: float, names: tuple[str, ...], count: int) -> RelayFields:
         masks = [FOCAL_MASKS[name](FOCAL_SAMPLES_PER) for name in names]
-        relay = [_relay(field, mask, relay_samples, scale) for mask in masks for field in amplitudes[:count]]
-        to_sensor = kernel(samples, samples_per, relay_samples, scale)
+        relay = [_relay(field, mask, scale) for mask in masks for field in amplitudes[:count]]
+        to_sensor = kernel(samples, SAMPLES_PER, RELAY_SAMPLES, scale)
         return RelayFields(
-            np.stack(relay).astype(np.complex64), (to_sensor * scale**0.5 / relay_samples).astype(np.complex64)
+            np.stack(relay).astype(np.complex64), (to_sensor * scale**0.5 / RELAY_SAMPLES).astype(np.complex64)
         )
 
-    others = [nm for nm in band.wavelengths_nm if nm != WAVELENGTH_NM]
+    others = [nm for nm in BAND.wavelengths_nm if nm != WAVELENGTH_NM]
     groups = [group(1.0, focal_masks, 1 + len(modes))]
     groups += [group(WAVELENGTH_NM / nm, focal_masks[:1], 1 + band_modes) for nm in others]
-    at_samples = kernel(samples, samples_per, relay_samples, 1.0)
-    at_centres = kernel(IMAGE_WIDTH * PIXELS_PER, PIXELS_PER, relay_samples, 1.0)
+    at_samples = kernel(samples, SAMPLES_PER, RELAY_SAMPLES, 1.0)
+    at_centres = kernel(IMAGE_WIDTH * PIXELS_PER, PIXELS_PER, RELAY_SAMPLES, 1.0)
     return Optics(
         focal_masks,
-        band,
         tuple(groups),
         band_modes,
         PupilForms.of(pupil, modes),
-        samples_per,
         (at_centres @ np.linalg.pinv(at_samples, rcond=1e-3)).astype(np.complex64),
     )
 
@@ -185,8 +168,9 @@ class SamCandidate:
         I0, H = _image_and_response(self.fields[first : first + count], WAVELENGTH_NM)
         flat = to_pixels @ self.fields[first] @ to_pixels.T
         peak = float(np.max(flat.real**2 + flat.imag**2)) * _PIXEL
-        return Signal(I0, H, _pixels_per_sample(self.optics), peak)
+        return Signal(I0, H, _PIXELS_PER_SAMPLE, peak)
 
+    @property
     def in_band(self) -> Signal:
         """I0 and H in the band with the first focal-plane mask."""
         optics, fields = self.optics, self.fields
@@ -194,20 +178,20 @@ class SamCandidate:
         other_starts = iter(range((1 + len(NOLLS_20)) * len(optics.focal_masks), len(fields), count))
         I0: Array = np.zeros(fields[0].size)
         H: Array = np.zeros((fields[0].size, optics.band_modes))
-        for wavelength_nm, weight in zip(optics.band.wavelengths_nm, optics.band.weights, strict=True):
+        for wavelength_nm, weight in zip(BAND.wavelengths_nm, BAND.weights, strict=True):
             start = 0 if wavelength_nm == WAVELENGTH_NM else next(other_starts)
             image, response = _image_and_response(fields[start : start + count], wavelength_nm)
             I0, H = I0 + weight * image, H + weight * response
-        return Signal(I0, H, _pixels_per_sample(optics), float(I0.max()))
+        return Signal(I0, H, _PIXELS_PER_SAMPLE, float(I0.max()))
 
     def nonlinearity_waves(self, modes: int) -> float:
         """A constant, the same for all masks."""
         return TABLE3_NONLINEARITY_WAVES[modes]
 
 
-def _relay(amplitude: Complex, mask: Array, samples: int, scale: float) -> Complex:
+def _relay(amplitude: Complex, mask: Array, scale: float) -> Complex:
     focal = to_image(amplitude, len(mask), FOCAL_SAMPLES_PER, scale)
-    return to_pupil(focal * mask, samples, FOCAL_SAMPLES_PER, scale)
+    return to_pupil(focal * mask, RELAY_SAMPLES, FOCAL_SAMPLES_PER, scale)
 
 
 def _covered(samples: int, centre: float, diameter: float) -> slice:
@@ -223,7 +207,3 @@ def _image_and_response(fields: SingleComplex, wavelength_nm: float) -> tuple[Ar
     I0 = (flat.real**2 + flat.imag**2).ravel().astype(np.float64)
     slopes = (flat.imag * modes.real - flat.real * modes.imag).reshape(len(modes), -1).astype(np.float64)
     return I0 * _PIXEL, slopes.T * (_PIXEL * 4.0 * np.pi / wavelength_nm)
-
-
-def _pixels_per_sample(optics: Optics) -> float:
-    return (PIXELS_PER / optics.samples_per) ** 2
