@@ -34,8 +34,7 @@ class Goal:
             "contrast": contrast added to the dark zone by the noise of 14 modes in one exposure of Table 4's star.
         estimator: "pinv", or "weighted", whose noise is the Cramer-Rao bound.
         modes: Number of modes in "table3", "pareto" and "condition".
-        weight: As in "pareto" and "paper" above, 0 to 1. None: 1/2 in "paper"; in a "pareto" search each chain
-            has its own weight.
+        weight: As in "pareto" and "paper" above, 0 to 1; None for 1/2.
     """
 
     merit: str = "paper"
@@ -58,7 +57,7 @@ class Goal:
 
 
 def merit(candidate: Candidate, goal: Goal) -> float:
-    """The figure of merit to minimise, above 0; infinite if a mode has no signal. "pareto" needs a weight."""
+    """The figure of merit to minimise, above 0; infinite if a mode has no signal."""
     try:
         value = _merit(candidate, goal)
     except np.linalg.LinAlgError:
@@ -78,10 +77,9 @@ def paper_ratios(candidate: Candidate, estimator: str = "pinv") -> dict[str, flo
 
 
 def _merit(candidate: Candidate, goal: Goal) -> float:
-    first = candidate.paper_rows[0]
+    first, weight = candidate.paper_rows[0], 0.5 if goal.weight is None else goal.weight
     match goal.merit:
         case "paper":
-            weight = 0.5 if goal.weight is None else goal.weight
             ratios = paper_ratios(candidate, goal.estimator)
             tilt = ratios.pop("table4")
             return float(max(max(ratios.values()) ** (2.0 * weight), tilt ** (2.0 * (1.0 - weight))))
@@ -93,12 +91,10 @@ def _merit(candidate: Candidate, goal: Goal) -> float:
             return 1.0 / throughput(candidate.central(first))
         case "contrast":
             return contrast_noise(candidate.forms, candidate.central(first), goal.estimator)
-        case "table3":
-            return table3_waves(candidate, first, goal.modes, goal.estimator)
-    if goal.weight is None:
-        raise ValueError("the merit pareto needs a weight")
     residual = table3_waves(candidate, first, goal.modes, goal.estimator)
-    return float(residual ** (1.0 - goal.weight) * _tilt_mas(candidate, goal.estimator) ** goal.weight)
+    if goal.merit == "table3":
+        return residual
+    return float(residual ** (1.0 - weight) * _tilt_mas(candidate, goal.estimator) ** weight)
 
 
 def _tilt_mas(candidate: Candidate, estimator: str) -> float:

@@ -21,7 +21,6 @@ from lowfc.optics.chain.sam import transmission
 from lowfc.optics.chain.sensor import pupil_radii, reference, response
 from lowfc.optics.chain.zernike import NOLLS_14, NOLLS_20, zernikes
 from lowfc.optics.detector.photometry import electrons
-from lowfc.programs.design.full_light_request import Spot
 from tests.support.loops import json_of, refusal
 
 LIGHT_E = electrons(STAR, TABLE4_EXPOSURE_S)
@@ -129,10 +128,6 @@ def test_the_command_writes_the_configuration_keys_of_the_best_sensor(tmp_path, 
 def test_impossible_options_are_refused_before_the_search(words, message, monkeypatch):
     monkeypatch.setattr("lowfc.programs.design.full_light.FocalLight", None)
     assert message in refusal("design", *words, kind=ConfigurationError)
-
-
-def test_the_default_weight_is_one_half():
-    assert [Spot(merit=name).goal.weight for name in ("paper", "pareto", "contrast")] == [0.5, 0.5, None]
 
 
 def test_sampling_of_the_holes_changes_image_and_response_by_under_1_percent():

@@ -138,6 +138,8 @@ def test_merits_agree_with_their_definitions(optics, fields):
     table4 = ratios.pop("table4")
     weighted = max(max(ratios.values()) ** 0.5, table4**1.5)
     assert merit(mask, Goal("paper", weight=0.25)) == pytest.approx(weighted)
+    for name in ("paper", "pareto"):
+        assert merit(mask, Goal(name)) == merit(mask, Goal(name, weight=0.5))
     assert merit(SamCandidate(optics, np.zeros_like(fields)), Goal("table4")) == np.inf
 
 

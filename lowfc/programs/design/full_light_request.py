@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
 
-from lowfc.design.goal import WEIGHTED, Goal
+from lowfc.design.goal import Goal
 from lowfc.programs.design.options import span
 
 Kind = Literal["zwfs", "clowfs"]
@@ -48,8 +48,7 @@ class _Request(ABC):
     @cached_property
     def goal(self) -> Goal:
         """The figure of merit to minimise."""
-        weight = 0.5 if self.weight is None and self.merit in WEIGHTED else self.weight
-        return Goal(self.merit, self.estimator, self.modes, weight)
+        return Goal(self.merit, self.estimator, self.modes, self.weight)
 
     @property
     @abstractmethod
