@@ -1,13 +1,11 @@
 """Simulation of integrators on noisy images of a drifting wavefront, to check `lowfc.design.tolerance`."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.control.calibration.calibration import normalise_flux, reconstructor
 from lowfc.design.trials import noisy_e
-from lowfc.optics.chain.zernike import zernikes
+from lowfc.optics.chain.zernike import NOLLS_14, zernikes
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, reference, response
 
 _INSTANTS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)  # imaged (Gauss-Legendre), in exposure times
@@ -15,56 +13,49 @@ _SAMPLE_TIMES = (np.arange(8) + 0.5) / 8  # times at which the residual is sampl
 _SETTLING_TIME_CONSTANTS = 8.0  # settling, in time constants of the slowest mode
 
 
-@dataclass(frozen=True, eq=False)
-class DriftTrial:
-    """Sensor, flux and exposure of a simulated loop with a delay of one frame.
+def simulated_residual_nm2(
+    twin: Twin,
+    light_e: float,
+    read_noise_e: float,
+    exposure: float,
+    step_nm2: Array,
+    gain: Array,
+    frames: int,
+    rng: np.random.Generator,
+) -> Array:
+    """Residual variance (14,), nm^2, of a simulated loop with a delay of one frame, averaged over each frame period.
 
-    Attributes:
+    Args:
         twin: Twin of the sensor.
-        noll: Noll indices of the fitted modes.
         light_e: Electrons per exposure of the light through the open circle.
         read_noise_e: Read noise of a pixel, electrons.
         exposure: Exposure time, in frame periods.
+        step_nm2: (14,) variance of each mode's step in a frame, nm^2.
+        gain: (14,) gains of the integrators; 0 for a mode that is not controlled; at least one is above 0.
+        frames: Number of frames averaged, after those in which the loop settles.
+        rng: Generator of all random numbers.
     """
-
-    twin: Twin
-    noll: tuple[int, ...]
-    light_e: float
-    read_noise_e: float
-    exposure: float
-
-    def residual_nm2(self, step_nm2: Array, gain: Array, frames: int, rng: np.random.Generator) -> Array:
-        """Residual variance (modes,) of the closed loop, nm^2, averaged over each frame period.
-
-        Args:
-            step_nm2: (modes,) variance of each mode's step in a frame, nm^2.
-            gain: (modes,) gains of the integrators; 0 for a mode that is not controlled; at least one is above 0.
-            frames: Number of frames averaged, after those in which the loop settles.
-            rng: Generator of all random numbers.
-        """
-        basis = zernikes(self.noll, *node_radii(self.twin))
-        I0, H = reference(self.twin).ravel(), response(self.twin, basis)
-        good = np.ones(I0.size)
-        normalised_I0, normalised_H = normalise_flux(I0, H, good)
-        R = reconstructor(
-            normalised_I0, normalised_H, good, self.light_e * float(I0.sum()), self.read_noise_e, "weighted"
-        )
-        evaluator, on_nodes = Evaluator(self.twin), basis.astype(np.float32)
-        times = np.concatenate([self.exposure * _INSTANTS, _SAMPLE_TIMES, [1.0]])
-        order = np.argsort(times, kind="stable")
-        lengths = np.diff(times[order], prepend=0.0)
-        settling = int(np.ceil(_SETTLING_TIME_CONSTANTS / gain[gain > 0].min()))
-        start, command, squares = np.zeros(len(gain)), np.zeros(len(gain)), np.zeros(len(gain))
-        moves = np.sqrt(lengths[:, None] * step_nm2)
-        for frame in range(settling + frames):
-            path = np.empty((len(times), len(gain)))
-            path[order] = start + np.cumsum(moves * rng.standard_normal(path.shape), axis=0)
-            residual = path + command
-            opds = residual[: len(_INSTANTS)].astype(np.float32) @ on_nodes
-            mean = np.mean([evaluator.image(opd).copy() for opd in opds], axis=0).ravel()  # the buffer is reused
-            image = noisy_e(rng, mean * self.light_e, self.read_noise_e)
-            if frame >= settling:
-                squares += np.square(residual[len(_INSTANTS) : -1]).mean(axis=0)
-            command = command - gain * (R @ (image / image.sum() - normalised_I0))
-            start = path[-1]
-        return squares / frames
+    basis = zernikes(NOLLS_14, *node_radii(twin))
+    I0, H = reference(twin).ravel(), response(twin, basis)
+    good = np.ones(I0.size)
+    normalised_I0, normalised_H = normalise_flux(I0, H, good)
+    R = reconstructor(normalised_I0, normalised_H, good, light_e * float(I0.sum()), read_noise_e, "weighted")
+    evaluator, on_nodes = Evaluator(twin), basis.astype(np.float32)
+    times = np.concatenate([exposure * _INSTANTS, _SAMPLE_TIMES, [1.0]])
+    order = np.argsort(times, kind="stable")
+    lengths = np.diff(times[order], prepend=0.0)
+    settling = int(np.ceil(_SETTLING_TIME_CONSTANTS / gain[gain > 0].min()))
+    start, command, squares = np.zeros(len(gain)), np.zeros(len(gain)), np.zeros(len(gain))
+    moves = np.sqrt(lengths[:, None] * step_nm2)
+    for frame in range(settling + frames):
+        path = np.empty((len(times), len(gain)))
+        path[order] = start + np.cumsum(moves * rng.standard_normal(path.shape), axis=0)
+        residual = path + command
+        opds = residual[: len(_INSTANTS)].astype(np.float32) @ on_nodes
+        mean = np.mean([evaluator.image(opd).copy() for opd in opds], axis=0).ravel()  # the buffer is reused
+        image = noisy_e(rng, mean * light_e, read_noise_e)
+        if frame >= settling:
+            squares += np.square(residual[len(_INSTANTS) : -1]).mean(axis=0)
+        command = command - gain * (R @ (image / image.sum() - normalised_I0))
+        start = path[-1]
+    return squares / frames

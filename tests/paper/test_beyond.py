@@ -200,7 +200,7 @@ def test_only_requested_sensors_are_anchored_and_simulated(monkeypatch):
 
     monkeypatch.setattr(anchors, "_pointing", lambda context, name: [])
     monkeypatch.setattr(anchors.pointing, "table4", table4)
-    monkeypatch.setattr(tolerance, "DriftTrial", lambda *_: SimpleNamespace(residual_nm2=lambda *_: np.zeros(14)))
+    monkeypatch.setattr(tolerance, "simulated_residual_nm2", lambda *_: np.zeros(14))
     monkeypatch.setattr(Prepared, "twin", None)
     few = Context(trials=2, sensors=("zwfs",))
     rows = anchors.anchors(few)

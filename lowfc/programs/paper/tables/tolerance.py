@@ -15,7 +15,7 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.sections import SensorSection
 from lowfc.control.calibration.calibration import noise_nm2
 from lowfc.control.laws.vibration import Line
-from lowfc.design.drift_trial import DriftTrial
+from lowfc.design.drift_trial import simulated_residual_nm2
 from lowfc.design.fisher import quantum_information
 from lowfc.design.tolerance import KINDS, Kind, tolerated_drift, tolerated_lines, tolerated_variance
 from lowfc.optics.chain.added_contrast import ModalContrast
@@ -179,10 +179,10 @@ def _checked(context: Context) -> list[Row]:
         noise = float(frame_noise_nm2(name, magnitude)[mode])
         drift = tolerated_drift(modal.variance_nm2(mode, CHECKED_CONTRAST), noise, EXPOSURE)
         frames = int(np.ceil(_FRAMES_PER_TRIAL * context.trials / drift.gain))
-        trial = DriftTrial(twins[name], NOLLS_14, light_e(magnitude), READ_NOISE_E, EXPOSURE)
         only = np.eye(len(NOLLS_14))[mode]
         rng = context.rng("tolerance", name, round(magnitude), noll)
-        residual_nm2 = trial.residual_nm2(drift.step_nm2 * only, drift.gain * only, frames, rng)
+        loop = (twins[name], light_e(magnitude), READ_NOISE_E, EXPOSURE)
+        residual_nm2 = simulated_residual_nm2(*loop, drift.step_nm2 * only, drift.gain * only, frames, rng)
         return Row(
             name,
             f"contrast added by Z{noll} {mode_name(noll)} at its tolerance, V = {magnitude:g}",
