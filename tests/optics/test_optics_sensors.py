@@ -70,13 +70,16 @@ def test_the_chain_agrees_with_prysm(prysm, sensor, opd_nm):
     assert relative_l2(ours / ours.sum(), theirs / theirs.sum()) < 1e-12
 
 
-def test_broadband_images_and_responses_are_weighted_sums(sensor, modes, opd_nm):
-    band = gauss_legendre(550.0, count=2)
-    each = [monochromatic(nm) for nm in band.wavelengths_nm]
-    images = sum(w * image(sensor, opd_nm, one) for w, one in zip(band.weights, each, strict=True))
-    np.testing.assert_allclose(image(sensor, opd_nm, band), images, rtol=1e-12)
-    slopes = sum(w * response(sensor, modes[:1], one) for w, one in zip(band.weights, each, strict=True))
-    np.testing.assert_allclose(response(sensor, modes[:1], band), slopes, rtol=1e-12, atol=1e-20)
+@pytest.mark.parametrize("name", ["sam", "clowfs", "zwfs"])
+def test_broadband_images_and_responses_are_weighted_sums(name, modes, opd_nm):
+    optics, band = sensor_named(name), gauss_legendre(550.0, count=2)
+    for quantity in (
+        lambda one: image(optics, opd_nm, one),
+        lambda one: response(optics, modes[:1], one),
+        lambda one: shear_response(optics, one),
+    ):
+        each = [quantity(monochromatic(nm)) for nm in band.wavelengths_nm]
+        np.testing.assert_allclose(quantity(band), np.tensordot(band.weights, each, 1), rtol=1e-12, atol=1e-15)
 
 
 def test_three_gauss_legendre_wavelengths_beat_the_papers_five(sensor):
@@ -266,13 +269,6 @@ def test_shear_moves_the_image(name, axis):
     inner = np.s_[8:-8, 8:-8]
     ours = shear_response(fine)[:, axis].reshape(I0.shape)
     assert relative_l2(ours[inner], slope[inner]) < 1e-4
-
-
-@pytest.mark.parametrize("name", ["sam", "clowfs", "zwfs"])
-def test_broadband_shear_is_a_weighted_sum(name):
-    optics, band = sensor_named(name), gauss_legendre(550.0, count=2)
-    each = [shear_response(optics, monochromatic(nm)) for nm in band.wavelengths_nm]
-    np.testing.assert_allclose(shear_response(optics, band), np.tensordot(band.weights, each, 1), atol=1e-15)
 
 
 @pytest.mark.parametrize("name", ["clowfs", "zwfs", "bar"])
