@@ -99,8 +99,12 @@ def test_layouts_are_read_from_files(tmp_path, monkeypatch):
     assert alone == Layout("mask", "two holes", ((0.1, 0.2, 0.1), (-0.3, 0.0, 0.1)))
     one = written(tmp_path, {"layouts": {"x": TWO_HOLES}}, "one.json")
     assert load_layout(str(one)) == load_layout(f"{one}:x")
-    several = written(tmp_path, {"layouts": {"x": TWO_HOLES, "y": TWO_HOLES}}, "several.json")
+    folder = tmp_path / "a.json.d"  # looks like a file
+    folder.mkdir()
+    several = written(folder, {"layouts": {"x": TWO_HOLES, "y": TWO_HOLES}}, "several.json")
     assert load_layout(f"{several}:y").name == "y"
+    with pytest.raises(ConfigurationError, match="no sparse-aperture layout is called"):
+        load_layout(f"{folder}/several")
     with pytest.raises(ConfigurationError, match=r"several layouts.* x, y"):
         load_layout(str(several))
     with pytest.raises(ConfigurationError, match="'z'"):

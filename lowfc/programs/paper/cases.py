@@ -4,7 +4,7 @@ import threading
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from math import isfinite
 from multiprocessing.pool import ThreadPool
@@ -243,8 +243,7 @@ ORDER = (
 
 def plain(row: Row) -> dict[str, Any]:
     """The row as a JSON object; numbers have six digits."""
-    values = asdict(row)
-    return {key: _plain(values[key]) for key in ORDER}
+    return {key: _plain(getattr(row, key)) for key in ORDER}
 
 
 def _plain(value: float | str | None) -> float | str | None:
