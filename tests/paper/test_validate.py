@@ -263,7 +263,8 @@ def test_rows_are_formatted_as_text_markdown_and_json():
         Row("a | b", "condition number", "", float("inf"), assumption="Dim."),
         Row("sensor", "electrons", "e-", 999.7, error=12.0),
     ]
-    table = {"table": "t", "title": "T", "trials": 9, "seed": 8, "plot": "t.png", "rows": [plain(row) for row in rows]}
+    head = {"table": "table1", "title": "T", "trials": 9, "seed": 8, "plot": "t.png"}
+    table = head | {"rows": [plain(row) for row in rows]}
     text, document = to_text(table), to_markdown([table])
     assert "0.123 ± 0.004" in text
     assert "1000 ± 10" in text

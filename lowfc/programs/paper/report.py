@@ -174,10 +174,8 @@ def write_page(folder: Path, table: Table) -> None:
 
 def _in_text(table: Table) -> Table:
     """The table with only the rows that text and page show."""
-    case = CASES.get(table["table"])
-    return (
-        table if case is None or case.in_text is None else table | {"rows": list(filter(case.in_text, table["rows"]))}
-    )
+    in_text = CASES[table["table"]].in_text
+    return table if in_text is None else table | {"rows": list(filter(in_text, table["rows"]))}
 
 
 def write_document(folder: Path, tables: Sequence[Table]) -> None:

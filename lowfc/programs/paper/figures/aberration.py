@@ -20,11 +20,9 @@ from lowfc.programs.paper.figures.exposure import (
     PINV,
     WEIGHTED_1,
     WEIGHTED_2,
-    bound_nm2,
     estimates_nm,
-    exposed_e,
 )
-from lowfc.programs.paper.tables.reconstruction import fits, mean_and_error
+from lowfc.programs.paper.tables.reconstruction import bound_nm2, exposed_e, fits, mean_and_error
 
 COMAS = (7, 8)
 REALISATIONS = 20
@@ -140,7 +138,7 @@ def fig7(context: Context) -> list[Row]:
         for coma in COMAS:
             case = _aberrated(context, name, coma)
             basis, wavelength_nm = case.ready.open_modes[:MODES], case.ready.sensor.wavelength_nm
-            root = np.linalg.cholesky(bound_nm2(case.ready))
+            root = np.linalg.cholesky(bound_nm2(case.ready, MODES))
             drawn_nm = context.rng("focus and coma", "limit").standard_normal((_LIMIT_DRAWS, MODES)) @ root.T
             limit = float(residual_pv(basis, drawn_nm).mean()) / wavelength_nm
             paper = _PAPER_PV_WAVES if case.ready.paper_name == "sam" else None

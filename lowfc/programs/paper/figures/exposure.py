@@ -1,15 +1,11 @@
 """The bright exposure of a single wavefront in the figures (Sect. 3.1), and its estimators."""
 
-import numpy as np
-
 from lowfc.arrays import Array
 from lowfc.design.estimators import KINDS, Fit, iterated
-from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.design.paper import PEAK_E, TABLE3_READ_NOISE_E
-from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.programs.paper.cases import Prepared
-from lowfc.programs.paper.tables.reconstruction import ITERATIONS, label, scale_e
+from lowfc.programs.paper.tables.reconstruction import ITERATIONS, label
 
 MODES = len(NOLLS_14)
 BRIGHT = (
@@ -23,11 +19,6 @@ PINV = label("pinv", 0)
 WEIGHTED, WEIGHTED_1, WEIGHTED_2 = (label("weighted", iterations) for iterations in ITERATIONS)
 
 
-def exposed_e(ready: Prepared, image: Array, rng: np.random.Generator) -> Array:
-    """A noisy image (pixels,) in electrons, from an image in fractions of the open circle's light."""
-    return noisy_e(rng, scale_e(ready) * image, TABLE3_READ_NOISE_E)
-
-
 def estimates_nm(ready: Prepared, linear: dict[str, Fit], image_e: Array) -> dict[str, Array]:
     """Estimates (modes,) from an image (pixels,) in electrons, by those of `ESTIMATORS` whose kind is in `linear`."""
     estimates: dict[str, Array] = {}
@@ -35,9 +26,3 @@ def estimates_nm(ready: Prepared, linear: dict[str, Fit], image_e: Array) -> dic
         steps_nm = iterated(fit, image_e, ready.model, ITERATIONS[-1])
         estimates |= {label(kind, iterations): steps_nm[iterations] for iterations in ITERATIONS}
     return estimates
-
-
-def bound_nm2(ready: Prepared) -> Array:
-    """Cramer-Rao bound (modes, modes) of the exposure."""
-    light_e = scale_e(ready)
-    return cramer_rao(light_e * ready.H[:, :MODES], variance_e(light_e * ready.I0, TABLE3_READ_NOISE_E))

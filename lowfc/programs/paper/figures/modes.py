@@ -12,17 +12,18 @@ from lowfc.design.trials import LITERAL_WAVES, bounds_waves, expected_r_squared,
 from lowfc.optics.chain.zernike import NOLLS_14, noll_to_orders
 from lowfc.programs.paper import plots
 from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
-from lowfc.programs.paper.figures.exposure import (
-    BRIGHT,
-    FULL_CHAIN,
-    MODES,
-    PINV,
-    WEIGHTED_2,
+from lowfc.programs.paper.figures.exposure import BRIGHT, FULL_CHAIN, MODES, PINV, WEIGHTED_2, estimates_nm
+from lowfc.programs.paper.tables.reconstruction import (
+    ITERATIONS,
+    Ensemble,
+    Input,
     bound_nm2,
-    estimates_nm,
+    ensemble,
     exposed_e,
+    fits,
+    inputs,
+    label,
 )
-from lowfc.programs.paper.tables.reconstruction import ITERATIONS, Ensemble, Input, ensemble, fits, inputs, label
 
 DEGREES = np.array([noll_to_orders(noll)[0] for noll in NOLLS_14])
 AMPLITUDES = np.array([0.005 * step for step in range(1, 31)])
@@ -139,7 +140,7 @@ def _r_squared_limit(ready: Prepared) -> Array:
     """Coefficient of determination (modes,) of estimates whose errors are at the Cramer-Rao bound."""
     wavefronts = _matched(ready)
     bounds_nm = bounds_waves(NOLLS_14, wavefronts.low, wavefronts.high) * ready.sensor.wavelength_nm
-    return expected_r_squared(np.diag(bound_nm2(ready)), bounds_nm)
+    return expected_r_squared(np.diag(bound_nm2(ready, MODES)), bounds_nm)
 
 
 @lru_cache(maxsize=8)

@@ -11,17 +11,8 @@ from lowfc.optics.chain.screen import kolmogorov
 from lowfc.optics.chain.sensor import image
 from lowfc.programs.paper import plots
 from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
-from lowfc.programs.paper.figures.exposure import (
-    BRIGHT,
-    FULL_CHAIN,
-    MODES,
-    PINV,
-    WEIGHTED,
-    WEIGHTED_2,
-    estimates_nm,
-    exposed_e,
-)
-from lowfc.programs.paper.tables.reconstruction import fits, mean_and_error
+from lowfc.programs.paper.figures.exposure import BRIGHT, FULL_CHAIN, MODES, PINV, WEIGHTED, WEIGHTED_2, estimates_nm
+from lowfc.programs.paper.tables.reconstruction import exposed_e, fits, mean_and_error
 
 SCREENS = 12
 WIDTHS = {4: "cut from four pupil diameters", 1: "periodic over one pupil diameter"}

@@ -94,6 +94,17 @@ def scale_e(sensor: Prepared) -> float:
     return PEAK_E / float(sensor.I0.max())
 
 
+def exposed_e(sensor: Prepared, image: Array, rng: np.random.Generator) -> Array:
+    """A noisy image (pixels,) in electrons, from an image in fractions of the open circle's light."""
+    return trials.noisy_e(rng, scale_e(sensor) * image, TABLE3_READ_NOISE_E)
+
+
+def bound_nm2(sensor: Prepared, modes: int) -> Array:
+    """Cramer-Rao bound (modes, modes) of Table 3's exposure."""
+    light_e = scale_e(sensor)
+    return cramer_rao(light_e * sensor.H[:, :modes], variance_e(light_e * sensor.I0, TABLE3_READ_NOISE_E))
+
+
 def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit]:
     """The linear estimators of Table 3 by kind; `nuisances` adds one that also fits flux and shear."""
     exposure = (modes, scale_e(sensor), TABLE3_READ_NOISE_E)
@@ -106,7 +117,7 @@ def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit
 def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisances: bool = False) -> Ensemble:
     """Draw the wavefronts, image them with the full chain and noise, and estimate them with every estimator."""
     sensor = prepared(name)
-    linear, light_e, wavelength_nm = fits(sensor, modes, nuisances), scale_e(sensor), sensor.sensor.wavelength_nm
+    linear, wavelength_nm = fits(sensor, modes, nuisances), sensor.sensor.wavelength_nm
     rng = context.rng("table3", modes, wavefronts.name)
     nolls = NOLLS_20[:modes]
     truth_nm = wavelength_nm * trials.random_wavefronts(rng, context.trials, nolls, wavefronts.low, wavefronts.high)
@@ -114,14 +125,13 @@ def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisanc
 
     def trial(i: int) -> dict[str, Array]:
         noise = context.rng("table3", name, modes, wavefronts.name, i)
-        image_e = trials.noisy_e(noise, light_e * sensor.image(truth_nm[i]), TABLE3_READ_NOISE_E)
+        image_e = exposed_e(sensor, sensor.image(truth_nm[i]), noise)
         estimates_nm = {key: estimate(each, image_e) for key, each in linear.items()}
         steps_nm = iterated(linear["weighted"], image_e, sensor.model, ITERATIONS[-1])
         return estimates_nm | {label("weighted", iterations): steps_nm[iterations] for iterations in ITERATIONS}
 
     results = context.map(f"table3 {name}, {modes} modes, {wavefronts.name}", trial, range(context.trials))
-    H_e, variance = linear["weighted"].response_e, variance_e(linear["weighted"].reference_e, TABLE3_READ_NOISE_E)
-    bound_nm = trials.expected_rms(sensor.gram[:modes, :modes], cramer_rao(H_e, variance))
+    bound_nm = trials.expected_rms(sensor.gram[:modes, :modes], bound_nm2(sensor, modes))
     return Ensemble(truth_nm, {key: np.stack([each[key] for each in results]) for key in results[0]}, bound_nm)
 
 
