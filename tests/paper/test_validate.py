@@ -160,20 +160,6 @@ def test_the_papers_inconsistencies_are_computed(few):
             assert row["measured"] > 0.985
 
 
-@pytest.mark.slow
-def test_tables_do_not_depend_on_the_number_of_threads(few):
-    names = ("table3", "table4")
-    again = run(names, Context(FEW, jobs=1, sensors=(SAM,)))
-    assert again == [few[name] for name in names]
-
-
-@pytest.mark.slow
-def test_another_seed_gives_other_draws_that_agree(few):
-    (again,) = run(["table4"], Context(FEW, seed=2, jobs=2, sensors=(SAM,)))
-    assert again["rows"] != few["table4"]["rows"]
-    compare(again, few["table4"])
-
-
 def test_the_command_prints_one_json_object():
     table = json_of("validate", "table1", "--trials", 7, "--seed", 3)
     assert (table["table"], table["trials"], table["seed"]) == ("table1", 7, 3)
