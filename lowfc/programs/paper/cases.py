@@ -253,11 +253,6 @@ def _plain(value: float | str | None) -> float | str | None:
     return float(f"{value:.6g}") if isfinite(value) else str(value)  # JSON has no infinity
 
 
-def assuming(rows: Sequence[Row], assumption: str) -> list[Row]:
-    """The rows with an additional assumption."""
-    return [replace(row, assumption="\n".join(filter(None, (row.assumption, assumption)))) for row in rows]
-
-
 @dataclass(frozen=True)
 class Context:
     """Settings with which a table is computed.
@@ -294,6 +289,15 @@ class Context:
                 results.append(result)
                 self.progress(what, len(results), len(todo))
         return results
+
+
+def assuming(assumption: str) -> Callable[[Callable[[Context], Iterable[Row]]], Callable[[Context], list[Row]]]:
+    """Decorator of a function that yields the rows of a figure: all of them have this assumption."""
+
+    def decorated(rows_of: Callable[[Context], Iterable[Row]]) -> Callable[[Context], list[Row]]:
+        return lambda context: [replace(row, assumption=assumption) for row in rows_of(context)]
+
+    return decorated
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Figures 2, 3, 4 and 10: light in the planes of the sensor, its focal-plane masks, and differences of images."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,23 +25,18 @@ _VIEW, _VIEW_SAMPLES_PER = 10, 8
 _FAINTEST = {"focal": 1e-8, "relay": 1e-4, "sensor": 1e-5}
 
 
-def fig2(context: Context) -> list[Row]:
+@assuming(
+    "Flat wavefront at the central wavelength. Our pupil and layout differ from the paper's, which are not published."
+)
+def fig2(context: Context) -> Iterator[Row]:
     """Fraction of the light that passes each plane, Fig. 2 and Sect. 3.3."""
-    rows = []
     for name in context.names("sam"):
         ready = prepared(name)
         budget, relay = ready.budget, PAPER_RELAY_MASK if ready.paper_name == "sam" else None
-        rows += [
-            Row(name, "shaped pupil / open circle", "", budget.pupil, PAPER_PUPIL),
-            Row(name, "reflected by the focal-plane mask / light on it", "", budget.focal_mask, PAPER_FOCAL_MASK),
-            Row(name, "sensor / reflected by the focal-plane mask", "", budget.sensor, relay),
-            Row(name, "brightest pixel / light on the sensor", "", budget.peak, PAPER_PEAK.get(ready.paper_name)),
-        ]
-    return assuming(
-        rows,
-        "Flat wavefront at the central wavelength. Our pupil and layout differ from the paper's, which are not "
-        "published.",
-    )
+        yield Row(name, "shaped pupil / open circle", "", budget.pupil, PAPER_PUPIL)
+        yield Row(name, "reflected by the focal-plane mask / light on it", "", budget.focal_mask, PAPER_FOCAL_MASK)
+        yield Row(name, "sensor / reflected by the focal-plane mask", "", budget.sensor, relay)
+        yield Row(name, "brightest pixel / light on the sensor", "", budget.peak, PAPER_PEAK.get(ready.paper_name))
 
 
 def plot_fig2(context: Context, path: Path) -> None:
@@ -63,21 +59,16 @@ def plot_fig2(context: Context, path: Path) -> None:
     plots.draw(path, panels, f"Fig. 2. {ready.name}: flat wavefront at {optics.wavelength_nm:.0f} nm.")
 
 
-def fig3(context: Context) -> list[Row]:
+@assuming("The paper gives the light of its own pupil on the disk only; opening of the wedges 95 degrees.")
+def fig3(context: Context) -> Iterator[Row]:
     """Sizes and reflected light of the focal-plane masks, Fig. 3."""
-    rows = []
     for name in context.names("sam", "bowtie"):
         ready = prepared(name)
         mask, reflected = np.abs(ready.sensor.focal_mask) ** 2, PAPER_FOCAL_MASK if ready.paper_name == "sam" else None
         radius = len(mask) / (2.0 * ready.sensor.samples_per)
-        rows += [
-            Row(name, "outer radius", "lambda/D", radius, {"sam": 4.0, "bowtie": 10.0}.get(ready.paper_name)),
-            Row(name, "reflecting area", "(lambda/D)^2", float(mask.sum()) / ready.sensor.samples_per**2),
-            Row(name, "reflected / light on it", "", ready.budget.focal_mask, reflected),
-        ]
-    return assuming(
-        rows, "The paper gives the light of its own pupil on the disk only; opening of the wedges 95 degrees."
-    )
+        yield Row(name, "outer radius", "lambda/D", radius, {"sam": 4.0, "bowtie": 10.0}.get(ready.paper_name))
+        yield Row(name, "reflecting area", "(lambda/D)^2", float(mask.sum()) / ready.sensor.samples_per**2)
+        yield Row(name, "reflected / light on it", "", ready.budget.focal_mask, reflected)
 
 
 def plot_fig3(context: Context, path: Path) -> None:
@@ -93,26 +84,22 @@ def plot_fig3(context: Context, path: Path) -> None:
     plots.draw(path, panels, "Fig. 3. Focal-plane masks: bright parts reflect to the sensor.")
 
 
-def fig4(context: Context) -> list[Row]:
+@assuming(
+    "lambda/30 rms, full optical chain, no noise; 'normalised to unity' is interpreted as I0's brightest pixel. "
+    "The layout differs from the paper's."
+)
+def fig4(context: Context) -> Iterator[Row]:
     """Largest change of the image by lambda/30, Fig. 4 and Table 2."""
-    rows = []
     for name in context.names("sam"):
         ready = prepared(name)
-        rows += [
-            Row(
+        for noll in _TABLE_NOLLS:
+            yield Row(
                 f"{name}, Z{noll} {mode_name(noll)}",
                 "peak of |I - I0| over peak of I0",
                 "",
                 float(np.abs(differential(ready, noll)).max()),
                 PAPER_TABLE2[noll] if ready.paper_name == "sam" else None,
             )
-            for noll in _TABLE_NOLLS
-        ]
-    return assuming(
-        rows,
-        "lambda/30 rms, full optical chain, no noise; 'normalised to unity' is interpreted as I0's brightest pixel. "
-        "The layout differs from the paper's.",
-    )
 
 
 def plot_fig4(context: Context, path: Path) -> None:
@@ -134,27 +121,23 @@ def _tilted_e(ready: Prepared, axis: int) -> tuple[Array, Array]:
     return light_e * ready.band_I0, light_e * tilt_signal(ready, axis)
 
 
-def fig10(context: Context) -> list[Row]:
+@assuming(
+    f"1 mas, {TABLE4_EXPOSURE_S} s, V = {STAR.magnitude}, 20 % band in five wavelengths including both ends, "
+    "1 e- read noise, our own photometry and masks, full optical chain. "
+    "The ratio of the image is that of the matched filter."
+)
+def fig10(context: Context) -> Iterator[Row]:
     """Signal of 1 mas of tilt in a short exposure, Fig. 10 and Sect. 3.3."""
-    rows = []
     for name in context.names("sam", "clowfs"):
         ready = prepared(name)
         for axis in (0, 1):
             row_name, (flat_e, change_e) = f"{name}, tilt {'xy'[axis]}", _tilted_e(ready, axis)
             signal_e, paper = float(np.ptp(change_e)), PAPER_SIGNAL.get(ready.paper_name)
             ratio = np.abs(change_e) / np.sqrt(variance_e(flat_e + change_e, TABLE4_READ_NOISE_E))
-            rows += [
-                Row(row_name, "P-V change over peak", "", signal_e / float(flat_e.max()), paper),
-                Row(row_name, "P-V change", "e-", signal_e),
-                Row(row_name, "largest signal-to-noise ratio of a pixel", "", float(ratio.max())),
-                Row(row_name, "signal-to-noise ratio of the image", "", float(np.sqrt(np.sum(ratio**2)))),
-            ]
-    return assuming(
-        rows,
-        f"1 mas, {TABLE4_EXPOSURE_S} s, V = {STAR.magnitude}, 20 % band in five wavelengths including both ends, "
-        "1 e- read noise, our own photometry and masks, full optical chain. "
-        "The ratio of the image is that of the matched filter.",
-    )
+            yield Row(row_name, "P-V change over peak", "", signal_e / float(flat_e.max()), paper)
+            yield Row(row_name, "P-V change", "e-", signal_e)
+            yield Row(row_name, "largest signal-to-noise ratio of a pixel", "", float(ratio.max()))
+            yield Row(row_name, "signal-to-noise ratio of the image", "", float(np.sqrt(np.sum(ratio**2))))
 
 
 def plot_fig10(context: Context, path: Path) -> None:

@@ -46,9 +46,12 @@ def _ensemble(context: Context, name: str) -> Ensemble:
     return ensemble(context, name, MODES, _matched(prepared(name)))
 
 
-def fig5(context: Context) -> list[Row]:
+@assuming(
+    "The wavefronts of Table 3, n = 1 to 4, input matched to its rms; the paper only shows the points, 'tight' "
+    f"about y = x. {BRIGHT} Images by the full optical chain."
+)
+def fig5(context: Context) -> Iterator[Row]:
     """Linear fit to estimated against true coefficients of each radial degree, Fig. 5."""
-    rows = []
     for name in context.names("sam"):
         ready, estimated = prepared(name), _ensemble(context, name)
         for degree in range(1, 5):
@@ -56,16 +59,9 @@ def fig5(context: Context) -> list[Row]:
             (slope, intercept), covariance = np.polyfit(truth, estimates, 1, cov=True)
             fitted = partial(Row, f"{name}, n = {degree}", modes=MODES, estimator=PINV)
             errors = np.sqrt(np.diag(covariance))
-            rows += [
-                fitted("slope", "", float(slope), 1.0, float(errors[0])),
-                fitted("intercept", "waves", float(intercept), 0.0, float(errors[1])),
-                fitted("correlation", "", float(np.corrcoef(truth, estimates)[0, 1])),
-            ]
-    return assuming(
-        rows,
-        "The wavefronts of Table 3, n = 1 to 4, input matched to its rms; the paper only shows the points, 'tight' "
-        f"about y = x. {BRIGHT} Images by the full optical chain.",
-    )
+            yield fitted("slope", "", float(slope), 1.0, float(errors[0]))
+            yield fitted("intercept", "waves", float(intercept), 0.0, float(errors[1]))
+            yield fitted("correlation", "", float(np.corrcoef(truth, estimates)[0, 1]))
 
 
 def plot_fig5(context: Context, path: Path) -> None:
@@ -90,27 +86,21 @@ def _waves(ready: Prepared, estimated: Ensemble) -> tuple[Array, Array]:
     return estimated.truth_nm / wavelength_nm, estimated.estimates_nm[PINV] / wavelength_nm
 
 
-def fig6(context: Context) -> list[Row]:
+@assuming(
+    "The wavefronts of Table 3, n = 1 to 4, input matched to its rms; limit: R^2 of "
+    f"estimates whose errors are at the Cramer-Rao bound. {BRIGHT} Images by the full optical chain."
+)
+def fig6(context: Context) -> Iterator[Row]:
     """Coefficient of determination of each mode, Fig. 6 and eq. (15)."""
-    rows = []
     for name, values in _r_squared(context).items():
         ready = prepared(name)
         limits = _r_squared_limit(ready)
         fitted = partial(Row, unit="", modes=MODES, estimator=PINV)
         paper = _PAPER_R2.get(ready.paper_name, (None, None))
-        rows += [
-            fitted(name, "least R^2", measured=float(values.min()), paper=paper[0], limit=float(limits.min())),
-            fitted(name, "mean R^2", measured=float(values.mean()), paper=paper[1], limit=float(limits.mean())),
-        ]
-        rows += [
-            fitted(f"{name}, Z{noll}", "R^2", measured=float(value), limit=float(limit))
-            for noll, value, limit in zip(NOLLS_14, values, limits, strict=True)
-        ]
-    return assuming(
-        rows,
-        "The wavefronts of Table 3, n = 1 to 4, input matched to its rms; limit: R^2 of "
-        f"estimates whose errors are at the Cramer-Rao bound. {BRIGHT} Images by the full optical chain.",
-    )
+        yield fitted(name, "least R^2", measured=float(values.min()), paper=paper[0], limit=float(limits.min()))
+        yield fitted(name, "mean R^2", measured=float(values.mean()), paper=paper[1], limit=float(limits.mean()))
+        for noll, value, limit in zip(NOLLS_14, values, limits, strict=True):
+            yield fitted(f"{name}, Z{noll}", "R^2", measured=float(value), limit=float(limit))
 
 
 def plot_fig6(context: Context, path: Path) -> None:

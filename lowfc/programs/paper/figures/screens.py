@@ -1,5 +1,6 @@
 """Figure 9: estimate of a Kolmogorov screen with 14 modes, and its residual."""
 
+from collections.abc import Iterator
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -50,9 +51,14 @@ def _screens(context: Context, name: str, width: int) -> list[_Screen]:
     return context.map(f"{name}, screens {WIDTHS[width]}", estimate, range(min(context.trials, SCREENS)))
 
 
-def fig9(context: Context) -> list[Row]:
+@assuming(
+    f"At most {SCREENS} screens of power law -11/3, scaled to {_INPUT_WAVES} waves rms over the open pupil; "
+    "the paper does not say how it generates its one screen, which determines its low orders: both of ours "
+    "have less tilt than an infinite screen, that of a single diameter hardly any. limit: "
+    f"the best fit of 14 modes to the screen itself. {BRIGHT} {FULL_CHAIN}"
+)
+def fig9(context: Context) -> Iterator[Row]:
     """Rms of estimate and residual of Kolmogorov screens, Fig. 9."""
-    rows = []
     for name in context.names("sam"):
         ready = prepared(name)
         for width, extent in WIDTHS.items():
@@ -66,17 +72,10 @@ def fig9(context: Context) -> list[Row]:
                 for key in (*_ESTIMATORS, _BEST):
                     mean, error = mean_and_error(values[key][:, k])
                     fitted = partial(Row, f"{name}, {extent}", modes=MODES, estimator=key)
-                    rows.append(fitted(f"{quantity} rms", "waves", mean, paper, error, limit=limit))
+                    yield fitted(f"{quantity} rms", "waves", mean, paper, error, limit=limit)
                     if quantity == "residual" and key == PINV:
-                        rows.append(fitted(f"least {quantity} rms", "waves", float(values[key][:, k].min())))
-                        rows.append(fitted(f"largest {quantity} rms", "waves", float(values[key][:, k].max())))
-    return assuming(
-        rows,
-        f"At most {SCREENS} screens of power law -11/3, scaled to {_INPUT_WAVES} waves rms over the open pupil; "
-        "the paper does not say how it generates its one screen, which determines its low orders: both of ours "
-        "have less tilt than an infinite screen, that of a single diameter hardly any. limit: "
-        f"the best fit of 14 modes to the screen itself. {BRIGHT} {FULL_CHAIN}",
-    )
+                        yield fitted(f"least {quantity} rms", "waves", float(values[key][:, k].min()))
+                        yield fitted(f"largest {quantity} rms", "waves", float(values[key][:, k].max()))
 
 
 def plot_fig9(context: Context, path: Path) -> None:
