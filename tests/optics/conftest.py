@@ -36,23 +36,18 @@ def coefficients_nm():
 
 
 @pytest.fixture(scope="session")
-def cache_dir(tmp_path_factory):
-    return tmp_path_factory.mktemp("twins")
+def fast(sensor):
+    return load_or_build(sensor, FAST)
 
 
 @pytest.fixture(scope="session")
-def fast(sensor, cache_dir):
-    return load_or_build(sensor, FAST, cache_dir=cache_dir)
+def accurate(sensor):
+    return load_or_build(sensor, ACCURATE)
 
 
 @pytest.fixture(scope="session")
-def accurate(sensor, cache_dir):
-    return load_or_build(sensor, ACCURATE, cache_dir=cache_dir)
-
-
-@pytest.fixture(scope="session")
-def broadband(sensor, cache_dir):
-    return load_or_build(sensor, FAST, gauss_legendre(550.0), cache_dir=cache_dir)
+def broadband(sensor):
+    return load_or_build(sensor, FAST, gauss_legendre(550.0))
 
 
 @pytest.fixture(scope="session")

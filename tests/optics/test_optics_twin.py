@@ -214,9 +214,9 @@ def test_wavefronts_that_are_not_at_the_used_nodes_are_refused(fast):
 
 
 @pytest.mark.usefixtures("fast", "accurate", "broadband")  # in the cache, so that they are not built again
-def test_benchmark_reports_all_three_twins(cache_dir, monkeypatch):
+def test_benchmark_reports_all_three_twins(monkeypatch):
     monkeypatch.setattr(bench, "WAVEFRONTS", 4)
-    result = bench.bench_twin(seconds=0.05, cache_dir=cache_dir)
+    result = bench.bench_twin(seconds=0.05)
     assert json.loads(json.dumps(result)) == result
     cases = result["cases"]
     assert [(case["rank"], case["wavelengths"]) for case in cases] == [(60, 1), (80, 1), (60, 3)]

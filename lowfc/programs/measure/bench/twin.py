@@ -5,7 +5,6 @@ import statistics
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +33,7 @@ def twin(as_json: Json = False) -> None:
     print_result(results, render(results), as_json=as_json)
 
 
-def bench_twin(seconds: float = 1.0, cache_dir: Path | None = None) -> dict[str, Any]:
+def bench_twin(seconds: float = 1.0) -> dict[str, Any]:
     """Measure three twins; the results of the first, the default of the live loop, are also at the top level.
 
     A time is the median for one frame, from the wavefront to the binned image; the models are timed one by one.
@@ -56,7 +55,7 @@ def bench_twin(seconds: float = 1.0, cache_dir: Path | None = None) -> dict[str,
         truths = {band: [image(optics, opd_nm, band) for opd_nm in opds_nm] for band in {case[2] for case in cases}}
         for name, spec, band in cases:
             begin = time.perf_counter()
-            twin = load_or_build(optics, spec, band, cache_dir=cache_dir)
+            twin = load_or_build(optics, spec, band)
             load_s = time.perf_counter() - begin
             evaluator = Evaluator(twin)
             at_nodes = (coefficients_nm @ zernikes(NOLLS_20, *node_radii(twin))).astype(np.float32)
