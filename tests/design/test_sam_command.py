@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from itertools import pairwise
 
@@ -36,17 +36,17 @@ RECORDED = {
 SMALL = {"merit": "table4", "holes": "4", "diameter": "0.1:0.2", "steps": BLOCK + 10, "chains": 2, "seed": 7}
 
 
-class Interrupted(Executor):
+class Interrupted(InProcessExecutor):
     """Executor that raises the user's Ctrl-C after a number of blocks."""
 
     def __init__(self, blocks: int) -> None:
-        self.blocks, self.inside = blocks, InProcessExecutor()
+        self.blocks = blocks
 
     def submit(self, fn, /, *args, **kwargs):
         if not self.blocks:
             raise KeyboardInterrupt
         self.blocks -= 1
-        return self.inside.submit(fn, *args, **kwargs)
+        return super().submit(fn, *args, **kwargs)
 
 
 def search_with(**options) -> Search:
