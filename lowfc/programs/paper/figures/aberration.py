@@ -21,9 +21,8 @@ from lowfc.programs.paper.figures.exposure import (
     PINV,
     WEIGHTED_1,
     WEIGHTED_2,
-    estimates_nm,
 )
-from lowfc.programs.paper.tables.reconstruction import bound_nm2, exposed_e, fits, mean_and_error
+from lowfc.programs.paper.tables.reconstruction import bound_nm2, exposed_e, fits, iterated_nm, mean_and_error
 
 COMAS = (7, 8)
 REALISATIONS = 20
@@ -56,7 +55,7 @@ def _aberrated(context: Context, name: str, coma: int) -> _Aberrated:
     ready.model(truth_nm)  # builds the twin before the threads use it
 
     def estimate(i: int) -> dict[str, Array]:
-        return estimates_nm(ready, linear, exposed_e(ready, image, context.rng("focus and coma", name, coma, i)))
+        return iterated_nm(ready, linear, exposed_e(ready, image, context.rng("focus and coma", name, coma, i)))
 
     results = context.map(f"{name}, coma Z{coma}", estimate, range(min(context.trials, REALISATIONS)))
     return _Aberrated(

@@ -12,7 +12,7 @@ from lowfc.design.trials import LITERAL_WAVES, bounds_waves, expected_r_squared,
 from lowfc.optics.chain.zernike import NOLLS_14, noll_to_orders
 from lowfc.programs.paper import plots
 from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
-from lowfc.programs.paper.figures.exposure import BRIGHT, FULL_CHAIN, MODES, PINV, WEIGHTED_2, estimates_nm
+from lowfc.programs.paper.figures.exposure import BRIGHT, FULL_CHAIN, MODES, PINV, WEIGHTED_2
 from lowfc.programs.paper.tables.reconstruction import (
     ITERATIONS,
     Ensemble,
@@ -22,6 +22,7 @@ from lowfc.programs.paper.tables.reconstruction import (
     exposed_e,
     fits,
     inputs,
+    iterated_nm,
     label,
 )
 
@@ -176,7 +177,7 @@ def _one_wavefront(context: Context, name: str, literal: bool) -> tuple[Array, d
     low, high = LITERAL_WAVES if literal else (matched.low, matched.high)
     truth = random_wavefronts(context.rng("fig8"), 1, NOLLS_14, low, high)[0]
     image_e = exposed_e(ready, ready.image(truth * wavelength_nm), context.rng("fig8", name))
-    estimates = estimates_nm(ready, fits(ready, MODES), image_e)
+    estimates = iterated_nm(ready, fits(ready, MODES), image_e)
     return truth, {key: modes_nm / wavelength_nm for key, modes_nm in estimates.items()}
 
 

@@ -12,8 +12,8 @@ from lowfc.optics.chain.screen import kolmogorov
 from lowfc.optics.chain.sensor import image
 from lowfc.programs.paper import plots
 from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
-from lowfc.programs.paper.figures.exposure import BRIGHT, FULL_CHAIN, MODES, PINV, WEIGHTED, WEIGHTED_2, estimates_nm
-from lowfc.programs.paper.tables.reconstruction import exposed_e, fits, mean_and_error
+from lowfc.programs.paper.figures.exposure import BRIGHT, FULL_CHAIN, MODES, PINV, WEIGHTED, WEIGHTED_2
+from lowfc.programs.paper.tables.reconstruction import exposed_e, fits, iterated_nm, mean_and_error
 
 SCREENS = 12
 WIDTHS = {4: "cut from four pupil diameters", 1: "periodic over one pupil diameter"}
@@ -44,7 +44,7 @@ def _screens(context: Context, name: str, width: int) -> list[_Screen]:
     def estimate(i: int) -> _Screen:
         opd_nm = _screen_nm(context, ready, width, i)
         image_e = exposed_e(ready, image(ready.sensor, opd_nm).ravel(), context.rng("screen", name, width, i))
-        modes_nm = estimates_nm(ready, linear, image_e)
+        modes_nm = iterated_nm(ready, linear, image_e)
         modes_nm[_BEST] = np.linalg.lstsq(centred.T, opd_nm[ready.open])[0]
         return opd_nm, modes_nm
 

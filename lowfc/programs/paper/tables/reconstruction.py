@@ -114,6 +114,12 @@ def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit
     return estimators
 
 
+def iterated_nm(sensor: Prepared, linear: dict[str, Fit], image_e: Array) -> dict[str, Array]:
+    """Estimates (modes,) from an image (pixels,) in electrons by each linear estimator after 0, 1 and 2 iterations."""
+    steps_nm = {kind: iterated(fit, image_e, sensor.model, ITERATIONS[-1]) for kind, fit in linear.items()}
+    return {label(kind, k): steps_nm[kind][k] for kind in linear for k in ITERATIONS}
+
+
 def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisances: bool = False) -> Ensemble:
     """Draw the wavefronts, image them with the full chain and noise, and estimate them with every estimator."""
     sensor = prepared(name)
@@ -126,9 +132,8 @@ def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisanc
     def trial(i: int) -> dict[str, Array]:
         noise = context.rng("table3", name, modes, wavefronts.name, i)
         image_e = exposed_e(sensor, sensor.image(truth_nm[i]), noise)
-        estimates_nm = {key: estimate(each, image_e) for key, each in linear.items()}
-        steps_nm = iterated(linear["weighted"], image_e, sensor.model, ITERATIONS[-1])
-        return estimates_nm | {label("weighted", iterations): steps_nm[iterations] for iterations in ITERATIONS}
+        once_nm = {key: estimate(each, image_e) for key, each in linear.items()}
+        return once_nm | iterated_nm(sensor, {"weighted": linear["weighted"]}, image_e)
 
     results = context.map(f"table3 {name}, {modes} modes, {wavefronts.name}", trial, range(context.trials))
     bound_nm = trials.expected_rms(sensor.gram[:modes, :modes], bound_nm2(sensor, modes))
