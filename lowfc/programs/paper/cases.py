@@ -23,7 +23,7 @@ from lowfc.control.calibration.calibration import normalise_flux, reconstructor
 from lowfc.design.estimators import Fit, fit
 from lowfc.design.trials import gram
 from lowfc.optics.chain.band import Band, uniform
-from lowfc.optics.chain.coronagraph import Coronagraph
+from lowfc.optics.chain.coronagraph import SAMPLES_PER, Coronagraph, contrast
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.sensor import LightBudget, Sensor, image, light_budget, reference, response, shear_response
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
@@ -128,6 +128,11 @@ class Prepared:
     def image(self, modes_nm: Array, band: Band | None = None) -> Array:
         """Image (pixels,) of the first modes (up to 20,) in nm by the full optical chain, the truth of the trials."""
         return image(self.sensor, self.opd_nm(modes_nm), band).ravel()
+
+    def star_image(self, modes_nm: Array, columns: int, samples_per: int = SAMPLES_PER) -> Array:
+        """Contrast (columns, columns) around the star with a wavefront of the first modes (up to 20,) in nm."""
+        opd_nm, wavelength_nm = self.opd_nm(modes_nm), self.sensor.wavelength_nm
+        return contrast(self.coronagraph, opd_nm, wavelength_nm, columns, samples_per=samples_per)
 
     def fit(
         self,

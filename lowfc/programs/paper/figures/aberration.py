@@ -9,7 +9,7 @@ import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.design.trials import residual_pv
-from lowfc.optics.chain.coronagraph import Wedge, contrast, contrast_curve, mean_contrast, wedge_samples
+from lowfc.optics.chain.coronagraph import Wedge, contrast_curve, mean_contrast, wedge_samples
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.programs.paper import plots
 from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
@@ -90,7 +90,7 @@ def fig1(context: Context) -> Iterator[Row]:
 def _between_samples(ready: Prepared) -> list[Row]:
     """Contrast halfway between the points of the fine grid of the pupil's design, with a flat wavefront."""
     columns = 2 * _VIEW * _FINE_SAMPLES_PER
-    image = _image(ready, np.zeros(MODES), _FINE_SAMPLES_PER)
+    image = ready.star_image(np.zeros(MODES), columns, _FINE_SAMPLES_PER)
     zone = image[wedge_samples(ready.coronagraph.dark_zone, columns, columns, _FINE_SAMPLES_PER)]
     row_name = f"{ready.name}, dark zone, {_FINE_SAMPLES_PER} samples per lambda/D"
     return [
@@ -107,7 +107,7 @@ def plot_fig1(context: Context, path: Path) -> None:
         case = _aberrated(context, name, coma)
         flat_nm = 0.0 * case.truth_nm
         for title, modes_nm in (("flat wavefront", flat_nm), (f"$\\lambda$/30 of Z4 and of Z{coma}", case.truth_nm)):
-            image = _image(case.ready, modes_nm, _VIEW_SAMPLES_PER)
+            image = case.ready.star_image(modes_nm, 2 * _VIEW * _VIEW_SAMPLES_PER, _VIEW_SAMPLES_PER)
             panels.append(plots.picture(image, title, plots.SKY, _VIEW, (1e-11, 1.0), "contrast", "log"))
         middles = (_CURVE_EDGES[1:] + _CURVE_EDGES[:-1]) / 2.0
         wavefronts = {"flat": flat_nm, "aberrated": case.truth_nm}
@@ -164,11 +164,6 @@ def plot_fig7(context: Context, path: Path) -> None:
             title = f"{title}\nP-V {np.ptp(inside):.2g} waves"
             panels.append(plots.picture(shown, title, plots.PUPIL, 0.5, (-bound, bound), "waves", "signed"))
     plots.draw(path, panels, f"Fig. 7. One estimate of {name}. {BRIGHT}", columns=4)
-
-
-def _image(ready: Prepared, modes_nm: Array, samples_per: int) -> Array:
-    columns, wavelength_nm = 2 * _VIEW * samples_per, ready.sensor.wavelength_nm
-    return contrast(ready.coronagraph, ready.opd_nm(modes_nm), wavelength_nm, columns, samples_per=samples_per)
 
 
 def _contrast(ready: Prepared, modes_nm: Array) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from lowfc.arrays import Array, Mask
 from lowfc.design.tolerance import best_gain, drift_residual_nm2
 from lowfc.optics.chain.band import Band, gauss_legendre
-from lowfc.optics.chain.coronagraph import DARK_ZONE, SAMPLES_PER, contrast, wedge_samples
+from lowfc.optics.chain.coronagraph import DARK_ZONE, SAMPLES_PER, wedge_samples
 from lowfc.optics.chain.sensor import reference, response
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.programs.paper.cases import Row, prepared
@@ -44,17 +44,13 @@ def coloured(temperature_K: float) -> Band:
 def _maps() -> tuple[Array, Array, Mask]:
     """Second-order maps (modes, samples, samples) of contrast per nm^2, the map of a flat wavefront, the dark zone."""
     samples = 2 * int(np.ceil(DARK_ZONE.outer)) * SAMPLES_PER
-    flat = _image(np.zeros(len(NOLLS_14)), samples)
-    pure_modes_nm = _SMALL_NM * np.eye(len(NOLLS_14))
-    maps = np.array([(_image(nm, samples) + _image(-nm, samples)) / 2 - flat for nm in pure_modes_nm])
-    return maps / _SMALL_NM**2, flat, wedge_samples(DARK_ZONE, samples, samples)
-
-
-def _image(modes_nm: Array, samples: int) -> Array:
-    """Contrast (samples, samples) of the shaped pupil with a wavefront (modes,)."""
     ready = prepared("sam")
-    wavelength_nm = ready.sensor.wavelength_nm
-    return contrast(ready.coronagraph, ready.opd_nm(modes_nm), wavelength_nm, samples)
+    flat = ready.star_image(np.zeros(len(NOLLS_14)), samples)
+    pure_modes_nm = _SMALL_NM * np.eye(len(NOLLS_14))
+    maps = np.array(
+        [(ready.star_image(nm, samples) + ready.star_image(-nm, samples)) / 2 - flat for nm in pure_modes_nm]
+    )
+    return maps / _SMALL_NM**2, flat, wedge_samples(DARK_ZONE, samples, samples)
 
 
 def zero_point_nm(name: str) -> Array:
@@ -84,7 +80,7 @@ def pair_rows(name: str) -> Iterator[Row]:
         )
     by_noise = np.tensordot(residual_nm2["target"] - residual_nm2["reference"], maps, 1)
     shift = zero_point_nm(name)
-    by_colour = _image(shift, len(flat)) - flat
+    by_colour = prepared("sam").star_image(shift, len(flat)) - flat
     yield new_row("zero-point shift by colour", unit="nm", measured=float(np.linalg.norm(shift)))
     for reference_image, change in (
         ("I0 of the reference star", by_noise + by_colour),
