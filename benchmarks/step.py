@@ -28,7 +28,6 @@ from lowfc.control.kernel import stepping
 from lowfc.control.loop import advance
 from lowfc.control.loop.estimator import Estimator
 from lowfc.control.loop.safety import LoopMode
-from lowfc.control.loop.state import ActiveLoop
 from lowfc.programs.measure.control_step import ControlStep, time_alone
 from lowfc.programs.measure.frame_source import Payloads
 from lowfc.programs.measure.latency.frame_statistics import percentiles
@@ -38,7 +37,7 @@ STAGES: dict[str, tuple[Any, str]] = {
     "decode": (codec, "decode_frame"),
     "saturation": (advance, "saturated_pixels"),
     "estimate": (Estimator, "estimate"),
-    "command seen": (ActiveLoop, "seen_nm"),
+    "command seen": (stepping, "seen_nm"),
     "law": (stepping, "integrate"),
     "limits": (stepping, "limit"),
     "encode": (codec, "encode_command"),
