@@ -112,12 +112,15 @@ def set_up_below_loop(priority: int | None, cpus: set[int] | None) -> Granted:
     """Set up a process that must keep up with the loop but never delay it, such as the recorder.
 
     Its SCHED_FIFO priority, if granted, is below the loop's and above everything else: in the normal class on a busy
-    host, a recorder loses messages of a 1 kHz loop.
+    host, a recorder loses messages of a 1 kHz loop. Without one it is in the batch class, in which a message that
+    arrives does not interrupt the loop to wake it.
     """
     leave_real_time()
+    if priority is None and os.sched_getscheduler(0) == os.SCHED_OTHER:
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     measures = _processors(cpus, "the recorder may get in the loop's way")
     measures += _scheduling(priority, "on a busy host the recorder loses messages")
-    return _request([] if priority is not None else ["normal scheduling class"], measures)
+    return _request([] if priority is not None else ["batch scheduling class"], measures)
 
 
 def let_send() -> None:
