@@ -258,7 +258,13 @@ def test_the_recorder_does_not_keep_the_real_time_class_of_its_parent() -> None:
     reported = report(f"set_up_below_loop(None, {{{cpu}}})", limits)
     lowest = os.sched_getscheduler(0) == os.SCHED_IDLE and not real_time
     assert (reported["policy"], reported["cpus"]) == (os.SCHED_IDLE if lowest else os.SCHED_BATCH, [cpu])
-    assert reported["granted"] == ["batch scheduling class", f"processors [{cpu}]"]
+    assert reported["granted"] == [*([] if lowest else ["batch scheduling class"]), f"processors [{cpu}]"]
+
+
+def test_a_host_without_the_batch_class_refuses_it() -> None:
+    other = "os.sched_getscheduler = lambda _: os.SCHED_OTHER; os.SCHED_BATCH = 99"
+    ((measure, _),) = report("set_up_below_loop(None, None)", other)["refused"]
+    assert measure == "batch scheduling class (Invalid argument)"
 
 
 def test_processes_in_lockstep_request_no_real_time_priority(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -112,15 +112,17 @@ def set_up_below_loop(priority: int | None, cpus: set[int] | None) -> Granted:
     """Set up a process that must keep up with the loop but never delay it, such as the recorder.
 
     Its SCHED_FIFO priority, if granted, is below the loop's and above everything else: in the normal class on a busy
-    host, a recorder loses messages of a 1 kHz loop. Without one it is in the batch class, in which a message that
-    arrives does not interrupt the loop to wake it.
+    host, a recorder loses messages of a 1 kHz loop. If none is requested, the process is in the batch class, in which a
+    message that arrives does not interrupt the loop to wake it.
     """
     leave_real_time()
+    measures: list[_Measure] = []
     if priority is None and os.sched_getscheduler(0) == os.SCHED_OTHER:
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-    measures = _processors(cpus, "the recorder may get in the loop's way")
+        enter_batch = partial(os.sched_setscheduler, 0, os.SCHED_BATCH, os.sched_param(0))
+        measures.append(("batch scheduling class", enter_batch, "the recorder's wake-ups interrupt the loop"))
+    measures += _processors(cpus, "the recorder may get in the loop's way")
     measures += _scheduling(priority, "on a busy host the recorder loses messages")
-    return _request([] if priority is not None else ["batch scheduling class"], measures)
+    return _request([], measures)
 
 
 def let_send() -> None:
@@ -191,8 +193,7 @@ def _lock_memory() -> None:
     Under a memory-lock limit nothing is locked, as later allocations would fail.
     """
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
-    capabilities = Path("/proc/self/status").read_text().partition("CapEff:")[2].split()[0]
-    if limit != resource.RLIM_INFINITY and not int(capabilities, 16) & _CAP_IPC_LOCK:
+    if limit != resource.RLIM_INFINITY and not _capabilities() & _CAP_IPC_LOCK:
         raise OSError(f"the limit is {limit // 1024} kB; set LimitMEMLOCK=infinity")
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
@@ -222,3 +223,10 @@ def _collapse_memory() -> None:
                     why = os.strerror(ctypes.get_errno())
     if not collapsed:
         raise OSError(why)
+
+
+def _capabilities() -> int:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("CapEff:"):
+            return int(line.split()[1], 16)
+    return 0
