@@ -175,7 +175,7 @@ class Realtime(Section):
     priority: int = Field(50, ge=0, le=98)
     """SCHED_FIFO priority of camera, controller and mirror; 0 for normal scheduling, which lockstep always has."""
     recorder_priority: int = Field(10, ge=0, le=98)
-    """SCHED_FIFO priority of the recorder, below `priority`; normal scheduling if either is 0."""
+    """SCHED_FIFO priority of the recorder, below `priority`; the batch class if either is 0, and in lockstep."""
     lock_memory: bool = True
     """Lock the memory of camera, controller and mirror, and move it to huge pages once they are ready (Linux 6.1)."""
     disable_cpu_idle: bool = True
