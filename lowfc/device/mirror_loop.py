@@ -155,7 +155,8 @@ class MirrorLoop:
                 self._next_command(sample)
 
     def _next_command(self, sample: Sample) -> None:
-        clock, command = self._service.clock, command_of(sample.payload, self._start_check)
+        clock = self._service.clock
+        command = command_of(sample.payload, self._start_check)
         if isinstance(clock, SimulatedClock):
             clock.set_ns(command.time_ns)
         before, refused_before = self._status, self._refused

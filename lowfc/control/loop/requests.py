@@ -245,7 +245,8 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
 
 
 def _stop(settings: Settings, state: State, request: Request) -> Handled:
-    loop, play = state.loop, None if state.loop is None else state.loop.play
+    loop = state.loop
+    play = None if loop is None else loop.play
     if loop is None or play is None or play.over(state.frame_sequence + 1):
         return state, "no probe sequence is being played"
     remaining = play.remaining(state.frame_sequence + 1)

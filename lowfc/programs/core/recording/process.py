@@ -2,6 +2,7 @@
 
 import contextlib
 import sys
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 from lowfc.adapters.bus.run import MODE, Run
@@ -52,7 +53,6 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
         (fifo_priority(config) and realtime.recorder_priority) or None, set(realtime.recorder_cpus) or None
     )
     clock = clock_of(config)
-    launched = run.links.ports.keys()  # by a launcher, which itself sends no Health
     origin = {**provenance(run.run_id, config.seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}
     with contextlib.closing(ZenohBus(run.links, Role.RECORDER, clock)) as bus, contextlib.ExitStack() as held:
         recorder = Recorder(
@@ -66,7 +66,7 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
             granted=granted,
             selection=selection,
             expected_bytes_per_s=announced_bytes_per_s,
-            awaited=launched - {Role.LAUNCHER, Role.RECORDER} if Role.LAUNCHER in launched else frozenset(),
+            awaited=_launched_processes(run),
         )
         if shared is not None:
             write_whole(run.path / "config.toml", shared, mode=MODE)
@@ -83,3 +83,9 @@ def log_limits(config: Configuration) -> LogLimits:
     """Size and duration of a log file, free disk space to leave, and file mode."""
     log = config.recorder
     return LogLimits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6), int(log.file_mode, 8))
+
+
+def _launched_processes(run: Run) -> AbstractSet[str]:
+    """The processes that a launcher starts besides the recorder; the launcher itself sends no Health."""
+    ports = run.links.ports.keys()
+    return ports - {Role.LAUNCHER, Role.RECORDER} if Role.LAUNCHER in ports else frozenset()
