@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import termios
+import time
 from unittest.mock import Mock
 
 import pytest
@@ -263,8 +264,10 @@ def test_a_signal_ends_the_loop_and_a_second_interrupt_the_process(number: str, 
     words = [sys.executable, "-c", LOOP.format(stuck=stuck)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "up\n"
+        begun_s = time.monotonic()
         process.send_signal(signal.Signals[number])
         assert process.stdout.readline() == number + "\n"
+        assert time.monotonic() - begun_s < PATIENCE_S, "the stop ended the wait"
         if stuck:
             process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE_S) == status

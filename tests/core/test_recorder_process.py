@@ -21,6 +21,7 @@ from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.realtime import NOTHING
 from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME, STEP, Role, Topic
 from lowfc.programs.core.recording.summary import Summary
 from lowfc.programs.launch.watch import topic_count
@@ -143,6 +144,16 @@ def test_a_recording_is_stopped_without_a_controller_and_a_second_recorder_is_re
     assert (len(list(reader)) > 0, reader.complete) == (True, True)
     refused = refusal("ctl", "status", "--run", bench.run.run_id)
     assert f"run '{bench.run.run_id}' has no controller" in refused
+
+
+@pytest.mark.usefixtures("own_runtime")
+def test_a_recorder_in_lockstep_requests_no_real_time_priority(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    set_up = Mock(side_effect=DataFileError("no further"))
+    monkeypatch.setattr("lowfc.programs.core.recording.process.set_up_below_loop", set_up)
+    for lockstep in ("true", "false"):
+        (config := tmp_path / "lowfc.toml").write_text(f"lockstep = {lockstep}")
+        assert refusal("record", "--folder", tmp_path, "--run", new_run_id(), "--config", config) == "no further"
+    assert [call.args[0] for call in set_up.mock_calls] == [None, 10]
 
 
 @pytest.mark.parametrize(

@@ -192,6 +192,7 @@ def test_a_channel_written_by_another_process_is_refused(folder: Path) -> None:
 def test_a_channel_that_is_being_created_is_awaited(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = file_of(folder, "dm00disp03")
     driver, events = mirror()
+    driver.apply(shape_nm(1))
     path.write_bytes(b"")
     with pytest.raises(StreamError, match="stream 'dm00disp03' is being created"):
         mirror()
