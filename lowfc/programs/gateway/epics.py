@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -57,7 +56,7 @@ class EpicsGateway:
             handler: dict[str, Any] = {}
             if one.put is not None:  # a thread for each PV: by default p4p has four for all, and `safe` would wait
                 handler["queue"] = p4p.util.ThreadedWorkQueue(maxsize=0, daemon=True).start()
-                handler["handler"] = SimpleNamespace(put=partial(_handle_put, carry_out, one.kind, one.put))
+                handler["handler"] = _PutHandler(one.kind, one.put, carry_out)
             self._pvs[one.name] = p4p.server.thread.SharedPV(nt=nt, initial=described, **handler)
         address, port = config.listen, config.port
         served = {
@@ -118,16 +117,22 @@ class EpicsGateway:
         self.changed.set()
 
 
-def _handle_put(carry_out: CarryOut, kind: Kind, put: Put, pv: Any, operation: Any) -> None:
-    """Carry out a put, on the variable's own thread; a refused one fails with the controller's message."""
-    try:
-        value = operation.value()
-        if kind is not Kind.BOOLEAN or value:  # a display writes 0 to reset a button
-            carry_out(put, value.tolist() if isinstance(value, np.ndarray) else value)
-    except LowfcError as fault:
-        operation.done(error=str(fault))
-    else:
-        operation.done()
+class _PutHandler:
+    """Carries out puts to a variable; a refused put fails with the controller's message."""
+
+    def __init__(self, kind: Kind, put: Put, carry_out: CarryOut) -> None:
+        self._kind, self._put, self._carry_out = kind, put, carry_out
+
+    def put(self, pv: Any, operation: Any) -> None:
+        """Carry out one put, on the variable's own thread."""
+        try:
+            value = operation.value()
+            if self._kind is not Kind.BOOLEAN or value:  # a display writes 0 to reset a button
+                self._carry_out(self._put, value.tolist() if isinstance(value, np.ndarray) else value)
+        except LowfcError as fault:
+            operation.done(error=str(fault))
+        else:
+            operation.done()
 
 
 def _value_of(value: Any) -> Value | None:
