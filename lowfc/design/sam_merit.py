@@ -84,8 +84,9 @@ class Optics:
 def build_optics(pupil: Array, focal_masks: tuple[str, ...] = ("disk",), band_modes: int = 2) -> Optics:
     """Propagate the flat wavefront and the modes to the relay pupil, eq. (4).
 
-    With this sampling every predicted value of a mask is within 2 % of that with the paper's sampling (Table 1),
-    but the share of the quantum limit is up to 8 % too large: pixels lose information near the zeros of the image.
+    With `RELAY_SAMPLES` and `SAMPLES_PER` every predicted value of a mask is within 2 % of that with the paper's
+    sampling (Table 1), but the share of the quantum limit is up to 8 % too large: pixels lose information near the
+    zeros of the image.
 
     Args:
         pupil: (n, n) amplitude transmission of the shaped pupil.

@@ -446,6 +446,13 @@ def test_memory_of_the_spectra_is_bounded() -> None:
     assert steady.FRAMES <= kept < steady.FRAMES + 500
 
 
+def test_the_raw_frame_is_drawn_twice_a_second() -> None:
+    panel, tape, frame = sensor.Sensor(), Tape(), np.full(CALIBRATION.shape, 100, np.uint16)
+    for number in range(30):
+        drawn(panel, tape, number * TICK_NS, frame=frame, frame_ns=START_NS + number * TICK_NS)
+    assert len(tape.logged[sensor.RAW]) == 2
+
+
 def test_latencies_are_those_of_the_last_second() -> None:
     rng = np.random.default_rng(2)
     tape, panel = Tape(), latency.Latency()

@@ -181,8 +181,10 @@ def _checked(context: Context) -> list[Row]:
         frames = int(np.ceil(_FRAMES_PER_TRIAL * context.trials / drift.gain))
         only = np.eye(len(NOLLS_14))[mode]
         rng = context.rng("tolerance", name, round(magnitude), noll)
-        loop = (twins[name], light_e(magnitude), READ_NOISE_E, EXPOSURE)
-        residual_nm2 = simulated_residual_nm2(*loop, drift.step_nm2 * only, drift.gain * only, frames, rng)
+        step_nm2, gain = drift.step_nm2 * only, drift.gain * only
+        residual_nm2 = simulated_residual_nm2(
+            twins[name], light_e(magnitude), READ_NOISE_E, EXPOSURE, step_nm2, gain, frames, rng
+        )
         return Row(
             name,
             f"contrast added by Z{noll} {mode_name(noll)} at its tolerance, V = {magnitude:g}",
