@@ -55,7 +55,7 @@ def forbidden(*_):
 def test_broadband_twins_are_read_back_unchanged(sensor, tmp_path):
     band = gauss_legendre(550.0, count=2)
     built = load_or_build(sensor, SMALL, band, cache_dir=tmp_path)
-    again = load_or_build(sensor, SMALL, band, cache_dir=tmp_path, progress=forbidden)
+    again = load_or_build(sensor, SMALL, band, cache_dir=tmp_path, progress=forbidden, notice=forbidden)
     assert_same(built, again)
     assert again.operator_hash == operator_hash(sensor, SMALL, band)
     assert [each.weight for each in again.operators] == list(band.weights)
