@@ -200,12 +200,23 @@ def test_a_channel_that_is_being_created_is_awaited(folder: Path, monkeypatch: p
         driver.apply(shape_nm(1))
     monkeypatch.setattr("lowfc.adapters.image_stream.channels._CREATION_S", 10.0)
     channel(folder, "complete", make=True)
-    creation = threading.Timer(0.05, lambda: (file_of(folder, "complete")).rename(path))
+    creation = threading.Timer(0.05, lambda: file_of(folder, "complete").rename(path))
     creation.start()
     driver.apply(shape_nm(1))
     creation.join()
     assert channel(folder).count == 1
     assert events.events()[1:] == ["STREAM_RENEWED"]
+
+
+def test_commands_fail_while_another_process_writes_the_recreated_channel(folder: Path) -> None:
+    driver, events = mirror()
+    other = channel(folder, make=True)
+    other.write(np.zeros(GRID))
+    other.pack("<i", other.writers, os.getppid())
+    with pytest.raises(RuntimeError, match=f"process {os.getppid()} writes stream 'dm00disp03'"):
+        driver.apply(shape_nm(1))
+    assert other.count == 1
+    assert events.events()[1:] == []
 
 
 class Sum(threading.Thread):
@@ -289,7 +300,7 @@ def test_a_sum_that_is_absent_although_expected_counts_as_not_following(
     driver, _ = mirror()
     summing = Sum(folder)
     assert driver.apply(shape_nm(1)) is None
-    (file_of(folder, "dm00disp")).unlink()
+    file_of(folder, "dm00disp").unlink()
     check_failure_without_sum(driver, "dm00disp")
     summing.total = channel(folder, "dm00disp", make=True)
     assert driver.apply(shape_nm(1)) is None, "it follows again"
