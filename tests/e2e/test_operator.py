@@ -27,7 +27,7 @@ from lowfc.contract.messages import COMMAND, EVENT, REQUEST, Log, wire
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limits
-from tests.support.loops import FIXED, background, children, interrupt, json_of, lowfc, payloads, refusal, until
+from tests.support.loops import FIXED, children, interrupt, json_of, lowfc, payloads, refusal, started, until
 from tests.support.safety_checks import violations
 
 pytestmark = pytest.mark.exclusive
@@ -69,7 +69,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
     before = set(running())
     (folder / "test.toml").write_text(FIXED)
     words = ("--config", "test.toml", "--rate", "100", "--json", "--disturbance", "bench", "--seed", "4")
-    with background(folder, "sim-loop", *words) as process:
+    with started(folder, "sim-loop", *words) as process:
         night = Night(folder, process)
         until(lambda: "controller" in children(process.pid) and set(running()) - before)
         (night.name,) = set(running()) - before
@@ -276,7 +276,7 @@ def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
 @pytest.mark.slow
 def test_requests_are_answered_while_a_process_is_stopped_beyond_the_timeout_of_its_links(tmp_path: Path) -> None:
     """A link that has timed out is closed without blocking the controller's receiving thread (formerly for 10 s)."""
-    with background(tmp_path, "sim-loop", "--run", "stopped", "--rate", "50", "--no-record") as process:
+    with started(tmp_path, "sim-loop", "--run", "stopped", "--rate", "50", "--no-record") as process:
         until(lambda: "sim_dm" in children(process.pid) and "stopped" in running())
         with Client("stopped") as loop:
             until(lambda: loop.status().state.frames_used)  # type: ignore[union-attr]

@@ -24,7 +24,7 @@ from lowfc.programs.gateway.variables import Kind, variables
 from lowfc.programs.gateway.watch import Watch
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from tests.support.loops import background, interrupt, refusal, until
+from tests.support.loops import interrupt, refusal, started, until
 
 Process = subprocess.Popen[str]
 IOC = """
@@ -218,9 +218,9 @@ def test_ioc_drives_an_interlock_and_scan_changes_a_gain(tmp_path: Path, ioc: tu
     (port,) = free_ports(1)
     (tmp_path / "bench.toml").write_text(CONFIG.format(port=port, search=search))
     words = ("--run", "epics", "--config", "bench.toml")
-    with background(tmp_path, "sim-loop", *words, "--duration", "600", "--no-record") as loop:
+    with started(tmp_path, "sim-loop", *words, "--duration", "600", "--no-record") as loop:
         until(lambda: "epics" in running(), 60)
-        with background(tmp_path, "gateway", "epics", *words) as gateway:
+        with started(tmp_path, "gateway", "epics", *words) as gateway:
             run_scan(loop, gateway, process, f"127.0.0.1:{port + 1} 127.0.0.1:{search}")
 
 

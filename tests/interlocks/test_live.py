@@ -12,7 +12,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.client import Client, running
 from lowfc.contract.errors import BusError, RequestRefusedError
 from lowfc.contract.messages import BENCH, CONTROL_INPUT, FRAME, STEP, wire
-from tests.support.loops import FIXED, background, interrupt, output_of, until
+from tests.support.loops import FIXED, interrupt, output_of, started, until
 
 RATE_HZ = 100  # leaves a host with two cores time for the flood: at 500 Hz its publisher waits for a core instead
 FLIPS = 60
@@ -44,7 +44,7 @@ def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) ->
     """Values act within a period, a flood of values loses no frame, and an old value acts as a missing one."""
     (tmp_path / "night.toml").write_text(CONFIG)
     words = ("--json", "--config", "night.toml", "--run", RUN, "--duration", "600")
-    with background(tmp_path, "sim-loop", *words) as process:
+    with started(tmp_path, "sim-loop", *words) as process:
         _publish()
         out, complaints = interrupt(process)
     assert process.returncode == 0, complaints

@@ -134,7 +134,7 @@ def start(folder: Path, *arguments: object) -> "subprocess.Popen[str]":
 
 
 @contextlib.contextmanager
-def background(folder: Path, *arguments: object) -> Iterator["subprocess.Popen[str]"]:
+def started(folder: Path, *arguments: object) -> Iterator["subprocess.Popen[str]"]:
     """Run `lowfc` in the background; at the end of the block it is killed, unless it has ended."""
     with start(folder, *arguments) as process:
         try:
