@@ -23,7 +23,7 @@ from lowfc.client import Answer
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.events import EVENTS
-from lowfc.contract.messages import EVENT, REQUEST, wire
+from lowfc.contract.messages import EVENT, HEALTH, REQUEST, wire
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.programs.console import app as application
 from lowfc.programs.console import feed, panels
@@ -405,6 +405,20 @@ def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatc
     until(lambda: not any(thread.name == "query" for thread in threading.enumerate()))
     assert ask.call_count == asked, "a known configuration is not requested again: each request is in the log"
     assert console_feed._config == CONFIG
+
+
+def test_states_are_queried_of_a_new_process_and_of_an_incomplete_controller_every_five_seconds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(monitor.Monitor, "_query", query := Mock())
+    hub, clock = MemoryHub(), HostClock()
+    reader = monitor.Monitor(MemoryBus(hub, "operator", clock), clock)
+    begin_ns = clock.now_ns()
+    for seconds, new, queries in ((0, "recorder", 1), (9, "controller", 2), (13, "", 2), (15, "", 3)):
+        if new:
+            MemoryBus(hub, new, clock).publisher(HEALTH, new).put(wire.Health(process=new).SerializeToString())
+        reader.snapshot(begin_ns + seconds * 10**9)
+        assert query.call_count == queries, seconds
 
 
 def test_a_request_is_in_the_log_of_every_console(run: LiveRun) -> None:
