@@ -279,6 +279,7 @@ def topic_of(key: str) -> Topic:
     raise KeyError(key)
 
 
+@lru_cache(maxsize=256)
 def known_topic(key: str) -> Topic | None:
     """Topic of a key on the bus; None if there is none, as for a key of another version or tool."""
     try:
