@@ -94,7 +94,7 @@ def test_an_invalid_map_gives_an_error_of_one_line(tmp_path: Path) -> None:
         **dict.fromkeys(("short.fits", "archive.npy", "pickle.npy"), "neither"),
         **dict.fromkeys(("line.npy", "words.npy", "nothing.npy"), "is an array"),
         "cube.npy": r"\(2, 3, 4\) of float64",
-        "none.fits": "there is no such file",
+        **dict.fromkeys(("none.fits", "none.npy"), "there is no such file"),
         "empty.fits": "there is no image",
     }.items():
         with pytest.raises(DataFileError, match=f"{file}.*{why}") as caught:
