@@ -31,6 +31,7 @@ from lowfc.optics.twin.twin import node_radii, reference, response
 from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate import align as calibrate_align
 from lowfc.programs.commissioning.calibrate import command, pokes, tasks
+from lowfc.programs.commissioning.calibrate import result as calibrate_result
 from lowfc.programs.commissioning.calibrate.align import on_sensor, oriented
 from lowfc.programs.commissioning.calibrate.result import comparison
 from lowfc.programs.commissioning.calibrate.run import Calibrator
@@ -179,7 +180,7 @@ def test_cycles_that_are_not_kept_are_not_reported(
 def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """First the star is faint; then its image also moves before R is checked, and the verdict reports both."""
+    """First the star is faint; then its image also moves before R is checked, and R is noisier than accepted."""
     monkeypatch.chdir(tmp_path)
     loop = connected(InProcessLoop(load(None, CONFIG | {"star.magnitude": 3.0})), monkeypatch)
     before = loop.calibration()
@@ -205,10 +206,12 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
 
     assert "cross-talk on separate frames" not in str(result["faults"])
     monkeypatch.setattr(Calibrator, "check", check_shifted)
+    monkeypatch.setattr(calibrate_result, "MAX_NOISE_RATIO", 0.5)
     done = lowfc("calibrate", *words, "--resume")
     assert done.exit_code == 1
     assert "verdict: NOT RECOMMENDED" in done.stdout
     assert "cross-talk on separate frames" in done.stdout
+    assert "times the noise of the computed reconstructor, expected at most 0.5" in done.stdout
     assert done.stdout.endswith("not loaded\n")
 
 
