@@ -284,11 +284,11 @@ class SimulatedCamera:
         middle = instants_nm.shape[2] // 2
         for disturbance_nm, residual_nm in instants_nm[:, :, middle]:
             self._contrast.add(disturbance_nm, residual_nm)
-        added = self._contrast.quadratic(instants_nm)
-        flat = added[:, 0].sum(axis=1).tolist()
-        for (exposed, _), truth, *contrast in zip(waiting, truths, flat, added[:, 1], strict=True):
-            self._statistics.add(truth, *contrast)
-            self._publish_truth(exposed, truth, *contrast)
+        quadratic = self._contrast.quadratic(instants_nm)
+        flat = quadratic[:, 0].sum(axis=1).tolist()
+        for (exposed, _), truth, added_flat, added in zip(waiting, truths, flat, quadratic[:, 1], strict=True):
+            self._statistics.add(truth, added_flat, added)
+            self._publish_truth(exposed, truth, added_flat, added)
 
     def _publish_truth(self, exposed: _Exposed, truth: Truth, added_flat: float, added: Single) -> None:
         """Publish the truth of a frame, with the contrast that it adds; arguments as for `WavefrontAccumulator.add`."""
@@ -340,9 +340,7 @@ class SimulatedCamera:
                 self._newest_state = state.frame_sequence
                 sequence, published_ns = self._published_ns[state.frame_sequence % _REMEMBERED]
                 if sequence == state.frame_sequence:  # otherwise the command is not from a frame, as in a mirror test
-                    if self._lateness.add(state.frame_sequence < self._last_frame):
-                        event = "COMMANDS_LATE" if self._lateness.habitual else "COMMANDS_IN_TIME"
-                        self._service.event(event, percent=self._lateness.percent)
+                    self._count_late(state.frame_sequence < self._last_frame)
                     self._frame_to_mirror.add(sample.publish_time_ns - published_ns)
 
     def _moment(self, publish_time_ns: int) -> float:
@@ -354,6 +352,12 @@ class SimulatedCamera:
         if self._service.clock.lockstep or index < 0 or self._config.camera.delay_frames % 1:
             return index + 1
         return index + (publish_time_ns - start_ns) / self._config.period_ns
+
+    def _count_late(self, late: bool) -> None:
+        """Count a command; report when commands become habitually late, and when they no longer are."""
+        if self._lateness.add(late):
+            event = "COMMANDS_LATE" if self._lateness.habitual else "COMMANDS_IN_TIME"
+            self._service.event(event, percent=self._lateness.percent)
 
     def _no_progress(self) -> str:
         """Text of the error of a run in lockstep without progress."""
