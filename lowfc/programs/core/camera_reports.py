@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.process.service import Service
@@ -25,14 +26,14 @@ class CameraReports:
         self.mailbox = service.mailbox(CAMERA_STATE)
         self._due_ns = 0
 
-    def apply(self, sample: Sample) -> None:
-        """Decode the settings in a message and pass them to the callback."""
+    def apply(self, sample: Sample, time_ns: int | None = None) -> None:
+        """Decode the settings in a message and pass them to the callback, with the time `time_ns` if it is given."""
         try:
             settings = codec.decode_camera(sample.payload, start_of(sample.sequence))
         except BadMessageError as fault:
             self._service.unreadable(sample.key, fault)
             return
-        self._apply(settings)
+        self._apply(settings if time_ns is None else replace(settings, time_ns=time_ns))
 
     def query(self) -> list[Sample]:
         """Query the camera, which may publish its settings rarely; empty within QUERY_PERIOD_NS of the last query."""
@@ -48,7 +49,8 @@ class CameraReports:
         deadline_ns = clock.host_ns() + (LOCKSTEP_WAIT_NS if clock.lockstep else 0)
         while self._service.running:
             for sample in self._service.bus.get(CAMERA_STATE.key, timeout_s=0.2):
-                self.apply(sample)
+                # Not the camera's time: the answer may already be the message that it publishes with its first frame.
+                self.apply(sample, clock.now_ns() if clock.lockstep else None)
                 return
             if clock.host_ns() >= deadline_ns:
                 return
