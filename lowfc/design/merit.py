@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from lowfc.arrays import Array
-from lowfc.control.calibration.calibration import condition_number
+from lowfc.control.calibration.calibration import ESTIMATORS, condition_number
 from lowfc.design.fisher import quantum_information
 from lowfc.design.paper import PEAK_E, STAR, TABLE3_READ_NOISE_E, TABLE4_EXPOSURE_S, TABLE4_READ_NOISE_E
 from lowfc.design.trials import expected_rms, gram
@@ -105,6 +105,7 @@ def covariance_nm2(signal: Signal, light_e: float, read_noise_e: float, modes: i
         estimator: "pinv", or "weighted", which attains the Cramer-Rao bound.
 
     Raises:
+        ValueError: The estimator is not known.
         numpy.linalg.LinAlgError: A mode has no signal.
     """
     H = signal.H[:, :modes] * light_e
@@ -112,6 +113,8 @@ def covariance_nm2(signal: Signal, light_e: float, read_noise_e: float, modes: i
     if estimator == "weighted":
         weighted = np.divide(H, variance_e2, out=np.zeros_like(H), where=variance_e2 > 0)
         return np.asarray(np.linalg.inv(H.T @ weighted) / signal.pixels_per_sample)
+    if estimator != "pinv":
+        raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
     inverse = np.linalg.inv(H.T @ H)
     return np.asarray(inverse @ (H.T @ (variance_e2 * H)) @ inverse / signal.pixels_per_sample)
 

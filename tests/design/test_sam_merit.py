@@ -148,6 +148,8 @@ def test_the_weighted_estimator_is_never_worse(optics, fields):
     for count in (2, 14, 20):
         plain, weighted = (covariance_nm2(disk_signal, 1e6, 3.0, count, name) for name in ("pinv", "weighted"))
         assert np.linalg.eigvalsh(plain - weighted).min() > -1e-9 * np.trace(plain)
+    with pytest.raises(ValueError, match="estimator must be one of"):
+        covariance_nm2(disk_signal, 1e6, 3.0, 2, "best")
 
 
 @pytest.mark.parametrize("modes", [14, 20])
