@@ -73,10 +73,11 @@ def calibrate_with_pokes(request: CalibrationRequest, run: str | None, *, load: 
     report = reporter(console)
     with contextlib.ExitStack() as stack:
         loop = stack.enter_context(Client(run))
-        computed = analytic(configuration_of(loop), console)
+        config = configuration_of(loop)
+        computed = analytic(config, console)
         progress = stack.enter_context(percentage_bar(console))
         lease = stack.enter_context(loop.reserved(f"lowfc calibrate --method {request.method}"))
-        progress = lease.expecting(progress, configuration_of(loop).camera.rate_hz)
+        progress = lease.expecting(progress, config.camera.rate_hz)
         calibrator = Calibrator(loop, request, report, progress, computed)
         try:
             with calibrator.required_mode():
