@@ -153,10 +153,7 @@ class Scene:
         end = len(modes) - len(self.instants)
         opds_nm = modes[end - self._image_weights.size : end] @ self._basis
         opds_nm += static_nm
-        shares = self._electrons * self._image_weights
-        electrons = self._evaluator.image(opds_nm[0]) * shares[0]
-        for opd_nm, share in zip(opds_nm[1:], shares[1:], strict=True):
-            electrons += self._evaluator.image(opd_nm) * share
+        electrons = self._evaluator.image(opds_nm, self._electrons * self._image_weights)
         if self._shear_slopes is not None:
             sheared = self._shear_slopes @ self._shear(index).astype(np.float32)
             electrons += (self._electrons * sheared).reshape(electrons.shape)

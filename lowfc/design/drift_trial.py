@@ -52,8 +52,7 @@ def simulated_residual_nm2(
         path[order] = start + np.cumsum(moves * rng.standard_normal(path.shape), axis=0)
         residual = path + command
         opds = residual[: len(_INSTANTS)].astype(np.float32) @ on_nodes
-        mean = np.mean([evaluator.image(opd).copy() for opd in opds], axis=0).ravel()  # the buffer is reused
-        image = noisy_e(rng, mean * light_e, read_noise_e)
+        image = noisy_e(rng, evaluator.image(opds).ravel() * (light_e / len(opds)), read_noise_e)
         if frame >= settling:
             squares += np.square(residual[len(_INSTANTS) : -1]).mean(axis=0)
         command = command - gain * (R @ (image / image.sum() - normalised_I0))

@@ -135,6 +135,17 @@ def test_twin_response_is_the_derivative_of_the_evaluator(name, request):
 
 
 @pytest.mark.parametrize("name", ["fast", "broadband", "zwfs"])
+def test_the_image_of_several_wavefronts_is_the_weighted_sum_of_theirs(name, request):
+    twin = fast_twin(name) if name == "zwfs" else request.getfixturevalue(name)
+    evaluator = Evaluator(twin)
+    opds_nm = np.random.default_rng(1).normal(scale=5.0, size=(3, twin.used.size)).astype(np.float32)
+    weights = np.array([0.5, 2.0, 0.0], np.float32)
+    images = np.array([evaluator.image(opd_nm) for opd_nm in opds_nm])
+    assert relative_l2(evaluator.image(opds_nm, weights), np.tensordot(weights, images, 1)) < 1e-6
+    assert relative_l2(evaluator.image(opds_nm), images.sum(axis=0)) < 1e-6
+
+
+@pytest.mark.parametrize("name", ["fast", "broadband", "zwfs"])
 @pytest.mark.parametrize("tilt_nm", [None, 20.0])
 def test_projected_response_is_the_projection_of_the_response(name, tilt_nm, request):
     twin = fast_twin(name) if name == "zwfs" else request.getfixturevalue(name)

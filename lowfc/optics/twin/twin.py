@@ -179,86 +179,68 @@ def _field(operator: Operator, nodes: Array | Complex) -> Complex:
 
 
 class Evaluator:
-    """Computes images with a twin in float32; each thread needs its own, as its buffers are overwritten.
-
-    Rounding leaves values down to about -1e-7 of the brightest pixel in dark pixels.
-    """
+    """Computes images with a twin in float32; rounding leaves values down to about -1e-7 of the brightest pixel."""
 
     def __init__(self, twin: Twin) -> None:
         self._used = twin.used.size
         self._stages = [_Stage(operator) for operator in twin.operators]
-        pixels, points = twin.to_pixels.shape
         self._to_pixels = twin.to_pixels.astype(np.float32)
         self._to_pixels_transposed = np.ascontiguousarray(self._to_pixels.T)
-        self._phase = np.empty(self._used, np.float32)
-        self._phasor = np.empty((self._used, 2), np.float32)
-        self._intensity = np.empty((points, points), np.float32)
-        self._half = np.empty((pixels, points), np.float32)
-        self._image = np.empty((pixels, pixels), np.float32)
 
-    def image(self, opd_nm: Single) -> Single:
-        """Image (pixels, pixels) for a wavefront (used,) in nm, as fractions of the open circle's light.
+    def image(self, opds_nm: Single, weights: Single | None = None) -> Single:
+        """Image (pixels, pixels) for wavefronts in nm, as fractions of the open circle's light.
 
-        The array is overwritten by the next call.
+        Args:
+            opds_nm: One wavefront (used,), or several (wavefronts, used), whose images are added.
+            weights: (wavefronts,) weight of each image, at least 0; None for 1.
 
         Raises:
-            ValueError: The wavefront does not have one value per used node.
+            ValueError: A wavefront does not have one value per used node.
         """
-        if opd_nm.shape != (self._used,):
-            raise ValueError(f"a wavefront must have one value for each of {self._used} nodes, got {opd_nm.shape}")
-        self._intensity.fill(0.0)
-        for stage in self._stages:
-            np.multiply(opd_nm, stage.wavenumber, out=self._phase)
-            # The flat wavefront's field is added later, computed in float64: smaller rounding errors in the sums.
-            np.cos(self._phase, out=self._phasor[:, 0])
-            np.subtract(self._phasor[:, 0], 1.0, out=self._phasor[:, 0])
-            np.sin(self._phase, out=self._phasor[:, 1])
-            stage.add_intensity(self._phasor, self._intensity)
-        np.matmul(self._to_pixels, self._intensity, out=self._half)
-        return np.matmul(self._half, self._to_pixels_transposed, out=self._image)
+        if opds_nm.shape[-1:] != (self._used,):
+            raise ValueError(f"a wavefront must have one value for each of {self._used} nodes, got {opds_nm.shape}")
+        several = np.atleast_2d(opds_nm)
+        weights = np.ones(len(several), np.float32) if weights is None else weights
+        intensity = self._stages[0].intensity(several, weights)
+        for stage in self._stages[1:]:
+            intensity += stage.intensity(several, weights)
+        return np.asarray(self._to_pixels @ intensity @ self._to_pixels_transposed)
 
 
 class _Stage:
-    """One wavelength's matrices and buffers in single precision."""
+    """One wavelength's matrices in single precision."""
 
     def __init__(self, operator: Operator) -> None:
-        points, functions = operator.basis.shape
-        self.wavenumber = np.float32(2.0 * np.pi / operator.wavelength_nm)
+        self._wavenumber = np.float32(2.0 * np.pi / operator.wavelength_nm)
         to_modes = np.sqrt(operator.weight) * operator.to_modes
         self._to_modes = to_modes.astype(np.float32)
-        self._flat_modes = to_modes.sum(axis=1).astype(np.float32)
+        self._flat_modes = to_modes.sum(axis=1).astype(np.float32)[:, None]
         # A real matrix multiplies the columns of real and imaginary parts, a complex one the complex numbers.
         self._unit = np.dtype(np.complex64 if np.iscomplexobj(operator.to_coefficients) else np.float32)
         self._to_coefficients = np.ascontiguousarray(operator.to_coefficients, self._unit)
-        self._modes = np.empty((len(self._to_modes), 2), np.float32)
-        self._pairs = np.empty((functions**2, 2), np.float32)
         basis, phases = _real_basis(operator.basis)
-        factors = np.outer(phases, phases).ravel()
-        # Multiplication by a power of i swaps the parts of a coefficient, changes their signs, or both.
-        places = np.arange(2 * functions**2).reshape(-1, 2)
-        self._places = np.where(np.abs(factors.imag) > 0.5, places.T[::-1], places.T)
-        signs = np.where(np.abs(factors.imag) > 0.5, (-factors.imag, factors.imag), factors.real)
-        self._signs = signs.astype(np.float32)
-        self._coefficients = np.empty(self._signs.shape, np.float32)
+        self._factors = np.outer(phases, phases).reshape(-1, 1).astype(np.complex64)
         self._basis = basis.astype(np.float32)
         self._basis_transposed = np.ascontiguousarray(self._basis.T)
-        self._half = np.empty((2 * functions, points), np.float32)
-        self._field = np.empty((2, points, points), np.float32)
 
-    def add_intensity(self, phasor: Single, intensity: Single) -> None:
-        """Add `|E|^2` at the points, for real and imaginary parts (used, 2) of exp(i phi) - 1."""
-        np.matmul(self._to_modes, phasor, out=self._modes)
-        self._modes[:, 0] += self._flat_modes
-        np.matmul(self._to_coefficients, self._modes.view(self._unit), out=self._pairs.view(self._unit))
-        np.take(self._pairs, self._places, out=self._coefficients, mode="clip")
-        self._coefficients *= self._signs
+    def intensity(self, opds_nm: Single, weights: Single) -> Single:
+        """The weighted sum of `|E|^2` (points, points) for wavefronts (wavefronts, used)."""
+        phase = self._wavenumber * opds_nm
+        # The flat wavefront's field is added later, computed in float64: smaller rounding errors in the sums.
+        phasor = np.empty((*phase.T.shape, 2), np.float32)
+        np.subtract(np.cos(phase).T, np.float32(1), out=phasor[..., 0])
+        phasor[..., 1] = np.sin(phase).T
+        modes = self._to_modes @ phasor.reshape(len(phasor), -1)
+        modes[:, ::2] += self._flat_modes
+        coefficients = (self._to_coefficients @ modes.view(self._unit)).view(np.complex64)
+        coefficients *= self._factors
         # The functions are real: multiply real and imaginary parts side by side.
         functions, points = self._basis_transposed.shape
-        np.matmul(self._coefficients.reshape(-1, functions), self._basis_transposed, out=self._half)
-        np.matmul(self._basis, self._half.reshape(2, functions, points), out=self._field)
-        np.multiply(self._field, self._field, out=self._field)
-        for part in self._field:
-            np.add(intensity, part, out=intensity)
+        parts = np.ascontiguousarray(coefficients.view(np.float32).T)
+        half = parts.reshape(-1, functions) @ self._basis_transposed
+        field = self._basis @ half.reshape(-1, functions, points)
+        field *= field
+        return np.asarray(weights.repeat(2) @ field.reshape(len(field), -1)).reshape(points, points)
 
 
 def _real_basis(basis: Complex) -> tuple[Array, Complex]:

@@ -1,6 +1,5 @@
 """Tables and figures as cases, the context in which they run, and the prepared sensors."""
 
-import threading
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -41,7 +40,6 @@ class Prepared:
         """Build the sensor of a section, or use `sensor` behind the section's coronagraph."""
         self.name, self.section = name, section
         self.sensor = sensor_from(section) if sensor is None else sensor
-        self._thread_local = threading.local()
 
     @property
     def paper_name(self) -> str:
@@ -167,15 +165,17 @@ class Prepared:
         return raised_as(ConfigurationError, ValueError, f"sensor {self.name}, {modes} modes")
 
     @cached_property
+    def _evaluator(self) -> Evaluator:
+        return Evaluator(self.twin)
+
+    @cached_property
     def _node_modes(self) -> Array:
         return zernikes(NOLLS_20, *node_radii(self.twin))
 
     def model(self, modes_nm: Array) -> Array:
-        """The same as `image` at the central wavelength, by the twin; thread-safe."""
-        if not hasattr(self._thread_local, "evaluator"):
-            self._thread_local.evaluator = Evaluator(self.twin)
+        """The same as `image` at the central wavelength, by the twin."""
         opd_nm = modes_nm @ self._node_modes[: len(modes_nm)]
-        return np.asarray(self._thread_local.evaluator.image(opd_nm.astype(np.float32)), np.float64).ravel()
+        return np.asarray(self._evaluator.image(opd_nm.astype(np.float32)), np.float64).ravel()
 
 
 @lru_cache(maxsize=1)
