@@ -196,6 +196,7 @@ def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
         ("wake-up", "warning", "max 4100 us", {"trial": trial(fifo_ns=[1000] * 999 + [4_100_000])}),
         ("wake-up", "warning", "a frame period is 4000 us", {"trial": trial(REFUSED, normal_ns=[500_000], fifo_ns=[])}),
         ("scheduling class", "note", "realtime.priority = 0", {"config": NOTHING_REQUESTED}),
+        ("scheduling class", "note", "normal scheduling: lockstep", {"config": load(None, {"lockstep": True})}),
         ("scheduling class", "warning", "LimitRTPRIO=50 frames come late", {"trial": trial(REFUSED)}),
         ("locked memory", "warning", "stalls", {"trial": trial(REFUSED)}),
         ("huge pages", "warning", "frames take longer", {"trial": trial(REFUSED)}),

@@ -8,6 +8,7 @@ import numpy as np
 
 from lowfc.adapters.process.clock import WALL_TOLERANCE_NS, HostClock, boot_file
 from lowfc.adapters.process.host import CPUS
+from lowfc.adapters.process.join import fifo_priority
 from lowfc.adapters.process.trial import Trial
 from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
 from lowfc.programs.commissioning.doctor.facts import Facts, named_cpus, ranges
@@ -31,9 +32,10 @@ _BUSY_SHOWN = 3
 @CHECKS.check("scheduling class")
 def _scheduling_class(facts: Facts) -> Check:
     """SCHED_FIFO at `realtime.priority`, requested as by the loop."""
-    priority = facts.config.realtime.priority
+    priority = fifo_priority(facts.config)
     if not priority:
-        return note("the configuration requests normal scheduling: realtime.priority = 0")
+        reason = "lockstep" if facts.config.lockstep else "realtime.priority = 0"
+        return note(f"the configuration requests normal scheduling: {reason}")
     if refused := facts.completed_trial.refused.get("priority"):
         what, cost = refused
         advice = f"`lowfc doctor --setup` (rtprio {priority} in limits.d), or the service's LimitRTPRIO={priority}"
