@@ -14,7 +14,8 @@ from lowfc.optics.chain.grid import image_axis
 
 SAMPLES_PER = 4
 """Samples per lambda / D. Two represent the image, but not the sharp edge of a zone, on which the contrast added by
-tilt depends: behind the shaped pupil two samples give a tenth of the value with 32 samples, four are within 10 %."""
+tilt depends: behind the shaped pupil two samples give a tenth of the value with 32 samples, four are within 20 %, for
+other modes too."""
 
 
 @dataclass(frozen=True)
