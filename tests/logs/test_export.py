@@ -16,6 +16,7 @@ from astropy.io import fits
 from astropy.table import Table
 from rich.console import Console
 
+from lowfc.adapters.logs.history import History
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import in_words
 from lowfc.arrays import Array
@@ -39,7 +40,9 @@ from lowfc.contract.messages import (
     from_timestamp,
     image,
 )
+from lowfc.programs.logs.export import files
 from lowfc.programs.logs.export.command import Format, export_log, render
+from lowfc.programs.logs.export.cubes import copy_frames_to_npy
 from tests.support import toy
 from tests.support.loops import json_of, lowfc, refusal
 from tests.support.mutated_logs import flipped
@@ -273,6 +276,22 @@ def test_a_failed_export_leaves_no_file(tmp_path: Path, to: Format, frame: Messa
     path = night.write(tmp_path / "night.mcap")
     with pytest.raises(DataFileError, match=f"{reason}.*; export without --frames"):
         export_log(path, to, frames=True, console=QUIET)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_log_replaced_during_its_export_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = NIGHT.write(tmp_path / "night.mcap")
+    shorter = a_night()
+    del shorter.samples[shorter.places(FRAME)[-1]]
+    replacement = shorter.write(tmp_path / "shorter.mcap")
+
+    def copy_after_change(cube: Path, history: History) -> None:
+        replacement.rename(path)
+        copy_frames_to_npy(cube, history)
+
+    monkeypatch.setattr(files, "copy_frames_to_npy", copy_after_change)
+    with pytest.raises(DataFileError, match="changed while it was read: it has 29 frames now, and had 30"):
+        export_log(path, Format.NPZ, frames=True, console=QUIET)
     assert list(tmp_path.iterdir()) == [path]
 
 
