@@ -74,7 +74,7 @@ ADVICE: dict[str, tuple[str, str]] = {
     ),
     "LAW_OVERRULED": (
         "the guard found that the law's residual exceeds the integrator's, or that the loop amplifies.",
-        "tune a law again from a recent log; `lowfc ctl law FILE` or `close` reactivates it.",
+        "tune a law again from a recent log; `lowfc ctl law FILE`, or `open` and then `close`, reactivates it.",
     ),
     "LAW_BACK": ("the law, simulated on the same frames, had a far smaller residual for some time.", _NOTHING),
     "NOTE": ("an operator wrote a note.", _NOTHING),
