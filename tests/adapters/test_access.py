@@ -189,6 +189,20 @@ def test_message_times_are_converted_to_the_receiving_hosts_clock(hosts: Hosts) 
     assert Service("camera", "hosts", camera.clock, camera).health().router_round_trip_ns > 0
 
 
+def test_a_camera_that_waits_for_the_mirror_across_hosts_starts(hosts: Hosts) -> None:
+    """Each of the two needs the other's Health, also the mirror, whose commands come under its own name only."""
+    hosts.join(ROUTER)
+    camera, mirror = (
+        Service(role, "hosts", bus.clock, bus)
+        for role, bus in ((role, hosts.join(role)) for role in ("camera", "mirror-dm"))
+    )
+    camera.state = mirror.state = "ready"
+    until(lambda: camera.last_health and mirror.last_health, each=lambda: (camera.beat(), mirror.beat()))
+    until(lambda: not camera.wait_for(["mirror-dm"], 0.0), each=lambda: (camera.beat(), mirror.beat()))
+    commands = {key for key in grant("mirror-dm").receives if key.endswith("/command")}
+    assert commands == {"lowfc/mirror/dm/command"}
+
+
 def test_a_role_runs_only_once_across_hosts(hosts: Hosts) -> None:
     hosts.join(ROUTER)
     hosts.join("camera").publisher(HEALTH, "camera").put(b"here")

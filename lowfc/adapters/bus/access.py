@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lowfc.adapters.bus.bus import ALL
-from lowfc.contract.messages import HEALTH, RECORD_KEY, REQUEST_KEY, TOPICS, Role, Topic
+from lowfc.contract.messages import COMMAND, HEALTH, RECORD_KEY, REQUEST_KEY, TOPICS, Role, Topic
 
 ROUTER = "router"
 """Role of the router itself: its common name, and its name in Health."""
@@ -24,8 +24,8 @@ class Grant:
     """Rights of a role, the common name of a certificate, as lists of keys.
 
     `subscribed` are the role's keys to which other processes may subscribe, `queried` those that they may query. A role
-    publishes Health under its own name only; a mirror publishes, answers and receives under its name only. All other
-    keys have "*" in place of a name.
+    publishes Health under its own name only; a mirror publishes, answers and receives commands under its name only. All
+    other keys have "*" in place of a name.
     """
 
     role: str
@@ -64,7 +64,7 @@ def grant(role: str) -> Grant:
         role,
         publishes=tuple(_own(topic, role, name) for topic in published),
         subscribed=tuple(topic.at(ALL) for topic in published),
-        receives=tuple(_own(topic, role, name) if kind is Role.MIRROR else topic.at(ALL) for topic in received),
+        receives=tuple(topic.at(name if topic is COMMAND and name else ALL) for topic in received),
         answers=tuple(answers),
         queried=tuple(queried),
         queries=(*queries, CLOCK_KEY),
