@@ -143,7 +143,8 @@ ADVICE: dict[str, tuple[str, str]] = {
     ),
     "START_AHEAD": (
         "the clock of the sender's host is ahead by more than `control.max_start_ahead_h`.",
-        "set the clocks of both hosts and start the sender again; `lowfc ctl clear` lets frame numbers restart.",
+        "set the clocks of both hosts and start the sender again; if its frames are then OUT_OF_ORDER, "
+        "`lowfc ctl safe` and then `clear` let their numbers restart (the mirror goes flat).",
     ),
     "LATCH_FAILED": (
         "a file that keeps safe mode across restarts cannot be read or written.",
