@@ -143,8 +143,7 @@ ADVICE: dict[str, tuple[str, str]] = {
     ),
     "START_AHEAD": (
         "the clock of the sender's host is ahead by more than `control.max_start_ahead_h`.",
-        "set the clocks of both hosts and start the sender again; if its frames are then OUT_OF_ORDER, "
-        "`lowfc ctl safe` and then `clear` let their numbers restart (the mirror goes flat).",
+        "set the clocks of both hosts and start the sender again; if frames are then OUT_OF_ORDER, see there.",
     ),
     "LATCH_FAILED": (
         "a file that keeps safe mode across restarts cannot be read or written.",
@@ -200,7 +199,11 @@ ADVICE: dict[str, tuple[str, str]] = {
 REASONS: dict[str, tuple[str, str]] = {
     "NO_CALIBRATION": ("no calibration is loaded", "load or measure one"),
     "WRONG_SIZE": ("rows, columns, encoding or bytes differ from the calibration", "set the camera's region"),
-    "OUT_OF_ORDER": ("an older frame than the last one", "nothing, unless two cameras publish in one run"),
+    "OUT_OF_ORDER": (
+        "an older frame than the last one",
+        "nothing if rare; if every frame, as after a clock was set back, `lowfc ctl safe` and then `clear` (the mirror "
+        "goes flat); else look for a second camera in the run",
+    ),
     "REPEATED": ("the frame was used before", "nothing, unless frequent"),
     "LATE": (
         "older than `control.max_frame_age_ms`, or than both 5 ms and three periods, or superseded by a newer frame",
