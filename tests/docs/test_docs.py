@@ -28,6 +28,7 @@ ELSEWHERE = {
     "lowfc ctl gain 0.3 --modes 2,3": "tests/e2e/test_operator.py",
     "lowfc runs": "tests/e2e/test_operator.py",
     "lowfc doctor": "tests/commissioning/test_doctor.py",
+    "lowfc doctor --config /etc/lowfc/lowfc.toml": "tests/commissioning/test_doctor.py",
     "lowfc gateway epics": "tests/interlocks/test_gateway.py",
     "rerun $(ls -t logs/*.mcap | head -1)": "tests/e2e/test_rerun_viewer.py",
     ROUTE: "tests/view/test_viewer_layouts.py",
