@@ -165,6 +165,9 @@ def test_the_units_match_the_programs_and_the_configuration() -> None:
         assert all(processors(name).isdisjoint(other) for other in others)
         assert len(processors(name)) == 1 or name not in LOOP
     assert Path(_LATENCY_DEVICE).name in (DEPLOY / "udev" / "70-lowfc.rules").read_text()
+    # The router starts first and stops last, so that the recorder receives the end of the run.
+    after_router = " ".join(settings("lowfc-router.service")["Before"]).split()
+    assert {*after_router, "lowfc-router.service"} == set(UNITS)
     # The longest waits of controller and camera must not trigger the watchdog.
     assert float(settings("lowfc-controller.service")["WatchdogSec"][0]) > MIRROR_PATIENCE_S
     assert float(settings("lowfc-sim-camera.service")["WatchdogSec"][0]) > PATIENCE_S
