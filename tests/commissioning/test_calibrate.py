@@ -15,7 +15,7 @@ import pytest
 
 from lowfc.client import Answer, mirror_watch
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import BusError, CalibrationError, DataFileError
+from lowfc.contract.errors import BusError, CalibrationError, DataFileError, RequestRefusedError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, wire
 from lowfc.control.calibration.calibration import Calibration
@@ -265,6 +265,32 @@ def test_a_sequence_during_a_device_restart_is_stopped_at_once_and_repeated() ->
     for play in faults:
         assert loop.begun[play] < loop.begun[play - 1] + 80, "a sequence ends soon after the fault, 50 frames in"
     assert np.abs(cross_talk(loop.calibration().reconstructor, data.measured.response)).max() < 0.05
+
+
+def lose_mirror(loop: InProcessLoop) -> None:
+    kill_mirror(loop)
+    loop.report_mirror("does not answer")
+
+
+def test_a_sequence_waits_until_the_controller_notices_that_a_restarted_mirror_follows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The mirror's first state arrives before the controller reads its first Health; until then `play` is refused."""
+    loop, waited_s = FaultyLoop({1: (lose_mirror, InProcessLoop.start_mirror)}), list[float]()
+
+    def follow(seconds: float) -> None:
+        waited_s.append(seconds)
+        if len(waited_s) == 2:
+            loop.report_mirror("")
+
+    monkeypatch.setattr(recording, "sleep", follow)
+    _, data = measure(loop, "hadamard")
+    assert len(waited_s) == 2
+    assert data.measured.cycles == 4
+    loop.report_mirror("refuses commands: STUCK")
+    monkeypatch.setattr(recording, "FAULT_S", 0.0)
+    with pytest.raises(RequestRefusedError, match="refuses commands: STUCK"):
+        measure(loop, "hadamard")
 
 
 def test_ctrl_c_restores_the_mirror_and_keeps_the_completed_cycles() -> None:

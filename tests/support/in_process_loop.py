@@ -29,7 +29,7 @@ from lowfc.contract.messages import EVENT, MIRROR_STATE, Topic, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.camera import CameraSettings
-from lowfc.control.loop.inputs import MirrorShape, Request, Step, Tick
+from lowfc.control.loop.inputs import MirrorReport, MirrorShape, Request, Step, Tick
 from lowfc.device import DriverOptions, driver
 from lowfc.device.mirror_loop import MirrorLoop
 from lowfc.programs.core.controller import Controller
@@ -141,6 +141,10 @@ class InProcessLoop(Client):
         for event in self._bench.process_input(Tick(0, 60_000_000)).events:
             message = EVENTS[event.name].log("controller", 0, **event.details)
             self.mirror_bus.publisher(EVENT).put(message.SerializeToString())
+
+    def report_mirror(self, fault: str) -> None:
+        """Let the controller find that the mirror has a fault, or with an empty text that it follows again."""
+        self._bench.process_input(MirrorReport(0, fault))
 
     def residual_nm(self, first: int, last: int | None = None) -> npt.NDArray[np.float64]:
         """True residual modes (frames, modes) in the exposures of the slice `first:last`."""

@@ -23,6 +23,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
     loop_of,
     probe_response,
 )
+from lowfc.programs.commissioning.calibrate.recording import begun
 
 ATTEMPTS = 3
 """Plays of a probe sequence that the mirror or the camera interrupts, before the test ends with an error."""
@@ -127,9 +128,9 @@ class Live:
         answer = self.client.note(ANNOUNCEMENT + json.dumps({"test": kind, **parameters, "frames": frames}))
         target = ""
         if basis is not None:
-            target, answer = MIRROR, self.client.play(basis, table)
+            target, answer = MIRROR, begun(self.client, lambda: self.client.play(basis, table))
         elif columns:
-            target, answer = OFFSET, self.client.play_offset(table)
+            target, answer = OFFSET, begun(self.client, lambda: self.client.play_offset(table))
         first = answer.frame_sequence
         recorded: list[Step] = []
         for step in steps:

@@ -3,15 +3,16 @@
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from time import monotonic, sleep
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Array, Integers, Long, Mask, Pixels
-from lowfc.client import Client, Frame, MirrorWatch
+from lowfc.client import Answer, Client, Frame, MirrorWatch
 from lowfc.contract.envelope import start_of
-from lowfc.contract.errors import CalibrationError, LowfcError
+from lowfc.contract.errors import CalibrationError, LowfcError, RequestRefusedError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay, NotSeenError, measure_delay
@@ -35,6 +36,8 @@ MAX_REFUSED_FRAMES = 50
 """Consecutive refused frames after which a probe sequence is abandoned."""
 ATTEMPTS = 5
 """Attempts at a sequence if frames are lost or a device restarts."""
+FAULT_S = 5.0
+"""Longest wait before a probe sequence for the end of the mirror's fault."""
 DITHER_SLOWEST = 1 / 16
 """Lowest frequency of a dither that is used, cycles per frame; most of the disturbance is below it."""
 _LIMITS = frozenset(Limit) - {Limit.LAW_OVERRULED}  # those that end a probe sequence
@@ -109,7 +112,8 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
     loop.check_lease()
     with _streams(loop) as (frames, steps):
         mirror = loop.mirror_watch()
-        first = loop.play(basis_nm.astype(np.float32), table.astype(np.float32)).frame_sequence
+        requested = basis_nm.astype(np.float32), table.astype(np.float32)
+        first = begun(loop, lambda: loop.play(*requested)).frame_sequence
         last = first + len(table) - 1
         end = last + 1 + AFTERWARDS
         images: list[Frame] = []
@@ -133,6 +137,29 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
         _check_devices(mirror, step.frame_sequence, first)
         loop.check_lease()
     return _recording(images, recorded, first)
+
+
+def begun(loop: Client, begin: Callable[[], Answer]) -> Answer:
+    """Request a probe sequence by `begin`; if the mirror's fault is the reason of a refusal, again once it has ended.
+
+    The first state of a restarted mirror arrives up to 0.1 s before the controller knows that the mirror follows again.
+    """
+    deadline_s = monotonic() + FAULT_S
+    while True:
+        try:
+            return begin()
+        except RequestRefusedError:
+            if not _mirror_fault(loop):
+                raise
+            while _mirror_fault(loop):
+                if monotonic() >= deadline_s:
+                    raise
+                sleep(0.05)
+
+
+def _mirror_fault(loop: Client) -> str:
+    state = loop.status().state
+    return "" if state is None else state.mirror_fault
 
 
 def next_frames(loop: Client, count: int) -> Pixels:
