@@ -26,6 +26,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
     _announced,
     logged_responses,
 )
+from lowfc.programs.commissioning.calibrate import recording
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop, configuration
 from tests.support.loops import refusal
 from tests.support.report_log import TOY_CALIBRATION, SyntheticLog
@@ -136,6 +137,15 @@ def test_an_interrupted_probe_sequence_is_repeated_in_the_same_mode(capsys: pyte
     often = InProcessLoop(configured(), lose=lambda index: index > 20 and not index % 30 and often.silence_camera())
     with pytest.raises(AcceptanceError, match=r"in 3 attempts no probe sequence was undisturbed; .*NO_FRAMES"):
         responses_of(often, linearity, hold_frames=7, cycles=3, modes=(2,))
+
+
+def test_a_probe_sequence_waits_for_a_mirror_that_has_just_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = InProcessLoop(configured())
+    loop.run(5)
+    loop.report_mirror("does not answer")
+    monkeypatch.setattr(recording, "sleep", lambda _: loop.report_mirror(""))
+    (response,) = responses_of(loop, linearity, hold_frames=7, cycles=3, modes=(2,))
+    assert linearity.judge([response], loop.config).passed
 
 
 def test_linearity_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain() -> None:
