@@ -23,7 +23,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
     loop_of,
     probe_response,
 )
-from lowfc.programs.commissioning.calibrate.recording import begun
+from lowfc.programs.commissioning.calibrate.recording import await_mirror
 
 ATTEMPTS = 3
 """Plays of a probe sequence that the mirror or the camera interrupts, before the test ends with an error."""
@@ -125,12 +125,13 @@ class Live:
         frames, columns = table.shape
         before = self._state()
         steps, watch = self.client.steps(), self.client.mirror_watch()
+        await_mirror(self.client)
         answer = self.client.note(ANNOUNCEMENT + json.dumps({"test": kind, **parameters, "frames": frames}))
         target = ""
         if basis is not None:
-            target, answer = MIRROR, begun(self.client, lambda: self.client.play(basis, table))
+            target, answer = MIRROR, self.client.play(basis, table)
         elif columns:
-            target, answer = OFFSET, begun(self.client, lambda: self.client.play_offset(table))
+            target, answer = OFFSET, self.client.play_offset(table)
         first = answer.frame_sequence
         recorded: list[Step] = []
         for step in steps:

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Array, Integers, Long, Mask, Pixels
-from lowfc.client import Answer, Client, Frame, MirrorWatch
+from lowfc.client import Client, Frame, MirrorWatch
 from lowfc.contract.envelope import start_of
-from lowfc.contract.errors import CalibrationError, LowfcError, RequestRefusedError
+from lowfc.contract.errors import CalibrationError, LowfcError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay, NotSeenError, measure_delay
@@ -110,10 +110,10 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
     stalled.
     """
     loop.check_lease()
+    await_mirror(loop)
     with _streams(loop) as (frames, steps):
         mirror = loop.mirror_watch()
-        requested = basis_nm.astype(np.float32), table.astype(np.float32)
-        first = begun(loop, lambda: loop.play(*requested)).frame_sequence
+        first = loop.play(basis_nm.astype(np.float32), table.astype(np.float32)).frame_sequence
         last = first + len(table) - 1
         end = last + 1 + AFTERWARDS
         images: list[Frame] = []
@@ -139,27 +139,14 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
     return _recording(images, recorded, first)
 
 
-def begun(loop: Client, begin: Callable[[], Answer]) -> Answer:
-    """Request a probe sequence by `begin`; if the mirror's fault is the reason of a refusal, again once it has ended.
+def await_mirror(loop: Client) -> None:
+    """Wait, before a probe sequence, until the controller knows that the mirror follows; at most `FAULT_S`.
 
-    The first state of a restarted mirror arrives up to 0.1 s before the controller knows that the mirror follows again.
+    The first state of a restarted mirror arrives up to 0.1 s before the end of its fault.
     """
     deadline_s = monotonic() + FAULT_S
-    while True:
-        try:
-            return begin()
-        except RequestRefusedError:
-            if not _mirror_fault(loop):
-                raise
-            while _mirror_fault(loop):
-                if monotonic() >= deadline_s:
-                    raise
-                sleep(0.05)
-
-
-def _mirror_fault(loop: Client) -> str:
-    state = loop.status().state
-    return "" if state is None else state.mirror_fault
+    while (state := loop.status().state) and state.mirror_fault and monotonic() < deadline_s:
+        sleep(0.05)
 
 
 def next_frames(loop: Client, count: int) -> Pixels:
