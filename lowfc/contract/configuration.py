@@ -24,6 +24,7 @@ from lowfc.contract.network import WithoutNul
 from lowfc.contract.printable import printable
 from lowfc.contract.sections import (
     IMPERFECTIONS,
+    MAX_VALUE,
     Camera,
     Disturbance,
     Gateway,
@@ -50,6 +51,7 @@ _ALTERNATIVE = re.compile(
 
 Milliseconds = Annotated[float, Field(ge=0, le=1e9)]
 Cpus = list[Annotated[int, Field(ge=0, lt=8192)]]  # the kernel's largest number of processors
+Count = Annotated[int, Field(ge=0, lt=2**32)]  # uint32 in the controller's state
 Gain = Annotated[float, Field(ge=0, le=4)]
 Amplitude = Annotated[float, Field(ge=1e-6, le=1e5)]  # acceptance plays it in small steps, whose table must fit memory
 ModalLimit = Annotated[float, Field(gt=0, le=MAX_LIMIT_NM)]
@@ -98,9 +100,9 @@ class Control(Section):
     host whose clock is not set."""
     min_flux_fraction: float = Field(0.2, ge=0, lt=1)
     """Fraction of the calibration's flux below which a frame is refused as dark."""
-    max_saturated_pixels: int = Field(8, ge=0)
+    max_saturated_pixels: Count = 8
     """Number of saturated pixels above which a frame is refused."""
-    max_identical_frames: int = Field(3, ge=0)
+    max_identical_frames: Count = 3
     """Consecutive frames that may equal the one before, as from a stuck camera; 0, or camera.noise off: no limit."""
     law: str = ""
     """Law file (FITS) written by `lowfc tune`; empty for the integrator."""
@@ -138,7 +140,7 @@ class Acceptance(Section):
     """Wavefront rms of tip or tilt from which the loop must close; 34 nm is 14 mas at 2 m."""
     capture_nm: Amplitude = 20.0
     """Wavefront rms of any other mode from which the loop must close."""
-    noise_ratio: float = Field(1.2, gt=1)
+    noise_ratio: float = Field(1.2, gt=1, le=MAX_VALUE)
     """Largest white noise of a mode, relative to its photon and read-out noise."""
 
 

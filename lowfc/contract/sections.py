@@ -13,9 +13,9 @@ MIRROR_NAME = r"^[a-z][a-z0-9_]{0,49}$"
 """Regular expression for the name of a mirror; with "mirror-" before it, the name is short enough for a certificate."""
 BENCH_NAME = r"^[A-Za-z][A-Za-z0-9_-]{0,63}$"
 """Regular expression for the name of a bench value."""
-Positive = Annotated[float, Field(gt=0)]
 MAX_VALUE = 1e12
 """Largest value of a key without a limit of its own; a far larger number overflows in single precision."""
+Positive = Annotated[float, Field(gt=0, le=MAX_VALUE)]
 MirrorLimit = Annotated[float, Field(gt=0.01, le=MAX_VALUE)]
 NotNegative = Annotated[float, Field(ge=0, le=MAX_VALUE)]
 Signed = Annotated[float, Field(ge=-MAX_VALUE, le=MAX_VALUE)]
