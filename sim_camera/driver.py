@@ -2,7 +2,6 @@
 
 from collections import deque
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from lowfc.adapters.files.twin_cache import load_or_fit_mirror
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Single
 from lowfc.contract.codecs.codec import actuators, latency
+from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import BusError, ConfigurationError
@@ -144,7 +144,7 @@ class SimulatedCamera:
         row, rows = _centred_region("rows", options.rows, self._scene.shape[0])
         column, columns = _centred_region("columns", options.columns, self._scene.shape[1])
         self._region = np.s_[row : row + rows, column : column + columns]
-        self._fault = read_fault(Path(options.fault)) if options.fault else None
+        self._fault = read_fault(user_path(options.fault)) if options.fault else None
         configured = CameraSettings.configured(config, rows, columns)
         self._settings = replace(configured, clock="run", region_row=row, region_column=column)
         self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)

@@ -1,5 +1,6 @@
 """Reports of the simulated camera: statistics of the wavefront, habitually late commands, and the readout region."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -21,7 +22,7 @@ NOLL = (2, 3, 4)
 PIXELS = np.arange(80 * 80, dtype=np.uint16).reshape(80, 80)
 
 
-def camera_of(config: Configuration, **options: int) -> SimulatedCamera:
+def camera_of(config: Configuration, **options: int | str) -> SimulatedCamera:
     """A camera whose optics always give the same image."""
     scene = SimpleNamespace(shape=PIXELS.shape, instants=(), expose=lambda index, shape: PIXELS)
     return SimulatedCamera(SimulatedCamera.Options(**options), config, scene)
@@ -174,3 +175,11 @@ def test_region_is_read_at_the_centre_of_the_sensor() -> None:
     assert np.array_equal(exposure.pixels, PIXELS[8:72, 15:65])
     with pytest.raises(ConfigurationError, match="rows is 81, the sensor has 80"):
         camera_of(Configuration(), rows=81)
+
+
+def test_the_path_of_a_fault_may_begin_with_a_tilde(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "fault.json").write_text('{"kind": "dark", "first": 1, "frames": 1}')
+    camera_of(load(None), fault="~/fault.json")
+    with pytest.raises(ConfigurationError, match="no-fault.json: not a fault"):
+        camera_of(load(None), fault="~/no-fault.json")
