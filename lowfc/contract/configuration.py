@@ -63,7 +63,8 @@ class Control(Section):
     """The control law."""
 
     start_mode: Literal["open", "closed"] = "open"
-    """Loop mode once a calibration is loaded; sim-loop starts closed if the file does not set it."""
+    """Loop mode once a calibration is loaded; closed: open until automatic gains are measured. sim-loop starts closed
+    if the file does not set it."""
     delay_frames: float = Field(0.0, ge=0, le=10)
     """Measured delay in frames: a command computed from frame n first acts on the whole exposure of frame n + delay; 0:
     camera.delay_frames. Twice the delay about halves the highest stable gain."""
@@ -72,14 +73,14 @@ class Control(Section):
     nuisance: list[Literal["background", "shear"]] = Field(default_factory=list)
     """Nuisance parameters fitted together with the modes: uniform background light, shear of the beam."""
     tilt_gain: Gain | Literal["auto"] = "auto"
-    """Integrator gain of tip and tilt; auto: optimised per mode for the least residual, 0 if every gain would harm."""
+    """Integrator gain of tip and tilt; auto: optimised per mode for the least residual, 0 if no gain reduces it."""
     gain: Gain | Literal["auto"] = "auto"
     """Integrator gain of the other modes."""
     on_harm: Literal["warn", "open", "integrator"] = "warn"
     """Action if the residual stays larger than in open loop: warn: event only; open: the loop opens; integrator: the
     integrator takes over from a law, or the loop opens if the integrator is already in force."""
     tilt_leak: float = Field(0.0, ge=0, le=1)
-    """Integrator leak of tip and tilt."""
+    """Integrator leak of tip and tilt: fraction of the command lost per frame."""
     leak: float = Field(0.0, ge=0, le=1)
     """Integrator leak of the other modes."""
     tilt_limit_nm: ModalLimit = 150.0
@@ -167,8 +168,8 @@ class Recorder(Section):
     on_event_level: Literal["info", "warning", "error"] = "error"
     """Lowest event level that runs the command."""
     on_event_every_s: float = Field(10.0, ge=0, le=1_000_000)
-    """Shortest time from the end of the command to its next run, which reports the most severe event since then;
-    LOWFC_OTHERS is the number of others."""
+    """Shortest time from the end of the command to its next run, which reports the most severe event since the last
+    run began; LOWFC_OTHERS is the number of others."""
 
 
 class Realtime(Section):

@@ -196,7 +196,7 @@ class Disturbance(Section):
     scale: NotNegative = 1.0
     """Multiplies the preset's amplitude."""
     line_width: float = Field(0.005, ge=0, le=0.05)
-    """Width of the reaction wheel's lines between half-power points, as a fraction of their frequency."""
+    """For reaction-wheel: width of the lines between half-power points, as a fraction of their frequency."""
     static_nm: dict[str, Signed] = Field(default_factory=dict)
     """Constant wavefront added to the preset: Noll index = nm rms."""
     drift_nm: dict[str, Signed] = Field(default_factory=dict)
@@ -210,7 +210,7 @@ class Disturbance(Section):
     wheel_hz: NotNegative = 0.0
     """Initial speed of a reaction wheel, turns per second (0: none). It excites tip and tilt at its harmonics."""
     wheel_mas: NotNegative = 3.0
-    """Amplitude of the wheel's first harmonic at high speed, mas rms per axis; the others have a half to a seventh."""
+    """Amplitude of the wheel's first harmonic at high speed, mas rms per axis; the others have 0.5 to 0.15 of it."""
     wheel_course: Literal["ramp", "walk", "run-down"] = "ramp"
     """Change of the wheel's speed: linear, random walk, or slowed by friction."""
     wheel_change: Signed = 0.0
@@ -261,9 +261,9 @@ class Mirror(Section):
     """Simulated mirror: time constant of an actuator's first-order response; without lockstep, images are correct for
     up to a fifth of the period."""
     dead: list[int] = Field(default_factory=list)
-    """Actuators that stay flat: row * columns + column."""
+    """Simulated mirror: actuators that stay flat, row * columns + column; exclude known ones with `active`."""
     stuck_nm: dict[str, Signed] = Field(default_factory=dict)
-    """Actuators stuck at a height: row * columns + column = nm."""
+    """Simulated mirror: actuators stuck at a height, row * columns + column = nm; exclude known ones with `active`."""
     slew_nm: MirrorLimit = 150.0
     """The mirror's own limit: largest change of an actuator per command."""
     neighbour_nm: MirrorLimit = 500.0
@@ -275,7 +275,7 @@ class Mirror(Section):
     active: str = ""
     """Map of the active actuators (FITS or .npy), 0 or 1: modes and flat map exclude the others; empty for all."""
     nm_per_unit: float = Field(1.0, ge=1e-9, le=1e9)
-    """For the mirror's driver: nm of surface per unit written to the hardware."""
+    """For a driver with VoltMap or of your own: nm of surface per unit written; isio has an option of this name."""
     shift_pitches: float = Field(0.0, ge=-2, le=2)
     """Simulated mirror: misregistration of its actuators along x and along y, pitches."""
     magnification: float = Field(1.0, ge=0.9, le=1.1)
