@@ -176,11 +176,11 @@ class Realtime(Section):
     """Real-time measures requested from the host; each process applies them before its first bus session."""
 
     priority: int = Field(50, ge=0, le=98)
-    """SCHED_FIFO priority of camera, controller and mirror; 0 for normal scheduling, which lockstep always has."""
+    """SCHED_FIFO priority of camera, controller, mirror and router; 0 for normal scheduling, as always in lockstep."""
     recorder_priority: int = Field(10, ge=0, le=98)
     """SCHED_FIFO priority of the recorder, below `priority`; the batch class if either is 0, and in lockstep."""
     lock_memory: bool = True
-    """Lock the memory of camera, controller and mirror, and move it to huge pages once they are ready (Linux 6.1)."""
+    """Lock the memory of camera, controller, mirror, router; the first three use huge pages once ready (Linux 6.1)."""
     disable_cpu_idle: bool = True
     """Keep processors out of deep idle states while the loop runs: lower latency, more power."""
     cache_warmup: bool = True
