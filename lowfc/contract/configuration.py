@@ -95,7 +95,8 @@ class Control(Section):
     on_frame_timeout: Literal["hold", "flat"] = "hold"
     """Action after a frame timeout: hold the command, or relax the mirror to flat."""
     command_timeout_ms: float = Field(200.0, gt=0, le=1e9)
-    """Time without a new command after which the mirror's last command expires; more than 2000 acts as 2000."""
+    """Time without a new command after which the mirror's last command expires; more than 2000 acts as 2000. Without
+    frames the controller repeats its command every 10 ms, so less than 20 lets it expire between slow frames."""
     max_start_ahead_h: float = Field(24.0, ge=0, le=1e9)
     """Hours by which the start time of a camera or controller may be ahead of this host's clock; 0: no limit, for a
     host whose clock is not set."""
