@@ -114,7 +114,7 @@ EVENTS: dict[str, Event] = {
         Event("MIRROR_BACK", Level.INFO, "the mirror follows again"),
         Event("MIRROR_REFUSED", Level.WARNING, "the mirror's shape is not adopted: {why}"),
         Event("LIMIT_HIT", Level.WARNING, "limit reached: {reason}"),
-        Event("LIMIT_CLEARED", Level.INFO, "mirror limit no longer reached: {reason}"),
+        Event("LIMIT_CLEARED", Level.INFO, "limit no longer reached: {reason}"),
         Event("COMMAND_EXPIRED", Level.WARNING, "the last command expired after {command_timeout_ms:.0f} ms; {action}"),
         Event("COMMAND_BACK", Level.INFO, "commands are back"),
         Event("COMMAND_REFUSED", Level.WARNING, "command refused: {reason}"),

@@ -163,6 +163,13 @@ def test_every_raised_event_is_in_the_table_with_the_same_details() -> None:
     assert {"MODE_CHANGED", "CALIBRATION_LOADED", "COMMAND_EXPIRED"} <= {name for _, name, _ in raised}
 
 
+@pytest.mark.parametrize("name", ["LIMIT_HIT", "LIMIT_CLEARED"])
+def test_the_events_of_a_limit_are_also_true_of_modal_limits(name: str) -> None:
+    message = EVENTS[name].log("controller", 0, reason=Limit.MODAL_LIMIT.name).message
+    assert "mirror" not in message
+    assert message.endswith(": MODAL_LIMIT")
+
+
 def test_every_event_formats_as_a_line() -> None:
     for name, event in EVENTS.items():
         assert re.fullmatch(r"[A-Z]+(_[A-Z]+)*", name)
