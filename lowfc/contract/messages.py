@@ -140,10 +140,17 @@ CONTROLLER_STATE = Topic(
     wire.ControllerState,
     1.0,
     _CONTROLLER,
-    "The controller's state: all that the next command depends on; calibration, law and probe sequence by identity.",
+    "The controller's state, with frames at this rate and when it changes: all that the next command depends on; "
+    "calibration, law and probe sequence by identity.",
     queryable=True,
 )
-REQUEST = Topic("lowfc/control/request", wire.Request, Rate.EVENT, _CONTROLLER, "An operator's request and its reply.")
+REQUEST = Topic(
+    "lowfc/control/request",
+    wire.Request,
+    Rate.EVENT,
+    _CONTROLLER,
+    "A request, of an operator or of the controller itself, and its reply.",
+)
 COMMAND = Topic(
     "lowfc/mirror/{name}/command",
     wire.MirrorCommand,
@@ -186,7 +193,7 @@ LAW = Topic(
     wire.LinearLaw,
     Rate.EVENT,
     _CONTROLLER,
-    "Control law in use instead of the integrator, with its matrices; the controller's states have only its identity.",
+    "A requested control law, with its matrices; the controller's states have the identity of the one in use.",
     queryable=True,
 )
 PLAY = Topic(
@@ -194,7 +201,7 @@ PLAY = Topic(
     wire.Play,
     Rate.EVENT,
     _CONTROLLER,
-    "Table of the current probe sequence; the controller's states have only its identity.",
+    "Table of a requested probe sequence; the controller's states have the identity of the current one.",
     queryable=True,
 )
 CALIBRATION = Topic(
@@ -202,7 +209,8 @@ CALIBRATION = Topic(
     wire.Calibration,
     Rate.EVENT,
     _CONTROLLER,
-    "Calibration in use: matrices from a frame to modes and to actuators.",
+    "A requested calibration: matrices from a frame to modes and to actuators; the controller's states have the "
+    "identity of the one in use.",
     queryable=True,
 )
 BENCH = Topic(
