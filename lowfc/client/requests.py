@@ -47,7 +47,7 @@ DECLARED: tuple[Declaration, ...] = (
         "step", "Close the loop for a number of frames, then open it again.", "step 100", ("values", "number of frames")
     ),
     _declared("safe", "Relax the mirror to flat and latch it there until `clear`.", "safe"),
-    _declared("clear", "Leave safe mode; the loop is open afterwards.", "clear"),
+    _declared("clear", "Leave safe mode; the loop is open afterwards, or idle without a calibration.", "clear"),
     _declared("reset", "Return the modal command to zero within the slew limit, and clear the law's memory.", "reset"),
     _declared(
         "gain",
@@ -75,7 +75,7 @@ DECLARED: tuple[Declaration, ...] = (
     _declared(
         "channel",
         "Add a shape to the mirror, and shift the sensor's zero point with it so that the loop does not undo it; "
-        "the channel `flat` does not shift the zero point.",
+        "the channel `flat` does not shift the zero point, and `external`, which other programs apply, is not sent.",
         "channel dark-hole shape.fits",
         ("text", "name: up to 32 of a-z, 0-9 and -, a letter first"),
         ("actuators", "float32, nm of surface, rows x columns; empty removes the channel"),
@@ -100,7 +100,7 @@ DECLARED: tuple[Declaration, ...] = (
     ),
     _declared(
         "load",
-        "Use another calibration; the loop must be open.",
+        "Use another calibration; a closed loop must be opened first.",
         "load calibration.fits",
         ("calibration", "the complete calibration"),
     ),
