@@ -143,11 +143,13 @@ ADVICE: dict[str, tuple[str, str]] = {
     ),
     "START_AHEAD": (
         "the clock of the sender's host is ahead by more than `control.max_start_ahead_h`.",
-        "set the clocks of both hosts and start the sender again; if frames are then OUT_OF_ORDER, see there.",
+        "set the clocks of both hosts and start the sender again; if its frames are then OUT_OF_ORDER, see the table "
+        "of reasons.",
     ),
     "LATCH_FAILED": (
         "a file that keeps safe mode across restarts cannot be read or written.",
-        "make the directory named in the event writable; safe mode itself is in force.",
+        "make the directory named in the event writable; the loop mode does not change. At its start a controller "
+        "takes an unreadable file for safe mode, and starts open if it can write none.",
     ),
     "COMMANDS_LATE": (
         "in the simulated camera, more than a quarter of the last 500 commands were applied after the next exposure "
@@ -201,8 +203,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "WRONG_SIZE": ("rows, columns, encoding or bytes differ from the calibration", "set the camera's region"),
     "OUT_OF_ORDER": (
         "an older frame than the last one",
-        "nothing if rare; if every frame, as after a clock was set back, `lowfc ctl safe` and then `clear` (the mirror "
-        "goes flat); else look for a second camera in the run",
+        "nothing, if rare; stop a second camera; if the camera's clock was set back, `lowfc ctl safe`, then `clear`",
     ),
     "REPEATED": ("the frame was used before", "nothing, unless frequent"),
     "LATE": (
@@ -232,7 +233,10 @@ REASONS: dict[str, tuple[str, str]] = {
     "NEIGHBOUR": ("neighbouring actuators would be too far apart", "smaller channels; look for a stuck actuator"),
     "NOT_FINITE": ("a value was not finite; the previous command is kept", "check calibration and law"),
     "WRONG_GRID": ("the grid differs from the mirror's", "load the calibration of this mirror"),
-    "CHANNEL": ("the channel's name is not valid, or it would be the seventeenth", "remove a channel"),
+    "CHANNEL": (
+        "the name of a command's channel has more than 32 characters, or it would be the mirror's seventeenth",
+        "a shorter name, or fewer programs that command this mirror",
+    ),
     "LAW_OVERRULED": ("the integrator has taken over modes from the law", "as for LAW_OVERRULED"),
 }
 """Cause and remedy of each rejection and limit, by its name on the wire without REASON_."""
