@@ -93,8 +93,8 @@ DECLARED: tuple[Declaration, ...] = (
     _declared("stop", "End the probe sequence.", "stop"),
     _declared(
         "law",
-        "Let a linear law drive the mirror: it first observes, then takes over in a cross-fade; an unstable law is "
-        "refused.",
+        "Let a linear law drive the mirror: it first observes, then takes over in a cross-fade; a law that is "
+        "unstable, or made for another rate or other modes, is refused.",
         "law lqg.fits",
         ("law", "the linear law; none for the integrator"),
     ),
