@@ -192,7 +192,7 @@ class Client:
         return self.ask("play", text=OFFSET, table=table)
 
     def load(self, calibration: Calibration) -> Answer:
-        """Use another calibration; the loop must be open."""
+        """Use another calibration; a closed loop must be opened first."""
         return self.ask("load", calibration=calibration)
 
     def law(self, law: LinearLaw | None = None) -> Answer:

@@ -140,8 +140,8 @@ CONTROLLER_STATE = Topic(
     wire.ControllerState,
     1.0,
     _CONTROLLER,
-    "The controller's state, with frames at this rate and when it changes: all that the next command depends on; "
-    "calibration, law and probe sequence by identity.",
+    "The controller's state, at this rate while frames come and after most other changes: all that the next command "
+    "depends on; calibration, law and probe sequence by identity.",
     queryable=True,
 )
 REQUEST = Topic(
