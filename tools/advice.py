@@ -10,7 +10,7 @@ ADVICE: dict[str, tuple[str, str]] = {
         "let a time server set the clock before the first run; `lowfc doctor` shows how to correct it later.",
     ),
     "REALTIME_REFUSED": (
-        "the host does not grant a real-time measure (SCHED_FIFO, locked memory, disabled CPU idle states).",
+        "the host does not grant a real-time measure (SCHED_FIFO, locked memory, disabled CPU idle, processors).",
         "run `lowfc doctor`, which names the missing permission; until then latencies have a longer tail.",
     ),
     "KERNEL": ("`realtime.kernel` selects this implementation of the control step.", _NOTHING),
@@ -106,7 +106,7 @@ ADVICE: dict[str, tuple[str, str]] = {
         "check that the program that held the reservation has stopped.",
     ),
     "INTERLOCK_ACTS": (
-        "a value of the bench meets a condition of `[[interlocks]]`, or is too old.",
+        "a value of the bench meets a condition of `[[interlocks]]`, or is missing, too old or of another type.",
         "remove the cause, or check the publisher of the value.",
     ),
     "INTERLOCK_CLEARED": ("the condition no longer holds.", "close the loop again, if the interlock opened it."),

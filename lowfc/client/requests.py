@@ -42,9 +42,14 @@ DECLARED: tuple[Declaration, ...] = (
     _declared("status", "Report the loop mode; the answer contains the controller's whole state.", "status"),
     _declared("open", "Open the loop; the mirror holds its shape.", "open"),
     _declared("close", "Close the loop: the control law drives the mirror.", "close"),
-    _declared("pause", "Open the loop, reported as paused; closing it resumes from the held command.", "pause"),
     _declared(
-        "step", "Close the loop for a number of frames, then open it again.", "step 100", ("values", "number of frames")
+        "pause",
+        "Open a closed loop; unless the holder of a reservation asked, it is reported as paused; closing it resumes from "
+        "the held command.",
+        "pause",
+    ),
+    _declared(
+        "step", "Close the loop for a number of frames, then open it again.", "step 100", ("values", "used frames")
     ),
     _declared("safe", "Relax the mirror to flat and latch it there until `clear`.", "safe"),
     _declared("clear", "Leave safe mode; the loop is open afterwards, or idle without a calibration.", "clear"),
