@@ -44,8 +44,8 @@ DECLARED: tuple[Declaration, ...] = (
     _declared("close", "Close the loop: the control law drives the mirror.", "close"),
     _declared(
         "pause",
-        "Open a closed loop; unless the holder of a reservation asked, it is reported as paused; closing it resumes from "
-        "the held command.",
+        "Open a closed loop; unless the holder of a reservation asked, it is reported as paused; closing it resumes "
+        "from the held command.",
         "pause",
     ),
     _declared(
