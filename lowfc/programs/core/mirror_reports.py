@@ -18,7 +18,7 @@ from lowfc.control.loop.state import State
 
 CHECK_PERIOD_NS = 100_000_000
 SILENT_NS = 1_600_000_000
-"""Longest time without a Health: the mirror sends two per second, so that three in a row may be missing."""
+"""Longest time without a Health: the mirror sends two per second, so that two in a row may be missing."""
 
 
 class MirrorReports:
