@@ -94,8 +94,9 @@ class Client:
         not close the bus.
 
         Raises:
-            BusError: there is no such run, none at all, or more than one to choose from.
-            DataFileError: the run's directory is damaged.
+            BusError: there is no such run, none at all, or more than one to choose from; or its router refuses this
+                host's certificate.
+            DataFileError: the run's directory is damaged; across hosts, the operator has no valid certificate here.
         """
         self.run_id = the_run(run) if bus is None else run or DEFAULT_RUN
         self._requester = by_this_process(program_name())
@@ -230,8 +231,9 @@ class Client:
     def held(self, purpose: str, hold_s: float) -> Iterator[None]:
         """Hold the loop for at most `hold_s` while something on the bench moves; a closed loop then resumes.
 
-        Until the end of the hold, requests that would change the loop are refused, also those of this client. Within
-        `reserved` a hold is refused: use `pause` and `close_loop` there.
+        Until the end of the hold, requests that would change the loop are refused, also those of this client, except
+        `open`, `pause`, `stop` and `safe`, which end the hold. Within `reserved` a hold is refused: use `pause` and
+        `close_loop` there.
         """
         identity = new_identity()
         self.permit(purpose, hold_s, identity)

@@ -23,7 +23,7 @@ class MirrorWatch:
         applied: frame sequences of the last applied commands, each with the time of the mirror's report, ns of the
             host's clock.
         interruption: clause on the last event since construction that ends a probe sequence: a mirror did not follow
-            commands, or received none because frames stopped; empty without one.
+            commands, received none because frames stopped, or restarted; empty without one.
         offset: offset of the router's clock from this host's; None on one host.
     """
 
