@@ -41,13 +41,13 @@ def make_certificates(
         renew: also renew existing certificates, with their present keys; the authority is never renewed.
 
     Returns:
-        Files of the new certificates.
+        Files of the roles' new certificates.
 
     Raises:
         ConfigurationError: an address is missing, invalid, or not in the router's certificate; `renew` finds no
             authority.
-        DataFileError: the authority's key or certificate is missing; a file is not the key or certificate that its
-            name says; the folder cannot be written.
+        DataFileError: the authority's key or certificate is missing, or its certificate has ended; a file is not the
+            key or certificate that its name says; the folder cannot be written.
     """
     names = [_general_name(address) for address in addresses]
     try:

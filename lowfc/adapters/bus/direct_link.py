@@ -23,7 +23,7 @@ Handler = Callable[[Sample], None]
 
 _BUFFER_BYTES = 4 << 20  # some hundred frames, up to the host's limit; the kernel doubles it
 _RETRY_S = 0.1
-_RECENT = 1 << 13  # envelopes: more messages than a socket buffers while its reader is stopped
+_RECENT = 1 << 13  # envelopes: more messages of 200 bytes or more than a socket buffers while its reader is stopped
 _ENVELOPE_BYTES = len(Envelope(0, 0).encode())
 
 

@@ -8,7 +8,7 @@ MAX_NAMES = 64
 """Largest number of names on one topic, in addition to those of `Role`."""
 MAX_NAME_LENGTH = 128
 MAX_HEALTH_BYTES = 256_000
-"""Enough for a recorder's Health with the paths of `MAX_HEALTH_LOGS` logs."""
+"""Enough for a recorder's Health with `MAX_HEALTH_LOGS` logs whose paths have up to 240 bytes."""
 MAX_HEALTH_LOGS = 1000
 """Largest number of logs in a recorder's Health, which then lists the newest."""
 

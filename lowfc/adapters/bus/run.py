@@ -36,7 +36,7 @@ _MAX_START_LENGTH = 20  # characters
 _LATEST_START_S = (1 << 32) - 3  # latest start that fits a sequence
 _MAX_SOCKET_PATH_BYTES = 107  # bytes of a Unix socket's address
 _PORT_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
-MODE = 0o1600  # of a run's files: private, and sticky, so that systemd-tmpfiles keeps old ones
+MODE = 0o1600  # of a run's files that must last: private, and sticky, so that systemd-tmpfiles keeps old ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Links:
 
     Attributes:
         run_id: name of the run.
-        ports: loopback TCP port of each listening role: "camera", "controller", "mirror-dm", "recorder".
+        ports: loopback TCP port of each listening role: "camera", "controller", "mirror-dm", "recorder", "launcher".
         user: user name of zenoh's user/password authentication.
         secret_file: zenoh's dictionary file, one line "user:password".
         network: the router of a run on several hosts; ports and secret are then not used.
@@ -167,12 +167,12 @@ def open_run(
         base: parent of its directory; the user's runtime directory when None.
         listeners: additional roles with a port, if this call creates the run: a launcher must listen to receive from a
             viewer, which only connects.
-        network: router of the run, if this call creates the run. An existing run must have the same one, unless this is
-            None or a launcher created the run: its runs stay on one host.
+        network: router of the run, if this call creates the run. An existing run must have the same one, unless this
+            has none or a launcher created the run: its runs stay on one host.
 
     Raises:
-        BusError: the name is invalid; the run exists without one of `mirrors`, or with another network; or `mirrors` is
-            empty and the run does not exist.
+        BusError: the name is invalid; the run exists without one of `mirrors`, or with another network; `mirrors` is
+            empty and the run does not exist; or too few ports are free.
         DataFileError: the run's directory is damaged, or cannot be made.
     """
     path, requested = run_path(run_id, base), _absolute(network or Network())

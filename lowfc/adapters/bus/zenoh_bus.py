@@ -156,8 +156,8 @@ class ZenohBus:
             beside: bus of another role in this process, already subscribed: the direct link to it is a function call.
 
         Raises:
-            BusError: the role's port is in use, or the role runs on another host; zenoh refuses the configuration, or
-                the router refuses the certificate.
+            BusError: the role's port is in use, or the role runs on another host; zenoh opens no session; or the
+                router refuses the certificate, or cannot be reached for a reason other than its absence.
             DataFileError: the run's secret is missing or damaged; across hosts, the role has no valid certificate.
         """
         self.role = role
