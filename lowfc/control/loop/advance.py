@@ -99,7 +99,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     reported = (*reasons, Limit.LAW_OVERRULED) if _overruled(state, loop) else reasons
     mode, command_nm, commanded = state.mode, loop.history_nm[0], state.may_command
     steps_left, stepped = max(state.steps_left - 1, 0), state.steps_left == 1
-    state = State(  # constructed: `_replace` takes four times as long
+    state = State(  # constructed: `_replace` takes twice as long
         mode,
         loop,
         frame.sequence,

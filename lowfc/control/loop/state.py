@@ -244,7 +244,7 @@ class ActiveLoop(NamedTuple):
 
     def with_command(self, command_nm: Single, actuators_nm: Single) -> "ActiveLoop":
         """A copy advanced by one frame, with this command."""
-        fixed = self[:-3]  # `_replace` would take four times as long
+        fixed = self[:-3]  # `_replace` would take twice as long
         command_channels = None if self.command_channels is None else self.command_channels.passed()
         return ActiveLoop(*fixed, command_channels, (command_nm, *self.history_nm[:-1]), actuators_nm)
 
