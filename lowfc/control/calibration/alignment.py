@@ -54,7 +54,7 @@ class Alignment:
     Attributes:
         geometry: Geometry of the better parity; its rotation may be off by 180 degrees.
         background: Background of each real pixel, in the unit of the image.
-        residual: Rms of real minus fitted image, relative to the rms of the real image.
+        residual: Rms of real minus fitted image, relative to the standard deviation of the real image.
         other_parity: The same residual for the other parity.
         orientations: Geometries that the image does not distinguish.
         circular: Whether the image is the same at all rotations, so that those of `orientations` are arbitrary.

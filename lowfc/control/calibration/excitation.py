@@ -29,7 +29,8 @@ def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, hi
         For each mode (lines,), cycles per period: odd, ascending, and used by no other mode.
 
     Raises:
-        ValueError: the period is too short for the lowest frequency, or for so many lines.
+        ValueError: the frequencies do not ascend within 0 to 0.5; or the period is too short for the lowest one, or
+            for so many lines.
     """
     if not 0 < lowest < highest <= 0.5:
         raise ValueError(f"frequencies must ascend from above 0 to at most half of the rate, got {lowest}, {highest}")

@@ -9,7 +9,7 @@ from lowfc.arrays import Mask, Single, single
 TIP_TILT = (2, 3)
 """Noll indices of tip and tilt, whose gains are set and judged separately from those of the other modes."""
 RELAXING = np.float32(0.99)
-"""Fraction of its command that a mode keeps from frame to frame while its automatic gain is 0, since nothing corrects
+"""Largest fraction of its command that a mode keeps per frame while its automatic gain is 0, since nothing corrects
 what an earlier gain put on the mirror."""
 
 
@@ -19,7 +19,7 @@ class Integrator:
 
     Attributes:
         uncorrected: (modes,) whether a mode is uncorrected because its automatic gain is 0.
-        kept: (modes,) fraction of the command that is kept: 1 - leak, or `RELAXING` for an uncorrected mode.
+        kept: (modes,) fraction of the command that is kept: 1 - leak, at most `RELAXING` for an uncorrected mode.
         rows: (3, modes) gain, kept and limit.
     """
 

@@ -83,7 +83,7 @@ def check_law(law: LinearLaw, delay_frames: float, rate_hz: float) -> None:
     """Refuse a law that was made for another loop; `rate_hz` is 0 if unknown.
 
     Raises:
-        ValueError: its rate differs, its delay differs (if its signal is "pol"), or it is not stable here.
+        ValueError: its rate differs, its delay differs (if its signal is "pol"), or `check_stable` refuses it.
     """
     if law.signal == "pol" and abs(law.delay_frames - delay_frames) > 1e-3:
         raise ValueError(

@@ -126,7 +126,7 @@ class CommandChannels(NamedTuple):
 
     @property
     def moving(self) -> bool:
-        """Whether the command changes with the next frame even in an open loop."""
+        """Whether the command may change with the next frame even in an open loop."""
         return self.play is not None or any(channel.moving for channel in self.channels)
 
     def target_nm(self, sequence: int) -> Single:
@@ -234,7 +234,7 @@ def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
     """Make a table to play, checked as far as possible without the loop; shapes as in `PlayTable`, nm.
 
     Raises:
-        ValueError: its parts do not match, it is too large, or a number in it is not finite.
+        ValueError: the target is unknown, the parts do not match, they are too large, or a number is not finite.
     """
     if target not in (MIRROR, OFFSET):
         raise ValueError(f"the target of a probe sequence is {MIRROR} or {OFFSET}, got {target!r}")
