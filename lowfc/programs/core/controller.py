@@ -340,7 +340,7 @@ class Controller:
             self._apply_report(MirrorReport(self._service.clock.now_ns(), fault, self._mirror.last()))
 
     def _send_start_requests(self) -> None:
-        """Once mirror and camera are known, request the configured shapes and control law, as an operator would."""
+        """Once the mirror is known and no camera awaited, request the configured shapes and law, like an operator."""
         state = self._state
         if state.loop is None or state.conditions.camera_awaited or not (self._start_pending and state.may_command):
             return

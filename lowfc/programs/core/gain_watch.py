@@ -26,7 +26,7 @@ STAR_STEP = 0.2
 HARMFUL_WINDOWS = 3
 """Consecutive windows in which an open loop would have had a smaller residual, before this is reported."""
 CAUTIOUS_GAIN = 0.05
-"""Highest gain of modes other than tip and tilt after a window with uncorrected tip and tilt.
+"""Highest gain of modes other than tip and tilt after their first window, in which tip and tilt may be uncorrected.
 
 The second-order response of the sensor to tip and tilt resembles these modes.
 """
@@ -169,7 +169,7 @@ class GainWatch:
         return float(per_nm2 @ open_nm2), per_nm2 * now_nm2
 
     def prepare(self, loop: ActiveLoop) -> None:
-        """Set up the groups if modes, leaks or limits of the loop differ; slow, so call it before the first frame."""
+        """Set up the groups if calibration, leaks or limits differ; slow, so call it before the first frame."""
         identity = loop.calibration.id, loop.integrator.leak.tobytes(), loop.integrator.limit_nm.tobytes()
         if identity == self._identity:
             return

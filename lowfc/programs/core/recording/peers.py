@@ -11,7 +11,10 @@ from lowfc.contract.messages import CAMERA_STATE, HEALTH, TOPICS, wire
 
 
 class Peers:
-    """The last `Health.state` of each process; `newest` has the calibration and state messages that start a log."""
+    """The last `Health.state` of each process; `newest` has the last message of every other key that can be queried.
+
+    A log starts with these: calibration, law, probe table, bench values, and the states of camera and controller.
+    """
 
     def __init__(self, bus: Bus) -> None:
         self.newest: dict[str, Sample] = {}

@@ -33,6 +33,7 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
 
     Raises:
         BusError: another recorder is recording this run.
+        ConfigurationError: an entry of recorder.topics matches no topic.
         DataFileError: a file cannot be read, or no log can be written in the folder.
     """
     recorder_section, realtime = config.recorder, config.realtime
