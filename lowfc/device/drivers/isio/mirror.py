@@ -67,7 +67,7 @@ class IsioMirror:
     def position(self) -> Single | None:
         """Present shape of the channel, as far as written if its writer died.
 
-        None if it is not finite: the mirror's process then writes zeros.
+        None if it is not finite: at its start the mirror's process then writes zeros.
         """
         self._reopen()
         shape = complete_shape(self._channel, self._channel.data[0].astype(np.float32))
