@@ -66,6 +66,7 @@ def run_camera(
     Raises:
         BusError: the run has a camera already, or one of `wait_for` did not appear.
         ConfigurationError: the run is in lockstep, and the driver does not wait for the mirror.
+        DataFileError: the run's directory is damaged; across hosts, the camera has no valid certificate here.
         LowfcError: the driver cannot be started, or reported a fault that a user has to correct.
     """
     with closed_on_fault(driver.close):
@@ -133,6 +134,7 @@ def run_mirror(driver: Mirror, config: Configuration, run: str) -> None:
 
     Raises:
         BusError: the run has this mirror already.
+        DataFileError: as in `run_camera`.
         ConfigurationError: the driver's grid or limits do not fit [mirror], or it cannot be started.
         LowfcError: the driver reported a fault that a user has to correct.
     """
