@@ -126,11 +126,14 @@ def json_objects() -> str:
 
 def _field_table(result: type[Result]) -> str:
     rows = []
-    for name, info in result.model_fields.items():
+    printed = {name: info for name, info in result.model_fields.items() if not info.exclude}
+    for name, info in printed.items():
         extra = info.json_schema_extra if isinstance(info.json_schema_extra, dict) else {}
         rows.append(
             (f"`{info.alias or name}`", f"`{_type(info.annotation)}`", extra.get("unit", ""), info.description or "")
         )
+    for name, computed in result.model_computed_fields.items():
+        rows.append((f"`{name}`", f"`{_type(computed.return_type)}`", "", one_line(computed.description)))
     return markdown(("key", "type", "unit", ""), rows)
 
 

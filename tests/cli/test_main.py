@@ -65,6 +65,7 @@ def test_the_error_of_a_wrong_argument_names_what_was_expected_and_found() -> No
         ("calibrate --method foo", "'--method': 'foo' is not one of 'analytic'"),
         ("sim-loop --rate fast", "'--rate': must be a valid number, got 'fast'\n"),
         ("sim-loop --duration 0", "'--duration': must be greater than or equal to 0.01, got '0'\n"),
+        ("ctl dark --frames 3", "'--frames': must be greater than or equal to 16, got '3'\n"),
     ):
         assert expected in CliRunner().invoke(app, words.split()).output
 

@@ -14,6 +14,8 @@ from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import TOPICS
 from lowfc.contract.wire import lowfc_pb2
 from lowfc.programs.cli.main import COMMANDS, PARTS
+from lowfc.programs.commissioning.tune.result import TuneResult
+from lowfc.programs.logs.replay.account import Account
 from tools.advice import REASONS
 from tools.site import BUILT
 
@@ -80,3 +82,11 @@ def test_the_site_has_every_page_and_every_declared_name(
 def test_typed_json_objects_name_the_commands_that_print_them() -> None:
     named = set(re.findall(r"Printed by `lowfc (\S+)`", BUILT["json"]()))
     assert {"hosts", "replay"} <= named <= {row.name for row in sum(COMMANDS.values(), ())}
+
+
+def test_the_table_of_a_typed_json_object_has_the_keys_that_are_printed() -> None:
+    page = BUILT["json"]()
+    for result in (Account(), TuneResult.model_construct()):
+        table = page.partition(f"### {type(result).__name__}\n")[2].partition("\n### ")[0]
+        printed = result.model_json_schema(mode="serialization")["properties"]
+        assert re.findall(r"^\| `(\w+)`", table, re.MULTILINE) == [*printed]

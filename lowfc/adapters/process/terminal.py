@@ -65,6 +65,7 @@ class AppGroup(TyperGroup):
             fault.message = reworded(fault.message)
             if fault.message.startswith("must ") and hasattr(cause, "errors"):  # a ValidationError
                 fault.message += f", got {brief(cause.errors()[0]['input'])}"
+                fault.__cause__ = None  # of a nested group, the outer one sees the error too
             raise
 
 

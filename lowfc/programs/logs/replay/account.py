@@ -30,12 +30,10 @@ class Account(Result):
         host_differs: versions and processor features that differ between the first log's host and this one.
         log_s: time from the first frame to the last; `speed` is `log_s` over the time of the replay.
         complete: whether every log has its end and summary.
-        finished: whether the recorder ended every log; `no_end` is the reason if not.
+        no_end: reason if the recorder did not end every log.
         damaged: parts of the logs that were left out.
         runs: names of the runs in the logs.
         stopped: reasons why a recording ended early.
-        recorded_on: versions and host in the first log.
-        span_ns: log times of the first frame and the last; (0, 0) without one.
     """
 
     frames: int = 0
@@ -62,8 +60,11 @@ class Account(Result):
     stopped: list[str] = Field([])
     host_differs: dict[str, tuple[str, str]] = Field({})
     recorded_on: dict[str, str] = Field({}, exclude=True)
+    """Versions and host in the first log."""
     finished: bool = Field(True, exclude=True)
+    """Whether the recorder ended every log."""
     span_ns: tuple[int, int] = Field((0, 0), exclude=True)
+    """Log times of the first frame and the last; (0, 0) without one."""
 
     @computed_field  # type: ignore[prop-decorator]
     @property
