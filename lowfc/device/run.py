@@ -48,7 +48,9 @@ PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_opt
 Frames = Annotated[int | None, typer.Option(min=1, help="Stop after this many frames; default: at Ctrl-C or SIGTERM.")]
 LEAVE_S = 2.0
 """Longest time for which an ending controller waits for a camera in its process."""
-WaitFor = Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; may be repeated.")]
+WaitFor = Annotated[
+    list[str] | None, typer.Option(help="Process that the first frame awaits, up to 30 s; may be repeated.")
+]
 
 
 def run_camera(

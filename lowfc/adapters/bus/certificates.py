@@ -56,13 +56,15 @@ def make_certificates(
             names = _router_addresses(folder)
         if ROUTER in missing and not names:
             raise ConfigurationError(
-                "the router's certificate needs the router's address: give the name by which other hosts reach it"
+                "the router's certificate needs the router's address: give with --router the name by which other "
+                "hosts reach it"
             )
         if renew and not (folder / CA).exists():
             raise ConfigurationError(f"{folder} has no authority whose certificates could be renewed")
         if ROUTER not in missing and (lacking := [n.value for n in names if n not in _router_addresses(folder)]):
             raise ConfigurationError(
-                f"the router's certificate is not for {', '.join(map(str, lacking))}: renew it, with all its addresses"
+                f"the router's certificate is not for {', '.join(map(str, lacking))}: renew it "
+                "(--renew), with --router for each of its addresses"
             )
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         key, authority = _authority(folder)

@@ -116,7 +116,10 @@ def config_check(
 def config_zenoh(
     role: Annotated[str, typer.Option(help="Role of your program, such as camera.")],
     run: AnyRun = None,
-    make: Annotated[bool, typer.Option("--make", help="Create the run if it does not exist.")] = False,
+    make: Annotated[
+        bool,
+        typer.Option("--make", help=f"Create the run if it does not exist; without --run, the run `{DEFAULT_RUN}`."),
+    ] = False,
 ) -> None:
     """Print the zenoh configuration with which your own program joins a run in a role.
 

@@ -83,7 +83,8 @@ Frames = Annotated[int, typer.Argument(help="Number of frames with the loop clos
 Text = Annotated[str, typer.Argument(help="The note.")]
 Purpose = Annotated[str, typer.Argument(help="What will be moved.")]
 Hold = Annotated[
-    float | None, typer.Option(help="Hold the loop for this many seconds; `open` ends the hold.", parser=number)
+    float | None,
+    typer.Option(help="Hold the loop for this many seconds, at most 60; `open` ends the hold.", parser=number),
 ]
 _NAME = "Name of the value, as in [[interlocks]] of the configuration."
 BenchName = Annotated[str, typer.Argument(help=_NAME, parser=bench_name)]

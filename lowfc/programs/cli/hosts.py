@@ -50,7 +50,10 @@ class HostsResult(Result):
 def certs(
     folder: Annotated[Path, typer.Argument(help="Folder of the certificate authority; created if missing.")],
     router: Annotated[
-        list[str] | None, typer.Option(help="Host name or IP address of the router; repeat for several.")
+        list[str] | None,
+        typer.Option(
+            help="Host name or IP address of the router, for a new certificate of the router; repeat for several."
+        ),
     ] = None,
     mirror: Annotated[
         list[str] | None, typer.Option(help="Name of a mirror; repeat. Default: those in the folder, or dm.")

@@ -26,7 +26,8 @@ def controller(
         ),
     ] = None,
     wait_for: Annotated[
-        list[str] | None, typer.Option(help="Process to wait for before the loop starts; repeat for several.")
+        list[str] | None,
+        typer.Option(help="Process to wait for, up to 30 s, before the loop starts; repeat for several."),
     ] = None,
 ) -> None:
     """Run the controller: frames in, mirror commands out.

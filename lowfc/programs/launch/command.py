@@ -13,7 +13,10 @@ from lowfc.programs.cli.output import print_result
 
 def sim_loop(
     config: ConfigFile = None,
-    duration: Annotated[float | None, typer.Option(min=0.01, max=1e7, help="Seconds; default: until Ctrl-C.")] = None,
+    duration: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=1e7, help="Seconds, with --lockstep simulated ones; default: until Ctrl-C."),
+    ] = None,
     rate: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
     disturbance: Annotated[Preset | None, typer.Option(help="Preset of the disturbance.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
@@ -30,7 +33,7 @@ def sim_loop(
     no_record: Annotated[bool, typer.Option("--no-record", help="Write no log.")] = False,
     open_loop: Annotated[bool, typer.Option("--open", help="Start with the loop open.")] = False,
     view_: Annotated[bool, typer.Option("--view", help="Open the view in a window.")] = False,
-    web: Annotated[bool, typer.Option("--web", help="Open the view in a browser.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Serve the view as a page for a browser.")] = False,
     name: Annotated[str | None, typer.Option("--run", help="Name of the run; default: a new one.")] = None,
     as_json: Json = False,
 ) -> None:

@@ -13,7 +13,7 @@ from lowfc.programs.cli.result import print_result
 calibrate_app = new_app("")
 
 Method = Literal["analytic", "poke", "hadamard", "in-loop"]
-Out = Annotated[Path, typer.Option("--out", help="Output file (FITS).")]
+Out = Annotated[Path, typer.Option("--out", help="Output file (FITS); an existing one is replaced.")]
 Load = Annotated[bool, typer.Option("--load", help="Load the result into the loop, which must be open.")]
 Snr = Annotated[float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")]
 _CYCLES = "Number of cycles; default: as many as --snr requires. The verdict still requires --snr, by default 20 then."
@@ -61,7 +61,9 @@ def calibrate(
             "analytic requires an open loop.",
         ),
     ] = False,
-    compare: Annotated[tuple[Path, Path] | None, typer.Option(help="Only compare two calibration files.")] = None,
+    compare: Annotated[
+        tuple[Path, Path] | None, typer.Option(help="Only compare two calibration files.", metavar="A.fits B.fits")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Calibrate a running loop by poking its mirror, or compute its calibration.
@@ -124,7 +126,8 @@ def dark(
         bool, typer.Option("--star-blocked", help="The star is already blocked: do not ask.")
     ] = False,
     file: Annotated[
-        Path | None, typer.Option("--file", help="Take the dark frames from a FITS cube (frames, rows, columns).")
+        Path | None,
+        typer.Option("--file", help="Take the dark frames from a FITS or .npy cube (frames, rows, columns)."),
     ] = None,
     load: Load = False,
     as_json: Json = False,

@@ -9,11 +9,11 @@ import typer
 from lowfc.adapters.process.terminal import AnyRun, Json
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli.output import print_result
-from lowfc.programs.commissioning.calibrate.command import Cycles, Out, Resume
+from lowfc.programs.commissioning.calibrate.command import Cycles, Resume
 
 
 def commission(
-    out: Out = Path("calibration.fits"),
+    out: Annotated[Path, typer.Option("--out", help="Output file (FITS).")] = Path("calibration.fits"),
     run: AnyRun = None,
     frames: Annotated[
         int, typer.Option(min=16, max=100_000, help="Frames of the dark and of the reference image.")

@@ -73,7 +73,7 @@ def mirror(
 ) -> None:
     """Send commands to a mirror and check its states against the contract; exit status 1 if a check fails.
 
-    The check takes the place of the controller, which must not be running. Ordinary commands are 5 % of the
+    The check takes the place of the controller, which must not be running. Ordinary commands are at most 5 % of the
     smallest limit, with alternating sign. Unless --gentle, the mirror is also raised by up to 10 nm, to see it relax;
     if no check fails, commands then exceed its stroke, slew and neighbour limits. At the end it returns to its shape.
 

@@ -25,7 +25,10 @@ def doctor(
     context: typer.Context,
     config: ConfigFile = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit status 1 if there is a warning.")] = False,
-    device: Annotated[str | None, typer.Option(help="Check only the requirements of the driver of this name.")] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(help="Check only the requirements of the driver of this name; exit status 1 if one is missing."),
+    ] = None,
     setup: Annotated[
         bool, typer.Option("--setup", help="Show the settings that grant a user real-time rights.")
     ] = False,

@@ -48,7 +48,12 @@ def export(
         list[str] | None,
         typer.Option(help="With --decimate: keep only this optional topic (key or pattern); repeat for several."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Output file; default: the log's name, next to the log.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Output file; default: next to the log, with its name, or NAME-every-N.mcap with --decimate."
+        ),
+    ] = None,
     frames: Annotated[
         bool, typer.Option("--frames", help="Export the frames, too; with npz as OUT.frames.npy.")
     ] = False,
