@@ -259,7 +259,7 @@ class Client:
         return self.ask("note", text=text)
 
     def record(self, on: bool) -> Answer:
-        """Start the next log, or finish the current one; the answer's text is its path."""
+        """Start the next log, if none is being recorded, or finish the current one; the answer's text is its path."""
         key = RECORD_KEY.format(name="start" if on else "stop")
         return self._answer("record", self._get(key, b"", SLOW_ANSWER_S, Role.RECORDER))
 

@@ -138,7 +138,12 @@ DECLARED: tuple[Declaration, ...] = (
         ("lease_id", "for a hold, as in `lease`"),
     ),
     _declared("configuration", "Report the configuration that the controller was started with.", "configuration"),
-    Declaration(RECORD_KEY.format(name="start"), (), "Start the next log and print its path.", "record start"),
+    Declaration(
+        RECORD_KEY.format(name="start"),
+        (),
+        "After `record stop`, start the next log and print its path; refused while recording.",
+        "record start",
+    ),
     Declaration(
         RECORD_KEY.format(name="stop"),
         (),
