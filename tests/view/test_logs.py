@@ -25,7 +25,7 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
-from lowfc.control.loop.safety import Rejection
+from lowfc.control.loop.safety import Limit, Rejection
 from lowfc.programs.logs.report.results import report_of
 from lowfc.programs.logs.report.source import read_run
 from lowfc.programs.view.layout import layout
@@ -348,6 +348,26 @@ def test_the_largest_stroke_of_a_log_is_taken_over_all_mirror_states(tmp_path: P
     night.change(MIRROR_STATE, 101, lambda state: setattr(state, "actuators", actuators))
     drawn(night.write(tmp_path / "night.mcap"))
     assert tile(shown[-1], "MIRROR").value == "50 %"
+
+
+def test_a_log_that_used_nearly_all_the_stroke_needs_attention_as_in_its_report(tmp_path: Path, shown: Shown) -> None:
+    night = SyntheticLog().frames(300)
+    actuators = np.full(GRID, -650, "<f4").tobytes()
+    night.change(MIRROR_STATE, 101, lambda state: setattr(state, "actuators", actuators))
+    log = night.write(tmp_path / "night.mcap")
+    drawn(log)
+    mirror = tile(shown[-1], "MIRROR")
+    assert (mirror.value, mirror.level) == ("93 %", Level.WARNING)
+    assert "93 % of its stroke" in shown[-1].headline
+    check = next(one for one in report_of(read_run(log)).results["verdict"]["checks"] if one["name"] == "mirror")
+    assert check["level"] == "look"
+
+
+def test_a_limit_in_a_log_is_not_blamed_on_the_disturbance(tmp_path: Path, shown: Shown) -> None:
+    night = SyntheticLog().frames(300)
+    night.change(STEP, 101, lambda step: step.reasons.append(Limit.SLEW.value))  # as after a request `reset`
+    drawn(night.write(tmp_path / "night.mcap"))
+    assert tile(shown[-1], "MIRROR").advice == "The mirror was at a limit (actuator slew: 1 time): see the events."
 
 
 def test_a_message_of_an_impossible_time_is_left_out(tmp_path: Path) -> None:

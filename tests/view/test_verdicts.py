@@ -114,6 +114,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "missing": (counting(missing=90), "FRAMES 90 LOST BAD", "90 never arrived"),
     "late frames": (setting(reasons=(Rejection.LATE,)), "FRAMES REFUSED BAD", "too late"),
     "wrong size": (setting(reasons=(Rejection.WRONG_SIZE,)), "FRAMES REFUSED BAD", "wrong size"),
+    "frames out of order": (setting(reasons=(Rejection.OUT_OF_ORDER,)), "FRAMES REFUSED BAD", "`lowfc ctl safe` and"),
     "frames ahead": (setting(reasons=(Rejection.AHEAD,)), "FRAMES REFUSED BAD", "clock"),
     "camera unknown": (setting(reasons=(Rejection.CAMERA_UNKNOWN,)), "FRAMES REFUSED BAD", "settings"),
     "mirror lost": (holding(Rejection.NO_MIRROR, mirror_fault="is silent"), "LOOP HOLDING WARNING", "mirror is silent"),
@@ -142,6 +143,11 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
         setting(status=wire.MIRROR_STATUS_WAITING, refused=Limit.WRONG_GRID),
         "MIRROR REFUSES BAD",
         "refuses the commands (WRONG_GRID)",
+    ),
+    "mirror's driver failed": (
+        setting(status=wire.MIRROR_STATUS_EXPIRED, refused=Rejection.NO_MIRROR),
+        "MIRROR REFUSES BAD",
+        "Its driver failed",
     ),
     "harmful": (setting(residual_nm=60.0), "WAVEFRONT 60.0 nm rms WARNING", "The loop does harm"),
     "diverging": (setting(residual_nm=400.0), "WAVEFRONT 400 nm rms BAD", "40.0 nm with a flat mirror"),
@@ -174,6 +180,38 @@ def test_each_state_has_its_tile_level_and_headline(verdicts: dict[str, Verdict]
 
 def test_no_two_states_have_the_same_headline(verdicts: dict[str, Verdict]) -> None:
     assert [line for line, count in Counter(one.headline for one in verdicts.values()).items() if count > 1] == []
+
+
+@pytest.mark.parametrize(
+    ("limit", "remedy"),
+    [
+        (Limit.MODAL_LIMIT, "`lowfc ctl limit`"),
+        (Limit.STROKE, "smaller channels"),
+        (Limit.SLEW, "nothing to do if the loop has just been closed or reset"),
+        (Limit.NEIGHBOUR, "stuck actuator"),
+        (Limit.NOT_FINITE, "check calibration and law"),
+    ],
+)
+def test_the_advice_at_a_limit_is_that_for_this_limit(limit: Limit, remedy: str) -> None:
+    headline = staged(setting(reasons=(limit,)), 2).headline
+    assert remedy in headline
+    assert limit is Limit.MODAL_LIMIT or "raise" not in headline  # the others protect the mirror
+
+
+def test_a_few_frames_out_of_order_are_no_reason_to_flatten_the_mirror() -> None:
+    stage = begun(1)
+    stage.reasons = (Rejection.OUT_OF_ORDER,)
+    stage.run(0.2)
+    stage.reasons = ()
+    headline = stage.run(0.3).headline
+    assert "second camera" in headline
+    assert "lowfc ctl safe" not in headline
+
+
+def test_a_contrast_from_the_sensor_is_called_estimated() -> None:
+    figures = {"recent_wavefront": wire.WavefrontFigures(costliest_modes="tip and tilt", added_contrast_flat=1e-8)}
+    assert "estimated" not in tile(staged(health("camera", **figures), 2), "CONTRAST").detail
+    assert "estimated from the sensor" in tile(staged(health("controller", **figures), 2), "CONTRAST").detail
 
 
 def test_a_closed_loop_without_usable_frames_is_shown_as_holding(verdicts: dict[str, Verdict]) -> None:

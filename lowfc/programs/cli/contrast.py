@@ -10,6 +10,8 @@ from lowfc.optics.chain.added_contrast import ModalContrast, by_group, costliest
 
 QUADRATIC = "; quadratic form, valid to 3 nm of a mode"
 """How the added contrast of a running loop is known: within 10 % for up to 3 nm rms of a mode (shaped pupil)."""
+ESTIMATED = ", estimated from the sensor"
+"""Source of the added contrast of a running loop whose true wavefront is not known."""
 
 
 def added_contrast(contrast: ModalContrast | None, covariance_nm2: Mapping[str, Array | None]) -> dict[str, Any] | None:

@@ -13,7 +13,7 @@ from lowfc.control.loop.command_channels import FLAT
 from lowfc.control.loop.safety import Limit, Rejection, reason_name
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.control.loop.wording import PAUSED, counted, mode_word
-from lowfc.programs.cli.contrast import QUADRATIC, contrast_cases, contrast_in_words, costliest_modes
+from lowfc.programs.cli.contrast import ESTIMATED, QUADRATIC, contrast_cases, contrast_in_words, costliest_modes
 from lowfc.programs.launch.watch import mode_name, topic_count, wavefront
 
 NO_HEALTH = wire.Health()
@@ -159,7 +159,7 @@ def text(known: dict[str, Any]) -> str:
 def _contrast_row(known: dict[str, Any]) -> dict[str, str]:
     if known["added_contrast"] is None:
         return {}
-    source = ", estimated from the sensor" if known["added_contrast_estimated"] else ""
+    source = ESTIMATED if known["added_contrast_estimated"] else ""
     cases = contrast_cases(known["added_contrast"])
     return {"contrast": contrast_in_words(cases, costliest_modes(known), how=source + QUADRATIC)}
 

@@ -24,17 +24,25 @@ REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.DARK: ("too dark", "the star is gone; check pointing, shutter and clouds"),
     Rejection.SATURATED: ("detector saturated", "too much light; shorten the exposure or dim the star"),
     Rejection.WRONG_SIZE: ("wrong size", "they do not match the calibration; reset the camera or calibrate again"),
-    Rejection.LATE: ("too late", "host or link is too slow; check the latency, lower the rate"),
+    Rejection.LATE: (
+        "too late",
+        "host or link is too slow, or their clocks differ; see `lowfc doctor`, lower the rate",
+    ),
     Rejection.NO_CALIBRATION: ("no calibration", "load a calibration"),
     Rejection.STUCK: ("stuck", "the camera repeats one image; restart it"),
     Rejection.REPEATED: ("repeated", "the camera sends a frame twice; restart it"),
-    Rejection.OUT_OF_ORDER: ("out of order", "there may be a second camera on the bus; stop one"),
+    Rejection.OUT_OF_ORDER: ("out of order", "there may be a second camera in the run; stop one"),
     Rejection.AHEAD: ("camera clock ahead", "set the clocks of both hosts and restart the camera"),
-    Rejection.CAMERA_UNKNOWN: ("camera settings unknown", "the camera restarted and sends no settings; restart it"),
+    Rejection.CAMERA_UNKNOWN: ("camera settings unknown", "it restarted; restart it again if they do not arrive"),
     Rejection.NO_MIRROR: ("no mirror", "the mirror does not follow; check it"),
     Rejection.HELD: ("loop held", "an interlock or a permit holds the loop"),
 }
 """Reasons for refusing a frame: text and advice."""
+_IF_ALL = {
+    Rejection.OUT_OF_ORDER: "a clock was set back, or there is a second camera; stop that one, or `lowfc ctl safe` and "
+    "then `lowfc ctl clear`, by which the mirror goes flat"
+}
+"""Advice if every frame is refused, where it is not that for some."""
 _FRAME_REASONS = [reason for reason in REFUSED if reason not in (Rejection.NO_MIRROR, Rejection.HELD)]
 """Reasons for an alarm of the tile FRAMES; the others are those of the tile LOOP."""
 
@@ -91,7 +99,7 @@ def _refused(state: RunState, expected: float) -> Tile:
     commonest = max(_FRAME_REASONS, key=lambda reason: (state.now if all_are else state.recent)[reason])
     word, advised = REFUSED[commonest]
     if all_are:
-        advice = f"Every frame is refused, {word}: {advised}. The mirror holds."
+        advice = f"Every frame is refused, {word}: {_IF_ALL.get(commonest, advised)}. The mirror holds."
         return Tile("FRAMES", "REFUSED", f"all: {word}", Level.BAD, advice)
     remedy = advised if state.now[commonest] else "it has ended"
     advice = f"{counted(refused, 'frame')} refused {state.lately}, {word}: {remedy}."

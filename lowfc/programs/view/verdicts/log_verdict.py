@@ -19,7 +19,7 @@ from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import PERIODS, RunState
 from lowfc.programs.view.verdicts.span_means import SpanMeans
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, rounded, worst_of
-from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, stroke
+from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, NEAR_STROKE, stroke
 from lowfc.programs.view.verdicts.watcher import FRAMES_SILENT_S
 
 _MODES = {mode.value: mode for mode in LoopMode}
@@ -175,12 +175,15 @@ def _frames(state: RunState) -> Tile:
 def _mirror(state: RunState, ended: LogEnd) -> Tile:
     value, of = stroke(ended.stroke_nm or 0.0, state.snapshot.stroke_nm)
     used = f"{value} {of} at most" if ended.stroke_nm is not None else "stroke not known"
-    if acted := {words: state.totals[reason] for reason, words in LIMITS.items() if state.totals[reason]}:
+    if acted := {words: state.totals[reason] for reason, (words, _) in LIMITS.items() if state.totals[reason]}:
         named = ", ".join(f"{words}: {counted(count, 'time')}" for words, count in acted.items())
-        advice = f"The mirror was at a limit ({named}): the disturbance was larger than it can correct."
+        advice = f"The mirror was at a limit ({named}): see the events."
         return Tile("MIRROR", "AT LIMIT", f"{named}; {used}", Level.WARNING, advice)
     if ended.stroke_nm is None:
         return Tile("MIRROR", "?", f"{used}, no limit acted")
+    if ended.stroke_nm > NEAR_STROKE * (state.snapshot.stroke_nm or np.inf):
+        advice = f"The mirror used {value} of its stroke at most: little was left."
+        return Tile("MIRROR", value, f"{of} at most: nearly all", Level.WARNING, advice)
     return Tile("MIRROR", value, f"{of} at most, no limit acted", Level.GOOD)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.messages import Role, from_timestamp, wire
-from lowfc.control.loop.safety import Limit, LoopMode, Reason, reason_name
+from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection, reason_name
 from lowfc.control.loop.wording import CAMERA_MISFIT, counted
 from lowfc.programs.cli.correction import Correction, correction
 from lowfc.programs.view.verdicts.camera_verdict import all_refused, frames, star
@@ -28,14 +28,32 @@ MANY_LATE = 0.05
 BEHIND_S, FAR_BEHIND_S = 1.0, 5.0
 """Delay of the view for a warning, and for an alarm."""
 
-LIMITS: dict[Reason, str] = {
-    Limit.MODAL_LIMIT: "modal limit",
-    Limit.STROKE: "actuator stroke",
-    Limit.SLEW: "actuator slew",
-    Limit.NEIGHBOUR: "neighbouring actuators",
-    Limit.NOT_FINITE: "command not finite",
-    Limit.WRONG_GRID: "wrong grid",
+LIMITS: dict[Reason, tuple[str, str]] = {
+    Limit.MODAL_LIMIT: (
+        "modal limit",
+        "centre the star, offload the slow part of the command, or raise it with `lowfc ctl limit`",
+    ),
+    Limit.STROKE: (
+        "actuator stroke",
+        "offload the slow part of the command, or use a better flat map or smaller channels",
+    ),
+    Limit.SLEW: ("actuator slew", "nothing to do if the loop has just been closed or reset, else lower the gain"),
+    Limit.NEIGHBOUR: ("neighbouring actuators", "use smaller channels, and look for a stuck actuator"),
+    Limit.NOT_FINITE: ("command not finite", "check calibration and law"),
+    Limit.WRONG_GRID: ("wrong grid", "load the calibration of this mirror"),
 }
+"""Limits that act on a command: text and advice."""
+
+_REFUSED_COMMAND: dict[Reason, str] = {
+    Rejection.NO_MIRROR: "Its driver failed: see the last warning in `lowfc ctl status`.",
+    Rejection.OUT_OF_ORDER: "Another process may command it: only one controller may.",
+    Rejection.AHEAD: "Set the clocks of both hosts and restart the controller.",
+    Limit.WRONG_GRID: "Set mirror.rows and mirror.columns, or load the calibration of this mirror.",
+    Limit.NOT_FINITE: "Check calibration and law.",
+    Limit.CHANNEL: "Too many programs command it: end one of them.",
+}
+"""Advice for each reason for which a mirror refuses commands."""
+_UNKNOWN = "See the events."
 
 
 def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
@@ -43,10 +61,10 @@ def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
     loop = _loop(state)
     residual = wavefront(state, nm_per_mas, loop)
     tiles = [loop, residual, frames(state), star(state), _mirror(state), _latency(state), _recorder(state)]
-    reported = (state.snapshot.health.get(role) for role in (Role.CAMERA, Role.CONTROLLER))
-    known = (one.health.recent_wavefront for one in reported if one is not None)
-    if recent := next((one for one in known if one.costliest_modes), None):
-        tiles.insert(2, contrast(recent, now=state.wavefront is not None))
+    reported = {role: state.snapshot.health.get(role) for role in (Role.CAMERA, Role.CONTROLLER)}
+    known = {role: one.health.recent_wavefront for role, one in reported.items() if one is not None}
+    if role := next((role for role, recent in known.items() if recent.costliest_modes), None):
+        tiles.insert(2, contrast(known[role], now=state.wavefront is not None, estimated=role is Role.CONTROLLER))
     if state.snapshot.behind_s > BEHIND_S:
         tiles.append(_view(state.snapshot.behind_s))
     worst = worst_of(tiles)
@@ -100,7 +118,7 @@ def _loop(state: RunState) -> Tile:
         advice = "Every frame is refused: the loop is closed and holds its command."
         return tile("HOLDING", "closed, but every frame is refused: command held", Level.WARNING, advice)
     if state.now[Limit.LAW_OVERRULED]:
-        advice = "The law leaves more than the integrator, which has taken over. Tune again: `lowfc tune --live`."
+        advice = "The law leaves more than the integrator, which has taken over. Tune again: `lowfc tune --live 20`."
         return tile("CLOSED", "the integrator in place of the law", Level.WARNING, advice)
     return tile("CLOSED", f"correcting{_since(reported)}", Level.GOOD, "Loop closed, nothing is wrong.")
 
@@ -143,8 +161,9 @@ def _mirror(state: RunState) -> Tile:
         return tile("?", "no state of it is known")
     if reported.refused and reported.status != wire.MIRROR_STATUS_FOLLOWING:
         why = reason_name(reported.refused)
-        advice = f"The mirror refuses the commands ({why}): it holds or relaxes by itself. "
-        return tile("REFUSES", f"the commands: {why}", Level.BAD, f"{advice}Check its grid and its clock.")
+        remedy = next((words for reason, words in _REFUSED_COMMAND.items() if reason == reported.refused), _UNKNOWN)
+        advice = f"The mirror refuses the commands ({why}): it holds or relaxes by itself. {remedy}"
+        return tile("REFUSES", f"the commands: {why}", Level.BAD, advice)
     if reported.status == wire.MIRROR_STATUS_WAITING:
         return tile("WAITING", "no command yet")
     if reported.status == wire.MIRROR_STATUS_EXPIRED and state.controller.life is not Liveness.STARTING:
@@ -153,16 +172,14 @@ def _mirror(state: RunState) -> Tile:
         return tile("EXPIRED", "no commands: holds or relaxes by itself", level, f"{advice}Check the controller.")
     used_nm, limit_nm = stroke_used_nm(reported), state.snapshot.stroke_nm
     value, of = stroke(used_nm, limit_nm)
-    acting = {words: state.recent[reason] for reason, words in LIMITS.items() if state.recent[reason]}
-    own = [words for reason, words in LIMITS.items() if reason.value in reported.limits_hit]
+    acting = {reason: state.recent[reason] for reason in LIMITS if state.recent[reason]}
+    own = [reason for reason in LIMITS if reason.value in reported.limits_hit]
     if acting or own:
-        words = ", ".join(acting or own)
+        words = ", ".join(LIMITS[reason][0] for reason in acting or own)
         how = f"{counted(max(acting.values()), 'time')} {state.lately}" if acting else "by its own limits"
         often = max(state.now[reason] for reason in LIMITS) > LIMITED * max(1, state.now["steps"])
-        advice = (
-            f"The mirror is at a limit ({words}), {how}: the disturbance is too large or the gain too high. "
-            "Lower the gain, offload, or raise the limit."
-        )
+        commonest = max(acting or own, key=lambda reason: state.recent[reason])
+        advice = f"The mirror is at a limit ({words}), {how}: {LIMITS[commonest][1]}."
         return tile("AT LIMIT", f"{words}: {how}; {value} {of}", Level.BAD if often else Level.WARNING, advice)
     if limit_nm and used_nm > NEAR_STROKE * limit_nm:
         advice = f"The mirror has used {value} of its stroke: little is left. Offload the slow part of the command."

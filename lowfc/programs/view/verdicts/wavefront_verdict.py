@@ -4,7 +4,7 @@ from functools import partial
 from math import hypot, sqrt
 
 from lowfc.contract.messages import wire
-from lowfc.programs.cli.contrast import QUADRATIC
+from lowfc.programs.cli.contrast import ESTIMATED, QUADRATIC
 from lowfc.programs.cli.correction import Correction, correction
 from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.view.verdicts.run_state import RunState
@@ -52,13 +52,17 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
     return tile(value, f"{compared} {flat}; {remarks}", level, advice)
 
 
-def contrast(known: wire.WavefrontFigures, *, now: bool) -> Tile:
-    """Tile CONTRAST: what the wavefront adds to the contrast of the dark zone; it has no threshold."""
+def contrast(known: wire.WavefrontFigures, *, now: bool, estimated: bool) -> Tile:
+    """Tile CONTRAST: what the wavefront adds to the contrast of the dark zone; it has no threshold.
+
+    `estimated`: whether it is from the controller's measurements, not from the true wavefront.
+    """
     if not now:
         return Tile("CONTRAST", "?", "not measured now")
     share = f"most from {short(known.costliest_modes)} ({100 * known.costliest_share:.0f} %)"
     flat = f"added to the dark zone; {known.added_contrast_flat:.1e} with a flat mirror"
-    return Tile("CONTRAST", f"{known.added_contrast:+.1e}", f"{flat}; {share}{QUADRATIC}")
+    source = ESTIMATED if estimated else ""
+    return Tile("CONTRAST", f"{known.added_contrast:+.1e}", f"{flat}; {share}{source}{QUADRATIC}")
 
 
 def factor(residual_nm: float, open_nm: float, noise_nm: float) -> float:
@@ -75,7 +79,7 @@ def merit(reduction: float, comparison: ResidualComparison | None) -> tuple[Leve
         return (Level.GOOD, "") if good else (Level.NEUTRAL, ": little is corrected")
     if comparison.residual_nm > hypot(NEAR_BEST * comparison.best_nm, NOISE_FLOOR * comparison.noise_nm):
         ratio = comparison.residual_nm / max(comparison.best_nm, 1e-9)
-        return Level.NEUTRAL, f", {ratio:.1f} x the residual of the best gains: run `lowfc tune`"
+        return Level.NEUTRAL, f", {ratio:.1f} x the residual of the best gains: run `lowfc tune --live 20`"
     if good:
         return Level.GOOD, ""
     best = comparison.residual_nm <= NEAR_BEST * comparison.best_nm
