@@ -204,7 +204,7 @@ def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None
     assert quadratic in status.text(status.json_object(message, {"camera": camera}))
     assert quadratic in summary_text(summary(watch, record=False))
     assert "  contrast by quadratic form -4.0e-11 of +7.0e-10  " in status_line(watch, 5.0)
-    assert quadratic.removeprefix(expected) in wavefront_verdict.contrast(recent, now=True).detail
+    assert quadratic.removeprefix(expected) in wavefront_verdict.contrast(recent, now=True, estimated=False).detail
     camera.wavefront.science_images = 200
     assert f"{expected}; computed from full images of the true wavefront" in summary_text(summary(watch, False))
     results = summary(watch, False) | {"costliest_modes": {"modes": "coma", "share": 0.7}}
