@@ -183,7 +183,7 @@ def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
     assert certificate_warnings(network, now + (99 - WARN_DAYS) * day) == []
     date = now + 100 * day
     assert certificate_warnings(network, now + (100.5 - WARN_DAYS) * day) == [
-        f"{role}'s certificate ends in {WARN_DAYS - 1} days, on {date:%Y-%m-%d}: lowfc certs --renew"
+        f"{role}'s certificate ends in {WARN_DAYS - 1} days, on {date:%Y-%m-%d}: lowfc certs FOLDER --renew"
         for role in ("camera", "router")
     ]
     warnings = certificate_warnings(network, now + (CA_DAYS - WARN_DAYS + 1) * day)

@@ -57,7 +57,7 @@ def read_certificate(authority: Path, certificate: Path, key: Path, *, server: b
         why = getattr(fault, "verify_message", "") or getattr(fault, "reason", "") or getattr(fault, "strerror", "")
         raise DataFileError(
             f"{certificate} is not a valid certificate of {key} signed by {authority} ({why or fault}): make it where "
-            "the authority's key is (lowfc certs --renew) and copy it here; is this host's clock right?"
+            "the authority's key is (lowfc certs FOLDER --renew) and copy it here; is this host's clock right?"
         ) from fault
     ends = datetime.datetime.fromtimestamp(min(last_s, authority_last_s), datetime.UTC)
     return OwnCertificate(name, ends, authority_last_s < last_s)

@@ -202,7 +202,7 @@ def certificate_warnings(network: Network, now: datetime.datetime) -> list[str]:
         if key.stat().st_mode & stat.S_IROTH:
             warnings.append(f"{key} can be read by every user of this host, who could then act as {role}: chmod o-rwx")
         if (left := certificate.ends - now) < datetime.timedelta(days=WARN_DAYS):
-            days, remedy = counted(left.days, "day"), ": lowfc certs --renew"
+            days, remedy = counted(left.days, "day"), ": lowfc certs FOLDER --renew"
             if certificate.ends_with_authority:
                 remedy = f", with its authority's {CA}: make all anew in an empty folder (lowfc certs)"
             warnings.append(f"{role}'s certificate ends in {days}, on {certificate.ends:%Y-%m-%d}{remedy}")

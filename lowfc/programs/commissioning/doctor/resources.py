@@ -148,7 +148,7 @@ def _open_files(facts: Facts) -> Check:
 
 @CHECKS.check(
     "certificates",
-    advice="lowfc certs --renew where the authority's key is, and copy each ROLE.pem here",
+    advice="lowfc certs FOLDER --renew where the authority's key is, and copy each ROLE.pem here",
     cost="existing links persist; processes and routers that start after the expiry are rejected",
 )
 def _certificates(facts: Facts) -> Check:
