@@ -142,7 +142,8 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
         return status.text(status.json_object(message, PROCESSES | changes, "night")).splitlines()[0]
 
     normal = (
-        "closed · residual 2.50 nm rms, noise included (true 2.00) · light 97 % · 3 frames lost · recording logs/a.mcap"
+        "closed · residual 2.50 nm rms, noise included (true 2.00 over 2 s) · light 97 % · 3 frames lost · recording "
+        "logs/a.mcap"
     )
     warned = "10 s ago camera: COMMANDS_LATE 9 % late"
     assert first_line() == f"{normal} · run night · law integrator · {warned}"
@@ -159,7 +160,7 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
     assert first_line(camera=wire.Health(), recorder=wire.Health()).endswith(" · no warning")
     before = state
     state, _ = feed(SETTINGS, state, Request((START + 2) * SECOND, "offset", (2,), (20.0,)))
-    assert "residual 2.50 nm rms, noise included (true 2.00, with offset and channels) ·" in first_line()
+    assert "residual 2.50 nm rms, noise included (true 2.00 over 2 s, with offset and channels) ·" in first_line()
     state = before
     words = ("paused", "open", "open", "closed", "in safe mode")  # `pause` of an open loop leaves it open
     for name, word in zip(("pause", "open", "pause", "close", "safe"), words, strict=True):

@@ -176,7 +176,7 @@ def test_every_request_is_made_by_a_command_of_the_document() -> None:
 def test_the_commands_print_what_they_did(night: Night) -> None:
     outputs = night.outputs
     status_of_a_closed_loop = (
-        r"closed · residual [\d.]+ nm rms, noise included( \(true [\d.]+\))? · light \d+ % · "
+        r"closed · residual [\d.]+ nm rms, noise included( \(true [\d.]+ over 2 s\))? · light \d+ % · "
         r"\d+ frames? lost · recording "
     )
     assert re.match(status_of_a_closed_loop, outputs["lowfc ctl status"])

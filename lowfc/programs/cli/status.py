@@ -205,7 +205,11 @@ def recording_state(recorder: wire.Health) -> str:
 
 
 def _in_short(known: dict[str, Any]) -> str:
-    """Summary line: mode, residual and flux of the last second, lost frames, recording, run, law, last warning."""
+    """Summary line: mode, residual and flux of the last second, lost frames, recording, run, law, last warning.
+
+    The true residual is that of the simulated camera's last two seconds, lost frames are those since the controller's
+    start.
+    """
     measured = ["no frame used in the last second"]
     if known["frames_used_last_second"]:
         true_nm = known["true_residual_rms_nm"]
@@ -213,7 +217,7 @@ def _in_short(known: dict[str, Any]) -> str:
         shapes = ", with offset and channels" if on_purpose else ""
         measured = [
             f"residual {known['residual_rms_nm']:.2f} nm rms, noise included"
-            + ("" if true_nm is None else f" (true {true_nm:.2f}{shapes})"),
+            + ("" if true_nm is None else f" (true {true_nm:.2f} over 2 s{shapes})"),
             f"light {100 * known['flux_fraction']:.0f} %",
         ]
     recording = {"recording": f"recording {known['log']}", "none": "not recording"}

@@ -80,7 +80,7 @@ def _rate(live: str, rate_hz: float, lockstep_hz: float | None) -> str:
 
 
 def _closed_for(controller: wire.Health, rate_hz: float) -> str:
-    """Text of how long the loop has been closed, if less than the span of the residual's statistics; else empty."""
+    """Text of how long the loop was closed in total, if less than the span of the residual's statistics; else empty."""
     frames = topic_count(controller, FRAME.key).received
     closed_s = frames / rate_hz - controller.not_closed_ns * 1e-9 if rate_hz else 0.0
     just_closed = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _RECENT_S
