@@ -199,8 +199,8 @@ def _checked_mode(loop: Client, step: Step, before: LoopMode | None, *, over: bo
     limits = [reason.name for reason in step.reasons if reason in _LIMITS]
     if limits and not over:
         raise CalibrationError(
-            f"a limit acted on the pokes ({', '.join(limits)}), which ended them: use a smaller --amplitude, or bring "
-            "the mirror closer to flat"
+            f"a limit acted on the pokes ({', '.join(limits)}), which ended them: bring the mirror closer to flat, or "
+            "poke less, as with `lowfc calibrate --amplitude`"
         )
     return step.mode
 

@@ -226,8 +226,8 @@ def judge(
         needed = cycles_for(required_snr, cycles, float(error.max()))
         faults.append(
             f"signal-to-noise ratio {reached:.3g} in Z{noll[int(error.argmax())]}, {required_snr:g} required: find "
-            f"what disturbs this mode, or measure about {needed} cycles (repeat the command with --resume --cycles "
-            f"{needed})"
+            f"what disturbs this mode, or measure about {needed} cycles (repeat the command with --resume --snr "
+            f"{required_snr:g} --cycles {needed})"
         )
     if not check.within(rms, largest):
         faults.append(
