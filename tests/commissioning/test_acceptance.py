@@ -217,6 +217,12 @@ def test_the_noise_floor_matches_photon_and_read_noise() -> None:
     assert not failed.passed
     assert "FAILED" in failed.text()
     assert drawn(noise, result).startswith(b"\x89PNG")
+    figure = figure_class()()
+    noise.draw(result.json_object(), figure)
+    [axes] = figure.axes
+    assert "per frame" not in axes.get_ylabel()  # the residual is not of one frame
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels == ["expected per frame", "open per frame", "closed per frame", "residual from noise"]
     with pytest.raises(AcceptanceError, match="found open; the test was ended, or the log begins or ends within it"):
         noise.judge(responses[:1], config)
 

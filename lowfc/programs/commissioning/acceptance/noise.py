@@ -108,14 +108,18 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> N
 
 
 def draw(result: dict[str, Any], figure: Any) -> None:
-    """Draw measured and expected noise of each mode."""
+    """Draw measured and expected noise of each mode, and the residual that it causes."""
     ax = figure.subplots()
     x = np.arange(len(result["modes"]))
-    for name, marker in (("expected_nm", "k_"), ("open_nm", "C0o"), ("closed_nm", "C1s"), ("residual_floor_nm", "C2^")):
-        label = name.removesuffix("_nm").replace("_", " ")
+    for name, label, marker in (
+        ("expected_nm", "expected per frame", "k_"),
+        ("open_nm", "open per frame", "C0o"),
+        ("closed_nm", "closed per frame", "C1s"),
+        ("residual_floor_nm", "residual from noise", "C2^"),
+    ):
         ax.semilogy(x, [mode[name] for mode in result["modes"]], marker, label=label)
     ax.set_xticks(x, [f"Z{mode['noll']}" for mode in result["modes"]])
-    ax.set_ylabel("nm rms of wavefront per frame")
+    ax.set_ylabel("nm rms of wavefront")
     ax.grid(alpha=0.3)
     ax.legend()
 
