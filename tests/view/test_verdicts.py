@@ -9,7 +9,7 @@ import pytest
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CAMERA_STATE, CONTROLLER_STATE, EVENT, FRAME, wire
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
-from lowfc.control.loop.wording import CAMERA_MISFIT
+from lowfc.control.loop.wording import CAMERA_MISFIT, MEASURED_FIRST
 from lowfc.programs.view.panels.tiles import FILL, GROUND, HEIGHT, TILES, WIDTH, Tiles, picture, png, tile_boxes
 from lowfc.programs.view.snapshot import Accumulator
 from lowfc.programs.view.verdicts.camera_verdict import REFUSED
@@ -98,6 +98,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "healthy": (setting(), "LOOP CLOSED GOOD", "nothing is wrong"),
     "open": (setting(mode=LoopMode.OPEN), "LOOP OPEN NEUTRAL", "lowfc ctl close"),
     "open, worse than flat": (setting(mode=LoopMode.OPEN, residual_nm=60.0), "LOOP OPEN NEUTRAL", HARMFUL),
+    "gains measured first": (to_mode(LoopMode.OPEN, MEASURED_FIRST), "LOOP OPEN NEUTRAL", "then closes by itself"),
     "camera changed": (to_mode(LoopMode.OPEN, MISFIT), "LOOP OPEN WARNING", "opened by itself"),
     "safe": (setting(mode=LoopMode.SAFE), "LOOP SAFE BAD", "lowfc ctl clear"),
     "idle": (setting(mode=LoopMode.IDLE, reasons=(Rejection.NO_CALIBRATION,)), "FRAMES REFUSED BAD", "no calibration"),

@@ -11,7 +11,7 @@ import numpy as np
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection, reason_name
-from lowfc.control.loop.wording import CAMERA_MISFIT, counted
+from lowfc.control.loop.wording import CAMERA_MISFIT, MEASURED_FIRST, counted
 from lowfc.programs.cli.correction import Correction, correction
 from lowfc.programs.view.verdicts.camera_verdict import all_refused, frames, star
 from lowfc.programs.view.verdicts.facts import facts
@@ -146,6 +146,8 @@ def _open(state: RunState) -> Tile:
     if rms is not None and correction(rms.residual_nm, rms.open_nm) is Correction.HARM:
         shape += ", worse than a flat mirror: `lowfc ctl safe` flattens it"
     level, advice = Level.NEUTRAL, "The loop is open: nothing is corrected, `lowfc ctl close` closes it."
+    if state.why == MEASURED_FIRST:
+        advice = "The loop is open until its gains are measured, and then closes by itself."
     if state.why.startswith(CAMERA_MISFIT):
         level = Level.WARNING
         advice = f"The loop opened by itself, as {CAMERA_MISFIT}: restore it or calibrate, then `lowfc ctl close`."
