@@ -228,7 +228,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "STROKE": ("an actuator reached its stroke", "a better flat map, or smaller channels"),
     "SLEW": (
         "an actuator reached its slew limit in one command",
-        "nothing if the loop has just closed; else lower gains",
+        "nothing if the loop has just closed or been reset; else lower gains",
     ),
     "NEIGHBOUR": ("neighbouring actuators would be too far apart", "smaller channels; look for a stuck actuator"),
     "NOT_FINITE": ("a value was not finite; the previous command is kept", "check calibration and law"),
