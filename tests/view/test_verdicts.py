@@ -155,6 +155,11 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "late commands": (health("camera", commands_late=80), "LATENCY 80 LATE WARNING", "80 commands, "),
     "slow": (setting(latency_us=30_000), "LATENCY 30000 us WARNING", "longer than a frame"),
     "recorder failed": (recording(failure="no space left"), "RECORDER FAILED BAD", "no space left"),
+    "recorder's folder gone": (
+        recording(failure="logs is gone"),
+        "RECORDER FAILED BAD",
+        "gone. Remove the cause, such as",
+    ),
     "control characters": (recording(failure="\x1b[2J"), "RECORDER FAILED BAD", "goes on: \\x1b[2J."),
     "recording stopped": (recording(file="a", stopped=True), "RECORDER STOPPED WARNING", "stopped by an operator"),
     "recorder stopped": (stop("recorder"), "RECORDER STOPPED WARNING", "The recorder was stopped"),

@@ -233,7 +233,8 @@ def _recorder(state: RunState) -> Tile:
     done = last.health.recording
     log, failure = map(short, (PurePath(done.file).stem, done.failure))
     if failure:
-        advice = f"Recording failed, the loop goes on: {failure}. Free disk space, then `lowfc ctl record start`."
+        advice = f"Recording failed, the loop goes on: {failure}. Remove the cause, such as a full disk, then "
+        advice += "`lowfc ctl record start`."
         return tile("FAILED", failure, Level.BAD, advice)
     gone = absent("RECORDER", "recorder", recorder, state.running_s, "nothing is recorded, the loop goes on")
     if gone is not None and recorder.life is Liveness.SILENT:
