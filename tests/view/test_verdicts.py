@@ -214,6 +214,15 @@ def test_a_few_frames_out_of_order_are_no_reason_to_flatten_the_mirror() -> None
     assert "lowfc ctl safe" not in headline
 
 
+def test_a_harmful_linear_law_has_no_gain_to_lower() -> None:
+    stage = begun(1, residual_nm=60.0)
+    assert "Lower the gain or open the loop" in stage.run(1).headline
+    stage.send(CONTROLLER_STATE, wire.ControllerState(mode=stage.mode.value, law=wire.LinearLaw(name="lqg")))
+    headline = stage.run(1).headline
+    assert "`lowfc ctl law integrator`" in headline
+    assert "gain" not in headline
+
+
 def test_a_contrast_from_the_sensor_is_called_estimated() -> None:
     figures = {"recent_wavefront": wire.WavefrontFigures(costliest_modes="tip and tilt", added_contrast_flat=1e-8)}
     assert "estimated" not in tile(staged(health("camera", **figures), 2), "CONTRAST").detail

@@ -43,7 +43,10 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
     raw, latest = rms.open_nm / rms.residual_nm if rms.residual_nm else 1.0, state.latest
     if latest is not None and {correction(one.residual_nm, one.open_nm) for one in (rms, latest)} == {Correction.HARM}:
         level = Level.BAD if raw < 1 / DIVERGING else Level.WARNING
-        advice = f"The loop does harm: {residual} nm rms, {flat}. Lower the gain or open the loop."
+        controller = state.snapshot.controller
+        law = controller is not None and controller.HasField("law")  # of which no gain can be set
+        remedy = "Return to the integrator, `lowfc ctl law integrator`," if law else "Lower the gain"
+        advice = f"The loop does harm: {residual} nm rms, {flat}. {remedy} or open the loop."
         return tile(value, f"worse than {flat}; {remarks}", level, advice)
     noise_nm = comparison.noise_nm if comparison is not None and not state.true else 0.0
     level, why = merit(factor(rms.residual_nm, rms.open_nm, noise_nm), comparison)
