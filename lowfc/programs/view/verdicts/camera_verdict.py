@@ -38,7 +38,7 @@ REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.HELD: ("loop held", "an interlock or a permit holds the loop"),
 }
 """Reasons for refusing a frame: text and advice."""
-_IF_ALL = {
+_IF_ALL: dict[Reason, str] = {
     Rejection.OUT_OF_ORDER: "a clock was set back, or there is a second camera; stop that one, or `lowfc ctl safe` and "
     "then `lowfc ctl clear`, by which the mirror goes flat"
 }

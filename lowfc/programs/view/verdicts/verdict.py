@@ -44,7 +44,7 @@ LIMITS: dict[Reason, tuple[str, str]] = {
 }
 """Limits that act on a command: text and advice."""
 
-_REFUSED_COMMAND: dict[Reason, str] = {
+_REFUSED_COMMAND: dict[int, str] = {
     Rejection.NO_MIRROR: "Its driver failed: see the last warning in `lowfc ctl status`.",
     Rejection.OUT_OF_ORDER: "Another process may command it: only one controller may.",
     Rejection.AHEAD: "Set the clocks of both hosts and restart the controller.",
@@ -53,7 +53,6 @@ _REFUSED_COMMAND: dict[Reason, str] = {
     Limit.CHANNEL: "Too many programs command it: end one of them.",
 }
 """Advice for each reason for which a mirror refuses commands."""
-_UNKNOWN = "See the events."
 
 
 def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
@@ -163,7 +162,7 @@ def _mirror(state: RunState) -> Tile:
         return tile("?", "no state of it is known")
     if reported.refused and reported.status != wire.MIRROR_STATUS_FOLLOWING:
         why = reason_name(reported.refused)
-        remedy = next((words for reason, words in _REFUSED_COMMAND.items() if reason == reported.refused), _UNKNOWN)
+        remedy = _REFUSED_COMMAND.get(int(reported.refused), "See the events.")
         advice = f"The mirror refuses the commands ({why}): it holds or relaxes by itself. {remedy}"
         return tile("REFUSES", f"the commands: {why}", Level.BAD, advice)
     if reported.status == wire.MIRROR_STATUS_WAITING:
