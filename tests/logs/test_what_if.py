@@ -1,6 +1,7 @@
 """What-ifs of logs, compared with runs with the same gains, and errors in the options."""
 
 import json
+import re
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -237,6 +238,8 @@ def test_a_configuration_file_gives_the_same_as_the_options(runs: dict[str, Logg
     by_file = results_of(runs["default"], requested("gain=0.3,tilt_gain=0.2,limit_nm=150,tilt_limit_nm=150", path))
     assert by_file == results_of(runs["default"], requested(OTHER + ",limit_nm=150"))
     table = render(by_file).splitlines()
+    titles = re.split(r"\s{2,}", next(line for line in table if line.startswith("residual, nm rms")).strip())
+    assert len(set(titles)) == len(titles) == 9  # no two columns have the same title
     assert sum(" -> " in line for line in table) == len(by_file["modes"])
     assert any("0.4 -> 0.2" in line and "tilt x" in line for line in table)
     assert any(f"{by_file['tilt_what_if_mas']:.2f}" in line and "mas" in line for line in table)

@@ -37,8 +37,8 @@ _TITLES = {
     "what_if": "what if",
     "true_was": "true as logged",
     "true_what_if": "true what if",
-    "continuous_was": "continuous",
-    "continuous_what_if": "what if",
+    "continuous_was": "continuous as logged",
+    "continuous_what_if": "continuous what if",
 }
 
 
@@ -173,8 +173,8 @@ def render(results: dict[str, Any]) -> str:
         "",
         *table(["residual, nm rms", *(_TITLES[name] for name in columns), "gain"], rows),
         "",
-        "measured values include sensor noise; true: at the start of each exposure; continuous: also between these "
-        "instants, while the mirror holds; the what-if assumes a linear sensor and no actuator limits",
+        "measured values include sensor noise; true: at the start of each exposure; continuous: true, also between "
+        "these instants, while the mirror holds; the what-if assumes a linear sensor and no actuator limits",
         *([] if results["added_contrast"] is None else [added_contrast_in_words(results["added_contrast"])]),
         *(f"warning: {warning}" for warning in results["warnings"]),
     ]
