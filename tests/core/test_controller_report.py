@@ -129,7 +129,7 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
     holding = {"controller": wire.Health(holding="no frame comes")}
     held = status.text(status.json_object(message, holding)).splitlines()[1]
     assert " open for 12 s (" in held
-    assert held.endswith("), command held: no frame comes"), "12 s is the time open, not the time without frames"
+    assert held.endswith("), not correcting: no frame comes"), "12 s is the time open, not the time without frames"
     expired = {"mirror-x": wire.Health(command_expired=True)}
     assert status.json_object(message, expired)["mirrors"]["mirror-x"]["expired"]
 
@@ -263,7 +263,7 @@ def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame
     shown = console.export_text()
     assert "2.20" not in shown, "statistics seven seconds old are not shown"
     assert "bench, V = 2, zwfs; 17 s" in shown
-    assert "closed (command held: reserved for [/b])" in shown, "text of an operator is not rich's markup"
+    assert "closed (not correcting: reserved for [/b])" in shown, "text of an operator is not rich's markup"
 
 
 @pytest.mark.parametrize(("received", "missing", "lost"), [(500, 0, 0), (371, 129, 129), (309, 0, 191), (0, 0, 0)])

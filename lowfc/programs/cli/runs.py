@@ -58,7 +58,7 @@ def _lines(rows: list[dict[str, Any]]) -> list[str]:
         if row["mode"] == "starting":  # its controller has not reported yet
             mode += " or not answering"
         if row["holding"]:
-            mode += f" (command held: {row['holding']})"
+            mode += f" (not correcting: {row['holding']})"
         rate = "" if row["rate_hz"] is None else f" at {hertz(row['rate_hz'])}, up {row['uptime_s']:.0f} s"
         starting = {one["process"] for one in row["processes"] if one["state"] == "starting"}
         no_recorder = "its recorder is starting or not answering" if Role.RECORDER in starting else "not recording"

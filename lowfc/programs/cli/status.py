@@ -251,7 +251,7 @@ def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Heal
 
 def _mode_in_words(known: dict[str, Any], since: str = "") -> str:
     word = ("paused" if known["paused"] else mode_word(known["mode"])) + since
-    return f"{word}, command held: {known['holding']}" if known["holding"] else word
+    return f"{word}, not correcting: {known['holding']}" if known["holding"] else word
 
 
 def _mirror_in_words(mirror: dict[str, Any]) -> str:

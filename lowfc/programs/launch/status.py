@@ -108,7 +108,7 @@ def _wavefront_in_words(camera: wire.Health) -> str:
 def mode(controller: wire.Health) -> str:
     """Text of the loop mode, with the reason if a closed loop holds its command."""
     word = mode_word(mode_name(controller.mode) or "starting")
-    return f"{word} (command held: {printable(controller.holding)})" if controller.holding else word
+    return f"{word} (not correcting: {printable(controller.holding)})" if controller.holding else word
 
 
 def latency(durations: wire.Latency) -> str:

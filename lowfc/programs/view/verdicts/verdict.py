@@ -101,21 +101,21 @@ def _loop(state: RunState) -> Tile:
     if Liveness.STARTING in (controller.life, camera.life) or camera.life is Liveness.NEVER:
         return tile("WAITING", "closed, no frame yet", advice="Waiting for the first frame.")
     if held := _held(reported):
-        advice = f"The loop is closed and holds its command: {held}."
-        return tile("HOLDING", f"closed, but {held}: command held", Level.WARNING, advice)
+        advice = f"The loop is closed but does not correct: {held}."
+        return tile("HOLDING", f"closed, but not correcting: {held}", Level.WARNING, advice)
     if mirror.life is Liveness.SILENT:  # in logs of version 0.1, which have no mirror fault
         return tile("CLOSED", "but the mirror is silent", Level.WARNING)
     if camera.life is Liveness.STOPPED:
-        advice = "The camera was stopped: the loop is closed and holds its command."
+        advice = "The camera was stopped: the loop is closed but does not correct."
         return tile("HOLDING", "closed, but the camera was stopped", advice=advice)
     if state.frame_silent_s is not None:
-        return tile("HOLDING", "closed, but no frames: command held", Level.WARNING)
+        return tile("HOLDING", "closed, but not correcting: no frames", Level.WARNING)
     if state.step_silent_s is not None:
         advice = "The controller processes no frames: the mirror holds or relaxes by itself. Check its last output."
         return tile("HOLDING", "closed, but no step in the last second", Level.WARNING, advice)
     if all_refused(state):
         advice = "Every frame is refused: the loop is closed and holds its command."
-        return tile("HOLDING", "closed, but every frame is refused: command held", Level.WARNING, advice)
+        return tile("HOLDING", "closed, but not correcting: every frame is refused", Level.WARNING, advice)
     if state.now[Limit.LAW_OVERRULED]:
         advice = "The law leaves more than the integrator, which has taken over. Tune again: `lowfc tune --live 20`."
         return tile("CLOSED", "the integrator in place of the law", Level.WARNING, advice)
