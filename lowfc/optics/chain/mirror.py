@@ -11,7 +11,7 @@ from lowfc.optics.chain.zernike import zernikes
 
 _TIKHONOV = 1e-4
 """Regularisation, relative to the mean diagonal of the normal matrix. With 1e-6 the mean error of the fit would be the
-same, 1.2 %, but some edge actuators would move up to three times as far."""
+same, 1.2 %, but the largest command of a mode, at the edge, would be up to three times as large."""
 
 
 @dataclass(frozen=True)
