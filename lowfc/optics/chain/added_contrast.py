@@ -18,7 +18,7 @@ from lowfc.optics.chain.science_camera import ScienceCamera
 from lowfc.optics.chain.zernike import mode_group, zernikes
 
 _BEYOND_QUADRATIC = 0.1
-_IMAGE_ROUNDING = 1e-13  # contrast; the images, of single precision, are exact to some 1e-14 behind a shaped pupil
+_IMAGE_ROUNDING = 1e-13  # contrast; means of images in single precision are exact to some 1e-14 behind a shaped pupil
 _DRAWS = 24  # random wavefronts compared, each with both signs
 
 
