@@ -153,7 +153,8 @@ def mean_contrast(
 def contrast_curve(coronagraph: Coronagraph, opd_nm: Array, wavelength_nm: float, edges: Array) -> Array:
     """Contrast (rings,) averaged in azimuth within the opening of `DARK_ZONE`, Fig. 1(c); arguments as for `contrast`.
 
-    `edges` (rings + 1,) are the radii between the rings, in lambda / D, spaced by at least one sample.
+    `edges` (rings + 1,) are the radii between the rings, in lambda / D: the first at least one sample, and spaced by at
+    least one; a ring without a sample is NaN.
     """
     sector = Wedge(0.0, float(edges[-1]), DARK_ZONE.half_opening_deg)
     columns, rows = _extent(sector, SAMPLES_PER)
