@@ -1,6 +1,7 @@
 """History of a run for reports, exports and what-ifs: columns of its frequent messages, and its rare messages.
 
-A history omits control inputs, bench values, offloads, images and commands' shapes; `History.reader` reads these.
+A history omits control inputs, bench values, offloads, images, surfaces and commands' shapes; `History.reader` reads
+these.
 """
 
 import contextlib
