@@ -41,7 +41,7 @@ class Host:
         return (self.root / path).read_text(errors="replace").strip()
 
     def text_or_nothing(self, path: str) -> str:
-        """As `text`; empty if the file does not exist."""
+        """As `text`; empty if the file cannot be read."""
         try:
             return self.text(path)
         except OSError:
