@@ -25,7 +25,8 @@ GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 MAX_TRUTHS = 10
 """Largest number of frames for which the truth is computed together."""
 _MAX_NODES = 256
-"""Largest number of nodes, which bounds the time to compute them and a frame; reached at frame rates below 1 Hz."""
+"""Largest number of nodes, which bounds the time to compute them and a frame; reached by the presets below 1 Hz, and
+by fast wheels at higher frame rates."""
 
 
 @dataclass(frozen=True, slots=True)
