@@ -1,6 +1,6 @@
 """Predicted performance of a sensor: the values that a search can minimise.
 
-A `Candidate` provides I0 and H, eqs. (6) and (12) of the paper. These determine its values in the paper's Tables 3 and
+A `Candidate` provides I0 and H, eqs. (8) and (12) of the paper. These determine its values in the paper's Tables 3 and
 4, and the contrast that the noise of an exposure adds to the dark zone.
 """
 

@@ -3,7 +3,7 @@
 The fields in the relay pupil, after the focal-plane mask, do not depend on the holes: the field of the flat wavefront
 and the first-order field of each mode are propagated once (`build_optics`). Each hole adds a small product of matrices
 to every field at the sensor (`hole_fields`), so that a search that moves one hole recomputes only that hole. I0 and H
-(the paper's eqs. (6) and (12)) follow from the fields (`SamCandidate`); `lowfc.design.merit` computes the performance.
+(the paper's eqs. (8) and (12)) follow from the fields (`SamCandidate`); `lowfc.design.merit` computes the performance.
 """
 
 from collections.abc import Callable
