@@ -66,7 +66,7 @@ def twin(config: Configuration, progress: Progress | None, warn: Callable[[str],
 
 
 def contrast_of(config: Configuration) -> ModalContrast:
-    """Contrast that the modes add in the dark zone, computed in 0.1 s (0.5 s with a Lyot stop).
+    """Contrast that the modes add in the dark zone, computed in 0.7 s (2 s with a Lyot stop).
 
     It is cached unless the pupil is a file.
     """
