@@ -236,7 +236,7 @@ def attached_configuration(log: LogReader) -> tuple[Configuration | None, list[s
 
 def attached_calibration(log: LogReader, calibration_id: str) -> Calibration | None:
     """The calibration of this identity, if it is attached to a log and can be read."""
-    from lowfc.adapters.files import calibration_file  # imports astropy, which takes 0.15 s
+    from lowfc.adapters.files import calibration_file  # imports astropy, which takes 0.3 s
 
     for name, content in log.attachments.items():
         if name.endswith(".fits"):
