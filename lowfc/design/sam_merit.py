@@ -84,7 +84,7 @@ class Optics:
 def build_optics(pupil: Array, focal_masks: tuple[str, ...] = ("disk",), band_modes: int = 2) -> Optics:
     """Propagate the flat wavefront and the modes to the relay pupil, eq. (4).
 
-    With `RELAY_SAMPLES` and `SAMPLES_PER` every predicted value of a mask is within 2 % of that with the paper's
+    With `RELAY_SAMPLES` and `SAMPLES_PER` every predicted value of a mask is within 3 % of that with the paper's
     sampling (Table 1), but the share of the quantum limit is up to 8 % too large: pixels lose information near the
     zeros of the image.
 
