@@ -37,7 +37,7 @@ _CHANGED = "its parts are intact, but some are missing or out of order, or bytes
 _BEGIN = MAGIC + bytes([Opcode.HEADER])
 _OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _FIRST_BLOCK_BYTES = 1 << 12
-_TRIES = 4  # the search for chunks reads at most this times the file's size: no file may occupy the reader for long
+_TRIES = 4  # the search tries possible chunks of this times the file's size: no file may occupy the reader for long
 
 
 @dataclass(slots=True)
