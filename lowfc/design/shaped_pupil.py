@@ -50,7 +50,7 @@ class Request:
         limit: Contrast in the linear programs, as a fraction of the required one; below 1 it saves rounds.
         cells: Cells in half the diameter: 8, 16, 32, 64, 128 or 256.
         step: Spacing of the first grid of points, in lambda/D.
-        symmetry: quarter: about both axes; octant: mask and zone also about the diagonals, four times faster.
+        symmetry: quarter: about both axes; octant: mask and zone also about the diagonals, 3 to 9 times faster.
         rounds: Largest number of programs for each number of cells.
     """
 
