@@ -45,6 +45,14 @@ def test_a_state_with_too_few_modes_is_refused(field: str) -> None:
         decode_state(message, calibration)
 
 
+@pytest.mark.parametrize("field", ["gain", "leak", "limit_nm", "auto_gain"])
+def test_settings_with_a_pair_of_another_length_are_refused(field: str) -> None:
+    message = controller_state(State(), settings(auto_gain=(True, False)), 1)
+    getattr(message.settings, field).append(1)
+    with pytest.raises(ValueError, match="two gains"):
+        decode_state(message, None)
+
+
 @pytest.mark.parametrize(
     "input_",
     [

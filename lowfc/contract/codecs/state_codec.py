@@ -214,12 +214,12 @@ def _encode_settings(settings: Settings) -> wire.ControllerSettings:
 
 def _decode_settings(message: wire.ControllerSettings, kernel: Callable[[str], Kernel]) -> Settings:
     pairs: dict[str, Any] = {name: tuple(getattr(message, name)) for name in _PAIRS}
+    pairs["auto_gain"] = tuple(message.auto_gain) or (False, False)
     if any(len(pair) != 2 for pair in pairs.values()):
-        raise ValueError("the settings of a controller have two gains, leaks and limits")
+        raise ValueError("the settings of a controller have two gains, each automatic or not, two leaks and two limits")
     return Settings(
         limits=Limits(*(getattr(message, name) for name in _LIMITS)),
         start_mode=LoopMode(message.start_mode),
-        auto_gain=tuple(message.auto_gain) or (False, False),  # type: ignore[arg-type]  # a pair
         interlocks=tuple(map(interlock_of, message.interlocks)),
         kernel=kernel(message.kernel or NUMPY.name),
         **fields_of(message, _SETTINGS),
