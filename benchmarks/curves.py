@@ -217,7 +217,7 @@ def about(result: Result) -> str:
     default = Size(**result["default"])
     loops = (
         f"The loop runs at {result['rate_hz']:g} Hz with its real-time set-up; its latency is from just before "
-        "publishing a frame to just after publishing its command. The controller's cpu is of all its threads, with "
+        "publishing a frame to just after sending its command. The controller's cpu is of all its threads, with "
         "telemetry, for each frame."
         if result["rate_hz"]
         else ""

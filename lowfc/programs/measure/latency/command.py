@@ -58,7 +58,7 @@ def latency(
 
     Prepared frames are sent on an absolute schedule and late frames are counted, so that stalls are not hidden. A bare
     zenoh echo of messages of the same sizes, one control step alone and the host's timer are measured in turns with
-    the loop. Times are from just before a frame is published to just after its command is published.
+    the loop. Times are from just before a frame is published to just after its command is sent.
 
     Example: lowfc latency --duration 10 --repeats 5 --json > latency.json
     """
