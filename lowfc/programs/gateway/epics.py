@@ -136,7 +136,7 @@ class _PutHandler:
 
 
 def _value_of(value: Any) -> Value | None:
-    """The bench value of a monitor's update; None if the PV is disconnected, invalid, not a scalar or too long."""
+    """The bench value of a monitor's update; None if disconnected, invalid, too long, not finite or no scalar."""
     plain: Any
     try:
         if value.get("alarm.severity", 0) >= _INVALID:
