@@ -106,7 +106,8 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
     Args:
         options: options.
         run: run with the files that the processes share.
-        children: processes in place of those of `lowfc latency`; the first ends by itself and writes `SENT_FILE`.
+        children: processes in place of those of `lowfc latency`; the first ends by itself, and one of them writes
+            `SENT_FILE`.
 
     Raises:
         ProcessDiedError: a process ended unexpectedly or with an error.
