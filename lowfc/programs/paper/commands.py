@@ -39,9 +39,10 @@ def validate(
     sensor: Annotated[
         list[str] | None,
         typer.Option(
-            help=f"Only this sensor, in all tables and figures but {' and '.join(WITH_FIXED_SENSORS)}: sam, bowtie, "
-            "bowtie:LAYOUT, clowfs, clowfs:MM (its defocus), clowfs_tuned, zwfs, zwfs_tuned, bar, open, lyot, aplc; or "
-            "a layout, FILE.json or FILE.json:NAME. May be repeated.",
+            help=f"Only this sensor, in all tables and figures but {' and '.join(WITH_FIXED_SENSORS)} (conditioning "
+            "keeps its open circle, bars and holes): sam, bowtie, bowtie:LAYOUT, clowfs, clowfs:MM (its defocus), "
+            "clowfs_tuned, zwfs, zwfs_tuned, bar, open, lyot, aplc; or a layout, FILE.json or FILE.json:NAME. May be "
+            "repeated.",
             show_default=False,
         ),
     ] = None,
