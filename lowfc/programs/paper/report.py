@@ -92,8 +92,8 @@ Three notes:
 
 - Table 3 gives every sensor 40,000 e- in its brightest pixel, so light that a mask loses costs nothing. Table 4 gives
   every sensor the same star; there the Zernike sensor, which uses most of the light, beats every sparse aperture.
-- In Table 3 the sparse aperture has the least residual because it is more linear. If the estimate is iterated on the
-  full model, CLOWFS has the least.
+- In Table 3 the sparse aperture has the least residual because it is more linear. If the estimate is iterated twice on
+  the full model, CLOWFS has the least.
 - The scatter over 100 realisations has an uncertainty of 7 %: if a value is near the paper's, compare *predicted*.
 """
 

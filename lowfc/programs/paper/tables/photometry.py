@@ -191,8 +191,9 @@ def _defocus_contradiction(clowfs: Prepared) -> Iterator[Row]:
         "mm",
         float(agreeing_mm),
         section.defocus_mm,
-        assumption="With the paper's electrons, its 0.080 mas needs about this defocus, where a fit of 14 modes has "
-        "ten times the scatter: see clowfs:1 in Table 4. No defocus agrees with both of the paper's CLOWFS tables.",
+        assumption="With the paper's electrons, its 0.080 mas needs about this defocus, where a fit of 14 modes (pinv) "
+        "has ten times the scatter; at 1 mm, clowfs:1 in Table 4, it has 36 times. No defocus agrees with both of the "
+        "paper's CLOWFS tables.",
     )
 
 
