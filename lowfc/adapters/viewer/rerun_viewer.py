@@ -165,7 +165,7 @@ class RerunViewer:
         self._stderr.close()
 
     def screenshot(self, path: Path | None = None, timeout_s: float = 20.0) -> bytes:
-        """PNG of the whole viewer, once it has loaded and then two images in turn are equal or `timeout_s` is over again.
+        """PNG of the whole viewer, at most `timeout_s` after it has loaded, or once two images in turn are equal.
 
         Raises:
             ViewerError: the viewer does not answer, or has not loaded everything within the timeout.
