@@ -128,8 +128,8 @@ def render(results: Results) -> str:
         f"{results['seconds']:g} s at {RATE_HZ:g} Hz, disturbance `{PRESET}`, one seed, with the first "
         f"automatic gains of the loop without imperfections, read {_UNTIL_GAINS_S:g} s after its start; from 4 s on, "
         "most gains of modes other than tilt are lower. The live loop's own `advance` processes the sensor images and "
-        "commands the simulated mirror. The calibration is analytic and includes no imperfection except dark current, or has dark "
-        "and reference image measured on that detector."
+        "commands the simulated mirror. The calibration is analytic and includes no imperfection except dark current, "
+        "or has dark and reference image measured on that detector."
     )
 
 
