@@ -44,10 +44,11 @@ DRIFT_PM = 20.0
 REACHED, NOT_REACHED = "reached", "not reached"
 
 ABOUT = """An anchor is a published value and lowfc's value by the same definition. *paper* is the published value,
-*limit* is lowfc's with the noise of the quantum limit of the light. Loops are the real processes in lockstep, judged by
-the true wavefront, in continuous time over the second half of a run; the means as in SCExAO are of the tilt at the
-start of each exposure, from 4 s on. A verdict compares lowfc's value (the predicted one, if theory gives one) with the
-published one. The scatter of the tuned CLOWFS and of the Zernike sensor is compared with that of the paper's CLOWFS.
+*limit* is lowfc's with the noise of the quantum limit of the light, unless the assumption says otherwise. Loops are the
+real processes in lockstep, judged by the true wavefront, in continuous time over the second half of a run; the means as
+in SCExAO are of the tilt at the start of each exposure, from 4 s on. A verdict compares lowfc's value (the predicted
+one, if theory gives one) with the published one. The scatter of the tuned CLOWFS and of the Zernike sensor is compared
+with that of the paper's CLOWFS.
 """
 LOOP = (
     f"lowfc sim-loop --lockstep: V = {MAGNITUDE:g}, 2 m, {RATE_HZ:g} Hz, exposure of half the period, delay of one "
