@@ -6,13 +6,17 @@ Example: python examples/log_to_pandas.py logs/20270101T220000Z.mcap
 import sys
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from lowfc import LogReader, read_history
 
 
 def table(path: Path) -> pd.DataFrame:
-    """Modal error, pseudo-open-loop modes and command of every step, nm rms of wavefront, and the flux in DN."""
+    """Modal error, pseudo-open-loop modes and command of every step, nm rms of wavefront, and the flux in DN.
+
+    All but the command are NaN if the frame was refused.
+    """
     history = read_history(LogReader(path))
     steps, calibration = history.steps, history.calibration
     if calibration is None:
@@ -22,8 +26,9 @@ def table(path: Path) -> pd.DataFrame:
         for name, values in (("error", steps.error_nm), ("pol", steps.pol_nm), ("command", steps.command_nm))
         for place, noll in enumerate(calibration.noll)
     }
+    flux_dn = np.where(np.isfinite(steps.error_nm).all(axis=1), steps.flux_dn, np.nan)  # 0 for a refused frame
     time = pd.to_datetime(steps.time_ns, unit="ns", utc=True)
-    return pd.DataFrame({**columns, "flux_dn": steps.flux_dn}, index=pd.Index(time, name="time"))
+    return pd.DataFrame({**columns, "flux_dn": flux_dn}, index=pd.Index(time, name="time"))
 
 
 if __name__ == "__main__":

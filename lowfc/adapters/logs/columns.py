@@ -35,8 +35,8 @@ class Steps:
         error_nm: measured modal error, nm rms of wavefront; NaN if the frame was refused.
         pol_nm: pseudo-open-loop modes, nm rms of wavefront; NaN if the frame was refused.
         command_nm: modal command after the step, nm rms of wavefront.
-        flux_dn: sum of the good pixels, dark subtracted, DN.
-        saturated_pixels: number of saturated pixels.
+        flux_dn: sum of the good pixels, dark subtracted, DN; 0 if the frame was refused.
+        saturated_pixels: number of saturated pixels; 0 if the frame was refused.
     """
 
     sequence: Sequences
