@@ -103,7 +103,7 @@ class FullLight:
         return _nonlinearity_waves(self, modes)
 
     def image(self, focal: Complex) -> Array:
-        """Image (pixels,) at the central wavelength of a field on the focal-plane mask."""
+        """Image (pixels,) at the central wavelength of a field on the mask, in fractions of the open circle's light."""
         return self._intensity(self._on_sensor(focal, WAVELENGTH_NM))
 
     def _signal(self, band: Band) -> Signal:

@@ -16,10 +16,11 @@ PACKAGES = ("client", "device", "optics", "design", "control")
 ARRAYS = re.compile(r"\b(Array|Single|SingleComplex|Complex|Integers|Long|Mask|Pixels|Sequences|ArrayLike|NDArray)\b")
 SHAPE = re.compile(r"\([\w+*/ .-]+,\)|\([\w+*/ .-]+(, ?[\w+*/ .-]+)+\)|shapes? as|any shape")
 UNIT = re.compile(
-    r"\b(nm2?|um|mas|DN|electrons?|e-|ns|s|Hz|rad|deg|waves|frames|diameters|lambda0?|"
+    r"(?<!')\b(nm2?|um|mas|DN|electrons?|e-|ns|s|Hz|rad|deg|waves|frames|diameters|lambda0?|"
     r"radii|(their|any) unit|without unit|variance|sequence|"
     r"fractions?|factors?|relative|transmissions?|weights|amplitudes?|indices|contrast|0 or 1|1 where|whether)\b"
 )
+"""A word for a unit; the s of a possessive is none."""
 
 Definition = ast.FunctionDef | ast.ClassDef
 

@@ -74,7 +74,7 @@ def onto(image: Array, geometry: Geometry, shape: tuple[int, int]) -> Array:
     Flux is conserved. Between pixels the image is a cubic spline; outside it is zero.
 
     Args:
-        image: Image on the computed sensor.
+        image: Image on the computed sensor, in any unit.
         geometry: Geometry of the real sensor.
         shape: Real rows and columns.
     """

@@ -203,7 +203,7 @@ def noise_nm(matrix: Array, reference: Array, flux_e: float, read_noise_e: float
 
 
 def noise_nm2(matrix: Array, reference: Array, flux_e: float, read_noise_e: float) -> Array:
-    """Covariance (modes, modes) of the modes of one frame, from photon and read noise through R (modes, pixels).
+    """Covariance (modes, modes) in nm2 of the modes of one frame: photon and read noise through R (modes, pixels).
 
     The normalisation divides by the frame's own noisy flux, so that each pixel's noise n acts as n - I0 sum(n).
     """

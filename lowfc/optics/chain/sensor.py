@@ -107,7 +107,7 @@ def propagate(
 
     Args:
         sensor: The optics.
-        pupil_field: The field after the pupil mask.
+        pupil_field: The field after the pupil mask, in any unit.
         wavelength_nm: The wavelength.
         focal_mask: Replaces the sensor's focal-plane mask if given.
     """
@@ -118,7 +118,7 @@ def propagate(
 
 
 def from_focus(sensor: Sensor, focal: Complex, wavelength_nm: float) -> Complex:
-    """Field at the sensor's samples for a field (k, k) after the focal-plane mask."""
+    """Field at the sensor's samples for a field (k, k) after the focal-plane mask, in any unit."""
     size, relay, scale = focal.shape[0], sensor.relay, sensor.wavelength_nm / wavelength_nm
     if isinstance(relay, ApertureMask):
         in_relay = to_pupil(focal, sensor.pupil.shape[0], sensor.samples_per, scale)
