@@ -5,6 +5,7 @@ A renamed field or topic fails here rather than during operation.
 
 import json
 import re
+import subprocess
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -165,3 +166,12 @@ def test_rerun_layouts_are_up_to_date(tmp_path: Path) -> None:
         field = message.DESCRIPTOR.fields_by_name[first.partition("[")[0]]
         assert field.is_repeated == ("[" in first)
         assert rest == (["name"] if field.enum_type is not None else [])
+
+
+def test_the_documented_rrd_route_writes_the_name_of_a_log_into_its_layout(tmp_path: Path) -> None:
+    import rerun_cli
+
+    routed = tmp_path / "log.rbl"
+    words = ("rrd", "route", "--application-id", "night", LAYOUTS / "log.rbl", "-o", routed)
+    subprocess.run([Path(rerun_cli.__file__).parent / "rerun", *words], capture_output=True, check=True)
+    assert rerun_layout(routed) == ("night", *rerun_layout(LAYOUTS / "log.rbl")[1:])
