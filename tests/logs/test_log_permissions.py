@@ -2,7 +2,7 @@
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -73,11 +73,19 @@ def test_a_log_is_not_replaced_by_another_file(tmp_path: Path) -> None:
 def test_a_folder_without_permission_is_an_error_and_no_traceback(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, name: str
 ) -> None:
-    def denied(*_: object, **__: object) -> None:
-        raise PermissionError(errno.EACCES, "Permission denied")
+    folder = tmp_path / "of another user"
 
-    monkeypatch.setattr(Path, "stat", denied)
-    assert "cannot be read" in refusal(command, tmp_path / "of another user" / name, kind=DataFileError)
+    def denied_in_folder(function: Callable[..., object]) -> Callable[..., object]:
+        def denied(path: object, *arguments: object, **options: object) -> object:
+            if str(path).startswith(str(folder)):
+                raise PermissionError(errno.EACCES, "Permission denied")
+            return function(path, *arguments, **options)
+
+        return denied
+
+    for function in ("open", "listdir", "scandir", "stat"):  # root has permission for everything
+        monkeypatch.setattr(os, function, denied_in_folder(getattr(os, function)))
+    assert "cannot be read: Permission denied" in refusal(command, folder / name, kind=DataFileError)
 
 
 def test_the_recorder_uses_the_configured_mode() -> None:
