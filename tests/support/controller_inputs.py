@@ -22,12 +22,12 @@ TIGHT = {
     "interlocks": INTERLOCKS,
 }
 """Settings under which limits and interlocks often act."""
-_KINDS = (*["frame"] * 5, "bad", "late", "tick", "request", "mirror", "camera", "close", "bench", "permit")
+_KINDS = (*["frame"] * 5, "bad", "late", "tick", "request", "mirror", "camera", "close", "bench", "permit", "play")
 
 
 @st.composite
 def inputs(draw: st.DrawFn) -> list[Input]:
-    """Draw good and bad frames, gaps, ticks, requests, states of devices and bench values."""
+    """Draw good and bad frames, gaps, ticks, requests, probe sequences, states of devices and bench values."""
     drawn: list[Input] = []
     count = 0
     for kind in draw(st.lists(st.sampled_from(_KINDS), min_size=1, max_size=40)):
@@ -47,7 +47,8 @@ def inputs(draw: st.DrawFn) -> list[Input]:
             case "tick":
                 drawn.append(Tick(seed, seed * 2_000))
             case "request":
-                name = ("gain", "leak", "status", "open", "safe", "clear", "nonsense")[seed % 7]
+                names = ("gain", "leak", "status", "open", "safe", "clear", "nonsense", "offset", "limit", "reset")
+                name = names[seed % len(names)]
                 drawn.append(Request(seed, name, (), (float(np.float32(rng.uniform(0, 1))),)))
             case "mirror":
                 shape = rng.normal(0, 30, CALIBRATION.grid).astype(np.float32)
@@ -62,6 +63,9 @@ def inputs(draw: st.DrawFn) -> list[Input]:
             case "permit":
                 text, values = "moving the mask", (2**-8,) if seed % 2 else ()
                 drawn.append(Request(seed, "permit", (), values, text, lease_id=1 + seed % 3))
+            case "play":
+                table = rng.normal(0, 3, (1 + seed % 9, len(NOLL))).astype(np.float32)
+                drawn.append(Request(seed, "play", text="offset", table=table))
             case "close":
                 drawn += [Request(seed, "clear"), Request(seed, "close")]
     return drawn

@@ -1,6 +1,7 @@
 """The panels draw the right numbers under the right names."""
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
@@ -161,14 +162,14 @@ def test_the_flux_of_refused_frames_is_a_gap() -> None:
 
 
 def test_unreadable_messages_and_unknown_values_do_not_affect_other_panels() -> None:
-    samples = []
-    for number, sample in enumerate(synthetic_log().samples):
+    samples, steps = [], itertools.count()
+    for sample in synthetic_log().samples:
         payload = sample.payload
         if sample.key == EVENT.key:
             log = Log.FromString(payload)
             log.level = 77
             payload = log.SerializeToString()
-        elif sample.key == STEP.key and number % 3 == 0:
+        elif sample.key == STEP.key and next(steps) % 3 == 0:
             step = wire.ControlStep.FromString(payload)
             step.mode = 200
             payload = step.SerializeToString()
@@ -178,7 +179,7 @@ def test_unreadable_messages_and_unknown_values_do_not_affect_other_panels() -> 
     accumulator = accumulated(samples)
     tape = rendered(accumulator.snapshot(samples[-1].publish_time_ns))
     assert accumulator.unreadable == 2, "only the newest picture of a topic is decoded"
-    assert wavefront.ERROR.path in tape.rows
+    assert len(tape.column(wavefront.ERROR.path)[0]) == FRAMES
 
 
 @pytest.mark.parametrize("seconds", [10**12, -(10**12), 6 * 10**9])
