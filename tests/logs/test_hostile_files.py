@@ -223,7 +223,12 @@ def test_a_file_in_the_home_of_an_unknown_user_is_reported_as_missing(key: str, 
     assert "there is no" in text
 
 
-@pytest.mark.parametrize("content", [b"[" * 100_000, b'{"holes": ' + b"[" * 900 + b"]" * 900 + b"}", b"9" * 100_000])
+NESTED = b"[" * 900 + b"]" * 900
+
+
+@pytest.mark.parametrize(
+    "content", [b"[" * 100_000, b'{"hole_diameter": 0.1, "holes": [[' + NESTED + b", 0]]}", b"9" * 100_000]
+)
 def test_a_hostile_layout_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "hostile.json"
     path.write_bytes(content)
