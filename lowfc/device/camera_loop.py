@@ -47,7 +47,7 @@ class CameraLoop:
         self._number_ns = self._lost = self._lost_due_ns = 0
         self.watch = DriverWatch(service, PATIENCE_S)
         self._settings: CameraSettings | None = None
-        self._settings_due_ns = 0
+        self._settings_due_ns = self._settings_asked_ns = 0
         self._publish_settings()
         self._settings_due_ns = 0  # publish them again with the first frame
         service.fill = self._fill
@@ -183,10 +183,9 @@ class CameraLoop:
         if not isinstance(settings, CameraSettings):
             raise TypeError(f"settings() returned {type(settings).__name__}, expected CameraSettings")
         time_ns = self._service.clock.now_ns() if settings.time_ns is None else settings.time_ns
-        if (
-            settings != self._settings
-            or time_ns + min(int(settings.period_ns), SETTINGS_NS) // 2 >= self._settings_due_ns
-        ):
+        step_ns = min(int(settings.period_ns), SETTINGS_NS, time_ns - self._settings_asked_ns)  # to the next call
+        self._settings_asked_ns = time_ns
+        if settings != self._settings or time_ns + step_ns // 2 >= self._settings_due_ns:
             self._states.put(camera_state(settings, time_ns).SerializeToString())
             self._settings, self._settings_due_ns = settings, time_ns + SETTINGS_NS
             self._simulated = settings.clock == "run"

@@ -174,9 +174,16 @@ def test_a_driver_whose_settings_are_of_another_type_is_refused() -> None:
 
 def test_expose_returning_none_is_no_failure_and_settings_are_published_twice_a_second_however_often_it_does() -> None:
     bench = CameraBench(settings=replace(SETTINGS, period_ns=2000 * MS))
-    bench.camera.expose = Mock(side_effect=[None] * 100 + [Exposure(GOOD)])
+    results = iter([None] * 200 + [Exposure(GOOD)])
+
+    def wait() -> Exposure | None:
+        bench.clock.advance(10 * MS)
+        return next(results)
+
+    begun_ns, bench.camera.expose = bench.clock.now_ns(), wait
     bench.loop.run()
-    assert len(bench.listener.messages(CAMERA_STATE)) == 2, "at the start and with the first exposure"
+    times_ms = [(sample.publish_time_ns - begun_ns) // MS for sample in bench.listener.samples[CAMERA_STATE]]
+    assert times_ms == [0, 0, 500, 1000, 1500, 2000], "at the start, with the first exposure, twice a second"
     assert bench.listener.events() == ["STARTED", "STOPPED"]
 
 
