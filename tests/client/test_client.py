@@ -208,13 +208,15 @@ def test_arrays_arrive_unchanged(controller: FakeController, loop: Client) -> No
     loop.play(np.stack([SHAPE, -SHAPE]), [[1, 2], [3, 4], [5, 6]])
     loop.play_offset(np.ones((4, 3)))
     loop.law(LAW)
-    shape, removed, played, offset, law = controller.requests
+    loop.load(KNOWN)
+    shape, removed, played, offset, law, load = controller.requests
     assert np.array_equal(shape.actuators_nm, SHAPE.ravel())
     assert removed.actuators_nm.size == 0
     assert np.array_equal(played.actuators_nm, [*SHAPE.ravel(), *-SHAPE.ravel()])
     assert np.array_equal(played.table, [[1, 2], [3, 4], [5, 6]])
     assert (offset.text, offset.table.tolist()) == ("offset", np.ones((4, 3)).tolist())
     assert law.law.id == LAW.id
+    assert load.calibration.id == KNOWN.id
 
 
 def test_a_refusal_raises_with_the_controllers_reply(controller: FakeController, loop: Client) -> None:
