@@ -39,7 +39,8 @@ def test_the_limits_of_the_mirror_are_by_default_wider_than_those_of_the_control
     config = load(None)
     assert config == Configuration()
     protection = protection_of(SimulatedMirror(DriverOptions(), config), config)
-    assert protection.tighter.stroke_nm > config.safety.stroke_nm
+    for name in ("stroke_nm", "slew_nm", "neighbour_nm"):
+        assert getattr(protection.tighter, name) > getattr(config.safety, name), name
 
 
 def test_every_key_has_a_description() -> None:
@@ -95,7 +96,7 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(
 ) -> None:
     path = write(tmp_path, text)
     message = error_of(path)
-    assert message.startswith(f"{path}: unknown key {unknown!r}; the nearest known one is '{near}")
+    assert message.startswith(f"{path}: unknown key {unknown!r}; the nearest known one is '{near}'")
     assert "\n" not in message
 
 
