@@ -142,7 +142,11 @@ def test_a_driver_is_found_by_entry_point_or_by_module_and_class(
     (tmp_path / "folder/in_a_folder.py").write_text("class Mine:\n    settings = expose = close = None\n")
     assert plugins.load("camera", "folder/in_a_folder.py:Mine").__name__ == "Mine"
     assert plugins.section("folder/in_a_folder.py:Mine") == "in_a_folder"
-    for name, why in [("sin", "did you mean 'sim'"), ("beside_me:Other", "cannot be loaded"), ("nowhere:X", "nowhere")]:
+    for name, why in [
+        ("sin", "did you mean 'sim'"),
+        ("beside_me:Other", "has no attribute 'Other'"),
+        ("nowhere:X", "No module named 'nowhere'"),
+    ]:
         with pytest.raises(ConfigurationError, match=why):
             plugins.load("camera", name)
 
