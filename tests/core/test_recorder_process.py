@@ -161,7 +161,7 @@ def test_a_recorder_in_lockstep_requests_no_real_time_priority(tmp_path: Path, m
     [
         (("--folder", "{}/logs", "--min-free-mb", 1e9), "MB free, and recorder.min_free_mb is 1000000000"),
         (("--folder", "/proc/logs", "--min-free-mb", 0), "/proc/logs"),
-        (("--longest-s", 0.5), "recorder.longest_s = 0.5"),
+        (("--folder", "{}/logs", "--longest-s", 0.5), "recorder.longest_s = 0.5"),
     ],
 )
 def test_an_impossible_recording_is_refused_before_any_file_is_created(
