@@ -23,7 +23,7 @@ from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, S
 from lowfc.programs.cli import status
 from sim_camera.disturbance import LINE_WIDTH, LINES_HZ, LINES_MAS
 from tests.support.in_process_loop import SMALL_MIRROR
-from tests.support.toy import NOLL, calibration, feed, frame, loaded, names, run_toy, settings
+from tests.support.toy import NOLL, calibration, feed, frame, loaded, run_toy, settings
 from tools.guard import MOVED, SEEDS, Case, identified_law, tilt_after_move, times_overruled
 from tools.law_bench import Bench, calibrated, configured, timing_of
 from tools.modal_bench import ModalBench
@@ -100,15 +100,18 @@ def test_the_takeover_has_an_event_and_no_jump(rate_hz: float, wait_s: int) -> N
     state = with_law(replace(BAD_TILT, rate_hz=rate_hz), setup)
     _, state = run(state, BEFORE + WORSE_BLOCKS * SPANS.block - 1)
     assert not any(overruled(state))
-    first = BEFORE + WORSE_BLOCKS * SPANS.block
-    before = state.loop.history_nm[0]
-    state, all_outputs = feed(SETUP, state, frame(first, SWAY_NM[first] + before))
-    assert names(all_outputs) == ["LAW_OVERRULED"]
-    event = all_outputs[0].events[0].details
+    first, moves_nm, events = BEFORE + WORSE_BLOCKS * SPANS.block, [], []
+    for number in range(first, first + 3):  # the cross-fade begins in the frame after the event
+        before = state.loop.history_nm[0]
+        state, all_outputs = feed(SETUP, state, frame(number, SWAY_NM[number] + before))
+        moves_nm.append(np.abs(state.loop.history_nm[0] - before).max())
+        events += all_outputs[0].events
+    assert [event.name for event in events] == ["LAW_OVERRULED"]
+    event = events[0].details
     assert event["modes"] == "tip and tilt"
     assert event["until"] == f"until the law would be far better for {wait_s} s"
-    assert np.abs(state.loop.history_nm[0] - before).max() < 200 / faded
-    _, state = run(state, faded, first + 1)
+    assert max(moves_nm) < 200 / faded
+    _, state = run(state, faded, first + 3)
     shown = status.json_object(controller_state(state, SETUP, 1))
     assert shown["law"]["overruled"] == ["tip and tilt"]
     assert "overruled: the integrator drives tip and tilt" in status.text(shown)
