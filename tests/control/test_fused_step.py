@@ -249,6 +249,7 @@ def test_several_threads_give_the_same_bytes(monkeypatch: pytest.MonkeyPatch) ->
             monkeypatch.setattr(compiled, "SHARED_BYTES", at_least)
             measured = shared.estimate(pixels, 0.0)
             assert (measured[0].tobytes(), measured[1]) == (expected[0].tobytes(), expected[1])
+        assert len(compiled.kernel(FUSED, threads).measure.__self__._shares) == threads, "each had a share"
 
 
 def test_the_fused_step_agrees_on_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:
