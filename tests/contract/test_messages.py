@@ -119,7 +119,7 @@ def test_only_frames_steps_commands_and_mirror_states_are_in_the_loop() -> None:
 
 
 def raised_events() -> Iterator[tuple[str, str, set[str]]]:
-    """Place, name and keys of the details of every raised event: PendingEvent(...) and ...event(...) calls."""
+    """Place, name and keys of the details of each event that is raised by its literal name."""
     for package in ("lowfc", "sim_camera", "sim_dm"):
         for path in sorted((ROOT / package).rglob("*.py")):
             text = path.read_text(encoding="utf-8")
@@ -151,7 +151,7 @@ def details_of(description: str) -> set[str]:
     return {name for _, name, _, _ in string.Formatter().parse(description) if name}
 
 
-def test_every_raised_event_is_in_the_table_with_the_same_details() -> None:
+def test_every_event_raised_by_its_literal_name_is_in_the_table_with_the_same_details() -> None:
     raised = list(raised_events())
     wrong = [
         f"{where}: {name} with {sorted(details)}"
