@@ -49,7 +49,7 @@ def applied(setup: Settings, state: State, name: str, **fields: object) -> tuple
         ("above", 3.0, 3.5, "mask is 3.5, above 3"),
         ("above", 3.0, 3.0, ""),
         ("below", 3.0, 2.5, "mask is 2.5, below 3"),
-        ("below", 3.0, 4.0, ""),
+        ("below", 3.0, 3.0, ""),
         ("above", 0.5, True, "mask is true, not a number"),
         ("equal", True, "true", "mask is 'true', not true or false"),
         ("equal", 1.0, None, "no value of mask has been received"),
