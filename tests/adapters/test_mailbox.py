@@ -41,7 +41,7 @@ def test_a_gap_counts_as_missing_and_a_new_start_does_not() -> None:
 
 
 def test_wake_ends_the_wait_at_once_and_only_once() -> None:
-    box = Mailbox()
+    box, begun_s = Mailbox(), time.monotonic()
     box.wake()
     assert box.take(PATIENCE_S) is None
     assert box.take(0.0) is None
@@ -53,6 +53,7 @@ def test_wake_ends_the_wait_at_once_and_only_once() -> None:
     box.put(sample(0))
     assert box.take(PATIENCE_S) == sample(0)
     assert box.take(PATIENCE_S) is None  # the wake before the message is still pending
+    assert time.monotonic() - begun_s < PATIENCE_S, "no wait ended by its timeout"
 
 
 def test_a_message_ends_the_wait_of_another_thread() -> None:
