@@ -102,7 +102,7 @@ def test_gains_are_measured_in_open_loop_before_the_loop_is_closed(faint: Bench)
 
 
 def test_closing_reduces_the_residual_on_a_faint_star(faint: Bench) -> None:
-    """With fixed gains of 0.5 and 0.05 at V = 6.5 and 250 Hz, a disturbance of 18 nm becomes a residual of some 47 nm."""
+    """With fixed gains of 0.5 and 0.05 at V = 6.5 and 250 Hz, a disturbance of 18 nm becomes one of some 47 nm."""
     residual_nm, open_nm = rms_nm(faint, 500)
     assert residual_nm < open_nm
 
