@@ -300,9 +300,10 @@ def test_missing_packages_are_reported_before_the_search(tmp_path, monkeypatch):
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", RECORDED)
 def test_recorded_command_finds_a_layout_as_good_as_the_packaged_one(tmp_path, name):
-    """The merits agree within 1 %.
+    """The merits agree within 3 %: those of one chain scatter by 2 % with the seed.
 
-    The layouts differ: the search that found the packaged ones overestimated the light through small holes.
+    The layouts differ: the search that found the packaged ones overestimated the light through small holes, and the
+    processor's rounding decides between steps of nearly equal merit.
     """
     ran = lowfc(*shlex.split(RECORDED[name])[1:], "--jobs", 1, "--out", tmp_path / "mask.json")
     assert ran.exit_code == 0, ran.output
@@ -314,4 +315,4 @@ def test_recorded_command_finds_a_layout_as_good_as_the_packaged_one(tmp_path, n
         fields = [hole_fields(optics, hole) for hole in load_layout(layout).holes]
         return merit(SamCandidate(optics, np.sum(fields, axis=0)), search.goal)
 
-    assert merit_of(f"{tmp_path / 'mask.json'}:{name}") == pytest.approx(merit_of(name), rel=0.01)
+    assert merit_of(f"{tmp_path / 'mask.json'}:{name}") == pytest.approx(merit_of(name), rel=0.03)
