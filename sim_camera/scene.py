@@ -131,6 +131,7 @@ class Scene:
         if instants > 1:
             nodes, weights = exposure_nodes(highest_hz(disturbance) * exposure / rate_hz)
         self._image_weights = weights.astype(np.float32)
+        self._image_electrons = self._electrons * self._image_weights
         fields_nm = np.vstack([self._basis, self._screen]).astype(np.float64)
         fields_nm -= (fields_nm @ optics.area_weights)[:, None]
         self._weighted = np.ascontiguousarray((fields_nm * optics.area_weights).T)
@@ -154,7 +155,7 @@ class Scene:
         end = len(modes) - len(self.instants)
         opds_nm = modes[end - self._image_weights.size : end] @ self._basis
         opds_nm += static_nm
-        electrons = self._evaluator.image(opds_nm, self._electrons * self._image_weights)
+        electrons = self._evaluator.image(opds_nm, self._image_electrons)
         if self._shear_slopes is not None:
             sheared = self._shear_slopes @ self._shear(index).astype(np.float32)
             electrons += (self._electrons * sheared).reshape(electrons.shape)
