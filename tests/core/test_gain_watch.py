@@ -236,7 +236,7 @@ def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset() -> N
 
 
 def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:
-    loop = bench(2.0)
+    loop = bench(-1.0)  # at V = 2 the noise of a frame is some ten times the residual: the estimate scatters by 4
     form = np.diag(factory.contrast_of(loop.config).form)
 
     def true(name: str, frames: int) -> float:
@@ -247,8 +247,7 @@ def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:
     loop.run(667)
     uncorrected, by_mode = loop.watch.added_contrast()
     assert uncorrected == pytest.approx(true("disturbance_nm", 667), rel=0.3)
-    # The noise of a frame is some ten times the residual: over seeds the estimate is 0.2 to 4 times the true contrast.
-    assert 0.2 < by_mode.sum() / true("residual_nm", 500) < 5
+    assert 0.5 < by_mode.sum() / true("residual_nm", 500) < 2
     loop.ask("open")
     loop.run(1)
     _, opened_by_mode = loop.watch.added_contrast()
