@@ -88,6 +88,12 @@ def holding(reason: Rejection, **state: object) -> Callable[[Stage], None]:
     return change
 
 
+def relaxing_camera_dead(stage: Stage) -> None:
+    settings = wire.ControllerSettings(on_frame_timeout="flat")
+    stage.send(CONTROLLER_STATE, wire.ControllerState(mode=stage.mode.value, settings=settings))
+    stage.silent.add("camera")
+
+
 MISFIT = f"{CAMERA_MISFIT}: bias_dn is 260"
 OTHER_SIZE = "the computed calibration is for frames of 32 x 32 pixels, the camera's are 64 x 64"
 LEASE = wire.Lease(holds=True, holder="calibrate")
@@ -104,7 +110,8 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "idle": (setting(mode=LoopMode.IDLE, reasons=(Rejection.NO_CALIBRATION,)), "FRAMES REFUSED BAD", "no calibration"),
     "idle, other size": (to_mode(LoopMode.IDLE, OTHER_SIZE), "LOOP IDLE WARNING", "no calibration for these frames"),
     "controller dead": (silence("controller"), "LOOP DEAD BAD", "Controller silent for 4 s"),
-    "camera dead": (silence("camera"), "FRAMES NO FRAMES BAD", "No frame for 4 s, camera silent"),
+    "camera dead": (silence("camera"), "FRAMES NO FRAMES BAD", "No frame for 4 s, camera silent: the loop holds"),
+    "camera dead, mirror relaxes": (relaxing_camera_dead, "FRAMES NO FRAMES BAD", "silent: the mirror relaxes to flat"),
     "mirror dead": (silence("mirror-dm"), "MIRROR DEAD BAD", "Mirror silent for 4 s"),
     "recorder dead": (silence("recorder"), "RECORDER DEAD BAD", "Recorder silent"),
     "all dead": (silence(*ALL_PROCESSES), "LOOP NO MESSAGES BAD", "No message from any process for 4 s"),

@@ -50,7 +50,10 @@ _FRAME_REASONS = [reason for reason in REFUSED if reason not in (Rejection.NO_MI
 def frames(state: RunState) -> Tile:
     """Tile FRAMES: whether frames arrive at the nominal rate and are used."""
     tile, camera, silent_s = partial(Tile, "FRAMES"), state.camera, state.frame_silent_s
-    gone = absent("FRAMES", "camera", camera, state.running_s, "the loop holds")
+    controller = state.snapshot.controller
+    relaxes = controller is not None and controller.settings.on_frame_timeout == "flat"
+    harm = "the mirror relaxes to flat" if relaxes else "the loop holds"
+    gone = absent("FRAMES", "camera", camera, state.running_s, harm)
     if gone is not None and camera.life is not Liveness.SILENT:  # reported below, by the time without frames
         return gone
     if camera.life is Liveness.STARTING:
@@ -59,7 +62,7 @@ def frames(state: RunState) -> Tile:
         alive = camera.life is not Liveness.SILENT and silent_s > HEALTH_OVERDUE_S
         who = "the camera runs, but sends none" if alive else "camera silent"
         since = duration(silent_s)
-        advice = f"No frame for {since}, {who}: the loop holds. Check the camera's last output and restart it."
+        advice = f"No frame for {since}, {who}: {harm}. Check the camera's last output and restart it."
         return tile("NO FRAMES", f"for {since}: {who}", Level.BAD, advice)
     lost = state.recent["skipped"] + state.recent["missing"]
     period_ns = state.snapshot.period_ns
