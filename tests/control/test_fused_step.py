@@ -27,7 +27,7 @@ from lowfc.programs.core.start_up import settings_under
 from tests.support import toy
 
 RATE_HZ = 1000.0
-SAME_NM = 2e-4  # the order of sums depends on the processor: 1.5e-4 nm with AVX-512, in a million frames
+SAME_NM = 5e-4  # the order of sums depends on the processor: 1.5e-4 nm on an Intel Xeon, 2.4e-4 on an AMD EPYC
 ROUNDINGS = 10
 """Allowed difference, in float32 roundings of a step's largest number (up to 500 nm without a saturation limit)."""
 COMMAND_ARRAYS = 2
