@@ -10,8 +10,15 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files import twin_cache
-from lowfc.adapters.files.twin_cache import default_cache_dir, load_or_build, load_or_fit_mirror, operator_hash
+from lowfc.adapters.files.twin_cache import (
+    default_cache_dir,
+    load_or_build,
+    load_or_compute_form,
+    load_or_fit_mirror,
+    operator_hash,
+)
 from lowfc.optics.chain.band import gauss_legendre, monochromatic
+from lowfc.optics.chain.coronagraph import Coronagraph, LyotStop, Wedge
 from lowfc.optics.chain.mirror import Mirror
 from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.twin.twin import Evaluator, TwinSpec
@@ -168,3 +175,25 @@ def test_mirror_is_cached_and_a_damaged_file_is_refitted(stored, sensor, tmp_pat
     for other in (again, rebuilt):
         for part in ("used", "y_factors", "x_factors", "reduce", "expand"):
             np.testing.assert_array_equal(getattr(first, part), getattr(other, part))
+
+
+def test_contrast_forms_are_read_back_unchanged_and_depend_on_every_input(tmp_path, monkeypatch):
+    pupil, opaque = np.ones((16, 16)), np.eye(32)
+    lyot = LyotStop(opaque, pupil)
+    other_mask, other_stop = LyotStop(np.tri(32), pupil), LyotStop(opaque, np.tri(16))
+    optics = Coronagraph(pupil, Wedge(), lyot), (2, 3), 550.0
+    variants = [
+        optics,
+        (replace(optics[0], pupil=np.tri(16)), (2, 3), 550.0),
+        (replace(optics[0], dark_zone=Wedge(outer=8.0)), (2, 3), 550.0),
+        (replace(optics[0], lyot=None), (2, 3), 550.0),
+        *((replace(optics[0], lyot=one), (2, 3), 550.0) for one in (other_mask, other_stop)),
+        (replace(optics[0], lyot=replace(lyot, samples_per=4)), (2, 3), 550.0),
+        (optics[0], (3, 2), 550.0),
+        (optics[0], (2, 3), 551.0),
+    ]
+    forms = [load_or_compute_form(*each, cache_dir=tmp_path) for each in variants]
+    monkeypatch.setattr(twin_cache, "contrast_form", forbidden)
+    for each, form in zip(variants, forms, strict=True):
+        np.testing.assert_array_equal(load_or_compute_form(*each, cache_dir=tmp_path, notice=forbidden), form)
+    assert len({form.tobytes() for form in forms}) == len(variants)

@@ -1,6 +1,6 @@
-"""Cache of digital twins: twin and mirror are built once, then read from files named by a hash of all their inputs.
+"""Cache of optical models: twin, mirror and contrast form are built once, then read from files named by their inputs.
 
-The hash includes the source of the optics, so that files of other versions are never read.
+A name is a hash of all inputs and of the source of the optics, so that files of other versions are never read.
 """
 
 import functools
@@ -18,8 +18,11 @@ from numpy.typing import NDArray
 
 import lowfc.optics
 from lowfc.adapters.files.whole_file import write_whole
+from lowfc.arrays import Array
 from lowfc.contract.errors import DataFileError
+from lowfc.optics.chain.added_contrast import contrast_form
 from lowfc.optics.chain.band import Band, monochromatic
+from lowfc.optics.chain.coronagraph import Coronagraph
 from lowfc.optics.chain.mirror import Mirror
 from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.chain.sensor import Sensor
@@ -33,7 +36,7 @@ _HASHED_AS = 3
 _TWIN_ARRAYS = ("operator_hash", "axis", "used", "area_weights", "to_pixels")
 _OPERATOR_ARRAYS = ("modes", "to_modes", "to_coefficients", "basis")
 
-_Cached = TypeVar("_Cached", Twin, TwinMirror)
+_Cached = TypeVar("_Cached")
 
 _log = logging.getLogger(__name__)
 
@@ -106,6 +109,27 @@ def load_or_fit_mirror(
         lambda content: TwinMirror(**_arrays(content)),
         lambda: twin_mirror(sensor, twin, mirror),
         lambda fitted: _packed({part.name: getattr(fitted, part.name) for part in fields(fitted)}),
+        notice,
+    )
+
+
+def load_or_compute_form(
+    coronagraph: Coronagraph,
+    noll: tuple[int, ...],
+    wavelength_nm: float,
+    cache_dir: Path | None = None,
+    notice: Callable[[str], None] = _log.warning,
+) -> Array:
+    """Load a `contrast_form` (modes, modes), per nm^2, from the cache, or compute and cache it."""
+    arrays, lyot = {"pupil": coronagraph.pupil}, coronagraph.lyot
+    if lyot is not None:
+        arrays |= {"opaque": lyot.opaque, "stop": lyot.stop}
+    numbers = coronagraph.dark_zone, lyot and lyot.samples_per, noll, wavelength_nm
+    return _cached(
+        _file("contrast", _digest(arrays, repr(numbers)), cache_dir),
+        lambda content: _arrays(content)["form"],
+        lambda: contrast_form(coronagraph, noll, wavelength_nm),
+        lambda form: _packed({"form": form}),
         notice,
     )
 

@@ -30,9 +30,11 @@ class ModalContrast:
         form: (modes, modes) quadratic form, see `contrast_form`.
     """
 
-    def __init__(self, coronagraph: Coronagraph, noll: tuple[int, ...], wavelength_nm: float) -> None:
-        """Compute the form and prepare the images."""
-        self.noll, self.form = noll, contrast_form(coronagraph, noll, wavelength_nm)
+    def __init__(
+        self, coronagraph: Coronagraph, noll: tuple[int, ...], wavelength_nm: float, form: Array | None = None
+    ) -> None:
+        """Prepare the images, and compute the form (modes, modes) unless it is given."""
+        self.noll, self.form = noll, contrast_form(coronagraph, noll, wavelength_nm) if form is None else form
         self._zone = coronagraph.dark_zone
         self._camera = ScienceCamera(coronagraph, noll, wavelength_nm, int(np.ceil(self._zone.outer)))
 
