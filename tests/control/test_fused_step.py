@@ -27,7 +27,8 @@ from lowfc.programs.core.start_up import settings_under
 from tests.support import toy
 
 RATE_HZ = 1000.0
-SAME_NM = 5e-4  # the order of sums depends on the processor: 1.5e-4 nm on an Intel Xeon, 2.4e-4 on an AMD EPYC
+SAME_NM = 2e-4  # the order of sums depends on the processor: 1.5e-4 nm with AVX-512, in a million frames
+LIMITED_NM = 5e-4  # the neighbour limit divides by small differences: 2.4e-4 nm in one of these, on an AMD EPYC
 ROUNDINGS = 10
 """Allowed difference, in float32 roundings of a step's largest number (up to 500 nm without a saturation limit)."""
 COMMAND_ARRAYS = 2
@@ -170,9 +171,8 @@ class Bench:
         self.counts["frames"] += 1
         assert (outputs.command is None) is (expected.command is None)
         numbers = list(zip(_numbers(outputs), _numbers(expected), strict=True))
-        allowed_nm = max(
-            SAME_NM, ROUNDINGS * np.spacing(max(np.abs(reference).max(initial=0) for _, reference in numbers))
-        )
+        largest_nm = max(np.abs(reference).max(initial=0) for _, reference in numbers)
+        allowed_nm = max(LIMITED_NM if step.reasons else SAME_NM, ROUNDINGS * np.spacing(largest_nm))
         for index, (fused, reference) in enumerate(numbers):
             assert np.isfinite(fused).all()
             difference_nm = float(np.abs(fused - reference).max(initial=0))
