@@ -36,10 +36,9 @@ def recorded(content: bytes) -> tuple[Configuration, list[str]]:
         if not of_keys:
             remarks += [f"{explain(detail)}; used as recorded" for detail in faults]
             return _constructed(data, {str(detail["loc"][0]) for detail in faults if detail["loc"]}), remarks
-        mended = [f"{explain(detail)}; {_mend(data, detail)}" for detail in of_keys]
-        remarks += mended[:MAX_FAULTS]
-        if len(mended) > MAX_FAULTS:
-            remarks.append(f"and {len(mended) - MAX_FAULTS} more")
+        remarks += [f"{explain(detail)}; {_mend(data, detail)}" for detail in of_keys[:MAX_FAULTS]]
+        if more := [_mend(data, detail) for detail in of_keys[MAX_FAULTS:]]:
+            remarks.append(f"and {len(more)} more")
         if isinstance(interlocks := data.get("interlocks"), list):
             data["interlocks"] = [interlock for interlock in interlocks if interlock is not None]
     return Configuration.model_validate(data), remarks

@@ -16,7 +16,7 @@ from lowfc.control.laws.kalman import lqg_block
 from lowfc.control.laws.linear_law import Block, LinearLaw, integrator, integrator_block, law_from_blocks
 from lowfc.control.laws.margins import sensitivity
 from lowfc.control.laws.pi_notch import Notch, pi_notch
-from lowfc.control.laws.spectra import Spectrum, TimeSeries, floor_nm2_hz, spectrum
+from lowfc.control.laws.spectra import Spectrum, TimeSeries, floor_nm2_hz, mean_periodogram, spectrum
 from lowfc.control.laws.stability import LOWEST_GAIN, MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG, delay_weights, highest_gain
 from lowfc.control.laws.vibration import FEWEST, Model, identify, resolution_hz
 from lowfc.control.laws.what_if import counterfactual, driven_by
@@ -262,10 +262,7 @@ def _whole_spectrum(run: TimeSeries, rate_hz: float) -> Spectrum | None:
     longest = max(run.values, key=len, default=None)
     if longest is None or len(longest) < FEWEST:
         return None
-    from scipy.signal import periodogram
-
-    frequency_hz, power = periodogram(longest, rate_hz, "hann", detrend="constant", axis=0)
-    return Spectrum(frequency_hz, power, 1)
+    return mean_periodogram(longest, rate_hz, len(longest))
 
 
 def _scaled(model: Model, factor: float, finest_hz: float) -> Model:
