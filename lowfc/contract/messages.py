@@ -49,7 +49,7 @@ class Rate(StrEnum):
     EVENT = "on event"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)  # hashed by identity, as it is a key of every message
 class Topic:
     """A topic of the table.
 

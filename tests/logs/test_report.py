@@ -207,6 +207,7 @@ def test_spectra_are_compared_with_theory(eventful: dict[str, Any]) -> None:
     assert tip["frequency_hz"][loudest] == pytest.approx(7, abs=eventful["spectra"]["resolution_hz"])
 
 
+@pytest.mark.usefixtures("without_drawings")
 def test_the_bands_of_a_slow_loop_end_at_half_its_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report_log, "PERIOD_NS", 200_000_000)
     slow = report_of(read_run((SyntheticLog().frames(600).write(tmp_path / "slow.mcap"),)))
@@ -238,6 +239,11 @@ def good_night() -> SyntheticLog:
 @pytest.fixture(scope="module")
 def good(good_night: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return good_night.write(tmp_path_factory.mktemp("good") / "x.mcap")
+
+
+@pytest.fixture(scope="module")
+def good_results(good: Path) -> dict[str, Any]:
+    return results_of(good)
 
 
 def damaged(good: Path, folder: Path) -> Path:
@@ -297,12 +303,9 @@ def test_the_noise_is_that_of_the_reconstructor_in_use(tmp_path: Path) -> None:
     assert np.array_equal(closed_loop.noise_of(run.history, slice(None)).total_nm, after.total_nm)
 
 
-def test_a_limit_of_mirror_and_controller_has_the_larger_count(good: Path) -> None:
-    results = results_of(good)
-    results["mirror"] |= {
-        "limits_at_mirror": {"stroke": 50, "slew": 2},
-        "limits_at_controller": {"stroke": 1, "slew": 3},
-    }
+def test_a_limit_of_mirror_and_controller_has_the_larger_count(good_results: dict[str, Any]) -> None:
+    limits = {"limits_at_mirror": {"stroke": 50, "slew": 2}, "limits_at_controller": {"stroke": 1, "slew": 3}}
+    results = good_results | {"mirror": good_results["mirror"] | limits}
     assert check_of({"verdict": verdict(results)}, "mirror")["text"] == "limits acted: stroke 50, slew 3"
 
 
@@ -352,13 +355,12 @@ def test_imperfections_of_the_simulated_world_are_named(tmp_path: Path) -> None:
     ],
 )
 def test_the_silence_of_a_camera_that_stopped_for_good_is_no_warning(
-    events: str, level: str, good_night: SyntheticLog, tmp_path: Path
+    events: str, level: str, good_results: dict[str, Any]
 ) -> None:
-    results = results_of(good_night.write(tmp_path / "x.mcap"))
     named = [event.split() for event in events.split(", ")]
     levels = {"NO_FRAMES": "warning"}
-    results["events"] = [{"process": who, "name": what, "level": levels.get(what, "info")} for who, what in named]
-    assert check_of({"verdict": verdict(results)}, "events")["level"] == level
+    events_named = [{"process": who, "name": what, "level": levels.get(what, "info")} for who, what in named]
+    assert check_of({"verdict": verdict(good_results | {"events": events_named})}, "events")["level"] == level
 
 
 def test_a_loop_in_safe_mode_is_not_a_good_run(tmp_path: Path) -> None:
@@ -452,6 +454,7 @@ def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
     assert results["closed_stretch"]["frames"] + results["closed_stretch"]["steps_settling"] == 250
 
 
+@pytest.mark.usefixtures("without_drawings")
 def test_the_page_has_the_rounded_gain_of_each_mode_or_one_for_all(tmp_path: Path) -> None:
     night = SyntheticLog(gain=(1 / 0.9, 1 / 57.6)).frames(50).request("gain", (0.2,)).frames(50)
     text = page(report_of(read_run(night.write(tmp_path / "x.mcap"))))
@@ -476,6 +479,7 @@ def test_a_frame_ahead_or_an_earlier_camera_start_after_clear_shifts_no_law_and_
     assert (results["run"]["steps_s"], results["light"]["refused"]) == (pytest.approx(0.119), {"ahead": 1})
 
 
+@pytest.mark.usefixtures("without_drawings")
 def test_frames_refused_as_out_of_order_or_saturated_shift_no_times_and_do_not_count_as_used() -> None:
     run = read_run((GOLDEN,))  # the log has one of each; the frame out of order has the time 0
     report = report_of(run)

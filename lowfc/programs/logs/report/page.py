@@ -1,6 +1,7 @@
 """The report's self-contained HTML page, made from results and drawings."""
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from importlib.resources import files
 from typing import Any
 
@@ -19,11 +20,9 @@ NOT_HERE = "not in this log"
 
 def page(report: Report, progress: Callable[[str], None] = lambda name: None) -> str:
     """HTML that needs no other file and no network."""
-    environment = _environment()
-    template = environment.from_string((files("lowfc") / "data" / "report.html").read_text(encoding="utf-8"))
     configuration = report.results["run"]["configuration"]
     added = report.results["residual"]["added_contrast"]
-    text: str = template.render(
+    text: str = _template().render(
         **report.results,
         contrast_in_words=added_contrast_in_words(added) if added is not None else "",
         drawings=drawings(report, progress),
@@ -34,7 +33,8 @@ def page(report: Report, progress: Callable[[str], None] = lambda name: None) ->
 
 def require_page() -> None:
     """Raise an error if the page cannot be made for lack of a package; called before the log is read."""
-    _environment()
+    with package_required("the HTML page, unlike --json, requires jinja2", "plots"):
+        import jinja2  # noqa: F401
     figure_class()
 
 
@@ -62,10 +62,11 @@ def per_mode(values: Sequence[float]) -> str:
     return f"{shown[0]} for all" if len(set(shown)) == 1 else ", ".join(shown)
 
 
-def _environment() -> Any:
-    with package_required("the HTML page, unlike --json, requires jinja2", "plots"):
-        from jinja2 import Environment, StrictUndefined
+@cache
+def _template() -> Any:
+    from jinja2 import Environment, StrictUndefined
+
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.finalize = lambda value: printable(value, keep=LINES) if type(value) is str else value  # keeps Markup
     environment.filters |= {"n": number, "fixed": fixed, "per_mode": per_mode}
-    return environment
+    return environment.from_string((files("lowfc") / "data" / "report.html").read_text(encoding="utf-8"))
