@@ -8,11 +8,12 @@ The command follows from the sampled loop; the residual has a floor, `1 - |h|^2`
 Frequencies are in rad per frame and may exceed pi, where the sampled loop sees the alias.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from lowfc.arrays import Array, Complex
+from lowfc.arrays import Array, Complex, Integers
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import sensitivity
 from lowfc.control.laws.stability import delay_weights
@@ -135,18 +136,25 @@ def means_while_applied(measured_nm: Array, timing: Timing) -> tuple[Array, Arra
         (frames, modes), NaN where there are too few neighbours; and the filter's response (frequencies,) at
         `_FILTER_OMEGA`, for the noise.
     """
-    response = _mean_while_applied(_FILTER_OMEGA, timing) / mean_over(_FILTER_OMEGA, timing.exposure)
-    full = np.fft.irfft(response, _FILTER_POINTS)
-    centre = round(timing.applied + (timing.held - timing.exposure) / 2)
-    lags = np.arange(-_FILTER_REACH, _FILTER_REACH + 1) + centre  # in frames ahead
-    taps = full[-lags % _FILTER_POINTS] * np.hanning(lags.size + 2)[1:-1]
-    taps /= taps.sum()
+    lags, taps, response = _filter(timing)
     means_nm = np.full(measured_nm.shape, np.nan)
     rows = np.arange(max(0, -lags[0]), len(measured_nm) - max(0, lags[-1]))
     if rows.size:
         for mean_nm, mode_nm in zip(means_nm.T, measured_nm.T, strict=True):
             mean_nm[rows] = np.correlate(mode_nm, taps, "valid")
-    return means_nm, np.asarray(np.exp(1j * np.outer(_FILTER_OMEGA, lags)) @ taps)
+    return means_nm, response
+
+
+@lru_cache(maxsize=32)
+def _filter(timing: Timing) -> tuple[Integers, Array, Complex]:
+    """Filter of `means_while_applied`: its lags in frames ahead, its taps and its response."""
+    response = _mean_while_applied(_FILTER_OMEGA, timing) / mean_over(_FILTER_OMEGA, timing.exposure)
+    full = np.fft.irfft(response, _FILTER_POINTS)
+    centre = round(timing.applied + (timing.held - timing.exposure) / 2)
+    lags = np.arange(-_FILTER_REACH, _FILTER_REACH + 1) + centre
+    taps = full[-lags % _FILTER_POINTS] * np.hanning(lags.size + 2)[1:-1]
+    taps /= taps.sum()
+    return lags, taps, np.asarray(np.exp(1j * np.outer(_FILTER_OMEGA, lags)) @ taps)
 
 
 def held_residual_nm2(
