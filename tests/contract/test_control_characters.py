@@ -69,16 +69,17 @@ def test_configuration_errors_are_escaped() -> None:
     check(str(caught.value))
 
 
-@pytest.fixture
-def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log whose recorder did not escape anything."""
-    monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"host": HOSTILE, "numpy": HOSTILE}})
     night = SyntheticLog().frames(200)
     night.put(EVENT, Log(level=3, name=HOSTILE, message=HOSTILE))  # type: ignore[arg-type]
     night.put(EVENT, Log(level=2, name="controller", message=f"MODE_CHANGED loop open -> closed: {HOSTILE}"))  # type: ignore[arg-type]
     night.put(REQUEST, wire.Request(name=HOSTILE, accepted=True, reply=HOSTILE))
     night.frames(50)
-    return night.write(tmp_path / "night.mcap")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"host": HOSTILE, "numpy": HOSTILE}})
+        return night.write(tmp_path_factory.mktemp("night") / "night.mcap")
 
 
 @pytest.mark.usefixtures("without_drawings")

@@ -235,7 +235,7 @@ def test_a_truncated_log_without_truth_and_with_an_accent_in_its_name_is_exporte
 
 
 def test_damage_is_reported_with_its_place_and_reason(tmp_path: Path) -> None:
-    log = SyntheticLog().frames(1500).write(tmp_path / "night.mcap")
+    log = SyntheticLog().frames(800).write(tmp_path / "night.mcap")
     flipped(log, log.stat().st_size // 3)
     results = export_log(log, Format.NPZ, tmp_path / "out.npz", console=QUIET)
     reader = LogReader(log, skip_damaged=True)

@@ -305,7 +305,7 @@ def test_every_view_of_the_layout_has_data_and_the_plots_span_the_whole_log(tmp_
 def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_the_lost_time(
     tmp_path: Path, shown: Shown
 ) -> None:
-    log = SyntheticLog().frames(1500).write(tmp_path / "night.mcap")
+    log = SyntheticLog().frames(800).write(tmp_path / "night.mcap")
     _, (begin, end), *_ = chunks_of(log)
     flipped(log, (begin + end) // 2)
     [remark] = drawn(log)[0].remarks
