@@ -103,6 +103,7 @@ def test_logs_that_do_not_name_their_recording_are_separate(folder: Path) -> Non
 
 
 def test_the_files_of_a_log_are_read_as_one(folder: Path, samples: list[Sample]) -> None:
+    samples = samples[: len(samples) // 4]
     files = recorded(folder, samples, 4)
     assert sum(len(list(LogReader(path))) for path in files) > len(samples)
     assert next(iter(LogReader(files[3]))).key in (CALIBRATION.key, CONTROLLER_STATE.key, "lowfc/camera/state")
@@ -114,7 +115,7 @@ def test_the_files_of_a_log_are_read_as_one(folder: Path, samples: list[Sample])
     assert log.metadata["recording"]["messages"] == str(len(samples))
     os.truncate(files[3], files[3].stat().st_size - 50)
     log = WholeLog(files, topics=[FRAME])
-    assert len(list(log)) == FRAMES
+    assert len(list(log)) == sum(FRAME.matches(one.key) for one in samples)
     assert not log.complete
 
 

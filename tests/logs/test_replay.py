@@ -60,7 +60,7 @@ from tests.support.toy import NOLL, calibration, frame, settings
 
 START_S = 1_767_225_600
 STATE_EVERY = 12
-STEPS = 1000
+STEPS = 600
 EXAMPLES = 40
 SHAPE = np.full(20, 3, np.float32)
 """Shape of a command channel, nm of surface."""
@@ -512,7 +512,7 @@ def test_a_finished_log_with_a_damaged_summary_is_not_called_cut_off(log: Path, 
 
 def test_a_forged_command_and_another_host_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     night = report_log.SyntheticLog().frames(STEPS)
-    night.change(COMMAND, 700, lambda command: raise_actuator(command, 13))
+    night.change(COMMAND, 400, lambda command: raise_actuator(command, 13))
     features = provenance()["cpu_features"] + " abacus"
     monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"numpy": "1.0", "cpu_features": features}})
     forged = night.write(tmp_path / "forged.mcap")
@@ -520,7 +520,7 @@ def test_a_forged_command_and_another_host_are_reported(tmp_path: Path, monkeypa
     assert done.exit_code == 1
     for words in (
         f"{STEPS} frames, 1 message differs",
-        "first difference   MirrorCommand of frame 700 ",
+        "first difference   MirrorCommand of frame 400 ",
         "actuators: [13] log",
         "numpy              1.0 in the log",
         "cpu_features       abacus in the log, none here",

@@ -671,14 +671,15 @@ def test_the_timeline_has_requests_of_the_whole_run(tmp_path: Path, monkeypatch:
 
 @pytest.mark.parametrize("module", ["jinja2", "matplotlib.figure"])
 def test_missing_packages_are_reported_before_the_log_is_read(
-    good: Path, monkeypatch: pytest.MonkeyPatch, module: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str
 ) -> None:
+    log = uneventful(SyntheticLog(), 3).write(tmp_path / "x.mcap")
     monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.setattr("lowfc.programs.logs.report.source.read_run", lambda *_: pytest.fail("the log was read"))
-    assert re.search(r"-m pip install .*'jinja2", refusal("report", good, kind=ConfigurationError))
+    assert re.search(r"-m pip install .*'jinja2", refusal("report", log, kind=ConfigurationError))
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, module, None)
-    assert json_of("report", good)["log"]["file"] == "x.mcap", "--json needs neither package"
+    assert json_of("report", log)["log"]["file"] == "x.mcap", "--json needs neither package"
 
 
 @pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part", "link.html", "other.fits"])

@@ -381,18 +381,18 @@ def test_a_log_of_a_simulated_run_is_drawn_without_a_runtime_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "missing"))
-    done, _ = drawn(SyntheticLog().frames(120).write(tmp_path / "night.mcap"), config=Configuration(lockstep=True))
+    done, _ = drawn(SyntheticLog().frames(30).write(tmp_path / "night.mcap"), config=Configuration(lockstep=True))
     assert done.snapshots > 0
 
 
 def test_logs_of_two_runs_are_not_drawn_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    logs = [SyntheticLog().frames(120).write(tmp_path / f"{name}.mcap") for name in "ab"]
+    logs = [SyntheticLog().frames(30).write(tmp_path / f"{name}.mcap") for name in "ab"]
     assert drawn(*logs)[0].snapshots > 0
-    repetition = SyntheticLog().frames(120)
+    repetition = SyntheticLog().frames(30)
     repetition.samples = [one._replace(publish_time_ns=one.publish_time_ns + 10**9) for one in repetition.samples]
     others = [repetition.write(tmp_path / "c.mcap")]
     monkeypatch.setitem(report_log.METADATA["lowfc"], "run", "another")
-    others.append(SyntheticLog().frames(120).write(tmp_path / "d.mcap"))
+    others.append(SyntheticLog().frames(30).write(tmp_path / "d.mcap"))
     for other in others:
         with pytest.raises(DataFileError, match="one run at a time"):
             drawn(logs[0], other)
