@@ -357,10 +357,9 @@ def test_imperfections_of_the_simulated_world_are_named(tmp_path: Path) -> None:
 def test_the_silence_of_a_camera_that_stopped_for_good_is_no_warning(
     events: str, level: str, good_results: dict[str, Any]
 ) -> None:
-    named = [event.split() for event in events.split(", ")]
-    levels = {"NO_FRAMES": "warning"}
-    events_named = [{"process": who, "name": what, "level": levels.get(what, "info")} for who, what in named]
-    assert check_of({"verdict": verdict(good_results | {"events": events_named})}, "events")["level"] == level
+    named = [(*event.split(), "warning" if "NO_FRAMES" in event else "info") for event in events.split(", ")]
+    results = good_results | {"events": [dict(zip(("process", "name", "level"), one, strict=True)) for one in named]}
+    assert check_of({"verdict": verdict(results)}, "events")["level"] == level
 
 
 def test_a_loop_in_safe_mode_is_not_a_good_run(tmp_path: Path) -> None:
@@ -458,12 +457,8 @@ def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
 def test_the_page_has_the_rounded_gain_of_each_mode_or_one_for_all(tmp_path: Path) -> None:
     night = SyntheticLog(gain=(1 / 0.9, 1 / 57.6)).frames(50).request("gain", (0.2,)).frames(50)
     text = page(report_of(read_run(night.write(tmp_path / "x.mcap"))))
-    assert re.findall(r'<td class="text">([\d., ]+(?: for all)?)</td>', text)[:4] == [
-        "1.111, 1.111, 0.01736",
-        "0 for all",
-        "0.2 for all",
-        "0 for all",
-    ]
+    shown = re.findall(r'<td class="text">([\d., ]+(?: for all)?)</td>', text)[:4]
+    assert shown == ["1.111, 1.111, 0.01736", "0 for all", "0.2 for all", "0 for all"]
 
 
 def test_a_frame_ahead_or_an_earlier_camera_start_after_clear_shifts_no_law_and_no_request(tmp_path: Path) -> None:
@@ -553,10 +548,8 @@ def test_theory_is_that_of_the_linear_law_in_use(tmp_path: Path, logged: bool) -
     night.law(0.05, logged=logged)
     night.frames(2000 if logged else 500)
     report = report_of(read_run(night.write(tmp_path / "x.mcap")))
-    assert [(one["law"], one["from_s"]) for one in report.results["laws"]] == [
-        ("integrator", 0.0),
-        ("pi", pytest.approx(0.3)),
-    ]
+    laws = [(one["law"], one["from_s"]) for one in report.results["laws"]]
+    assert laws == [("integrator", 0.0), ("pi", pytest.approx(0.3))]
     stretch = report.results["closed_stretch"]
     assert stretch["law"] == ("pi" if logged else "integrator")
     assert stretch["to_s"] == pytest.approx(2.299 if logged else 0.299)

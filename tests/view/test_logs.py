@@ -344,16 +344,14 @@ def test_a_frame_of_a_camera_whose_clock_is_ahead_does_not_move_the_time_line(tm
 
 def test_the_largest_stroke_of_a_log_is_taken_over_all_mirror_states(tmp_path: Path, shown: Shown) -> None:
     night = SyntheticLog().frames(120)
-    actuators = np.full(GRID, -350, "<f4").tobytes()
-    night.change(MIRROR_STATE, 101, lambda state: setattr(state, "actuators", actuators))
+    night.change(MIRROR_STATE, 101, lambda state: setattr(state, "actuators", np.full(GRID, -350, "<f4").tobytes()))
     drawn(night.write(tmp_path / "night.mcap"))
     assert tile(shown[-1], "MIRROR").value == "50 %"
 
 
 def test_a_log_that_used_nearly_all_the_stroke_needs_attention_as_in_its_report(tmp_path: Path, shown: Shown) -> None:
     night = SyntheticLog().frames(120)
-    actuators = np.full(GRID, -650, "<f4").tobytes()
-    night.change(MIRROR_STATE, 101, lambda state: setattr(state, "actuators", actuators))
+    night.change(MIRROR_STATE, 101, lambda state: setattr(state, "actuators", np.full(GRID, -650, "<f4").tobytes()))
     log = night.write(tmp_path / "night.mcap")
     drawn(log)
     mirror = tile(shown[-1], "MIRROR")

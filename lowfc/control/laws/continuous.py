@@ -125,7 +125,7 @@ def _commanded(S: Complex, omega: Array, delay: float) -> Complex:
     return np.asarray((S - 1) / seen[:, None])
 
 
-def means_while_applied(measured_nm: Array, timing: Timing) -> tuple[Array, Array]:
+def means_while_applied(measured_nm: Array, timing: Timing) -> tuple[Array, Complex]:
     """Mean of each mode over the period in which a command is in force, from the measurements before and after.
 
     Args:

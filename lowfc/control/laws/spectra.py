@@ -108,10 +108,7 @@ def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSe
 
 
 def spectrum(run: TimeSeries, rate_hz: float) -> Spectrum | None:
-    """Welch's estimate over all pieces of at least a segment; None if there are none.
-
-    The length of a segment, a power of two, follows from the longest piece.
-    """
+    """Welch's estimate over all pieces of at least a segment, its length set by the longest; None if there are none."""
     if run.longest < SHORTEST:
         return None
     frames = min(LONGEST, max(SHORTEST, 1 << ((run.longest // _SEGMENT_SHARE).bit_length() - 1)))
@@ -131,7 +128,7 @@ def mean_periodogram(values: Array, rate_hz: float, frames: int) -> Spectrum:
     waves = np.fft.rfft((segments - segments.mean(axis=2, keepdims=True)) * window)
     power = np.mean(np.abs(waves) ** 2, axis=0).T / (rate_hz * np.sum(window**2))
     power[1 : (frames + 1) // 2] *= 2
-    return Spectrum(np.fft.rfftfreq(frames, 1 / rate_hz), power, len(segments))
+    return Spectrum(np.asarray(np.fft.rfftfreq(frames, 1 / rate_hz), np.float64), power, len(segments))
 
 
 def floor_nm2_hz(found: Spectrum) -> Array:
