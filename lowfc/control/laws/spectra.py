@@ -118,13 +118,13 @@ def spectrum(run: TimeSeries, rate_hz: float) -> Spectrum | None:
     return Spectrum(found[0].frequency_hz, np.asarray(total / segments), segments)
 
 
-def mean_periodogram(values: Array, rate_hz: float, frames: int) -> Spectrum:
-    """Mean of the periodograms of a piece's segments of this number of frames, of which each overlaps the next by half.
+def mean_periodogram(values_nm: Array, rate_hz: float, frames: int) -> Spectrum:
+    """Mean periodogram of a piece, nm (frames, columns), in segments of `frames` which overlap by half.
 
     Each segment's mean is subtracted, and Hann's window applied. scipy.signal is not used: its import takes a second.
     """
     window = np.hanning(frames + 1)[:-1]
-    segments = np.lib.stride_tricks.sliding_window_view(values, frames, axis=0)[:: frames // 2]
+    segments = np.lib.stride_tricks.sliding_window_view(values_nm, frames, axis=0)[:: frames // 2]
     waves = np.fft.rfft((segments - segments.mean(axis=2, keepdims=True)) * window)
     power = np.mean(np.abs(waves) ** 2, axis=0).T / (rate_hz * np.sum(window**2))
     power[1 : (frames + 1) // 2] *= 2
