@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.ndimage import map_coordinates, spline_filter
+from scipy.ndimage import affine_transform, spline_filter
 from scipy.optimize import least_squares
 
 from lowfc.arrays import Array, Complex, Mask
@@ -95,20 +95,22 @@ def align(real: Array, computed: Array, good: Mask | None = None) -> Alignment:
         ValueError: the image has no light, or does not resemble the computed one.
     """
     real, used = np.asarray(real, np.float64), np.ones(real.shape, np.bool_) if good is None else good
-    spline = spline_filter(np.asarray(computed, np.float64))
+    computed = np.asarray(computed, np.float64)
+    spline = spline_filter(computed)
     background = float(np.median(np.concatenate([real[0], real[-1], real[:, 0], real[:, -1]])))
     light = np.where(used, real - background, 0.0)
     if not light.sum() > 0:
         raise ValueError("the reference image has no light above its edge")
-    # Scale 1 is tried as well: a detector region may cut off the image's wings, and so reduce its size.
-    scales = {_size(light) / _size(np.asarray(computed, np.float64)), 1.0}
+    # Scale 1 is tried as well: a detector region may cut off the image's wings, and so reduce its size. Rounding avoids
+    # that two almost equal scales are tried.
+    scales = {round(_size(light) / _size(computed), 2), 1.0}
     spectrum = np.fft.rfft2(light, _doubled(light.shape))
     fits = []
     for parity in (1, -1):
         guesses = []
         for scale, angle in product(scales, np.arange(_ANGLES) * 180.0 / _ANGLES):
-            guess = _placed(spline, Geometry(scale, 0.0, 0.0, float(angle), parity), light.shape, spectrum)
-            guesses.append((_residual(_sample(spline, guess, real.shape)[used], real[used])[0], guess))
+            placed, guess = _placed(computed, Geometry(scale, 0.0, 0.0, float(angle), parity), real.shape, spectrum)
+            guesses.append((_residual(placed[used], real[used])[0], guess))
         guesses.sort(key=lambda each: each[0])
         fits.append(min((_refine(spline, guess, real, used) for _, guess in guesses[:3]), key=lambda each: each[0]))
     fits.sort(key=lambda each: each[0])
@@ -141,33 +143,29 @@ def _doubled(shape: tuple[int, ...]) -> tuple[int, int]:
     return 2 * shape[0], 2 * shape[1]
 
 
-def _placed(spline: Array, geometry: Geometry, shape: tuple[int, ...], spectrum: Complex) -> Geometry:
-    """The geometry with the centre at which the model best matches an image, to within a pixel.
+def _placed(computed: Array, geometry: Geometry, shape: tuple[int, ...], spectrum: Complex) -> tuple[Array, Geometry]:
+    """The model, interpolated linearly, at the pixel where it best matches an image, and the geometry there.
 
     Args:
-        spline: Spline of the computed image.
+        computed: The computed image.
         geometry: Scale, rotation and parity.
         shape: Rows and columns of the image.
         spectrum: Fourier transform of the image, padded to twice its rows and columns.
     """
     rows, columns = shape
-    middle = replace(geometry, row=rows // 2, column=columns // 2)
-    model = _sample(spline, middle, _doubled(shape))
-    correlation = np.fft.irfft2(spectrum * np.fft.rfft2(model).conj(), model.shape)
-    row, column = np.unravel_index(int(correlation.argmax()), model.shape)
-    down, across = (int(row) + rows) % (2 * rows) - rows, (int(column) + columns) % (2 * columns) - columns
-    return replace(middle, row=float(middle.row + down), column=float(middle.column + across))
+    model = _sample(computed, replace(geometry, row=rows, column=columns), _doubled(shape), order=1)
+    correlation = np.fft.irfft2(spectrum * np.fft.rfft2(model).conj(), model.shape)[rows:, columns:]
+    row, column = map(int, np.unravel_index(correlation.argmax(), correlation.shape))
+    placed = model[rows - row : 2 * rows - row, columns - column : 2 * columns - column]
+    return placed, replace(geometry, row=float(row), column=float(column))
 
 
-def _sample(spline: Array, geometry: Geometry, shape: tuple[int, ...]) -> Array:
-    angle = np.deg2rad(geometry.rotation_deg)
-    down = (np.arange(shape[0])[:, None] - geometry.row) / geometry.scale
-    across = (np.arange(shape[1]) - geometry.column) / geometry.scale
-    x = geometry.parity * (np.cos(angle) * across + np.sin(angle) * down)
-    y = np.cos(angle) * down - np.sin(angle) * across
-    at = np.array([y + (spline.shape[0] - 1) / 2, x + (spline.shape[1] - 1) / 2])
-    sampled = map_coordinates(spline, at, order=3, mode="constant", cval=0.0, prefilter=False)
-    return np.asarray(sampled / geometry.scale**2)
+def _sample(spline: Array, geometry: Geometry, shape: tuple[int, ...], order: int = 3) -> Array:
+    angle, parity = np.deg2rad(geometry.rotation_deg), geometry.parity
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [parity * np.sin(angle), parity * np.cos(angle)]])
+    turn /= geometry.scale
+    offset = (np.array(spline.shape) - 1) / 2 - turn @ [geometry.row, geometry.column]
+    return np.asarray(affine_transform(spline, turn, offset, shape, order=order, prefilter=False)) / geometry.scale**2
 
 
 def _residual(model: Array, real: Array) -> tuple[float, float, float]:
@@ -187,12 +185,14 @@ def _refine(spline: Array, guess: Geometry, real: Array, used: Mask) -> tuple[fl
         return Geometry(scale * guess.scale, row, column, rotation_deg, guess.parity)
 
     def residuals(values: Array) -> Array:
-        model, image = _sample(spline, geometry(values), real.shape)[used], real[used]
+        model = _sample(spline, geometry(values), real.shape)[used]
         _, flux, background = _residual(model, image)
-        return np.asarray((image - flux * model - background) / image.std())
+        return np.asarray((image - flux * model - background) / image_std)
 
+    image = real[used]
+    image_std = image.std()
     start = np.array([1.0, guess.row, guess.column, guess.rotation_deg])
-    fit = least_squares(residuals, start, x_scale=np.array([0.01, 0.3, 0.3, 1.0]), diff_step=[1e-5])
+    fit = least_squares(residuals, start, ftol=1e-5, x_scale=np.array([0.01, 0.3, 0.3, 1.0]), diff_step=[1e-5])
     best = geometry(fit.x)
     return float(np.sqrt(np.mean(fit.fun**2))), best
 
