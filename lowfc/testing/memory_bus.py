@@ -3,6 +3,7 @@
 import contextlib
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -56,11 +57,11 @@ class MemoryPublisher:
 
 
 class MemoryRing:
-    """See `Ring`; but `receive_time_ns` is the time of the put."""
+    """See `Ring`; but `receive_time_ns` is the time of the put. It is closed when nobody refers to it any more."""
 
     def __init__(self, bus: "MemoryBus", topic: Topic, capacity: int) -> None:
         self.waiting: deque[Sample] = deque(maxlen=capacity)
-        self._leave = bus.subscribe(topic, self.waiting.append)
+        self._leave = weakref.finalize(self, bus.subscribe(topic, self.waiting.append))
 
     def drain(self) -> list[Sample]:
         """See `Ring.drain`."""
@@ -68,8 +69,7 @@ class MemoryRing:
 
     def close(self) -> None:
         """See `Ring.close`."""
-        with contextlib.suppress(ValueError):
-            self._leave()
+        self._leave()
 
 
 class MemoryBus:

@@ -37,7 +37,7 @@ from lowfc.programs.commissioning.calibrate.result import comparison
 from lowfc.programs.commissioning.calibrate.run import Calibrator
 from lowfc.programs.commissioning.calibrate.tasks import zero_point
 from tests.support import toy
-from tests.support.in_process_loop import BRIGHT, SMALL_MIRROR, InProcessLoop
+from tests.support.in_process_loop import BRIGHT, SMALL_MIRROR, InProcessLoop, computed
 from tests.support.loops import json_of, lowfc, refusal
 
 CONFIG = BRIGHT | {"sensor.modes": 3}
@@ -320,21 +320,23 @@ def test_the_computed_calibration_is_resampled_to_a_scaled_and_rotated_sensor(lo
 
 
 def test_a_poke_resolves_the_rotation_by_180_degrees(noiseless_loop: InProcessLoop) -> None:
-    result = json_of("calibrate", "align", "--out", "aligned.fits", "--frames", "200")
+    result = json_of("calibrate", "align", "--out", "aligned.fits", "--frames", "16")
     assert (result["pixels_per_lambda_d"], result["parity"]) == (pytest.approx(4, rel=0.003), 1)
     calibration = calibration_file.load(Path("aligned.fits"))
     assert np.abs(cross_talk(calibration.reconstructor, noiseless_loop.calibration().response)).max() < 0.05
 
 
-def test_no_calibration_is_aligned_to_a_turned_mirror(loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_calibration_is_aligned_to_a_turned_mirror(
+    noiseless_loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A poke of tip makes tilt, so its image does not correlate with the computed one and cannot show the sign."""
-    play = loop.play
+    loop, play = noiseless_loop, noiseless_loop.play
 
     def turned(basis_nm: Any, table: Any) -> Any:
         return play(np.rot90(basis_nm.reshape(-1, 12, 12), axes=(1, 2)).reshape(basis_nm.shape), table)
 
     monkeypatch.setattr(loop, "play", turned)
-    error = refusal("calibrate", "align", "--out", "aligned.fits", "--frames", "200", kind=CalibrationError)
+    error = refusal("calibrate", "align", "--out", "aligned.fits", "--frames", "16", kind=CalibrationError)
     assert "their correlation is 0.0" in error
     assert not Path("aligned.fits").exists()
 
@@ -346,12 +348,12 @@ def test_pokes_resolve_a_reflection_or_rotation_that_does_not_change_the_image(
 ) -> None:
     """Without a mask, the image of a circular pupil is circular, that of the other pupil symmetric about both axes."""
     config = load(None, SMALL_MIRROR | {"sensor.kind": "clowfs", "sensor.modes": 3} | pupil)
-    computed = analytic(config, SILENT)
-    image = computed.reference.astype(float).reshape(80, 80)
+    first = computed(config.to_toml())
+    image = first.reference.astype(float).reshape(80, 80)
     alignment = align(onto(image, geometry, (80, 80)), image)
-    H = onto(computed.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
+    H = onto(first.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
     alignment = replace(alignment, residual=0.1, other_parity=0.2)  # the better parity may be the wrong one
-    found, calibration, correlation = oriented(config, computed, alignment, computed, lambda mode: H[:, mode])
+    found, calibration, correlation = oriented(config, first, alignment, first, lambda mode: H[:, mode])
     assert (found.geometry.rotation_deg, found.geometry.parity) == (pytest.approx(-168, abs=0.1), geometry.parity)
     assert found.residual == (0.1 if alignment.geometry.parity == geometry.parity else 0.2)
     assert correlation > 0.99
@@ -423,7 +425,10 @@ def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop)
         ("dark --file cube.fits --frames 50", "--frames has no effect with --file"),
     ],
 )
-def test_an_option_without_effect_is_refused(loop: InProcessLoop, words: str, why: str) -> None:
+def test_an_option_without_effect_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, why: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
     before = {path.name for path in Path().iterdir()}
     assert re.search(why, refusal("calibrate", *words.split(), kind=ConfigurationError))
     assert {path.name for path in Path().iterdir()} == before
