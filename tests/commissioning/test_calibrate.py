@@ -38,6 +38,7 @@ NOISELESS = FEW | {"camera.noise": False}
 def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pokes, "DELAY_FRAMES", 240)
+    monkeypatch.setattr(pokes, "HOLD", 2)
 
 
 Action = Callable[[Any], object]
@@ -78,8 +79,11 @@ def calibrated(loop: InProcessLoop, method: str) -> tuple[Calibration, Calibrati
         pytest.param("in-loop", 2.0, 6, False, marks=pytest.mark.slow),
     ],
 )
-def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, modes: int, lost: bool) -> None:
+def test_a_measured_calibration_reads_the_true_modes(
+    monkeypatch: pytest.MonkeyPatch, method: str, delay: float, modes: int, lost: bool
+) -> None:
     """Lost frames do not bias the calibration."""
+    monkeypatch.setattr(pokes, "HOLD", 4)
     config = configured(camera__delay_frames=delay, sensor__modes=modes)
     loop = InProcessLoop(config, lose=lambda index: lost and index > 300 and index % 41 == 0)
     if method == "in-loop":
@@ -187,7 +191,7 @@ def test_errors_name_why_a_calibration_is_impossible(monkeypatch: pytest.MonkeyP
         calibrator_of(loop, "hadamard", amplitude_nm=5.0)
     with pytest.raises(CalibrationError, match="slew limit; at most"):
         calibrator_of(loop, "poke", amplitude_nm=500.0)
-    lossy = InProcessLoop(configured(**FEW), lose=lambda index: index % 50 == 49)
+    lossy = InProcessLoop(configured(**NOISELESS), lose=lambda index: index % 50 == 49)
     with pytest.raises(CalibrationError, match="in 2 attempts there were no 240 consecutive frames"):
         measure(lossy, "hadamard")
 

@@ -60,8 +60,9 @@ def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
 
 @pytest.fixture
 def noiseless_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
-    """Like `loop`, but without noise, so that a frame takes half the time, and with a slew limit that shrinks pokes."""
+    """Like `loop`, but without noise, so that shorter pokes suffice, and with a slew limit that shrinks pokes."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(pokes, "HOLD", 2)
     config = load(None, CONFIG | {"control.max_identical_frames": 0, "safety.slew_nm": 5.0})
     return connected(InProcessLoop(config, world=load(None, STATIC | {"camera.noise": False})), monkeypatch)
 
@@ -97,7 +98,7 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
     done = lowfc("calibrate", *words)
     assert done.exit_code == 130
     assert done.stderr.splitlines()[-1].startswith("kept in night.fits.part.npz: 4 cycles; the same command")
-    assert "4 cycles of 226 frames and 3 check cycles; about" in done.stderr
+    assert "4 cycles of 146 frames and 3 check cycles; about" in done.stderr
     assert not Path("night.fits").exists()
     assert loop.calibration().id == before.id
     monkeypatch.setattr(Calibrator, "check", check)

@@ -89,7 +89,7 @@ class Bench:
 @pytest.fixture(scope="module", autouse=True)
 def _few_frames() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commissioning, "MIN_RESIDUAL_FRAMES", 300)
+        patch.setattr(commissioning, "MIN_RESIDUAL_FRAMES", 200)
         patch.setattr(pokes, "DELAY_FRAMES", 240)
         yield
 
