@@ -28,6 +28,7 @@ from lowfc.contract.configuration import Configuration, Realtime, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.commissioning.checks import Check, note, ok
 from lowfc.programs.commissioning.doctor import command, permissions, resources, timing
+from lowfc.programs.commissioning.doctor import facts as facts_module
 from lowfc.programs.commissioning.doctor.facts import Facts, gather
 from lowfc.programs.core.recording.volume import bytes_per_s
 from tests.support.loops import LOWFC, lowfc, refusal, until
@@ -125,12 +126,6 @@ def facts(root: Path, changes: dict[str, object] | None = None, **others: object
 
 def examine(facts: Facts) -> dict[str, Check]:
     return {check.name: check for check in command.examine(facts)}
-
-
-@pytest.fixture
-def briefly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorten the wake-up measurement."""
-    monkeypatch.setattr(command, "TRIAL_S", 0.02)
 
 
 def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
@@ -353,7 +348,8 @@ def test_busy_finds_a_process_that_uses_the_cpu() -> None:
     assert not any(name.endswith(here) for name, _ in host.busy())
 
 
-def test_doctor_checks_this_host(briefly: None) -> None:
+def test_doctor_checks_this_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "TRIAL_S", 0.02)
     done = lowfc("doctor", "--json")
     assert done.exit_code == 0, done.output
     (line,) = done.stdout.splitlines()
@@ -367,9 +363,8 @@ def test_doctor_checks_this_host(briefly: None) -> None:
     assert "1000 sleeps per second" in done.stderr
 
 
-def test_strict_fails_on_warnings_but_not_on_notes(
-    briefly: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_strict_fails_on_warnings_but_not_on_notes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(facts_module, "try_out", lambda *_: trial())
     config = tmp_path / "lowfc.toml"
     config.write_text("[realtime]\ncamera_cpus = [8000]\n")
     done = lowfc("doctor", "--config", config)
