@@ -48,20 +48,19 @@ SILENT = Console(quiet=True)
 
 
 @pytest.fixture(autouse=True)
-def _few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+def _few_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pokes, "DELAY_FRAMES", DELAY_FRAMES)
 
 
 @pytest.fixture
-def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
-    monkeypatch.chdir(tmp_path)
+def loop(monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
     return connected(InProcessLoop(load(None, CONFIG), world=load(None, STATIC)), monkeypatch)
 
 
 @pytest.fixture
-def noiseless_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
+def noiseless_loop(monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
     """Like `loop`, but without noise, so that shorter pokes suffice, and with a slew limit that shrinks pokes."""
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pokes, "HOLD", 2)
     config = load(None, CONFIG | {"control.max_identical_frames": 0, "safety.slew_nm": 5.0})
     return connected(InProcessLoop(config, world=load(None, STATIC | {"camera.noise": False})), monkeypatch)
@@ -178,11 +177,8 @@ def test_cycles_that_are_not_kept_are_not_reported(
     assert "kept in" not in done.stderr
 
 
-def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
     """First the star is faint; then its image also moves before R is checked, and R is noisier than accepted."""
-    monkeypatch.chdir(tmp_path)
     loop = connected(InProcessLoop(load(None, CONFIG | {"star.magnitude": 3.0})), monkeypatch)
     before = loop.calibration()
     words = ["--cycles", "4", "--snr", "200", "--out", "night.fits", "--load"]
@@ -327,11 +323,9 @@ def test_a_poke_resolves_the_rotation_by_180_degrees(noiseless_loop: InProcessLo
     assert np.abs(cross_talk(calibration.reconstructor, noiseless_loop.calibration().response)).max() < 0.05
 
 
-def test_no_calibration_is_aligned_to_a_turned_mirror(
-    noiseless_loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_calibration_is_aligned_to_a_turned_mirror(loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch) -> None:
     """A poke of tip makes tilt, so its image does not correlate with the computed one and cannot show the sign."""
-    loop, play = noiseless_loop, noiseless_loop.play
+    play = loop.play
 
     def turned(basis_nm: Any, table: Any) -> Any:
         return play(np.rot90(basis_nm.reshape(-1, 12, 12), axes=(1, 2)).reshape(basis_nm.shape), table)
@@ -391,8 +385,7 @@ def test_a_computed_calibration_may_truncate_singular_values(loop: InProcessLoop
     assert "no regularisation needed" in done.stdout
 
 
-def test_a_truncation_keeps_the_fit_of_a_background(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_truncation_keeps_the_fit_of_a_background() -> None:
     fitted = load(None, {"sensor.kind": "zwfs", "control.nuisance": ["background"]} | SMALL_MIRROR)
     compute(fitted, "few.fits", "--truncate", 0.3)
     calibration = calibration_file.load(Path("few.fits"))
@@ -426,10 +419,7 @@ def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop)
         ("dark --file cube.fits --frames 50", "--frames has no effect with --file"),
     ],
 )
-def test_an_option_without_effect_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, why: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_an_option_without_effect_is_refused(words: str, why: str) -> None:
     before = {path.name for path in Path().iterdir()}
     assert re.search(why, refusal("calibrate", *words.split(), kind=ConfigurationError))
     assert {path.name for path in Path().iterdir()} == before
@@ -480,14 +470,12 @@ def test_the_response_is_the_derivative_of_the_image(config: Configuration) -> N
     assert np.abs(response(optics, modes, 0 * state_nm) - flat).max() < 1e-12 * np.abs(flat).max()
 
 
-def test_the_option_at_takes_a_mirror_shape_for_the_wavefront_that_it_makes(
-    config: Configuration, tmp_path: Path
-) -> None:
+def test_the_option_at_takes_a_mirror_shape_for_the_wavefront_that_it_makes(config: Configuration) -> None:
     flat, at_zero_point = analytic(config, SILENT), analytic(config, SILENT, zero_point(config, ZERO_POINT)[1])
     command_nm = np.zeros(len(flat.noll))
     command_nm[[flat.noll.index(4), flat.noll.index(7)]] = 20.0, -20.0
-    np.save(tmp_path / "shape.npy", (flat.modes_to_actuators @ command_nm).reshape(flat.grid))
-    shaped = analytic(config, SILENT, zero_point(config, str(tmp_path / "shape.npy"))[1])
+    np.save("shape.npy", (flat.modes_to_actuators @ command_nm).reshape(flat.grid))
+    shaped = analytic(config, SILENT, zero_point(config, "shape.npy")[1])
     change = at_zero_point.reference - flat.reference
     assert np.linalg.norm(shaped.reference - at_zero_point.reference) < 0.1 * np.linalg.norm(change)
     assert at_zero_point.id != flat.id

@@ -4,6 +4,7 @@ import contextlib
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -86,6 +87,10 @@ def load_dark_zone(file: Traversable) -> Wedge:
     return zone
 
 
+_shaped_pupil = lru_cache(load_pupil)
+_transmission = lru_cache(maxsize=8)(sams.transmission)
+
+
 def sensor_from(
     section: SensorSection | None = None, wavelength_nm: float = 550.0, warn: Callable[[str], None] = _log.warning
 ) -> Sensor:
@@ -117,7 +122,7 @@ def sensor_from(
                 layout = _layout(section.sam)
                 for text in layout_warnings(layout):
                     warn(text)
-                relay = ApertureMask(sams.transmission(layout, len(pupil), section.hole_samples))
+                relay = ApertureMask(_transmission(layout, len(pupil), section.hole_samples))
         return Sensor(pupil, focal_mask, relay, wavelength_nm)
 
 
@@ -175,7 +180,7 @@ def _layout(name: str) -> sams.Layout:
 def _pupil(section: SensorSection) -> Array:
     match section.pupil:
         case "shaped":
-            return load_pupil()
+            return _shaped_pupil()
         case "circle":
             return circle(SAMPLES)
         case "prolate" if section.focal_radius <= _MAX_PROLATE_RADIUS:

@@ -9,6 +9,7 @@ needed. If the image is circular, only these pokes show the rotation.
 
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Literal
 
 import numpy as np
 from scipy.ndimage import affine_transform, spline_filter
@@ -101,8 +102,7 @@ def align(real: Array, computed: Array, good: Mask | None = None) -> Alignment:
     light = np.where(used, real - background, 0.0)
     if not light.sum() > 0:
         raise ValueError("the reference image has no light above its edge")
-    # Scale 1 is tried as well: a detector region may cut off the image's wings, and so reduce its size. Rounding avoids
-    # that two almost equal scales are tried.
+    # Scale 1 as well: a detector region may cut off the image's wings. Rounded, so that no two scales are almost equal.
     scales = {round(_size(light) / _size(computed), 2), 1.0}
     spectrum = np.fft.rfft2(light, _doubled(light.shape))
     fits = []
@@ -160,7 +160,7 @@ def _placed(computed: Array, geometry: Geometry, shape: tuple[int, ...], spectru
     return placed, replace(geometry, row=float(row), column=float(column))
 
 
-def _sample(spline: Array, geometry: Geometry, shape: tuple[int, ...], order: int = 3) -> Array:
+def _sample(spline: Array, geometry: Geometry, shape: tuple[int, ...], order: Literal[1, 3] = 3) -> Array:
     angle, parity = np.deg2rad(geometry.rotation_deg), geometry.parity
     turn = np.array([[np.cos(angle), -np.sin(angle)], [parity * np.sin(angle), parity * np.cos(angle)]])
     turn /= geometry.scale
