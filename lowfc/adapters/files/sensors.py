@@ -87,8 +87,19 @@ def load_dark_zone(file: Traversable) -> Wedge:
     return zone
 
 
-_shaped_pupil = lru_cache(load_pupil)
-_transmission = lru_cache(maxsize=8)(sams.transmission)
+@lru_cache
+def _shaped_pupil() -> Array:
+    return _read_only(load_pupil())
+
+
+@lru_cache(maxsize=8)
+def _transmission(layout: sams.Layout, samples: int, hole_samples: int) -> Array:
+    return _read_only(sams.transmission(layout, samples, hole_samples))
+
+
+def _read_only(shared: Array) -> Array:
+    shared.flags.writeable = False
+    return shared
 
 
 def sensor_from(
