@@ -16,6 +16,7 @@ from lowfc.control.calibration.calibration import reconstructor
 from lowfc.design.merit import BAND, WAVELENGTH_NM, PupilForms, Signal
 from lowfc.design.paper import MODES, TABLE3_INPUT_WAVES
 from lowfc.design.trials import LITERAL_WAVES, bounds_waves, input_rms, random_wavefronts, residual_rms
+from lowfc.optics.chain import pupil
 from lowfc.optics.chain.band import Band, monochromatic
 from lowfc.optics.chain.fourier import to_image
 from lowfc.optics.chain.sensor import Sensor, from_focus, pixel_sums, pupil_radii
@@ -47,9 +48,8 @@ class FocalLight:
         modes = zernikes(NOLLS_20, *pupil_radii(sensor))
 
         def focal(pupil_field: Array | Complex, wavelength_nm: float = WAVELENGTH_NM) -> Complex:
-            size = len(sensor.focal_mask)
-            field = np.asarray(pupil_field, np.complex128)
-            return to_image(field, size, sensor.samples_per, WAVELENGTH_NM / wavelength_nm)
+            scale = WAVELENGTH_NM / wavelength_nm
+            return to_image(pupil_field, len(sensor.focal_mask), sensor.samples_per, scale)
 
         all_nm = {WAVELENGTH_NM, *BAND.wavelengths_nm}
         fields = {nm: np.array([focal(sensor.pupil * shape, nm) for shape in (1.0, *modes)]) for nm in all_nm}
@@ -60,7 +60,7 @@ class FocalLight:
             waves = random_wavefronts(np.random.default_rng(_SEED), _WAVEFRONTS, nolls, low * scale, high * scale)
             phases = (np.tensordot(wavefront, modes[:count], 1) for wavefront in waves)
             drawn[count] = waves * WAVELENGTH_NM
-            aberrated[count] = np.array([focal(sensor.pupil * np.exp(2j * np.pi * phase)) for phase in phases])
+            aberrated[count] = np.array([focal(pupil.aberrated(sensor.pupil, phase, 1.0)) for phase in phases])
         return cls(forms, fields, drawn, aberrated)
 
 

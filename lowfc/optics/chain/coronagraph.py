@@ -11,6 +11,7 @@ import numpy as np
 from lowfc.arrays import Array, Complex, Mask
 from lowfc.optics.chain.fourier import kernel, to_image, to_pupil
 from lowfc.optics.chain.grid import image_axis
+from lowfc.optics.chain.pupil import aberrated
 
 SAMPLES_PER = 4
 """Samples per lambda / D. Two represent the image, but not the sharp edge of a zone, on which the contrast added by
@@ -74,7 +75,7 @@ class LyotStop:
 
     def _blocked(self, field: Array | Complex) -> Complex:
         """Field (n, n) in the stop's plane of the light that the mask blocks."""
-        focal = to_image(np.asarray(field, np.complex128), len(self.opaque), self.samples_per, 1.0)
+        focal = to_image(field, len(self.opaque), self.samples_per, 1.0)
         return to_pupil(focal * self.opaque, len(field), self.samples_per, 1.0)
 
 
@@ -119,17 +120,11 @@ def contrast(
         columns: Samples along x.
         rows: Samples along y; as many as columns when None.
         samples_per: Samples per lambda / D.
-
-    Raises:
-        ValueError: The wavefront is not sampled like the pupil.
     """
     pupil = coronagraph.pupil
-    if opd_nm.shape != pupil.shape:
-        raise ValueError(f"a wavefront must be sampled like the pupil, {pupil.shape}, got {opd_nm.shape}")
     in_x = kernel(columns, samples_per, len(pupil), 1.0)
     in_y = kernel(columns if rows is None else rows, samples_per, len(pupil), 1.0)
-    field = pupil * np.exp((2j * np.pi / wavelength_nm) * opd_nm)
-    image = in_y @ coronagraph.behind(field) @ in_x.T
+    image = in_y @ coronagraph.behind(aberrated(pupil, opd_nm, wavelength_nm)) @ in_x.T
     return np.asarray((image.real**2 + image.imag**2) / coronagraph.peak**2)
 
 

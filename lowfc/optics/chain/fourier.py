@@ -3,6 +3,7 @@
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lowfc.arrays import Complex
 from lowfc.optics.chain.grid import image_axis, pupil_axis
@@ -18,7 +19,7 @@ def kernel(image_samples: int, samples_per: int, pupil_samples: int, scale: floa
     return matrix
 
 
-def to_image(pupil: Complex, image_samples: int, samples_per: int, scale: float) -> Complex:
+def to_image(pupil: NDArray[np.inexact], image_samples: int, samples_per: int, scale: float) -> Complex:
     """Complex (image_samples, image_samples) amplitude in the focal plane of a square pupil field; conserves energy."""
     matrix = kernel(image_samples, samples_per, pupil.shape[0], scale)
     return (scale / pupil.size) * (matrix @ pupil @ matrix.T)

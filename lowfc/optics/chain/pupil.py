@@ -1,9 +1,9 @@
-"""Pupils: the open circle, apodised pupils for coronagraphs, and a circle with a bar for the relay."""
+"""Pupils: the open circle, apodised pupils for coronagraphs, a circle with a bar for the relay; fields after them."""
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from lowfc.arrays import Array
+from lowfc.arrays import Array, Complex
 from lowfc.optics.chain.grid import pupil_axis
 
 
@@ -102,3 +102,12 @@ def from_quarter(quarter: ArrayLike, samples: int) -> Array:
         )
     right = np.vstack([quarter[::-1], quarter])
     return np.kron(np.hstack([right[:, ::-1], right]), np.ones((repeat, repeat)))
+
+
+def aberrated(pupil: Array, opd_nm: NDArray[np.floating], wavelength_nm: float) -> Complex:
+    """Field (n, n) after a pupil of a wavefront (n, n) in nm; ValueError if it is not sampled like the pupil."""
+    if opd_nm.shape != pupil.shape:
+        raise ValueError(f"a wavefront must be sampled like the pupil, {pupil.shape}, got {opd_nm.shape}")
+    field, transmits = np.zeros(pupil.shape, np.complex128), pupil != 0  # a shaped pupil transmits in a fifth
+    field[transmits] = pupil[transmits] * np.exp((2j * np.pi / wavelength_nm) * opd_nm[transmits])
+    return field

@@ -9,6 +9,7 @@ from lowfc.arrays import Array, Complex
 from lowfc.optics.chain.band import Band, monochromatic
 from lowfc.optics.chain.fourier import to_image, to_pupil
 from lowfc.optics.chain.grid import OPEN_AREA, image_axis, pupil_axis
+from lowfc.optics.chain.pupil import aberrated
 from lowfc.optics.chain.relay import ApertureMask, Defocus, PupilImage, Relay, direct_kernel
 
 
@@ -113,7 +114,7 @@ def propagate(
     """
     mask = sensor.focal_mask if focal_mask is None else focal_mask
     scale = sensor.wavelength_nm / wavelength_nm
-    focal = to_image(np.asarray(pupil_field, np.complex128), mask.shape[0], sensor.samples_per, scale)
+    focal = to_image(pupil_field, mask.shape[0], sensor.samples_per, scale)
     return from_focus(sensor, focal * mask, wavelength_nm)
 
 
@@ -134,14 +135,9 @@ def field(sensor: Sensor, opd_nm: NDArray[np.floating], wavelength_nm: float | N
         sensor: The optics.
         opd_nm: Optical path difference.
         wavelength_nm: The central wavelength when None.
-
-    Raises:
-        ValueError: The wavefront is not sampled like the pupil.
     """
-    if opd_nm.shape != sensor.pupil.shape:
-        raise ValueError(f"a wavefront must be sampled like the pupil, {sensor.pupil.shape}, got {opd_nm.shape}")
     wavelength_nm = sensor.wavelength_nm if wavelength_nm is None else wavelength_nm
-    return propagate(sensor, sensor.pupil * np.exp((2j * np.pi / wavelength_nm) * opd_nm), wavelength_nm)
+    return propagate(sensor, aberrated(sensor.pupil, opd_nm, wavelength_nm), wavelength_nm)
 
 
 def image(sensor: Sensor, opd_nm: NDArray[np.floating], band: Band | None = None) -> Array:
@@ -212,7 +208,7 @@ def shear_response(sensor: Sensor, band: Band | None = None) -> Array:
 def light_budget(sensor: Sensor) -> LightBudget:
     """The throughput of each element at the central wavelength, flat wavefront."""
     samples, area = sensor.pupil.shape[0], 1.0 / sensor.samples_per**2
-    focal = to_image(sensor.pupil.astype(np.complex128), sensor.focal_mask.shape[0], sensor.samples_per, 1.0)
+    focal = to_image(sensor.pupil, sensor.focal_mask.shape[0], sensor.samples_per, 1.0)
     focal = focal * sensor.focal_mask
     after_pupil = np.sum(sensor.pupil**2) / samples**2
     after_focal = np.sum(np.abs(focal) ** 2) * area
