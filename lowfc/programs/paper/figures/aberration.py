@@ -133,14 +133,14 @@ def plot_fig1(context: Context, path: Path) -> None:
 def fig7(context: Context) -> Iterator[Row]:
     """Peak-to-valley residual of the estimate, Fig. 7(c)."""
     for name in context.names("sam"):
+        ready = prepared(name)
+        basis, wavelength_nm = ready.open_modes[:MODES], ready.sensor.wavelength_nm
+        root = np.linalg.cholesky(bound_nm2(ready, MODES))
+        drawn_nm = context.rng("focus and coma", "limit").standard_normal((_LIMIT_DRAWS, MODES)) @ root.T
+        limit = float(residual_pv(basis, drawn_nm).mean()) / wavelength_nm
+        paper = _PAPER_PV_WAVES if ready.paper_name == "sam" else None
         for coma in COMAS:
-            case = _aberrated(context, name, coma)
-            basis, wavelength_nm = case.ready.open_modes[:MODES], case.ready.sensor.wavelength_nm
-            root = np.linalg.cholesky(bound_nm2(case.ready, MODES))
-            drawn_nm = context.rng("focus and coma", "limit").standard_normal((_LIMIT_DRAWS, MODES)) @ root.T
-            limit = float(residual_pv(basis, drawn_nm).mean()) / wavelength_nm
-            paper = _PAPER_PV_WAVES if case.ready.paper_name == "sam" else None
-            for key, residuals_nm in case.residuals_nm.items():
+            for key, residuals_nm in _aberrated(context, name, coma).residuals_nm.items():
                 mean, error = mean_and_error(residual_pv(basis, residuals_nm) / wavelength_nm)
                 fitted = partial(Row, f"{name}, coma Z{coma}", modes=MODES, estimator=key)
                 yield fitted("P-V residual", "waves", mean, paper, error, limit=limit)
