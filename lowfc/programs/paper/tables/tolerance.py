@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -138,12 +138,10 @@ def tolerance(context: Context) -> list[Row]:
     from lowfc.programs.paper.tables.star_pair import pair_rows
 
     names = context.names(*SENSORS_COMPARED)
+    context.map("noise", partial(frame_noise_nm2, magnitude=MAGNITUDES[0]), names)  # reports errors before the work
     lines = {kind: tolerated_lines(kind, Line(LINE_HZ, LINE_WIDTH * LINE_HZ, 1.0), RATE_HZ, EXPOSURE) for kind in KINDS}
-
-    def rows_of(name: str) -> list[Row]:
-        return list(_tolerated(name, lines))
-
-    rows = [row for of_sensor in context.map("tolerance", rows_of, names) for row in of_sensor]
+    tolerated = context.map("tolerance", lambda name: list(_tolerated(name, lines)), names)
+    rows = [row for of_sensor in tolerated for row in of_sensor]
     rows += _checked(context)
     return rows + [row for name in names if prepared(name).section.pupil == "shaped" for row in pair_rows(name)]
 
