@@ -130,6 +130,12 @@ def without_drawings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lowfc.programs.logs.report.drawings._DRAWINGS", {})
 
 
+@pytest.fixture
+def without_layout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Omit the layout of plots, which takes half of their time."""
+    monkeypatch.setattr("lowfc.adapters.files.drawing.lay_out", lambda figure, *_: figure.set_layout_engine(None))
+
+
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     if NO_SKIPS and report.skipped and not hasattr(report, "wasxfail"):
         report.outcome = "failed"

@@ -8,7 +8,6 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from itertools import pairwise
@@ -69,21 +68,15 @@ def uninterrupted(tmp_path_factory):
     return result, out.read_text()
 
 
-@pytest.fixture
-def scheduler() -> Iterator[str]:
-    """Address of a Dask scheduler with one worker, in threads of this process."""
+def test_result_does_not_depend_on_the_executor(uninterrupted, tmp_path):
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
-        yield cluster.scheduler_address
-
-
-def test_result_does_not_depend_on_the_executor(scheduler, uninterrupted, tmp_path):
-    for jobs, address in ((2, None), (1, scheduler)):
-        with open_executor(jobs, address) as executor:
-            result, out = run(search_with(), tmp_path, executor)
-        assert out.read_text() == uninterrupted[1], address
-        assert result["merits"] == uninterrupted[0]["merits"]
+        for jobs, address in ((2, None), (1, cluster.scheduler_address)):
+            with open_executor(jobs, address) as executor:
+                result, out = run(search_with(), tmp_path, executor)
+            assert out.read_text() == uninterrupted[1], address
+            assert result["merits"] == uninterrupted[0]["merits"]
     assert len(set(result["merits"])) == 2
 
 
@@ -209,6 +202,7 @@ def test_state_files_are_read_or_refused(tmp_path):
         read_state(state, "another")
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_pareto_front_is_written_and_plotted(tmp_path):
     search = search_with(merit="pareto", chains=3, steps=60, name="edge", estimator="pinv", seed=4)
     table, picture = tmp_path / "front.csv", tmp_path / "front.png"

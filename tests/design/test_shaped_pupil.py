@@ -97,6 +97,7 @@ def test_first_program_has_the_same_optimum_as_another_formulation_and_solver():
     assert -alternative.fun / 32**2 / OPEN_AREA == pytest.approx(first.open_area, abs=1e-6)
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_command_writes_a_mask_that_meets_the_contrast_between_the_points_of_its_design(tmp_path):
     path, picture = tmp_path / "spc.npz", tmp_path / "spc.png"
     result = json_of("design", "spc", "--outer", 8, "--cells", 64, "--out", path, "--plot", picture)

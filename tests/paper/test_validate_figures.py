@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from lowfc.adapters.files import drawing
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S
 from lowfc.optics.chain.grid import pupil_axis
@@ -64,9 +63,9 @@ LAID_OUT = ("fig3", "fig6")
         *(pytest.param(figure, True, marks=pytest.mark.slow) for figure in FIGURES if figure not in LAID_OUT),
     ],
 )
-def test_every_figure_is_plotted(figure, laid_out, tables, tmp_path, monkeypatch):
+def test_every_figure_is_plotted(figure, laid_out, tables, tmp_path, request):
     if not laid_out:
-        monkeypatch.setattr(drawing, "lay_out", lambda figure, canvas, dpi: figure.set_layout_engine(None))
+        request.getfixturevalue("without_layout")
     from matplotlib.image import imread
 
     path = tmp_path / f"{figure}.png"
