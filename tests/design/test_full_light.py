@@ -100,7 +100,9 @@ def test_sweep_finds_the_minimum_between_its_values():
     assert sweep(abs, 2.0, 2.0, 5)[1] == 2.0
 
 
-def test_the_command_writes_the_configuration_keys_of_the_best_sensor(tmp_path, monkeypatch):
+def test_the_command_writes_the_configuration_keys_of_the_best_sensor(focal_light, tmp_path, monkeypatch):
+    pupils = {sensor_named("zwfs").pupil.tobytes(): focal_light}  # the light on the mask depends on nothing else
+    monkeypatch.setattr(FocalLight, "of", lambda sensor: pupils[sensor.pupil.tobytes()])
     monkeypatch.setattr("lowfc.programs.design.full_light._POINTS", 3)
     out = tmp_path / "clowfs.toml"
     found = json_of("design", "clowfs", "--defocus", "3.2:4.2", "--out", out)
