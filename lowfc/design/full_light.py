@@ -48,8 +48,7 @@ class FocalLight:
         modes = zernikes(NOLLS_20, *pupil_radii(sensor))
 
         def focal(pupil_field: Array | Complex, wavelength_nm: float = WAVELENGTH_NM) -> Complex:
-            scale = WAVELENGTH_NM / wavelength_nm
-            return to_image(pupil_field, len(sensor.focal_mask), sensor.samples_per, scale)
+            return to_image(pupil_field, len(sensor.focal_mask), sensor.samples_per, WAVELENGTH_NM / wavelength_nm)
 
         all_nm = {WAVELENGTH_NM, *BAND.wavelengths_nm}
         fields = {nm: np.array([focal(sensor.pupil * shape, nm) for shape in (1.0, *modes)]) for nm in all_nm}

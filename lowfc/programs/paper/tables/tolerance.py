@@ -140,8 +140,7 @@ def tolerance(context: Context) -> list[Row]:
     names = context.names(*SENSORS_COMPARED)
     context.map("noise", partial(frame_noise_nm2, magnitude=MAGNITUDES[0]), names)  # reports errors before the work
     lines = {kind: tolerated_lines(kind, Line(LINE_HZ, LINE_WIDTH * LINE_HZ, 1.0), RATE_HZ, EXPOSURE) for kind in KINDS}
-    tolerated = context.map("tolerance", lambda name: list(_tolerated(name, lines)), names)
-    rows = [row for of_sensor in tolerated for row in of_sensor]
+    rows = [row for each in context.map("tolerance", lambda name: [*_tolerated(name, lines)], names) for row in each]
     rows += _checked(context)
     return rows + [row for name in names if prepared(name).section.pupil == "shaped" for row in pair_rows(name)]
 
