@@ -120,6 +120,9 @@ def contrast(
         columns: Samples along x.
         rows: Samples along y; as many as columns when None.
         samples_per: Samples per lambda / D.
+
+    Raises:
+        ValueError: The wavefront is not sampled like the pupil.
     """
     pupil = coronagraph.pupil
     in_x = kernel(columns, samples_per, len(pupil), 1.0)

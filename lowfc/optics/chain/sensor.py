@@ -135,6 +135,9 @@ def field(sensor: Sensor, opd_nm: NDArray[np.floating], wavelength_nm: float | N
         sensor: The optics.
         opd_nm: Optical path difference.
         wavelength_nm: The central wavelength when None.
+
+    Raises:
+        ValueError: The wavefront is not sampled like the pupil.
     """
     wavelength_nm = sensor.wavelength_nm if wavelength_nm is None else wavelength_nm
     return propagate(sensor, aberrated(sensor.pupil, opd_nm, wavelength_nm), wavelength_nm)
