@@ -4,7 +4,9 @@ The fit is Whittle's: it minimises the sum of log P + J / P over frequencies, wi
 P the model's spectrum. A further line must raise the likelihood by more than chance does among all frequencies.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.fft import rfft
@@ -65,7 +67,7 @@ class Model:
         Its mean over all frequencies from -pi to pi is the variance.
         """
         shown = np.maximum(omega, 2 * np.pi * self.lowest_hz / self.rate_hz)
-        power = _drift(shown, self.drift_nm2, self.cutoff_hz / self.rate_hz)
+        power = _drifts(shown)(self.drift_nm2, self.cutoff_hz / self.rate_hz)
         for line in self.lines:
             power = power + _line(omega, *_per_frame(line, self.rate_hz))
         return power
@@ -173,7 +175,7 @@ class _Whittle:
 
     def misfit(self, power: Array, spectrum: Array, counts: Array | float) -> float:
         """Negative log-likelihood, up to a constant."""
-        return float(np.sum(counts * (np.log(spectrum) + power / spectrum))) * self.segments / _HANN
+        return float((counts * (np.log(spectrum) + power / spectrum)).sum()) * self.segments / _HANN
 
     def grouped(self, lines: tuple[Line, ...], robust: bool) -> tuple[Array, Array, Array]:
         """Frequency, power and count of groups: single frequencies near lines and 0, else even in the logarithm."""
@@ -203,29 +205,29 @@ class _Whittle:
         white = float(np.median(self.power[self.power.size // 2 :])) / (np.log(2) if self.segments == 1 else 1)
         low = slice(0, max(8, omega.size // 20))
         step = float(np.median(np.maximum(power[low] - white - known[low], 1e-3 * white) * omega[low] ** 2))
-        fits: list[tuple[float, Model]] = []
+        drift_of, fits = _drifts(omega), list[tuple[float, tuple[float, float, float]]]()
         for cutoff in (np.inf, 0.03, 0.003):  # cycles per frame to begin with
 
-            def model_of(parameters: Array, cutoff: float = cutoff) -> Model:
-                corner = np.exp(min(parameters[2], 0.0)) * self.rate_hz if np.isfinite(cutoff) else np.inf
-                return replace(
-                    model,
-                    drift_nm2=max(np.exp(parameters[0]), _MIN_DRIFT * np.exp(parameters[1])),
-                    noise_nm2=float(np.exp(parameters[1])),
-                    cutoff_hz=float(np.clip(corner, self.spacing_hz, self.rate_hz / 2)) if corner < np.inf else corner,
-                )
+            def floor_of(parameters: Array, cutoff: float = cutoff) -> tuple[float, float, float]:
+                noise_nm2 = float(np.exp(parameters[1]))
+                drift_nm2 = max(float(np.exp(parameters[0])), _MIN_DRIFT * noise_nm2)
+                if not np.isfinite(cutoff):
+                    return drift_nm2, np.inf, noise_nm2
+                corner_hz = float(np.exp(min(parameters[2], 0.0))) * self.rate_hz
+                return drift_nm2, min(max(corner_hz, self.spacing_hz), self.rate_hz / 2), noise_nm2
 
             def cost(parameters: Array) -> float:
-                trial = model_of(parameters)
-                floor = _drift(omega, trial.drift_nm2, trial.cutoff_hz / self.rate_hz) + trial.noise_nm2
+                drift_nm2, cutoff_hz, noise_nm2 = floor_of(parameters)
+                floor = drift_of(drift_nm2, cutoff_hz / self.rate_hz) + noise_nm2
                 return self.misfit(power, floor + known, counts)
 
             start = np.log([step, white] + ([cutoff] if np.isfinite(cutoff) else []))
             found = minimize(cost, start, method="Nelder-Mead", options={"maxiter": 300, "xatol": 1e-2, "fatol": 1e-2})
             price = 0.5 * len(start) * np.log(self.omega.size)
-            fits.append((found.fun + price, model_of(found.x)))
-        _, best = min(fits, key=lambda fit: fit[0])
-        return replace(best, noise_nm2=max(best.noise_nm2, _MIN_NOISE * white))
+            fits.append((found.fun + price, floor_of(found.x)))
+        _, (drift_nm2, cutoff_hz, noise_nm2) = min(fits, key=lambda fit: fit[0])
+        noise_nm2 = max(noise_nm2, _MIN_NOISE * white)
+        return replace(model, drift_nm2=drift_nm2, cutoff_hz=cutoff_hz, noise_nm2=noise_nm2)
 
     def another_line(self, model: Model) -> Line | None:
         """The most significant missing line; None if none is certain."""
@@ -256,8 +258,8 @@ class _Whittle:
         excess = self.power[max(place - scale, 0) : place + scale + 1].sum() / self.power.size
 
         def line_of(parameters: Array) -> Line:
-            width = float(np.clip(np.exp(parameters[1]), 1e-3, 1e3)) * self.spacing_hz
-            offset = float(np.clip(parameters[0], -scale / 3, scale / 3)) * self.spacing_hz
+            width = min(max(float(np.exp(parameters[1])), 1e-3), 1e3) * self.spacing_hz
+            offset = min(max(float(parameters[0]), -scale / 3), scale / 3) * self.spacing_hz
             centre = max(float(self.omega[place]) / step + offset, _LOBE * self.spacing_hz)
             return Line(centre, width, float(np.exp(parameters[2])))
 
@@ -280,12 +282,20 @@ class _Whittle:
         model = self.fit_floor(model, robust=False)  # the fit of all parameters searches only near its start
         omega, power, counts = self.grouped(model.lines, robust=False)
         spacing, corner = self.spacing_hz, np.isfinite(model.cutoff_hz)
-        allowed_hz = spacing, self.rate_hz / 2 - spacing
+        lowest_hz, highest_hz = spacing, self.rate_hz / 2 - spacing
+        drift_of = lru_cache(1)(_drifts(omega))
+
+        @lru_cache(2 * _MAX_LINES)  # the derivatives change one parameter at a time
+        def line_of(line: Line) -> Array:
+            return _line(omega, *_per_frame(line, self.rate_hz))
 
         def model_of(parameters: Array) -> Model:
             floor, rest = parameters[: 2 + corner], parameters[2 + corner :].reshape(-1, 3)
             lines = tuple(
-                Line(float(np.clip(line.frequency_hz + shift * spacing, *allowed_hz)), *np.exp(others).tolist())
+                Line(
+                    float(min(max(line.frequency_hz + shift * spacing, lowest_hz), highest_hz)),
+                    *np.exp(others).tolist(),
+                )
                 for line, (shift, *others) in zip(model.lines, rest, strict=True)
             )
             cutoff = float(np.exp(floor[2])) if corner else np.inf
@@ -299,7 +309,8 @@ class _Whittle:
 
         def cost(parameters: Array) -> float:
             trial = model_of(parameters)
-            return self.misfit(power, trial.spectrum_nm2(omega) + trial.noise_nm2, counts)
+            drift = drift_of(trial.drift_nm2, trial.cutoff_hz / self.rate_hz)
+            return self.misfit(power, sum(map(line_of, trial.lines), drift) + trial.noise_nm2, counts)
 
         floor = [np.log(model.drift_nm2), np.log(model.noise_nm2)] + ([np.log(model.cutoff_hz)] if corner else [])
         lines = [[0.0, np.log(line.width_hz), np.log(line.variance_nm2)] for line in model.lines]
@@ -331,12 +342,18 @@ def _kept(cutoff: float) -> float:
     return float(np.exp(-2 * np.pi * cutoff))
 
 
-def _drift(omega: Array, step_nm2: float, cutoff: float) -> Array:
-    walk = step_nm2 / (4 * np.sin(omega / 2) ** 2)
-    if not np.isfinite(cutoff):
-        return np.asarray(walk)
-    kept = _kept(cutoff)
-    return np.asarray(walk * (1 - kept) ** 2 / (1 - 2 * kept * np.cos(omega) + kept**2))
+def _drifts(omega: Array) -> Callable[[float, float], Array]:
+    """Function of the step's variance and the corner, in cycles per frame: spectrum (frequencies,) of the drift."""
+    squares, cosines = 4 * np.sin(omega / 2) ** 2, np.cos(omega)
+
+    def drift(step_nm2: float, cutoff: float) -> Array:
+        walk = step_nm2 / squares
+        if not np.isfinite(cutoff):
+            return np.asarray(walk)
+        kept = _kept(cutoff)
+        return np.asarray(walk * (1 - kept) ** 2 / (1 - 2 * kept * cosines + kept**2))
+
+    return drift
 
 
 def _per_frame(line: Line, rate_hz: float) -> tuple[float, float, float]:

@@ -15,9 +15,8 @@ _QUERY_AGAIN_NS = 5_000_000_000  # until a controller that did not answer is que
 
 
 def import_late_modules() -> None:
-    """Import the modules that only a later verdict uses: imported then, they would delay all values of that reading."""
-    for name in ("lowfc.control.laws.tuning", "scipy.signal"):
-        import_module(name)
+    """Import the module that only a later verdict uses: imported then, it would delay all values of that reading."""
+    import_module("lowfc.control.laws.tuning")
 
 
 class Monitor:
