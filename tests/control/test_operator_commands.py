@@ -29,6 +29,7 @@ REQUEST_COUNT = 40
 """Number of requests in each run."""
 TIGHT: dict[str, object] = {"limit_nm": (40.0, 15.0), "max_saturated_pixels": 0}
 CALIBRATION = identified(calibration())
+TO_MODES = np.linalg.pinv(CALIBRATION.modes_to_actuators)
 OTHERS = tuple(identified(calibration(noll, scale)) for noll, scale in ((NOLL, 1.1), ((2, 3), 1.0), ((2,), 0.9)))
 OTHER_MIRROR = identified(replace(CALIBRATION, grid=(5, 4)))
 KNOWN = {each.id: each for each in (CALIBRATION, *OTHERS, OTHER_MIRROR)}
@@ -130,8 +131,7 @@ class Script:
         self.count += 1 + int(self.rng.random() < 0.03) * 3
         disturbance = self.rng.normal(STATIC_NM, 3)
         if state.loop is not None:
-            mirror = CALIBRATION.modes_to_actuators
-            disturbance = disturbance + np.linalg.lstsq(mirror, state.loop.actuators_nm.ravel(), rcond=None)[0]
+            disturbance = disturbance + TO_MODES @ state.loop.actuators_nm.ravel()
         return frame(self.count, disturbance, sequence=frame_sequence(self.count, self.start))
 
     def disruption(self) -> Input:
@@ -166,9 +166,10 @@ class Script:
 
 @dataclass
 class Run:
-    """Inputs and outputs of a run; the outputs as bytes."""
+    """Inputs and outputs of a run, the outputs as bytes; its newest state, also as a message."""
 
     state: State
+    message: wire.ControllerState
     inputs: list[Input]
     outputs: list[bytes]
     counts: Counter[tuple[str, bool]]
@@ -185,15 +186,17 @@ def serialised(input_: Input, outputs: Outputs, state: State) -> bytes:
     return b"|".join((step, command, reply, *events))
 
 
-def checked_advance(setup: Settings, state: State, input_: Input) -> tuple[State, Outputs]:
+def checked_advance(setup: Settings, run: Run, input_: Input) -> Outputs:
     """Process an input, its image read-only; check purity, limits, and that a refused request changes nothing."""
     if isinstance(input_, Frame) and input_.pixels is not None:
         input_.pixels.flags.writeable = False
-    before = controller_state(state, setup, 0)
+    state = run.state
     after, outputs = advance(setup, state, input_)
     again, repeated = advance(setup, state, input_)
-    assert serialised(input_, repeated, again) == serialised(input_, outputs, after)
-    assert controller_state(again, setup, 0) == controller_state(after, setup, 0)
+    run.outputs.append(serialised(input_, outputs, after))
+    assert serialised(input_, repeated, again) == run.outputs[-1]
+    run.state, before, run.message = after, run.message, controller_state(after, setup, 0)
+    assert controller_state(again, setup, 0) == run.message
     assert controller_state(state, setup, 0) == before
     if isinstance(input_, Frame):
         assert outputs.step is not None
@@ -223,19 +226,18 @@ def checked_advance(setup: Settings, state: State, input_: Input) -> tuple[State
         assert isinstance(input_, Request)
         assert input_.name == "clear"
         assert after.mode is not LoopMode.CLOSED
-    return after, outputs
+    return outputs
 
 
 def random_run(setup: Settings, names: list[str], pauses: list[int], seed: int) -> Run:
     """Run of a loop with these requests, each after a number of frames."""
     script = Script(setup, seed)
     state, _ = advance(setup, State(), Load(0, CALIBRATION, "a test"))
-    run = Run(state, [], [], Counter())
+    run = Run(state, controller_state(state, setup, 0), [], [], Counter())
     for name, pause in zip(names, pauses, strict=True):
         for input_ in inputs_up_to(script, name, pause, run):
-            run.state, outputs = checked_advance(setup, run.state, input_)
+            outputs = checked_advance(setup, run, input_)
             run.inputs.append(input_)
-            run.outputs.append(serialised(input_, outputs, run.state))
             if outputs.reply is not None:
                 run.counts[name, outputs.reply.accepted] += 1
     return run

@@ -98,22 +98,22 @@ def at_rest(law: LinearLaw) -> Single:
 
 def predict_and_update(law: LinearLaw, x: Single, y: Single, command_nm: Single) -> Single:
     """The state (states,) after a frame, from its y (modes,), nm, and the last command after limits (modes,)."""
-    after: Single = law.transition @ x
-    after += law.measurement_gain @ y
-    after += law.command_gain @ command_nm
+    after: Single = law.transition.dot(x)  # half a microsecond less than `@`
+    after += law.measurement_gain.dot(y)
+    after += law.command_gain.dot(command_nm)
     return after
 
 
 def predict(law: LinearLaw, x: Single, command_nm: Single) -> Single:
     """The state (states,) after a missing or refused frame, from the last command after limits (modes,)."""
-    after: Single = law.predict_only @ x
-    after += law.command_gain @ command_nm
+    after: Single = law.predict_only.dot(x)
+    after += law.command_gain.dot(command_nm)
     return after
 
 
 def respond(law: LinearLaw, x: Single) -> Single:
     """The command of the law (modes,), nm of wavefront rms, before any limit."""
-    command_nm: Single = law.output @ x
+    command_nm: Single = law.output.dot(x)
     return command_nm
 
 
