@@ -5,7 +5,7 @@ They are too long for the sources of a page. `tools.measure` writes shorter tabl
 
 import re
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from types import ModuleType
 from typing import Any, get_args
@@ -110,6 +110,7 @@ def messages() -> str:
     return "\n".join(parts)
 
 
+@cache
 def json_objects() -> str:
     """Every typed `--json` object."""
     for module in modules("lowfc.programs"):

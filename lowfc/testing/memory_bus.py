@@ -7,6 +7,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TypeVar
 
 from lowfc.adapters.bus.bus import ALL, Faults, Query, Sample
@@ -85,7 +86,7 @@ class MemoryBus:
         self.start_s = max(clock.start_s, hub.starts.get(role, -1) + 1)
         hub.starts[role] = self.start_s
         self.publishers: list[MemoryPublisher] = []
-        self._subscriptions: list[tuple[Topic, str, Callable[[Sample], None]]] = []
+        self._subscriptions: list[tuple[Callable[[str], bool], str, Callable[[Sample], None]]] = []
         self.queryables: list[tuple[str, Callable[[Query], None]]] = []
         hub.buses.append(self)
 
@@ -97,7 +98,8 @@ class MemoryBus:
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
         """See `Bus.subscribe`."""
-        subscription = (topic, topic.at(name), handler)
+        pattern = topic.at(name)
+        subscription = (lru_cache(topic.matches) if name == ALL else pattern.__eq__, pattern, handler)
         self._subscriptions.append(subscription)
         return lambda: self._subscriptions.remove(subscription)
 
@@ -152,8 +154,8 @@ class MemoryBus:
         """Call the handlers for a published message."""
         if self.hub.lose(self.role, key, envelope):
             return
-        for topic, pattern, handler in list(self._subscriptions):
-            if key == pattern or (pattern == topic.at(ALL) and topic.matches(key)):
+        for matches, pattern, handler in list(self._subscriptions):
+            if matches(key):
                 self.call("handler of", pattern, handler, _sample(key, payload, envelope, self.clock))
 
     def call(self, what: str, key: str, handler: Callable[[T], None], argument: T) -> bool:

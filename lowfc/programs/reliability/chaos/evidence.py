@@ -15,7 +15,7 @@ from lowfc.arrays import Array, Long, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import COMMAND, EVENT, HEALTH, MIRROR_STATE, STEP, TRUTH, Topic
+from lowfc.contract.messages import COMMAND, EVENT, HEALTH, MIRROR_STATE, STEP, TRUTH, Topic, known_topic
 
 FORGED_S = 1
 """Start time in the sequence of injected messages; it is in 1970, so no process of a run has it."""
@@ -112,8 +112,8 @@ def _add(evidence: Evidence, message: Sample, number: int | None) -> None:
         return
     if number is not None and message.key != EVENT.key:  # all processes publish events: the publisher is ambiguous
         evidence.received.setdefault((number, message.key, start_s), Gaps(count)).add(count)
-    topic = next((topic for topic in DECODED if topic.matches(message.key)), None)
-    if topic is None:
+    topic = known_topic(message.key)
+    if topic is None or topic not in DECODED:
         return
     try:
         decoded: Any = topic.message.FromString(message.payload)
