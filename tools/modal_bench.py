@@ -115,7 +115,7 @@ class ModalBench(Bench):
                 weight * past for weight, past in zip(self._weights, self._mirror_shapes_nm, strict=True)
             )
             modes_nm = self._sampler.at(self._index)
-            pixels = _encoded(modes_nm[:2].mean(axis=0) + mirror_nm + noise_nm[count % _NOISE_BLOCK])
+            pixels = _encoded((modes_nm[0] + modes_nm[1]) / 2 + mirror_nm + noise_nm[count % _NOISE_BLOCK])
             self._index += 1
             outputs = self.process_input(self.frame(pixels))
             newest_nm = self._mirror_shapes_nm[0]

@@ -38,12 +38,12 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def shape_of(seed: int, special: float = 0.0) -> Single:
-    """Shape of boundary values and of others, each half of the actuators, and of a fraction of `special` values."""
+    """Shape of boundary values and of others, mostly at few levels, and of a fraction of `special` values."""
     rng = np.random.default_rng(seed)
-    kind, others = rng.random(GRID), rng.uniform(-2000, 2000, GRID)
-    return np.select([kind < special, kind < 0.5], [rng.choice(SPECIAL, GRID), rng.choice(EDGES, GRID)], others).astype(
-        np.float32
-    )
+    levels = int(rng.choice([1, 2, 3, 20]))
+    values = np.where(rng.random(levels) < 0.7, rng.choice(EDGES, levels), rng.uniform(-2000, 2000, levels))
+    shape = rng.choice(values, GRID)
+    return np.where(rng.random(GRID) < special, rng.choice(SPECIAL, GRID), shape).astype(np.float32)
 
 
 def within_limits(shape: Single) -> Single:

@@ -70,15 +70,17 @@ def run(law: LinearLaw, disturbance_nm: Array, delay_frames: float, limit_nm: fl
     """Errors and commands (frames, modes) of a loop without noise; its delay may differ from the law's."""
     weights = delay_weights(delay_frames).astype(np.float32)
     assumed = delay_weights(law.delay_frames).astype(np.float32)
-    history = [np.zeros(disturbance_nm.shape[1], np.float32)] * max(len(weights), len(assumed))
-    x, errors, commands = at_rest(law), [], []
+    history = np.zeros((max(len(weights), len(assumed)), disturbance_nm.shape[1]), np.float32)
+    limit, x, errors, commands = np.float32(limit_nm), at_rest(law), [], []
     for disturbance in disturbance_nm.astype(np.float32):
-        error = disturbance + sum(weight * past for weight, past in zip(weights, history, strict=False))
-        pol = error - sum(weight * past for weight, past in zip(assumed, history, strict=False))
-        x = predict_and_update(law, x, error if law.signal == "error" else pol, history[0])
-        history = [np.clip(respond(law, x), -limit_nm, limit_nm, dtype=np.float32), *history[:-1]]
+        error = y = disturbance + weights.dot(history[: len(weights)])
+        if law.signal == "pol":
+            y = error - assumed.dot(history[: len(assumed)])
+        x = predict_and_update(law, x, y, history[0])
+        history[1:] = history[:-1]
+        history[0] = np.minimum(np.maximum(respond(law, x), -limit), limit)
         errors.append(error)
-        commands.append(history[0])
+        commands.append(history[0].copy())
     return np.array(errors, float), np.array(commands, float)
 
 
@@ -88,11 +90,10 @@ def realised(model: Model, frames: int, seed: int = 0) -> Array:
     F, Q, C = model.states()
     root = np.linalg.svd(Q)
     steps = rng.standard_normal((frames, len(F))) @ (root.U * np.sqrt(root.S)).T
-    x, disturbance_nm = np.zeros(len(F)), np.zeros((frames, 1))
-    for row, step in enumerate(steps):
-        x = F @ x + step
-        disturbance_nm[row] = C @ x
-    return disturbance_nm + np.sqrt(model.noise_nm2) * rng.standard_normal((frames, 1))
+    x = np.zeros(len(F))
+    for step in steps:
+        x = step[:] = F.dot(x) + step
+    return steps @ C[:, None] + np.sqrt(model.noise_nm2) * rng.standard_normal((frames, 1))
 
 
 def modes_nm(disturbance: Disturbance, first: int, count: int, rate_hz: float) -> Array:
