@@ -123,7 +123,7 @@ class ModalBench(Bench):
                 newest_nm = 2 * outputs.command.actuators_nm.ravel()
             self._mirror_shapes_nm = [newest_nm, *self._mirror_shapes_nm[:-1]]
             if self._record_and_watch(outputs, record):
-                self._squares.append(np.square(modes_nm[2:] + mirror_nm).mean(axis=0))
+                self._squares.append(np.square(modes_nm[2:] + mirror_nm).sum(axis=0) / len(_TRUTH_SAMPLES))
 
     def residual_nm(self, *, continuous: bool = True) -> Array:
         """True residual (frames, modes) of the record, rms over each period; ValueError unless `continuous`."""

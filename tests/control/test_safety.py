@@ -61,7 +61,7 @@ allowed_shapes = shapes.map(within_limits)
 """Shapes within the limits, many of them exactly at a limit."""
 
 
-@settings(max_examples=400, deadline=None, derandomize=True)
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(previous=allowed_shapes, requested=st.builds(shape_of, seeds, st.sampled_from([0.0, 0.02, 0.1])))
 def test_the_limits_hold_for_any_requested_shape(previous: Single, requested: Single) -> None:
     assert violations(LIMITS, previous, previous) == []
@@ -88,7 +88,7 @@ def test_the_limits_hold_for_any_limits(stroke: float, slew: float, neighbour: f
         shape = after
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(previous=allowed_shapes, share=st.floats(0, 1))
 def test_a_move_within_the_limits_is_unchanged(previous: Single, share: float) -> None:
     """A move well within all limits is not changed, and no reason is reported; `share` is that of the slew limit."""
@@ -162,7 +162,7 @@ def test_a_shape_outside_the_limits_comes_back(previous: Single, requested: Sing
     assert violations(LIMITS, shape, limit(LIMITS, shape, requested).actuators_nm) == []
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(previous=st.one_of(allowed_shapes, shapes))
 def test_relaxing_reaches_flat(previous: Single) -> None:
     shape, steps = previous, 0

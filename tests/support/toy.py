@@ -34,6 +34,7 @@ class Toy:
         rng = np.random.default_rng(11)
         count = SHAPE[0] * SHAPE[1]
         self.reference = rng.uniform(0.5, 1.5, count)
+        self.total = self.reference.sum()
         self.response = 0.002 * rng.standard_normal((count, len(NOLL)))
         self.response -= self.response.mean(axis=0)  # the flux stays the same, so that the sensor is linear
         y, x = np.meshgrid(np.linspace(-1, 1, GRID[0]), np.linspace(-1, 1, GRID[1]), indexing="ij")
@@ -41,8 +42,8 @@ class Toy:
 
     def pixels(self, modes_nm: npt.ArrayLike, flux_dn: float = FLUX_DN) -> Pixels:
         """Frame (rows, columns) of a wavefront, exactly linear up to the rounding to DN."""
-        image = self.reference + self.response @ np.asarray(modes_nm, float)
-        return np.rint(DARK_DN + flux_dn * image.reshape(SHAPE) / self.reference.sum()).astype(np.uint16)
+        image = self.reference + self.response.dot(np.asarray(modes_nm, float))
+        return np.rint(DARK_DN + flux_dn * image.reshape(SHAPE) / self.total).astype(np.uint16)
 
 
 TOY = Toy()
@@ -168,6 +169,6 @@ def run_toy(
             assert outputs.step is not None
             steps.append(outputs.step)
             if outputs.command is not None:
-                newest = to_modes @ outputs.command.actuators_nm.reshape(-1)
+                newest = to_modes.dot(outputs.command.actuators_nm.reshape(-1))
         commanded = [newest, *commanded[:-1]]
     return steps, residual_nm, state
