@@ -3,13 +3,13 @@
 import ast
 import re
 from collections.abc import Callable, Iterable
-from functools import cache, partial
+from functools import partial
 from importlib import import_module
 from importlib.resources import files
 from pkgutil import walk_packages
 from typing import Any, get_args
 
-from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from lowfc.client import stream
 from lowfc.client.requests import DECLARED as REQUESTS
@@ -151,7 +151,11 @@ def when(topic: Topic) -> str:
 
 def fields(message: str) -> str:
     """Number, type and description of every field of one of our messages."""
-    file, comments = _declared()
+    descriptors = FileDescriptorSet.FromString((files("lowfc.contract.wire") / "lowfc.desc").read_bytes())
+    file = next(file for file in descriptors.file if file.package == "lowfc.v1")
+    comments = {
+        tuple(location.path): one_line(location.leading_comments) for location in file.source_code_info.location
+    }
     index = [one.name for one in file.message_type].index(message)
     rows = []
     for place, field in enumerate(file.message_type[index].field):
@@ -160,17 +164,6 @@ def fields(message: str) -> str:
         comment = comments.get((_MESSAGES, index, _FIELDS, place)) or _UNCOMMENTED[field.name]
         rows.append((f"`{field.name}`", many + kind, field.number, comment))
     return markdown(("field", "type", "number", ""), rows)
-
-
-@cache
-def _declared() -> tuple[FileDescriptorProto, dict[tuple[int, ...], str]]:
-    """Our messages, and the comment on each of their parts by its path."""
-    descriptors = FileDescriptorSet.FromString((files("lowfc.contract.wire") / "lowfc.desc").read_bytes())
-    file = next(file for file in descriptors.file if file.package == "lowfc.v1")
-    comments = {
-        tuple(location.path): one_line(location.leading_comments) for location in file.source_code_info.location
-    }
-    return file, comments
 
 
 def one_line(text: str | None) -> str:

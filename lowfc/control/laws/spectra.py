@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.fft import rfft
 
 from lowfc.arrays import Array, Integers, Sequences
 from lowfc.control.loop.inputs import COUNT_BITS
@@ -107,28 +108,26 @@ def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSe
     return TimeSeries(tuple(pieces), int(missing[missing <= MAX_INTERPOLATED_FRAMES].sum()))
 
 
-def spectrum(run: TimeSeries, rate_hz: float) -> Spectrum | None:
-    """Welch's estimate over all pieces of at least a segment, its length set by the longest; None if there are none."""
+def spectrum(run: TimeSeries, rate_hz: float, frames: int = 0) -> Spectrum | None:
+    """Welch's estimate over all pieces of at least a segment; None if there are none.
+
+    Each segment's mean is subtracted, and Hann's window applied; its default length, a power of two, follows from the
+    longest piece. The import of `scipy.signal` takes half a second.
+    """
     if run.longest < SHORTEST:
         return None
-    frames = min(LONGEST, max(SHORTEST, 1 << ((run.longest // _SEGMENT_SHARE).bit_length() - 1)))
-    found = [mean_periodogram(piece, rate_hz, frames) for piece in run.values if len(piece) >= frames]
-    segments = sum(one.segments for one in found)
-    total = sum(one.segments * one.power_nm2_hz for one in found)
-    return Spectrum(found[0].frequency_hz, np.asarray(total / segments), segments)
-
-
-def mean_periodogram(values_nm: Array, rate_hz: float, frames: int) -> Spectrum:
-    """Mean periodogram of a piece, nm (frames, columns), in segments of `frames` which overlap by half.
-
-    Each segment's mean is subtracted, and Hann's window applied. scipy.signal is not used: its import takes a second.
-    """
-    window = np.hanning(frames + 1)[:-1]
-    segments = np.lib.stride_tricks.sliding_window_view(values_nm, frames, axis=0)[:: frames // 2]
-    waves = np.fft.rfft((segments - segments.mean(axis=2, keepdims=True)) * window)
-    power = np.mean(np.abs(waves) ** 2, axis=0).T / (rate_hz * np.sum(window**2))
-    power[1 : (frames + 1) // 2] *= 2
-    return Spectrum(np.asarray(np.fft.rfftfreq(frames, 1 / rate_hz), np.float64), power, len(segments))
+    frames = frames or min(LONGEST, max(SHORTEST, 1 << ((run.longest // _SEGMENT_SHARE).bit_length() - 1)))
+    window = 0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, frames + 1)[:-1])
+    total, segments = np.zeros((run.values[0].shape[1], frames // 2 + 1)), 0
+    for piece in run.values:
+        if len(piece) >= frames:
+            columns = np.ascontiguousarray(piece.T, np.float64)
+            parts = np.lib.stride_tricks.sliding_window_view(columns, frames, axis=-1)[:, :: frames // 2]
+            total += (np.abs(rfft(window * (parts - parts.mean(axis=-1, keepdims=True)))) ** 2).sum(axis=1)
+            segments += parts.shape[1]
+    total[:, 1 : (frames + 1) // 2] *= 2  # both signs of the frequency
+    frequency_hz = np.asarray(np.fft.rfftfreq(frames, 1 / rate_hz), dtype=np.float64)
+    return Spectrum(frequency_hz, total.T / (segments * rate_hz * np.sum(window**2)), segments)
 
 
 def floor_nm2_hz(found: Spectrum) -> Array:

@@ -16,7 +16,7 @@ from lowfc.control.laws.kalman import lqg_block
 from lowfc.control.laws.linear_law import Block, LinearLaw, integrator, integrator_block, law_from_blocks
 from lowfc.control.laws.margins import sensitivity
 from lowfc.control.laws.pi_notch import Notch, pi_notch
-from lowfc.control.laws.spectra import TimeSeries, floor_nm2_hz, mean_periodogram, spectrum
+from lowfc.control.laws.spectra import TimeSeries, floor_nm2_hz, spectrum
 from lowfc.control.laws.stability import LOWEST_GAIN, MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG, delay_weights, highest_gain
 from lowfc.control.laws.vibration import FEWEST, Model, identify, resolution_hz
 from lowfc.control.laws.what_if import counterfactual, driven_by
@@ -80,15 +80,15 @@ def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> 
     """
     from scipy.optimize import minimize_scalar
 
-    if (coarse := spectrum(run, rate_hz)) is None or run.longest < FEWEST:
+    # Coarse segments would lose a slow mode's drift.
+    fine, coarse = spectrum(run, rate_hz, run.longest), spectrum(run, rate_hz)
+    if fine is None or coarse is None or run.longest < FEWEST:
         raise ValueError(f"a law is tuned from at least {FEWEST} frames in a row, the longest run has {run.longest}")
-    longest = max(run.values, key=len)
-    fine = mean_periodogram(longest, rate_hz, len(longest))  # coarse segments would lose a slow mode's drift
     noise_nm2 = floor_nm2_hz(coarse) * rate_hz / 2
     omega = 2 * np.pi * fine.frequency_hz[1:] / rate_hz  # an integrator without leak has no value at 0 Hz
     measured = fine.power_nm2_hz[1:] * rate_hz / 2
     leaks: list[float] = leak.tolist()
-    means_nm = [float(longest[:, mode].mean()) for mode in range(len(leaks))]
+    means_nm = [float(max(run.values, key=len)[:, mode].mean()) for mode in range(len(leaks))]
     gains, residual_nm2, sensed_nm2 = np.zeros((3, len(leaks)))
 
     def law_of(gain: float, mode: int) -> LinearLaw:

@@ -4,9 +4,8 @@ The fit is Whittle's: it minimises the sum of log P + J / P over frequencies, wi
 P the model's spectrum. A further line must raise the likelihood by more than chance does among all frequencies.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.fft import rfft
@@ -67,7 +66,7 @@ class Model:
         Its mean over all frequencies from -pi to pi is the variance.
         """
         shown = np.maximum(omega, 2 * np.pi * self.lowest_hz / self.rate_hz)
-        power = _drifts(shown)(self.drift_nm2, self.cutoff_hz / self.rate_hz)
+        power = _drift(shown, self.drift_nm2, self.cutoff_hz / self.rate_hz)
         for line in self.lines:
             power = power + _line(omega, *_per_frame(line, self.rate_hz))
         return power
@@ -205,7 +204,7 @@ class _Whittle:
         white = float(np.median(self.power[self.power.size // 2 :])) / (np.log(2) if self.segments == 1 else 1)
         low = slice(0, max(8, omega.size // 20))
         step = float(np.median(np.maximum(power[low] - white - known[low], 1e-3 * white) * omega[low] ** 2))
-        drift_of, fits = _drifts(omega), list[tuple[float, tuple[float, float, float]]]()
+        fits: list[tuple[float, tuple[float, float, float]]] = []
         for cutoff in (np.inf, 0.03, 0.003):  # cycles per frame to begin with
 
             def floor_of(parameters: Array, cutoff: float = cutoff) -> tuple[float, float, float]:
@@ -218,7 +217,7 @@ class _Whittle:
 
             def cost(parameters: Array) -> float:
                 drift_nm2, cutoff_hz, noise_nm2 = floor_of(parameters)
-                floor = drift_of(drift_nm2, cutoff_hz / self.rate_hz) + noise_nm2
+                floor = _drift(omega, drift_nm2, cutoff_hz / self.rate_hz) + noise_nm2
                 return self.misfit(power, floor + known, counts)
 
             start = np.log([step, white] + ([cutoff] if np.isfinite(cutoff) else []))
@@ -282,30 +281,20 @@ class _Whittle:
         model = self.fit_floor(model, robust=False)  # the fit of all parameters searches only near its start
         omega, power, counts = self.grouped(model.lines, robust=False)
         spacing, corner = self.spacing_hz, np.isfinite(model.cutoff_hz)
-        lowest_hz, highest_hz = spacing, self.rate_hz / 2 - spacing
-        drift_of = lru_cache(1)(_drifts(omega))
-
-        @lru_cache(2 * _MAX_LINES)  # the derivatives change one parameter at a time
-        def line_of(line: Line) -> Array:
-            return _line(omega, *_per_frame(line, self.rate_hz))
+        highest_hz = self.rate_hz / 2 - spacing
+        # Kept, as derivatives change one parameter at a time.
+        drift_of = lru_cache(1)(partial(_drift, omega))
+        line_of = lru_cache(2 * _MAX_LINES)(lambda line: _line(omega, *_per_frame(line, self.rate_hz)))
 
         def model_of(parameters: Array) -> Model:
             floor, rest = parameters[: 2 + corner], parameters[2 + corner :].reshape(-1, 3)
             lines = tuple(
-                Line(
-                    float(min(max(line.frequency_hz + shift * spacing, lowest_hz), highest_hz)),
-                    *np.exp(others).tolist(),
-                )
-                for line, (shift, *others) in zip(model.lines, rest, strict=True)
+                Line(min(max(line.frequency_hz + shift * spacing, spacing), highest_hz), *np.exp(others).tolist())
+                for line, (shift, *others) in zip(model.lines, rest.tolist(), strict=True)
             )
-            cutoff = float(np.exp(floor[2])) if corner else np.inf
-            return replace(
-                model,
-                drift_nm2=float(np.exp(floor[0])),
-                noise_nm2=float(np.exp(floor[1])),
-                cutoff_hz=cutoff,
-                lines=lines,
-            )
+            drift_nm2, noise_nm2, *cutoff = (float(np.exp(value)) for value in floor)
+            cutoff_hz = cutoff[0] if corner else np.inf
+            return Model(drift_nm2, cutoff_hz, lines, noise_nm2, self.rate_hz, model.lowest_hz)
 
         def cost(parameters: Array) -> float:
             trial = model_of(parameters)
@@ -342,18 +331,12 @@ def _kept(cutoff: float) -> float:
     return float(np.exp(-2 * np.pi * cutoff))
 
 
-def _drifts(omega: Array) -> Callable[[float, float], Array]:
-    """Function of the step's variance and the corner, in cycles per frame: spectrum (frequencies,) of the drift."""
-    squares, cosines = 4 * np.sin(omega / 2) ** 2, np.cos(omega)
-
-    def drift(step_nm2: float, cutoff: float) -> Array:
-        walk = step_nm2 / squares
-        if not np.isfinite(cutoff):
-            return np.asarray(walk)
-        kept = _kept(cutoff)
-        return np.asarray(walk * (1 - kept) ** 2 / (1 - 2 * kept * cosines + kept**2))
-
-    return drift
+def _drift(omega: Array, step_nm2: float, cutoff: float) -> Array:
+    walk = step_nm2 / (4 * np.sin(omega / 2) ** 2)
+    if not np.isfinite(cutoff):
+        return np.asarray(walk)
+    kept = _kept(cutoff)
+    return np.asarray(walk * (1 - kept) ** 2 / (1 - 2 * kept * np.cos(omega) + kept**2))
 
 
 def _per_frame(line: Line, rate_hz: float) -> tuple[float, float, float]:
