@@ -98,8 +98,7 @@ class MemoryBus:
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
         """See `Bus.subscribe`."""
-        pattern = topic.at(name)
-        subscription = (lru_cache(topic.matches) if name == ALL else pattern.__eq__, pattern, handler)
+        subscription = (lru_cache(topic.matches) if name == ALL else topic.at(name).__eq__, topic.at(name), handler)
         self._subscriptions.append(subscription)
         return lambda: self._subscriptions.remove(subscription)
 

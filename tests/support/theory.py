@@ -73,9 +73,8 @@ def run(law: LinearLaw, disturbance_nm: Array, delay_frames: float, limit_nm: fl
     history = np.zeros((max(len(weights), len(assumed)), disturbance_nm.shape[1]), np.float32)
     limit, x, errors, commands = np.float32(limit_nm), at_rest(law), [], []
     for disturbance in disturbance_nm.astype(np.float32):
-        error = y = disturbance + weights.dot(history[: len(weights)])
-        if law.signal == "pol":
-            y = error - assumed.dot(history[: len(assumed)])
+        error = disturbance + weights.dot(history[: len(weights)])
+        y = error - assumed.dot(history[: len(assumed)]) if law.signal == "pol" else error
         x = predict_and_update(law, x, y, history[0])
         history[1:] = history[:-1]
         history[0] = np.minimum(np.maximum(respond(law, x), -limit), limit)

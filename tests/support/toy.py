@@ -34,7 +34,6 @@ class Toy:
         rng = np.random.default_rng(11)
         count = SHAPE[0] * SHAPE[1]
         self.reference = rng.uniform(0.5, 1.5, count)
-        self.total = self.reference.sum()
         self.response = 0.002 * rng.standard_normal((count, len(NOLL)))
         self.response -= self.response.mean(axis=0)  # the flux stays the same, so that the sensor is linear
         y, x = np.meshgrid(np.linspace(-1, 1, GRID[0]), np.linspace(-1, 1, GRID[1]), indexing="ij")
@@ -43,7 +42,7 @@ class Toy:
     def pixels(self, modes_nm: npt.ArrayLike, flux_dn: float = FLUX_DN) -> Pixels:
         """Frame (rows, columns) of a wavefront, exactly linear up to the rounding to DN."""
         image = self.reference + self.response.dot(np.asarray(modes_nm, float))
-        return np.rint(DARK_DN + flux_dn * image.reshape(SHAPE) / self.total).astype(np.uint16)
+        return np.rint(DARK_DN + flux_dn * image.reshape(SHAPE) / self.reference.sum()).astype(np.uint16)
 
 
 TOY = Toy()

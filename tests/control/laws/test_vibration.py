@@ -1,7 +1,6 @@
 """Models of drift, lines and noise identified from known processes, and their LQG residuals."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ NM_PER_MAS = tilt_nm_per_mas(2.0)
 SAMPLED = Timing.sampled(1.0)
 
 
-@cache
 def ideal_wheel() -> TimeSeries:
     """Tip of the ideal reaction wheel, measured with white noise."""
     simulated = preset_disturbance("reaction-wheel-ideal", (2, 3, 4), 1, NM_PER_MAS, 550.0)
