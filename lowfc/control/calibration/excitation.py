@@ -66,15 +66,15 @@ def multisine(period_frames: int, bins: list[Integers], rms_nm: float, seed: int
         seed: Seed of the phases.
     """
     rng = np.random.default_rng([seed, 7])
-    columns = []
-    for places in bins:
+    spectrum = np.zeros(period_frames // 2 + 1, complex)
+
+    def drawn(places: Integers) -> Array:
+        spectrum[:] = 0
         height = rms_nm * np.sqrt(2 / len(places)) * period_frames / 2
-        drawn = []
-        for _ in range(_DRAWS):
-            spectrum = np.zeros(period_frames // 2 + 1, complex)
-            spectrum[places] = height * np.exp(2j * np.pi * rng.random(len(places)))
-            drawn.append(np.fft.irfft(spectrum, period_frames))
-        columns.append(min(drawn, key=lambda column: float(np.abs(column).max())))
+        spectrum[places] = height * np.exp(2j * np.pi * rng.random(len(places)))
+        return np.fft.irfft(spectrum, period_frames)
+
+    columns = [min((drawn(places) for _ in range(_DRAWS)), key=lambda column: np.abs(column).max()) for places in bins]
     return np.stack(columns, axis=1).astype(np.float32)
 
 

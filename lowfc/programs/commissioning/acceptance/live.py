@@ -91,6 +91,14 @@ class Live:
         for _ in self.client.steps(frames):
             pass
 
+    def check_length(self, frames: int, columns: int, basis: Single | None) -> None:
+        """AcceptanceError if a table of this size is too large for a request with these shapes."""
+        shape_bytes = 0 if basis is None else basis.nbytes
+        most_frames = (max_bytes("play") - _OTHER_BYTES - shape_bytes) // (4 * max(columns, 1))
+        if columns and frames > most_frames:
+            longest_s = most_frames / self.loop.rate_hz
+            raise AcceptanceError(f"a probe sequence of {columns} columns is too long: shorten it to {longest_s:.0f} s")
+
     def play(
         self, kind: Kind, parameters: dict[str, Any], mode: LoopMode, table: Single, basis: Single | None = None
     ) -> ProbeResponse:
@@ -99,12 +107,8 @@ class Live:
         A table without columns adds no probe: only the steps are recorded. AcceptanceError if the table is too large
         for a request, gains or law changed, or the mirror or the camera interrupted `ATTEMPTS` plays.
         """
-        frames, columns = table.shape
-        shape_bytes = 0 if basis is None else basis.nbytes
-        most_frames = (max_bytes("play") - _OTHER_BYTES - shape_bytes) // (table.itemsize * max(columns, 1))
-        if columns and frames > most_frames:
-            longest_s = most_frames / self.loop.rate_hz
-            raise AcceptanceError(f"a probe sequence of {columns} columns is too long: shorten it to {longest_s:.0f} s")
+        frames = len(table)
+        self.check_length(*table.shape, basis)
         self.set_mode(mode)
         for _ in range(ATTEMPTS):
             response, interruption = self._played(kind, parameters, mode, table, basis)

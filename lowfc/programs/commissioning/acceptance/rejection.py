@@ -120,12 +120,13 @@ def play(
         raise AcceptanceError(
             f"{duration_s:g} s at {rate_hz:.4g} Hz, {len(tested)} modes, from {required.lowest_hz:g} Hz up: {error}"
         ) from None
-    period = np.zeros((frames, len(noll)), np.float32)
-    period[:, [noll.index(mode) for mode in tested]] = multisine(frames, bins, rms_nm, seed)
-    table = with_lead_in(period, live.loop.settling_frames() + _LEAD_FRAMES)
-    basis = None
+    basis, lead_frames = None, live.loop.settling_frames() + _LEAD_FRAMES
     if isinstance(live.loop.law, LinearLaw) and live.loop.law.signal == "pol":
         basis = np.ascontiguousarray(live.calibration.modes_to_actuators.T)
+    live.check_length(lead_frames + frames, len(noll), basis)  # before a long computation
+    period = np.zeros((frames, len(noll)), np.float32)
+    period[:, [noll.index(mode) for mode in tested]] = multisine(frames, bins, rms_nm, seed)
+    table = with_lead_in(period, lead_frames)
     return [live.play(KIND, {"period_frames": frames}, LoopMode.CLOSED, table, basis)]
 
 
