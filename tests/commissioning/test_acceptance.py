@@ -41,6 +41,7 @@ THREE_MODES = {
     "acceptance.lowest_hz": 2.0,
 }
 configured = partial(configuration, FIXED_GAINS | SMALL_MIRROR | THREE_MODES)
+noiseless = partial(configured, camera__noise=False)
 
 
 def responses_of(loop: InProcessLoop, test: Any, **options: Any) -> list[ProbeResponse]:
@@ -87,7 +88,7 @@ def test_the_rejection_of_the_simulated_bench_matches_theory(multisine: tuple[In
 
 
 def test_with_a_pseudo_open_loop_law_the_multisine_is_added_to_the_mirror() -> None:
-    loop = InProcessLoop(configured())
+    loop = InProcessLoop(noiseless())
     loop.law(law_from_blocks([integrator_block(0.3, 0.001, "pol", 1.0)] * 3, "pol", "leaky", (2, 3, 4), 1.0, 250.0))
     result = rejection.judge(responses_of(loop, rejection, **MULTISINE), loop.config)
     assert (result.injected, result.law) == ("mirror", "leaky")
@@ -130,17 +131,17 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, Prob
 
 
 def test_an_interrupted_probe_sequence_is_repeated_in_the_same_mode(capsys: pytest.CaptureFixture[str]) -> None:
-    once = InProcessLoop(configured(), lose=lambda index: index == 60 and once.silence_camera())
+    once = InProcessLoop(noiseless(), lose=lambda index: index == 60 and once.silence_camera())
     (response,) = responses_of(once, linearity, hold_frames=7, cycles=3, modes=(2,))
     assert linearity.judge([response], once.config).passed
     assert capsys.readouterr().out.count("NO_FRAMES no frame for 60 ms; holding the command) during a probe") == 1
-    often = InProcessLoop(configured(), lose=lambda index: index > 20 and not index % 30 and often.silence_camera())
+    often = InProcessLoop(noiseless(), lose=lambda index: index > 20 and not index % 30 and often.silence_camera())
     with pytest.raises(AcceptanceError, match=r"in 3 attempts no probe sequence was undisturbed; .*NO_FRAMES"):
         responses_of(often, linearity, hold_frames=7, cycles=3, modes=(2,))
 
 
 def test_a_probe_sequence_waits_for_a_mirror_that_has_just_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
-    loop = InProcessLoop(configured())
+    loop = InProcessLoop(noiseless())
     loop.run(5)
     loop.report_mirror("does not answer")
     monkeypatch.setattr(recording, "sleep", lambda _: loop.report_mirror(""))
@@ -180,7 +181,7 @@ def test_linearity_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain(
 def test_the_capture_range_ends_at_the_modal_limit_or_the_sensor_range(
     changes: dict[str, Any], tilt_nm: float, captured_nm: float, lost_nm: float | None, limits: list[str]
 ) -> None:
-    config = configured(**changes, acceptance__capture_tilt_nm=tilt_nm)
+    config = noiseless(**changes, acceptance__capture_tilt_nm=tilt_nm)
     trials = responses_of(InProcessLoop(config), capture, modes=(2,))  # Z2, tip
     result = capture.judge(trials, config)
     (mode,) = result.modes
@@ -201,7 +202,7 @@ def test_a_capture_range_needs_a_gain() -> None:
 def test_the_noise_floor_matches_photon_and_read_noise() -> None:
     config = configured(disturbance__preset="bench", camera__instants=8)
     loop = InProcessLoop(config)
-    responses, calibration = responses_of(loop, noise, duration_s=3.0), loop.calibration()
+    responses, calibration = responses_of(loop, noise, duration_s=1.5), loop.calibration()
     result = noise.judge(responses, config)
     assert result.passed, result.text()
     for mode in result.modes:
