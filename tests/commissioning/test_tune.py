@@ -16,6 +16,7 @@ import pytest
 from astropy.io import fits
 
 from lowfc.adapters.files import law_file
+from lowfc.adapters.files.drawing import png
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.client import Answer
 from lowfc.contract.codecs.calibration_codec import identified
@@ -31,7 +32,7 @@ from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.commissioning.tune.command import apply_gains
 from lowfc.programs.commissioning.tune.data import Telemetry, telemetry_from_log, telemetry_from_run
-from lowfc.programs.commissioning.tune.result import picture, result_of, tuned
+from lowfc.programs.commissioning.tune.result import result_of, tuned
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
 from tests.support.loops import json_of, lowfc, refusal
 from tests.support.report_log import SyntheticLog
@@ -43,9 +44,14 @@ CONFIG = load(None, KEYS | SMALL_MIRROR)
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    night = SyntheticLog().request("close").frames(3000)
-    return night.write(tmp_path_factory.mktemp("night") / "night.mcap")
+def closed() -> SyntheticLog:
+    """A closed loop of 3 s, to be copied."""
+    return SyntheticLog().request("close").frames(3000)
+
+
+@pytest.fixture(scope="module")
+def log(closed: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return closed.write(tmp_path_factory.mktemp("night") / "night.mcap")
 
 
 @pytest.fixture(scope="module")
@@ -95,23 +101,21 @@ def test_the_true_residual_over_all_time_is_read_from_the_log(tmp_path: Path) ->
     np.testing.assert_allclose(run.continuous_rms_nm, 2 * np.sqrt(np.diag(run.true_nm2)), rtol=1e-5)
 
 
-def test_the_command_writes_the_law_and_draws_it(
-    log: Path, tuned_as: Callable[[str], tuple[Tuned, Gains]], tmp_path: Path
+def test_the_command_writes_the_law_and_draws_it_with_the_labels_of_the_page_and_the_power_of_narrow_lines(
+    log: Path,
+    telemetry: Telemetry,
+    tuned_as: Callable[[str], tuple[Tuned, Gains]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr("lowfc.adapters.files.drawing.png", lambda figure: drawn.append(figure) or png(figure))
     out, plot = tmp_path / "law.fits", tmp_path / "law.png"
     result = json_of("tune", log, "--controller", "lqg", "--out", out, "--plot", plot)
     assert result["files"] == [str(out), str(plot)]
     assert plot.read_bytes()[:4] == b"\x89PNG"
-    assert law_file.load(out).id == tuned_as("lqg")[0].law.id
-
-
-def test_the_picture_has_the_labels_of_the_page_on_tuning_and_keeps_the_power_of_narrow_lines(
-    telemetry: Telemetry, tuned_as: Callable[[str], tuple[Tuned, Gains]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn: list[Any] = []
-    monkeypatch.setattr("lowfc.adapters.files.drawing.png", drawn.append)
     best, gains = tuned_as("lqg")
-    picture(telemetry, best)
+    assert law_file.load(out).id == best.law.id
     page = " ".join((Path(__file__).parents[2] / "docs/howto/tuning.md").read_text().split())
     curves = {line.get_label().split(" (")[0]: line.get_ydata() for line in drawn[0].axes[0].lines}
     assert [label for label in curves if f"the {label}" not in page] == []
@@ -123,12 +127,14 @@ def test_the_picture_has_the_labels_of_the_page_on_tuning_and_keeps_the_power_of
         assert variance_nm2 == pytest.approx(rms_nm**2, rel=0.05)
     # The model's line is far narrower than the spacing of the drawn frequencies.
     assert curves["model of the pseudo-open-loop"].sum() == pytest.approx(curves["pseudo-open-loop"].sum(), rel=0.2)
-    drawn[0].draw_without_rendering()
     for axes in drawn[0].axes:
         assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1  # above all lines
 
 
-def test_the_result_is_printed_although_the_loop_refuses_the_law(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_result_is_printed_although_the_loop_refuses_the_law(
+    log: Path, tuned_as: Callable[[str], tuple[Tuned, Gains]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lowfc.programs.commissioning.tune.result.tuned", lambda _, controller: tuned_as(controller))
     monkeypatch.setattr("lowfc.client.the_run", lambda _: "bench")
     monkeypatch.setattr("lowfc.client.Client", Mock(side_effect=RequestRefusedError("another delay")))
     done = lowfc("tune", log, "--controller", "lqg", "--apply", "--json")
@@ -137,13 +143,15 @@ def test_the_result_is_printed_although_the_loop_refuses_the_law(log: Path, monk
 
 
 @pytest.mark.parametrize(("frames", "extent"), [(3000, "over the last 2500, theory is for all"), (1000, "over all of")])
-def test_the_residual_achieved_is_that_of_the_last_gains(tmp_path: Path, frames: int, extent: str) -> None:
+def test_the_residual_achieved_is_that_of_the_last_gains(
+    closed: SyntheticLog, tmp_path: Path, frames: int, extent: str
+) -> None:
     """Frames with earlier gains give pseudo-open-loop modes, but their errors do not follow the last law's theory."""
-    night = SyntheticLog().request("close").frames(3600).request("gain", (0.1,) * 3).frames(frames)
+    night = closed.copy().request("gain", (0.1,) * 3).frames(frames)
     result = json_of("tune", night.write(tmp_path / "night.mcap"))
     tip = result["modes"][0]
     assert (tip["achieved_nm"] == pytest.approx(tip["predicted_now_nm"], rel=0.1)) is (frames == 3000)
-    assert result["frames"] == 3600 - 500 + frames
+    assert result["frames"] == 3000 - 500 + frames
     (warning,) = result["warnings"]
     assert warning.startswith(f"law or gains changed in these frames: the achieved residual is {extent}")
 
@@ -156,26 +164,24 @@ def test_an_offset_does_not_belong_to_the_disturbance_at_a_measured_delay(tmp_pa
     assert np.ptp(run.pol.joined()[:, 2]) < 10
 
 
-def test_an_offset_or_a_channel_in_the_true_residual_is_reported(tmp_path: Path) -> None:
+def test_an_offset_or_a_channel_in_the_true_residual_is_reported(closed: SyntheticLog, tmp_path: Path) -> None:
     shaped = "an offset or channels were in force: the achieved residual contains their shapes, theory does not"
     night = SyntheticLog().request("close").frames(100).request("offset", (0.0, 0.0, 20.0)).frames(2700)
     result = json_of("tune", night.write(tmp_path / "night.mcap"))
     assert result["modes"][2]["achieved_nm"] > 19
     assert result["warnings"] == [shaped]
-    night = SyntheticLog().request("close").frames(2700)
-    for name, warnings in (("flat", []), ("dark-hole", [shaped])):
-        night.change(CONTROLLER_STATE, -1, lambda state, name=name: state.channels.add(name=name))
-        assert json_of("tune", night.write(tmp_path / f"{name}.mcap"))["warnings"] == warnings
+    night = closed.copy()
+    night.change(CONTROLLER_STATE, -1, lambda state: state.channels.add(name="dark-hole"))
+    assert telemetry_from_log(LogReader(night.write(tmp_path / "dark-hole.mcap"))).warnings == (shaped,)
 
 
 def test_a_loop_that_was_closed_for_too_few_frames_is_not_simply_called_open(tmp_path: Path) -> None:
     """Its achieved residual is not given, so there is no warning that the residual contains the offset."""
-    night = SyntheticLog().request("open").frames(400).request("close").frames(100)
+    night = SyntheticLog().request("open").frames(100).request("close").frames(100)
     night.request("offset", (0.0, 0.0, 20.0)).frames(1900)
-    result = json_of("tune", log := night.write(tmp_path / "night.mcap"))
-    assert not result["closed"]
-    assert "2400 frames at 1000 Hz, loop closed in 2000 of them, delay" in lowfc("tune", log).stdout
-    (warning,) = result["warnings"]
+    lines = lowfc("tune", night.write(tmp_path / "night.mcap")).stdout.splitlines()
+    assert "2100 frames at 1000 Hz, loop closed in 2000 of them, delay" in lines[0]
+    (warning,) = [line for line in lines if line.startswith("warning: ")]
     assert "in closed loop at most 2000 good frames are consecutive, fewer than 2048" in warning
 
 
@@ -185,10 +191,11 @@ def test_a_loop_that_was_closed_for_just_enough_frames_and_then_opened_is_tuned_
     assert (result["closed"], result["frames"], result["warnings"]) == (True, 2048, [])
 
 
-def test_a_weighted_reconstructor_is_reported(tmp_path: Path) -> None:
+def test_a_weighted_reconstructor_is_reported_and_a_flat_map_is_not(closed: SyntheticLog, tmp_path: Path) -> None:
     """A gain for a mode that had none would replace this reconstructor by one with more noise."""
-    night = SyntheticLog().request("close").frames(2700)
+    night = closed.copy()
     night.change(CONTROLLER_STATE, -1, lambda state: state.prior_nm2.extend([0, 0, 4]))
+    night.change(CONTROLLER_STATE, -1, lambda state: state.channels.add(name="flat"))
     warnings = json_of("tune", night.write(tmp_path / "night.mcap"))["warnings"]
     assert ["modes that they do not correct (Z4)" in warning for warning in warnings] == [True]
 
@@ -208,14 +215,13 @@ def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path)
 
 
 def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
-    path = SyntheticLog().request("open").frames(2150).write(tmp_path / "open.mcap")
-    result = json_of("tune", path)
-    assert not result["closed"]
-    assert result["modes"][0]["achieved_nm"] is None
-    assert result["warnings"] == []
-    run = telemetry_from_log(LogReader(path))
-    larger = replace(run, nm_per_mas=run.nm_per_mas / 10)
-    warned = result_of(larger, *tuned(larger, "integrator"), "integrator").text()
+    run = telemetry_from_log(LogReader(SyntheticLog().request("open").frames(2150).write(tmp_path / "open.mcap")))
+    best = tuned(run, "integrator")
+    result = result_of(run, *best, "integrator")
+    assert not result.closed
+    assert result.modes[0].achieved_nm is None
+    assert result.warnings == []
+    warned = result_of(replace(run, nm_per_mas=run.nm_per_mas / 10), *best, "integrator").text()
     assert "above 10: the optical gain of the sensor is low" in warned
 
 
@@ -404,8 +410,8 @@ def test_the_previous_law_is_restored_without_an_answer_or_the_error_says_that_i
     assert loop.law_and_gains() == (None, before[1])
 
 
-def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
-    night = SyntheticLog().request("close").frames(2700).request("open")
+def test_a_log_that_is_too_short_is_refused(closed: SyntheticLog, tmp_path: Path) -> None:
+    night = closed.copy().request("open")
     night.load(identified(replace(night.calibration, flux_dn=1.0)))  # frames of the former calibration do not count
     short = night.request("close").frames(700).write(tmp_path / "short.mcap")
     error = refusal("tune", short, kind=DataFileError)

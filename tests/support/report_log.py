@@ -1,6 +1,7 @@
 """A log of the loop of `tests.support.toy`, from the real controller's `advance`, without processes."""
 
 from collections.abc import Callable, Collection
+from copy import copy, deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -67,6 +68,7 @@ class SyntheticLog:
         self._camera_start = START
         self._count = self._frames = 0
         self._to_modes = np.linalg.pinv(self.calibration.modes_to_actuators)
+        self._dark_dn = self.calibration.dark.reshape(SHAPE).astype(float)
         self._moved_nm = np.zeros(len(NOLL), np.float32)
         self.start_controller()
         camera = wire.CameraState(
@@ -78,6 +80,12 @@ class SyntheticLog:
             bit_depth=16,
         )
         self.put(CAMERA_STATE, camera)
+
+    def copy(self) -> Self:
+        """An independent log that continues this one."""
+        other = copy(self)
+        other.samples, other._counts, other._rng = [*self.samples], {**self._counts}, deepcopy(self._rng)
+        return other
 
     def start_controller(self) -> None:
         """Start a new controller, without the state of the previous one."""
@@ -237,7 +245,6 @@ class SyntheticLog:
 
     def _pixels(self, residual_nm: Single, flux_dn: float) -> Pixels:
         """Draw photon and read noise."""
-        mean_dn = TOY.pixels(residual_nm, flux_dn).astype(float)
-        dark_dn = self.calibration.dark.reshape(SHAPE).astype(float)
-        drawn = dark_dn + self._rng.poisson(mean_dn - dark_dn) + READ_NOISE_E * self._rng.standard_normal(SHAPE)
+        electrons = self._rng.poisson(TOY.pixels(residual_nm, flux_dn) - self._dark_dn)
+        drawn = self._dark_dn + electrons + READ_NOISE_E * self._rng.standard_normal(SHAPE)
         return np.asarray(np.rint(np.clip(drawn, 0, 65_535)), np.uint16)
