@@ -211,9 +211,7 @@ def test_the_noise_floor_matches_photon_and_read_noise() -> None:
         assert 0 < mode.residual_floor_nm < mode.closed_nm
     brighter = configured(star__magnitude=-2.0)
     four_times = replace(calibration, flux_dn=4 * calibration.flux_dn)
-    of_brighter_star = [
-        replace(response, loop=replace(response.loop, calibration=four_times)) for response in responses
-    ]
+    of_brighter_star = [replace(each, loop=replace(each.loop, calibration=four_times)) for each in responses]
     failed = noise.judge(of_brighter_star, brighter)
     assert not failed.passed
     assert "FAILED" in failed.text()

@@ -41,11 +41,11 @@ from tests.support.toy import NOLL, PERIOD_NS, frame_sequence
 
 KEYS = {"sensor.modes": 3, "camera.rate_hz": 1000, "control.tilt_gain": 0.4, "control.gain": 0.2}
 CONFIG = load(None, KEYS | SMALL_MIRROR)
+TunedAs = Callable[[str], tuple[Tuned, Gains]]
 
 
 @pytest.fixture(scope="module")
 def closed() -> SyntheticLog:
-    """A closed loop of 3 s, to be copied."""
     return SyntheticLog().request("close").frames(3000)
 
 
@@ -60,14 +60,12 @@ def telemetry(log: Path) -> Telemetry:
 
 
 @pytest.fixture(scope="module")
-def tuned_as(telemetry: Telemetry) -> Callable[[str], tuple[Tuned, Gains]]:
+def tuned_as(telemetry: Telemetry) -> TunedAs:
     return cache(partial(tuned, telemetry))
 
 
 @pytest.mark.parametrize("controller", ["integrator", "pi-notch", "lqg"])
-def test_each_law_is_tuned_from_a_closed_loop(
-    telemetry: Telemetry, tuned_as: Callable[[str], tuple[Tuned, Gains]], controller: str
-) -> None:
+def test_each_law_is_tuned_from_a_closed_loop(telemetry: Telemetry, tuned_as: TunedAs, controller: str) -> None:
     """Tip is a sine of 12 nm at 7 Hz with noise: the line is found, and each law predicts a smaller residual."""
     best, gains = tuned_as(controller)
     result = result_of(telemetry, best, gains, controller)
@@ -102,11 +100,7 @@ def test_the_true_residual_over_all_time_is_read_from_the_log(tmp_path: Path) ->
 
 
 def test_the_command_writes_the_law_and_draws_it_with_the_labels_of_the_page_and_the_power_of_narrow_lines(
-    log: Path,
-    telemetry: Telemetry,
-    tuned_as: Callable[[str], tuple[Tuned, Gains]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    log: Path, telemetry: Telemetry, tuned_as: TunedAs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[Any] = []
     monkeypatch.setattr("lowfc.adapters.files.drawing.png", lambda figure: drawn.append(figure) or png(figure))
@@ -132,7 +126,7 @@ def test_the_command_writes_the_law_and_draws_it_with_the_labels_of_the_page_and
 
 
 def test_the_result_is_printed_although_the_loop_refuses_the_law(
-    log: Path, tuned_as: Callable[[str], tuple[Tuned, Gains]], monkeypatch: pytest.MonkeyPatch
+    log: Path, tuned_as: TunedAs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lowfc.programs.commissioning.tune.result.tuned", lambda _, controller: tuned_as(controller))
     monkeypatch.setattr("lowfc.client.the_run", lambda _: "bench")

@@ -114,14 +114,13 @@ class SyntheticLog:
             self._count, self._frames = self._count + 1, self._frames + 1
             self.put(FRAME, image(frame, self.now_ns, "sensor"), sequence)
             if self.truth:
-                rms = [float(np.linalg.norm(one)) for one in (wave_nm, residual_nm)]
                 truth = wire.Truth(
                     timestamp=timestamp(self.now_ns),
                     frame_sequence=sequence,
                     disturbance_nm=wave_nm,
                     residual_nm=residual_nm,
-                    disturbance_rms_nm=rms[0],
-                    residual_rms_nm=rms[1],
+                    disturbance_rms_nm=np.linalg.norm(wave_nm),
+                    residual_rms_nm=np.linalg.norm(residual_nm),
                 )
                 if self.instants:
                     truth.instants = self.instants

@@ -66,10 +66,9 @@ def multisine(period_frames: int, bins: list[Integers], rms_nm: float, seed: int
         seed: Seed of the phases.
     """
     rng = np.random.default_rng([seed, 7])
-    spectrum = np.zeros(period_frames // 2 + 1, complex)
 
     def drawn(places: Integers) -> Array:
-        spectrum[:] = 0
+        spectrum = np.zeros(period_frames // 2 + 1, complex)
         height = rms_nm * np.sqrt(2 / len(places)) * period_frames / 2
         spectrum[places] = height * np.exp(2j * np.pi * rng.random(len(places)))
         return np.fft.irfft(spectrum, period_frames)

@@ -107,8 +107,7 @@ class Live:
         A table without columns adds no probe: only the steps are recorded. AcceptanceError if the table is too large
         for a request, gains or law changed, or the mirror or the camera interrupted `ATTEMPTS` plays.
         """
-        frames = len(table)
-        self.check_length(*table.shape, basis)
+        self.check_length(frames := len(table), table.shape[1], basis)
         self.set_mode(mode)
         for _ in range(ATTEMPTS):
             response, interruption = self._played(kind, parameters, mode, table, basis)
