@@ -11,11 +11,11 @@ import numpy.typing as npt
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Ring, Sample
-from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.contract.codecs import codec
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import BadMessageError, BusError
 from lowfc.contract.messages import from_timestamp, wire
+from lowfc.contract.sequence_gaps import Gaps
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode, reason_of
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.dispatch import OLD_NS, Dispatch
 from lowfc.adapters.bus.mailbox import Mailbox
-from lowfc.adapters.logs.sequence_gaps import REMEMBERED, Gaps
 from lowfc.contract.envelope import count_of, sequence_of
 from lowfc.contract.messages import FRAME
+from lowfc.contract.sequence_gaps import REMEMBERED, Gaps
 
 PATIENCE_S = 30.0
 

@@ -131,6 +131,12 @@ def test_imports_point_downward() -> None:
     assert [fault for name, path in FILES.items() for fault in layer_faults(name, path.read_text("utf-8"))] == []
 
 
+def test_the_bus_does_not_depend_on_the_logs() -> None:
+    bus = {name: path.read_text("utf-8") for name, path in FILES.items() if inside(name, "lowfc.adapters.bus")}
+    imports = [(name, target) for name, source in bus.items() for target in imports_of(ast.parse(source))]
+    assert [pair for pair in imports if inside(pair[1], "lowfc.adapters.logs")] == []
+
+
 def test_numerical_modules_are_pure() -> None:
     pure = {name: path.read_text("utf-8") for name, path in FILES.items() if is_pure(name)}
     assert [fault for name, source in pure.items() for fault in purity_faults(name, source)] == []

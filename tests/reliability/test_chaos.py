@@ -13,7 +13,6 @@ import pytest
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import runtime_base
-from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.terminal import INTERRUPTED
 from lowfc.contract.configuration import load
@@ -21,6 +20,7 @@ from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, TRUTH, Log, Topic, wire
+from lowfc.contract.sequence_gaps import Gaps
 from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Outcome, ProcessEnd
 from lowfc.programs.reliability.chaos.case import Case, lacking
 from lowfc.programs.reliability.chaos.cases import CASES

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.logs.sequence_gaps import Arrivals
+from lowfc.contract.sequence_gaps import Arrivals
 
 MAX_IN_A_ROW = 16
 """Number of messages dispatched back to back before waiting ones are skipped."""
@@ -71,5 +71,5 @@ class Dispatch(Arrivals):
                 self._skipped += 1
             else:
                 handler(sample)
-            self.count(sample)
+            self.count(sample.sequence)
             self._done_ns = self._now_ns()

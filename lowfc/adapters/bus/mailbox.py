@@ -5,10 +5,10 @@ import time
 from collections import deque
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.logs.sequence_gaps import Arrivals
+from lowfc.contract.sequence_gaps import Arrivals
 
 MAX_WAIT_S = 0.5
-"""Longest single wait: Python handles a signal that arrives just before a wait only when that wait ends."""
+"""Longest single wait. A signal that arrives just before a wait is handled after it, so this bounds the delay."""
 
 
 class Mailbox(Arrivals):
@@ -37,7 +37,7 @@ class Mailbox(Arrivals):
 
     def put(self, sample: Sample) -> None:
         """Store a message, usually on the bus's thread."""
-        self.count(sample)
+        self.count(sample.sequence)
         self._slot.append(sample)
         self._notify()
 

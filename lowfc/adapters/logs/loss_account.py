@@ -9,9 +9,9 @@ from google.protobuf.message import DecodeError
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.names import MAX_NAME_LENGTH, MAX_NAMES, Names
 from lowfc.adapters.logs.selection import EVERYTHING, Selection
-from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.contract.envelope import COUNT_BITS, count_of, start_of
 from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, known_topic, wire
+from lowfc.contract.sequence_gaps import Gaps
 
 MAX_STARTS = 8
 """Number of a publisher's newest starts with separate counts; earlier ones are summed."""

@@ -19,7 +19,6 @@ from lowfc.adapters.bus.bus import ALL, UNREADABLE, Bus, Publisher, Sample
 from lowfc.adapters.bus.dispatch import Dispatch
 from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.bus.names import Names
-from lowfc.adapters.logs.sequence_gaps import Arrivals
 from lowfc.adapters.process.clock import WALL_TOLERANCE_NS, Clock
 from lowfc.adapters.process.host import resident_bytes
 from lowfc.adapters.process.realtime import NOTHING, Granted
@@ -29,6 +28,7 @@ from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import EVENT, HEALTH, Log, Role, Topic, timestamp, wire
+from lowfc.contract.sequence_gaps import Arrivals
 from lowfc.control.loop.wording import counted
 
 HEALTH_PERIOD_NS = 500_000_000

@@ -10,12 +10,12 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.arrays import Array, Long, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import COMMAND, EVENT, HEALTH, MIRROR_STATE, STEP, TRUTH, Topic, known_topic
+from lowfc.contract.sequence_gaps import Gaps
 
 FORGED_S = 1
 """Start time in the sequence of injected messages; it is in 1970, so no process of a run has it."""

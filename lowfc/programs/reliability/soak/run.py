@@ -12,10 +12,10 @@ import psutil
 
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.selection import EVERYTHING
-from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.messages import EVENT, FRAME, Role, topic_of, wire
+from lowfc.contract.sequence_gaps import Gaps
 from lowfc.control.loop.safety import mode_name
 from lowfc.programs.launch.sim_loop import check, deferred_signals
 from lowfc.programs.launch.watch import topic_count

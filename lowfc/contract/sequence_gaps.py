@@ -1,6 +1,5 @@
 """Detection of gaps in a publisher's sequence; a late message closes its gap."""
 
-from lowfc.adapters.bus.bus import Sample
 from lowfc.contract.envelope import count_of, start_of
 
 REMEMBERED = 4096
@@ -65,9 +64,8 @@ class Arrivals:
         """Number of received messages that were not processed; 0 unless a subclass skips messages."""
         return 0
 
-    def count(self, sample: Sample) -> None:
-        """Count a received message."""
-        sequence = sample.sequence
+    def count(self, sequence: int) -> None:
+        """Count a received message by its sequence."""
         if sequence == self.last_sequence + 1 and self.received and count_of(sequence):  # the usual case in the loop
             self.last_sequence = sequence
             self._gaps.next += 1
