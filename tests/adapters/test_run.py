@@ -14,7 +14,7 @@ import pytest
 from lowfc.adapters.bus.bus import ALL, Query
 from lowfc.adapters.bus.run import mirror_role, new_run_id, open_run, own_directory, runtime_base
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.files.whole_file import require_folder, write_whole
+from lowfc.adapters.files.whole_file import being_written, draft, require_folder, write_whole
 from lowfc.adapters.process import latch as latch_module
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.latch import Latch, latch_files
@@ -293,6 +293,24 @@ def test_a_file_that_cannot_be_written_is_an_error_before_and_at_the_writing(tmp
         write_whole(allowed, b"")
     with pytest.raises(DataFileError, match="nowhere/file cannot be written: No such file"):
         write_whole(tmp_path / "nowhere" / "file", b"")
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, calls = tmp_path / "file", list[bool]()
+    monkeypatch.setattr(os, "fsync", lambda _: calls.append(path.exists()))
+    write_whole(path, b"content")
+    assert calls == [False]
+
+
+def test_only_errors_of_the_writing_are_reported_as_errors_of_the_file(tmp_path: Path) -> None:
+    with (
+        pytest.raises(DataFileError, match="file cannot be written: Connection refused"),
+        being_written(tmp_path / "file"),
+    ):
+        raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
+    with pytest.raises(ConnectionRefusedError), draft(tmp_path / "file"):
+        raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_failed_write_leaves_the_old_file_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Atomic writing of files: complete or absent."""
+"""Atomic writing of files: complete or absent, also after a power failure."""
 
 import contextlib
 import errno
@@ -11,32 +11,48 @@ from pathlib import Path
 
 from lowfc.contract.errors import ConfigurationError, DataFileError, raised_as
 
-_NAME_LENGTH = 50  # characters of the final name in that of the temporary file, which must not be too long
+_NAME_LENGTH = 50  # at most so many characters of the final name go into the temporary one: file systems limit it
 
 
 @contextlib.contextmanager
 def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> Iterator[Path]:
+    """As `draft`, for a block that only writes the file: its OSErrors are DataFileErrors as well."""
+    with _reported(path), draft(path, source, mode) as part:
+        yield part
+
+
+@contextlib.contextmanager
+def draft(path: Path, source: Path | None = None, mode: int = 0o666) -> Iterator[Path]:
     """Yield a temporary file that is renamed to `path` on success and removed on failure.
 
     A log, a directory, device or pipe at `path` is not replaced. The permissions are `mode` without the umask's bits,
     and at most those of `source`, the file that the content comes from.
 
     Raises:
-        DataFileError: the file cannot be written, or is a log.
+        DataFileError: the file cannot be written, or is a log. Errors of the block are raised unchanged.
     """
-    try:
+    with _reported(path):
         _require_replaceable(path, source)
         permitted = source.stat().st_mode & mode if source is not None and source.exists() else mode
         part = path.with_name(f".{path.name[:_NAME_LENGTH]}.{secrets.token_hex(4)}")
         descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, permitted)
         mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
         os.close(descriptor)
-        try:
-            yield part
+    try:
+        yield part
+        with _reported(path):
             part.chmod(mode)  # the writer may have replaced it
+            with part.open("rb") as written:
+                os.fsync(written.fileno())  # otherwise the file may be empty after a power failure
             part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _reported(path: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise DataFileError(f"{path} cannot be written: {error.strerror or f'is the disk full? {error}'}") from error
 
@@ -52,7 +68,7 @@ def write_whole(path: Path, content: bytes, source: Path | None = None, mode: in
 
 
 def require_folder(*files: Path | None) -> None:
-    """Check that files can be written later, as by `being_written`; None is skipped.
+    """Check that files can be written later with `being_written`; None is skipped.
 
     Raises:
         DataFileError: A file's folder does not exist or cannot be written, or the file cannot be replaced.
@@ -71,7 +87,7 @@ def require_folder(*files: Path | None) -> None:
 
 
 def _require_replaceable(path: Path, source: Path | None = None) -> None:
-    """Refuse to replace `source`, any log, whatever its name, and anything that is not a regular file."""
+    """Refuse to replace `source`, a log of any name, or anything but a regular file."""
     if path.name and not path.exists():
         return
     if not path.is_file():
@@ -79,7 +95,7 @@ def _require_replaceable(path: Path, source: Path | None = None) -> None:
     from mcap.writer import MCAP0_MAGIC  # slow
 
     with (
-        raised_as(DataFileError, OSError, f"{path} is not overwritten: cannot read whether it is a log"),
+        raised_as(DataFileError, OSError, f"{path} is not overwritten: cannot determine whether it is a log"),
         path.open("rb") as file,
     ):
         is_log = file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC

@@ -14,7 +14,7 @@ import typer
 
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.files import factory
-from lowfc.adapters.files.whole_file import being_written, write_whole
+from lowfc.adapters.files.whole_file import being_written
 from lowfc.adapters.process.join import join
 from lowfc.adapters.process.realtime import let_send
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
@@ -98,7 +98,9 @@ def frame_source(
         states.put(state.SerializeToString())
         service.state = "running"
         begin_ns = clock.now_ns() + _FIRST_FRAME_PERIODS * period_ns
-        write_whole(folder / BEGIN_FILE, str(begin_ns).encode())
+        draft = folder / f".{BEGIN_FILE}"  # `write_whole` waits for the disk, and the first frame would be late
+        draft.write_text(str(begin_ns))
+        draft.replace(folder / BEGIN_FILE)
         for index in range(math.ceil(seconds * settings.camera.rate_hz)):
             next_ns = begin_ns + index * period_ns
             payload = payloads.at(index, next_ns)

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.files.whole_file import being_written, require_folder
+from lowfc.adapters.files.whole_file import draft, require_folder
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.join import clock_of
 from lowfc.adapters.process.progress import reading_bar
@@ -42,7 +42,7 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
     clock = clock_of(config)
     with contextlib.ExitStack() as stack:
         if target.save is not None:
-            target.part = stack.enter_context(being_written(target.save))
+            target.part = stack.enter_context(draft(target.save))
         bus = ZenohBus(run.links, Role.VIEWER, clock, monitor=True)
         stack.callback(bus.close)
         view = LiveView(config, run_id, clock, bus, target)
@@ -84,7 +84,7 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
     drawn = Drawn()
     with contextlib.ExitStack() as stack:
         if target.save is not None:
-            target.part = stack.enter_context(being_written(target.save, logs[0]))
+            target.part = stack.enter_context(draft(target.save, logs[0]))
         viewer = target.viewer()
         if viewer is not None:
             stack.callback(viewer.stop)
