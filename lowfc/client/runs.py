@@ -27,7 +27,9 @@ def the_run(name: str | None) -> str:
         if not runs:
             raise BusError("; ".join(filter(None, (no_loop_message(), _silent_routers(None)))))
         if len(runs) > 1:
-            raise BusError(f"choose a run with --run, the beginning of its name is enough: there are {_listed(runs)}")
+            raise BusError(
+                f"more than one run is live: {_listed(runs)}; choose one with --run (a unique prefix is enough)"
+            )
         return next(iter(runs))
     if name in runs:
         return name

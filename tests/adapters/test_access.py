@@ -246,7 +246,9 @@ def test_a_lost_router_is_reported_with_the_reason(hosts: Hosts, capfd: pytest.C
 
     router = hosts.join(ROUTER)
     hosts.join("camera")
-    until(lambda: socket_options(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT).count(routed.LEASE_MS) == 2)  # both ends
+    until(
+        lambda: socket_options(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT).count(routed.LINK_LEASE_MS) == 2
+    )  # both ends
     router.close()
     await_report(f"camera: no link to the router at tls/127.0.0.1:{hosts.port}: Connection refused\n")
     hosts.join(ROUTER)

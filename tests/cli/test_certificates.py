@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from cryptography import x509
 
 from lowfc.adapters.bus.access import ROUTER
 from lowfc.adapters.bus.own_certificate import WARN_DAYS, read_certificate
@@ -186,6 +187,27 @@ def test_a_certificate_is_checked_as_its_peers_check_it(tmp_path: Path) -> None:
         read_certificate(tmp_path / "ca.pem", camera[0], tmp_path / "own.key")
 
 
+def test_a_certificate_without_a_name_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    named = certificates._name
+    monkeypatch.setattr(certificates, "_name", lambda name: x509.Name([]) if name == "camera" else named(name))
+    make(tmp_path, ("camera",), [])
+    with pytest.raises(DataFileError, match="no common name"):
+        read_certificate(tmp_path / "ca.pem", tmp_path / "camera.pem", tmp_path / "camera.key")
+
+
+def test_another_authority_in_the_file_does_not_end_a_certificate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(tmp_path, ("camera",), [], 100)
+    monkeypatch.setattr(certificates, "CA_DAYS", 10)
+    make(tmp_path / "former", ("camera",), [], 100)
+    both = tmp_path / "both.pem"
+    both.write_bytes((tmp_path / "ca.pem").read_bytes() + (tmp_path / "former" / "ca.pem").read_bytes())
+    certificate = read_certificate(both, tmp_path / "camera.pem", tmp_path / "camera.key")
+    assert certificate.ends - datetime.datetime.now(datetime.UTC) > datetime.timedelta(days=99)
+    assert not certificate.ends_with_authority
+
+
 def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
     now, day = datetime.datetime.now(datetime.UTC), datetime.timedelta(days=1)
     network = Network(router="tls/localhost:7447", certificates=str(tmp_path))
@@ -194,12 +216,12 @@ def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
     assert certificate_warnings(network, now + (99 - WARN_DAYS) * day) == []
     date = now + 100 * day
     assert certificate_warnings(network, now + (100.5 - WARN_DAYS) * day) == [
-        f"{role}'s certificate ends in {WARN_DAYS - 1} days, on {date:%Y-%m-%d}: lowfc certs FOLDER --renew"
+        f"{role}'s certificate expires in {WARN_DAYS - 1} days, on {date:%Y-%m-%d}: lowfc certs FOLDER --renew"
         for role in ("camera", "router")
     ]
     warnings = certificate_warnings(network, now + (CA_DAYS - WARN_DAYS + 1) * day)
     assert len(warnings) == 3, "the authority's certificate ends before the viewer's"
-    assert warnings[2].endswith("with its authority's ca.pem: make all anew in an empty folder (lowfc certs)")
+    assert warnings[2].endswith("ca.pem expires then: create all of them anew in an empty folder (lowfc certs)")
     (tmp_path / "viewer.key").chmod(0o644)
     (warning,) = certificate_warnings(network, now)
     assert "viewer.key can be read by every user" in warning

@@ -144,7 +144,7 @@ def test_the_numbers_of_the_document_are_those_of_the_code() -> None:
     assert retry["period_max_ms"] == 1000
     for sentence in (
         f"Certificates are valid for {certificates.DAYS} days",
-        f"A link that is silent for {routed.LEASE_MS / 1000:g} s is closed, and",
+        f"A link that is silent for {routed.LINK_LEASE_MS / 1000:g} s is closed, and",
         "reconnection is tried at least every second",
         f"{FIRST_EXCHANGES} times before its first message and then {1 / PERIOD_S:g} times a second",
         f"the shortest round trip of the last {RECENT}:",

@@ -323,7 +323,7 @@ def test_runs_are_found_by_their_listening_processes(own_runtime: Path, listen: 
     assert running() == ["whole"]
     (open_run("damaged").path / "links.json").write_text("")
     assert (the_run("whole"), the_run("left")) == ("whole", "left"), "a damaged run does not affect others"
-    with pytest.raises(BusError, match=r"choose a run with --run.*: there are left \(no controller yet\), whole$"):
+    with pytest.raises(BusError, match=r"more than one run is live: left \(no controller yet\), whole; choose"):
         the_run(None)  # `left` may be starting
     with pytest.raises(DataFileError, match=r"links\.json"):
         the_run("damaged")

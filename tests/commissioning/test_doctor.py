@@ -270,7 +270,7 @@ def test_expiring_or_absent_certificates_are_a_warning(tmp_path: Path, monkeypat
     certificates.make_certificates(folder, ("camera",), [], 59, renew=True)
     finding = examine(facts(tmp_path, config=routed))["certificates"]
     assert finding.status == "warning"
-    assert "camera's certificate ends in 58 days" in finding.got
+    assert "camera's certificate expires in 58 days" in finding.got
 
 
 def test_the_kernels_clock_state_is_read_from_the_right_fields() -> None:

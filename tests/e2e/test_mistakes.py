@@ -1,4 +1,4 @@
-"""A user's mistakes: one clear message, exit status 2, nothing half done. Most commands run in this process."""
+"""A user's mistakes: one clear message, exit status 2, no file or run left behind. Most run in this process."""
 
 import contextlib
 import json
@@ -132,7 +132,9 @@ def _refused(folder: Path, *words: str, expected: str, config: str = "") -> str:
         ("runs --help", "2>&-", 0, ""),
     ],
 )
-def test_a_full_disk_or_a_closed_stream_has_a_one_line_error(words: str, output: str, status: int, error: str) -> None:
+def test_a_full_disk_or_a_closed_stream_gives_at_most_one_line(
+    words: str, output: str, status: int, error: str
+) -> None:
     script = ["sh", "-c", f'exec "$@" {words} {output}', "sh", *LOWFC]
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     done = subprocess.run(script, env=buffered, capture_output=True, text=True, check=False)
@@ -140,7 +142,7 @@ def test_a_full_disk_or_a_closed_stream_has_a_one_line_error(words: str, output:
 
 
 @pytest.mark.parametrize("fault", ["EDQUOT", "EFBIG"])
-def test_a_used_up_quota_has_a_one_line_error(fault: str) -> None:
+def test_a_used_up_quota_or_file_size_limit_has_a_one_line_error(fault: str) -> None:
     imports = "import errno; from unittest.mock import Mock; from lowfc.adapters.process.terminal import run_app"
     code = f"{imports}; run_app(Mock(side_effect=OSError(errno.{fault}, 'no room')))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -191,7 +193,7 @@ def test_unusable_logs_and_files_are_refused_in_one_line(tmp_path: Path, words: 
 def test_a_starting_loop_is_listed_and_makes_a_request_without_a_run_ambiguous(
     own_runtime: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A request that names no run must not reach the only other one."""
+    """A request without a run must not be sent to `other` just because `night` has no controller yet."""
     found: list[object] = []
 
     def meanwhile(config: Configuration, run: Run, console: object) -> None:
@@ -209,7 +211,7 @@ def test_a_starting_loop_is_listed_and_makes_a_request_without_a_run_ambiguous(
         sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
     refusal, listed = found
     assert refusal == (
-        "choose a run with --run, the beginning of its name is enough: there are night (no controller yet), other"
+        "more than one run is live: night (no controller yet), other; choose one with --run (a unique prefix is enough)"
     )
     assert listed == [("night", "starting"), ("other", "starting")]
     assert not (own_runtime / "lowfc" / "night").exists()
@@ -226,15 +228,15 @@ def test_a_folder_without_permission_is_refused_before_anything_starts(
         sim_loop.sim_loop(load(None, {"recorder.folder": str(tmp_path / "logs")}), 1.0, record=True)
 
 
-def test_an_interruption_or_a_fault_before_the_first_process_leaves_no_run(
+def test_an_interruption_or_a_fault_before_the_first_process_leaves_no_run_but_that_of_another_launcher(
     own_runtime: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (open_run("night", listeners=(Role.LAUNCHER,)).path / "config.toml").mkdir()
     with pytest.raises(DataFileError, match=r"config.toml cannot be written"):
         sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
-    for fault, live in ((KeyboardInterrupt, set()), (BusError("another was faster"), {"launcher"})):
+    for fault, live in ((KeyboardInterrupt(), set()), (BusError("another was faster"), {"launcher"})):
         monkeypatch.setattr(sim_loop, "ZenohBus", Mock(side_effect=fault))
         monkeypatch.setattr(Links, "live", Mock(side_effect=[set(), live]))
-        with pytest.raises((KeyboardInterrupt, BusError)):
+        with pytest.raises(type(fault)):
             sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
         assert (own_runtime / "lowfc" / "night").exists() is bool(live)

@@ -1,4 +1,4 @@
-"""Check of a role's certificate as its peers will check it: by a TLS handshake in memory, before a session opens."""
+"""Check of a role's certificate before a session opens, by a TLS handshake in memory."""
 
 import contextlib
 import datetime
@@ -25,9 +25,10 @@ class OwnCertificate(NamedTuple):
 
 
 def read_certificate(authority: Path, certificate: Path, key: Path, *, server: bool = False) -> OwnCertificate:
-    """Read a certificate and check it as a peer does: signed by `authority`, matching `key`, a router's if `server`.
+    """Read a certificate and check that `authority` signed it for `key`, and for a server if `server` (router).
 
-    DataFileError if a file cannot be read, the key is encrypted, the three do not match, or one is not valid now.
+    DataFileError if a file cannot be read, the key is encrypted, the three do not match, one is not valid now, or the
+    certificate has no common name. Whether a router's certificate has the router's host name is not checked.
     """
     import ssl  # slow to import, and only loops on several hosts need it
 
@@ -49,10 +50,13 @@ def read_certificate(authority: Path, certificate: Path, key: Path, *, server: b
                 side.do_handshake()
         verifying = sides[1] if server else sides[0]
         own: Any = verifying.getpeercert() or {}
-        name = dict(pair for part in own["subject"] for pair in part)["commonName"]
+        name = dict(pair for part in own["subject"] for pair in part).get("commonName")
+        if not name:
+            raise ValueError("it has no common name, which must be the role")
         authorities: Any = verifier.get_ca_certs()
+        issuers = [each for each in authorities if each["subject"] == own["issuer"]] or authorities
         last_s = ssl.cert_time_to_seconds(own["notAfter"])
-        authority_last_s = min(ssl.cert_time_to_seconds(each["notAfter"]) for each in authorities)
+        authority_last_s = max(ssl.cert_time_to_seconds(each["notAfter"]) for each in issuers)
     except (OSError, KeyError, ValueError) as fault:  # ssl.SSLError is an OSError
         why = getattr(fault, "verify_message", "") or getattr(fault, "reason", "") or getattr(fault, "strerror", "")
         raise DataFileError(

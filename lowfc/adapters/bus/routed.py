@@ -26,14 +26,15 @@ CA_KEY = "ca.key"
 """File name of the authority's key, which must not be on any host of the loop."""
 
 CONNECT_MS = 1000
-LEASE_MS = 2000
+LINK_LEASE_MS = 2000
+"""zenoh's link lease: time without traffic after which a link is closed."""
 _ALERT_S = 0.5  # time in which a router that refuses the certificate sends its TLS alert
 _ABSENT = {
     *(errno.ECONNREFUSED, errno.ECONNRESET, errno.ETIMEDOUT),
     *(errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ENETUNREACH, errno.ENETDOWN),
     socket.EAI_AGAIN,
 }
-"""Error numbers of a router or network that is not up yet; timeouts and a handshake cut short mean the same."""
+"""errno values that mean that the router or the network is not up yet, as do timeouts and handshakes cut short."""
 
 
 def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict[str, Any]:
@@ -121,7 +122,8 @@ def router_trouble(network: Network, role: str) -> str:
         why = ": ".join(filter(None, (fault.reason or str(fault), getattr(fault, "verify_message", ""))))
         raise BusError(
             f"the router at {network.router} and {certificate} do not accept each other ({why.strip('.')}): "
-            f"both must be signed by {ca}, valid today, and the router's made for the name {host!r}; see lowfc certs"
+            f"both must be signed by {ca} and valid today; the router's must be issued for host name {host!r}; see "
+            "lowfc certs"
         ) from fault
     except OSError as fault:
         why = fault.strerror or str(fault)
@@ -154,7 +156,7 @@ class RouterWatch:
         if why != self._reported:
             self._reported = why
             text = f"no link to the router at {self._network.router}: {why}" if why else "the router is back"
-            with contextlib.suppress(OSError):  # a closed terminal must not end this thread, which also compares clocks
+            with contextlib.suppress(OSError):  # a closed terminal must not end this thread: it also compares clocks
                 sys.stderr.write(f"{self._role}: {text}\n")
 
 
@@ -188,7 +190,7 @@ def require_certificate(network: Network, role: str) -> None:
 
 
 def certificate_warnings(network: Network, now: datetime.datetime) -> list[str]:
-    """Warnings on this host's certificates: absent, invalid, ending within `WARN_DAYS`, or a key that all can read."""
+    """Warnings on this host's certificates: absent, invalid, near expiry (`WARN_DAYS`), or a key that all can read."""
     folder = user_path(network.certificates)
     roles = sorted(key.stem for key in folder.glob("*.key") if key.name != CA_KEY)
     warnings = [] if roles else [f"{folder} has no certificate with its key, ROLE.pem and ROLE.key"]
@@ -204,13 +206,13 @@ def certificate_warnings(network: Network, now: datetime.datetime) -> list[str]:
         if (left := certificate.ends - now) < datetime.timedelta(days=WARN_DAYS):
             days, remedy = counted(left.days, "day"), ": lowfc certs FOLDER --renew"
             if certificate.ends_with_authority:
-                remedy = f", with its authority's {CA}: make all anew in an empty folder (lowfc certs)"
-            warnings.append(f"{role}'s certificate ends in {days}, on {certificate.ends:%Y-%m-%d}{remedy}")
+                remedy = f", because {CA} expires then: create all of them anew in an empty folder (lowfc certs)"
+            warnings.append(f"{role}'s certificate expires in {days}, on {certificate.ends:%Y-%m-%d}{remedy}")
     return warnings
 
 
 def _transport(network: Network, role: str, end: str, sending: dict[str, Any], **more: object) -> dict[str, Any]:
-    """TLS links of a role whose certificate is used at the `end` "connect" or "listen"; `more` are keys of `tls`."""
+    """Transport section of zenoh for a role: `end` is "connect" (router: "listen"); `more` are other keys of `tls`."""
     ca, certificate, key = certificate_files(network, role)
     return {
         "link": {
@@ -222,9 +224,9 @@ def _transport(network: Network, role: str, end: str, sending: dict[str, Any], *
                 f"{end}_private_key": str(key),
                 **more,
             },
-            # A link that is silent for the lease is closed, and restored as soon as possible. Messages sent while it is
-            # silent wait, and arrive stale if it recovers before it is closed.
-            "tx": {**sending, "lease": LEASE_MS, "keep_alive": 4},
+            # A closed link is restored as soon as possible. Messages sent while a link is silent wait, and arrive stale
+            # if it recovers before it is closed.
+            "tx": {**sending, "lease": LINK_LEASE_MS, "keep_alive": 4},
         },
         "shared_memory": {"enabled": False},
     }

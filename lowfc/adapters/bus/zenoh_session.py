@@ -14,7 +14,7 @@ from zenoh.handlers import Callback
 
 from lowfc.adapters.bus.access import ROUTER
 from lowfc.adapters.bus.bus import ALL
-from lowfc.adapters.bus.routed import LEASE_MS, client_session, router_session
+from lowfc.adapters.bus.routed import LINK_LEASE_MS, client_session, router_session
 from lowfc.adapters.bus.run import Links
 from lowfc.contract.messages import TOPICS
 
@@ -61,7 +61,7 @@ def prevent_slow_closing(session: zenoh.Session) -> None:
                     if opened.family in (socket.AF_INET, socket.AF_INET6):
                         opened.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
                         if str(opened.getpeername()[1]) == tls_port:
-                            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LEASE_MS)
+                            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LINK_LEASE_MS)
                 finally:
                     opened.detach()
 
