@@ -38,7 +38,7 @@ def test_the_page_is_rendered_from_its_json_file(name):
 
 def test_a_long_table_prints_selected_rows_and_agrees_with_simulation():
     table = committed("tolerance")
-    assert all(CASES["tolerance"].in_text(row) for row in table["rows"])
+    assert all(CASES["tolerance"].is_printed(row) for row in table["rows"])
     longer = table | {
         "rows": [*table["rows"], table["rows"][0] | {"quantity": "drift of Z15 tetrafoil 45, V = 8, 1e-09"}]
     }
@@ -82,7 +82,7 @@ def test_tolerances_of_a_sensor_have_the_committed_values(monkeypatch):
         monkeypatch.setattr(module, name, lambda argument: [])
     rows = tolerance.tolerance(Context(sensors=(SMALLEST,)))
     assert len(rows) == len(tolerance.MAGNITUDES) * 14 * len(tolerance.ALLOWED) * 2 * len(KINDS)
-    shown = [row for row in rows if tolerance.in_text(plain(row))]
+    shown = [row for row in rows if tolerance.is_printed(plain(row))]
     assert agree(shown, "tolerance") == len(shown) == 4 * 2 * 2
 
 

@@ -309,12 +309,12 @@ def assuming(assumption: str) -> Callable[[Callable[[Context], Iterable[Row]]], 
 class Case:
     """A table or figure: title, function that computes its rows, and function that plots it if there is a plot.
 
-    `in_text` tells whether text and page show a row of `plain`, if there are too many rows to show all. `about` is the
-    introduction of the page of an additional table.
+    `is_printed` tells whether text and page show a row of `plain`, if there are too many rows to show all. `about` is
+    the introduction of the page of an additional table.
     """
 
     title: str
     run: Callable[[Context], list[Row]]
     plot: Callable[[Context, Path], None] | None = None
-    in_text: Callable[[Mapping[str, Any]], bool] | None = None
+    is_printed: Callable[[Mapping[str, Any]], bool] | None = None
     about: str = ""

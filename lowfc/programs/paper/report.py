@@ -1,4 +1,4 @@
-"""Run tables and figures; results as text, as JSON, and as pages of docs/measured: paper.md and the additional ones."""
+"""Run tables and figures; results as text, JSON and pages: paper.md, and one page for each additional table."""
 
 import json
 from collections.abc import Sequence
@@ -17,6 +17,7 @@ from lowfc.contract.errors import ConfigurationError, DataFileError, raised_as
 from lowfc.programs.cli.result import table as text_table
 from lowfc.programs.paper.cases import Case, Context, plain, prepared
 from lowfc.programs.paper.figures import aberration, light, modes, screens
+from lowfc.programs.paper.tables.pointing import SCALED_PUPIL
 from lowfc.programs.paper.tables.tables import ADDITIONAL, TABLES
 
 _ALL = {**aberration.CASES, **light.CASES, **modes.CASES, **screens.CASES}
@@ -32,7 +33,7 @@ Table = dict[str, Any]
 _RESIDUAL = "RMS residual, matched input"
 _SCATTER = "std of x tilt, 1 mas, {}"
 _LIGHT = ("paper's electrons", "own photometry")
-_DIMMED = "predicted std of x tilt, 1 mas, own photometry, pupil dimmed to 14.7 %"
+_SCALED = f"predicted std of x tilt, 1 mas, {SCALED_PUPIL}"
 GLANCE = (
     *(
         ("table3", name, modes, estimator, _RESIDUAL)
@@ -47,18 +48,21 @@ GLANCE = (
         for modes in (2, 14)
         for estimator in ("pinv", "weighted")
     ),
-    *(("table4", "sam", 2, estimator, _DIMMED) for estimator in ("pinv", "weighted")),
+    *(("table4", "sam", 2, estimator, _SCALED) for estimator in ("pinv", "weighted")),
     *(("fig6", name, 14, "pinv", f"{which} R^2") for name in ("sam", "clowfs", "zwfs") for which in ("least", "mean")),
     *(("fig7", f"sam, coma {coma}", 14, "weighted + 1 iteration", "P-V residual") for coma in ("Z7", "Z8")),
     ("fig1", "sam, dark zone, 10 samples per lambda/D", None, None, "largest contrast, flat wavefront"),
-    *(("fig1", f"sam, coma {coma}", 14, "weighted + 1 iteration", "corrected over flat") for coma in ("Z7", "Z8")),
     *(
-        ("fig8", name, 14, "pinv", f"{which} deviation at lambda/20")
+        ("fig1", f"sam, coma {coma}", 14, "weighted + 1 iteration", "contrast, corrected / flat wavefront")
+        for coma in ("Z7", "Z8")
+    ),
+    *(
+        ("fig8", name, 14, "pinv", f"{which} relative deviation from linearity at lambda/20")
         for name in ("sam", "clowfs", "zwfs")
         for which in ("mean", "largest")
     ),
     *(
-        ("fig9", "sam, cut from four pupil diameters", 14, estimator, "residual rms")
+        ("fig9", f"sam, {screens.WIDTHS[4]}", 14, estimator, "residual rms")
         for estimator in ("pinv", "best possible fit")
     ),
     *(("conditioning", name, 14, None, "condition number") for name in ("open", "sam")),
@@ -68,7 +72,7 @@ GLANCE = (
         for quantity in ("noise", "noise, 20 % band", "share of the quantum limit")
     ),
 )
-"""Table and key of the rows at the beginning of the page."""
+"""Rows of "At a glance": table, name, modes, estimator, quantity."""
 
 _HEADER = ("", "modes", "estimator", "quantity", "paper", "lowfc", "predicted", "limit", "unit", "assumption")
 _ABOUT = f"""# The paper, reproduced
@@ -80,20 +84,25 @@ a sparse aperture mask", J. Astron. Telesc. Instrum. Syst. 1(3), 039001 (2015): 
 `{COMMAND}` generates this page.
 
 *lowfc* is our value (`measured` in the JSON), with its standard error if it is a mean or a scatter over trials;
-*predicted* is its theoretical value; *limit* is the Cramer-Rao bound unless the assumption says otherwise. The paper's
-shaped pupil and sparse aperture mask are not published, so agreement to a few per cent is not expected: the
-assumptions, numbered below each table, give our choices where the paper is silent or contradicts itself.
+*predicted* is its theoretical value; *limit* is the Cramer-Rao bound, or what the assumption in the table's own section
+states. The paper's shaped pupil and sparse aperture mask are not published, so agreement to a few per cent is not
+expected: the assumptions, numbered below each table, give our choices where the paper is silent or contradicts itself.
 
-An input of Table 3 is named by the bounds of its coefficients: *matched* gives the input rms of the table, *literal*
-has the bounds of the text, *quarter* a quarter of those. Table 4 is computed for the paper's electrons and for our own
-photometry.
+Inputs of Table 3, by the bounds of their coefficients:
+
+- *matched*: bounds scaled to the input rms in the paper's table;
+- *literal*: the bounds in the paper's text;
+- *quarter*: a quarter of those.
+
+Table 4 is computed for the paper's electrons and for our own photometry.
 
 Three notes:
 
 - Table 3 gives every sensor 40,000 e- in its brightest pixel, so light that a mask loses costs nothing. Table 4 gives
-  every sensor the same star; there the Zernike sensor, which uses most of the light, beats every sparse aperture.
+  every sensor the same star; there the Zernike sensor, which receives about 14 times the light of `sam`, has less
+  scatter than every sparse aperture.
 - In Table 3 the sparse aperture has the least residual because it is more linear. If the estimate is iterated twice on
-  the full model, CLOWFS has the least.
+  the full model, `clowfs` has the least (`clowfs_tuned` does not).
 - The scatter over 100 realisations has an uncertainty of 7 %: if a value is near the paper's, compare *predicted*.
 """
 
@@ -127,13 +136,13 @@ def run(names: Sequence[str], context: Context, plots: Path | None = None) -> li
 
 
 def to_json(tables: Sequence[Table]) -> str:
-    """One JSON object: the table itself if there is only one."""
+    """JSON of the table; for several tables, an object with the list `tables`."""
     return json.dumps(tables[0] if len(tables) == 1 else {"tables": list(tables)}, allow_nan=False)
 
 
 def to_text(table: Table) -> str:
     """A table for a terminal."""
-    rows = _in_text(table)["rows"]
+    rows = _with_printed_rows(table)["rows"]
     header, body, notes = _cells(rows)
     if len(rows) < len(table["rows"]):
         notes.append(f"{len(rows)} of {len(table['rows'])} rows; --json has all of them")
@@ -167,15 +176,15 @@ def to_page(table: Table) -> str:
 
 def write_page(folder: Path, table: Table) -> None:
     """Write the JSON file of a table, with the rows that the page shows, and the page generated from it."""
-    in_text = _in_text(table)
-    write_whole(folder / f"{table['table']}.json", _one_row_to_a_line([in_text]).encode())
-    write_whole(folder / f"{table['table']}.md", to_page(in_text).encode())
+    printed = _with_printed_rows(table)
+    write_whole(folder / f"{table['table']}.json", _one_row_to_a_line([printed]).encode())
+    write_whole(folder / f"{table['table']}.md", to_page(printed).encode())
 
 
-def _in_text(table: Table) -> Table:
+def _with_printed_rows(table: Table) -> Table:
     """The table with only the rows that text and page show."""
-    in_text = CASES[table["table"]].in_text
-    return table if in_text is None else table | {"rows": list(filter(in_text, table["rows"]))}
+    is_printed = CASES[table["table"]].is_printed
+    return table if is_printed is None else table | {"rows": list(filter(is_printed, table["rows"]))}
 
 
 def write_document(folder: Path, tables: Sequence[Table]) -> None:

@@ -78,13 +78,13 @@ def fig1(context: Context) -> Iterator[Row]:
             flat, aberrated = _contrast(ready, 0.0 * case.truth_nm), _contrast(ready, case.truth_nm)
             yield Row(row_name, "contrast, flat wavefront", "", flat, _PAPER_GOAL)
             yield Row(row_name, "contrast, aberrated", "", aberrated)
-            yield Row(row_name, "aberrated over flat", "", aberrated / flat, _PAPER_WORSE)
+            yield Row(row_name, "contrast, aberrated / flat wavefront", "", aberrated / flat, _PAPER_WORSE)
             for key in _CORRECTED:
                 corrected = context.map(f"{row_name}, {key}", partial(_contrast, ready), case.residuals_nm[key])
                 mean, error = mean_and_error(np.array(corrected))
                 fitted = partial(Row, row_name, modes=MODES, estimator=key)
                 yield fitted("contrast, corrected", "", mean, error=error, limit=flat)
-                yield fitted("corrected over flat", "", mean / flat, error=error / flat, limit=1.0)
+                yield fitted("contrast, corrected / flat wavefront", "", mean / flat, error=error / flat, limit=1.0)
 
 
 def _between_samples(ready: Prepared) -> list[Row]:

@@ -211,8 +211,9 @@ def _range_rows(context: Context, name: str) -> Iterator[Row]:
         fitted = partial(Row, modes=MODES, estimator=label("pinv", iterations), assumption=assumption)
         for amplitude, j in columns.items():
             paper = in_paper[amplitude] if iterations == 0 else None
-            yield fitted(name, f"mean deviation at {amplitude}", "", float(deviation[:, j].mean()), paper)
-            yield fitted(name, f"largest deviation at {amplitude}", "", float(deviation[:, j].max()))
+            quantity = f"relative deviation from linearity at {amplitude}"
+            yield fitted(name, f"mean {quantity}", "", float(deviation[:, j].mean()), paper)
+            yield fitted(name, f"largest {quantity}", "", float(deviation[:, j].max()))
         ranges = np.array([linear_range(mode) for mode in deviation])
         quantity = "amplitude of 10 % deviation"
         yield fitted(name, f"{quantity}, median mode", "waves", _amplitude(float(np.median(ranges))))

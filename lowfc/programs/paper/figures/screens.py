@@ -16,7 +16,7 @@ from lowfc.programs.paper.figures.exposure import BRIGHT, FULL_CHAIN, MODES, PIN
 from lowfc.programs.paper.tables.reconstruction import exposed_e, fits, iterated_nm, mean_and_error
 
 SCREENS = 12
-WIDTHS = {4: "cut from four pupil diameters", 1: "periodic over one pupil diameter"}
+WIDTHS = {4: "cut from a periodic screen four pupil diameters wide", 1: "periodic over one pupil diameter"}
 """Width of the periodic screen, in pupil diameters, and its description."""
 _INPUT_WAVES = 0.05
 _PAPER_WAVES = {"reconstructed": 0.038, "residual": 0.030}
@@ -53,9 +53,9 @@ def _screens(context: Context, name: str, width: int) -> list[_Screen]:
 
 @assuming(
     f"At most {SCREENS} screens of power law -11/3, scaled to {_INPUT_WAVES} waves rms over the open pupil; "
-    "the paper does not say how it generates its one screen, which determines its low orders: both of ours "
-    "have less tilt than an infinite screen, that of a single diameter hardly any. limit: "
-    f"the best fit of 14 modes to the screen itself. {BRIGHT} {FULL_CHAIN}"
+    "the paper does not say how it generates its one screen, on which its low orders depend: both of ours "
+    "have less tilt than an infinite screen, and that periodic over one diameter has almost none. "
+    f"The column limit is the best fit of 14 modes to the screen itself. {BRIGHT} {FULL_CHAIN}"
 )
 def fig9(context: Context) -> Iterator[Row]:
     """Rms of estimate and residual of Kolmogorov screens, Fig. 9."""
@@ -106,7 +106,7 @@ def plot_fig9(context: Context, path: Path) -> None:
 
 
 def _rms_waves(ready: Prepared, screen: _Screen, key: str) -> tuple[float, float]:
-    """Rms in waves over the open pupil of the estimate and of the residual."""
+    """Rms of the estimate and of the residual, waves, over the open pupil."""
     opd_nm, modes_nm = screen
     fitted = modes_nm[key] @ ready.open_modes[:MODES]
     residual = opd_nm[ready.open] - fitted

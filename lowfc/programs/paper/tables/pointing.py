@@ -23,6 +23,7 @@ FITTED = {1: (2, 14, 20), 10: (2, 14)}
 NM_PER_MAS = tilt_nm_per_mas(STAR.diameter_m)
 
 PAPER_PUPIL, PAPER_FOCAL_MASK, PAPER_RELAY_MASK = 0.147, 0.567, 0.091
+SCALED_PUPIL = f"own photometry, pupil transmission scaled to the paper's {100 * PAPER_PUPIL:g} %"
 """Throughputs, each relative to the light that reaches the element."""
 
 ASSUMPTION = (
@@ -69,13 +70,13 @@ def exposures(sensor: Prepared) -> tuple[Exposure, Exposure]:
 
 
 def dimmed(sensor: Prepared) -> Exposure:
-    """Own photometry with our pupil dimmed to the paper's transmission."""
+    """Own photometry with our pupil's transmission scaled to the paper's."""
     own = electrons(STAR, TABLE4_EXPOSURE_S) * PAPER_PUPIL / sensor.budget.pupil
     return Exposure(
-        f"own photometry, pupil dimmed to {100 * PAPER_PUPIL:g} %",
+        SCALED_PUPIL,
         own,
-        f"{own * float(sensor.band_I0.sum()):.3g} e- on the sensor: own photometry with our pupil, which "
-        f"transmits {100 * sensor.budget.pupil:.1f} %, dimmed to the paper's transmission.",
+        f"{own * float(sensor.band_I0.sum()):.3g} e- on the sensor: own photometry with the transmission "
+        f"of our pupil, {100 * sensor.budget.pupil:.1f} %, scaled to the paper's.",
     )
 
 

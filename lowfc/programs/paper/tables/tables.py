@@ -85,6 +85,10 @@ TABLES: dict[str, Case] = {
 ADDITIONAL: dict[str, Case] = {
     "anchors": Case("Anchors: published values and lowfc's", anchors.anchors, anchors.plot, None, anchors.ABOUT),
     "tolerance": Case(
-        "Tolerated drift and vibration lines", tolerance.tolerance, tolerance.plot, tolerance.in_text, tolerance.ABOUT
+        "Tolerated drift and vibration lines",
+        tolerance.tolerance,
+        tolerance.plot,
+        tolerance.is_printed,
+        tolerance.ABOUT,
     ),
 }

@@ -196,7 +196,7 @@ def _checked(context: Context) -> list[Row]:
     return context.map("tolerance by simulation", simulated, cases)
 
 
-def in_text(row: Mapping[str, Any]) -> bool:
+def is_printed(row: Mapping[str, Any]) -> bool:
     """Whether a row is on the page and in its JSON file; `--json` prints all rows."""
     quantity = row["quantity"]
     if not quantity.startswith(("drift", "line")):
