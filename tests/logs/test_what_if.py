@@ -482,11 +482,14 @@ def test_steps_under_another_calibration_give_a_warning() -> None:
 
 
 def test_too_few_frames_to_compare_are_an_error() -> None:
-    with pytest.raises(DataFileError, match="no frame is left to compare: of 40, 0 were refused and 40 have saturated"):
+    with pytest.raises(DataFileError, match="of 40, 0 were refused, 40 have saturated pixels and 10 are within"):
         rows_compared(LoggedRun(history(saturated_pixels=np.ones(40, np.int64))))
     nothing = np.full((40, 3), np.nan, np.float32)
-    for short in (history(error_nm=nothing), replace(history(), calibration=None)):
-        with pytest.raises(DataFileError, match="too few frames used by a calibrated controller"):
+    for short, why in (
+        (history(error_nm=nothing), "its controller used no frame"),
+        (replace(history(), calibration=None), "it has no calibration"),
+    ):
+        with pytest.raises(DataFileError, match=why):
             LoggedRun(short)
     with pytest.raises(DataFileError, match="gains and delay are unknown"):
         LoggedRun(replace(history(), controllers=[]))

@@ -482,6 +482,9 @@ def test_latencies_are_those_of_the_last_second() -> None:
     assert np.average(middles, weights=counts) == pytest.approx(whole_us.mean(), abs=widths[0] / 2)
     np.testing.assert_allclose(np.diff(middles), widths[1:], rtol=1e-6)
     assert tape.column(latency.COUNTS.path)[1][-1].tolist() == [7, 3, 5]
+    del health[Role.RECORDER]
+    drawn(panel, tape, 2_000_000_000, health=health)
+    np.testing.assert_array_equal(tape.column(latency.COUNTS.path)[1][-1], [7, 3, np.nan], "unknown without a recorder")
 
 
 def test_a_silent_controller_has_no_latency() -> None:

@@ -36,7 +36,10 @@ _PICTURES: dict[str, tuple[str, rrb.VisualBounds2D | None]] = {
     mirror.ACTUATORS: ("Mirror, nm (yellow: at limit)", None),
     mirror.SURFACE: ("Mirror over the pupil, nm", None),
     pointing.TRAIL: ("Residual pointing, mas", pointing.BOUNDS),
-    science.IMAGE: ("Computed science image: contrast; numbers: mean over 2 λ/D from the mask's edge", science.BOUNDS),
+    science.IMAGE: (
+        "Computed science image: contrast; numbers: mean over the inner 2 λ/D of the dark zone",
+        science.BOUNDS,
+    ),
     trend.TREND: ("Trend of the residual wavefront, nm rms", bounds(trend.WIDTH)),
     spectra.TILTS: ("Power spectrum of tip and tilt, nm²/Hz", bounds(spectra.WIDTH)),
     spectra.OTHERS: ("Power spectrum of the other modes, nm²/Hz", bounds(spectra.WIDTH)),

@@ -1,1 +1,1 @@
-"""`lowfc publish`: republish a log on the bus, at its own pace."""
+"""`lowfc publish`: republish a log on the bus, at the recorded rate."""

@@ -35,17 +35,19 @@ from lowfc.control.loop.safety import LoopMode
 
 DELAY_DIFFERS = 0.05
 """Difference in frames beyond which a measured delay counts as different from the controller's, or as fractional."""
-_COMMAND_LOST_NM = 0.01  # if the command seen differs by more from the logged ones, the log lacks it
+_COMMAND_LOST_NM = 0.01  # a command seen that differs by more than this from the logged ones is not in the log
 
 
 class SeenCommands(NamedTuple):
     """Commands seen by the exposures of consecutive steps.
 
     Attributes:
-        delay_frames: the measured delay (rounded if it is nearly whole) if it differs from the controller's, otherwise
-            the controller's. `weights` are its `delay_weights`.
-        seen_nm: (steps, modes) commands seen; with the controller's delay, NaN where a frame was not used.
-        command_lost: (steps,) True where the exposure saw a command that no step has: the log lacks it.
+        delay_frames: the controller's delay, unless the measured one differs. The measured one is rounded if it is
+            nearly whole.
+        weights: `delay_weights` of this delay.
+        seen_nm: (steps, modes) commands seen. With the controller's delay they come from the steps, and are NaN for
+            unused frames.
+        command_lost: (steps,) True where the exposure saw a command that is in no logged step.
         target_nm: (steps, modes) target of the loop, which has been subtracted from the steps' errors.
     """
 
@@ -65,10 +67,10 @@ class SeenCommands(NamedTuple):
         measured_delay: float | None,
         played: Mask,
     ) -> "SeenCommands":
-        """Commands seen by these steps, of which the first has a used frame; the states give the loop's target.
+        """Commands seen by these steps; the first step must have a used frame, and `states` supply the loop's target.
 
-        A probe sequence may change the target, too: in its steps (`played`) the commands seen are computed from the
-        commands of the steps.
+        A probe sequence may change the target, too: in its steps (`played`) the commands seen come from the logged
+        commands, not from error minus POL.
         """
         weights = delay_weights(controller_delay).astype(np.float32)
         target_nm = _target_nm(states, steps.sequence, steps.error_nm.shape[1])
@@ -87,17 +89,17 @@ class SeenCommands(NamedTuple):
 
 
 class LoggedRun:
-    """Steps of a log with distinct exposures, from the first step whose frame was used.
+    """Steps of a log that have a new exposure (no repeated frames), from the first step whose frame was used.
 
     Attributes:
         steps: these steps.
-        missing: (steps,) number of exposures without a step before each.
+        missing: (steps,) number of exposures without a step that precede each step.
         true_nm: disturbance and residual (steps, modes) at the start of each exposure, NaN where unknown; None without
             any.
         continuous_rms_nm: rms of the true residual (steps, modes) over each period; None if the log does not have it.
         calibration: calibration of the log.
         used: (steps,) whether the frame was used.
-        under_calibration: (steps,) see `History`.
+        under_calibration: (steps,) see `History.under_calibration`.
         law: last integrator of the run.
         controller_delay: delay assumed by the controller, frames.
         measured_delay: delay measured from the log, frames; None if it cannot be measured.
@@ -112,8 +114,12 @@ class LoggedRun:
         self.history = history
         rows = exposed(history.steps.reasons)
         used = rows & np.isfinite(history.steps.error_nm).all(axis=1)
-        if history.calibration is None or not used.any() or not history.rate_hz:
-            raise DataFileError(f"{history.log.path}: it has too few frames used by a calibrated controller")
+        if history.calibration is None:
+            raise DataFileError(f"{history.log.path}: it has no calibration")
+        if not used.any():
+            raise DataFileError(f"{history.log.path}: its controller used no frame")
+        if not history.rate_hz:
+            raise DataFileError(f"{history.log.path}: its frame rate is unknown: it has too few frames")
         rows[: int(np.argmax(used))] = False  # before the first used frame, the disturbance is unknown
         self.calibration = history.calibration
         self.steps = history.steps.at(rows)
@@ -136,7 +142,7 @@ class LoggedRun:
     def uncorrected(self) -> Mask:
         """Modes (modes,) that automatic gains did not correct at the end of the run.
 
-        Automatic gains weighted the reconstructor for these modes.
+        The reconstructor in use was computed with a prior variance for these modes (`prior_nm2`).
         """
         state = self.history.controller
         modes = len(self.calibration.noll)
@@ -151,14 +157,15 @@ class LoggedRun:
 
     @property
     def simulated_delay(self) -> float:
-        """Delay of the simulated camera, frames; every log with a true wavefront is of that camera."""
+        """Delay of the simulated camera, frames; only the simulated camera logs a true wavefront."""
         return (self.history.configuration or Configuration()).camera.delay_frames
 
     @property
     def moves_at(self) -> float:
-        """Time at which the mirror moves, periods after the start of an exposure: 1 in a lockstep log.
+        """Time at which the mirror moves, frame periods after the start of an exposure.
 
-        With a fractional delay of the simulated camera, the mirror moves during the exposure.
+        It is 1, the end of the period, in lockstep with a whole delay. With a fractional delay of the simulated camera,
+        the mirror moves during the exposure.
         """
         if self.simulated_delay % 1:
             return self.history.timing(self.simulated_delay).applied % 1
@@ -166,11 +173,11 @@ class LoggedRun:
         return timing.applied - timing.delay + 1
 
     def rows_to_compare(self, laws: list[Integrator], usable: Mask) -> tuple[Mask, int, str]:
-        """Usable steps to compare, the settling time of the laws in frames, and a description."""
+        """Usable steps to compare, the settling time of the laws in frames, and which steps these are, as text."""
         steps, missing = self.steps, self.missing
-        closed, over = steps.mode == LoopMode.CLOSED, "closed loop"
+        closed, compared = steps.mode == LoopMode.CLOSED, "closed loop"
         if not (closed & usable).any():
-            over = "no usable frame in closed loop" if closed.any() else "the loop was never closed"
+            compared = "no usable frame in closed loop" if closed.any() else "the loop was never closed"
             closed = np.ones_like(closed)
         since = frames_since(self.command_lost, closed, missing)
         settling = max(settling_frames(law.gain, law.leak, self.history.rate_hz) for law in laws)
@@ -179,9 +186,10 @@ class LoggedRun:
         if not rows.any():
             raise DataFileError(
                 f"{self.history.log.path}: no frame is left to compare: of {len(rows)}, {np.count_nonzero(~usable)} "
-                f"were refused and {np.count_nonzero(steps.saturated_pixels)} have saturated pixels"
+                f"were refused, {np.count_nonzero(steps.saturated_pixels)} have saturated pixels and "
+                f"{np.count_nonzero(since < settling)} are within the settling time of {settling} frames"
             )
-        return rows, settling, over
+        return rows, settling, compared
 
     def measured_again(self, calibration: Calibration) -> Single:
         """Errors (steps, modes) measured in the used frames with another calibration, in a second pass.
@@ -244,7 +252,7 @@ def during_probe(sequence: Sequences, first: int, frames: int) -> Mask:
 def _target_nm(states: Sequence[wire.ControllerState], sequence: Sequences, modes: int) -> Single:
     """Target (steps, modes) of the loop: the offset of the last state before each step, or else of the first state.
 
-    A state is logged at every change; that of a `clear` has no frame, because it resets the frame sequence.
+    A state is logged at every change. That after `clear` has frame sequence 0, because `clear` resets the sequence.
     """
     known = [(state.frame_sequence, state.offset_nm or [0.0] * modes) for state in states]
     known = [(frame, offset_nm) for frame, offset_nm in known if len(offset_nm) == modes]

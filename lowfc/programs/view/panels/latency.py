@@ -24,7 +24,7 @@ STAGE_DURATIONS = Plot(
 )
 COUNTS = Plot(
     "latency/frames",
-    "Frames skipped and missing, messages lost, since the start",
+    "Frames skipped and missing, messages lost, since each process started",
     {"skipped: a newer one was waiting": ORANGE, "missing: never arrived": RED, "messages lost by the recorder": GREY},
 )
 WINDOW_NS = 1_000_000_000
@@ -65,7 +65,7 @@ class Latency(Panel):
         controller, recorder = (snapshot.health.get(role) for role in (Role.CONTROLLER, Role.RECORDER))
         if controller is not None:
             frames = topic_count(controller.health, FRAME.key)
-            lost = recorder.health.recording.lost if recorder is not None else 0
+            lost = recorder.health.recording.lost if recorder is not None else np.nan
             COUNTS.add_one(stream, now_ns, frames.skipped, frames.missing, lost)
 
     def _draw_histogram(self, stream: rr.RecordingStream, time_ns: int, us: Array) -> None:

@@ -17,19 +17,19 @@ from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
 
 IMAGE = "science/image"
-CONTRAST = Plot("science/contrast", "Computed contrast, mean over 2 λ/D from the mask's edge, log10", width=1.6)
+CONTRAST = Plot("science/contrast", "Computed contrast, mean over the inner 2 λ/D of the dark zone, log10", width=1.6)
 _ZONE_WIDTH = 2.0
 """Width of the zone in which contrast is averaged, from the inner edge of the dark zone on, lambda / D."""
 
 _AVERAGED = 5
-"""Number of wavefronts averaged in one image, each the newest of a snapshot."""
+"""Number of images averaged for one picture, each of the newest wavefront of a snapshot."""
 _DARKEST, _BRIGHTEST = -10, -4
 """Range of the colour scale, log10 of contrast."""
 _HALF_WIDTH, _SAMPLING = 12, 4  # half width of an image, lambda / D; samples per lambda / D, fewer for a larger zone
 _SAMPLES = 2 * _HALF_WIDTH * _SAMPLING
 _GAP, _BAR = 6, 5  # samples between the pictures, and across the colour scale
-_SECOND = _SAMPLES + _GAP  # start of the second picture; `_SCALE`: start of the colour scale
-_SCALE = 2 * _SECOND
+_SECOND = _SAMPLES + _GAP  # start of the second picture
+_SCALE = 2 * _SECOND  # start of the colour scale
 _WIDTH = _SCALE + _BAR
 _LABEL = 5  # samples by which the viewer draws a label below its position
 BOUNDS = rrb.VisualBounds2D(x_range=[-4, _WIDTH + 24], y_range=[-2 * _GAP - _LABEL, _SAMPLES + 14])
@@ -62,7 +62,7 @@ class Science(Panel):
         self._named = ""
 
     def begin(self, stream: rr.RecordingStream) -> None:
-        """Draw the static parts: the edge of the mask, the zone of the mean contrast, and the colour scale."""
+        """Draw the static parts: the dark zone's inner edge, the zone of the mean contrast, and the colour scale."""
         outlined = _outlines(self._wedge, self._sampling)
         lines = [line + np.array([start, 0]) for start in (0, _SECOND) for line in outlined]
         outlines = rr.LineStrips2D(lines, colors=[GREY], radii=rr.Radius.ui_points(0.7))
@@ -125,7 +125,7 @@ def _side_by_side(now: Single, flat: Single) -> Rgb:
 
 
 def _outlines(wedge: Wedge, sampling: int) -> list[Array]:
-    """Lines (points, 2) in pixels of one image: the mask's edge, and the wedge on either side of the star."""
+    """Lines (points, 2) in pixels of an image: the dark zone's inner edge, and the wedge on either side of the star."""
     angle = np.linspace(0, 2 * np.pi, 97)
     opening = np.deg2rad(wedge.half_opening_deg) * np.linspace(-1, 1, 33)
     arcs = [radius * _directions(opening) for radius in (wedge.inner, wedge.outer)]
