@@ -1,4 +1,4 @@
-"""Frame to command over ImageStreamIO and over the direct link: same controller and frames, in turns.
+"""Latency from frame to command, by ImageStreamIO and by the direct link, with the same controller and frames.
 
 Over ImageStreamIO a program writes each frame into a stream. A camera process, or the controller itself (`--camera`),
 reads it with the driver `isio`, extended by time stamps (`stream_ends.TimedCamera`). `lowfc mirror isio` writes the
@@ -45,7 +45,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, report: Report) -> Result:
-    """Run the loops in turns, every other time in the opposite order.
+    """Run the three loops one after the other; reverse the order in every second turn.
 
     Returns:
         turns (the results of `one_run` by loop), seconds and rate_hz.
@@ -69,9 +69,9 @@ def one_run(rate_hz: float, seconds: float, name: str) -> Result:
     driver = stream_ends.__name__
     config = configuration(SIZE, rate_hz).model_copy(update={"drivers": {driver: {"stream": FRAME_STREAM}}})
     by_streams = name != DIRECT
-    options = LatencyOptions(config, seconds, 1)
+    loop = LatencyOptions(config, seconds, 1)
     with prepared_run(SIZE, config) as run, tempfile.TemporaryDirectory(prefix="lowfc-streams-", dir=_MEMORY) as folder:
-        found = one_loop(options, run, _loop(options, run, Path(folder), name) if by_streams else None)
+        found = one_loop(loop, run, _processes(loop, run, Path(folder), name) if by_streams else None)
     start = "due" if by_streams else "frame"
     spans_us = {f"frame_to_{end}": found["latency_us"][f"{start}_to_{end}"] for end in ("command", "mirror")}
     if by_streams:
@@ -79,25 +79,25 @@ def one_run(rate_hz: float, seconds: float, name: str) -> Result:
     return spans_us | {"frames": found["frames"], "without_command": found["frames_without_command"]}
 
 
-def _loop(options: LatencyOptions, run: Run, folder: Path, name: str) -> list[Child]:
+def _processes(loop: LatencyOptions, run: Run, folder: Path, name: str) -> list[Child]:
     """Processes of a loop whose streams are in a folder; the first is the program that writes the frames."""
-    config, seconds = options.config, WARM_UP_S + options.duration_s
+    config, seconds = loop.config, WARM_UP_S + loop.duration_s
     Stream.create(folder / stream_path(FRAME_STREAM).name, (SIZE.side, SIZE.side), np.uint16)
     role = mirror_role(config.mirror.name)
     shared = ["--run", run.run_id, "--config", str(run.path / "config.toml")]
-    writer, mirror_there = stream_ends.__name__, ["--wait-for", role]
+    writer, wait_for_mirror = stream_ends.__name__, ["--wait-for", role]
     driver = f"{writer}:{stream_ends.TimedCamera.__name__}"
     commands = {
         "source": ["-m", writer, str(run.path), FRAME_STREAM, str(round(seconds * config.camera.rate_hz))],
         role: ["-m", "lowfc", "mirror", "isio", *shared, "--stream", CHANNEL],
     }
     if name == CAMERA_PROCESS:
-        waits = ["--wait-for", str(Role.CONTROLLER), *mirror_there]
+        waits = ["--wait-for", str(Role.CONTROLLER), *wait_for_mirror]
         commands[str(Role.CAMERA)] = ["-m", "lowfc", "camera", driver, *shared, *waits]
-    children = [program(role, words, run.path / f"{role}.stderr") for role, words in commands.items()]
+    children = [program(role, arguments, run.path / f"{role}.stderr") for role, arguments in commands.items()]
     (controller,) = (one for one in children_of(config, run, seconds, record=False) if one.name == Role.CONTROLLER)
     if name == IN_CONTROLLER:
-        controller.command += ["--camera", driver, *mirror_there]
+        controller.command += ["--camera", driver, *wait_for_mirror]
     children.append(controller)
     for child in children:
         child.environment = os.environ | {"MILK_SHM_DIR": str(folder), "PYTHONPATH": str(ROOT)}
@@ -108,7 +108,7 @@ def tables(result: Result) -> list[Lines]:
     """Latencies of each loop, and their ratios turn by turn."""
     turns = result["turns"]
     lines = [
-        ["", *(f"{words}, us: {at}" for words in SPANS.values() for at in PERCENTILES.values()), "without a command"]
+        ["", *(f"{label}, us: {at}" for label in SPANS.values() for at in PERCENTILES.values()), "without a command"]
     ]
     for name in (DIRECT, CAMERA_PROCESS, IN_CONTROLLER):
         each = [turn[name] for turn in turns]
@@ -120,7 +120,7 @@ def tables(result: Result) -> list[Lines]:
             [turn[name][span][at] / turn[DIRECT][span][at] for turn in turns] for span in SPANS for at in PERCENTILES
         ]
         ratios = [ranged(one, "{:.2f}".format) for one in each]
-        lines.append([f"{name}: over {DIRECT}, turn by turn", *ratios, ""])
+        lines.append([f"{name}: ratio to the {DIRECT} of the same turn", *ratios, ""])
     return [lines]
 
 
@@ -135,6 +135,6 @@ def about(result: Result) -> str:
         f"Hz; {SIZE.side} x {SIZE.side} pixels, {SIZE.modes} modes, {SIZE.actuators} actuators. Latency "
         "begins just before the writer sets the stream's write flag, or just before the frame is sent over the direct "
         "link; it ends just after the controller's send, or just before the mirror publishes its state. Over "
-        f"ImageStreamIO, {camera_process} us (p50) of the latency pass before the camera process publishes the frame; "
-        f"if the controller reads the stream itself, {controller} us before it has the frame."
+        f"ImageStreamIO, the latency includes {camera_process} us (p50) until the camera process publishes the frame; "
+        f"if the controller reads the stream itself, {controller} us until it has the frame."
     )

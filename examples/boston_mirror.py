@@ -7,11 +7,11 @@ Example: lowfc mirror examples/boston_mirror.py:BostonMirror --run bench --confi
 
 import bmc
 
-from lowfc.device import Configuration, Single, VoltMap, VoltOptions, geometry
+from lowfc.device import Configuration, ConfigurationError, Single, VoltMap, VoltOptions, geometry
 
 
 class BostonMirror:
-    """A mirror whose values are fractions of the voltage range, 0 to 1."""
+    """A mirror whose drive values are fractions of the voltage range, 0 to 1."""
 
     class Options(VoltOptions):
         """The mirror's serial number, in addition to the options of `VoltOptions`."""
@@ -24,10 +24,14 @@ class BostonMirror:
         self.geometry = geometry(config)
         self.dm = bmc.BmcDm()
         self.check(self.dm.open_dm(options.serial))
-        self.map = VoltMap(options, config, self.dm.num_actuators())
+        try:
+            self.map = VoltMap(options, config, self.dm.num_actuators())
+        except ConfigurationError:
+            self.close()
+            raise
 
     def apply(self, actuators_nm: Single) -> Single:
-        """Send the values and return the surface that they produce."""
+        """Send the values; return the surface by a linear estimate (a real stroke is roughly quadratic in voltage)."""
         values = self.map.values(actuators_nm)
         self.check(self.dm.send_data(values))
         return self.map.surface_nm(values)

@@ -14,16 +14,18 @@ STEP = 0.01
 
 
 class MyMirror:
-    """A mirror whose hardware has units of `mirror.nm_per_unit` nm of surface."""
+    """One unit of the hardware moves the surface by `mirror.nm_per_unit` nm."""
 
     def __init__(self, options: DriverOptions, config: Configuration) -> None:
         """Open the mirror; its actuators and limits are those of [mirror]."""
         self.nm_per_unit = config.mirror.nm_per_unit
-        self.geometry = replace(geometry(config), step_nm=STEP * self.nm_per_unit)  # the limits allow for rounding
+        # lowfc tightens the limits by one step, so that rounding cannot exceed them
+        self.geometry = replace(geometry(config), step_nm=STEP * self.nm_per_unit)
 
     def apply(self, actuators_nm: Single) -> Single:
         """Move the mirror to this shape (rows, columns), nm of surface from flat; return the shape reached."""
         units = STEP * np.round(actuators_nm / (STEP * self.nm_per_unit))
+        # send `units` to the hardware here
         return (units * self.nm_per_unit).astype(np.float32)
 
     def close(self) -> None:

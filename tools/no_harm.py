@@ -24,6 +24,7 @@ IMAGED = ("sam", "zwfs")
 """Sensors for which some stars are repeated with simulated images."""
 MODAL = ("sam", "sam27d10_bal14", "clowfs", "zwfs", "bar")
 IMAGED_MAGNITUDES = (2, 5, 8)
+SHOWN = (-1, *IMAGED_MAGNITUDES)
 TOLERATED = 0.01
 """Tolerated added contrast as a fraction of the dark zone's own, in addition to three standard errors."""
 RATE_HZ, SECONDS = 250.0, 20.0
@@ -53,7 +54,7 @@ def _contrast(sensor: str) -> tuple[Array, float]:
 
 @lru_cache(maxsize=64)
 def _open_nm2(preset: str, seed: int) -> Array:
-    """Mean squares (modes,) of the disturbance over the second half, for any sensor and star."""
+    """Mean squares (modes,) of the disturbance over the second half; independent of sensor and star."""
     config = _configured("sam", preset, 0.0, seed, FIXED_GAINS)
     bench = ModalBench(config, np.eye(len(config.noll)))
     bench.ask("open")
@@ -72,15 +73,18 @@ def _closed_nm2(sensor: str, preset: str, magnitude: float, seed: int, gains: di
 
 
 def modal_case(case: tuple[str, str, float]) -> Results:
-    """Contrast that closing adds for a sensor, preset and star, without terms between modes, by modal benches.
+    """Contrast added by closing the loop for a sensor, preset and star, simulated with `ModalBench`.
 
-    For bright stars, the residual with fixed gains too.
+    Only the diagonal of the quadratic form counts. For bright stars it also compares the residual with that of the best
+    fixed gains.
     """
     sensor, preset, magnitude = case
     try:
         _noise_nm2(sensor, magnitude)
-    except CalibrationError as saturated:
-        return {"sensor": sensor, "preset": preset, "magnitude": magnitude, "saturates": str(saturated)}
+    except CalibrationError as error:
+        if "the star saturates" not in str(error):
+            raise
+        return {"sensor": sensor, "preset": preset, "magnitude": magnitude, "saturates": str(error)}
     residual_nm2 = np.array([_closed_nm2(*case, seed, _AUTO) for seed in SEEDS])
     disturbance_nm2 = np.array([_open_nm2(preset, seed) for seed in SEEDS])
     row = _row(case, residual_nm2, disturbance_nm2)
@@ -132,8 +136,8 @@ def _row(case: tuple[str, str, float], residual_nm2: Array, disturbance_nm2: Arr
 
 def harms(row: Results) -> bool:
     """Whether closing the loop adds more contrast than tolerated."""
-    errors = 0 if row["preset"] == "quiet" else 3
-    return bool(row["change"] > errors * row["error"] + TOLERATED * row["own"])
+    allowed_sigmas = 0 if row["preset"] == "quiet" else 3
+    return bool(row["change"] > allowed_sigmas * row["error"] + TOLERATED * row["own"])
 
 
 def measure() -> Results:
@@ -147,16 +151,16 @@ def measure() -> Results:
 
 
 def render(results: Results) -> str:
-    """A row for each sensor and star: wavefront open and closed by preset, and cases in which closing harms."""
+    """Wavefront in open and closed loop by sensor, preset and star (V in `SHOWN`), and the harmful cases."""
     rows = [row for row in results["rows"] if "saturates" not in row]
     modal = [row for row in rows if "images" not in row]
     table = []
     for sensor, magnitude in dict.fromkeys((row["sensor"], row["magnitude"]) for row in modal):
         mine = {row["preset"]: row for row in modal if (row["sensor"], row["magnitude"]) == (sensor, magnitude)}
-        if magnitude in (-1, 2, 5, 8):
+        if magnitude in SHOWN:
             table.append(
                 {"sensor": sensor, "magnitude": magnitude}
-                | {preset: "{open_nm:.2f} to {closed_nm:.2f}".format(**row) for preset, row in mine.items()}
+                | {preset: "{open_nm:.2f} -> {closed_nm:.2f}".format(**row) for preset, row in mine.items()}
             )
     harmful, saturated = [row for row in rows if harms(row)], len(results["rows"]) - len(rows)
     stars = _magnitudes(modal)
@@ -171,11 +175,11 @@ def render(results: Results) -> str:
     }
     return (
         f"{formatted_table(heads, table)}\n"
-        f"True wavefront, open to closed with automatic gains, nm rms over the second half of "
+        f"True wavefront, open loop -> closed loop with automatic gains, nm rms over the second half of "
         f"{results['seconds']:g} s at {results['rate_hz']:g} Hz, mean of {results['seeds']} seeds. "
-        f"Number of cases: {len(rows)} (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them "
-        f"with every image simulated), without {saturated} in which the star saturates the detector. Added contrast is "
-        "without the terms between modes. A case counts as harmful if closing adds more contrast than "
+        f"{len(rows)} cases (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them with every image "
+        f"simulated); {saturated} more were excluded because the star saturates the detector. Added contrast excludes "
+        "the cross terms between modes. A case counts as harmful if closing adds more contrast than "
         f"{100 * TOLERATED:g} % of the dark zone's own plus three standard errors (`quiet`: {100 * TOLERATED:g} % "
         f"alone). Harmful cases, with the ratio of added contrast to the dark zone's own: {names or 'none'}. On bright "
         f"stars (V = {_magnitudes(bright)}; without `quiet`; two seeds) the residual with automatic gains is "

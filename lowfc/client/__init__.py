@@ -1,4 +1,4 @@
-"""Python client of a running loop: the operator's requests, and the loop's frames and its steps (results of a frame).
+"""Python client of a running loop: the operator's requests, and the loop's frames and control steps.
 
 with Client() as loop:
     loop.gain(0.4, modes=[2, 3])

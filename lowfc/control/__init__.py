@@ -1,1 +1,1 @@
-"""Estimation, control law, safety and stability: pure functions of arrays."""
+"""Estimation, control law, requests, safety and stability, without clock, file or bus; mostly pure functions."""

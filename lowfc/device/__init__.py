@@ -1,4 +1,4 @@
-"""Drivers of cameras and mirrors: their interfaces, and the two loops that run them."""
+"""Drivers of cameras and mirrors: their interfaces, and the main loops that call them."""
 
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels, Single

@@ -203,17 +203,19 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     config = load(None, keys)
     growth = bytes_per_s(config, configured_selection(config))
     assert 3e6 < growth < 5e6
-    assert estimate(config).startswith(f"recording into {tmp_path}: about {growth * 3600 / 1e9:.0f} GB an hour; ")
-    assert estimate(config).endswith(" h, at 250 Hz and 80 x 80 pixels, the simulated camera's")
+    expected = (
+        f"about {growth * 3600 / 1e9:.0f} GB an hour at 250 Hz and 80 x 80 pixels (size of the simulated camera); "
+    )
+    assert estimate(config).startswith(f"recording into {tmp_path}: {expected}")
     assert estimate(load(None, {"recorder.folder": ""})).startswith("recording into .: ")
     camera = wire.CameraState(rows=160, columns=120)
-    assert estimate(config, camera).endswith(" h, at 250 Hz and 160 x 120 pixels")
+    assert " GB an hour at 250 Hz and 160 x 120 pixels; " in estimate(config, camera)
     added_per_s = bytes_per_s(config, configured_selection(config), camera) - growth
     assert added_per_s == pytest.approx((160 * 120 - 80 * 80) * 2 * 0.6 * 250)
     assert estimate(config, wire.CameraState()) == estimate(config)
     lockstep = config.model_copy(update={"lockstep": True})
-    assert " h, at 250 Hz in simulated time and 80 x 80 pixels" in estimate(lockstep)
-    assert estimate(load(None, keys | {"sensor.kind": "zwfs"})).endswith(" 40 x 40 pixels, the simulated camera's")
+    assert " GB an hour at 250 Hz in simulated time and 80 x 80 pixels" in estimate(lockstep)
+    assert " 40 x 40 pixels (size of the simulated camera); " in estimate(load(None, keys | {"sensor.kind": "zwfs"}))
     fields = *wire.ControlStep.DESCRIPTOR.fields, *wire.Truth.DESCRIPTOR.fields
     modal = sum(field.is_repeated and field.name.endswith("_nm") for field in fields)
     added_per_s = bytes_per_s(load(None, keys | {"sensor.modes": 35}), EVERYTHING) - growth

@@ -1,13 +1,24 @@
 """Automatic gains over the bus: closing the loop does no harm on bright or faint stars."""
 
+import contextlib
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from lowfc.contract.errors import CalibrationError
 from tests.support.loops import loop
+from tools import no_harm
 from tools.no_harm import TOLERATED
 
 OPTIONS = "--lockstep --rate 250 --duration 20 --disturbance bench --no-record"
+
+
+@pytest.mark.parametrize(("why", "recorded"), [("the star saturates the sensor: ...", True), ("no light", False)])
+def test_only_a_saturating_star_is_recorded_as_such(why: str, recorded: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(no_harm, "_noise_nm2", Mock(side_effect=CalibrationError(why)))
+    with contextlib.nullcontext() if recorded else pytest.raises(CalibrationError, match=why):
+        assert no_harm.modal_case(("sam", "bench", 0))["saturates"] == why
 
 
 @pytest.mark.slow

@@ -435,7 +435,7 @@ def test_a_refused_report_of_other_channels_is_repeated_every_two_seconds(
     others = bridge.ExternalChannels(client, bus, ["dm00disp01"], 1000.0)
     for tick in range(100):
         now_s = tick * 0.1
-        others.pass_on()
+        others.report_changes()
     assert requested_s == [0.0, 2.0, 4.0, 6.0], "refused three times, then accepted"
 
 
@@ -446,9 +446,9 @@ def test_a_shape_of_other_channels_is_removed_only_if_the_controller_has_one(fol
     states = MemoryBus(hub, "controller", FakeClock()).publisher(CONTROLLER_STATE)
     channel(folder, "dm00disp01", make=True).write(np.zeros(GRID, np.float32))
     others = bridge.ExternalChannels(client, MemoryBus(hub, "operator", FakeClock()), ["dm00disp01"], 1000.0)
-    others.pass_on()
+    others.report_changes()
     assert requests == []
     reported = wire.Channel(name="external", actuators=np.ones(GRID, np.float32).tobytes())
     states.put(wire.ControllerState(channels=[reported]).SerializeToString())
-    others.pass_on()
+    others.report_changes()
     assert requests == [("external", None)]

@@ -46,7 +46,7 @@ class Run:
         message = wire.ControlStep(mode=wire.LOOP_MODE_CLOSED, **fields)
         message.timestamp.FromNanoseconds(AT_NS)
         self.steps.put(message.SerializeToString())
-        self.streams.pass_on()
+        self.streams.write_new_steps()
 
 
 def test_each_step_is_an_image_of_one_row(folder: Path) -> None:
@@ -58,7 +58,7 @@ def test_each_step_is_an_image_of_one_row(folder: Path) -> None:
     assert values == [[3, -4], [1, 2], [5], [500]]
     run.step(command_nm=[1, 3], flux_dn=0)  # a refused frame has no error
     run.steps.put(b"\xff")
-    run.streams.pass_on()
+    run.streams.write_new_steps()
     assert [image.count for image in (error, command, residual, flux)] == [1, 2, 1, 2]
     assert command.pixels.ravel().tolist() == [1, 3]
     run.step(error_nm=[1, 2, 2], command_nm=[0, 0, 0], flux_dn=1)  # another calibration: the stream is created again
@@ -81,18 +81,19 @@ def test_an_existing_stream_is_adopted_unless_another_process_writes_it(folder: 
         Run().step(command_nm=[1, 2])
 
 
-@pytest.mark.parametrize("case", ["", "busy", "late", "again"])
+@pytest.mark.parametrize("case", ["normal", "busy", "controller-late", "run-restarted"])
 def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The bridge ends after ten rounds. In the fourth, the controller starts again ("late": for the first time).
+    """The bridge polls ten times. Cases:
 
-    With "again" the run starts again instead, and the bridge joins it. A busy controller answers from the sixth on.
+    normal: the controller restarts at the fourth poll; busy: it also refuses at the first five; controller-late: it
+    only starts at the fourth; run-restarted: instead the run is restarted, and the bridge joins the new one.
     """
     hub, clock, received = MemoryHub(), FakeClock(AT_NS), list[wire.Request]()
     controller = MemoryBus(hub, "controller", clock)
     controller.publisher(CALIBRATION).put(encode_calibration(identified(calibration()), 0))
     states = controller.publisher(CONTROLLER_STATE)
     started = wire.ControllerState(mirror_rows=GRID[0], mirror_columns=GRID[1]).SerializeToString()
-    if case != "late":
+    if case != "controller-late":
         states.put(started)
 
     def answer(query: Query) -> None:
@@ -106,7 +107,7 @@ def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkey
     stream(folder, "dm00disp04", GRID[1], GRID[0], make=True).write(np.full(GRID, np.nan, np.float32))
     stream(folder, "dm00disp05", 7, 6, make=True)
     real_channel, rounds = bridge.Client.channel, 0
-    restarts = iter([False] * 4 + [case == "again"])
+    restarts = iter([False] * 4 + [case == "run-restarted"])
 
     def channel(client: bridge.Client, name: str, shape_nm: Any) -> Any:
         if case == "busy" and rounds < 5:
@@ -117,7 +118,7 @@ def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkey
         nonlocal rounds
         rounds += 1
         clock.advance(10**9)
-        if rounds == 4 and case != "again":
+        if rounds == 4 and case != "run-restarted":
             states.put(started)
         if rounds == 7:
             states.put(b"\xff")
@@ -138,20 +139,20 @@ def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkey
     shapes = [np.frombuffer(request.actuators, np.float32) for request in received]
     assert {request.text for request in received} == {"external"}
     *reported, removed = shapes
-    assert len(reported) == (1 if case in ("busy", "late") else 2), "to each controller"
+    assert len(reported) == (1 if case in ("busy", "controller-late") else 2), "once to each controller"
     for shape in reported:
         assert shape == pytest.approx(np.full(GRID[0] * GRID[1], 40.0))
     assert removed.size == 0
     left_out = [line for line in done.stderr.splitlines() if line.startswith("other channels: dm00disp01")]
-    assert len(left_out) == (2 if case == "again" else 1)
+    assert len(left_out) == (2 if case == "run-restarted" else 1)
     assert all(f"stream 'dm00disp0{cause}" in left_out[0] for cause in ("5' has 7 x 6", "4' has values that are not"))
     assert done.stderr.count("other channels: not reported to the loop: busy") == (case == "busy")
-    assert done.stderr.count("not reported to the loop: run 'bench' has no controller") == (case == "late")
+    assert done.stderr.count("not reported to the loop: run 'bench' has no controller") == (case == "controller-late")
 
 
 @pytest.mark.parametrize(
     "options",
     [["dm00"], ["dm00disp03", "--external", "dm00disp03"], ["", "--external", "dm00disp04", "--external", "dm00disp"]],
 )
-def test_the_loops_own_channel_has_a_number_and_is_not_external(options: list[str]) -> None:
+def test_the_own_channel_must_be_a_numbered_dm_channel_and_not_external(options: list[str]) -> None:
     assert "--external" in refusal("bridge", "isio", "--beside", *options, kind=ConfigurationError)

@@ -101,3 +101,8 @@ def test_the_boston_mirror_example_sends_values_and_raises_the_vendors_errors(mo
     assert mirror.dm.closed
     with pytest.raises(ConfigurationError, match="cannot be opened: OSError: error 5"):
         opened("another")
+    left_open: list[BmcDm] = []
+    monkeypatch.setattr(BmcDm, "num_actuators", lambda dm: left_open.append(dm) or 1)
+    with pytest.raises(ConfigurationError, match="each actuator needs its own channel below 1"):
+        opened("17CW000#001")
+    assert [dm.closed for dm in left_open] == [True]

@@ -8,12 +8,13 @@ import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from astropy.io import fits
 
-from lowfc.adapters.files import calibration_file, law_file
+from lowfc.adapters.files import calibration_file, fits_file, law_file
 from lowfc.adapters.files.array_file import read_array
 from lowfc.adapters.files.layouts import load_layout
 from lowfc.adapters.files.sensors import load_pupil
@@ -195,6 +196,13 @@ def test_the_unit_of_a_shape_is_checked_and_that_of_a_map_of_active_actuators_is
     image.header["BUNIT"] = "nm"
     image.writeto(path, overwrite=True)
     check_files(load(None, {"mirror.flat": str(path)}))
+
+
+def test_an_error_without_text_is_named(tmp_path: Path) -> None:
+    content = fits_file.to_bytes(fits_file.primary_hdu("map"), [])
+    parse = Mock(side_effect=MemoryError)
+    text = error_of(lambda: fits_file.load(tmp_path / "a.fits", ("map",), "map", parse, content=content))
+    assert text.endswith("a.fits: not a readable map: MemoryError")
 
 
 def test_fits_images_and_pupils_with_a_huge_header_are_refused(tmp_path: Path) -> None:

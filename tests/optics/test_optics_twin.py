@@ -51,7 +51,7 @@ def default_images(sensor, modes, coefficients_nm):
 
 
 def worst_error(twin, coefficients_nm, images):
-    """Largest relative error of the twin's images; the full chain's `images` may be of fewer wavefronts."""
+    """Largest relative error of the twin's images; the full chain's `images` may cover only the first wavefronts."""
     evaluator, at_nodes = Evaluator(twin), zernikes(NOLLS_20, *node_radii(twin))
     return max(
         relative_l2(evaluator.image((each @ at_nodes).astype(np.float32)), full)
@@ -100,13 +100,13 @@ def test_twin_of_every_sensor_agrees_with_the_full_chain(spec, name, limit, mode
     ("defocus_mm", "limit"),
     [(3.0, 5e-5), *(pytest.param(*far, marks=pytest.mark.slow) for far in ((1.5, 2e-4), (12.0, 5e-5)))],
 )
-def test_defocused_twin_is_accurate_at_any_distance(defocus_mm, limit, modes, coefficients_nm):
+def test_defocused_twin_is_accurate_at_several_distances(defocus_mm, limit, modes, coefficients_nm):
     sensor = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
     images = full_images(sensor, modes, coefficients_nm[:1])
     assert worst_error(build(sensor, FAST), coefficients_nm, images) < limit
 
 
-def test_twin_of_an_annulus_thinner_than_a_sample_agrees_with_the_full_chain():
+def test_twin_of_a_clowfs_with_an_annulus_thinner_than_a_sample_agrees_with_the_full_chain():
     """Some rows of the focal-plane mask's samples, which are 0.125 lambda/D apart, have no sample in the annulus."""
     sensor = sensor_from(SensorSection(kind="clowfs", inner_radius=3.9))
     assert relative_l2(twin_reference(build(sensor, FAST)), reference(sensor)) < 5e-4
@@ -134,7 +134,7 @@ def test_twin_response_is_the_derivative_of_the_evaluator(name, request):
 
 
 @pytest.mark.parametrize("name", ["fast", "broadband", "zwfs"])
-def test_the_image_of_several_wavefronts_is_the_weighted_sum_of_theirs(name, request):
+def test_the_image_of_several_wavefronts_is_the_weighted_sum_of_their_images(name, request):
     twin = fast_twin(name) if name == "zwfs" else request.getfixturevalue(name)
     evaluator = Evaluator(twin)
     opds_nm = np.random.default_rng(1).normal(scale=5.0, size=(3, twin.used.size)).astype(np.float32)
@@ -173,7 +173,7 @@ def test_mirror_on_the_nodes_gives_the_commanded_wavefront(sensor, fast):
     commands = modes_to_actuators(Mirror(), NOLLS_20)
     for command, mode in zip(commands.T, zernikes(NOLLS_20, *node_radii(fast)), strict=True):
         error = wavefront_nm(on_nodes, 10.0 * command.reshape(34, 34)) - 10.0 * mode
-        assert wavefront_rms_nm(fast, error) < 0.35  # fit errors of the full surface reach 0.16 nm
+        assert wavefront_rms_nm(fast, error) < 0.35  # the fit by influence functions leaves up to 0.16 nm of it
     pokes_nm = poke_wavefronts_nm(on_nodes) @ commands
     for command, wavefront in zip(commands.T, pokes_nm.T, strict=True):
         np.testing.assert_allclose(wavefront, wavefront_nm(on_nodes, command.reshape(34, 34)), atol=1e-5)

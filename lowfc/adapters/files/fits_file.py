@@ -32,7 +32,7 @@ DAMAGED = (
 
 
 def header_text(text: str) -> str:
-    """Text for a header, which holds printable ASCII only: other characters as escapes of a Python string."""
+    """Text for a header, which holds printable ASCII only: other characters become Python escapes."""
     return printable(text).encode("ascii", "backslashreplace").decode()
 
 
@@ -63,7 +63,7 @@ def extension(name: str, array: npt.NDArray[np.generic], description: str, unit:
 def to_bytes(primary: fits.PrimaryHDU, extensions: list[fits.ImageHDU]) -> bytes:
     """Encode a file, with checksums."""
     stream = io.BytesIO()
-    with warnings.catch_warnings(action="ignore", category=fits.verify.VerifyWarning):  # of a comment cut off
+    with warnings.catch_warnings(action="ignore", category=fits.verify.VerifyWarning):  # a truncated comment
         fits.HDUList([primary, *extensions]).writeto(stream, checksum=True)
     return stream.getvalue()
 
@@ -78,7 +78,7 @@ def opened(path: Path, content: bytes | None = None) -> Iterator[fits.HDUList]:
     ):
         warnings.simplefilter("error", AstropyWarning)  # astropy only warns of a truncated file
         magic = stream.read(2)
-        if magic in (b"PK", b"\x1f\x9d"):  # astropy raises AttributeError or ModuleNotFoundError
+        if magic in (b"PK", b"\x1f\x9d"):  # astropy's errors for these are not in DAMAGED
             raise ValueError("it is an archive, such as .npz or .Z, and not a FITS file")
         stream.seek(0)
         if magic == b"\x1f\x8b":  # astropy does not read as far as the checksum
@@ -109,7 +109,7 @@ def load(
         content: content of the file, if it is not read from `path`, which then names it in errors.
 
     Raises:
-        DataFileError: the file is missing, damaged or holds something else.
+        DataFileError: the file is missing or damaged, or is of another kind.
     """
     try:
         with opened(path, content) as hdus:
@@ -150,4 +150,4 @@ def one_line(error: BaseException) -> str:
     if "SIMPLE card" in str(error):
         return "it is not a FITS file"
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return " ".join(text.split())[:300]
+    return " ".join(text.split())[:300] or type(error).__name__

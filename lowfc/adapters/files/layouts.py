@@ -26,8 +26,9 @@ def load_layout(name: str) -> sams.Layout:
 
     Args:
         name: A shipped layout, `file.json` with one layout, or `file.json:name` with several. A file has the form
-            of the shipped one: {"layouts": {name: {"purpose", "hole_diameter", "holes": [[x, y], ...]}}} in pupil
-            diameters; a hole [x, y, diameter] has its own size. A single layout may stand alone, without "layouts".
+            of the shipped one: {"layouts": {name: {"purpose", "hole_diameter", "holes": [[x, y], ...]}}}; a hole
+            [x, y, diameter] has its own size. Positions and diameters are in pupil diameters. A single layout may stand
+            alone, without "layouts".
 
     Raises:
         ConfigurationError: No layout has that name, or the file holds several and none is named.
@@ -42,7 +43,7 @@ def load_layout(name: str) -> sams.Layout:
     if chosen not in layouts:
         known = ", ".join(sorted(layouts))
         if not chosen:
-            raise ConfigurationError(f"{file} holds several layouts; choose one as {file}:name, of {known}")
+            raise ConfigurationError(f"{file} holds several layouts; choose one with {file}:NAME; it has {known}")
         raise ConfigurationError(
             f"no sparse-aperture layout is called {chosen!r}{nearest(chosen, layouts)}: there are {known}"
         )
@@ -97,7 +98,9 @@ def _read_layouts(file: Traversable) -> dict[str, Any]:
         return {str(content.get("name", Path(file.name).stem)): content}
     layouts = content.get("layouts") if isinstance(content, dict) else None
     if not isinstance(layouts, dict) or not layouts:
-        raise DataFileError(f'{file} holds no layouts: expected {{"layouts": {{name: ...}}}} or one with "holes"')
+        raise DataFileError(
+            f'{file} holds no layouts: expected {{"layouts": {{name: ...}}}} or a single layout with "holes"'
+        )
     return layouts
 
 

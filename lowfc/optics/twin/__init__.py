@@ -1,1 +1,1 @@
-"""The digital twin: a compressed model, within 1e-4 of the full chain (built-in sensors), fast enough for the loop."""
+"""The digital twin: a compressed model, fast enough for the loop; its images agree with the full chain's to 1e-4."""

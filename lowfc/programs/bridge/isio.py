@@ -39,7 +39,7 @@ def bridge_isio(
     run: AnyRun = None,
     prefix: Annotated[str, typer.Option(help="Prefix of the streams' names.")] = "lowfc",
     beside: Annotated[
-        str, typer.Option(help="Channel that the loop writes; the loop does not undo this mirror's other channels.")
+        str, typer.Option(help="The loop's own channel; the loop does not undo the other channels of its mirror.")
     ] = "",
     external: Annotated[list[str] | None, typer.Option(help="Channel not undone by the loop; may be repeated.")] = None,
     nm_per_unit: Annotated[float, typer.Option(min=1e-9, max=1e9, help="Surface per unit of a channel, nm.")] = 1000.0,
@@ -73,9 +73,9 @@ def bridge_isio(
                 streams = f"{prefix}_error, _command, _residual and _flux"
                 sys.stderr.write(f"publishing run {run_id!r} as streams {streams}; Ctrl-C ends this\n")
                 while not joined.restarted():
-                    steps.pass_on()
+                    steps.write_new_steps()
                     if others is not None:
-                        others.pass_on()
+                        others.report_changes()
                     time.sleep(_POLL_S)
 
 
@@ -93,7 +93,7 @@ class StepStreams:
         self._prefix = prefix
         self._streams: dict[str, Stream] = {}
 
-    def pass_on(self) -> None:
+    def write_new_steps(self) -> None:
         """Write the steps that have arrived.
 
         Raises:
@@ -134,7 +134,7 @@ class ExternalChannels:
         self._next_request_s = 0.0
         self._report = ""
 
-    def pass_on(self) -> None:
+    def report_changes(self) -> None:
         """Request the channel `external` if it differs from the controller's."""
         for sample in self._states.drain():
             with contextlib.suppress(DecodeError):

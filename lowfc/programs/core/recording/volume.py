@@ -21,7 +21,7 @@ _COMPRESSED_FRACTION = {FRAME: 0.6, COMMAND: 0.9, MIRROR_STATE: 0.55}
 
 
 def payload_bytes(config: Configuration, camera: wire.CameraState | None = None) -> dict[Topic, int]:
-    """Bytes of the large arrays in one message of each large topic, from the sizes of camera and mirror.
+    """Uncompressed arrays of one message, bytes, for each topic with large arrays.
 
     Without the camera's state, frames are those of the simulated camera.
     """
@@ -54,12 +54,13 @@ def estimate(config: Configuration, camera: wire.CameraState | None = None) -> s
     """Sentence on the disk space that a recording will use, with the assumed rate and frame size."""
     recorded = configured_selection(config)
     folder, min_free_bytes = user_path(config.recorder.folder), config.recorder.min_free_mb * 1e6
-    growth = growth_in_words(bytes_per_s(config, recorded, camera), folder, min_free_bytes)
     rows, columns, source = _frame_size(config, camera)
     selected = f" ({recorded.description})" if recorded.description else ""
     size = f"{rows} x {columns} pixels{source}{selected}"
     time = " in simulated time" if config.lockstep else ""
-    return f"recording into {folder}: {growth}, at {config.camera.rate_hz:g} Hz{time} and {size}"
+    conditions = f" at {config.camera.rate_hz:g} Hz{time} and {size}"
+    growth = growth_in_words(bytes_per_s(config, recorded, camera), folder, min_free_bytes, conditions)
+    return f"recording into {folder}: {growth}"
 
 
 def check_folder(config: Configuration) -> None:
@@ -72,11 +73,12 @@ def check_folder(config: Configuration) -> None:
         raise DataFileError(fault)
 
 
-def growth_in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: float) -> str:
-    """Growth per hour, and the time until the disk of `folder` has only `min_free_bytes` left."""
+def growth_in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: float, conditions: str = "") -> str:
+    """Growth per hour, `conditions` (" at 250 Hz"), and time until the disk of `folder` has `min_free_bytes` left."""
     free_bytes = shutil.disk_usage(existing(folder)).free
     lasts_h = max(0.0, free_bytes - min_free_bytes) / growth_bytes_per_s / 3600
-    return f"about {_size(growth_bytes_per_s * 3600)} an hour; {_size(free_bytes)} free, enough for {lasts_h:.1f} h"
+    growth = f"about {_size(growth_bytes_per_s * 3600)} an hour{conditions}"
+    return f"{growth}; {_size(free_bytes)} free, enough for {lasts_h:.1f} h"
 
 
 def _frame_size(config: Configuration, camera: wire.CameraState | None) -> tuple[int, int, str]:
@@ -84,7 +86,7 @@ def _frame_size(config: Configuration, camera: wire.CameraState | None) -> tuple
     if camera is not None and camera.rows and camera.columns:
         return camera.rows, camera.columns, ""
     side = PUPIL_IMAGE_PIXELS if config.sensor.kind == "zwfs" else Sensor.pixels
-    return side, side, ", the simulated camera's"
+    return side, side, " (size of the simulated camera)"
 
 
 def _rate_hz(topic: Topic, config: Configuration, recorded: Selection) -> float:
