@@ -167,7 +167,7 @@ def test_a_message_in_transit_during_the_switch_is_delivered_once(reader: Reader
 
 
 def test_a_reader_is_closed_although_a_handler_never_returns(reader: ReaderOnTwoPaths) -> None:
-    reader.direct._turn.acquire()  # as held while a handler runs
+    reader.direct._lock.acquire()  # as held while a handler runs
     closing = threading.Thread(target=reader.direct.close, daemon=True)
     closing.start()
     closing.join(PATIENCE_S)

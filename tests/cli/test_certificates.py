@@ -264,7 +264,7 @@ def test_errors_name_the_file_or_option_at_fault(tmp_path: Path) -> None:
 
 def test_nothing_is_signed_by_an_authority_that_has_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(certificates, "CA_DAYS", 0)
-    with pytest.raises(DataFileError, match=r"ca\.pem ended on .*: make all certificates anew in an empty folder"):
+    with pytest.raises(DataFileError, match=r"ca\.pem expired on .*: make all certificates anew in an empty folder"):
         make(tmp_path, ("camera",), [])
     assert not (tmp_path / "camera.pem").exists()
 

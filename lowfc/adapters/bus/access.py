@@ -1,4 +1,4 @@
-"""Access control at the router, derived from the table of topics; everything else is denied.
+"""Access control at the router: the table of topics defines what is permitted, all other messages are denied.
 
 The common name of a process's certificate is its role: "camera", "mirror-dm". Directions are the router's: ingress is
 from a process to the router, egress from the router to a process.
@@ -14,7 +14,7 @@ from lowfc.contract.messages import COMMAND, HEALTH, RECORD_KEY, REQUEST_KEY, TO
 ROUTER = "router"
 """Role of the router itself: its common name, and its name in Health."""
 CLOCK_KEY = "lowfc/clock"
-"""Key of the queryable that answers with the router's time, which all envelopes have in a run on several hosts."""
+"""Key of the queryable that answers with the router's time; in a run on several hosts, envelopes have this time."""
 
 _LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # never part of a run on several hosts
 

@@ -60,10 +60,10 @@ class Publisher(Protocol):
     """Publishes one topic under one key.
 
     Attributes:
-        published: count that the next message's sequence has: the number of messages so far plus `skipped`.
-        skipped: number of counts that no message has, because the camera lost the frame.
-        handed_ns: time at which the last message was handed to the direct link, or to the bus if the link did not take
-            it; host clock.
+        published: count in the next message's sequence: the number of messages so far plus `skipped`.
+        skipped: number of counts without a message, because the camera lost the frame.
+        handed_ns: time at which the last message was handed to the direct link, or to the bus if the link did not
+            accept it; host clock.
     """
 
     topic: Topic
@@ -114,7 +114,7 @@ class Bus(Protocol):
         """Number of other processes connected to this one."""
 
     def restart(self) -> None:
-        """Give later messages a new start time; publishers count from 0, as when a camera restarts its numbers."""
+        """Give later messages a new start time and count them from 0, as after a camera restarts its frame numbers."""
 
     def close(self) -> None:
         """Leave the run."""
@@ -163,7 +163,7 @@ class Faults:
         if not before:
             text = "".join(traceback.format_exception(fault))
             with contextlib.suppress(OSError):  # for example a full disk: the receive thread must go on
-                sys.stderr.write(f"{where}: {text}(further ones at this place are only counted)\n")
+                sys.stderr.write(f"{where}: {text}(further exceptions at this place are only counted)\n")
 
     def add_unreadable(self, key: str, why: object) -> None:
         """Count an unreadable message by its key or key expression."""

@@ -36,7 +36,7 @@ def make_certificates(
     Args:
         folder: folder of the authority; created with access for this user only.
         roles: roles to make certificates for, including the router's.
-        addresses: names and IP addresses by which other hosts reach the router; empty to keep those of its certificate.
+        addresses: names and IP addresses by which other hosts reach the router; empty: those in its last certificate.
         days: validity of the certificates, days.
         renew: also renew existing certificates, with their present keys; the authority is never renewed.
 
@@ -46,7 +46,7 @@ def make_certificates(
     Raises:
         ConfigurationError: an address is missing, invalid, or not in the router's certificate; `renew` finds no
             authority.
-        DataFileError: the authority's key or certificate is missing, or its certificate has ended; a file is not the
+        DataFileError: the authority's key or certificate is missing, or its certificate has expired; a file is not the
             key or certificate that its name says; the folder cannot be written.
     """
     names = [_general_name(address) for address in addresses]
@@ -69,9 +69,9 @@ def make_certificates(
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         key, authority = _authority(folder)
         for role in missing:
-            own = _own_key(folder, role)
+            role_key = _role_key(folder, role)
             usage = ExtendedKeyUsageOID.SERVER_AUTH if role == ROUTER else ExtendedKeyUsageOID.CLIENT_AUTH
-            builder = _builder(role, own, days).issuer_name(authority.subject)
+            builder = _builder(role, role_key, days).issuer_name(authority.subject)
             builder = builder.add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
             if role == ROUTER:
                 builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
@@ -85,10 +85,10 @@ def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]
     certificate_file, key_file = folder / CA, folder / CA_KEY
     missing = [file.name for file in (certificate_file, key_file) if not file.exists()]
     if len(missing) == 2:
-        own = generate_private_key(SECP256R1())
-        builder = _builder("lowfc authority", own, CA_DAYS, authority=True).issuer_name(_name("lowfc authority"))
-        write_whole(key_file, _pem(own), mode=0o600)
-        write_whole(certificate_file, builder.sign(own, SHA256()).public_bytes(Encoding.PEM))
+        new_key = generate_private_key(SECP256R1())
+        builder = _builder("lowfc authority", new_key, CA_DAYS, authority=True).issuer_name(_name("lowfc authority"))
+        write_whole(key_file, _pem(new_key), mode=0o600)
+        write_whole(certificate_file, builder.sign(new_key, SHA256()).public_bytes(Encoding.PEM))
     elif missing:
         raise DataFileError(
             f"{folder} has no {missing[0]}: use the folder that has both {CA} and {CA_KEY}, or make all "
@@ -103,9 +103,9 @@ def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]
         raise DataFileError(
             f"{key_file} is not the key of {certificate_file}; make all certificates anew in an empty folder"
         )
-    if (ended := certificate.not_valid_after_utc) <= datetime.datetime.now(datetime.UTC):
+    if (expiry := certificate.not_valid_after_utc) <= datetime.datetime.now(datetime.UTC):
         raise DataFileError(
-            f"{certificate_file} ended on {ended:%Y-%m-%d}: make all certificates anew in an empty folder"
+            f"{certificate_file} expired on {expiry:%Y-%m-%d}: make all certificates anew in an empty folder"
         )
     return key, certificate
 
@@ -119,14 +119,14 @@ def _router_addresses(folder: Path) -> list[x509.GeneralName]:
     raise DataFileError(f"{file} is not a router's certificate; remove it to have a new one made")
 
 
-def _own_key(folder: Path, role: str) -> EllipticCurvePrivateKey:
-    """A role's key; if missing, it is made before the certificate: an interruption leaves no mismatched pair."""
+def _role_key(folder: Path, role: str) -> EllipticCurvePrivateKey:
+    """A role's key; a missing key is made before the certificate, so that an interruption leaves no mismatched pair."""
     file = folder / f"{role}.key"
     if not file.exists():
-        (folder / f"{role}.pem").unlink(missing_ok=True)  # it belongs to a lost key
-        own = generate_private_key(SECP256R1())
-        write_whole(file, _pem(own), mode=0o600)
-        return own
+        (folder / f"{role}.pem").unlink(missing_ok=True)  # the certificate of a lost key
+        new_key = generate_private_key(SECP256R1())
+        write_whole(file, _pem(new_key), mode=0o600)
+        return new_key
     with contextlib.suppress(ValueError, TypeError):
         stored = load_pem_private_key(file.read_bytes(), password=None)
         if isinstance(stored, EllipticCurvePrivateKey):
@@ -134,7 +134,7 @@ def _own_key(folder: Path, role: str) -> EllipticCurvePrivateKey:
     raise DataFileError(f"{file} is not a key made by lowfc; remove it to have a new one made")
 
 
-def _builder(name: str, own: EllipticCurvePrivateKey, days: int, *, authority: bool = False) -> x509.CertificateBuilder:
+def _builder(name: str, key: EllipticCurvePrivateKey, days: int, *, authority: bool = False) -> x509.CertificateBuilder:
     """Certificate builder for a key, without issuer and extended key usage."""
     now = datetime.datetime.now(datetime.UTC)
     usage = x509.KeyUsage(
@@ -151,13 +151,13 @@ def _builder(name: str, own: EllipticCurvePrivateKey, days: int, *, authority: b
     return (
         x509.CertificateBuilder()
         .subject_name(_name(name))
-        .public_key(own.public_key())
+        .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - _BACKDATED)
         .not_valid_after(now + datetime.timedelta(days=days))
         .add_extension(x509.BasicConstraints(ca=authority, path_length=0 if authority else None), critical=True)
         .add_extension(usage, critical=True)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(own.public_key()), critical=False)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
 
 

@@ -21,9 +21,9 @@ from lowfc.contract.envelope import Envelope
 
 Handler = Callable[[Sample], None]
 
-_BUFFER_BYTES = 4 << 20  # some hundred frames, up to the host's limit; the kernel doubles it
+_BUFFER_BYTES = 4 << 20  # for some hundred frames; the kernel cuts it to the host's limit, then doubles it
 _RETRY_S = 0.1
-_RECENT = 1 << 13  # envelopes: more messages of 200 bytes or more than a socket buffers while its reader is stopped
+_RECENT = 1 << 13  # envelopes remembered; a socket buffers fewer messages (of 200 bytes or more) for a stopped reader
 _ENVELOPE_BYTES = len(Envelope(0, 0).encode())
 
 
@@ -37,7 +37,7 @@ class DirectWriter:
         self._retry_s = 0.0
 
     def send(self, envelope: bytes, payload: bytes) -> bool:
-        """Send a message and return whether it was sent; a reader too far behind loses it, as on the bus."""
+        """Send a message and return whether it was sent; a reader too far behind loses the message, as on the bus."""
         if self._socket is None:
             self._connect()
             if self._socket is None:
@@ -48,7 +48,7 @@ class DirectWriter:
             return False
         except OSError as fault:
             self.close()  # the reader has gone
-            if fault.errno == errno.EMSGSIZE:  # larger than this host's socket limit, as the next one will be
+            if fault.errno == errno.EMSGSIZE:  # larger than this host's socket limit, as later messages will be
                 self._retry_s = math.inf
             return False
         return True
@@ -97,13 +97,13 @@ class DirectReader:
     A copy is recognised by its envelope; the sequence alone is not enough, as two publishers may have started in the
     same second.
 
-    A topic with one publisher: once the socket works, a message from the bus is dropped as late unless it is newer than
-    all before. Once a message has come both ways, the reader unsubscribes from the bus, until the publisher disconnects
-    from the socket. Messages from the socket are forwarded as they arrive, even if their sequences decrease; without
-    the bus, the newest one is forwarded again if the publisher repeats it.
+    For a topic with one publisher: once the socket works, a message from the bus is dropped as late unless it is newer
+    than all earlier ones. Once a message has arrived on both paths, the reader unsubscribes from the bus, until the
+    publisher disconnects from the socket. Messages from the socket are forwarded as they arrive, even if their
+    sequences decrease. While unsubscribed, the reader also forwards a repetition of the newest message.
 
-    A topic with several publishers: the reader stays subscribed to the bus, and a message that only the bus carried may
-    be forwarded after a newer one.
+    For a topic with several publishers: the reader stays subscribed to the bus, and a message that only the bus carried
+    may be forwarded after a newer one.
     """
 
     def __init__(
@@ -125,8 +125,8 @@ class DirectReader:
             handler: called with each message, one at a time, on a thread of the bus, of this reader or of a writer.
             subscribe: subscribes a handler to the same topic on the bus; the function it returns unsubscribes.
             now_ns: the host's clock.
-            failed: called with the exception if a message of the direct link has an invalid envelope, or `handler`
-                raises on one; the bus handles exceptions on its own messages.
+            failed: called with the exception if a message of the direct link has an invalid envelope, or if `handler`
+                raises for such a message; the bus handles exceptions for its own messages.
             shared: whether the topic has several publishers.
         """
         self._handler = handler
@@ -134,7 +134,7 @@ class DirectReader:
         self.now_ns = now_ns
         self._failed = failed
         self._shared = shared
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._key = key
         self._closed = False
         self._recent, self._older = set[tuple[int, int]](), set[tuple[int, int]]()
@@ -150,13 +150,13 @@ class DirectReader:
         self._accepting.start()
 
     def take(self, envelope: bytes, payload: bytes, now_ns: int) -> None:
-        """Forward a message received at `now_ns`; called on the socket's thread, or on a writer's in this process."""
+        """Forward a message received at `now_ns`; called on the socket's thread or that of a writer in this process."""
         try:
             sample = Sample(self._key, payload, *Envelope.decode_checked(envelope), now_ns)
-            with self._turn:
+            with self._lock:
                 if self._first < 0:
                     self._first = sample.sequence
-                # Without the bus, a newer message is no copy; it is not remembered, and its repetition is forwarded.
+                # While unsubscribed, a newer message is no copy; it is not remembered: a repetition is forwarded.
                 surely_new = self._unsubscribe is None and sample.sequence > self._newest
                 if surely_new or not self._is_copy(sample):
                     self._forward(sample)
@@ -166,7 +166,7 @@ class DirectReader:
             self._leave_bus()
 
     def close(self) -> None:
-        """Stop forwarding, without a wait for a handler that never returns; not to be called on a forwarding thread."""
+        """Stop forwarding, without waiting for a running handler; not to be called on a forwarding thread."""
         if self._closed:
             return
         self._closed = True
@@ -176,7 +176,7 @@ class DirectReader:
         self._leave_bus()
 
     def _by_bus(self, sample: Sample) -> None:
-        with self._turn:
+        with self._lock:
             late = not self._shared and self._first >= 0 and sample.sequence <= self._newest
             if not late and not self._is_copy(sample):
                 self._forward(sample)
@@ -207,7 +207,7 @@ class DirectReader:
 
     def writer_gone(self) -> None:
         """Subscribe to the bus again after a writer has disconnected."""
-        with self._turn:
+        with self._lock:
             self._on_both_paths, self._first, self._newest = False, -1, -1
         if self._unsubscribe is None and not self._closed:
             self._unsubscribe = self._subscribe(self._by_bus)
@@ -221,7 +221,7 @@ class DirectReader:
                 accepted = None
                 with contextlib.suppress(OSError):
                     accepted, _ = self._listener.accept()
-                if accepted is None and not self._closed:  # for example without free file descriptors
+                if accepted is None and not self._closed:  # accept failed, for example for lack of file descriptors
                     time.sleep(_RETRY_S)
                     continue
                 if serving is not None and connection is not None:

@@ -9,7 +9,7 @@ from lowfc.contract.sequence_gaps import Arrivals
 MAX_IN_A_ROW = 16
 """Number of messages dispatched back to back before waiting ones are skipped."""
 QUEUED_WITHIN_NS = 50_000
-"""A message received within this time of the end of the previous one's dispatch counts as queued."""
+"""A message counts as queued if it is received within this time after the dispatch of the previous message ended."""
 OLD_NS = 5_000_000
 """Age from which any message counts as superseded, or three periods if that is longer."""
 
@@ -18,8 +18,8 @@ class Dispatch(Arrivals):
     """Passes messages to a handler in their order of arrival and identifies superseded ones.
 
     Messages queue while the process stands still. A queued message is superseded if it is at least a period old when
-    received, and any message at 5 ms or three periods, whichever is longer. So that a slow handler cannot fall
-    further and further behind, messages that still wait after `MAX_IN_A_ROW` back to back are skipped.
+    received; any other message, from an age of 5 ms or three periods, whichever is longer. After `MAX_IN_A_ROW`
+    messages back to back, those that still wait are skipped, so that a slow handler does not fall ever further behind.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Dispatch(Arrivals):
         self._period_ns = period_ns
         self._old_ns = max(OLD_NS, 3 * (period_ns or 0))
         self._superseded = superseded
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._skipped = 0
         self._in_a_row = 0
         self._done_ns = 0
@@ -57,7 +57,7 @@ class Dispatch(Arrivals):
 
     def put(self, sample: Sample) -> None:
         """Dispatch or skip a message, one at a time; callable from any receive thread."""
-        with self._turn:
+        with self._lock:
             handler: Callable[[Sample], None] | None = self._handler
             if self._period_ns is not None:
                 queued = sample.receive_time_ns - self._done_ns <= QUEUED_WITHIN_NS

@@ -1,4 +1,4 @@
-"""Names of processes and mirrors on the bus; their number is bounded, as a faulty program could invent any number."""
+"""Names of processes and mirrors on the bus, bounded in number: a faulty program could invent names without end."""
 
 from lowfc.adapters.bus.bus import name_in
 from lowfc.contract.errors import BadMessageError

@@ -1,4 +1,4 @@
-"""Search of this host's processes for loops, when the user's runtime directory has none."""
+"""Search for loops among this host's processes, when the user's runtime directory has none."""
 
 import contextlib
 import itertools
@@ -34,7 +34,7 @@ def no_loop_message() -> str:
 
 
 def other_loops() -> Iterator[tuple[str, bool]]:
-    """Yield, for each simulated loop and each separate controller on this host, of any user, a sentence and a flag.
+    """Yield a sentence and a flag for each simulated loop and each separate controller on this host, of any user.
 
     The flag is set for a young process of this user with this runtime directory: as no run was found there, the loop is
     starting or ending.
@@ -50,14 +50,14 @@ def other_loops() -> Iterator[tuple[str, bool]]:
                 yield f"{who} `{program}` (process {process.pid}){where}", starting
 
 
-def _program(words: Sequence[str]) -> str:
+def _program(arguments: Sequence[str]) -> str:
     """Short form `lowfc controller --run NAME` of a loop's command line; empty for all others, such as `sudo lowfc`."""
-    if not words or not words[0].rpartition("/")[2].startswith("python"):
+    if not arguments or not arguments[0].rpartition("/")[2].startswith("python"):
         return ""
-    for before, word in itertools.pairwise(words):
-        if before.rpartition("/")[2] == "lowfc" and word in _PROGRAMS:
-            name = re.search(r" --run[ =](\S+)", " ".join(words))
-            return f"lowfc {word}" + (f" --run {name[1][:_MAX_NAME_LENGTH]}" if name else "")
+    for program, command in itertools.pairwise(arguments):
+        if program.rpartition("/")[2] == "lowfc" and command in _PROGRAMS:
+            name = re.search(r" --run[ =](\S+)", " ".join(arguments))
+            return f"lowfc {command}" + (f" --run {name[1][:_MAX_NAME_LENGTH]}" if name else "")
     return ""
 
 

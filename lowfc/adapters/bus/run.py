@@ -32,11 +32,11 @@ _USER = "lowfc"
 _RUN_ID = re.compile(r"[a-z0-9][a-z0-9._-]{0,47}")
 _LOWEST_PORT = 15000
 _CONNECT_S = 1.0
-_MAX_START_LENGTH = 20  # characters
+_MAX_START_LENGTH = 20  # characters of a stored start time
 _LATEST_START_S = (1 << 32) - 3  # latest start that fits a sequence
 _MAX_SOCKET_PATH_BYTES = 107  # bytes of a Unix socket's address
 _PORT_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
-MODE = 0o1600  # of a run's files that must last: private, and sticky, so that systemd-tmpfiles keeps old ones
+MODE = 0o1600  # of a run's files that must last: private, and sticky, so that systemd-tmpfiles does not remove them
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,8 +167,8 @@ def open_run(
         base: parent of its directory; the user's runtime directory when None.
         listeners: additional roles with a port, if this call creates the run: a launcher must listen to receive from a
             viewer, which only connects.
-        network: router of the run, if this call creates the run. An existing run must have the same one, unless this
-            has none or a launcher created the run: its runs stay on one host.
+        network: router of the run, if this call creates the run. An existing run must have the same router, unless
+            `network` has none, or a launcher created the run: a launcher's runs stay on one host.
 
     Raises:
         BusError: the name is invalid; the run exists without one of `mirrors`, or with another network; `mirrors` is
@@ -184,8 +184,9 @@ def open_run(
     own_directory(path)
     links = _read(path)
     if requested.router and requested != links.network and Role.LAUNCHER not in links.ports:
-        known = links.network
-        where = f"on {known.router} with certificates {known.certificates!r}" if known.router else "on this host alone"
+        present = links.network
+        at_router = f"on {present.router} with certificates {present.certificates!r}"
+        where = at_router if present.router else "on this host alone"
         raise BusError(
             f"run {run_id!r} is {where}, and the configuration has {requested.router} with {requested.certificates!r}; "
             f"{_ADVICE} ({path}), or start another run"
@@ -200,7 +201,7 @@ def open_run(
 
 
 def run_path(run_id: str, base: Path | None = None) -> Path:
-    """Directory of a run below `base`, whether or not it exists; BusError if the name is invalid. See `open_run`."""
+    """Directory of a run below `base` (as in `open_run`), which may not exist; BusError if the name is invalid."""
     if not _RUN_ID.fullmatch(run_id):
         raise BusError(
             "a run's name is up to 48 of a-z, 0-9, '.', '_', '-' and begins with a letter or digit; got "
@@ -313,8 +314,8 @@ def _read(path: Path) -> Links:
 def free_ports(count: int, taken: AbstractSet[int] = frozenset()) -> list[int]:
     """Return free loopback TCP ports below the host's ephemeral range and not in `taken`; BusError if too few are free.
 
-    An outgoing connection could take an ephemeral port before its role listens; and a connection that is retried to
-    such a port without a listener could get the same port on its own side, and connect to itself. If the ephemeral
+    An outgoing connection could take an ephemeral port before the role listens on it. A connection that is retried to
+    an ephemeral port without a listener could get this port on its own side, and connect to itself. If the ephemeral
     range begins at 15000 or below, the kernel chooses ports within it.
     """
     candidates = sorted({*range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))} - taken)

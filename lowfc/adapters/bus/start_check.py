@@ -1,4 +1,4 @@
-"""Refusal of sequences with a start too far in the future, after which valid sequences would be out of order."""
+"""Refusal of sequences whose start is too far in the future: later valid sequences would seem out of order."""
 
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -16,18 +16,18 @@ class StartCheck:
     def __init__(self, clock: Clock, max_ahead_h: float, refused: Callable[..., None]) -> None:
         """Refuse starts more than `max_ahead_h` hours ahead of `clock`; 0 or a simulated clock disables the check.
 
-        `refused` is called with the refused `start` and this host's time, `here`, both UTC, when the start changes, at
-        most once a second.
+        `refused` is called for each new refused start, at most once a second, with `start` (the refused start) and
+        `here` (this host's time), both UTC.
         """
         self._clock = clock
         self._ahead_s = round(max_ahead_h * _HOUR_S)
         self._refused = refused
-        self._reported_s = self._reported_at_s = 0
+        self._reported_start_s = self._reported_at_s = 0
         self._enabled = max_ahead_h > 0 and not clock.lockstep
         self._allowed = 0
 
     def ahead(self, sequence: int) -> bool:
-        """Whether this sequence starts too far ahead."""
+        """Whether the start in this sequence is too far ahead."""
         if sequence < self._allowed or not self._enabled:  # time only increases: an allowed sequence stays allowed
             return False
         now_s = self._clock.host_ns() // _NS
@@ -35,8 +35,8 @@ class StartCheck:
         if sequence < self._allowed:
             return False
         start_s = start_of(sequence)
-        if start_s != self._reported_s and now_s != self._reported_at_s:  # a faulty sender must not fill the log
-            self._reported_s, self._reported_at_s = start_s, now_s
+        if start_s != self._reported_start_s and now_s != self._reported_at_s:  # a faulty sender must not fill the log
+            self._reported_start_s, self._reported_at_s = start_s, now_s
             self._refused(start=_utc(start_s), here=_utc(now_s))
         return True
 

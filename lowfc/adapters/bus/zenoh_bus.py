@@ -1,6 +1,6 @@
-"""The bus between processes: zenoh peers over loopback TCP, each connected to all others of its run.
+"""The bus between processes: zenoh peers over loopback TCP, each connected to all roles of its run that listen.
 
-Monitors connect by Unix socket and get `latest_only` topics at a lower rate; across hosts, all connect to a router.
+Monitors connect by Unix socket and get `latest_only` topics at a lower rate. Across hosts, all connect to a router.
 `zenoh_session` and `routed` explain each setting.
 """
 
@@ -33,7 +33,7 @@ from lowfc.contract.errors import BusError
 from lowfc.contract.messages import HEALTH, Role, Topic
 
 ROLE_CHECK_S = 0.5
-"""Timeout for an answer of the router, or of another process with this role."""
+"""Timeout for an answer of the router, or of another process with the same role as this one."""
 FLUSH_S = 2.0
 """Time that a closing session waits for peers that have not received everything yet."""
 CLOSE_S = 5.0
@@ -107,7 +107,7 @@ class ZenohPublisher:
 
 
 class ZenohRing:
-    """See `Ring`."""
+    """Ring buffer of a zenoh subscriber; see `Ring`."""
 
     def __init__(self, bus: "ZenohBus", subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]") -> None:
         self._bus, self._subscriber = bus, subscriber
@@ -137,7 +137,7 @@ class ZenohBus:
 
     Attributes:
         offset: offset of the router's clock, in a run on several hosts. Envelopes on the network have the router's
-            time; those that `put` returns, and the samples that handlers get, have this host's.
+            time; those that `put` returns, and the samples that handlers get, have this host's time.
         read: converts a message of zenoh to a `Sample`.
         direct_readers: readers of the topics that this process receives over a direct link, by key.
     """
@@ -151,8 +151,8 @@ class ZenohBus:
             links: links of the run.
             role: role of this process.
             clock: clock of the run.
-            monitor: whether this process is a monitor; set it in a process's first bus. A monitor polls `Ring`s;
-                it needs half the processor time: display rate for `latest_only` topics, one receive thread, a pool.
+            monitor: whether this process is a monitor; set it in a process's first bus. A monitor polls `Ring`s. It
+                saves half the processor time by display rate (`latest_only`), one receive thread and a pool of buffers.
             beside: bus of another role in this process, already subscribed: the direct link to it is a function call.
 
         Raises:
@@ -289,7 +289,7 @@ class ZenohBus:
             except Exception as fault:
                 self.faults.add(f"{self.role}: answer to", key, fault)
 
-        with usable(key):  # it may be invalid
+        with usable(key):  # the key may be invalid
             self._session.get(
                 key,
                 Callback(answered, done.set, indirect=False),
@@ -311,7 +311,7 @@ class ZenohBus:
         return Envelope(envelope.sequence, envelope.publish_time_ns + self.offset.offset_ns).encode()
 
     def peers(self) -> int:
-        """See `Bus.peers`; across hosts, the router only."""
+        """See `Bus.peers`; across hosts, only the router is counted."""
         return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
 
     def restart(self) -> None:

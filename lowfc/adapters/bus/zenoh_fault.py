@@ -22,7 +22,7 @@ def plain(fault: zenoh.ZError) -> str:
 
 @contextmanager
 def usable(key: str) -> Iterator[None]:
-    """Turn zenoh's error in the block, as of an invalid key or a closed session, into BusError."""
+    """Convert an error of zenoh in the block, such as for an invalid key or a closed session, to BusError."""
     try:
         yield
     except zenoh.ZError as fault:

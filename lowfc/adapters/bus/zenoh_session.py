@@ -21,7 +21,7 @@ from lowfc.contract.messages import TOPICS
 _SOCKET = "unixsock-stream"
 _DISPLAY_HZ = 40.0  # a viewer draws 30 images a second, each from a new message
 _BATCH_BYTES = 65535  # zenoh's default
-_SMALL_BATCH_BYTES = 16384  # of a monitor, which keeps messages: each holds its receive buffer
+_SMALL_BATCH_BYTES = 16384  # of a monitor: each message that it keeps occupies a whole receive buffer
 _OPEN_MS = 2000  # a closing session waits this long for a process that is stopped; zenoh's default is 10 s
 _SPARE_BUFFERS = 1024  # of a monitor; otherwise zenoh allocates and clears one for every message
 _PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
@@ -41,13 +41,13 @@ def keep_thread_state() -> None:
 
 
 def prevent_slow_closing(session: zenoh.Session) -> None:
-    """Set options of this process's TCP sockets after each new link of a session, so that no dead link delays it.
+    """Set options of this process's TCP sockets after each new link of a session, so that closing a link never blocks.
 
-    SO_LINGER is turned off. With zenoh's 10 s, closing the link of a process that is stopped blocks the thread that
-    receives for this time, in which no request is answered. The kernel still sends what was written.
+    SO_LINGER is turned off. With zenoh's 10 s, closing the link of a process that is stopped blocks the receive thread
+    for 10 s, and no request is answered meanwhile. The kernel still sends what was written.
 
-    Across hosts, TCP_USER_TIMEOUT is set to the lease. Otherwise a link that was cut while data waited in its buffer is
-    not closed until the network is back and the kernel sends again, up to two minutes later.
+    Across hosts, TCP_USER_TIMEOUT is set to zenoh's link lease. Otherwise a link that was cut while data waited in its
+    buffer is not closed until the network is back and the kernel sends again, up to two minutes later.
     """
 
     def changed(event: zenoh.LinkEvent) -> None:
@@ -75,8 +75,8 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
     """
     batch_bytes = _SMALL_BATCH_BYTES if monitor else _BATCH_BYTES
     sending = {
-        "batch_size": batch_bytes,  # for both directions: the smaller of the two ends applies
-        # A full queue delays a put by at most 1 ms, then the message is dropped; at 0 bursts are lost.
+        "batch_size": batch_bytes,  # in both directions: a link uses the smaller value of its two ends
+        # A full queue delays a put by at most 1 ms, then the message is dropped; without this delay bursts are lost.
         "queue": {"size": dict.fromkeys(_PRIORITIES, 16), "congestion_control": {"drop": {"wait_before_drop": 1000}}},
     }
     scouting = {"delay": 100, "multicast": {"enabled": False}, "gossip": {"enabled": False}}
@@ -91,7 +91,7 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
     throttled = [{"key_expr": topic.at(ALL), "freq": _DISPLAY_HZ} for topic in TOPICS if topic.latest_only]
     return {
         "mode": "peer",
-        # Peers do not forward, so each connects to all others; with a timeout of -1 any start order works.
+        # Peers do not forward, so each connects to all that listen; with a timeout of -1 any start order works.
         "listen": {"endpoints": [link for link in listening if link], "exit_on_failure": True, "timeout_ms": 0},
         "connect": {
             "endpoints": [
@@ -121,7 +121,7 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
             # No gain at these sizes, and a receiver descheduled for 100 ms loses messages silently.
             "shared_memory": {"enabled": False},
         },
-        # Monitors connect by Unix socket, and get as many of these as they display: sending costs the loop time.
+        # Monitors, which connect by Unix socket, get these topics at display rate: sending costs the loop time.
         "downsampling": [
             {"id": "monitor", "flows": ["egress"], "messages": ["put"], "link_protocols": [_SOCKET], "rules": throttled}
         ],
@@ -140,7 +140,7 @@ def _socket(links: Links, role: str) -> str | None:
 def receive_in_one_thread() -> None:
     """Make zenoh receive and decode messages in one thread; call it before the first session.
 
-    It saves waking a second thread in a process that blocks on input; in one that computes meanwhile it would delay
-    messages. Child processes inherit it.
+    It saves waking a second thread in a process that blocks on input; in a process that computes meanwhile it would
+    delay messages. Child processes inherit the setting.
     """
     os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
