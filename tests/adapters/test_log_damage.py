@@ -305,6 +305,6 @@ def test_an_unsupported_compression_is_reported_as_such(tmp_path: Path, source: 
     with pytest.raises(DataFileError) as caught:
         list(LogReader(path, skip_damaged=skip_damaged))
     assert str(caught.value) == (
-        f"{path} is compressed with 'brotli'; lz4, zstd and none are supported: "
+        f"{path} is compressed with 'brotli'; lz4, zstd and no compression are supported: "
         "compress it again with `mcap compress --compression zstd`"
     )

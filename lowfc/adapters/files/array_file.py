@@ -25,7 +25,7 @@ def read_array(
         units: permitted units of a FITS image that states one; empty for any.
 
     Raises:
-        DataFileError: the file is missing, damaged or holds something else.
+        DataFileError: the file is missing or damaged, or has no such array.
     """
     try:
         array, unit = (_npy(path), "") if path.suffix == ".npy" else _fits(path)

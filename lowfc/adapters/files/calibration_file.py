@@ -72,7 +72,7 @@ def load(path: Path, content: bytes | None = None) -> Calibration:
     """Read a FITS file, or its `content` if given (`path` is then only named in errors), and check its identity.
 
     Raises:
-        DataFileError: the file is missing, damaged or holds something else.
+        DataFileError: the file is missing or damaged, or is of another kind.
     """
     calibration = fits_file.load(path, (KIND,), "calibration file", _read, content=content)
     fits_file.require_identity(path, calibration.identity(), calibration.id)

@@ -27,12 +27,12 @@ def png(figure: Any, dpi: int = 120) -> bytes:
     return content.getvalue()
 
 
-def lay_out(figure: Any, canvas: Any, dpi: float) -> None:
-    """Lay a figure out for a class of canvases; otherwise `savefig` draws the figure twice."""
+def lay_out(figure: Any, canvas_class: Any, dpi: float) -> None:
+    """Lay out a figure for a class of canvases; otherwise `savefig` draws the figure twice."""
     engine = figure.get_layout_engine()
     if engine is None:
         return
-    canvas(figure)
+    canvas_class(figure)
     former_dpi, figure.dpi = figure.dpi, dpi
     engine.execute(figure)
     figure.dpi = former_dpi

@@ -71,7 +71,7 @@ def contrast_of(config: Configuration) -> ModalContrast:
 
 
 def known_contrast(config: Configuration | None) -> ModalContrast | None:
-    """`contrast_of` the configuration of a log or running loop; None without one or, with a warning, if it fails."""
+    """`contrast_of` a log's or loop's configuration; None without a configuration, or with a warning if it fails."""
     try:
         return None if config is None else contrast_of(config)
     except LowfcError as error:
@@ -150,7 +150,7 @@ def settings(config: Configuration) -> Settings:
         auto_gain=(control.tilt_gain == "auto", control.gain == "auto"),
         leak=(control.tilt_leak, control.leak),
         limit_nm=(control.tilt_limit_nm, control.limit_nm),
-        # Images without noise are identical.
+        # Without noise, images of a working camera are identical.
         max_identical_frames=control.max_identical_frames if config.camera.noise else 0,
         rate_hz=config.camera.rate_hz,
         guard=control.guard,
@@ -168,10 +168,9 @@ def analytic_calibration(
 ) -> Calibration:
     """Calibration from the sensor's digital twin: I0 and H (the paper's eqs. 6 to 12), R, and the mirror's modes.
 
-    The modes are fitted to the influence functions, then mixed slightly so that the sensor measures each modal command
-    as itself: through the shaped pupil, the mirror's print-through looks like low orders, up to 0.3 % of a command.
-
-    Inactive actuators are in no mode, and the sensor's response to them is set to 0.
+    The modes are fitted with the influence functions, then mixed slightly so that the sensor measures each modal
+    command as itself: through the shaped pupil, the mirror's print-through looks like low-order modes, up to 0.3 % of a
+    command. Inactive actuators are in no mode, and the sensor's response to them is set to 0.
 
     Args:
         config: Configuration of the instrument.
@@ -289,7 +288,7 @@ def _check_exposure(config: Configuration, light: Array) -> None:
 
 
 def _nuisance(config: Configuration, light: Array, good: Array) -> Array | None:
-    """Slopes (pixels, parameters) of the normalised image along the fitted nuisance parameters; None without one."""
+    """Slope of the normalised image (pixels, parameters) for each fitted nuisance parameter; None without any."""
     columns = [
         np.ones((light.size, 1)) if name == "background" else shear_slopes(config) for name in config.control.nuisance
     ]
@@ -306,10 +305,10 @@ def _dark_dn(camera: Detector) -> float:
 
 
 def equivalent_read_noise_e(camera: Detector) -> float:
-    """Read noise equivalent to all noise except photon noise, in electrons before multiplication, for the weights.
+    """Read noise equivalent to all noise except photon noise, electrons before multiplication, for the weights of R.
 
-    With EM gain a pixel's variance is 2 (I0 + read_noise^2 / (2 gain^2)), as the register doubles that of the photons.
-    Charge without light adds noise as light does.
+    With EM gain a pixel's variance is 2 (I0 + read_noise^2 / (2 gain^2)), as the register doubles the variance of the
+    photons. Clock-induced charge and dark current add noise as light does.
     """
     read_noise_e = camera.read_noise_e
     if camera.em_gain > 1:

@@ -49,7 +49,7 @@ def load(path: Path) -> LinearLaw:
     """Read a FITS file and check its identity.
 
     Raises:
-        DataFileError: the file is missing, damaged or holds something else.
+        DataFileError: the file is missing or damaged, or is of another kind.
     """
     law, stated = fits_file.load(
         path, (KIND, FORMER_KIND), "law file", _read, ": make one with `lowfc tune LOG --out FILE`"

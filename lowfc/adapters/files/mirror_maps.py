@@ -18,7 +18,7 @@ def read_shape(path: Path, units: tuple[str, ...] = _NM) -> Single:
     `units` are the spellings of the unit that a FITS file may state; nothing is converted.
 
     Raises:
-        DataFileError: the file is missing, damaged or holds something else.
+        DataFileError: the file is missing or damaged, or has no such array.
     """
     from lowfc.adapters.files.array_file import read_array  # astropy is slow to import
 
@@ -30,8 +30,8 @@ def active_actuators(config: Configuration) -> Mask | None:
     """Read the map of active actuators (rows, columns) of `mirror.active`; None if all are active.
 
     Raises:
-        ConfigurationError: the file is missing, damaged, does not fit the mirror, holds other values than 0 and 1, or
-            no 1.
+        ConfigurationError: the file is missing or damaged, or does not fit the mirror; a value is not 0 or 1; no value
+            is 1.
     """
     if not config.mirror.active:
         return None
@@ -59,7 +59,7 @@ def flat_nm(config: Configuration) -> Single | None:
 def shape_of(config: Configuration, key: str, file: str, units: tuple[str, ...] = _NM) -> Single:
     """Read one value per actuator (rows, columns), such as a shape in nm of surface; `key` names the file in errors.
 
-    If `units` are given, a FITS file that states another unit is refused.
+    If `units` is not empty, a FITS file that states another unit is refused.
 
     Raises:
         ConfigurationError: the file is missing, damaged or does not fit the mirror.

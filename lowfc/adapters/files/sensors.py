@@ -29,7 +29,7 @@ from lowfc.optics.chain.sensor import Sensor
 _DATA = resources.files("lowfc") / "data"
 _MAX_BYTES = 1 << 30
 PUPIL_IMAGE_PIXELS = 40  # across the image of a Zernike sensor
-_MAX_PROLATE_RADIUS = 7.0  # lambda / D; beyond, double precision confuses the prolate function with the next ones
+_MAX_PROLATE_RADIUS = 7.0  # lambda / D; beyond, double precision mixes the prolate function with the next orders
 _WITH_LYOT_STOP = ("circle", "prolate")
 _LYOT_OUTER = 12.0
 """Outer radius of the annular dark zone with a Lyot stop, lambda / D; the inner radius is the mask's edge."""
@@ -51,12 +51,12 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
         quarter = np.asarray(arrays["quarter"])
     with raised_as(DataFileError, ValueError, file):
         from_quarter(quarter, 2 * max(cells := len(np.atleast_1d(quarter)), 1))
-        corner = np.arange(cells)  # of each cell, the nearest to the centre
+        corner = np.arange(cells)  # coordinate of each cell's corner nearest to the centre, cells
         beyond = quarter[corner[:, None] ** 2 + corner**2 >= cells**2]
         if beyond.any():
             found = f"up to {float(beyond.max()):g} in {counted(int(np.count_nonzero(beyond)), 'cell')}"
             raise ValueError(
-                f"`quarter` must be 0 beyond the pupil's circle, whose radius is its {cells} cells, got {found}: "
+                f"`quarter` must be 0 beyond the pupil's circle, with a radius of {cells} cells, got {found}: "
                 "set these to 0, or scale the opening down"
             )
     with raised_as(ConfigurationError, ValueError, file):
@@ -67,7 +67,7 @@ def load_dark_zone(file: Traversable) -> Wedge:
     """Load the dark zone for which `lowfc design spc` made a pupil; `DARK_ZONE` if the file has no array `made_by`.
 
     Raises:
-        DataFileError: The file is missing or damaged, or the request in `made_by` has no such zone.
+        DataFileError: The file is missing or damaged, or the request in `made_by` has no valid dark zone.
     """
     with _opened(file) as arrays:
         if "made_by" not in arrays:
@@ -180,7 +180,7 @@ def _opened(file: Traversable) -> Iterator[Mapping[str, NDArray[np.generic]]]:
 def _layout(name: str) -> sams.Layout:
     try:
         return load_layout(name)
-    except ConfigurationError as error:  # on the command line sensors and layouts share an option
+    except ConfigurationError as error:  # on the command line one option names a sensor or a layout
         if name.partition(":")[0].endswith(".json"):
             raise
         raise ConfigurationError(

@@ -34,8 +34,8 @@ def other_channel_names(channel: str) -> tuple[str, ...]:
 class OtherChannels:
     """Sum of a mirror's channels except one, in the unit of the streams.
 
-    Unusable channels are left out: those with another grid or layout, or a value that is not finite. A channel being
-    written, or whose writer died meanwhile, counts with its last complete shape, or as it is if none was read before.
+    Unusable channels are left out: those with another grid or layout, or a value that is not finite. While a channel is
+    being written, or if its writer died meanwhile, its last complete shape counts; before any, the shape as it is.
     """
 
     def __init__(self, names: Iterable[str], grid: tuple[int, int]) -> None:

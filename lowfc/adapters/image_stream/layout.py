@@ -37,7 +37,7 @@ HEADER = np.dtype(
     }
 )
 NEWEST, NEWEST_START = struct.Struct("@2q64x2Q8xB"), 184
-"""Fields that change with each image, read at once: `atime`, `cnt0`, `cnt1`, `write`; and the first byte of them."""
+"""Fields that change with each image, read at once (`atime`, `cnt0`, `cnt1`, `write`), and their first byte."""
 TIMES = struct.Struct("<4q")
 """`atime` and `writetime`, from byte `NEWEST_START`, each in seconds and nanoseconds."""
 KEYWORD = np.dtype(
@@ -81,7 +81,7 @@ class Layout(NamedTuple):
 
     @classmethod
     def of(cls, header: np.void, file_bytes: int) -> "Layout":
-        """Layout declared by a header, for a file of that size; ValueError with the difference if not supported."""
+        """Layout declared by a header, for a file of that size; ValueError with the reason if it is not supported."""
         version = header["version"].partition(b"\0")[0].decode("ascii", "backslashreplace")
         if version != VERSION:
             raise ValueError(f"has layout version {version!r}, expected {VERSION!r}")

@@ -15,7 +15,7 @@ _ATTEMPTS = 3
 
 
 class StreamImage(NamedTuple):
-    """Copy of an image (rows, columns), its number in the stream, and the stream's `generation`, both from 1.
+    """Copy of an image (rows, columns), its number in the stream, and the stream's `generation`, both counted from 1.
 
     `acquired_ns` is the acquisition time stated by its writer, ns since the epoch.
     """

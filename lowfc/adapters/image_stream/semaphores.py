@@ -11,7 +11,7 @@ MAX_VALUE = 10
 """Value at which a semaphore is no longer posted: its reader is behind or absent."""
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
-_FIXED = slice(8, 12)  # bytes of a semaphore with its sharing mode, which no operation changes
+_FIXED = slice(8, 12)  # bytes that contain a semaphore's sharing mode, which no operation changes
 
 
 class _TimeSpec(ctypes.Structure):
@@ -35,7 +35,7 @@ class Semaphores:
             _LIBC.sem_init(address, 1, 0)
 
     def usable(self) -> bool:
-        """Whether this C library created them; it would abort the process on others."""
+        """Whether this C library created the semaphores; it aborts a process that uses those of another library."""
         fresh = ctypes.create_string_buffer(SEMAPHORE_BYTES)
         _LIBC.sem_init(fresh, 1, 0)
         memory = self._memory.raw

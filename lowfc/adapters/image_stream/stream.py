@@ -79,7 +79,7 @@ class Stream:
         data: (planes, rows, columns) view of the pixels.
         semaphores: semaphores, one for each reader.
         readers: (semaphores,) view of the process ids that wait for them; 0 or less for none.
-        writers: (semaphores,) view of the process ids that posted them last.
+        writers: (semaphores,) view of the ids of the processes that last posted them.
         identity: identity of the file, which differs for another file of the same name.
     """
 
@@ -182,14 +182,14 @@ class Stream:
 
     def keywords(self) -> dict[str, float | str]:
         """Values of the stream's keywords, by name."""
-        words = np.frombuffer(self._mapping, KEYWORD, self.layout.keywords, self.layout.starts["keywords"]).copy()
+        records = np.frombuffer(self._mapping, KEYWORD, self.layout.keywords, self.layout.starts["keywords"]).copy()
         fields = {b"L": "integer", b"D": "real", b"S": "text"}
         values = {}
-        for word in words:
-            field = fields.get(bytes(word["type"]))
+        for record in records:
+            field = fields.get(bytes(record["type"]))
             if field is not None:
-                value = word[field].item()
-                values[_text(word["name"])] = _text(value) if isinstance(value, bytes) else value
+                value = record[field].item()
+                values[_text(record["name"])] = _text(value) if isinstance(value, bytes) else value
         return values
 
     def put(self, image: npt.NDArray[np.generic], acquired_ns: int | None = None) -> None:
@@ -241,7 +241,7 @@ class Stream:
         return next((pid for pid in set(self.writers.tolist()) - {os.getpid()} if self._wrote(pid)), 0)
 
     def _wrote(self, pid: int) -> bool:
-        """Whether that process wrote, and not a later one with the same process id."""
+        """Whether the living process `pid` wrote the stream, rather than an ended one with the same process id."""
         try:
             written_ns = _since_epoch_ns(*self._header["writetime"][0].tolist())
             return alive(pid) and psutil.Process(pid).create_time() * _NS <= written_ns + _NS

@@ -32,7 +32,7 @@ class CompressionError(UnsoundError):
     """A chunk has an unsupported compression."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(f"a chunk is compressed with {name!r}; lz4, zstd and none are supported")
+        super().__init__(f"a chunk is compressed with {name!r}; lz4, zstd and no compression are supported")
         self.name = name
 
 

@@ -58,7 +58,7 @@ class Steps:
 class Truths:
     """Truth of a simulation, one row per frame; empty for a log of real devices.
 
-    If `instants` is not 0, rms values are over the frame's whole period: the star moves in it while the mirror holds.
+    If `instants` is not 0, rms values are over the whole frame period: the wavefront changes while the mirror holds.
     If it is 0 (older logs, and simulations without such rms values), all values are those at the start of the exposure.
 
     Attributes:
@@ -101,7 +101,7 @@ class Columns:
     """Columns that grow row by row, each with a number or a vector per row."""
 
     def __init__(self, widths: Mapping[str, int] = MappingProxyType({}), /, **kinds: str) -> None:
-        """Make a column for each name in `kinds`, with this type code of `array`; `widths` has the vector lengths."""
+        """Make columns; `kinds` maps their names to type codes of `array`, `widths` maps names to vector lengths."""
         self._columns: dict[str, array[Any]] = {name: array(kind) for name, kind in kinds.items()}
         self._widths = widths
         self._rows = 0

@@ -105,9 +105,9 @@ class History:
         configuration: configuration of the recorded loop; None if there is no readable one.
         remarks: sentences on parts of the configuration that this version cannot use, and on the calibration if its
             message is lost; each names the log.
-        calibration: the last one recorded; if the log has no message of it, the attached one that `controller` names.
+        calibration: the last recorded one; without any in the log, the attached calibration that `controller` names.
         controllers: states of the controllers, in order.
-        camera: state with the camera's settings in most steps under `calibration` (closed-loop ones, if there are any).
+        camera: camera state whose settings held in most steps under `calibration` (most closed-loop steps, if any).
         under_camera: (steps,) whether the camera had the settings of `camera` in each step.
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
         command_sequence, command_publish_ns: message sequence and publish time of every mirror command in the log.
@@ -120,10 +120,10 @@ class History:
         events: (publish time in ns, message) of each event.
         health: last Health of each process, by name.
         commands_late: commands that the camera counted as late between its first and last Health in the log, also
-            across restarts; None if it sent fewer than two.
+            across restarts; None with fewer than two Healths.
         counts: number of messages, by topic key.
         published: calibrations, laws and played tables, by identity.
-        span_ns: log times of the first message that is not retained, and of the last message; (0, 0) if all are.
+        span_ns: log times of the first message of a topic that is not queryable, and of the last message; (0, 0): none.
     """
 
     log: LogReader
@@ -163,12 +163,12 @@ class History:
         return frame_rate_hz(self.camera, self.steps)
 
     def camera_lag_ns(self, process: str) -> int:
-        """Time to add to a frame's time for the clock of another process, ns; publish times are on the recorder's."""
+        """Time, ns, to add to a frame's time for that on another process's clock; the recorder's for publish times."""
         camera, other = (self.health.get(name, wire.Health()) for name in (Role.CAMERA, process))
         return camera.router_offset_ns - other.router_offset_ns
 
     def timing(self, delay_frames: float) -> Timing:
-        """Timing of the loop from the mirror's reports; in lockstep, which has no such times, that of `Timing.of`."""
+        """Timing of the loop from the mirror's reports; that of `Timing.of` without usable reports, as in lockstep."""
         if (exposure := exposure_fraction(self.camera)) is None:
             exposure = (self.configuration or Configuration()).camera.exposure_fraction
         applied = self.mirror.sequence, self.mirror.publish_time_ns - self.camera_lag_ns(Role.RECORDER)
@@ -248,7 +248,7 @@ def attached_calibration(log: LogReader, calibration_id: str) -> Calibration | N
 
 
 class _HistoryBuilder:
-    """Fills a history message by message; columns grow here, all other content goes to the history directly."""
+    """Fills a history message by message; columns grow here, all other content is stored in the history directly."""
 
     def __init__(self, history: History) -> None:
         self._history = history
@@ -278,7 +278,7 @@ class _HistoryBuilder:
     def _decode(self, message: Sample) -> None:
         topic, history = topic_of(message.key), self._history
         first_ns, last_ns = history.span_ns
-        if first_ns or not topic.queryable:  # retained messages (states, calibration) at the start may be hours old
+        if first_ns or not topic.queryable:  # states and calibrations at the start may be hours old
             history.span_ns = (first_ns or message.receive_time_ns, max(last_ns, message.receive_time_ns))
         if topic is FRAME:
             self._frames.add(sequence=message.sequence, publish_ns=message.publish_time_ns)
@@ -369,7 +369,7 @@ class _HistoryBuilder:
                 considered = closed
             begun_ns = np.maximum.accumulate([float(from_timestamp(state.timestamp)) for _, state in self._cameras])
             settings = np.array([settings for settings, _ in self._cameras])
-            # Number of the first state with the same settings, to which a camera may have returned.
+            # Index of the first state with the same settings; a camera may return to earlier settings.
             first = np.array([np.isclose(settings, row, rtol=0.01, atol=0).all(axis=1).argmax() for row in settings])
             numbers = first[np.maximum(np.searchsorted(begun_ns, steps.time_ns) - 1, 0)]
             usual = np.bincount(numbers[considered]).argmax() if considered.any() else first[-1]
@@ -391,7 +391,7 @@ class _HistoryBuilder:
 
 
 def measured_timing(timing: Timing, steps: Steps, applied: Sequences, applied_ns: Integers, rate_hz: float) -> Timing:
-    """Timing by the mirror's reports: the frame of each command (`applied`), and `applied_ns` on the camera's clock."""
+    """Timing from the frame sequences of applied commands and `applied_ns`, the time of each on the camera's clock."""
     rows = rows_of(applied, steps.sequence)
     if not (rows >= 0).any():
         return timing

@@ -53,7 +53,7 @@ class _Tally:
 
     @property
     def confirmed(self) -> int:
-        """Number lost; if the camera has lost frames before sending, at most `lost` at the last call of `newly_lost`.
+        """Number surely lost; if the camera lost frames before sending, at most `lost` at the last `newly_lost`.
 
         The newest gap may consist of further frames that the camera never sent; its next Health reports them.
         """
@@ -144,7 +144,7 @@ class LossAccount:
         return +self._sum(lambda tally: tally.lost)
 
     def newly_lost(self) -> dict[str, int]:
-        """Number of messages lost since the last call, by key; the late arrival of a lost one offsets a later loss."""
+        """Number of messages lost since the last call, by key; a lost message that arrives late offsets a later one."""
         lost = +self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():
             tally.reported = max(tally.reported, tally.confirmed)

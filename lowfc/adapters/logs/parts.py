@@ -122,8 +122,8 @@ class WholeLog(LogReader):
 def named_logs(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Parts]:
     """Logs named on a command line, each with all of its named files.
 
-    `last` is the newest log in the default folder, with all files of its recording, and FOLDER/last that of another
-    folder, unless a file of that name exists.
+    `last` is the newest log in the default folder, with all files of its recording, FOLDER/last the newest log in
+    another folder; an existing file of that name has precedence.
 
     Args:
         names: names on the command line.
@@ -173,11 +173,11 @@ def titled(paths: Parts) -> str:
 
 
 def missing_between(paths: Sequence[Path]) -> int:
-    """Number of missing files, summed over the recordings, each between its first and its last file."""
+    """Number of files missing between the first and the last file of each recording, summed over the recordings."""
     numbers: dict[tuple[str, ...], list[int]] = {}
     for recording, number in map(_recording_and_number, paths):
         numbers.setdefault(recording, []).append(number)
-    return sum(max(known) - min(known) + 1 - len({*known}) for known in numbers.values())
+    return sum(max(present) - min(present) + 1 - len({*present}) for present in numbers.values())
 
 
 def metadata_at_start(path: Path) -> dict[str, dict[str, str]]:
@@ -212,7 +212,7 @@ def _files(names: Sequence[Path]) -> Iterator[Path]:
 
 def _newest(folder: Path) -> list[Path]:
     """Files of the newest log of a folder, in order; the newest is found by its name, which begins with the time."""
-    hint = f"that of another folder is FOLDER/{LAST}"
+    hint = f"the newest log of another folder is FOLDER/{LAST}"
     try:
         files = {path: match for path in folder.iterdir() if (match := _NAMED.fullmatch(path.name))}
     except OSError as fault:

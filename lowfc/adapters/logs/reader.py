@@ -60,9 +60,9 @@ class LogReader:
             topics: topics whose messages are delivered; None: all.
             skip_damaged: whether to leave out damaged stretches instead of raising an error.
             from_ns: log time; chunks known to end before it are skipped.
-            always: topics whose messages keep their chunk, with all its messages, from being skipped by `from_ns`.
+            always: topics for which `from_ns` skips nothing: a chunk with a message of them is read with all messages.
             sparse: whether to skip chunks without messages of `topics`, by their indexes: for topics with few messages
-                in a long log. The checksum of a skipped chunk is not checked, nor then that of the data section.
+                in a long log. The checksums of skipped chunks, and then of the data section, are not checked.
         """
         self.path = path
         self.paths: tuple[Path, ...] = (path,)
@@ -133,7 +133,7 @@ class LogReader:
             raise DataFileError(f"{self.path} is not an MCAP file")
 
     def _needs(self, end_ns: int, channels: Collection[int]) -> bool:
-        """Whether a chunk with these channels is needed; a channel not declared yet may be declared in it."""
+        """Whether a chunk with these channels is needed; an undeclared channel may be declared in the chunk."""
         if any(number not in self._delivered for number in channels):
             return True
         if end_ns < self._from_ns:
@@ -220,8 +220,8 @@ class LogReader:
     def _error(self, position: int, why: str) -> DataFileError:
         if self._file.unsupported_compression and not self._has_chunks:
             return DataFileError(
-                f"{self.path} is compressed with {self._file.unsupported_compression!r}; lz4, zstd and none are "
-                "supported: compress it again with `mcap compress --compression zstd`"
+                f"{self.path} is compressed with {self._file.unsupported_compression!r}; lz4, zstd and no compression "
+                "are supported: compress it again with `mcap compress --compression zstd`"
             )
         if position == 0:
             return DataFileError(f"{self.path} is not an MCAP file; if it was one, `lowfc recover` saves intact parts")

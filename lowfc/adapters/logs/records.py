@@ -1,8 +1,8 @@
-"""Records of a log file: intact ones, damaged stretches, and the end of a truncated file.
+"""Records of a log file: reads intact records, and finds damaged stretches and a truncated end.
 
 Everything is checked by checksums. In a finished log they cover every byte: each chunk and attachment has its own,
-DataEnd has that of the data section, the footer that of the summary. A log rewritten by another tool may lack checksums
-and chunks; one written by lowfc may lack only the checksum of the data section.
+DataEnd contains that of the data section, the footer that of the summary. A log rewritten by another tool may lack
+checksums and chunks; a log written by lowfc may lack only the checksum of the data section.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ _CHANGED = "its parts are intact, but some are missing or out of order, or bytes
 _BEGIN = MAGIC + bytes([Opcode.HEADER])
 _OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _FIRST_BLOCK_BYTES = 1 << 12
-_TRIES = 4  # the search tries possible chunks of this times the file's size: no file may occupy the reader for long
+_TRIES = 4  # the search for chunks reads up to this many times the file's size: no file may occupy it for long
 
 
 @dataclass(slots=True)
@@ -132,7 +132,7 @@ class LogFile:
             if needed and opcode == Opcode.CHUNK and end <= self.size:
                 end_ns = int.from_bytes(self._read(at + HEAD.size + 8, 8), "little")
                 if (channels := self._channels_after(end)) and not needed(end_ns, channels):
-                    at, intact = end, False  # the checksum of the data section needs all of it
+                    at, intact = end, False  # the checksum of the data section cannot be computed without this chunk
                     continue
             try:
                 if opcode in _OF_CHUNKS and self._unchunked and (content := self._unchunked_records(at)):

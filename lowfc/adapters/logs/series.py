@@ -139,7 +139,7 @@ class LogSeries:
             self._await_finished()
 
     def remove(self) -> None:
-        """Remove the files, which must all be finished; the caller knows that they hold no other process's messages."""
+        """Remove the files, which must all be finished and, as the caller ensures, hold no other process's messages."""
         while self.files:
             with raised_as(DataFileError, OSError, f"{self.files[-1]} is empty and cannot be removed"):
                 self.files[-1].unlink(missing_ok=True)
@@ -181,7 +181,7 @@ def _finish(log: LogWriter, totals: Mapping[str, str]) -> int:
     """Finish a file; return its growth in bytes."""
     before_bytes = log.bytes_written
     log.finish({"recording": totals})
-    return log.bytes_written - before_bytes  # not from the file, which another program may have moved already
+    return log.bytes_written - before_bytes  # not the file's size: another program may have moved the file already
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str:

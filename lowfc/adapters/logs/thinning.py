@@ -28,7 +28,7 @@ def thin(
     """
     combined = requested.within(Selection.of(metadata_at_start(log[0])))
     reader = WholeLog(log, progress)
-    copied_names = {PART, SELECTION}  # not copied: the thinned log has a selection of its own and is a single file
+    excluded_names = {PART, SELECTION}  # the thinned log is a single file with its own selection
 
     def include(message: Sample) -> bool:
         topic = known_topic(message.key)
@@ -36,9 +36,9 @@ def thin(
 
     def include_record(record: Metadata | Attachment) -> bool:
         """Whether to copy a record: the first of each name; all "recording" and "recovery", as readers use the last."""
-        known = record.name in copied_names and record.name not in ("recording", RECOVERY)
-        copied_names.add(record.name)
-        return not known
+        excluded = record.name in excluded_names and record.name not in ("recording", RECOVERY)
+        excluded_names.add(record.name)
+        return not excluded
 
     out = out or log[0].parent / f"{stem_of(log[0])}-every-{requested.interval_frames}.mcap"
     with new_log(out, log[0]) as file:
