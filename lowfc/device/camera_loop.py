@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lowfc.adapters.process.realtime import let_send
+from lowfc.adapters.process.realtime import yield_to_sender
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels
 from lowfc.contract.envelope import COUNT_BITS
@@ -118,7 +118,7 @@ class CameraLoop:
         if self._simulated:
             self._service.clock.sleep_until_ns(end_ns)
         envelope = self._puts.put(payload)
-        let_send()
+        yield_to_sender()
         self.watch.call(self._sent, envelope)
         self._last_put_ns = envelope.publish_time_ns
         self._first_put_ns = self._first_put_ns or envelope.publish_time_ns

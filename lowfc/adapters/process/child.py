@@ -86,7 +86,7 @@ class Child:
         """One line on how the process ended."""
         status = self.status
         if status is not None and status < 0:
-            names = {known.value: known.name for known in signal.Signals}  # without most real-time signals
+            names = {member.value: member.name for member in signal.Signals}  # without most real-time signals
             return f"{self.name} was killed by {names.get(-status, f'signal {-status}')}"
         return f"{self.name} ended with exit status {status}"
 

@@ -15,7 +15,7 @@ SIMULATED_START_NS = 1_767_225_600_000_000_000
 """2026-01-01T00:00:00Z, the start of every lockstep run."""
 
 WALL_TOLERANCE_NS = 100_000_000
-"""Difference from the wall clock above which it is reported: the wall clock was set after the offset was fixed."""
+"""Difference from the wall clock above which an event reports it: the wall clock was set after the offset was fixed."""
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _NS = 1_000_000_000
@@ -26,8 +26,8 @@ class HostClock:
 
     Attributes:
         lockstep: whether the time is simulated and set explicitly.
-        start_s: Unix time (in lockstep simulated) of the process's start, s; the upper half of its sequences.
-        offset_ns: offset to add to CLOCK_MONOTONIC for time since the epoch.
+        start_s: Unix time (simulated in lockstep) of the process's start, s; the upper half of its sequences.
+        offset_ns: offset to add to CLOCK_MONOTONIC to get the time since the epoch.
     """
 
     lockstep = False
@@ -38,7 +38,7 @@ class HostClock:
         self.start_s = self.now_ns() // _NS
 
     def host_ns(self) -> int:
-        """Time of the host, for envelopes and durations; `now_ns`, the run's time, differs from it only in lockstep."""
+        """Time of the host, for envelopes and durations; `now_ns`, the run's time, is another one only in lockstep."""
         return time.monotonic_ns() + self.offset_ns
 
     now_ns = host_ns
@@ -85,7 +85,7 @@ def boot_file(base: Path | None = None) -> Path:
 
 
 def boot_offset_ns(base: Path) -> int:
-    """Offset to add to CLOCK_MONOTONIC for time since the epoch, ns; the first call since the boot fixes it.
+    """Offset to add to CLOCK_MONOTONIC to get the time since the epoch, ns; the first call since the boot fixes it.
 
     DataFileError if its file in `base` is damaged, or cannot be read or made.
     """

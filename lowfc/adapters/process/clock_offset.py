@@ -17,7 +17,7 @@ PERIOD_S = 0.5
 
 
 class Exchange(NamedTuple):
-    """One query with its answer: the offset to add to this host's clock for the other's, and the round trip."""
+    """One query with its answer: the offset to add to this host's time to get the other's, and the round trip."""
 
     offset_ns: int
     round_trip_ns: int
@@ -32,16 +32,16 @@ class ClockOffset:
 
     @property
     def offset_ns(self) -> int:
-        """Offset to add to this host's clock for the other's; 0 until it is known."""
+        """Offset to add to this host's time to get the other's; 0 until it is known."""
         best = self.best
         return 0 if best is None else best.offset_ns
 
-    def exchanged(self, queried_ns: int, theirs_ns: int, answered_ns: int) -> None:
-        """Add one exchange: this host's time at query and receipt, and the other's time at its answer."""
-        new = Exchange(theirs_ns - (queried_ns + answered_ns) // 2, answered_ns - queried_ns)
+    def exchanged(self, queried_ns: int, other_ns: int, received_ns: int) -> None:
+        """Add one exchange: this host's time at query and receipt, and the other host's time at its answer."""
+        new = Exchange(other_ns - (queried_ns + received_ns) // 2, received_ns - queried_ns)
         apart_ns = abs(new.offset_ns - self.offset_ns) - 1_000_000  # 1 ms, ten times the drift
         if self.best is not None and apart_ns > (new.round_trip_ns + self.best.round_trip_ns) // 2:
-            self._recent.clear()  # another clock, as after the other host's reboot
+            self._recent.clear()  # the other clock was set, as after a reboot of its host
         self._recent.append(new)
         self.best = min(self._recent, key=lambda exchange: exchange.round_trip_ns)
 
@@ -56,8 +56,8 @@ class ClockAsker:
 
         Args:
             offset: receives the exchanges.
-            ask: queries the other host; returns its time at the answer minus the known offset, and this host's time at
-                receipt, for each answer.
+            ask: queries the other host; returns for each answer the other host's time minus the known offset, and this
+                host's time at receipt.
             host_ns: this host's clock.
         """
         self._offset = offset
@@ -82,6 +82,6 @@ class ClockAsker:
     def _exchange(self) -> bool:
         queried_ns = self._host_ns()
         answers = self._ask()
-        for theirs_ns, answered_ns in answers:
-            self._offset.exchanged(queried_ns, theirs_ns + self._offset.offset_ns, answered_ns)
+        for corrected_ns, received_ns in answers:
+            self._offset.exchanged(queried_ns, corrected_ns + self._offset.offset_ns, received_ns)
         return bool(answers)

@@ -63,11 +63,11 @@ class Pool:
         self._work: tuple[Any, ...] = ()
         self._scratch = [np.empty(0, np.float32)] * (threads - 1)
         self._shares: list[tuple[int, int]] = []
-        self._turns = [(threading.Lock(), threading.Lock()) for _ in range(threads - 1)]
-        for number, turn in enumerate(self._turns):
-            for lock in turn:
+        self._locks = [(threading.Lock(), threading.Lock()) for _ in range(threads - 1)]  # go and done of each thread
+        for number, go_and_done in enumerate(self._locks):
+            for lock in go_and_done:
                 lock.acquire()
-            threading.Thread(target=self._help, args=(number, *turn), name="fused step", daemon=True).start()
+            threading.Thread(target=self._help, args=(number, *go_and_done), name="fused step", daemon=True).start()
 
     def measure(
         self,
@@ -80,21 +80,21 @@ class Pool:
         totals: Sequences,
         *rest: Any,
     ) -> float:
-        """As `lowfc.control.kernel.functions.measure`."""
+        """Same as `lowfc.control.kernel.functions.measure`, with the pass over a large frame shared by the threads."""
         scanned = pixels, good, dark, tiles, scratch, sums_nm, totals
         if tiles.nbytes < SHARED_BYTES:
             return self._measure(*scanned, *rest)
         if self._scratch[0].size != scratch.size or self._shares[-1][1] != len(totals):
-            threads = len(self._turns) + 1
+            threads = len(self._locks) + 1
             edges = [len(totals) * number // threads for number in range(threads + 1)]
             self._shares = list(pairwise(edges))
-            self._scratch = [np.empty(scratch.size, np.float32) for _ in self._turns]
+            self._scratch = [np.empty(scratch.size, np.float32) for _ in self._locks]
         self._work = scanned
-        for go, _ in self._turns:
+        for go, _ in self._locks:
             go.release()
         first, last = self._shares[-1]
         self._measure_blocks(pixels, good, dark, tiles, scratch, first, last, sums_nm, totals)
-        for _, done in self._turns:
+        for _, done in self._locks:
             done.acquire()
         return self._measure(pixels[:0], *scanned[1:], *rest)  # no pixels: it uses the sums computed above
 
@@ -131,9 +131,9 @@ def _compiled() -> list[Any]:
         register_jitable(**options)(called)
     compiled = []
     for function, signature in signatures.items():
-        shared = {"nogil": function is functions.measure_blocks}
+        gil = {"nogil": function is functions.measure_blocks}
         try:
-            compiled.append(njit(signature, cache=True, **options, **shared)(function))
+            compiled.append(njit(signature, cache=True, **options, **gil)(function))
         except RuntimeError:  # no writable cache folder
-            compiled.append(njit(signature, **options, **shared)(function))
+            compiled.append(njit(signature, **options, **gil)(function))
     return compiled

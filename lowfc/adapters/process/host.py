@@ -41,7 +41,7 @@ class Host:
         return (self.root / path).read_text(errors="replace").strip()
 
     def text_or_nothing(self, path: str) -> str:
-        """As `text`; empty if the file cannot be read."""
+        """Content as by `text`; empty if the file cannot be read."""
         try:
             return self.text(path)
         except OSError:
@@ -145,9 +145,9 @@ class Counters:
     """Reads the `Counts` of a thread; the files stay open, so that a reading takes about 20 us."""
 
     def __init__(self, process: int, thread: int, cpus: Collection[int]) -> None:
-        """Open the files of a thread; OSError if there is none.
+        """Open the files of a thread; OSError if there is no such thread.
 
-        Stolen time is that of the processor in `cpus`, or of all processors if it does not hold exactly one.
+        Stolen time is that of the processor in `cpus`, or of all processors if `cpus` has not exactly one.
         """
         folder = f"/proc/{process}/task/{thread}"
         self._cpu = f"cpu{next(iter(cpus))} " if len(cpus) == 1 else "cpu "
@@ -171,7 +171,7 @@ class Counters:
 
 
 def busiest_thread(process: int, seconds: float) -> int:
-    """Return the thread of a process with the most processor time in the next seconds; OSError without a process."""
+    """Return the thread of a process with the most processor time in the next `seconds`; OSError without a process."""
     before = _run_ns(process)
     time.sleep(seconds)
     return max((ran_ns - before.get(thread, 0), thread) for thread, ran_ns in _run_ns(process).items())[1]
@@ -205,13 +205,13 @@ def resident_bytes(process: int | None = None) -> int:
     """Resident memory of a process (None: this one); psutil.NoSuchProcess if it does not exist."""
     if process is not None:
         return int(psutil.Process(process).memory_info().rss)
-    pages = _content(_own_memory(os.getpid())).split()[1]  # several times as fast as psutil, for every Health
+    pages = _content(_own_memory(os.getpid())).split()[1]  # for every Health: several times as fast as psutil
     return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
 @functools.lru_cache(1)
 def _own_memory(process: int) -> int:
-    """Descriptor of the open file with this process's memory use; `process`, its id, differs after a fork."""
+    """Descriptor of the open file with this process's memory use; the key `process`, its id, differs after a fork."""
     return os.open(f"/proc/{process}/statm", os.O_RDONLY)
 
 
@@ -234,5 +234,5 @@ def program_name() -> str:
 
 
 def by_this_process(what: str) -> str:
-    """An action with this user and process: `lowfc ctl by ann (process 12)`."""
+    """Text of an action with its user and process, here this one: `lowfc ctl by ann (process 12)`."""
     return f"{what} by {psutil.Process().username()} (process {os.getpid()})"

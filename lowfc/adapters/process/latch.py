@@ -45,11 +45,11 @@ class Latch:
     """
 
     def __init__(self, files: Sequence[Path], failed: Callable[[str], None] = lambda why: None) -> None:
-        """Read the files; `failed` is called with the fault of a file, once until the file works again."""
+        """Read the files; `failed` is called with a file's fault, and again only after the file has worked."""
         self._files = tuple(files)
         self._failed = failed
         self._reported: set[Path] = set()
-        # Lists, as every file is tried: `any` and `all` would stop earlier.
+        # Lists, so that every file is tried: `any` and `all` would stop at the first result.
         self.safe = True in [self._exists(file) for file in self._files]
         self.writable = True in [self._try(_probe, file) for file in self._files]
         self._target = self.safe
@@ -66,7 +66,7 @@ class Latch:
             self._changed.notify()
 
     def close(self) -> None:
-        """Finish writing: one more attempt, for up to a second."""
+        """Finish writing: make one more attempt, for up to a second."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -110,7 +110,7 @@ class Latch:
         return True
 
     def _report(self, file: Path, why: str) -> None:
-        """Report a fault of a file once until it works again; a failing handler does not end this thread."""
+        """Report a file's fault, again only after the file has worked; a failing handler does not end this thread."""
         if file not in self._reported:
             self._reported.add(file)
             with contextlib.suppress(Exception):

@@ -1,4 +1,4 @@
-"""Progress: bars that disappear at the end, or lines without a terminal."""
+"""Progress display: bars that disappear at the end; without a terminal, lines."""
 
 import contextlib
 import time
@@ -21,7 +21,7 @@ def passing_bar(console: Console, *columns: ProgressColumn) -> Progress:
 def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted]:
     """One bar for several tasks in turn, with `columns` beside its description; it appears with the first progress.
 
-    Without a terminal: lines, see `progress_lines`.
+    Without a terminal, lines are printed: see `progress_lines`.
     """
     if not console.is_terminal:
         yield progress_lines(lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True))
@@ -38,12 +38,12 @@ def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted
 
 
 def percentage_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
-    """As `counting_bar`, in per cent of the whole."""
+    """Bar as by `counting_bar`, in per cent of the total amount."""
     return counting_bar(console, TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn())
 
 
 def reading_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
-    """As `counting_bar`, for the bytes read from a file."""
+    """Bar as by `counting_bar`, for the bytes read from a file."""
     return counting_bar(console, DownloadColumn(), TimeRemainingColumn())
 
 

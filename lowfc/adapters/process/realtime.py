@@ -21,7 +21,7 @@ _CAP_IPC_LOCK = 1 << 14
 _MONITOR_NICE = 5  # of 19
 _LATENCY_DEVICE = "/dev/cpu_dma_latency"
 _HUGE_PAGE_BYTES = "/sys/kernel/mm/transparent_hugepage/hpage_pmd_size"
-_COMPILER = "llvmlite"  # not used after the first frame, and larger than everything else
+_COMPILER = "llvmlite"  # library whose pages are not locked: large, and not used after the first frame
 
 _Measure = tuple[str, Callable[[], object], str]
 """Name of a measure, the function that requests it, and the cost of its refusal."""
@@ -125,12 +125,12 @@ def set_up_below_loop(priority: int | None, cpus: set[int] | None) -> Granted:
     return _request([], measures)
 
 
-def let_send() -> None:
+def yield_to_sender() -> None:
     """Yield so that the bus's thread sends the last put before this thread continues.
 
-    With equal SCHED_FIFO priority on the same processor, that thread would wait until this one sleeps; so would the
-    mirror and its bus thread, hence the second yield. In the normal class the kernel schedules them, and yielding would
-    let any process run.
+    With equal SCHED_FIFO priority on the same processor, the bus's thread would wait until this one sleeps. So would
+    the mirror and its bus thread, hence the second yield. In the normal class the kernel schedules these threads, and
+    yielding would let any process run.
     """
     if os.sched_getscheduler(0) == os.SCHED_FIFO:
         os.sched_yield()
@@ -187,7 +187,7 @@ def _disable_cpu_idle() -> None:
 
 
 def _lock_memory() -> None:
-    """Lock resident pages, and all pages of mapped files, as reading them later is slow; other pages once touched.
+    """Lock resident pages, all pages of mapped files (reading them later is slow), and other pages once touched.
 
     Locking all reserved memory would allocate it: most of it is buffers and thread stacks that BLAS does not use.
     Under a memory-lock limit nothing is locked, as later allocations would fail.
@@ -206,7 +206,7 @@ def _lock_memory() -> None:
 
 
 def _collapse_memory() -> None:
-    """Collapse each range of the heap and of anonymous mappings that fills a huge page, unless nothing is in it."""
+    """Move each part of the heap and of anonymous mappings that fills a huge page to one, unless the part is empty."""
     try:
         size = int(Path(_HUGE_PAGE_BYTES).read_text())
     except FileNotFoundError as fault:

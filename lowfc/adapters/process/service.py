@@ -76,11 +76,11 @@ class Service:
             run_id: identifier of the run.
             clock: clock of the run.
             bus: bus of the process.
-            granted: real-time measures requested before.
+            granted: real-time measures requested before the bus was opened.
             at_ready: requests further measures once the process is ready; a refusal (older kernels) gives no event.
             fill: adds the role's own fields to each Health.
             announces: see the attribute.
-            supervisor: the host's by default.
+            supervisor: service manager; by default that of the environment.
         """
         self.name = name
         self.clock = clock
@@ -231,7 +231,7 @@ class Service:
             self._send_health(now_ns)
 
     def finish(self) -> None:
-        """Publish the last Health, with all counts, and nothing after it; or raise the fault of a failed handler."""
+        """Publish a final Health, with all counts, as the last message; raise a failed handler's fault instead."""
         if self._fault is not None:
             raise self._fault
         self._report_unreadable()
@@ -266,7 +266,7 @@ class Service:
 
     def _print(self, line: str) -> None:
         with contextlib.suppress(OSError, ValueError):  # a closed terminal or a full disk must not end the process
-            if select.select((), (2,), (), 0)[1]:  # nor a stopped terminal (Ctrl-S) or a full pipe halt it
+            if select.select((), (2,), (), 0)[1]:  # nor may a stopped terminal (Ctrl-S) or a full pipe block it
                 sys.stderr.write(f"{self.name}: {line}\n")
 
     def unreadable(self, key: str, why: object) -> None:

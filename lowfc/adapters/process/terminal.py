@@ -41,7 +41,7 @@ _LOGS = "Logs (MCAP), finished or not; all files of a recording are one log. `la
 Logs = Annotated[list[Path], typer.Argument(help=_LOGS, metavar="LOG", readable=False, show_default=False)]
 _IfAny = partial(typer.Argument, metavar="LOG", readable=False, show_default=False)
 LogsIfAny = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one: the running loop.")]
-LogsOrLive = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one: --live.")]
+LogsOrLive = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one, --live is required.")]
 LogsOrMeasure = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one: a loop started for this measurement.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).", show_default=False)]
 
@@ -65,7 +65,7 @@ class AppGroup(TyperGroup):
             fault.message = reworded(fault.message)
             if fault.message.startswith("must ") and hasattr(cause, "errors"):  # a ValidationError
                 fault.message += f", got {brief(cause.errors()[0]['input'])}"
-                fault.__cause__ = None  # of a nested group, the outer one sees the error too
+                fault.__cause__ = None  # in a nested group, the outer group handles the error too
             raise
 
 

@@ -22,8 +22,8 @@ class Trial(NamedTuple):
     """Result of a trial.
 
     Attributes:
-        refused: those of `priority`, `lock_memory`, `huge_pages` and `disable_cpu_idle` that are refused, each with the
-            measure and the cost of its refusal.
+        refused: for each refused key (`priority`, `lock_memory`, `huge_pages`, `disable_cpu_idle`) the measure and the
+            cost of its refusal.
         cpus: processors that the process may use, also beyond the caller's.
         normal_ns: lateness of each wake-up in the normal scheduling class, ns.
         fifo_ns: lateness of each wake-up under SCHED_FIFO, ns; empty if not requested or refused.

@@ -10,23 +10,23 @@ UNITS = 4
 class WorkRate:
     """Rate of work over the last half second or, if the work is slow, over its last four units or a few more.
 
-    The rate is 0 at the first update with work, from which time runs, and after a silence in which four units were
-    expected.
+    The rate is 0 at the first update with work, which starts the measurement, and after a silence in which four units
+    were expected.
     """
 
     def __init__(self) -> None:
-        self._known: deque[tuple[int, int]] = deque(maxlen=16)  # times and counts after new work
+        self._known: deque[tuple[int, int]] = deque(maxlen=16)  # time (ns) and count at each update with new work
         self._last = 0, 0
         self._rate_hz = 0.0
 
     def update(self, now_ns: int, work: int) -> float:
-        """Rate, Hz, of the work that has reached this count now; call it repeatedly."""
+        """Rate, Hz, when the number of units is now `work`; call it repeatedly."""
         if not self._known:
             if work:
                 self._known.append((now_ns, work))
         elif work != self._last[1]:
             past = (*self._known, self._last)
-            usable = [it for it in past if work - it[1] >= UNITS and now_ns - it[0] >= WINDOW_NS]
+            usable = [(at_ns, count) for at_ns, count in past if work - count >= UNITS and now_ns - at_ns >= WINDOW_NS]
             since_ns, done = usable[-1] if usable else self._known[0]
             if not self._rate_hz:  # at first and after a silence: measure from now on
                 self._known.clear()

@@ -12,7 +12,7 @@ Measured with rerun 0.41:
 - `disconnect`, `del`, and the end of the process block while the viewer hangs: call stop() first.
 - A browser's page must be reloaded after its server has restarted.
 - The memory limit applies to the data as counted by rerun: the memory of a viewer levelled off at 184 MB for "100MB",
-  of a headless one at 545 MB for "200MB".
+  that of a headless viewer at 545 MB for "200MB".
 - ViewerClient has no timeout: all calls here run in a thread that may be abandoned.
 """
 
@@ -165,7 +165,7 @@ class RerunViewer:
         self._stderr.close()
 
     def screenshot(self, path: Path | None = None, timeout_s: float = 20.0) -> bytes:
-        """PNG of the whole viewer, at most `timeout_s` after it has loaded, or once two images in turn are equal.
+        """PNG of the whole viewer once loaded and two consecutive images are equal, or `timeout_s` after it has loaded.
 
         Raises:
             ViewerError: the viewer does not answer, or has not loaded everything within the timeout.

@@ -15,7 +15,7 @@ _FORWARDED = ("Content-Type", "rerun-final-length")  # the second is used by the
 
 
 class ViewerPage:
-    """Serves the content of another server on this host with the policy added, until stop()."""
+    """Serves the content of another server on this host, with the content security policy added, until stop()."""
 
     def __init__(self, host: str, port: int, source_port: int, stream_port: int) -> None:
         """Listen at `host` and `port`, and serve the content of `source_port`; OSError if the port is in use.

@@ -10,7 +10,7 @@ from lowfc.adapters.bus.start_check import StartCheck
 from lowfc.adapters.files.factory import contrast_of
 from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.adapters.process.latch import Latch
-from lowfc.adapters.process.realtime import let_send
+from lowfc.adapters.process.realtime import yield_to_sender
 from lowfc.adapters.process.service import Service
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.state_codec import controller_state, reason_counts
@@ -202,7 +202,7 @@ class Controller:
         ready_ns = clock.host_ns()
         self._send(outputs)
         sent_ns = self._commands.handed_ns if outputs.command is not None else clock.host_ns()
-        let_send()
+        yield_to_sender()
         if self._state.frame_sequence != newest:  # an old frame does not show that the camera is alive
             self._last_frame_ns = clock.now_ns() if clock.lockstep else start_ns
         if not newest:  # the first frame

@@ -22,7 +22,7 @@ from lowfc.adapters.bus.zenoh_session import keep_thread_state, session_config
 from lowfc.adapters.files.whole_file import being_written
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.join import prepare, prepare_ready
-from lowfc.adapters.process.realtime import let_send
+from lowfc.adapters.process.realtime import yield_to_sender
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.arrays import Long
 from lowfc.contract.configuration import Configuration
@@ -111,7 +111,7 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) ->
             round_trip_ns.append(_LOST)
             sent_ns.append(clock.host_ns())
             publisher.put(payload, attachment=Envelope(len(sent_ns) - 1, sent_ns[-1]).encode())
-            let_send()
+            yield_to_sender()
             due_ns += config.period_ns
         time.sleep(_SETTLE_S)
         session.put(FRAME.key, b"", congestion_control=zenoh.CongestionControl.BLOCK)

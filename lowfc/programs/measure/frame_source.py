@@ -16,7 +16,7 @@ from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.files import factory
 from lowfc.adapters.files.whole_file import being_written
 from lowfc.adapters.process.join import join
-from lowfc.adapters.process.realtime import let_send
+from lowfc.adapters.process.realtime import yield_to_sender
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
@@ -108,7 +108,7 @@ def frame_source(
             if not service.running:
                 break
             envelope = frames.put(payload)
-            let_send()
+            yield_to_sender()
             due_ns.append(next_ns)
             sequence.append(envelope.sequence)
             put_ns.append(envelope.publish_time_ns)

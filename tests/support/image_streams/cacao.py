@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from lowfc.adapters.process.clock import HostClock
-from lowfc.adapters.process.realtime import let_send, set_up
+from lowfc.adapters.process.realtime import set_up, yield_to_sender
 from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import load
 from lowfc.contract.envelope import Envelope, sequence_of
@@ -103,7 +103,7 @@ def main() -> None:
         # The stream's times are TAI.
         ahead_ns = round(clock.ahead_ns() - (time.clock_gettime(time.CLOCK_TAI) - time.time()) * 1e9)
         stream.end(exposure.end_ns - ahead_ns)
-        let_send()  # lets the loop's processes run before the truth is computed
+        yield_to_sender()  # lets the loop's processes run before the truth is computed
         driver.sent(Envelope(sequence_of(clock.start_s, count), clock.host_ns()))
         count += 1
         if not select.select([sys.stdin], [], [], 0)[0]:
