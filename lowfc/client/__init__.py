@@ -1,4 +1,4 @@
-"""Python client of a running loop: the operator's requests, and the loop's frames and control steps.
+"""Python client of a running loop: the operator's requests, and the loop's frames and control steps (one per frame).
 
 with Client() as loop:
     loop.gain(0.4, modes=[2, 3])

@@ -79,7 +79,7 @@ def _plain(name: str) -> Callable[["Client"], Answer]:
 
 
 class Client:
-    """A connection to a loop until `disconnect`, for use by one thread (a second thread renews a reservation).
+    """A connection to a loop until `disconnect`, for use by one thread (the client's own thread renews a reservation).
 
     Only the process that answers a request has to be running.
 
@@ -220,7 +220,7 @@ class Client:
             self._lease.check()
 
     def permit(self, purpose: str, hold_s: float | None = None, lease_id: int = 0) -> Answer:
-        """Ask permission to move something on the bench; with `hold_s`, the loop holds for that time: see `held`.
+        """Ask permission to move something on the bench; with `hold_s`, the loop holds its command: see `held`.
 
         `lease_id` identifies the hold when it is released; 0 for a new identity.
         """

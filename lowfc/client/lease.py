@@ -29,13 +29,13 @@ class Lease:
     """A reservation of the loop, from its construction to `release`; the holder's requests carry its `id`."""
 
     def __init__(self, ask: Callable[..., object], purpose: str, duration_s: float | None, *, lockstep: bool) -> None:
-        """Reserve the loop, by the client's `ask`, for a purpose such as "lowfc calibrate", with its duration if known.
+        """Reserve the loop for a purpose such as "lowfc calibrate", with its expected duration, or None if unknown.
 
-        In lockstep the loop's time, in which a reservation ends, may run a hundred times faster than the host's clock:
-        without renewal the reservation then stays in force for as long as the controller allows.
+        `ask` sends the requests. In lockstep the loop's time, in which a reservation ends, may run a hundred times
+        faster than the host's clock: so each renewal lasts as long as the controller allows.
 
         Raises:
-            RequestRefusedError: another client has reserved it, or it is in safe mode.
+            RequestRefusedError: another client has reserved the loop, or the loop is in safe mode.
             BusError: no controller is running.
         """
         self.id = new_identity()

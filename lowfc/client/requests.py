@@ -44,8 +44,8 @@ DECLARED: tuple[Declaration, ...] = (
     _declared("close", "Close the loop: the control law drives the mirror.", "close"),
     _declared(
         "pause",
-        "Open a closed loop; unless the holder of a reservation asked, it is reported as paused; closing it resumes "
-        "from the held command.",
+        "Open a closed loop; closing it resumes from the held command. It is reported as paused, unless the holder of "
+        "a reservation sent the request.",
         "pause",
     ),
     _declared(
@@ -80,7 +80,8 @@ DECLARED: tuple[Declaration, ...] = (
     _declared(
         "channel",
         "Add a shape to the mirror, and shift the sensor's zero point with it so that the loop does not undo it; "
-        "the channel `flat` does not shift the zero point, and `external`, which other programs apply, is not sent.",
+        "the channel `flat` does not shift the zero point. Other programs apply the channel `external`: it only shifts "
+        "the zero point.",
         "channel dark-hole shape.fits",
         ("text", "name: up to 32 of a-z, 0-9 and -, a letter first"),
         ("actuators", "float32, nm of surface, rows x columns; empty removes the channel"),
@@ -121,10 +122,10 @@ DECLARED: tuple[Declaration, ...] = (
     ),
     _declared(
         "renew",
-        "Extend a reservation; if it has ended, refused with the cause.",
+        "Extend a reservation; refused with the cause if the reservation has ended.",
         "",
         ("lease_id", "as in `lease`"),
-        ("values", "seconds"),
+        ("values", "as in `lease`"),
         ("text", "as in `lease`"),
     ),
     _declared("release", "End a reservation.", "", ("lease_id", "as in `lease`")),

@@ -48,7 +48,7 @@ def the_run(name: str | None) -> str:
 
 
 def _silent_routers(name: str | None) -> str:
-    """Say of each stored run with a router, or of run `name` alone, that its router does not answer.
+    """Clause on the routers that do not answer: of all stored runs with a router, or of run `name` alone.
 
     Call it only for runs that are not live.
     """

@@ -63,11 +63,11 @@ class Control(Section):
     """The control law."""
 
     start_mode: Literal["open", "closed"] = "open"
-    """Loop mode once a calibration is loaded; closed: open until automatic gains are measured. sim-loop starts closed
-    if the file does not set it."""
+    """Loop mode once a calibration is loaded; with automatic gains, closed takes effect once these are measured.
+    sim-loop starts closed if the file does not set this key."""
     delay_frames: float = Field(0.0, ge=0, le=10)
     """Measured delay in frames: a command computed from frame n first acts on the whole exposure of frame n + delay; 0:
-    camera.delay_frames. Twice the delay about halves the highest stable gain."""
+    camera.delay_frames. Doubling the delay about halves the highest stable gain."""
     estimator: Literal["weighted", "pinv"] = "weighted"
     """Noise-weighted or plain pseudo-inverse of H."""
     nuisance: list[Literal["background", "shear"]] = Field(default_factory=list)
@@ -109,7 +109,7 @@ class Control(Section):
     law: str = ""
     """Law file (FITS) written by `lowfc tune`; empty for the integrator."""
     guard: bool = True
-    """Guard: the integrator takes over from a law whose residual is larger than the integrator's, or that amplifies."""
+    """The integrator takes over from a law that amplifies the disturbance or leaves a larger residual than it would."""
 
 
 class Safety(Section):
@@ -170,7 +170,7 @@ class Recorder(Section):
     """Lowest event level that runs the command."""
     on_event_every_s: float = Field(10.0, ge=0, le=1_000_000)
     """Shortest time from the end of the command to its next run, which reports the most severe event since the last
-    run began; LOWFC_OTHERS is the number of others."""
+    run began; LOWFC_OTHERS is the number of the other events."""
 
 
 class Realtime(Section):
@@ -179,7 +179,7 @@ class Realtime(Section):
     priority: int = Field(50, ge=0, le=98)
     """SCHED_FIFO priority of camera, controller, mirror and router; 0 for normal scheduling, as always in lockstep."""
     recorder_priority: int = Field(10, ge=0, le=98)
-    """SCHED_FIFO priority of the recorder, below `priority`; the batch class if either is 0, and in lockstep."""
+    """SCHED_FIFO priority of the recorder, below `priority`; in lockstep, or if either is 0, the batch class."""
     lock_memory: bool = True
     """Lock the memory of camera, controller, mirror, router; the first three use huge pages once ready (Linux 6.1)."""
     disable_cpu_idle: bool = True

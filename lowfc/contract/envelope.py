@@ -18,7 +18,7 @@ class Envelope(NamedTuple):
 
     Attributes:
         sequence: the publisher's start in unix seconds << 32 | its count on this topic, from 0.
-        publish_time_ns: just before the put, nanoseconds since the epoch on the host's clock.
+        publish_time_ns: time just before the put, nanoseconds since the epoch on the host's clock.
     """
 
     sequence: int
@@ -56,7 +56,7 @@ class Envelope(NamedTuple):
 def sequence_of(start_s: int, count: int) -> int:
     """Sequence of message number `count` of a publisher that started at `start_s` (unix seconds).
 
-    A count of 2^32, after 50 days at 1 kHz, carries into the start: sequences go on growing.
+    A count of 2^32, reached after 50 days at 1 kHz, carries into the start: sequences go on growing.
     """
     return (start_s << COUNT_BITS) + count
 

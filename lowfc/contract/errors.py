@@ -19,7 +19,7 @@ from difflib import get_close_matches
 
 
 class LowfcError(Exception):
-    """Base of the errors that a user can correct; the text has what is wrong, expected and found, and what to do."""
+    """Base of the errors that a user can correct; the text says what is wrong, expected and found, and what to do."""
 
     exit_status = 2
 
@@ -52,7 +52,7 @@ class RequestRefusedError(LowfcError):
 def raised_as(
     kind: type[Exception], caught: type[Exception] | tuple[type[Exception], ...], about: object = ""
 ) -> Iterator[None]:
-    """Raise the exceptions `caught` in the block as errors of this kind; their text follows `about` and a colon.
+    """Raise the exceptions `caught` in the block as errors of type `kind`; their text follows `about` and a colon.
 
     The text of an OSError is its reason alone, without number and path.
     """

@@ -59,8 +59,8 @@ class Topic:
         rate: every frame, on event, or a number of hertz.
         publishers: roles that may publish it; a router drops messages of other roles.
         subscribers: roles that receive it.
-        deterministic: in lockstep two runs with the same seed write the same payload bytes.
-        queryable: a late joiner can query the publisher for the last message.
+        deterministic: in lockstep, two runs with the same seed publish the same payload bytes.
+        queryable: a process that joins late can query the publisher for the last message.
         latest_only: monitors receive only the newest message, at display rate.
         direct_subscriber: role that receives it over the direct link from a publisher on the same host; None for none.
         multiple_publishers: several programs of one host may publish it, so that its direct subscriber also reads the
@@ -140,8 +140,8 @@ CONTROLLER_STATE = Topic(
     wire.ControllerState,
     1.0,
     _CONTROLLER,
-    "The controller's state, at this rate while frames come and after most other changes: all that the next command "
-    "depends on; calibration, law and probe sequence by identity.",
+    "The controller's state, at this rate while frames arrive, and after most other changes. It contains all that the "
+    "next command depends on, but only the identities of calibration, law and probe sequence.",
     queryable=True,
 )
 REQUEST = Topic(
@@ -209,8 +209,8 @@ CALIBRATION = Topic(
     wire.Calibration,
     Rate.EVENT,
     _CONTROLLER,
-    "A requested calibration: matrices from a frame to modes and to actuators; the controller's states have the "
-    "identity of the one in use.",
+    "A requested calibration: matrices from a frame to modes, and from modes to actuators; the controller's states "
+    "have the identity of the one in use.",
     queryable=True,
 )
 BENCH = Topic(
@@ -337,7 +337,7 @@ def floats(data: bytes, *shape: int) -> Single:
 
 
 def fields_of(source: object, names: Iterable[str]) -> dict[str, Any]:
-    """Attributes of `source` by name; it is a value or a message, in which these fields have the same names."""
+    """Attributes of `source`, a value or a message, by name; the fields `names` are called alike in both."""
     return {name: getattr(source, name) for name in names}
 
 

@@ -20,7 +20,7 @@ WithoutNul = Annotated[str, AfterValidator(_without_nul)]
 
 
 class Section(BaseModel):
-    """A section: unknown keys are errors, values are immutable, and only integers are converted, to floats."""
+    """A section: unknown keys are errors, values are immutable; the only conversion is from integer to float."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 

@@ -10,7 +10,7 @@ LINES = "\n\t"
 
 
 def printable(text: str, keep: str = "") -> str:
-    """Text with its control characters, except those in `keep`, as escapes of a Python string."""
+    """Text whose control characters, except those in `keep`, have become Python escapes."""
     if text.isprintable():
         return text
     return "".join(
@@ -22,5 +22,5 @@ def printable(text: str, keep: str = "") -> str:
 
 
 def encodable(text: str) -> str:
-    """Text with the bytes of a file name that are not UTF-8 as escapes: messages and logs are UTF-8."""
+    """Text whose bytes that are not UTF-8 (of a file name) have become escapes: messages and logs are UTF-8."""
     return text.encode(errors="backslashreplace").decode()

@@ -24,7 +24,7 @@ class Published:
     plays: dict[str, PlayTable] = field(default_factory=dict)
 
     def store(self, topic: Topic, payload: bytes) -> None:
-        """Store a received message of `TOPICS`; an incomplete one is ignored, so that its identity stays unknown."""
+        """Store a received message of `TOPICS`; ignore an incomplete message, whose identity then stays unknown."""
         with contextlib.suppress(DecodeError, ValueError):
             if topic is CALIBRATION:
                 calibration = decode_calibration(wire.Calibration.FromString(payload))

@@ -31,13 +31,13 @@ def recorded(content: bytes) -> tuple[Configuration, list[str]]:
         renamed_keys(data)
     remarks: list[str] = []
     while faults := _faults(data):
-        # The others are contradictions between several keys, which a validator of sections reports.
-        of_keys = [detail for detail in faults if len(detail["loc"]) > 1 or detail["type"] != "value_error"]
-        if not of_keys:
+        # All other faults are contradictions between several keys, which a validator of sections reports.
+        single_key = [detail for detail in faults if len(detail["loc"]) > 1 or detail["type"] != "value_error"]
+        if not single_key:
             remarks += [f"{explain(detail)}; used as recorded" for detail in faults]
             return _constructed(data, {str(detail["loc"][0]) for detail in faults if detail["loc"]}), remarks
-        remarks += [f"{explain(detail)}; {_mend(data, detail)}" for detail in of_keys[:MAX_FAULTS]]
-        if more := [_mend(data, detail) for detail in of_keys[MAX_FAULTS:]]:
+        remarks += [f"{explain(detail)}; {_mend(data, detail)}" for detail in single_key[:MAX_FAULTS]]
+        if more := [_mend(data, detail) for detail in single_key[MAX_FAULTS:]]:
             remarks.append(f"and {len(more)} more")
         if isinstance(interlocks := data.get("interlocks"), list):
             data["interlocks"] = [interlock for interlock in interlocks if interlock is not None]
@@ -69,7 +69,7 @@ def _mend(data: dict[str, Any], detail: Any) -> str:
 
 
 def _constructed(data: dict[str, Any], contradictory: set[str]) -> Configuration:
-    """A configuration whose keys are valid one by one."""
+    """Build a configuration whose keys are valid one by one; the sections `contradictory` are not validated."""
     sections: dict[str, Any] = {
         name: kind.model_construct(**data[name]) if name in contradictory else kind.model_validate(data[name])
         for name, kind in _SECTIONS.items()

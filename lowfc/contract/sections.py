@@ -85,7 +85,7 @@ class SensorSection(Section):
     """sam: sparse aperture mask; clowfs: coronagraphic low-order sensor; zwfs: Zernike sensor; bar: relay pupil
     with a bar; open: open relay pupil."""
     pupil: str = "shaped"
-    """Coronagraph: the shaped pupil; circle for a classical Lyot, prolate for an apodised one; or FILE.npz."""
+    """shaped: shaped-pupil coronagraph; circle: classical Lyot; prolate: apodised-pupil Lyot; or a pupil FILE.npz."""
     focal_mask: Literal["disk", "bowtie"] = "disk"
     """Reflective focal-plane mask: a disk, or the bowtie of the paper's Fig. 3."""
     focal_radius: float = Field(4.0, ge=1, le=10)
@@ -210,14 +210,14 @@ class Disturbance(Section):
     wheel_hz: NotNegative = 0.0
     """Initial speed of a reaction wheel, turns per second (0: none). It excites tip and tilt at its harmonics."""
     wheel_mas: NotNegative = 3.0
-    """Amplitude of the wheel's first harmonic at high speed, mas rms per axis; the others have 0.5 to 0.15 of it."""
+    """Amplitude of the wheel's first harmonic at high speed, mas rms per axis; further ones have 0.5 to 0.15 of it."""
     wheel_course: Literal["ramp", "walk", "run-down"] = "ramp"
     """Change of the wheel's speed: linear, random walk, or slowed by friction."""
     wheel_change: Signed = 0.0
     """Rate of change of the wheel's speed: ramp, Hz per second; walk, Hz per root second; run-down, decrease at time 0
     in Hz per second. 0 for constant speed."""
     second_wheel_hz: Signed = 0.0
-    """Initial speed of a second, identical wheel above that of the first, turns per second; the two beat. 0: no second
+    """Initial speed of a second, identical wheel minus that of the first, turns per second; the two beat. 0: no second
     wheel."""
 
     @model_validator(mode="after")
@@ -258,8 +258,8 @@ class Mirror(Section):
     driver_bits: int = Field(16, ge=8, le=24)
     """Bits of the driver over the full range."""
     settling_us: NotNegative = 50.0
-    """Simulated mirror: time constant of an actuator's first-order response; without lockstep, images are correct for
-    up to a fifth of the period."""
+    """Simulated mirror: time constant of an actuator's first-order response; without lockstep, images are correct if
+    it is at most a fifth of the frame period."""
     dead: list[int] = Field(default_factory=list)
     """Simulated mirror: actuators that stay flat, row * columns + column; exclude known ones with `active`."""
     stuck_nm: dict[str, Signed] = Field(default_factory=dict)

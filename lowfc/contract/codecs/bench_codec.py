@@ -57,7 +57,7 @@ def _checked(message: wire.BenchValue) -> Value:
 
 
 def wire_report(report: BenchReport) -> wire.BenchReport:
-    """Message of a value as received."""
+    """Message of a report on a bench value."""
     value = None if report.value is None else wire_value(report.value)
     return wire.BenchReport(timestamp=timestamp(report.time_ns), name=report.name, value=value, age_ns=report.age_ns)
 

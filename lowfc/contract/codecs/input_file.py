@@ -20,7 +20,7 @@ def opened(path: Path, largest_bytes: int) -> BinaryIO:
 
     OSError if it is something else or cannot be opened; its `strerror` is a phrase for the user.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe without a writer would wait
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # else a pipe without a writer would block
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):

@@ -94,8 +94,8 @@ def command_channels_of(
 ) -> CommandChannels | None:
     """Offset, command channels and probe sequence of a state; None if it has none.
 
-    `empty` has the shapes of the arrays. The table of a probe sequence is found in `plays` by its identity; states from
-    before 0.2 contain the rows to play instead.
+    `empty` defines the shapes of the arrays. The table of a probe sequence is found in `plays` by its identity; states
+    from versions before 0.2 contain the rows to play instead.
 
     Raises:
         ValueError: the shapes do not match, or the table is missing.

@@ -40,7 +40,7 @@ _LEASE = ("id", "holder", "last_sequence", "ended", "holds")
 
 
 def controller_state(state: State, settings: Settings, time_ns: int) -> wire.ControllerState:
-    """Message of everything the next command depends on; calibration, law and table by identity."""
+    """Message of everything the next command depends on; of calibration, law and table only the identities."""
     conditions, loop, estimate, lease = state.conditions, state.loop, state.estimate, state.conditions.lease
     message = wire.ControllerState(
         timestamp=timestamp(time_ns),
@@ -137,7 +137,7 @@ def decode_state(
                 raise ValueError("the law of the controller's state does not fit")
         if message.HasField("camera_expected"):
             loop = loop._replace(camera=camera_settings(message.camera_expected))
-        if prior_nm2.size:  # before the channels are set: it would change their past shifts
+        if prior_nm2.size:  # before the channels are set: `with_weighting` would change their past shifts
             loop = loop.with_weighting(Weighting(prior_nm2, message.weighting_flux_dn))
         loop = loop._replace(
             law_runner=law_runner,
