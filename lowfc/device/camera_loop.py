@@ -22,7 +22,7 @@ AHEAD_NS = 5_000_000
 """Largest time by which the end of an exposure may be ahead of its clock."""
 MAX_LOST_FRAMES, MAX_RATE_RATIO = 100, 4
 """Largest plausible step of frame numbers: MAX_LOST_FRAMES + MAX_RATE_RATIO x periods since the last frame. A
-larger one is a restart."""
+larger step is a restart."""
 FRAME_ID = "lowfc_camera"
 
 _NO_EXTRAS = CameraExtras()
@@ -63,7 +63,7 @@ class CameraLoop:
         service = self._service
         step = getattr(self._driver, "step", _NO_EXTRAS.step) if service.clock.lockstep else _NO_EXTRAS.step
         finish = getattr(self._driver, "finish", _NO_EXTRAS.finish)
-        with self.watch.over(self._driver.close, self._fill_extra, finish):
+        with self.watch.until_closed(self._driver.close, self._fill_extra, finish):
             service.require(wait_for, WAIT_S, "the camera does not start")
             service.awaited = lambda: "" if service.work else "the camera's first frame"
             service.state = "running"
@@ -84,7 +84,7 @@ class CameraLoop:
         service.finish()
 
     def _next_frame(self) -> tuple[Pixels, int] | None:
-        """Pixels of the next exposure and the run's time of its end; None if there is no frame."""
+        """Pixels of the next exposure, and its end by the run's clock; None if there is no frame."""
         clock, watch = self._service.clock, self.watch
         if clock.host_ns() < watch.retry_ns:
             return None
@@ -152,7 +152,7 @@ class CameraLoop:
             raise ValueError(
                 f"lost is {lost}, expected the number of frames lost before this one, below 2^{COUNT_BITS}"
             )
-        number = None if exposure.number is None else int(exposure.number)  # numpy's integers overflow
+        number = None if exposure.number is None else int(exposure.number)  # a numpy integer could overflow
         if number is not None and self._number is not None:
             step = (number - self._number) % int(settings.number_wrap)
             if step == 0:
@@ -183,7 +183,7 @@ class CameraLoop:
         if not isinstance(settings, CameraSettings):
             raise TypeError(f"settings() returned {type(settings).__name__}, expected CameraSettings")
         time_ns = self._service.clock.now_ns() if settings.time_ns is None else settings.time_ns
-        step_ns = min(int(settings.period_ns), SETTINGS_NS, time_ns - self._settings_asked_ns)  # to the next call
+        step_ns = min(int(settings.period_ns), SETTINGS_NS, time_ns - self._settings_asked_ns)  # until the next call
         self._settings_asked_ns = time_ns
         if settings != self._settings or time_ns + step_ns // 2 >= self._settings_due_ns:
             self._states.put(camera_state(settings, time_ns).SerializeToString())

@@ -271,14 +271,14 @@ class MirrorExtras:
         return None
 
     def beside(self) -> Single | None:
-        """Shape (rows, columns), nm of surface, added by other programs; the stroke limit applies to the sum."""
+        """Shape (rows, columns), nm of surface, that other programs add; the stroke limit applies to the sum."""
         return None
 
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
         """Called instead of `apply`, for simulated mirrors; also called repeatedly without a new command.
 
-        Arguments are the shape to approach, (rows, columns) nm of surface, and the run's time since the previous
-        command, ns; without a new command, since the last call; infinite at first. Return the positions reached.
+        Return the positions reached. `actuators_nm` is the shape to approach, (rows, columns) nm of surface;
+        `elapsed_ns` the run's time since the previous command or, without a new one, the last call; infinite at first.
         """
         raise NotImplementedError
 

@@ -56,8 +56,8 @@ _NONE: Single = np.zeros(0, np.float32)
 def protection_of(driver: Mirror, config: Configuration) -> MirrorProtection:
     """Protection of a mirror, with the tighter of its driver's limits and those of [mirror].
 
-    ConfigurationError if its grid is not that of [mirror], or if its steps are not below every limit; ValueError if a
-    limit of the driver is impossible.
+    ConfigurationError if its grid is not that of [mirror], or if the driver's step is not below every limit; ValueError
+    if a limit of the driver is impossible.
     """
     own, configured = driver.geometry, geometry(config)
     if (own.rows, own.columns) != (configured.rows, configured.columns):
@@ -105,7 +105,7 @@ class MirrorLoop:
         self._start_check = StartCheck(service.clock, config.control.max_start_ahead_h, report_ahead)
         flat_nm = np.zeros(self._protection.grid, np.float32)
         self._status = Status(flat_nm, flat_nm)
-        self._known = self._returning = False
+        self._position_known = self._returning = False
         self._driven_nm: Single | None = None
         with contextlib.suppress(_LostError):
             self._start(flat_nm)
@@ -121,12 +121,12 @@ class MirrorLoop:
             self._status = Status(flat_nm, self._drive(flat_nm, np.inf))
         else:
             self._status, self._driven_nm = Status(held_nm, held_nm), held_nm
-        self._known = True
+        self._position_known = True
 
     def run(self) -> None:
         """Run the command timeout and the recovery from faults; the receive thread applies commands."""
         service = self._service
-        with self.watch.over(self._close, self._fill_extra):
+        with self.watch.until_closed(self._close, self._fill_extra):
             while service.running:
                 time.sleep(TICK_NS * 1e-9)
                 acquired = self._driver_lock.acquire(timeout=TICK_NS * 1e-9)
@@ -218,13 +218,13 @@ class MirrorLoop:
                 return shape_nm
         except (Exception, SystemExit) as fault:  # a driver's `sys.exit` would end only the receive thread
             self.watch.failed(fault)
-        self._known, self._returning, self._driven_nm = False, True, None
+        self._position_known, self._returning, self._driven_nm = False, True, None
         self._status = self._status._replace(following=False, channels={}, command_nm=_NONE)
         raise _LostError
 
     def _report_hang(self) -> None:
         """Publish the position as unknown; called on the watch's thread."""
-        self._known, self._refused = False, Rejection.NO_MIRROR
+        self._position_known, self._refused = False, Rejection.NO_MIRROR
         self._publish(self._service.clock.now_ns())
 
     def _return_to_idle(self) -> None:
@@ -238,7 +238,7 @@ class MirrorLoop:
             else:  # the failed call may have moved the mirror: repeat the last shape, surely within the slew limit
                 protection = replace(protection, flatten=False)
         self._status = tick(protection, self._status, self._service.clock.now_ns(), self._drive)
-        self._known = True
+        self._position_known = True
         self._returning = self._protection.flatten and bool(self._status.driven_nm.any())
         if not self._returning:
             self._refused = None
@@ -260,10 +260,12 @@ class MirrorLoop:
 
     def _publish(self, time_ns: int) -> None:
         status = self._status
-        self._states.put(state_of(status, time_ns, self._refused, known=self._known).SerializeToString())
+        self._states.put(
+            state_of(status, time_ns, self._refused, position_known=self._position_known).SerializeToString()
+        )
         now_ns = self._service.clock.now_ns()  # not `time_ns`, which may be the time in a command, and wrong
         self._state_due_ns = now_ns + IDLE_STATE_NS
-        if now_ns >= self._picture_due_ns and self._known:
+        if now_ns >= self._picture_due_ns and self._position_known:
             picture = np.asarray(self._y_factors @ status.surface_nm @ self._x_factors.T, np.float32)
             self._surfaces.put(image(picture, time_ns, "mirror").SerializeToString())
             self._picture_due_ns = now_ns + int(1e9 / float(SURFACE.rate))
@@ -277,17 +279,19 @@ class MirrorLoop:
         self.watch.fill(self._fill_extra, health)
 
 
-def state_of(status: Status, time_ns: int, refused: Reason | None = None, *, known: bool = True) -> wire.MirrorState:
-    """Message of a mirror's state: why the last command was `refused`, and whether the mirror's position is `known`."""
+def state_of(
+    status: Status, time_ns: int, refused: Reason | None = None, *, position_known: bool = True
+) -> wire.MirrorState:
+    """Message of a mirror's state; `refused` is the reason if the last command was refused."""
     rows, columns = status.surface_nm.shape
-    following = wire.MIRROR_STATUS_FOLLOWING if status.following and known else wire.MIRROR_STATUS_EXPIRED
+    following = wire.MIRROR_STATUS_FOLLOWING if status.following and position_known else wire.MIRROR_STATUS_EXPIRED
     return wire.MirrorState(
         timestamp=timestamp(time_ns),
         frame_sequence=status.frame_sequence,
-        status=following if status.received_ns or not known else wire.MIRROR_STATUS_WAITING,
+        status=following if status.received_ns or not position_known else wire.MIRROR_STATUS_WAITING,
         rows=rows,
         columns=columns,
-        actuators=status.surface_nm.tobytes() if known else b"",
+        actuators=status.surface_nm.tobytes() if position_known else b"",
         command_nm=status.command_nm.tolist(),
         limits_hit=[reason.value for reason in status.limits_hit],  # type: ignore[misc]  # numbered alike
         channels=sorted(status.channels),
@@ -297,7 +301,7 @@ def state_of(status: Status, time_ns: int, refused: Reason | None = None, *, kno
 
 
 def command_of(payload: bytes, start_check: StartCheck | None = None) -> Command:
-    """Decode a command; DecodeError if it is not one, BadMessageError if its sequence or time is impossible."""
+    """Decode a MirrorCommand; DecodeError if it cannot be read, BadMessageError for an impossible sequence or time."""
     message = wire.MirrorCommand.FromString(payload)
     return Command(
         message.channel,

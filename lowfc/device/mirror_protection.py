@@ -24,8 +24,8 @@ AHEAD_NS = 1_000_000_000
 
 
 Move = Callable[[Single, float], Single]
-"""Function that drives the actuators (rows, columns), nm of surface, and returns their positions; its second argument
-is the run's time, ns, since the previous command; without a new command, since the last call; infinite at first."""
+"""Function that drives the actuators (rows, columns), nm of surface, and returns their positions. Its second argument
+is the run's time, ns, since the previous command or, without a new one, since the last call; infinite at first."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class Status(NamedTuple):
     """State of the mirror.
 
     Attributes:
-        driven_nm: (rows, columns) as sent to the driver, before its rounding; within the limits, unless it was read
-            back from the driver.
+        driven_nm: (rows, columns) shape sent to the driver, before its rounding, nm of surface; within the limits,
+            unless it was read back from the driver.
         surface_nm: (rows, columns) positions of the actuators, nm of surface.
         channels: last shape (rows, columns) of each command channel, nm of surface; the mirror applies their sum.
         command_nm: modal command of the last command; empty if the mirror's own limits changed it.
@@ -111,7 +111,7 @@ def apply_command(
     move: Move,
     others_nm: Single | None = None,
 ) -> tuple[Status, Reason | None]:
-    """Apply a command received at `now_ns`; return the status, unchanged if the command is refused, and why it is.
+    """Apply a command received at `now_ns`; return the new status and None, or the former one and why it was refused.
 
     `others_nm` (rows, columns) is the shape of other programs on the mirror; it uses part of the stroke.
     """
@@ -148,7 +148,7 @@ def apply_command(
 
 
 def _limited(protection: MirrorProtection, previous_nm: Single, target_nm: Single, others_nm: Single | None) -> Limited:
-    """Limit the command so that its sum with other programs' shape exceeds the stroke no more than theirs alone."""
+    """Limit the command so that its sum with other programs' shape exceeds the stroke no more than that shape alone."""
     if others_nm is None or not others_nm.any() or not finite(target_nm):
         return limit(protection.tighter, previous_nm, target_nm)
     stroke_nm = np.float32(protection.tighter.kept_stroke_nm)

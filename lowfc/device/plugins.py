@@ -40,7 +40,7 @@ def load(kind: Kind, name: str) -> Any:
                     f"the driver {name!r} cannot be loaded: file and class must have names of letters, digits and _, "
                     "as in folder/my_camera.py:MyCamera: rename the file or the class"
                 )
-            # `python -P` excludes the current folder
+            # also with `python -P`, whose search path has no current folder
             sys.path.insert(0, str(Path(module).resolve().parent if module.endswith(".py") else Path.cwd()))
             point = EntryPoint(name, f"{section(name)}:{attribute}", f"lowfc.{kind}s")
         elif name in (known := installed(kind)):
@@ -66,13 +66,13 @@ def section(name: str) -> str:
     return Path(module).stem if module.endswith(".py") else module
 
 
-def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = (), driver: Any = None) -> Any:
-    """Open a driver with the options of the configuration, overridden by `words` ("--key", "value" or "--key=value").
+def opened(kind: Kind, name: str, config: Configuration, arguments: Sequence[str] = (), driver: Any = None) -> Any:
+    """Open a driver with the options of the configuration, overridden by `arguments` (--key value, --key=value).
 
     `driver` is its class, if known. ConfigurationError if it cannot be loaded or opened, or an option is wrong.
     """
     driver = load(kind, name) if driver is None else driver
-    values = options(driver, table(config, kind, name), words)
+    values = options(driver, table(config, kind, name), arguments)
     with opening(f"the {kind} {name!r} cannot be opened"):
         return driver(values, config)
 
@@ -124,17 +124,17 @@ def _nested(tables: dict[str, Any], name: str) -> dict[str, Any]:
     return nested if isinstance(nested, dict) else {}
 
 
-def options(driver: Any, configured: dict[str, Any], words: Sequence[str] = ()) -> DriverOptions:
-    """Options of a driver's class from a table, overridden by the words of a command line, `--key value`.
+def options(driver: Any, configured: dict[str, Any], arguments: Sequence[str] = ()) -> DriverOptions:
+    """Options of a driver's class from a table, overridden by command-line arguments `--key value`.
 
     ConfigurationError if one is unknown or wrong.
     """
     model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
-    values, faults = {key: _choice(model, key, value) for key, value in _parsed(words).items()}, []
+    values, faults = {key: _choice(model, key, value) for key, value in _parsed(arguments).items()}, []
     try:
         # In JSON, as in TOML, a list stands for a tuple, and text for a path or an enum.
         validated = model.model_validate_json(json.dumps(configured, default=str))
-    except ValidationError as error:  # options missing here may be among the words
+    except ValidationError as error:  # options missing here may be among the arguments
         faults = [detail for detail in error.errors() if not (values and detail["type"] == "missing")]
     if values and not faults:
         try:
@@ -186,10 +186,10 @@ def _explained(fault: Any, model: type[DriverOptions]) -> str:
     return explain(fault)
 
 
-def _parsed(words: Sequence[str]) -> dict[str, Any]:
+def _parsed(arguments: Sequence[str]) -> dict[str, Any]:
     """Parse a command line into values by field name; lists and tables are written as in TOML."""
     values: dict[str, Any] = {}
-    remaining = list(words)
+    remaining = list(arguments)
     while remaining:
         key, equals, value = remaining.pop(0).partition("=")
         if not key.startswith("--") or not (equals or remaining):

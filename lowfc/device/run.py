@@ -22,7 +22,7 @@ from lowfc.device.watch import closed_on_fault, opening
 
 
 def driver_command(kind: Kind, name: str | None = None) -> type[TyperCommand]:
-    """Make a command whose help lists the options of the driver `name`, if None of the command's argument `driver`."""
+    """Make a command whose help lists the options of a driver: `name`, or if None the command's argument `driver`."""
 
     class WithOptions(TyperCommand):
         driver = name
@@ -33,9 +33,9 @@ def driver_command(kind: Kind, name: str | None = None) -> type[TyperCommand]:
 
         def format_options(self, ctx: Any, formatter: Any) -> None:
             super().format_options(ctx, formatter)
-            words = {word for parameter in self.params for word in parameter.opts}  # not passed on to the driver
+            own = {option for parameter in self.params for option in parameter.opts}  # not passed on to the driver
             rows = options_help(load(kind, self.driver)) if self.driver else []
-            rows = [row for row in rows if row[0].split()[0] not in words]
+            rows = [row for row in rows if row[0].split()[0] not in own]
             if rows:
                 with formatter.section(f"Options of the driver {self.driver}"):
                     formatter.write_dl(rows)
@@ -44,7 +44,7 @@ def driver_command(kind: Kind, name: str | None = None) -> type[TyperCommand]:
 
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": ["-h", "--help"]}
-"""Settings of a command that passes unknown words to the driver as its options."""
+"""Settings of a command that passes unknown arguments to the driver as its options."""
 Frames = Annotated[int | None, typer.Option(min=1, help="Stop after this many frames; default: at Ctrl-C or SIGTERM.")]
 LEAVE_S = 2.0
 """Longest time for which an ending controller waits for a camera in its process."""
@@ -62,7 +62,7 @@ def run_camera(
         driver: driver of the camera.
         config: configuration of the run.
         run: name of the run.
-        frames: number of frames after which it stops.
+        frames: number of frames after which it stops; None: no limit.
         wait_for: processes that the first frame waits for.
 
     Raises:
@@ -75,7 +75,7 @@ def run_camera(
         if config.lockstep and own_method(driver, "step", CameraExtras.step) is None:
             raise ConfigurationError(
                 "in lockstep a camera waits for the mirror after each frame, and this driver has no method `step` that "
-                "does; leave out lockstep"
+                "does so; leave out lockstep"
             )
         service = join(config, run, Role.CAMERA, config.realtime.camera_cpus)
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter

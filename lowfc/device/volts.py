@@ -1,4 +1,4 @@
-"""Conversion from nm of surface to clipped drive values in the vendor's order of channels."""
+"""Linear conversion from nm of surface to clipped drive values in the vendor's order of channels."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class VoltOptions(DriverOptions):
 
 
 class VoltMap:
-    """Converts a surface to channel values and back; `channels` includes channels without an actuator."""
+    """Converts a surface to channel values and back, linearly; `channels` includes channels without an actuator."""
 
     def __init__(self, options: VoltOptions, config: Configuration, channels: int | None = None) -> None:
         """Read the maps; `channels` is the number of channels of the electronics, if known.

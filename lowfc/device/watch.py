@@ -44,7 +44,7 @@ def described(fault: Exception | SystemExit) -> str:
 
 @contextmanager
 def opening(what: str) -> Iterator[None]:
-    """Turn any exception of a driver that is not watched yet, except `LowfcError`, into a ConfigurationError."""
+    """Raise any exception of a driver that is not watched yet, except `LowfcError`, as a ConfigurationError."""
     try:
         yield
     except LowfcError:
@@ -75,13 +75,13 @@ class DriverWatch:
         retry_ns: time before which the driver is not called, ns of the host's clock.
     """
 
-    def __init__(self, service: Service, timeout_s: float, hanging: Callable[[], None] = lambda: None) -> None:
-        """Set the timeout of a call, after which `hanging` is called on another thread."""
+    def __init__(self, service: Service, timeout_s: float, on_hang: Callable[[], None] = lambda: None) -> None:
+        """Set the timeout of a call, after which `on_hang` is called on another thread."""
         self.failures = self.failed_ns = self.retry_ns = 0
         self.hangs, self.why = False, ""
         self.timeout_s = timeout_s
         self._service = service
-        self._hanging = hanging
+        self._on_hang = on_hang
         self._calls = self._checked_call = self._checks = self._consecutive = self._since_recovery = 0
         self._in_call = False
         self._kind, self._reported_ns, self._fields = "", 0, wire.Health()
@@ -89,10 +89,10 @@ class DriverWatch:
         self._ending = threading.Lock()  # a call does not end while it is being reported as hanging
 
     @contextmanager
-    def over(
+    def until_closed(
         self, close: Callable[[], None], fill: Callable[[wire.Health], None], finish: Callable[[], None] = lambda: None
     ) -> Iterator[None]:
-        """Watch on a separate thread; at the end call `finish`, `fill` (for the last Health) and `close`."""
+        """Watch on a separate thread during the block; then call `finish`, `fill` (for the last Health) and `close`."""
         threading.Thread(target=self._run_checks, name="driver's watch", daemon=True).start()
         try:
             yield
@@ -173,7 +173,7 @@ class DriverWatch:
                 self.hangs, self.why = True, "the driver does not return"
                 self._count()
                 self._service.event("DRIVER_HANGS", hangs_s=self._checks * CHECK_S)
-                self._hanging()
+                self._on_hang()
 
     def _count(self) -> None:
         self.failures += 1

@@ -58,7 +58,7 @@ class MemoryPublisher:
 
 
 class MemoryRing:
-    """See `Ring`; but `receive_time_ns` is the time of the put. It is closed when nobody refers to it any more."""
+    """Ring buffer; see `Ring`, but `receive_time_ns` is the time of the put. It is closed once nobody refers to it."""
 
     def __init__(self, bus: "MemoryBus", topic: Topic, capacity: int) -> None:
         self.waiting: deque[Sample] = deque(maxlen=capacity)

@@ -48,7 +48,7 @@ class AravisCamera:
             return [Need("aravis", "", str(fault))]
         aravis.update_device_list()
         detected = [aravis.get_device_id(index) for index in range(aravis.get_n_devices())]
-        advice = "connect one; `arv-tool-0.8` lists them"
+        advice = "connect one; `arv-tool-0.8` lists the connected cameras"
         return [Need("aravis", "0.8", ""), Need("a camera", ", ".join(detected), advice)]
 
     def start(self) -> None:

@@ -65,7 +65,7 @@ class IsioMirror:
         self._service = service
 
     def position(self) -> Single | None:
-        """Present shape of the channel, as far as written if its writer died.
+        """Present shape of the channel; only partly the new one if its writer died during a write.
 
         None if it is not finite: at its start the mirror's process then writes zeros.
         """
@@ -81,7 +81,7 @@ class IsioMirror:
         return self._beside[1]
 
     def apply(self, actuators_nm: Single) -> Single | None:
-        """Write the channel (rows, columns); return its part of the sum if that is updated in time and differs."""
+        """Write the channel (rows, columns); return its part of the sum if updated in time and different, else None."""
         self._reopen()
         self._check_writer()
         total = self._current_total()
