@@ -14,7 +14,7 @@ from lowfc.contract.messages import COMMAND, HEALTH, RECORD_KEY, REQUEST_KEY, TO
 ROUTER = "router"
 """Role of the router itself: its common name, and its name in Health."""
 CLOCK_KEY = "lowfc/clock"
-"""Key of the queryable that answers with the router's time; in a run on several hosts, envelopes have this time."""
+"""Key of the queryable that answers with the router's time, which envelopes carry in a run on several hosts."""
 
 _LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # never part of a run on several hosts
 

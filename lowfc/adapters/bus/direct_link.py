@@ -166,7 +166,7 @@ class DirectReader:
             self._leave_bus()
 
     def close(self) -> None:
-        """Stop forwarding, without waiting for a running handler; not to be called on a forwarding thread."""
+        """Stop forwarding, even if a handler never returns; not to be called on a forwarding thread."""
         if self._closed:
             return
         self._closed = True

@@ -71,7 +71,7 @@ def contrast_of(config: Configuration) -> ModalContrast:
 
 
 def known_contrast(config: Configuration | None) -> ModalContrast | None:
-    """`contrast_of` a log's or loop's configuration; None without a configuration, or with a warning if it fails."""
+    """Result of `contrast_of` for a log or running loop; None without configuration, or with a warning if it fails."""
     try:
         return None if config is None else contrast_of(config)
     except LowfcError as error:

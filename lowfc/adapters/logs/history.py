@@ -163,7 +163,7 @@ class History:
         return frame_rate_hz(self.camera, self.steps)
 
     def camera_lag_ns(self, process: str) -> int:
-        """Time, ns, to add to a frame's time for that on another process's clock; the recorder's for publish times."""
+        """Correction to add to a frame's time for another process's clock, ns; publish times are on the recorder's."""
         camera, other = (self.health.get(name, wire.Health()) for name in (Role.CAMERA, process))
         return camera.router_offset_ns - other.router_offset_ns
 
