@@ -373,7 +373,7 @@ def test_a_task_expands_a_tilde_and_its_load_field_takes_yes_or_no() -> None:
     assert dark.command({"frames": "9", "out": "~/dark.fits"}, RUN)[3:7] == ["--frames", "9", "--out", out]
     for answer, expected in (("y", ["--load"]), ("Yes", ["--load"]), ("n", []), ("NO", []), ("", [])):
         assert dark.command({"load": answer}, RUN) == [*dark.task, *expected, "--run", RUN]
-    with pytest.raises(ConfigurationError, match="load is yes or no, got 'yep': write yes, y, no or n"):
+    with pytest.raises(ConfigurationError, match="load must be yes or no, got 'yep': write yes, y, no or n"):
         dark.command({"load": "yep"}, RUN)
 
 

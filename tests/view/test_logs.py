@@ -260,7 +260,7 @@ def test_a_log_larger_than_the_memory_of_the_viewer_gives_a_remark() -> None:
     assert memory_remarks(511_000_000, target) == []
     [remark] = memory_remarks(1_652_000_000, target)
     assert remark.startswith(
-        "the log has 1652 MB, the viewer keeps 512 MB (--memory-mb): curves of every frame may begin late"
+        "the log has 1652 MB, the viewer keeps 512 MB (--memory-mb): curves with a point for every frame may begin late"
     )
 
 

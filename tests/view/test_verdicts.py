@@ -18,7 +18,7 @@ from lowfc.programs.view.verdicts.steady import ResidualComparison
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict
 from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
-from lowfc.programs.view.verdicts.wavefront_verdict import factor, merit
+from lowfc.programs.view.verdicts.wavefront_verdict import merit, reduction_of
 from tests.support.report_log import SyntheticLog
 from tests.support.stage import MAS, Stage, Tape, tile
 from tests.support.toy import START
@@ -372,8 +372,8 @@ def test_a_loop_is_good_if_it_corrects_and_other_gains_would_not_do_better(
 
 
 def test_noise_is_subtracted_before_a_measured_wavefront_is_judged() -> None:
-    assert factor(5.0, 13.0, 0.0) == pytest.approx(2.6)
-    assert factor(5.0, 13.0, 4.0) == pytest.approx(np.sqrt(13**2 - 4**2) / 3)
+    assert reduction_of(5.0, 13.0, 0.0) == pytest.approx(2.6)
+    assert reduction_of(5.0, 13.0, 4.0) == pytest.approx(np.sqrt(13**2 - 4**2) / 3)
 
 
 def test_a_loop_that_corrects_little_is_neutral_and_so_is_its_headline() -> None:

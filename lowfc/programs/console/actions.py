@@ -46,7 +46,7 @@ class Action(NamedTuple):
         options = [word for name, value in given.items() for word in (f"--{name}", value)]
         answer = values.get(LOAD, "").lower()
         if answer not in ("y", "yes", "n", "no", ""):
-            raise ConfigurationError(f"load is yes or no, got {answer!r}: write yes, y, no or n; empty is no")
+            raise ConfigurationError(f"load must be yes or no, got {answer!r}: write yes, y, no or n; empty means no")
         load = ["--load"] if answer in ("y", "yes") else []
         return [*self.task, *options, *load, "--run", run]
 
@@ -89,21 +89,21 @@ _READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "law": ("law", _law),
     "calibration": ("calibration", _calibration),
 }
-"""The client's argument and the parser of each field of a request."""
+"""For each field of a request: the client's argument, and the parser of the operator's text."""
 _LABELS = {
     "modes": "modes: Noll indices as in 2,3 or 4-8; empty for all",
     "actuators": "shape: file (FITS or .npy), nm of surface; empty removes the channel",
     "law": "law: file (FITS); empty for the integrator",
     "calibration": "calibration: file (FITS)",
     "step values": "number of frames",
-    "gain values": "gain: one, or one for each mode; auto for automatic gains",
-    "leak values": "leak: one, or one for each mode",
-    "limit values": "limit: one, or one for each mode, nm rms of wavefront",
-    "offset values": "offset: one, or one for each mode, nm rms of wavefront; empty for zero",
+    "gain values": "gain: one value, or one for each mode; auto for automatic gains",
+    "leak values": "leak: one value, or one for each mode",
+    "limit values": "limit: one value, or one for each mode, nm rms of wavefront",
+    "offset values": "offset: one value, or one for each mode, nm rms of wavefront; empty for zero",
     "channel text": "name: up to 32 of a-z, 0-9 and -, starting with a letter",
     "note text": "note",
 }
-"""Label of each field of a request in a form, by the field or by request and field."""
+"""Label of a request's field in a form; the key is the field, or the request and the field."""
 
 
 def request_action(key: str, name: str, confirm: str = "") -> Action:
@@ -134,7 +134,7 @@ def _record(loop: Client, values: Values) -> Answer:
 
 
 _OUT = Field("out", "out: output file (FITS)", lambda: f"calibration-{datetime.now(UTC):%Y%m%dT%H%M%S}.fits")
-_LOAD = Field(LOAD, "load: load it into the loop, which must be open (yes, no)", lambda: "yes")
+_LOAD = Field(LOAD, "load: load the calibration into the loop, which must be open (yes, no)", lambda: "yes")
 _TARGET = (Field("target", "target"), Field("observer", "observer"))
 
 SAFE = request_action("s", "safe")
@@ -175,7 +175,7 @@ ACTIONS = (
             Field("method", "method: poke, hadamard, in-loop", lambda: "hadamard"),
             Field("snr", "snr: signal-to-noise ratio to reach in the noisiest mode", lambda: "70"),
             _OUT,
-            _LOAD._replace(label="load: load it into the loop (yes, no)"),
+            _LOAD._replace(label="load: load the calibration into the loop (yes, no)"),
         ),
         task=("calibrate",),
     ),

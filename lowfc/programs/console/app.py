@@ -186,7 +186,7 @@ class Console(OrderedKeys):
     def _do(self, action: Action, values: Values, form: Form | None = None) -> None:
         """Start a task, or send a request, in a new thread.
 
-        A request waits for the answer to the previous one of its button; those of SAFE do not wait.
+        A request waits for the answer to the previous request of the same button; SAFE does not wait.
         """
         self._answer(f"{action.name}: requested", ok=True)
         previous = self._requesting.get(action.name) if action is not SAFE else None
@@ -213,7 +213,7 @@ class Console(OrderedKeys):
         self._requesting[action.name].start()
 
     def _answered(self, action: Action, form: Form | None, text: str, *, ok: bool) -> None:
-        """Show the answer to an action, or why it failed, also in the form that was sent for it, if any."""
+        """Show the answer to an action, or why it failed; also in the form of the action, if it has one."""
         if self._torn_down:
             return
         self._answer(text, ok=ok)

@@ -31,7 +31,7 @@ TREND_S = 34
 _IMPORT_AFTER_S = 4.0
 """Time after which a thread does the slow imports: the first values do not need them."""
 _PUNCTUAL_S = 0.5
-"""Time between two readings up to which the values count as up to date."""
+"""Longest time between two readings for which the values count as up to date."""
 _TREND_STEP_NS = 1_000_000_000
 _HIDDEN_REQUESTS = frozenset(("status", "configuration", "renew"))
 """Periodic requests that change nothing."""
@@ -69,7 +69,7 @@ class Reading(NamedTuple):
 class Feed(Monitor):
     """Reads a run several times a second; it also queries the configuration."""
 
-    _patience_s = 1.0  # longer than in the base class, since queries have their own thread here
+    _query_timeout_s = 1.0  # longer than in the base class, since queries have their own thread here
 
     def __init__(self, bus: Bus, run_id: str, clock: Clock) -> None:
         """Subscribe."""
@@ -96,11 +96,11 @@ class Feed(Monitor):
         self._frame = self._frame if snapshot.frame is None else snapshot.frame
         self._extend_trend(state, host_ns)
         newest_ns = max(snapshot.sent_ns.values(), default=0)
-        per_mas = None if self._config is None else tilt_nm_per_mas(self._config.star.diameter_m)
+        nm_per_mas = None if self._config is None else tilt_nm_per_mas(self._config.star.diameter_m)
         return Reading(
             (host_ns - newest_ns) * 1e-9 if newest_ns else None,
             state,
-            judge(state, per_mas),
+            judge(state, nm_per_mas),
             self._frame,
             self.steps.command_nm[-1:].ravel(),
             [request for request in requests if request is not None],
@@ -121,14 +121,14 @@ class Feed(Monitor):
     def _query(self) -> None:
         """Query in a thread, because a frozen process delays the answer.
 
-        Each query of the configuration is a request in the log, so there is one for each start of the controller.
+        The configuration is queried once for each start of the controller, because each query is a request in the log.
         """
         query = super()._query
 
         def query_all() -> None:
             with contextlib.suppress(LowfcError):  # the console ends, or there is no controller that sends Health yet
                 query()
-                controller = {known for known in self._known if known[0] == Role.CONTROLLER}
+                controller = {process for process in self._known_processes if process[0] == Role.CONTROLLER}
                 if self._config is None or controller != self._configured:
                     self._config = configuration_of(Client(self._run_id, bus=self._bus))
                     self._configured = controller

@@ -19,15 +19,15 @@ STEP, FINE_STEP = 0.05, 0.01
 FINE_BELOW = 0.1
 """Knobs below this gain are turned in fine steps."""
 _BAR = 8  # columns of the bar without its mark
-_BEFORE = 11  # columns before the bar
-_PENDING_S = 1.0  # time for which a knob shows the requested gain: by then the controller's state has it
+_BAR_START = 11  # columns before the bar
+_PENDING_S = 1.0  # time for which a knob shows the requested gain, until the controller reports it
 
 
 class Gains(Lines):
     """The knobs, scrolled to the chosen one. Keys or a click turn a knob; the gains of its modes keep their ratios."""
 
     def __init__(self, send: Callable[[Sequence[int], Sequence[float]], None]) -> None:
-        """Make the knobs; `send` is called with the modes of a turned knob and their gains, none for automatic ones."""
+        """Make the knobs; `send` receives the modes of a knob and their new gains; no gains mean automatic ones."""
         super().__init__("gains")
         self._send = send
         self._chosen = self._top = 0  # index of the chosen knob, and of the first one shown
@@ -73,8 +73,8 @@ class Gains(Lines):
         """Choose a knob, and turn it to where its bar was clicked."""
         if 0 <= event.y < len(groups(self._noll)) - self._top:
             self._chosen = self._top + event.y
-            if _BEFORE <= event.x <= _BEFORE + _BAR:
-                self._request(self._chosen, (event.x - _BEFORE) / _BAR * HIGHEST)
+            if _BAR_START <= event.x <= _BAR_START + _BAR:
+                self._request(self._chosen, (event.x - _BAR_START) / _BAR * HIGHEST)
             self._draw()
 
     def _request(self, number: int, gain: float) -> None:
@@ -95,16 +95,16 @@ class Gains(Lines):
         lines = []
         for number, (name, _) in enumerate(groups(self._noll)):
             gain, indices = self._shown_gain(number), self._indices(number)
-            at = round(min(max(gain / HIGHEST, 0.0), 1.0) * _BAR)
+            filled = round(min(max(gain / HIGHEST, 0.0), 1.0) * _BAR)
             lowest = float(self._gain[indices].min())
             range_start = "" if lowest >= 0.99 * gain else f"{lowest:.2g}-"
             chosen = number == self._chosen
             lines.append(
                 Text.assemble(
-                    (f"{'▸' if chosen else ' '}{name:{_BEFORE - 1}}", BOLD if chosen else DIM),
-                    ("━" * at, style(BLUE)),
+                    (f"{'▸' if chosen else ' '}{name:{_BAR_START - 1}}", BOLD if chosen else DIM),
+                    ("━" * filled, style(BLUE)),
                     ("●", BOLD),
-                    ("━" * (_BAR - at), style(GREY)),
+                    ("━" * (_BAR - filled), style(GREY)),
                     f" {range_start}{gain:.2g}" if range_start else f" {gain:.3g}",
                     (" auto" if self._automatic[indices].all() else "", DIM),
                 )

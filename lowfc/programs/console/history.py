@@ -1,4 +1,4 @@
-"""Events and requests, newest last; an event that repeats is one line with its count."""
+"""Events and requests, newest last; a repeated event is one line with its count."""
 
 import re
 from collections import deque
@@ -22,7 +22,7 @@ class History:
         self._lines: deque[tuple[wire.Request | Log, int]] = deque(maxlen=_LINES)
 
     def add(self, entry: wire.Request | Log) -> None:
-        """Add an event or request; an event that repeats one of the last lines replaces it."""
+        """Add an event or request; an event that repeats one of the last lines replaces that line."""
         times = 1
         for line in reversed(range(len(self._lines))[-_SEARCHED:]):
             if _repeats(self._lines[line][0], entry):

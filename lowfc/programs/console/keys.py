@@ -37,7 +37,7 @@ class OrderedKeys(App[str]):
             await self._next_key(self._turn)
 
     async def _next_key(self, turn: int) -> None:
-        """Send the next key, unless it has been sent since `turn`."""
+        """Send the next key, unless another call has sent it since `turn`."""
         if turn != self._turn:
             return
         self._turn += 1

@@ -67,7 +67,7 @@ def tiles(reading: Reading) -> list[Text]:
 
 
 def pictures(reading: Reading) -> list[Text]:
-    """The newest frame and the mirror, small."""
+    """The newest frame and the mirror's surface, as small pictures with captions."""
     lines = [Text() for _ in range(_PIXELS // 2)]
     captions = []
     mirror = reading.state.mirror_state
@@ -91,7 +91,7 @@ def reduced(array: Array) -> Array:
     for axis in (0, 1):
         edges = np.linspace(0, array.shape[axis], _PIXELS + 1).astype(int)[:-1]
         sizes = np.diff([*edges, array.shape[axis]])
-        sums = np.add.reduceat(array, edges, axis=axis)  # with fewer pixels than parts, some are repeated
+        sums = np.add.reduceat(array, edges, axis=axis)  # with fewer pixels than parts, some pixels are repeated
         array = sums / np.maximum(sizes, 1).reshape((-1, 1) if axis == 0 else (1, -1))
     return array
 
@@ -122,7 +122,7 @@ def sparks(reading: Reading) -> list[Text]:
 
 def sparkline(values: Sequence[float]) -> str:
     """Values as bars from zero to the largest; a negative value has the lowest bar, NaN a space."""
-    bounded = np.minimum(values, np.finfo(float).max)  # the share of infinity would be NaN
+    bounded = np.minimum(values, np.finfo(float).max)  # infinity / infinity is NaN
     largest = max(np.nanmax(bounded, initial=0.0), 1e-9)
     return "".join(" " if np.isnan(one) else _SPARKS[min(int(max(one, 0.0) / largest * 8), 7)] for one in bounded)
 
@@ -150,7 +150,7 @@ def modes(reading: Reading, width: int) -> list[Text]:
 def _mode(noll: int, command_nm: float, limit_nm: float, width: int) -> Text:
     numbers_text = f"{command_nm:+6.1f}/{limit_nm:.0f}" if width >= 22 else ""
     half = max(1, (width - 4 - 11 * bool(numbers_text)) // 2)
-    share = abs(command_nm) / limit_nm if abs(command_nm) < limit_nm else 1.0  # NaN of another program fills the bar
+    share = abs(command_nm) / limit_nm if abs(command_nm) < limit_nm else 1.0  # a NaN from outside fills the bar
     bar = "█" * round(share * half)
     left, right = (f"{bar:>{half}}", " " * half) if command_nm < 0 else (" " * half, f"{bar:{half}}")
     ink = WRONG if share >= _NEAR_LIMIT else style(ORANGE)
@@ -160,9 +160,9 @@ def _mode(noll: int, command_nm: float, limit_nm: float, width: int) -> Text:
 
 def facts(reading: Reading) -> Text:
     """Settings: law, offset and channels, lease or last note."""
-    known, state = reading.verdict.facts, reading.state.snapshot.controller
-    law = _GAINS.sub("", known["CONTROL LAW"])
-    rows = {"law": law, "shapes": known["OFFSET AND CHANNELS"], "note": known["LAST NOTE"]}
+    by_title, state = reading.verdict.facts, reading.state.snapshot.controller
+    law = _GAINS.sub("", by_title["CONTROL LAW"])
+    rows = {"law": law, "shapes": by_title["OFFSET AND CHANNELS"], "note": by_title["LAST NOTE"]}
     if state is not None and state.lease.id and not state.lease.ended:
         rows["note"] = f"reserved for {printable(state.lease.holder)}"
     return Text("\n").join(Text.assemble((f"{name:7}", DIM), value) for name, value in rows.items())

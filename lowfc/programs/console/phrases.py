@@ -16,7 +16,7 @@ _LIST = re.compile(rf"(?<![\w.]){_NUMBER}(?: {_NUMBER}){{3,}}(?![\w.])")
 
 
 def phrased(text: str) -> str:
-    """A sentence with the console's keys, and short enough for its lines."""
+    """Text with the console's keys in place of commands, and the ranges of long lists of numbers."""
     return _LIST.sub(lambda match: numbers([float(word) for word in match[0].split()]), _COMMAND.sub(_key, text))
 
 

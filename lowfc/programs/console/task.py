@@ -14,17 +14,17 @@ _TAIL_BYTES = 4000
 class Task:
     """A command in its own process, with the name of its button; its output goes to the file `output`."""
 
-    def __init__(self, name: str, words: Sequence[str]) -> None:
+    def __init__(self, name: str, arguments: Sequence[str]) -> None:
         """Start `lowfc` with these arguments, in its own session: neither Ctrl-C nor a lost terminal reaches it."""
         self.name = name
         self._began_s = time.monotonic()
-        descriptor, path = tempfile.mkstemp(prefix=f"lowfc-{words[0]}-", suffix=".txt")
+        descriptor, path = tempfile.mkstemp(prefix=f"lowfc-{arguments[0]}-", suffix=".txt")
         self.output = Path(path)
         # ZENOH_RUNTIME is set for monitors; it would delay the messages of a command that computes.
         environment = {key: value for key, value in os.environ.items() if key != "ZENOH_RUNTIME"}
         with os.fdopen(descriptor, "wb") as stream:
             self._process = subprocess.Popen(  # noqa: S603  # our own program
-                [sys.executable, "-P", "-m", "lowfc", *words],  # -P: import nothing from the working directory
+                [sys.executable, "-P", "-m", "lowfc", *arguments],  # -P: import nothing from the working directory
                 stdin=subprocess.DEVNULL,
                 stdout=stream,
                 stderr=stream,

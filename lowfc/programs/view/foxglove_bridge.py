@@ -1,8 +1,8 @@
 """The bus as a Foxglove WebSocket server, for Foxglove and Lichtblick.
 
 Payloads are passed on unchanged; the schemas are those of the log. A channel hands its message to the server's threads
-and returns at once, so the bus's threads call its `log` directly. A client that does not read loses its oldest
-messages: at most 1024 wait for it.
+and returns at once, so the bus's threads call the channel's `log` directly. A client that does not read loses its
+oldest messages: at most 1024 wait for it.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ SHOWN = tuple(topic for topic in TOPICS if Role.VIEWER in topic.subscribers)
 """Topics to which a viewer subscribes."""
 
 _POLL_S = 0.05
-_PATIENCE_S = 0.2
+_QUERY_TIMEOUT_S = 0.2
 
 
 class FoxgloveBridge:
@@ -78,20 +78,20 @@ class FoxgloveBridge:
         self.join(bus)
 
     def join(self, bus: Bus) -> None:
-        """Subscribe on the bus of a run; the bus of an earlier run of the same name is closed by then."""
+        """Subscribe on the bus of a run; the bus of an earlier run of the same name is already closed."""
         self._bus, self._names = bus, Names()
         self.last_states.clear()
-        # Before the service subscribes to Health: peers take that for the last of the viewer's subscriptions.
+        # The service subscribes to Health after these: peers take that for the last of the viewer's subscriptions.
         for topic in SHOWN:
             bus.subscribe(topic, partial(self._publish, topic))
         self.service = Service(Role.VIEWER, self._run_id, self._clock, bus)
 
     def run(self, restarted: Callable[[], bool] = lambda: False) -> None:
-        """Serve until stopped, or until the run has `restarted`."""
+        """Serve until stopped, or until `restarted` returns True."""
         self.service.state = "running"
         while self.service.running and not restarted():
             if self.service.has_newcomers():
-                for topic, sample in last_messages(self._bus, SHOWN, _PATIENCE_S):  # published before the connection
+                for topic, sample in last_messages(self._bus, SHOWN, _QUERY_TIMEOUT_S):  # published before joining
                     last = self.last_states.get(sample.key)
                     if last is None or last.sequence < sample.sequence:
                         try:
@@ -141,7 +141,7 @@ class FoxgloveBridge:
 
 
 def serve_foxglove(run_id: str, clock: Clock, port: int) -> None:
-    """Serve a run, and each later one of its name, until SIGTERM or SIGINT; see `FoxgloveBridge`."""
+    """Serve a run, and each later run of the same name, until SIGTERM or SIGINT; see `FoxgloveBridge`."""
     bridge: FoxgloveBridge | None = None
     while bridge is None or bridge.service.running:
         joined = open_run(run_id, ())

@@ -56,8 +56,9 @@ def layout(
 ) -> rrb.Blueprint:
     """The layout as rerun's blueprint, with the tab `active` in front.
 
-    Plots show the last `window_s` seconds or, for a log, the interval `span_ns`; with neither, the viewer chooses. In a
-    `still` picture of a whole log, the operator's tab has curves and problems in place of pictures of the last instant.
+    Plots show the last `window_s` seconds or, for a log, the interval `span_ns`; if both are None, the viewer chooses.
+    In a `still` picture of a whole log, the operator's tab shows curves, warnings and errors of the whole log in place
+    of pictures of its last instant.
     """
     tabs = {
         Tab.OPERATOR: _whole_log() if still else _operator(),
@@ -71,7 +72,7 @@ def layout(
         _set_time_range(tabs.values(), absolute(nanos=span_ns[0]), absolute(nanos=span_ns[1]))
     return rrb.Blueprint(
         rrb.Tabs(*tabs.values(), active_tab=list(tabs).index(active)),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),  # a log is shown at its end
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),  # a log opens at its end
         rrb.TopPanel(state="collapsed"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),

@@ -38,18 +38,18 @@ OWN_BYTES = 512_000_000
 """Memory of this process above which the view restarts. Normal use is at most 390 MB: 160 MB for the process itself, 80
 MB in ring buffers, and 150 MB of data that the viewer has not read."""
 VIEWER_SPARE_BYTES = 1_500_000_000
-"""Memory granted to a viewer for textures, plots and window, beyond its limit for the stream."""
+"""Memory granted to a viewer for textures, plots and window, beyond `--memory-mb` for the stream."""
 STUCK_S = 10.0
 """Time without a drawn snapshot after which the viewer counts as hung."""
 MAX_EARLIER_EVENTS = 1000
 """Largest number of events shown from before the start of the view."""
 
-_RECORDER_S = 3.0  # after which a recorder without Health counts as absent
-_FILE_S = 60.0  # for the last data to be written to a file
+_RECORDER_S = 3.0  # time without its Health after which the recorder counts as absent
+_FILE_S = 60.0  # longest time for the last data to be written to a file
 _POLL_S = 0.1
 _CHECK_S = 1.0
 _FROZEN_S = 3.0  # a longer time between two checks means that this process was stopped meanwhile
-_MAX_RENEWALS = 5
+_MAX_RENEWALS = 5  # restarts within `_RENEWALS_S`; after more, the view ends
 _RENEWALS_S = 60.0
 
 
@@ -73,7 +73,7 @@ class LiveView:
         self._drawn = self.renewals = self.peak_bytes = 0
         self._renewed_s: deque[float] = deque(maxlen=_MAX_RENEWALS)
         self._stuck = self._earlier_events_requested = False
-        self._awake_s = self._began_s = time.monotonic()
+        self._resumed_s = self._began_s = time.monotonic()
         self._rings = {topic: bus.ring(topic, RING_LENGTHS[topic]) for topic in SHOWN}
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
@@ -98,7 +98,7 @@ class LiveView:
                 now_s = time.monotonic()
                 if now_s - checked_s >= _CHECK_S:
                     if now_s - checked_s > _FROZEN_S:
-                        self._awake_s = now_s  # the render thread could not draw before
+                        self._resumed_s = now_s  # the render thread could not draw while this process was stopped
                     checked_s = now_s
                     self._check(now_s)
         finally:
@@ -136,7 +136,7 @@ class LiveView:
                 self._renew(f"drawing failed: {fault!r}")  # raises a ViewError
 
     def _add_earlier(self, render: RenderThread) -> None:
-        """Add messages from before this view; in a thread, because a frozen peer answers late."""
+        """Add messages published before this view began; in a thread, because a frozen peer answers late."""
         recorder = self.service.last_health.get(Role.RECORDER)
         events_due = not self._earlier_events_requested and (
             recorder is not None or self._recorder_absent(time.monotonic())
@@ -159,7 +159,7 @@ class LiveView:
         assert render is not None  # noqa: S101  # `_begin` made it
         if self.service.has_newcomers() or (not self._earlier_events_requested and self._recorder_absent(now_s)):
             self._add_earlier(render)
-        own_bytes, stuck_s = resident_bytes(), now_s - max(render.drawn_s, self._awake_s)
+        own_bytes, stuck_s = resident_bytes(), now_s - max(render.drawn_s, self._resumed_s)
         viewer_bytes = viewer.resident_bytes() if viewer is not None else 0
         self.peak_bytes = max(self.peak_bytes, own_bytes)
         native = viewer is not None and viewer.show is Show.NATIVE
@@ -188,7 +188,8 @@ class LiveView:
     def _renew(self, why: str) -> None:
         """Restart with a new viewer on the same ports.
 
-        ViewError after too many restarts, and for a file, which cannot be continued: it is kept as it is.
+        It raises ViewError after too many restarts, or if the view is written to a file: a file is kept as it is, and
+        cannot be continued.
         """
         if self.viewer is None:
             raise ViewError(f"writing the view to a file failed: {why}")
@@ -219,19 +220,19 @@ def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
         return [_view_event("earlier events are not shown: there is no recorder", now_ns)]
     if recorder.host and recorder.host != platform.node():
         return [_view_event(f"earlier events are not shown: they are in the log on {recorder.host}", now_ns)]
-    found: list[Sample] = []
+    events: list[Sample] = []
     missing = []
     for name in reversed(recorder.recording.files):
         finished = Path(recorder.recording.folder, name.removesuffix(UNFINISHED))
         unfinished = finished.with_name(finished.name + UNFINISHED)
         log = unfinished if unfinished.exists() else finished
         try:
-            found = [*LogReader(log, topics=(EVENT,), skip_damaged=True, sparse=True), *found]
+            events = [*LogReader(log, topics=(EVENT,), skip_damaged=True, sparse=True), *events]
         except DataFileError as fault:
             missing.append(_view_event(f"some earlier events are missing: {fault}", now_ns))
-        if len(found) >= MAX_EARLIER_EVENTS:
+        if len(events) >= MAX_EARLIER_EVENTS:
             break
-    return [*found[-MAX_EARLIER_EVENTS:], *missing]
+    return [*events[-MAX_EARLIER_EVENTS:], *missing]
 
 
 def _view_event(text: str, now_ns: int) -> Sample:

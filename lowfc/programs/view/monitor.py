@@ -10,22 +10,22 @@ from lowfc.contract.messages import EVENT, STEP, SURFACE, TRUTH, Role
 from lowfc.programs.view.snapshot import SHOWN, Accumulator, Snapshot
 from lowfc.programs.view.verdicts.watcher import Watcher
 
-_RING_SIZES = {EVENT: 200, STEP: 4000, TRUTH: 200}  # messages; the newest 200 truths per reading suffice for an rms
-_QUERY_AGAIN_NS = 5_000_000_000  # until a controller that did not answer is queried again
+_RING_SIZES = {EVENT: 200, STEP: 4000, TRUTH: 200}  # messages; for an rms, 200 truths per snapshot suffice
+_QUERY_AGAIN_NS = 5_000_000_000  # time until a controller that did not answer is queried again
 
 
 def import_late_modules() -> None:
-    """Import the module that only a later verdict uses: imported then, it would delay all values of that reading."""
+    """Import the module that only later verdicts use: an import during a verdict would delay all values shown."""
     import_module("lowfc.control.laws.tuning")
 
 
 class Monitor:
-    """Receives as a monitor: messages wait in rings that keep the newest, so that the loop never waits for it.
+    """Receives through ring buffers, which keep the newest messages: the loop never waits for a monitor.
 
-    `watcher`: state of the run, from which the verdict is made. `steps`: the newest ones; none before the first.
+    `watcher`: state of the run, from which the verdict is made. `steps`: the newest steps; no row before the first.
     """
 
-    _patience_s = 0.2
+    _query_timeout_s = 0.2
     """Timeout of a query of one topic."""
 
     def __init__(self, bus: Bus, clock: Clock) -> None:
@@ -39,11 +39,11 @@ class Monitor:
         }
         self._accumulator = Accumulator(clock.now_ns() if clock.lockstep else None)
         self._answers: deque[Sample] = deque()
-        self._known: set[tuple[str, int]] = set()
+        self._known_processes: set[tuple[str, int]] = set()
         self._queried_ns = 0
 
     def snapshot(self, now_ns: int, behind_s: float = 0.0) -> Snapshot:
-        """Return the messages since the last call; states published by new processes are queried, for the next call."""
+        """Return the data since the last call; states of new processes are queried, and are in the next snapshot."""
         while self._answers:
             self._accumulator.add(self._answers.popleft())
         for ring in self._rings.values():
@@ -52,8 +52,8 @@ class Monitor:
         snapshot = self._accumulator.snapshot(now_ns, behind_s=behind_s)
         processes = {(name, last.start_s) for name, last in snapshot.health.items()}
         incomplete = Role.CONTROLLER in snapshot.health and not self._complete(snapshot)
-        if not processes <= self._known or (incomplete and now_ns - self._queried_ns > _QUERY_AGAIN_NS):
-            self._known, self._queried_ns = processes, now_ns
+        if not processes <= self._known_processes or (incomplete and now_ns - self._queried_ns > _QUERY_AGAIN_NS):
+            self._known_processes, self._queried_ns = processes, now_ns
             self._query()
         self.watcher.feed(snapshot)
         if snapshot.steps.mode.size:
@@ -61,9 +61,9 @@ class Monitor:
         return snapshot
 
     def _complete(self, snapshot: Snapshot) -> bool:
-        """Whether everything that is queried of the controller is known; subclasses may query more."""
+        """Whether all states queried of the controller have arrived; subclasses may query more."""
         return None not in (snapshot.calibration, snapshot.controller)
 
     def _query(self) -> None:
         """Query the states published earlier."""
-        self._answers.extend(sample for _, sample in last_messages(self._bus, SHOWN, self._patience_s))
+        self._answers.extend(sample for _, sample in last_messages(self._bus, SHOWN, self._query_timeout_s))

@@ -55,10 +55,10 @@ def draw_logs(
     drawn, accumulator = Drawn(), Accumulator()
     renderer: Renderer | None = None
     due_ns = first_ns = last_ns = ended_ns = earlier_bytes = 0
-    newest_frame = last_frame = -1, 0  # largest sequence and its publish time: so far, and in the logs before
+    newest_frame = last_frame = -1, 0  # largest sequence, and its publish time: so far, and before this log
     damaged, no_end, run, host = 0, "", "", ""
     stroke_nm: float | None = None
-    lost: dict[str, int] = {}  # by recording, whose last file has the count of all its files
+    lost: dict[str, int] = {}  # by recording; its last file has the count of all its files
     for log in logs:
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
         for number, message in enumerate(reader):
@@ -71,7 +71,7 @@ def draw_logs(
                 previous_run, run, host = run, recorded.get("run", "") or run, host or recorded.get("host", "")
                 if previous_run not in ("", run):
                     raise DataFileError(
-                        f"{log} is of run {run!r}, and the log before it of {previous_run!r}: show one run at a time"
+                        f"{log} is of run {run!r}, and the log before it is of {previous_run!r}: show one run at a time"
                     )
             topic = topic_of(message.key)
             if not topic.queryable and message.receive_time_ns < ended_ns - REORDERING_NS:
@@ -115,7 +115,7 @@ def draw_logs(
         if re.fullmatch("[0-9]{1,18}", account := reader.metadata.get("recording", {}).get("messages_lost", "")):
             lost[reader.metadata.get(PART, {}).get("of", log.name)] = int(account)
     if renderer is None:
-        raise DataFileError(f"nothing to show in {', '.join(map(str, logs))}: no message that a view shows")
+        raise DataFileError(f"nothing to show in {', '.join(map(str, logs))}: they have no message that a view shows")
     name, missing_files = logs[-1].name.partition(".")[0], missing_between(logs)
     ended = LogEnd(name, run, host, no_end, damaged, missing_files, sum(lost.values()), stroke_nm)
     renderer.draw(accumulator.snapshot(last_ns, ended=ended))
@@ -126,9 +126,9 @@ def draw_logs(
 
 
 def _configuration_of(reader: LogReader, remarks: list[str]) -> Configuration:
-    """The configuration in a log, or the default one; what cannot be used is added to the remarks."""
-    known, reasons = attached_configuration(reader)
+    """The configuration in a log, or the default one; reasons why parts of it are not used go to `remarks`."""
+    attached, reasons = attached_configuration(reader)
     remarks += reasons
-    if known is None:
+    if attached is None:
         remarks.append("the default configuration is used for pupil and telescope, because the log has no readable one")
-    return known or Configuration()
+    return attached or Configuration()

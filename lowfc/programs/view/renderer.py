@@ -134,7 +134,7 @@ class RenderThread(threading.Thread):
         due_s = began_s = complete_due_s = time.monotonic()
         while not self._abandoned:
             now_s = time.monotonic()
-            behind_s = max(0.0, now_s - began_s - 1 / PICTURES_HZ)  # waiting messages may be that old
+            behind_s = max(0.0, now_s - began_s - 1 / PICTURES_HZ)  # largest age of a waiting message
             began_s = now_s
             if complete := now_s >= complete_due_s:
                 complete_due_s = now_s + (PICTURES_PER_COMPLETE - 0.5) / PICTURES_HZ  # before the rings overflow
@@ -149,5 +149,5 @@ class RenderThread(threading.Thread):
             self.drawn_s = time.monotonic()
             due_s = max(due_s + 1 / PICTURES_HZ, self.drawn_s)
             time.sleep(due_s - self.drawn_s)
-        stream.flush()  # raises the fault of a full disk, unlike `disconnect`
+        stream.flush()  # unlike `disconnect`, raises an error if the disk is full
         stream.disconnect()

@@ -120,8 +120,8 @@ def memory_remarks(log_bytes: int, target: Target) -> list[str]:
     if target.save is not None or log_bytes <= target.memory_mb * 1e6:
         return []
     return [
-        f"the log has {log_bytes / 1e6:.0f} MB, the viewer keeps {target.memory_mb:g} MB (--memory-mb): curves of "
-        "every frame may begin late; trend, tiles and mode cover the whole log"
+        f"the log has {log_bytes / 1e6:.0f} MB, the viewer keeps {target.memory_mb:g} MB (--memory-mb): curves "
+        "with a point for every frame may begin late; trend, tiles and mode cover the whole log"
     ]
 
 

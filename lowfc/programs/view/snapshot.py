@@ -54,12 +54,12 @@ _UNREADABLE = (BadMessageError, DecodeError, KeyError, OverflowError, ValueError
 
 
 class Wavefronts(NamedTuple):
-    """The wavefront of some frames, nm: `residual`, and `open`, as it would be with a flat mirror.
+    """Residual wavefront of some frames, and `open`, the wavefront with a flat mirror: both true or both measured.
 
-    `residual_nm` and `open_nm` (frames, modes): true ones at the start of each exposure, or as measured.
-    `residual_rms_nm` and `open_rms_nm` (frames, modes): rms over the frame period if known, otherwise the same
-    values up to their signs. `rms_nm` (frames, 2): rms of residual and open, true ones over the open pupil, measured
-    ones of all modes.
+    `residual_nm` and `open_nm` (frames, modes): modes; true ones are those at the start of each exposure.
+    `residual_rms_nm` and `open_rms_nm` (frames, modes): rms of each mode over the frame period if it is known,
+    otherwise the modes themselves, with or without their signs. `rms_nm` (frames, 2): rms of residual and open; over
+    the open pupil if true, of all modes if measured.
     """
 
     sequence: Sequences
@@ -109,8 +109,8 @@ class Snapshot:
     """New data, and the latest states.
 
     Attributes:
-        time_ns: time on the timeline: that of the newest step (without a controller: frame), plus the host time since
-            then; in lockstep, the simulated time of that step alone.
+        time_ns: time on the timeline: time of the newest step (without a controller, of the newest frame) plus the host
+            time passed since then; in lockstep, only the simulated time of that step.
         host_ns: time of the snapshot by the host clock. `sent_ns`, the time of each topic's last message, and
             `LastHealth` are by the same clock.
         steps, truths, timings, events: new rows and events; timings are the durations of the controller's stages.
@@ -118,8 +118,8 @@ class Snapshot:
             none has arrived since the last snapshot or, in a `complete` one, since the last complete one. If there is a
             controller, `frame_ns` is at most `time_ns`, because the camera's clock may be ahead.
         calibration, camera, controller: the latest of each; None before the first. health: the latest by process.
-        complete: whether all new data are included; otherwise only the newest pictures are; rows and events
-            wait for a complete one.
+        complete: whether all new data are included. An incomplete snapshot has only the newest frame, mirror state and
+            surface; rows and events wait for a complete one.
         behind_s: longest time for which its messages may have waited.
         ended: end of the logs, in their last snapshot.
     """
@@ -160,7 +160,7 @@ class Snapshot:
 
     @property
     def new_exposures(self) -> Mask:
-        """Whether each step is of a new exposure and has its time, so that it can be drawn at that time."""
+        """Whether the frame of each step is a new exposure: only then is the step's time the time of an exposure."""
         return exposed(self.steps.reasons)
 
     @property
@@ -174,8 +174,8 @@ class Snapshot:
         if true:
             new = self.truths
             rms_nm = np.stack([new.residual_rms_nm, new.disturbance_rms_nm], axis=1)
-            over = new.modes_residual_rms_nm, new.modes_disturbance_rms_nm
-            return Wavefronts(new.sequence, new.time_ns, new.residual_nm, new.disturbance_nm, *over, rms_nm)
+            modes_rms_nm = new.modes_residual_rms_nm, new.modes_disturbance_rms_nm
+            return Wavefronts(new.sequence, new.time_ns, new.residual_nm, new.disturbance_nm, *modes_rms_nm, rms_nm)
         steps, used = self.steps, self.used
         modes_nm = steps.error_nm[used], steps.pol_nm[used]
         rms_nm = np.stack([np.linalg.norm(one, axis=1) for one in modes_nm], axis=1)
@@ -186,7 +186,7 @@ class Accumulator:
     """Receives messages and makes snapshots of them; unreadable messages are left out and counted in `unreadable`."""
 
     def __init__(self, simulated_ns: int | None = None) -> None:
-        """`simulated_ns`: start of a lockstep run, whose data has times of a simulated clock."""
+        """`simulated_ns`: start of a lockstep run by its simulated clock; None if the run is not in lockstep."""
         self._simulated_ns = simulated_ns
         self.unreadable = 0
         self._steps, self._truths, self._timings = StepRows(0), TruthRows(0), TimingRows()
@@ -276,7 +276,7 @@ class Accumulator:
         return self._data_ns + max(0, host_ns - self._data_host_ns) if self._data_ns else host_ns
 
     def _read(self, topic: Topic, message: Sample) -> None:
-        """Read a message of a topic whose every message counts; another number of modes discards the rows so far."""
+        """Read a message of a topic of which all are kept; another number of modes discards the rows so far."""
         if topic is STEP:
             step = wire.ControlStep.FromString(message.payload)
             time_ns = checked_time_ns(step.timestamp)
@@ -315,18 +315,18 @@ class Accumulator:
             self._data_ns, self._data_host_ns = data_ns, publish_time_ns
 
     def _newest_of(self, topic: Topic, decode: Callable[[bytes], Any], *, complete: bool) -> Any:
-        """The newest message of a topic, decoded; None without a new one that can be read.
+        """The newest message of a topic, decoded; None if there is no new one that can be read.
 
         A complete snapshot has the newest message since the last complete one, even if an incomplete one had it too:
         some panels draw only complete snapshots.
         """
-        found = None
+        decoded = None
         if (payload := self._newest.pop(topic, None)) is not None:
             try:
-                found = self._decoded[topic] = decode(payload)
+                decoded = self._decoded[topic] = decode(payload)
             except _UNREADABLE:
                 self.unreadable += 1
-        return self._decoded.pop(topic, None) if complete else found
+        return self._decoded.pop(topic, None) if complete else decoded
 
 
 def _added(rows: Any, message: Message) -> Any:

@@ -16,7 +16,7 @@ from lowfc.programs.view.layout import APPLICATION, layout
 
 @dataclass(slots=True)
 class Target:
-    """At most one of window, page, file and picture; by default a window, or a page if there is no screen.
+    """One of window, page, file and picture; by default a window, or a page if there is no screen.
 
     `part`: path of the file while it is being written.
     """
@@ -50,7 +50,7 @@ class Target:
         if self.port and self.port == self.web_port:
             raise ConfigurationError(f"--port and --web-port must differ; both are {self.port}")
         if self.port and self.show is None:
-            raise ConfigurationError("--port is the port of a viewer: --save writes a file")
+            raise ConfigurationError("--port is the port of a viewer; --save starts no viewer")
         if self.web_port and self.show is not Show.WEB:
             raise ConfigurationError("--web-port is the port of a page: add --web")
         free = free_ports(2)  # now, so that a restarted viewer has the same ports

@@ -36,7 +36,7 @@ class Scale:
 
 
 class Picture:
-    """Pictures at one path; the format is sent only when it changes, which saves two thirds of a picture's time."""
+    """Pictures at one path; the format is sent only when it changes, which saves two thirds of the time."""
 
     def __init__(self, path: str) -> None:
         self.path = path

@@ -15,7 +15,7 @@ from lowfc.programs.view.draw.colours import WHITE, Colour
 
 TIMELINE = "time"
 BOX_HEIGHT = 90.0
-"""Height of a plot with custom axes."""
+"""Height of a plot with custom axes, in units of its view."""
 LABEL = 5.0
 """Distance by which the viewer draws a label below its position, in a box of `BOX_HEIGHT`."""
 
@@ -35,7 +35,7 @@ def labels(positions: npt.ArrayLike, texts: Sequence[str], colours: Sequence[Col
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """Curves against time: `curves` has the name and colour of each, the last one on top.
+    """Curves against time: `curves` has the name and colour of each; the last curve is drawn on top.
 
     `curves` is empty if the names depend on the run. If `legend` is None, the viewer chooses its position.
     """
@@ -47,7 +47,7 @@ class Plot:
     legend: rrb.Corner2D | rrb.PlotLegend | None = rrb.Corner2D.LeftTop
 
     def name(self, stream: rr.RecordingStream, curves: Mapping[str, Colour] | None = None) -> None:
-        """Send the names and colours of the curves, for all times; by default the declared ones."""
+        """Send the names and colours of the curves, for all times; by default those of `self.curves`."""
         named = self.curves if curves is None else curves
         style = rr.SeriesLines(
             names=list(named),

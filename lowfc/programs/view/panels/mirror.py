@@ -14,7 +14,7 @@ from lowfc.programs.view.snapshot import Snapshot
 ACTUATORS, SURFACE = "mirror/command", "mirror/surface"
 STROKE = Plot("mirror/stroke", "Mirror: stroke used, %", {"largest stroke used, % of the limit": YELLOW}, legend=None)
 _NEAR = 0.995
-"""Fraction of the stroke at which an actuator counts as limited: the controller keeps a margin, the driver rounds."""
+"""Fraction of the stroke from which an actuator counts as limited: the controller keeps a margin, the driver rounds."""
 
 
 class Mirror(Panel):
@@ -40,8 +40,8 @@ class Mirror(Panel):
         stroke_nm = snapshot.stroke_nm
         if not stroke_nm:
             return
-        largest = max(float(surface_nm.max()), -float(surface_nm.min())) / stroke_nm
-        limited = largest >= _NEAR
+        used_fraction = max(float(surface_nm.max()), -float(surface_nm.min())) / stroke_nm
+        limited = used_fraction >= _NEAR
         if limited or self._limited:
             rows, columns = np.nonzero(np.abs(surface_nm) >= _NEAR * stroke_nm)
             positions = np.stack([columns + 0.5, rows + 0.5], axis=1)
@@ -49,4 +49,4 @@ class Mirror(Panel):
             stream.log(f"{ACTUATORS}/at_limit", rr.Points2D(positions, radii=0.3, colors=[YELLOW]))
         self._limited = limited
         if snapshot.complete:
-            STROKE.add_one(stream, snapshot.time_ns, 100 * largest)
+            STROKE.add_one(stream, snapshot.time_ns, 100 * used_fraction)

@@ -33,7 +33,7 @@ class Panel(ABC):
 
     def due(self, snapshot: Snapshot) -> bool:
         """Whether the period has passed or the clock was set back; if so, the next period begins."""
-        over = not 0 <= snapshot.time_ns - self._drawn_ns < self.period_ns
-        if over:
+        is_due = not 0 <= snapshot.time_ns - self._drawn_ns < self.period_ns
+        if is_due:
             self._drawn_ns = snapshot.time_ns
-        return over
+        return is_due

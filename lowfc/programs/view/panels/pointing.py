@@ -19,7 +19,7 @@ from lowfc.programs.view.snapshot import Snapshot
 TRAIL = "pointing/trail"
 BOUNDS = rrb.VisualBounds2D(x_range=[-1.15, 1.15], y_range=[-1.15, 1.15])
 _MAX_POINTS = 400
-"""Largest number of points of the trail; for a fast loop not every frame has one."""
+"""Largest number of points of the trail; for a fast loop, not every frame has a point."""
 _TRAIL_NS = 2_000_000_000
 _RINGS = (0.25, 0.5, 1.0)
 _MIN_MAS = 0.5
@@ -28,7 +28,7 @@ Points = npt.NDArray[np.floating]
 
 
 class Pointing(Panel):
-    """The trail of the last two seconds; the outer ring grows with it."""
+    """The trail of the last two seconds, and rings whose scale follows its largest deviation."""
 
     def __init__(self, nm_per_mas: float) -> None:
         self._nm_per_mas = nm_per_mas

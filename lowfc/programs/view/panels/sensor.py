@@ -18,7 +18,7 @@ class Sensor(Panel):
     """Pictures of the newest frame and its difference from the reference, and of the reference of a new calibration."""
 
     pictures = True
-    period_ns = 500_000_000  # of the raw frame
+    period_ns = 500_000_000  # between two raw frames
 
     def __init__(self) -> None:
         self._calibration: Calibration | None = None
@@ -55,6 +55,6 @@ class Sensor(Panel):
 
 
 def _log_stretched(light_dn: Single, limit_dn: float) -> Rgb:
-    """Colours of the two decades below the limit, logarithmic; less light is nearly black."""
+    """Colours of the two decades below the limit, logarithmic; anything darker is nearly black."""
     knee_dn = np.float32(limit_dn * 1e-2)
     return sequential(np.log1p(np.maximum(light_dn, 0) / knee_dn) / np.log1p(limit_dn / knee_dn))

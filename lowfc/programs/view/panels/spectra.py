@@ -27,7 +27,7 @@ _MAX_DECADES = 2
 _MAX_LABELS = 6
 _STATE_POSITION = (WIDTH - 34.0, BOX_HEIGHT - 12.0)
 _LEAST = 1e-12
-"""Lowest power drawn, as a fraction of the highest; lower values are drawn there."""
+"""Lowest power drawn, as a fraction of the highest; lower values are drawn at that power."""
 _NAMES, _COLOURS = ("pseudo-open-loop", "measured error", "rejection² x open"), (GREY, GREEN, YELLOW)
 _WIDTHS = (1.2, 1.8, 0.6)
 
@@ -72,7 +72,7 @@ class Spectra(Panel):
             elif ended and modes.any() and axes.path in self._last:  # no more frames will come
                 text, frequency_hz, powers = self._last[axes.path]
                 text += " before a change"
-            if powers and rate_hz:  # else the axes stay: the curves are the last ones
+            if powers and rate_hz:  # otherwise the axes stay, because the curves are the last ones
                 self._fit(stream, axes, rate_hz, np.concatenate(powers))
             axes.draw(stream, np.log10(frequency_hz), [np.log10(power) for power in powers], _COLOURS, _WIDTHS)
             stream.log(f"{axes.path}/state", labels([_STATE_POSITION], [text]))
@@ -91,18 +91,18 @@ class Spectra(Panel):
 
 
 def power_curves(spectra: Spectrum, modes: Mask, law: LawInForce | None, rate_hz: float) -> tuple[Array, list[Array]]:
-    """Frequency, Hz, and the power of some modes, nm^2/Hz: pseudo-open-loop, error and, for an integrator, prediction.
+    """Frequency, Hz, and power spectra summed over `modes`, nm^2/Hz: pseudo-open-loop, error, prediction.
 
-    `spectra` has a column for the error of each mode, then one for each pseudo-open-loop, all with noise; `law` is None
-    for an open loop. A constant wavefront has no curves.
+    `spectra` has a column for the error of each mode, then one for the pseudo-open-loop of each mode, all with noise.
+    `law` is None for an open loop; only an integrator has a prediction. A constant wavefront has no curves.
     """
     error, pol = spectra.power_nm2_hz[:, : modes.size], spectra.power_nm2_hz[:, modes.size :]
     columns = [pol[:, modes].sum(axis=1), error[:, modes].sum(axis=1)]
     if law is not None and not law.linear:
-        any_noll = tuple(range(2, 2 + modes.size))  # the rejection does not depend on it
+        any_noll = tuple(range(2, 2 + modes.size))  # the rejection does not depend on the indices
         integrating = integrator(law.gain, law.leak, any_noll, law.delay_frames, rate_hz)
-        passed = rejection(integrating, spectra.frequency_hz)[:, modes] ** 2
-        columns.append((passed * pol[:, modes]).sum(axis=1))
+        squared_rejection = rejection(integrating, spectra.frequency_hz)[:, modes] ** 2
+        columns.append((squared_rejection * pol[:, modes]).sum(axis=1))
     if not any(column[1:].any() for column in columns):
         return np.zeros(0), []
     frequency_hz, means = in_bins(spectra.frequency_hz, columns)

@@ -43,7 +43,7 @@ Shades = npt.NDArray[np.uint8]
 
 
 class Tiles(Panel):
-    """Draws the verdict on the run when its words change and once a second; at the log's end, that on the whole log."""
+    """Draws the verdict on the run, once a second and when its words change; at a log's end, that on the whole log."""
 
     def __init__(self, nm_per_mas: float) -> None:
         """`nm_per_mas`: wavefront rms of a tilt of 1 mas."""

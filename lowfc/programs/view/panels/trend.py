@@ -19,7 +19,7 @@ from lowfc.programs.view.verdicts.span_means import SpanMeans
 TREND = "residual/trend"
 WIDTH = 200.0
 
-_FIRST_SPAN_S, _LONGER = 60.0, 1.4
+_FIRST_SPAN_S, _GROWTH = 60.0, 1.4
 """First span of the time axis, and the factor by which it grows when it is full."""
 _TICKS_S = (10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 86_400, 172_800, 604_800, 2_592_000)
 _MAX_TICKS, _MAX_TICKS_WITH_SECONDS = 6, 3
@@ -39,16 +39,16 @@ class Trend(Panel):
         if not self.due(snapshot) and snapshot.ended is None:
             return
         after_ns, rms_nm = means.wavefront()
-        known = np.isfinite(rms_nm).all(axis=1) & (rms_nm > 0).all(axis=1)
-        if not known.any() or means.begin_ns is None:
+        valid = np.isfinite(rms_nm).all(axis=1) & (rms_nm > 0).all(axis=1)
+        if not valid.any() or means.begin_ns is None:
             return
         at(stream, snapshot.time_ns)
         after_s, logarithms = after_ns * 1e-9, np.full(rms_nm.shape, np.nan)
-        logarithms[known] = np.log10(rms_nm[known])
-        span_s = max(float(after_s[known][-1]), 1.0)
+        logarithms[valid] = np.log10(rms_nm[valid])
+        span_s = max(float(after_s[valid][-1]), 1.0)
         if snapshot.ended is None:
-            span_s = _FIRST_SPAN_S * _LONGER ** max(0, ceil(log(span_s / _FIRST_SPAN_S, _LONGER)))
-        y_ticks = _nm_ticks(float(rms_nm[known].min()), float(rms_nm[known].max()))
+            span_s = _FIRST_SPAN_S * _GROWTH ** max(0, ceil(log(span_s / _FIRST_SPAN_S, _GROWTH)))
+        y_ticks = _nm_ticks(float(rms_nm[valid].min()), float(rms_nm[valid].max()))
         y = (y_ticks[0][0], y_ticks[-1][0])
         if len(y_ticks) > _MAX_TICKS:
             y_ticks = [tick for tick in y_ticks if tick[0] == round(tick[0])]

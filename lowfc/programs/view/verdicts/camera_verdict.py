@@ -15,36 +15,36 @@ FEW = 0.005
 MANY_LOST = 0.1
 """Fraction of frames lost above which the loop no longer behaves as tuned."""
 DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
-"""Fractions of the expected light. Below a fifth the controller refuses frames by default; at half the noise is 1.4
-times larger; more than twice is not the calibrated star."""
+"""Fractions of the expected light. Below a fifth of it, the controller refuses frames by default; at half of it, the
+noise is 1.4 times larger; with more than twice, the star is not the calibrated one."""
 HEALTH_OVERDUE_S = 4.0
-"""Time without a frame after which a camera that is not silent must be running: a dead one would be silent by then."""
+"""Time without a frame after which a camera that is not silent certainly runs: a dead one would be silent by then."""
 
 REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.DARK: ("too dark", "the star is gone; check pointing, shutter and clouds"),
     Rejection.SATURATED: ("detector saturated", "too much light; shorten the exposure or dim the star"),
-    Rejection.WRONG_SIZE: ("wrong size", "they do not match the calibration; reset the camera or calibrate again"),
+    Rejection.WRONG_SIZE: ("wrong size", "frame and calibration differ in size; reset the camera or calibrate again"),
     Rejection.LATE: (
         "too late",
-        "host or link is too slow, or their clocks differ; see `lowfc doctor`, lower the rate",
+        "host or link is too slow, or the hosts' clocks differ; see `lowfc doctor`, lower the rate",
     ),
     Rejection.NO_CALIBRATION: ("no calibration", "load a calibration"),
     Rejection.STUCK: ("stuck", "the camera repeats one image; restart it"),
     Rejection.REPEATED: ("repeated", "the camera sends a frame twice; restart it"),
     Rejection.OUT_OF_ORDER: ("out of order", "there may be a second camera in the run; stop one"),
     Rejection.AHEAD: ("camera clock ahead", "set the clocks of both hosts and restart the camera"),
-    Rejection.CAMERA_UNKNOWN: ("camera settings unknown", "it restarted; restart it again if they do not arrive"),
+    Rejection.CAMERA_UNKNOWN: ("camera settings unknown", "the camera restarted; restart it if they stay unknown"),
     Rejection.NO_MIRROR: ("no mirror", "the mirror does not follow; check it"),
     Rejection.HELD: ("loop held", "an interlock or a permit holds the loop"),
 }
 """Reasons for refusing a frame: text and advice."""
 _IF_ALL: dict[Reason, str] = {
-    Rejection.OUT_OF_ORDER: "a clock was set back, or there is a second camera; stop that one, or `lowfc ctl safe` and "
-    "then `lowfc ctl clear`, by which the mirror goes flat"
+    Rejection.OUT_OF_ORDER: "a clock was set back, or there is a second camera; stop that camera, or `lowfc ctl safe` "
+    "and then `lowfc ctl clear`, which flatten the mirror"
 }
-"""Advice if every frame is refused, where it is not that for some."""
+"""Advice if every frame is refused, where it differs from that in `REFUSED`."""
 _FRAME_REASONS = [reason for reason in REFUSED if reason not in (Rejection.NO_MIRROR, Rejection.HELD)]
-"""Reasons for an alarm of the tile FRAMES; the others are those of the tile LOOP."""
+"""Reasons that the tile FRAMES reports; the tile LOOP reports the others."""
 
 
 def frames(state: RunState) -> Tile:
@@ -98,10 +98,10 @@ def _lost(state: RunState, lost: int, expected: float) -> Tile:
 
 
 def _refused(state: RunState, expected: float) -> Tile:
-    all_are, refused = all_refused(state, _FRAME_REASONS), sum(state.recent[reason] for reason in _FRAME_REASONS)
-    commonest = max(_FRAME_REASONS, key=lambda reason: (state.now if all_are else state.recent)[reason])
+    all_frames, refused = all_refused(state, _FRAME_REASONS), sum(state.recent[reason] for reason in _FRAME_REASONS)
+    commonest = max(_FRAME_REASONS, key=lambda reason: (state.now if all_frames else state.recent)[reason])
     word, advised = REFUSED[commonest]
-    if all_are:
+    if all_frames:
         advice = f"Every frame is refused, {word}: {_IF_ALL.get(commonest, advised)}. The mirror holds."
         return Tile("FRAMES", "REFUSED", f"all: {word}", Level.BAD, advice)
     remedy = advised if state.now[commonest] else "it has ended"
@@ -129,8 +129,10 @@ def star(state: RunState) -> Tile:
         advice = f"Near saturation, {full}: shorten the exposure."
         return tile(value, f"{full}; {detail}", Level.WARNING, advice)
     if not DIM <= flux <= BRIGHT:
-        word, what = ("dim", "check for clouds") if flux < DIM else ("bright", "check that it is the calibrated star")
-        return tile(value, f"{word}: {detail}", Level.WARNING, f"The star is {word}, {value} {detail}: {what}.")
+        word, advised = (
+            ("dim", "check for clouds") if flux < DIM else ("bright", "check that it is the calibrated star")
+        )
+        return tile(value, f"{word}: {detail}", Level.WARNING, f"The star is {word}, {value} {detail}: {advised}.")
     return tile(value, f"{detail}, no pixel saturated", Level.GOOD)
 
 

@@ -23,15 +23,15 @@ def facts(state: RunState) -> dict[str, str]:
         note = f"{at} {short(state.note.message.partition(' ')[2])}"
     law = shapes = "not known"
     if snapshot.controller is not None:
-        known = json_object(snapshot.controller)
-        law = short(law_in_words(known))
+        status = json_object(snapshot.controller)
+        law = short(law_in_words(status))
         if not snapshot.controller.HasField("law"):
-            leak = f", leak {numbers(known['leak'])}" if any(known["leak"]) else ""
-            law += f", gain {numbers(known['gain'])}{leak}" if known["gain"] else ", no calibration"
+            leak = f", leak {numbers(status['leak'])}" if any(status["leak"]) else ""
+            law += f", gain {numbers(status['gain'])}{leak}" if status["gain"] else ", no calibration"
         law += f"; delay {counted(snapshot.controller.delay_frames, 'frame')}"
-        shapes = f"{_offset(known['offset_nm'], snapshot.noll)}; {short(channels_in_words(known))}"
-        if known["playing"]:
-            shapes += f"; probe sequence on the {printable(known['playing']['target'])}"
+        shapes = f"{_offset(status['offset_nm'], snapshot.noll)}; {short(channels_in_words(status))}"
+        if status["playing"]:
+            shapes += f"; probe sequence on the {printable(status['playing']['target'])}"
     return {"RUN": _run(snapshot), "CONTROL LAW": law, "OFFSET AND CHANNELS": shapes, "LAST NOTE": note}
 
 

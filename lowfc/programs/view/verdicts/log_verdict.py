@@ -23,8 +23,8 @@ from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, NEAR_STROKE,
 from lowfc.programs.view.verdicts.watcher import FRAMES_SILENT_S
 
 _MODES = {mode.value: mode for mode in LoopMode}
-_MOST = 8192
-"""Largest number of steps, and of wavefronts without a step, that are kept: a loaded host records one seconds late."""
+_MAX_KEPT = 8192
+"""Most steps, and most wavefronts without a step, that are kept: a loaded host may record a step seconds late."""
 _NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", None: "without frames"}
 
 _LEVELS = {Correction.GOOD: Level.GOOD, Correction.LITTLE: Level.NEUTRAL, Correction.HARM: Level.WARNING}
@@ -41,7 +41,7 @@ class LogVerdict:
         self._mode_ns: Counter[LoopMode | None] = Counter()
         self._first_ns = self._last_ns = 0
         self._latency = Durations()
-        self._shaped = False
+        self._shape_held = False
 
     def feed(self, snapshot: Snapshot) -> None:
         """Add a snapshot."""
@@ -51,7 +51,7 @@ class LogVerdict:
         self._add_closed(snapshot.steps, snapshot.wavefronts(true=self._means.true))
         for duration_ns in snapshot.timings["frame_to_command"].tolist():
             self._latency.add(duration_ns)
-        self._shaped |= holds_shape(snapshot.controller)
+        self._shape_held |= holds_shape(snapshot.controller)
 
     def verdict(self, state: RunState, ended: LogEnd) -> Verdict:
         """Tiles of the whole log, and a headline, with the advice of the worst tile if it needs attention."""
@@ -72,18 +72,18 @@ class LogVerdict:
 
     def _add_closed(self, steps: Steps, wavefronts: Wavefronts) -> None:
         """Add the wavefronts of the closed loop; step and true wavefront of a frame may be in different snapshots."""
-        self._modes = np.hstack([self._modes, np.stack([steps.sequence, steps.mode.astype(np.uint64)])])[:, -_MOST:]
+        self._modes = np.hstack([self._modes, np.stack([steps.sequence, steps.mode.astype(np.uint64)])])[:, -_MAX_KEPT:]
         waiting_sequence, waiting_ns, waiting_nm = self._waiting
         sequence = np.concatenate([waiting_sequence, wavefronts.sequence])
         time_ns = np.concatenate([waiting_ns, wavefronts.time_ns])
         rms_nm = np.concatenate([waiting_nm, wavefronts.rms_nm])
         closed = np.isin(sequence, self._modes[0, self._modes[1] == LoopMode.CLOSED.value])
         self._closed.add_wavefronts(time_ns[closed], rms_nm[closed], true=self._means.true)
-        waiting = np.flatnonzero(~np.isin(sequence, self._modes[0]))[-_MOST:]
+        waiting = np.flatnonzero(~np.isin(sequence, self._modes[0]))[-_MAX_KEPT:]
         self._waiting = sequence[waiting], time_ns[waiting], rms_nm[waiting]
 
     def _add_modes(self, steps: Steps, period_ns: int) -> None:
-        """Add the time before each step to its mode; a gap that the live view would report is time without frames."""
+        """Add the time before each step to its loop mode; a gap that a live view would report has no frames."""
         time_ns = steps.time_ns
         if not time_ns.size:
             return
@@ -114,13 +114,13 @@ class LogVerdict:
         worst_nm = float(np.nanmax(self._closed.wavefront()[1][:, 0]))
         factor = flat_nm / residual_nm if residual_nm else 1.0
         compared = f"{factor:.1f} x better" if factor >= 1 else "worse"
-        on_purpose = self._closed.true and self._shaped
-        shapes = " with offset and channels," if on_purpose else ""
+        includes_shapes = self._closed.true and self._shape_held
+        shapes = " with offset and channels," if includes_shapes else ""
         detail = (
             f"while closed,{shapes} {compared} than {rounded(flat_nm)} nm with a flat mirror; worst "
             f"{_span(self._closed)}: {rounded(worst_nm)} nm; {'true' if self._closed.true else 'measured, with noise'}"
         )
-        level = _LEVELS[Correction.LITTLE if on_purpose and factor < 1 else correction(residual_nm, flat_nm)]
+        level = _LEVELS[Correction.LITTLE if includes_shapes and factor < 1 else correction(residual_nm, flat_nm)]
         value, than = f"{rounded(residual_nm)} nm rms", "worse than " if level is Level.WARNING else ""
         advice = f"residual while closed {value},{shapes} {than}{rounded(flat_nm)} nm with a flat mirror"
         return Tile("WAVEFRONT", value, detail, level, advice)
@@ -173,8 +173,8 @@ def _frames(state: RunState) -> Tile:
 
 
 def _mirror(state: RunState, ended: LogEnd) -> Tile:
-    value, of = stroke(ended.stroke_nm or 0.0, state.snapshot.stroke_nm)
-    used = f"{value} {of} at most" if ended.stroke_nm is not None else "stroke not known"
+    value, of_limit = stroke(ended.stroke_nm or 0.0, state.snapshot.stroke_nm)
+    used = f"at most {value} {of_limit}" if ended.stroke_nm is not None else "stroke not known"
     if acted := {words: state.totals[reason] for reason, (words, _) in LIMITS.items() if state.totals[reason]}:
         named = ", ".join(f"{words}: {counted(count, 'time')}" for words, count in acted.items())
         advice = f"The mirror was at a limit ({named}): see the events."
@@ -183,8 +183,8 @@ def _mirror(state: RunState, ended: LogEnd) -> Tile:
         return Tile("MIRROR", "?", f"{used}, no limit acted")
     if ended.stroke_nm > NEAR_STROKE * (state.snapshot.stroke_nm or np.inf):
         advice = f"The mirror used {value} of its stroke at most: little was left."
-        return Tile("MIRROR", value, f"{of} at most: nearly all", Level.WARNING, advice)
-    return Tile("MIRROR", value, f"{of} at most, no limit acted", Level.GOOD)
+        return Tile("MIRROR", value, f"{of_limit} at most: nearly all", Level.WARNING, advice)
+    return Tile("MIRROR", value, f"{of_limit} at most, no limit acted", Level.GOOD)
 
 
 def _log(state: RunState, ended: LogEnd) -> Tile:

@@ -19,7 +19,7 @@ PERIODS = 10
 GRACE_S = 10.0
 """Time for processes to start, after which an absent one is reported."""
 OTHER_CLOCK_NS = 3_600_000_000_000
-"""Difference from host time at which frame times count as simulated, or as those of another clock."""
+"""Difference from host time above which frame times count as simulated, or as those of another clock."""
 
 Counts = Counter[Reason | str]
 
@@ -42,7 +42,7 @@ class Process(NamedTuple):
 
 
 class Rms(NamedTuple):
-    """Rms of the residual wavefront, and of the wavefront without the mirror (`open`); tilt per axis."""
+    """Rms of the residual wavefront and of the wavefront with a flat mirror (`open`); the rms of tilt is per axis."""
 
     residual_nm: float
     open_nm: float
@@ -62,13 +62,13 @@ class RunState:
         controller, camera, mirror, recorder: liveness of the processes; with several mirrors that of the worst.
         frame_silent_s, step_silent_s: time without a frame or step; None up to 1 s, or ten frame periods if longer.
         recent, now, totals: counts of each reason, of "steps", and of "skipped", "missing", "late" and "lost", in
-            `RECENT_S`, in `NOW_S` (both at least `PERIODS` frame periods) and since the start.
+            `RECENT_S`, in `NOW_S` (both at least `PERIODS` frame periods) and since the first snapshot.
         flux: light on the newest frame as a fraction of the calibration's; None without a frame or calibration.
         saturated: number of good pixels at full well in the newest frame.
         wavefront: rms of the last second; once the controller was stopped, of its last second with a step. `latest` is
             the rms of the last 0.3 s. With `true`, both are the simulation's true wavefront, otherwise measured.
         comparison: residual of the loop, and of the best gains.
-        latency_us: p50 and p99 from frame to command in the second of `wavefront`; None if not measured.
+        latency_us: p50 and p99 of frame to command in the second of `wavefront`; None if not measured.
         mirror_state: last state of the mirror; None before the first.
         note: last note of the operator.
     """
@@ -104,5 +104,5 @@ class RunState:
 
     @property
     def simulated(self) -> bool:
-        """Whether the frame times are not those of this host."""
+        """Whether the frame times are not by this host's clock."""
         return abs(self.snapshot.time_ns - self.snapshot.host_ns) > OTHER_CLOCK_NS

@@ -15,7 +15,7 @@ _COLUMNS = 8
 
 
 class SpanMeans:
-    """Means of each span of `span_ns`, one second long at first, from `begin_ns` on (None before the first row).
+    """Means over consecutive spans of `span_ns`, at first one second; they begin at `begin_ns`, None before any row.
 
     The wavefront is the `true` one of a simulation, otherwise the measured one.
     """
@@ -50,7 +50,7 @@ class SpanMeans:
         return np.asarray((np.arange(len(sums)) + 0.5) * self.span_ns, np.float64), np.asarray(np.sqrt(_means(sums)))
 
     def rms_nm(self) -> tuple[float, float]:
-        """Rms of all wavefronts: residual, with a flat mirror; NaN without one."""
+        """Rms of all wavefronts: residual, with a flat mirror; NaN if there is none."""
         residual_nm, flat_nm = np.sqrt(_means(self._wavefront.sum(axis=0, keepdims=True)))[0].tolist()
         return residual_nm, flat_nm
 

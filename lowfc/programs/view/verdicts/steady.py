@@ -20,7 +20,7 @@ FRAMES = 6144
 
 
 class LawInForce(NamedTuple):
-    """The integrator, and the linear law that replaces it, if any; an overruled law counts as another law."""
+    """The integrator and, in `linear`, identity and overruled modes of the law that replaces it; empty for none."""
 
     gain: tuple[float, ...]
     leak: tuple[float, ...]
@@ -31,7 +31,7 @@ class LawInForce(NamedTuple):
 class Steady:
     """Measured error and pseudo-open-loop of the last frames since loop mode or law changed, after settling.
 
-    `mode` is 0 before the first step; `law` is None if the controller reports none, or one for other modes.
+    `mode` is 0 before the first step; `law` is None if the controller reports none, or a law for other modes.
     """
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class Steady:
         self._kept: deque[tuple[Sequences, Single]] = deque()
 
     def feed(self, snapshot: Snapshot) -> bool:
-        """Add the steps of a snapshot; False if it has none with the modes of its calibration."""
+        """Add the steps of a snapshot; False if no step of it has the modes of its calibration."""
         steps, calibration = snapshot.steps, snapshot.calibration
         if calibration is None or not len(steps.error_nm) or steps.error_nm.shape[1] != len(calibration.noll):
             return False
@@ -64,7 +64,7 @@ class Steady:
         return True
 
     def rows(self) -> tuple[Sequences, Single]:
-        """Sequence of each frame, and error and pseudo-open-loop (frames, 2 x modes); after the first `feed`."""
+        """Sequence of each frame, and error and pseudo-open-loop (frames, 2 x modes); only after the first `feed`."""
         sequence, signals = (np.concatenate(column) for column in zip(*self._kept, strict=True))
         return sequence, signals
 
@@ -83,7 +83,7 @@ class ResidualComparison(NamedTuple):
 def compare_with_best_gains(
     steady: Steady, rate_hz: float, camera: wire.CameraState | None
 ) -> ResidualComparison | None:
-    """Evaluate the last frames; None if the loop is not closed, its law unknown, or too few frames are consecutive."""
+    """Evaluate the last frames; None if the loop is not closed, its law unknown, or too few frames consecutive."""
     law, modes = steady.law, len(steady.law.gain) if steady.law is not None else 0
     if law is None or steady.mode != LoopMode.CLOSED or not rate_hz:
         return None

@@ -1,4 +1,4 @@
-"""Verdict on a run, for an operator who has never seen one: whether the loop is closed, how good it is, what is wrong.
+"""Verdict on a run, for an operator new to such loops: whether the loop is closed, how well it works, what is wrong.
 
 `judge` is a pure function from the state of the last seconds to tiles.
 """
@@ -24,20 +24,20 @@ NEAR_STROKE = 0.9
 LIMITED = 0.5
 """Fraction of limited commands above which the limit is not transient."""
 MANY_LATE = 0.05
-"""Fraction of late commands that a busy host causes; above it, the delay is longer than the loop is tuned for."""
+"""Fraction of late commands that a busy host may cause; above it, the delay is longer than the loop is tuned for."""
 BEHIND_S, FAR_BEHIND_S = 1.0, 5.0
 """Delay of the view for a warning, and for an alarm."""
 
 LIMITS: dict[Reason, tuple[str, str]] = {
     Limit.MODAL_LIMIT: (
         "modal limit",
-        "centre the star, offload the slow part of the command, or raise it with `lowfc ctl limit`",
+        "centre the star, offload the slow part of the command, or raise the limit with `lowfc ctl limit`",
     ),
     Limit.STROKE: (
         "actuator stroke",
         "offload the slow part of the command, or use a better flat map or smaller channels",
     ),
-    Limit.SLEW: ("actuator slew", "nothing to do if the loop has just been closed or reset, else lower the gain"),
+    Limit.SLEW: ("actuator slew", "nothing to do if the loop has just been closed or reset; otherwise lower the gain"),
     Limit.NEIGHBOUR: ("neighbouring actuators", "use smaller channels, and look for a stuck actuator"),
     Limit.NOT_FINITE: ("command not finite", "check calibration and law"),
     Limit.WRONG_GRID: ("wrong grid", "load the calibration of this mirror"),
@@ -46,7 +46,7 @@ LIMITS: dict[Reason, tuple[str, str]] = {
 
 _REFUSED_COMMAND: dict[int, str] = {
     Rejection.NO_MIRROR: "Its driver failed: see the last warning in `lowfc ctl status`.",
-    Rejection.OUT_OF_ORDER: "Another process may command it: only one controller may.",
+    Rejection.OUT_OF_ORDER: "A second controller may command it: stop all controllers but one.",
     Rejection.AHEAD: "Set the clocks of both hosts and restart the controller.",
     Limit.WRONG_GRID: "Set mirror.rows and mirror.columns, or load the calibration of this mirror.",
     Limit.NOT_FINITE: "Check calibration and law.",
@@ -61,9 +61,10 @@ def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
     residual = wavefront(state, nm_per_mas, loop)
     tiles = [loop, residual, frames(state), star(state), _mirror(state), _latency(state), _recorder(state)]
     reported = {role: state.snapshot.health.get(role) for role in (Role.CAMERA, Role.CONTROLLER)}
-    known = {role: one.health.recent_wavefront for role, one in reported.items() if one is not None}
-    if role := next((role for role, recent in known.items() if recent.costliest_modes), None):
-        tiles.insert(2, contrast(known[role], now=state.wavefront is not None, estimated=role is Role.CONTROLLER))
+    recent_wavefronts = {role: one.health.recent_wavefront for role, one in reported.items() if one is not None}
+    if role := next((role for role, recent in recent_wavefronts.items() if recent.costliest_modes), None):
+        measured_now = state.wavefront is not None
+        tiles.insert(2, contrast(recent_wavefronts[role], now=measured_now, estimated=role is Role.CONTROLLER))
     if state.snapshot.behind_s > BEHIND_S:
         tiles.append(_view(state.snapshot.behind_s))
     worst = worst_of(tiles)
@@ -117,7 +118,9 @@ def _loop(state: RunState) -> Tile:
         advice = "Every frame is refused: the loop is closed and holds its command."
         return tile("HOLDING", "closed, but not correcting: every frame is refused", Level.WARNING, advice)
     if state.now[Limit.LAW_OVERRULED]:
-        advice = "The law leaves more than the integrator, which has taken over. Tune again: `lowfc tune --live 20`."
+        advice = (
+            "The law has a larger residual than the integrator, which took over. Tune again: `lowfc tune --live 20`."
+        )
         return tile("CLOSED", "the integrator in place of the law", Level.WARNING, advice)
     return tile("CLOSED", f"correcting{_since(reported)}", Level.GOOD, "Loop closed, nothing is wrong.")
 
@@ -159,7 +162,7 @@ def _mirror(state: RunState) -> Tile:
     if gone is not None:
         return gone
     if reported is None:
-        return tile("?", "no state of it is known")
+        return tile("?", "its state is not known")
     if reported.refused and reported.status != wire.MIRROR_STATUS_FOLLOWING:
         why = reason_name(reported.refused)
         remedy = _REFUSED_COMMAND.get(int(reported.refused), "See the events.")
@@ -172,7 +175,7 @@ def _mirror(state: RunState) -> Tile:
         advice = "The mirror receives no commands: the last one has expired, it holds or relaxes by itself. "
         return tile("EXPIRED", "no commands: holds or relaxes by itself", level, f"{advice}Check the controller.")
     used_nm, limit_nm = stroke_used_nm(reported), state.snapshot.stroke_nm
-    value, of = stroke(used_nm, limit_nm)
+    value, of_limit = stroke(used_nm, limit_nm)
     acting = {reason: state.recent[reason] for reason in LIMITS if state.recent[reason]}
     own = [reason for reason in LIMITS if reason.value in reported.limits_hit]
     if acting or own:
@@ -181,11 +184,11 @@ def _mirror(state: RunState) -> Tile:
         often = max(state.now[reason] for reason in LIMITS) > LIMITED * max(1, state.now["steps"])
         commonest = max(acting or own, key=lambda reason: state.recent[reason])
         advice = f"The mirror is at a limit ({words}), {how}: {LIMITS[commonest][1]}."
-        return tile("AT LIMIT", f"{words}: {how}; {value} {of}", Level.BAD if often else Level.WARNING, advice)
+        return tile("AT LIMIT", f"{words}: {how}; {value} {of_limit}", Level.BAD if often else Level.WARNING, advice)
     if limit_nm and used_nm > NEAR_STROKE * limit_nm:
         advice = f"The mirror has used {value} of its stroke: little is left. Offload the slow part of the command."
-        return tile(value, f"{of}: nearly all", Level.WARNING, advice)
-    return tile(value, f"{of}, no limit acts", Level.GOOD)
+        return tile(value, f"{of_limit}: nearly all", Level.WARNING, advice)
+    return tile(value, f"{of_limit}, no limit acts", Level.GOOD)
 
 
 def stroke_used_nm(mirror: wire.MirrorState) -> float:
@@ -217,8 +220,8 @@ def _latency(state: RunState) -> Tile:
             f"{counted(late, 'command')}, {100 * share:.2g} %, came after the start of the next exposure: "
             "the delay is longer than the loop is tuned for. Free the host's processors or lower the rate."
         )
-        what = f"{'command' if late == 1 else 'commands'} {state.lately}; {value}, {detail}"
-        return tile(f"{late} LATE", what, Level.WARNING, advice)
+        explanation = f"{'command' if late == 1 else 'commands'} {state.lately}; {value}, {detail}"
+        return tile(f"{late} LATE", explanation, Level.WARNING, advice)
     if 0 < state.snapshot.period_ns < state.latency_us[1] * 1e3:
         advice = f"1 command in 100 takes over {p99} us, longer than a frame. Free the host or lower the rate."
         return tile(value, f"slow: {detail}", Level.WARNING, advice)
@@ -229,8 +232,8 @@ def _recorder(state: RunState) -> Tile:
     tile, recorder, last = partial(Tile, "RECORDER"), state.recorder, state.snapshot.health.get(Role.RECORDER)
     if last is None:
         return tile("NONE", "there is no recorder: nothing is recorded")
-    done = last.health.recording
-    log, failure = map(short, (PurePath(done.file).stem, done.failure))
+    recording = last.health.recording
+    log, failure = map(short, (PurePath(recording.file).stem, recording.failure))
     if failure:
         advice = f"Recording failed, the loop goes on: {failure}. Remove the cause, such as a full disk, then "
         advice += "`lowfc ctl record start`."
@@ -243,16 +246,16 @@ def _recorder(state: RunState) -> Tile:
             return tile("STOPPED", f"{log} is complete")
         advice = "The recorder was stopped, the loop goes on: nothing is recorded. Restart `lowfc record`."
         return tile("STOPPED", f"{log} is complete; nothing is recorded now", Level.WARNING, advice)
-    if done.stopped:
+    if recording.stopped:
         advice = "Recording was stopped by an operator: nothing is recorded. `lowfc ctl record start` resumes."
         return tile("STOPPED", f"not recording since {log} was finished", Level.WARNING, advice)
     if state.recent["lost"]:
         messages = counted(state.recent["lost"], "message")
         advice = f"The recorder lost {messages} {state.lately}: disk or processor is too slow."
-        return tile("LOSING", f"{messages} {state.lately}, {done.lost} in all", Level.BAD, advice)
-    if not done.file:
+        return tile("LOSING", f"{messages} {state.lately}, {recording.lost} in all", Level.BAD, advice)
+    if not recording.file:
         return tile("WAITING", "no log yet")
-    losses = f"{counted(done.lost, 'message')} lost" if done.lost else "nothing lost"
+    losses = f"{counted(recording.lost, 'message')} lost" if recording.lost else "nothing lost"
     return tile("RECORDING", f"{log}, {losses}", Level.GOOD)
 
 

@@ -161,7 +161,7 @@ class Watcher:
     def _silent_s(self, topic: Topic) -> float | None:
         if not self._begun_ns:
             return None
-        sent_ns = self._snapshot.sent_ns  # a step implies a frame, which a log may not have
+        sent_ns = self._snapshot.sent_ns  # a step implies a frame, and a log may have no frames
         silent_s = self._since_s(max(sent_ns.get(topic, self._begun_ns), sent_ns.get(STEP, 0)))
         return silent_s if silent_s > max(FRAMES_SILENT_S, PERIODS * self._snapshot.period_ns * 1e-9) else None
 
@@ -170,7 +170,7 @@ class Watcher:
         return max(0.0, (self._snapshot.host_ns - time_ns) * 1e-9 - self._snapshot.behind_s)
 
     def _update_mode(self, snapshot: Snapshot) -> None:
-        """Keep the mode of the last step; without a new step, that of the last state or, without one, of Health."""
+        """Keep the newest step's mode; without a new step, that of the controller's state; without one, of Health."""
         last = snapshot.health.get(Role.CONTROLLER)
         report = snapshot.controller or (last.health if last is not None else None)
         mode = snapshot.steps.mode[-1] if snapshot.steps.mode.size else report.mode if report is not None else 0

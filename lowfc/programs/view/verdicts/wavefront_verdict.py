@@ -12,9 +12,9 @@ from lowfc.programs.view.verdicts.steady import ResidualComparison
 from lowfc.programs.view.verdicts.tile import Level, Tile, rounded, short
 
 DIVERGING = 3.0
-"""Residual over open wavefront above which the loop is unstable or has wrong signs, not only bad gains."""
+"""Ratio of residual to open wavefront above which the loop is unstable or has wrong signs, not only bad gains."""
 NEAR_BEST = 1.3
-"""Residual over that of the best gains above which the gains are worth tuning."""
+"""Ratio of the residual to that of the best gains above which the gains are worth tuning."""
 NOISE_FLOOR = 0.2
 """Uncertainty of a residual whose noise was subtracted, as a fraction of the sensor's noise."""
 UNCORRECTED = ("OPEN", "SAFE", "IDLE", "WAITING", "DEAD", "NO CONTROLLER")
@@ -40,35 +40,35 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
     if state.true and holds_shape(state.snapshot.controller):
         why = f"The wavefront is {value}, including the shapes of offset and channels; {flat}."
         return tile(value, f"with offset and channels; {flat}; {remarks}", advice=why)
-    raw, latest = rms.open_nm / rms.residual_nm if rms.residual_nm else 1.0, state.latest
+    reduction, latest = rms.open_nm / rms.residual_nm if rms.residual_nm else 1.0, state.latest
     if latest is not None and {correction(one.residual_nm, one.open_nm) for one in (rms, latest)} == {Correction.HARM}:
-        level = Level.BAD if raw < 1 / DIVERGING else Level.WARNING
+        level = Level.BAD if reduction < 1 / DIVERGING else Level.WARNING
         controller = state.snapshot.controller
-        law = controller is not None and controller.HasField("law")  # of which no gain can be set
+        law = controller is not None and controller.HasField("law")  # a law has no gain to lower
         remedy = "Return to the integrator, `lowfc ctl law integrator`," if law else "Lower the gain"
         advice = f"The loop does harm: {residual} nm rms, {flat}. {remedy} or open the loop."
         return tile(value, f"worse than {flat}; {remarks}", level, advice)
     noise_nm = comparison.noise_nm if comparison is not None and not state.true else 0.0
-    level, why = merit(factor(rms.residual_nm, rms.open_nm, noise_nm), comparison)
-    compared = f"{raw:.1f} x better than" if raw >= 1 else "of"
+    level, why = merit(reduction_of(rms.residual_nm, rms.open_nm, noise_nm), comparison)
+    compared = f"{reduction:.1f} x better than" if reduction >= 1 else "of"
     advice = f"The residual of the last second is {value}, compared with {flat}{why}."
     return tile(value, f"{compared} {flat}; {remarks}", level, advice)
 
 
-def contrast(known: wire.WavefrontFigures, *, now: bool, estimated: bool) -> Tile:
-    """Tile CONTRAST: what the wavefront adds to the contrast of the dark zone; it has no threshold.
+def contrast(figures: wire.WavefrontFigures, *, now: bool, estimated: bool) -> Tile:
+    """Tile CONTRAST: what the wavefront adds to the contrast of the dark zone; the tile has no threshold.
 
-    `estimated`: whether it is from the controller's measurements, not from the true wavefront.
+    `estimated`: whether it is computed from the controller's measurements, not from the true wavefront.
     """
     if not now:
         return Tile("CONTRAST", "?", "not measured now")
-    share = f"most from {short(known.costliest_modes)} ({100 * known.costliest_share:.0f} %)"
-    flat = f"added to the dark zone; {known.added_contrast_flat:.1e} with a flat mirror"
+    share = f"most from {short(figures.costliest_modes)} ({100 * figures.costliest_share:.0f} %)"
+    flat = f"added to the dark zone; {figures.added_contrast_flat:.1e} with a flat mirror"
     source = ESTIMATED if estimated else ""
-    return Tile("CONTRAST", f"{known.added_contrast:+.1e}", f"{flat}; {share}{source}{QUADRATIC}")
+    return Tile("CONTRAST", f"{figures.added_contrast:+.1e}", f"{flat}; {share}{source}{QUADRATIC}")
 
 
-def factor(residual_nm: float, open_nm: float, noise_nm: float) -> float:
+def reduction_of(residual_nm: float, open_nm: float, noise_nm: float) -> float:
     """Reduction of the wavefront by the loop, without the sensor's noise."""
     least_nm = max(NOISE_FLOOR * noise_nm, 1e-9)
     residual_nm, open_nm = (max(sqrt(max(one**2 - noise_nm**2, 0.0)), least_nm) for one in (residual_nm, open_nm))
