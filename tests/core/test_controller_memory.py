@@ -488,7 +488,7 @@ def test_an_exception_in_frame_processing_ends_the_controller(
     """If the bus's thread only counted the exception, the loop would stop silently."""
     monkeypatch.setattr("lowfc.programs.core.controller.MIRROR_PATIENCE_S", 0.01)
     listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
-    monkeypatch.setattr(controller, "_frame", Mock(side_effect=ArithmeticError("one and one is three")))
+    monkeypatch.setattr(controller, "_control_step", Mock(side_effect=ArithmeticError("one and one is three")))
     frames = listener.service("camera").publisher(FRAME)
     late = threading.Timer(0.2, frames.put, [b""])
     late.start()

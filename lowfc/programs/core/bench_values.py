@@ -14,7 +14,7 @@ ANSWER_S = 0.2
 
 
 class BenchValues:
-    """The newest value of each name; however many arrive, a frame costs one check of each name."""
+    """The newest value of each name; however many values arrive, a frame costs one check of each name."""
 
     def __init__(
         self, service: Service, interlocks: Iterable[Interlock], report: Callable[[BenchReport], None]
@@ -59,7 +59,7 @@ class _Slot:
         self._received_ns = 0
 
     def report(self, now_ns: int, age_ns: int = 0) -> BenchReport | None:
-        """The newest value and its age; None without a value. A value that is waiting has the age `age_ns`."""
+        """The newest value and its age; None without a value. A value waiting in the mailbox has the age `age_ns`."""
         sample = self.mailbox.take(0.0)
         if sample is not None:
             try:

@@ -49,7 +49,7 @@ class CameraReports:
         deadline_ns = clock.host_ns() + (LOCKSTEP_WAIT_NS if clock.lockstep else 0)
         while self._service.running:
             for sample in self._service.bus.get(CAMERA_STATE.key, timeout_s=0.2):
-                # Not the camera's time: the answer may already be the message that it publishes with its first frame.
+                # The clock's time, not the camera's: the answer may be the message published with the first frame.
                 self.apply(sample, clock.now_ns() if clock.lockstep else None)
                 return
             if clock.host_ns() >= deadline_ns:

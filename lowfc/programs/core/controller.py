@@ -59,7 +59,7 @@ from lowfc.programs.core.start_up import StartUp, settings_under
 MIRROR_PATIENCE_S = 1.0
 """Longest time that the start waits for the mirror to report its shape."""
 STATE_PERIOD_NS = 1_000_000_000
-CHANNEL = "lowfc"
+CHANNEL = "lowfc"  # channel of the mirror that the commands set
 
 
 class Controller:
@@ -68,7 +68,7 @@ class Controller:
     def __init__(
         self, config: Configuration, service: Service, calibration: Calibration | None, source: str, latch: Latch
     ) -> None:
-        """Join the bus; load the calibration (None: idle), called `source` in events. LowfcError: a file is invalid."""
+        """Join the bus; load the calibration (None: idle), in events named `source`. LowfcError: a file is invalid."""
         name = config.mirror.name
         self._service = service
         self._latch = latch
@@ -128,7 +128,7 @@ class Controller:
             self._send_start_requests()
             self._mirror_adopted = True
             if self._first_frame is not None:
-                self._frame(self._first_frame)
+                self._control_step(self._first_frame)
         while self._service.running:
             wait_ns = None if self._warmup is None else self._warmup.wait_ns(self._service.clock.host_ns())
             camera = self._camera.mailbox.take((TICK_NS if wait_ns is None else min(wait_ns, TICK_NS)) * 1e-9)
@@ -159,7 +159,7 @@ class Controller:
 
     def fill(self, health: wire.Health) -> None:
         """Add mode, counts, latency and statistics of the loop to a Health."""
-        health.mode = self._state.mode.value  # type: ignore[assignment]  # numbered alike
+        health.mode = self._state.mode.value  # type: ignore[assignment]  # same numbers
         health.counts.extend(reason_counts(self._state))
         now_ns = self._service.clock.now_ns()
         health.not_closed_ns, health.not_closed_cause = self._not_closed.note(self._state, now_ns, self._last_frame_ns)
@@ -176,15 +176,15 @@ class Controller:
             if not self._mirror_adopted:
                 self._first_frame = sample
             elif self._service.running:
-                self._frame(sample, superseded)
+                self._control_step(sample, superseded)
 
-    def _frame(self, sample: Sample, superseded: bool = False) -> None:
+    def _control_step(self, sample: Sample, superseded: bool = False) -> None:
         """Do one control step: send the command before anything else is encoded.
 
         A superseded frame counts as late, whatever its age, and the command is held: frames exposed with the same
         mirror shape must not all be integrated.
         """
-        clock, newest = self._service.clock, self._state.frame_sequence
+        clock, newest_sequence = self._service.clock, self._state.frame_sequence
         start_ns = clock.host_ns()
         age_ns = 0 if clock.lockstep else start_ns - sample.publish_time_ns
         if superseded:
@@ -203,9 +203,9 @@ class Controller:
         self._send(outputs)
         sent_ns = self._commands.handed_ns if outputs.command is not None else clock.host_ns()
         yield_to_sender()
-        if self._state.frame_sequence != newest:  # an old frame does not show that the camera is alive
+        if self._state.frame_sequence != newest_sequence:  # an old frame does not show that the camera is alive
             self._last_frame_ns = clock.now_ns() if clock.lockstep else start_ns
-        if not newest:  # the first frame
+        if not newest_sequence:  # the first frame
             self._not_closed.note(self._state, self._last_frame_ns)
         self._publish(outputs)
         self._watch_gains(outputs)
@@ -304,7 +304,7 @@ class Controller:
         self._camera.mailbox.wake()
 
     def _update_latch(self) -> None:
-        """Set or clear the latch if safe mode has changed; called after the reply, and the latch has its own thread."""
+        """Set or clear the latch if safe mode began or ended; after the reply, and in the latch's own thread."""
         safe = self._state.mode is LoopMode.SAFE or safe_pending(self._settings, self._state)
         if safe is not self._latched_safe:
             self._latched_safe = safe
@@ -340,7 +340,7 @@ class Controller:
             self._apply_report(MirrorReport(self._service.clock.now_ns(), fault, self._mirror.last()))
 
     def _send_start_requests(self) -> None:
-        """Once the mirror is known and no camera awaited, request the configured shapes and law, like an operator."""
+        """Request the configured shapes and law like an operator, once the mirror is known and no camera awaited."""
         state = self._state
         if state.loop is None or state.conditions.camera_awaited or not (self._start_pending and state.may_command):
             return
@@ -376,7 +376,7 @@ class Controller:
             self._commands.put(codec.encode_command(outputs.command, self._valid_ns, CHANNEL, self._state.input_number))
 
     def _publish(self, outputs: Outputs) -> None:
-        """Publish the step and the events; publish the state if more than a frame's ordinary update changed."""
+        """Publish the step and the events; publish the state if more changed than with every frame."""
         if outputs.step is not None:
             self._steps.put(codec.encode_step(outputs.step, self._state.input_number))
             self._last_second.add(outputs.step, self._service.clock.host_ns())

@@ -61,7 +61,7 @@ class StageTiming:
 
 
 class Offload:
-    """The mean modal command, published once per `frames` frames.
+    """The modal command averaged over `frames` frames, published once for each average.
 
     Frames are counted, and no clock is read, so that runs are reproducible.
     """
@@ -93,7 +93,7 @@ class Offload:
 class LastSecond:
     """Modal error and flux of the frames used in the last second.
 
-    If frames arrive faster than the configured rate, only the newest count.
+    If frames arrive faster than the configured rate, only the newest are counted.
     """
 
     def __init__(self, period_ns: int) -> None:
@@ -101,7 +101,7 @@ class LastSecond:
         self._count = 0
 
     def add(self, step: Step, now_ns: int) -> None:
-        """Add a step; one whose frame was refused has no measurement."""
+        """Add a step; a step without a measurement, of a refused frame, is ignored."""
         if step.error_nm is not None:
             self._rows[self._count % len(self._rows)] = now_ns, step.error_nm @ step.error_nm, step.flux_dn
             self._count += 1
@@ -146,7 +146,7 @@ class Arrays:
             self._plays.put(wire_play(request.played, request.time_ns).SerializeToString())
 
     def publish_in_use(self, refused: Request, state: State) -> None:
-        """Publish the arrays in use again after a refused request, whose arrays are otherwise the last published."""
+        """After a refused request, publish the arrays in use again, so that the last ones published are in use."""
         loop = state.loop
         if loop is None:
             return
@@ -162,7 +162,7 @@ class Arrays:
 
 
 class NotClosed:
-    """Total time, from the first frame to the newest, for which the loop was not closed, and the causes."""
+    """Total time for which the loop was not closed, from the first frame to the newest, and its causes."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -174,7 +174,7 @@ class NotClosed:
         self._occurrences = 0
 
     def note(self, state: State, now_ns: int, newest_ns: int | None = None) -> tuple[int, str]:
-        """Note the loop mode; return the time not closed, ns, and the causes, the longest first.
+        """Note the loop mode; return the total time not closed, ns, and its causes as text, the longest first.
 
         `newest_ns` is the time of the newest frame if it is not `now_ns`.
         """

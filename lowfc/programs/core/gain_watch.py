@@ -1,4 +1,4 @@
-"""Automatic gains: requests optimal gains from measurements; reports a closed loop that does harm, and reacts to it."""
+"""Automatic gains: request optimal gains from measurements; report a closed loop that does harm, and react to it."""
 
 from functools import partial
 from typing import NamedTuple
@@ -22,9 +22,9 @@ TILT_S, OTHERS_S = 1.0, 10.0
 FLUX_S = 0.25
 """Averaging time of the flux."""
 STAR_STEP = 0.2
-"""Relative change of the flux in two consecutive averages that means another star."""
+"""Relative change of the flux, in two consecutive averages, above which the star counts as another one."""
 HARMFUL_WINDOWS = 3
-"""Consecutive windows in which an open loop would have had a smaller residual, before this is reported."""
+"""Number of windows in a row in which an open loop would have had a smaller residual, after which it is reported."""
 CAUTIOUS_GAIN = 0.05
 """Highest gain of modes other than tip and tilt after their first window, in which tip and tilt may be uncorrected.
 
@@ -48,7 +48,7 @@ NOTHING = Actions()
 
 
 class _Group:
-    """Modes that are evaluated together: tip and tilt, or the others."""
+    """Modes that are evaluated together: tip and tilt, or the other modes."""
 
     def __init__(self, mask: Mask, tilt: Mask | None, settings: Settings, loop: ActiveLoop, window_s: float) -> None:
         """Evaluate the modes in `mask` (modes,).
@@ -108,7 +108,7 @@ class GainWatch:
             return NOTHING
         self._newest = newest
         same_camera = newest >> COUNT_BITS == before >> COUNT_BITS
-        held = newest - before - 1 if same_camera and newest > before else 1  # after `clear` it may be lower
+        held = newest - before - 1 if same_camera and newest > before else 1  # `clear` may lower the sequence
         channels = loop.command_channels
         playing = channels is not None and channels.play is not None
         if (
@@ -157,19 +157,19 @@ class GainWatch:
             return None
         open_nm2, now_nm2 = np.zeros((2, len(self._contrast)))
         for group in self._groups:
-            known, mask, closed = group.verdict, group.mask, self._mode is LoopMode.CLOSED
-            if known is None or known.noise_nm2 is None or mask.size != now_nm2.size:
+            verdict, mask, closed = group.verdict, group.mask, self._mode is LoopMode.CLOSED
+            if verdict is None or verdict.noise_nm2 is None or mask.size != now_nm2.size:
                 return None
-            open_nm2[mask] = now_nm2[mask] = np.maximum(known.power_nm2 - known.noise_nm2, 0)
+            open_nm2[mask] = now_nm2[mask] = np.maximum(verdict.power_nm2 - verdict.noise_nm2, 0)
             if closed:
-                if known.loop_nm2 is None:
+                if verdict.loop_nm2 is None:
                     return None
-                now_nm2[mask] = np.maximum(open_nm2[mask] + known.loop_nm2, injected(group.gain) * known.noise_nm2)
+                now_nm2[mask] = np.maximum(open_nm2[mask] + verdict.loop_nm2, injected(group.gain) * verdict.noise_nm2)
         per_nm2 = np.diag(self._contrast)
         return float(per_nm2 @ open_nm2), per_nm2 * now_nm2
 
     def prepare(self, loop: ActiveLoop) -> None:
-        """Set up the groups if calibration, leaks or limits differ; slow, so call it before the first frame."""
+        """Set up the groups anew if calibration, leaks or limits changed; slow, so call it before the first frame."""
         identity = loop.calibration.id, loop.integrator.leak.tobytes(), loop.integrator.limit_nm.tobytes()
         if identity == self._identity:
             return
@@ -201,7 +201,7 @@ class GainWatch:
         return ratio
 
     def _star_changed(self, step: Step, loop: ActiveLoop, ratio: float) -> Actions:
-        """Halve the automatic gains until measured again; if the flux fell below half, lower them in its proportion."""
+        """Halve the automatic gains until measured again; if the flux fell below half, lower them by that ratio."""
         for group in self._groups:
             group.bank.restart()
         events = (PendingEvent("STAR_CHANGED", {"ratio": ratio}),)
@@ -290,26 +290,26 @@ class GainWatch:
         )
 
     def _harm_events(self, group: _Group, verdict: Verdict, loop: ActiveLoop) -> list[PendingEvent]:
-        """The event if an open loop would have had a smaller residual for `HARMFUL_WINDOWS` consecutive windows."""
+        """The event if an open loop would have had a smaller residual in `HARMFUL_WINDOWS` windows in a row."""
         if verdict.loop_nm2 is None:
             group.harmful_windows = 0
             return []
-        worse, error = verdict.loop_nm2.sum(), np.sqrt(np.square(verdict.loop_error_nm2).sum())
-        group.harmful_windows = group.harmful_windows + 1 if worse > 3 * error else 0
+        added_nm2, error_nm2 = verdict.loop_nm2.sum(), np.sqrt(np.square(verdict.loop_error_nm2).sum())
+        group.harmful_windows = group.harmful_windows + 1 if added_nm2 > 3 * error_nm2 else 0
         if group.harmful_windows != HARMFUL_WINDOWS:
             return []
         reaction = self._reaction(loop)
-        if reaction == "law":  # judge anew: the integrator, or the law if the request was refused
+        if reaction == "law":  # count anew for the integrator, or for the law if the request is refused
             for each in self._groups:
                 each.harmful_windows = 0
         noise_nm2 = self._noise_nm2(loop)
         noise = 0.0 if noise_nm2 is None else float(noise_nm2[group.mask].sum())
         open_nm2 = max(float(verdict.power_nm2.sum()) - noise, 0.0)
-        culprits = (verdict.loop_nm2 > 2 * verdict.loop_error_nm2) | (verdict.loop_nm2 == verdict.loop_nm2.max())
+        harmful = (verdict.loop_nm2 > 2 * verdict.loop_error_nm2) | (verdict.loop_nm2 == verdict.loop_nm2.max())
         noll = np.array(loop.calibration.noll)[group.mask]
         details: dict[str, object] = {
-            "modes": ", ".join(f"Z{index}" for index in noll[culprits]),
-            "closed_nm": float(np.sqrt(open_nm2 + worse)),
+            "modes": ", ".join(f"Z{index}" for index in noll[harmful]),
+            "closed_nm": float(np.sqrt(open_nm2 + added_nm2)),
             "open_nm": float(np.sqrt(open_nm2)),
             "action": _REACTIONS[reaction],
         }

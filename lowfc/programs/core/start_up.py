@@ -30,7 +30,7 @@ MIN_FLAT_SHARE = 0.5
 
 
 def check_files(config: Configuration) -> None:
-    """Open the files of [sensor], [mirror] and [control], and check the gains; ConfigurationError: a line per fault."""
+    """Open the files of [sensor], [mirror] and [control], and check the gains; ConfigurationError lists all faults."""
     checks: tuple[Callable[[Configuration], object], ...] = (
         lambda config: factory.sensor(config, lambda _: None),
         lambda config: coronagraph_from(config.sensor),
@@ -66,7 +66,7 @@ def _configured_law(config: Configuration) -> LinearLaw | None:
 
 
 def settings_under(latch: Latch, config: Configuration, event: Callable[..., None]) -> Settings:
-    """The settings of a configuration with its kernel loaded; they start in safe mode if the latch is set.
+    """The settings of a configuration with its kernel loaded; the loop starts in safe mode if the latch is set.
 
     If the latch cannot be stored, the loop starts open and stays open until an operator closes it. An event reports a
     kernel other than numpy, or a missing one.
@@ -132,8 +132,8 @@ def _adopted_nm(state: State, flat_nm: Single) -> Single | None:
     shapes = [channel.shape_nm for channel in loop.command_channels.channels if channel.name == ADOPTED]
     if not shapes:
         return None
-    flattened = shapes[0].reshape(-1), flat_nm.reshape(-1)
-    adopted, flat = (shape - loop.to_actuators @ (loop.inverse @ shape) for shape in flattened)
+    vectors = shapes[0].reshape(-1), flat_nm.reshape(-1)
+    adopted, flat = (shape - loop.to_actuators @ (loop.inverse @ shape) for shape in vectors)
     return shapes[0] if float(adopted @ flat) > MIN_FLAT_SHARE * float(flat @ flat) else None
 
 
@@ -161,7 +161,7 @@ def _check_law_modes(config: Configuration) -> None:
     linear_law = _configured_law(config)
     if linear_law is not None and linear_law.noll != config.noll:
         raise ConfigurationError(
-            f"control.law = {config.control.law!r}: this law is for modes {_modes(linear_law.noll)}, the sensor's "
+            f"control.law = {config.control.law!r}: this law is for modes {_modes(linear_law.noll)}, but the sensor's "
             f"{config.sensor.modes} modes are {_modes(config.noll)}"
         )
 

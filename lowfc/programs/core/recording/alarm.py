@@ -3,7 +3,7 @@
 The recorder runs it, because a run has at most one recorder, which receives every event and is not in the loop; a
 console may be closed, or open twice. A thread without real-time priority starts the command, which inherits its
 scheduling class. Events during the command, and for `recorder.on_event_every_s` after it, wait; then, or when the
-recorder ends, the command is run once, for the worst of them.
+recorder ends, the command is run once, for the most severe one.
 """
 
 import contextlib
@@ -68,7 +68,7 @@ class Alarm:
 
     def _run(self, event: Log, others: int) -> None:
         name, _, text = printable(event.message).partition(" ")
-        arguments = {
+        variables = {
             "LOWFC_RUN": self._service.run_id,
             "LOWFC_EVENT": name,
             "LOWFC_TEXT": text,
@@ -81,7 +81,7 @@ class Alarm:
             command = subprocess.Popen(  # noqa: S603  # configured by the user
                 ["/bin/sh", "-c", self._command],
                 stdin=subprocess.DEVNULL,
-                env={**os.environb, **{key.encode(): value.encode() for key, value in arguments.items()}},  # UTF-8
+                env={**os.environb, **{key.encode(): value.encode() for key, value in variables.items()}},  # UTF-8
                 start_new_session=True,
             )
             due_s = time.monotonic() + TIMEOUT_S

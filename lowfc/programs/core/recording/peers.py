@@ -26,11 +26,11 @@ class Peers:
         self._answers: Future[list[Sample]] | None = None
 
     def note(self, sample: Sample, health: wire.Health) -> None:
-        """Store the state of a process, unless a later start of it has reported already."""
+        """Store the state of a process, unless a later start of the process has already reported."""
         name, start_s = name_in(HEALTH, sample.key), start_of(sample.sequence)
-        known_s, _ = self._states.get(name, (-1, ""))
-        self._query_due |= start_s > known_s
-        if start_s >= known_s:
+        last_start_s, _ = self._states.get(name, (-1, ""))
+        self._query_due |= start_s > last_start_s
+        if start_s >= last_start_s:
             self._states[name] = start_s, health.state
 
     def stopped(self, except_name: str) -> bool:
@@ -54,12 +54,12 @@ class Peers:
 
     def already_received(self, sample: Sample) -> bool:
         """Whether a query returned this message before the bus delivered it; true once per message."""
-        known = (sample.key, sample.sequence) in self._queried
+        was_queried = (sample.key, sample.sequence) in self._queried
         self._queried.discard((sample.key, sample.sequence))
-        return known
+        return was_queried
 
     def query(self) -> list[Sample]:
-        """Query calibration and states; return the new ones: published before this process started, or lost."""
+        """Query calibration and states; return those that are new: published before this process started, or lost."""
         return self._store_new(self._query_all())
 
     def query_soon(self) -> None:

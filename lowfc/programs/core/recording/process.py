@@ -44,7 +44,7 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
         sys.stderr.write(f"{estimate(config, camera)}\n")
         return bytes_per_s(config, selection, camera)
 
-    # Every value, also the defaults that a user's file omits.
+    # All values, including the defaults of keys that the user's file omits.
     attachments = [Attachment("config.toml", "application/toml", config.to_toml().encode())]
     if calibration is not None:
         with raised_as(DataFileError, OSError, f"{calibration} cannot be read for the log"):

@@ -39,9 +39,9 @@ MAX_CHANNELS = 4096
 
 _ITERATION_S = 0.02
 _FLUSH_NS = 250_000_000
-_SETTLE_S = (0.3, 1.5)
+_SETTLE_S = (0.3, 1.5)  # shortest and longest wait for the Health of the other processes
 _DRAIN_S = 1.0
-_SLOW_NS = 1_000_000_000
+_SLOW_NS = 1_000_000_000  # duration of a write above which the disk counts as slow
 _DONE = {"start": "recording into", "stop": "recording stopped:"}
 
 
@@ -66,7 +66,7 @@ class Recorder:
         """Subscribe to everything; `run` starts the recording. Each log starts with `metadata` and `attachments`.
 
         Recording starts once each of the `awaited` processes has sent Health, or after a timeout. If none is named, as
-        many processes are awaited as the bus has peers; across hosts one, as the router is then the only peer.
+        many processes are awaited as the bus has peers; across hosts only one, because the router is the only peer.
         `expected_bytes_per_s` is called before the first log begins, with the camera's state or None; its result holds
         until growth is measured.
         """
@@ -78,7 +78,7 @@ class Recorder:
         self._selection = selection
         self._folder, self._min_free_bytes = folder, limits.min_free_bytes
         self._working_folder = encodable(str(Path.cwd()))  # read now: the folder may be removed later
-        self._expect, self._expected_bytes_per_s = expected_bytes_per_s, 0.0
+        self._estimate_bytes_per_s, self._expected_bytes_per_s = expected_bytes_per_s, 0.0
         self._series = LogSeries(folder, clock, {**metadata, **selection.metadata}, attachments, limits)
         self._peers = Peers(bus)
         self._paused = self._stopping = self._skip_drain = False
@@ -87,7 +87,7 @@ class Recorder:
         self._begun_ns = self._oldest_ns = 0
         self._messages_before, self._lost_before = 0, dict[str, int]()  # of earlier recordings
         self._longest_wait_ns = self._longest_unflushed_ns = self._slowest_ns = 0
-        # Before the service subscribes to Health: a peer that knows of that subscription knows of all these.
+        # The service subscribes to Health after these: a peer that knows of that subscription knows of all these.
         for topic in TOPICS:
             bus.subscribe(topic, partial(self._backlog.put, topic))
         self.service = Service(Role.RECORDER, run_id, clock, bus, granted=granted, fill=self._fill_health)
@@ -97,7 +97,7 @@ class Recorder:
     def catch_signals(self) -> None:
         """Finish the log at SIGTERM or Ctrl-C; to be called in the main thread.
 
-        After a second signal the recorder does not wait for the last Health of the others.
+        After a second signal the recorder does not wait for the last Health of the other processes.
         """
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._stop_by_signal)
@@ -106,7 +106,7 @@ class Recorder:
         """Record until stopped; DataFileError if the first log cannot be opened."""
         self._settle()
         self._peers.query()  # fills `newest`, with which the log begins
-        self._expected_bytes_per_s = self._expect(self._peers.camera())
+        self._expected_bytes_per_s = self._estimate_bytes_per_s(self._peers.camera())
         self._begin()
         self._begun_ns = self._clock.host_ns()
         self.service.awaited = lambda: "" if self.service.last_health else "any other process"
@@ -138,7 +138,7 @@ class Recorder:
                 return
 
     def _begin(self, *, anew: bool = True) -> None:
-        """Begin a recording, or without `anew` its next file, with the calibration and states its messages refer to."""
+        """Begin a recording, or without `anew` its next file, with calibration and states that messages refer to."""
         if anew:
             self._messages_before, self._lost_before = self._series.messages, self._account.lost()
         self._series.begin(self._peers.newest.values(), new_recording=anew)
@@ -242,7 +242,7 @@ class Recorder:
         except BadMessageError as fault:
             self.service.unreadable(topic.key, fault)
             return
-        written = self._peers.already_received(sample)  # and was written when a query returned it
+        written = self._peers.already_received(sample)  # if so, it was written when the query returned it
         unwanted = self._paused or not self._selection.keeps(topic, sample.sequence, sample.payload)
         recorded = not self._failure if written else not unwanted and self._write(sample)
         self._account.enter(topic, sample, recorded=recorded, unwanted=unwanted)
@@ -302,7 +302,7 @@ class Recorder:
             self._oldest_ns = 0
 
     def _fail(self, fault: DataFileError) -> None:
-        """End the recording but not the process, which counts the messages lost from here on."""
+        """End the recording, but not the process: it counts the messages lost from now on."""
         self._series.give_up()
         self._account.revert()
         self._failure = str(fault)
@@ -313,7 +313,7 @@ class Recorder:
             self.service.event("MESSAGES_LOST", topic=topic, count=count)
 
     def _drain(self) -> None:
-        """Wait up to _DRAIN_S for the last Health of the others, which counts the messages they sent."""
+        """Wait up to _DRAIN_S for the last Health of the other processes, which counts the messages they sent."""
         deadline_s = time.monotonic() + _DRAIN_S
         while not self._skip_drain:
             self._iterate()
