@@ -201,7 +201,7 @@ def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None
     message = controller_state(loaded(SETTINGS), SETTINGS, (START + 12) * SECOND)
     watch = Watch({"camera": camera}, [])
     expected = "added to the dark zone's contrast: flat mirror +7.0e-10, residual -4.0e-11"
-    quadratic = f"{expected}; quadratic form, valid to 3 nm of a mode"
+    quadratic = f"{expected}; quadratic form, valid to 3 nm rms of a mode"
     assert quadratic in status.text(status.json_object(message, {"camera": camera}))
     assert quadratic in summary_text(summary(watch, record=False))
     assert "  contrast by quadratic form -4.0e-11 of +7.0e-10  " in status_line(watch, 5.0)

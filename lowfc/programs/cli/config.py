@@ -137,10 +137,10 @@ def config_zenoh(
         raise fault if make else BusError(f"{fault}; --make creates a run that does not exist") from None
     links = joined.links
     local = sorted({*links.ports, "bench", "operator", "launcher"})
-    known = roles(links.mirrors) if links.network.router else local
-    if role not in known:
+    run_roles = roles(links.mirrors) if links.network.router else local
+    if role not in run_roles:
         if created is not None:
             created.remove()
-        raise BusError(f"run {joined.run_id!r} has no role {role!r}; its roles are {', '.join(known)}")
-    HostClock()  # writes the offset of the clock to a file, which the program reads
+        raise BusError(f"run {joined.run_id!r} has no role {role!r}; its roles are {', '.join(run_roles)}")
+    HostClock()  # writes the clock offset to a file that the program reads
     typer.echo(json.dumps(session_config(links, role), indent=2))

@@ -8,18 +8,18 @@ import numpy as np
 from lowfc.arrays import Array
 from lowfc.optics.chain.added_contrast import ModalContrast, by_group, costliest
 
-QUADRATIC = "; quadratic form, valid to 3 nm of a mode"
-"""How the added contrast of a running loop is known: within 10 % for up to 3 nm rms of a mode (shaped pupil)."""
+QUADRATIC = "; quadratic form, valid to 3 nm rms of a mode"
+"""Method for the added contrast of a running loop: within 10 % for up to 3 nm rms of a mode (shaped pupil)."""
 ESTIMATED = ", estimated from the sensor"
 """Source of the added contrast of a running loop whose true wavefront is not known."""
 
 
 def added_contrast(contrast: ModalContrast | None, covariance_nm2: Mapping[str, Array | None]) -> dict[str, Any] | None:
-    """Contrast added by wavefronts with these covariances (modes, modes), by name; None where one is unknown.
+    """Contrast added by wavefronts with these covariances (modes, modes), by name; None for an unknown one.
 
     Further keys: `by_group`, the contribution of each group of modes; `beyond_quadratic`, the names for which full
-    images disagree with the quadratic form. The result is None without a science image, without a
-    known covariance, or if the number of modes differs.
+    images disagree with the quadratic form. The result is None without a `contrast`, without a known covariance, or if
+    the numbers of modes differ.
     """
     known = {name: covariance for name, covariance in covariance_nm2.items() if covariance is not None}
     if contrast is None or not known or any(len(covariance) != len(contrast.noll) for covariance in known.values()):
@@ -54,7 +54,7 @@ def contrast_cases(added: Mapping[str, float]) -> dict[str, float | None]:
 def contrast_in_words(
     added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = (), how: str = ""
 ) -> str:
-    """The added contrast of each case, the modes that contribute most to the last case, and `how` it is known."""
+    """The added contrast of each case, the modes that contribute most to the last case, and `how` it was computed."""
     cases = ", ".join(f"{name} {value:+.1e}" for name, value in added.items() if value is not None)
     largest = "" if most is None else f"; {most[0]} contributes most ({100 * most[1]:.0f} %)"
     caveat = f"; full images differ from the quadratic form by more than 10 %: {', '.join(beyond)}" if beyond else ""

@@ -3,9 +3,9 @@
 from enum import Enum, auto
 
 WORSE = 1.1
-"""Residual over open wavefront above which a closed loop does harm; the rms of a second scatters by less than 10 %."""
+"""Ratio of residual to open wavefront above which a closed loop does harm; an rms over 1 s scatters by under 10 %."""
 GOOD_FACTOR = 2.0
-"""Reduction that counts as good: leaked starlight scales with the square of the wavefront, so a quarter is left."""
+"""Reduction of the wavefront that counts as good: leaked light scales with its square, so a quarter is left."""
 
 
 class Correction(Enum):
@@ -17,9 +17,9 @@ class Correction(Enum):
 
 
 def correction(residual_nm: float, open_nm: float) -> Correction:
-    """HARM if the residual exceeds `WORSE` times the open wavefront, GOOD at `GOOD_FACTOR` below it, LITTLE between.
+    """HARM if residual / open is above `WORSE`, GOOD if open / residual is at least `GOOD_FACTOR`, otherwise LITTLE.
 
-    Both are over one span: the last second (live view, console), all frames in closed loop (view of a log), or the
+    Both rms are over one span: the last second (live view, console), all frames in closed loop (view of a log), or the
     longest stretch under one law (report).
     """
     if residual_nm > WORSE * open_nm:

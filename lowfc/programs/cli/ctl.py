@@ -51,7 +51,7 @@ def frame_count(word: str) -> int:
     try:
         return int(word)
     except ValueError:
-        raise typer.BadParameter(f"{word!r} is not a whole number: write 50") from None
+        raise typer.BadParameter(f"{word!r} is not a whole number: write one, as in 50") from None
 
 
 def bench_value(word: str) -> bool | float | str:
@@ -142,9 +142,9 @@ def _status(run: AnyRun = None, as_json: Json = False) -> None:
 
     with _client(run) as loop:
         state, processes = loop.status().state, loop.processes()
-        assert state is not None  # noqa: S101  # a status reply always has one
-    known = json_object(state, processes, loop.run_id)
-    print_result(known, text(known), as_json=as_json)
+        assert state is not None  # noqa: S101  # a status reply always has a state
+    status = json_object(state, processes, loop.run_id)
+    print_result(status, text(status), as_json=as_json)
 
 
 def _configuration(run: AnyRun = None, as_json: Json = False) -> None:
@@ -153,8 +153,8 @@ def _configuration(run: AnyRun = None, as_json: Json = False) -> None:
 
     with _client(run) as loop:
         text = loop.configuration()
-    known = json.loads(json.dumps(tomllib.loads(text), default=str), parse_constant=str)  # dates, inf and nan as text
-    print_result(known, f"# run {loop.run_id}\n{text.rstrip()}", as_json=as_json)
+    parsed = json.loads(json.dumps(tomllib.loads(text), default=str), parse_constant=str)  # dates, inf, nan as text
+    print_result(parsed, f"# run {loop.run_id}\n{text.rstrip()}", as_json=as_json)
 
 
 def _step(frames: Frames, run: AnyRun = None, as_json: Json = False) -> None:
@@ -200,12 +200,12 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
         loop.status()  # wait for the connection: a controller that has replied also receives the value
         loop.bench(name, parsed)
         state = loop.status().state
-        assert state is not None  # noqa: S101  # a status reply always has one
-    known = json_object(state, run=loop.run_id)
+        assert state is not None  # noqa: S101  # a status reply always has a state
+    status = json_object(state, run=loop.run_id)
     names = sorted({interlock.name for interlock in state.settings.interlocks})
-    unused = "" if name in names else f"; no interlock uses it (they use {', '.join(names)})" if names else ""
-    acting = f"interlocks: {interlocks(known)}" if names else "no interlock is configured"
-    result = {"run": loop.run_id, "name": name, "value": parsed, "interlocks": known["interlocks"]}
+    unused = "" if name in names else f"; no interlock uses it (interlocks use {', '.join(names)})" if names else ""
+    acting = f"interlocks: {interlocks(status)}" if names else "no interlock is configured"
+    result = {"run": loop.run_id, "name": name, "value": parsed, "interlocks": status["interlocks"]}
     print_result(result, f"{name} is {value}{unused}; {acting} (run {loop.run_id})", as_json=as_json)
 
 

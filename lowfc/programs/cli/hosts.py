@@ -32,7 +32,7 @@ class HostProcess(Result):
     process: str = result_field("process")
     state: str = result_field("state")
     clock_offset_us: float | None = result_field("router's clock minus its own", "us", "+.0f")
-    clock_error_us: float | None = result_field("error at most", "us", ".0f")
+    clock_error_us: float | None = result_field("clock error at most", "us", ".0f")
 
 
 class HostsResult(Result):
@@ -56,9 +56,10 @@ def certs(
         ),
     ] = None,
     mirror: Annotated[
-        list[str] | None, typer.Option(help="Name of a mirror; repeat. Default: those in the folder, or dm.")
+        list[str] | None,
+        typer.Option(help="Name of a mirror; may be repeated. Default: those in the folder, or dm."),
     ] = None,
-    days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificates are valid.")] = 825,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="Validity of the certificates, days.")] = 825,
     renew: Annotated[
         bool, typer.Option("--renew", help="Also renew existing certificates; they keep their keys.")
     ] = False,
@@ -162,7 +163,7 @@ def hosts(config: ConfigFile = None, run: AnyRun = None, as_json: Json = False) 
     name = next((health.run_id for health in processes.values() if health.run_id), run)
     if links.network.router:
         if name == run:
-            open_run(run, mirrors, network=settings.network)  # ctl and view now find it without the configuration
+            open_run(run, mirrors, network=settings.network)  # ctl and view now find the run without the configuration
         for warning in certificate_warnings(links.network, datetime.datetime.now(datetime.UTC)):
             sys.stderr.write(f"warning: {warning}\n")
     rows = [_host_process(health) for _, health in sorted(processes.items())]

@@ -11,18 +11,18 @@ from lowfc.adapters.process.terminal import AppGroup, new_app
 
 
 class Row(NamedTuple):
-    """A command: its name, its "module:attribute" below `lowfc.programs` (empty for a group), and its description.
+    """A command: name, target "module:attribute" below `lowfc.programs` (empty for a group), and description.
 
     Name and description fit in 80 columns. The attribute is a function or a typer application.
     """
 
     name: str
-    where: str
+    target: str
     description: str
 
 
 class Commands(Mapping[str, Any]):
-    """Commands by name; a command is imported when it is looked up."""
+    """Commands by name; each is imported when it is looked up."""
 
     def __init__(self, rows: Sequence[Row], parts: Sequence[Row]) -> None:
         """`rows` are the commands and groups; `parts` are the commands of the groups, named "GROUP COMMAND"."""
@@ -30,8 +30,8 @@ class Commands(Mapping[str, Any]):
 
     def __getitem__(self, name: str) -> Any:
         row = self._rows[name]
-        if row.where:
-            module, _, attribute = row.where.partition(":")
+        if row.target:
+            module, _, attribute = row.target.partition(":")
             command = getattr(import_module(f"lowfc.programs.{module}"), attribute)
         else:
             parts = [part for part in self._parts if part.name.startswith(f"{name} ")]

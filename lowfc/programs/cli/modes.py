@@ -13,14 +13,14 @@ Modes = Annotated[
 ]
 
 HIGHEST = 1000
-"""Highest index accepted, far above any controlled mode."""
+"""Highest Noll index accepted, far above any controlled mode."""
 
 
 def noll_of(words: Sequence[str] | None) -> tuple[int, ...]:
-    """Noll indices of words such as "2,3" and "4-11", without duplicates; empty, meaning all, without words."""
+    """Noll indices of words such as "2,3" and "4-11", without duplicates; empty (all modes) without words."""
     if not words:
         return ()
-    found: list[int] = []
+    indices: list[int] = []
     joined = ",".join(words).replace(" ", "")
     parts = [part for part in joined.split(",") if part]
     for part in parts or [joined]:  # commas alone are refused
@@ -28,5 +28,5 @@ def noll_of(words: Sequence[str] | None) -> tuple[int, ...]:
         last = last if dash else first
         if not (first.isdecimal() and last.isdecimal() and 0 < int(first) <= int(last) <= HIGHEST):
             raise ConfigurationError(f"--modes takes Noll indices, as in 2,3 or 4-11; got {part!r}")
-        found += range(int(first), int(last) + 1)
-    return tuple(dict.fromkeys(found))
+        indices += range(int(first), int(last) + 1)
+    return tuple(dict.fromkeys(indices))

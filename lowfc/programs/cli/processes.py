@@ -22,7 +22,7 @@ def controller(
     camera: Annotated[
         str | None,
         typer.Option(
-            metavar="DRIVER", help="Read this camera driver in the controller's process; default: a separate process."
+            metavar="DRIVER", help="Run this camera driver in the controller's process; default: in its own process."
         ),
     ] = None,
     wait_for: Annotated[

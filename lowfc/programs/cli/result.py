@@ -76,7 +76,7 @@ def table(headings: Sequence[str], rows: Any) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     first, *others = widths
     return [
-        "  ".join([f"{row[0]:{first}}", *(f"{cell:>{wide}}" for cell, wide in zip(row[1:], others, strict=True))])
+        "  ".join([f"{row[0]:{first}}", *(f"{cell:>{width}}" for cell, width in zip(row[1:], others, strict=True))])
         for row in cells
     ]
 

@@ -34,11 +34,11 @@ def runs(as_json: Json = False) -> None:
 def _row(name: str, roles: set[str]) -> dict[str, Any]:
     """State of a run from the Health of its processes; a process that has not sent one yet is starting."""
     with Client(name) as loop:
-        found = loop.processes()
-    roles = set(found) if open_run(name, ()).links.network.router else roles  # only the router listens, if there is one
-    controller, recorder = found.get(Role.CONTROLLER, NO_HEALTH), found.get(Role.RECORDER, NO_HEALTH)
-    starting = [{"process": role, "state": "starting", "pid": None} for role in roles - {*found, Role.LAUNCHER}]
-    processes = [{"process": key, "state": health.state, "pid": health.pid} for key, health in found.items()]
+        alive = loop.processes()
+    roles = set(alive) if open_run(name, ()).links.network.router else roles  # only the router listens, if there is one
+    controller, recorder = alive.get(Role.CONTROLLER, NO_HEALTH), alive.get(Role.RECORDER, NO_HEALTH)
+    starting = [{"process": role, "state": "starting", "pid": None} for role in roles - {*alive, Role.LAUNCHER}]
+    processes = [{"process": key, "state": health.state, "pid": health.pid} for key, health in alive.items()]
     return {
         "run": name,
         "mode": mode_name(controller.mode) or ("starting" if {Role.LAUNCHER, Role.CONTROLLER} & roles else None),
@@ -55,7 +55,7 @@ def _lines(rows: list[dict[str, Any]]) -> list[str]:
     lines = []
     for row in rows:
         mode = "no controller" if row["mode"] is None else mode_word(row["mode"])
-        if row["mode"] == "starting":  # its controller has not reported yet
+        if row["mode"] == "starting":  # the controller has not reported yet
             mode += " or not answering"
         if row["holding"]:
             mode += f" (not correcting: {row['holding']})"

@@ -121,72 +121,72 @@ def json_object(
     }
 
 
-def text(known: dict[str, Any]) -> str:
+def text(status: dict[str, Any]) -> str:
     """The state as text; the first line is a summary."""
-    since = "" if known["mode_s"] is None else f" for {known['mode_s']:.0f} s ({known['mode_cause']})"
-    opens = f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else ""
-    playing = known["playing"]
+    since = "" if status["mode_s"] is None else f" for {status['mode_s']:.0f} s ({status['mode_cause']})"
+    opens = f", opens after {counted(status['steps_left'], 'frame')}" if status["steps_left"] else ""
+    playing = status["playing"]
     rows = {
-        "loop": _mode_in_words(known, since) + opens,
-        **{name: _mirror_in_words(one) for name, one in known["mirrors"].items()},
-        "frame": f"number {known['frame']}; {known['frames_used']} used since the controller started"
-        + (f"; the last was refused as {_in_words(known['refused'])}" if known["refused"] else ""),
-        "command": f"{known['command_rms_nm']:.3f} nm rms" + (", returning to zero" if known["homing"] else ""),
-        "offset": f"{known['offset_rms_nm']:.3f} nm rms",
-        **_contrast_row(known),
-        "law": law_in_words(known),
-        "gain": _values(known["gain"])
-        + _automatic_in_words(known["gain_automatic"])
-        + ("" if known["law"]["name"] == "integrator" else ", for the integrator only"),
-        "leak": _values(known["leak"]),
-        "limit": _values(known["limit_nm"], " nm"),
-        "channels": channels_in_words(known),
+        "loop": _mode_in_words(status, since) + opens,
+        **{name: _mirror_in_words(one) for name, one in status["mirrors"].items()},
+        "frame": f"number {status['frame']}; {status['frames_used']} used since the controller started"
+        + (f"; the last was refused as {_in_words(status['refused'])}" if status["refused"] else ""),
+        "command": f"{status['command_rms_nm']:.3f} nm rms" + (", returning to zero" if status["homing"] else ""),
+        "offset": f"{status['offset_rms_nm']:.3f} nm rms",
+        **_contrast_row(status),
+        "law": law_in_words(status),
+        "gain": _values(status["gain"])
+        + _automatic_in_words(status["gain_automatic"])
+        + ("" if status["law"]["name"] == "integrator" else ", for the integrator only"),
+        "leak": _values(status["leak"]),
+        "limit": _values(status["limit_nm"], " nm"),
+        "channels": channels_in_words(status),
         "playing": f"{playing['target']}, {playing['frames_left']} of {counted(playing['frames'], 'frame')} left"
         if playing
         else "nothing",
-        "reserved": f"for {known['reserved_for']}" if known["reserved_for"] else "no",
-        "interlocks": interlocks(known),
-        "mirror limits": f"stroke {known['stroke_nm']:g} nm, slew {known['slew_nm']:g} nm a frame, "
-        f"neighbours {known['neighbour_nm']:g} nm; {_limits_in_words(known['limits_hit'])}",
-        "counted": ", ".join(_count_text(name, count) for name, count in known["counts"].items()) or "nothing refused",
-        "delay": counted(float(known["delay_frames"]), "frame"),
-        "calibration": (known["calibration_id"][:12] or "none")
-        + (", provisional: from the first steps of commissioning" if known["calibration_provisional"] else ""),
+        "reserved": f"for {status['reserved_for']}" if status["reserved_for"] else "no",
+        "interlocks": interlocks(status),
+        "mirror limits": f"stroke {status['stroke_nm']:g} nm, slew {status['slew_nm']:g} nm a frame, "
+        f"neighbours {status['neighbour_nm']:g} nm; {_limits_in_words(status['limits_hit'])}",
+        "counted": ", ".join(_count_text(name, count) for name, count in status["counts"].items()) or "nothing refused",
+        "delay": counted(float(status["delay_frames"]), "frame"),
+        "calibration": (status["calibration_id"][:12] or "none")
+        + (", provisional: from the first steps of commissioning" if status["calibration_provisional"] else ""),
     }
-    return "\n".join([_in_short(known), *(f"{name:14} {value}" for name, value in rows.items())])
+    return "\n".join([_in_short(status), *(f"{name:14} {value}" for name, value in rows.items())])
 
 
-def _contrast_row(known: dict[str, Any]) -> dict[str, str]:
-    if known["added_contrast"] is None:
+def _contrast_row(status: dict[str, Any]) -> dict[str, str]:
+    if status["added_contrast"] is None:
         return {}
-    source = ESTIMATED if known["added_contrast_estimated"] else ""
-    cases = contrast_cases(known["added_contrast"])
-    return {"contrast": contrast_in_words(cases, costliest_modes(known), how=source + QUADRATIC)}
+    source = ESTIMATED if status["added_contrast_estimated"] else ""
+    cases = contrast_cases(status["added_contrast"])
+    return {"contrast": contrast_in_words(cases, costliest_modes(status), how=source + QUADRATIC)}
 
 
-def law_in_words(known: dict[str, Any]) -> str:
+def law_in_words(status: dict[str, Any]) -> str:
     """Text of the law in force and of the modes that the integrator drives in its place."""
-    law, weight = known["law"], known["law"]["weight"]
+    law, weight = status["law"], status["law"]["weight"]
     fading = "" if weight == 1 else f" with weight {weight:.2f}; the integrator has weight {1 - weight:.2f}"
     overruled_modes = f"; overruled: the integrator drives {' and '.join(law['overruled'])}" if law["overruled"] else ""
     return f"{law['name']}{fading}{overruled_modes}"
 
 
-def channels_in_words(known: dict[str, Any]) -> str:
+def channels_in_words(status: dict[str, Any]) -> str:
     """Text of the command channels."""
     channels = [
         f"{one['name']} {one['rms_nm']:.3g} nm rms of surface"
         f"{'' if one['reached'] else ', not reached'}{'' if one['shifts_zero_point'] else ', zero point not shifted'}"
-        for one in known["channels"]
+        for one in status["channels"]
     ]
     return "; ".join(channels) or "no channel"
 
 
-def interlocks(known: dict[str, Any]) -> str:
+def interlocks(status: dict[str, Any]) -> str:
     """Text of the interlocks that act."""
-    if known["interlocks"]:
-        return "; ".join(f"{one['why']} ({one['action'].replace('_', ' ')})" for one in known["interlocks"])
-    count = known["interlocks_configured"]
+    if status["interlocks"]:
+        return "; ".join(f"{one['why']} ({one['action'].replace('_', ' ')})" for one in status["interlocks"])
+    count = status["interlocks_configured"]
     return f"none of {count} acts" if count else "none"
 
 
@@ -204,32 +204,32 @@ def recording_state(recorder: wire.Health) -> str:
     return "stopped" if recorder.recording.stopped else "recording"
 
 
-def _in_short(known: dict[str, Any]) -> str:
+def _in_short(status: dict[str, Any]) -> str:
     """Summary line: mode, residual and flux of the last second, lost frames, recording, run, law, last warning.
 
-    The true residual is that of the simulated camera's last two seconds, lost frames are those since the controller's
+    The true residual is over the simulated camera's last two seconds; lost frames are counted from the controller's
     start.
     """
     measured = ["no frame used in the last second"]
-    if known["frames_used_last_second"]:
-        true_nm = known["true_residual_rms_nm"]
-        on_purpose = any(known["offset_nm"]) or any(channel["name"] != FLAT for channel in known["channels"])
+    if status["frames_used_last_second"]:
+        true_nm = status["true_residual_rms_nm"]
+        on_purpose = any(status["offset_nm"]) or any(channel["name"] != FLAT for channel in status["channels"])
         shapes = ", with offset and channels" if on_purpose else ""
         measured = [
-            f"residual {known['residual_rms_nm']:.2f} nm rms, noise included"
+            f"residual {status['residual_rms_nm']:.2f} nm rms, noise included"
             + ("" if true_nm is None else f" (true {true_nm:.2f} over 2 s{shapes})"),
-            f"light {100 * known['flux_fraction']:.0f} %",
+            f"light {100 * status['flux_fraction']:.0f} %",
         ]
-    recording = {"recording": f"recording {known['log']}", "none": "not recording"}
-    warning = known["last_warning"]
+    recording = {"recording": f"recording {status['log']}", "none": "not recording"}
+    warning = status["last_warning"]
     return " · ".join(
         (
-            _mode_in_words(known),
+            _mode_in_words(status),
             *measured,
-            f"{counted(known['frames_skipped'] + known['frames_missing'], 'frame')} lost",
-            recording.get(known["recording"], f"recording {known['recording']}"),
-            f"run {known['run']}",
-            f"law {known['law']['name']}" + (", overruled" if known["law"]["overruled"] else ""),
+            f"{counted(status['frames_skipped'] + status['frames_missing'], 'frame')} lost",
+            recording.get(status["recording"], f"recording {status['recording']}"),
+            f"run {status['run']}",
+            f"law {status['law']['name']}" + (", overruled" if status["law"]["overruled"] else ""),
             "no warning"
             if warning is None
             else f"{warning['age_s']:.0f} s ago {warning['process']}: {warning['text']}",
@@ -238,20 +238,22 @@ def _in_short(known: dict[str, Any]) -> str:
 
 
 def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Health]) -> dict[str, Any] | None:
-    """The newest warning; first that of a mirror whose driver fails, before what it causes in other processes."""
-    found = [(from_timestamp(one.last_warning_timestamp), name) for name, one in processes.items() if one.last_warning]
-    if not found:
+    """The newest warning; if a mirror's driver fails, that mirror's, because it causes warnings of other processes."""
+    warnings = [
+        (from_timestamp(one.last_warning_timestamp), name) for name, one in processes.items() if one.last_warning
+    ]
+    if not warnings:
         return None
-    failing = [one for one in found if processes[one[1]].command_refused == wire.REASON_NO_MIRROR]
-    time_ns, process = max(failing or found)
+    failing = [one for one in warnings if processes[one[1]].command_refused == wire.REASON_NO_MIRROR]
+    time_ns, process = max(failing or warnings)
     text = processes[process].last_warning
     age_s = max(0, from_timestamp(state.timestamp) - time_ns) * 1e-9
     return {"process": process, "age_s": round(age_s, 3), "text": text}
 
 
-def _mode_in_words(known: dict[str, Any], since: str = "") -> str:
-    word = ("paused" if known["paused"] else mode_word(known["mode"])) + since
-    return f"{word}, not correcting: {known['holding']}" if known["holding"] else word
+def _mode_in_words(status: dict[str, Any], since: str = "") -> str:
+    word = ("paused" if status["paused"] else mode_word(status["mode"])) + since
+    return f"{word}, not correcting: {status['holding']}" if status["holding"] else word
 
 
 def _mirror_in_words(mirror: dict[str, Any]) -> str:
@@ -277,7 +279,7 @@ def _count_text(reason: str, count: int) -> str:
         return f"no frame {counted(count, 'time')}"
     if reason in Rejection.__members__:
         return f"{counted(count, 'frame')} refused as {_in_words(reason)}"
-    if reason not in Limit.__members__:  # of a controller of a later version
+    if reason not in Limit.__members__:  # from a controller of a later version
         return f"reason {reason} {counted(count, 'time')}"
     return f"{_in_words(reason)} acted on {counted(count, 'command')}"
 

@@ -36,7 +36,7 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
 
     Example: lowfc gateway epics --run bench
     """
-    protocol()  # raises now if p4p is missing
+    protocol()  # raises at once if p4p is missing
     import_late_modules()
     joined = open_run(the_known_run(run), ())
     run_id, run_config = joined.run_id, joined.path / "config.toml"
@@ -57,8 +57,8 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
         stack.callback(lambda: bus.close())
         gateway = EpicsGateway(settings.gateway, tuple(variables()), request)
         stack.callback(gateway.close)
-        where = f"{settings.gateway.listen}:{gateway.port}, PVs {settings.gateway.prefix}*"
-        sys.stderr.write(f"gateway: run {run_id} by PV Access at {where}\n")
+        served_at = f"{settings.gateway.listen}:{gateway.port}, PVs {settings.gateway.prefix}*"
+        sys.stderr.write(f"gateway: run {run_id} by PV Access at {served_at}\n")
         while True:
             _serve(Client(run_id, bus=bus), Watch(bus, clock), gateway, ended)
             if signalled:
@@ -66,7 +66,7 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
             bus.close()
             joined = open_run(run_id, ())
             bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
-            sys.stderr.write(f"gateway: run {run_id} was started again and is joined\n")
+            sys.stderr.write(f"gateway: run {run_id} was started again, and the gateway has joined it\n")
 
 
 def _serve(loop: Client, watch: Watch, gateway: EpicsGateway, ended: Callable[[], bool]) -> None:

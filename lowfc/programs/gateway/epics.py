@@ -59,7 +59,7 @@ class EpicsGateway:
                 handler["handler"] = _PutHandler(one.kind, one.put, carry_out)
             self._pvs[one.name] = p4p.server.thread.SharedPV(nt=nt, initial=described, **handler)
         address, port = config.listen, config.port
-        served = {
+        server_settings = {
             "EPICS_PVAS_INTF_ADDR_LIST": address,
             "EPICS_PVAS_SERVER_PORT": str(port),
             "EPICS_PVAS_BROADCAST_PORT": str(port + 1),
@@ -68,13 +68,13 @@ class EpicsGateway:
         }
         provided = {f"{config.prefix}{name}": pv for name, pv in self._pvs.items()}
         with raised_as(BusError, RuntimeError, f"cannot serve PV Access on {address}:{port}"):
-            self._server = p4p.server.Server(providers=[provided], conf=served, useenv=False)
+            self._server = p4p.server.Server(providers=[provided], conf=server_settings, useenv=False)
         if self.port != port:  # the port is in use: the library chose another one
             self._server.stop()
             raise BusError(f"cannot serve PV Access on {address}:{port}: it is in use; set another gateway.port")
-        searched = {"EPICS_PVA_ADDR_LIST": config.search, "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
+        client_settings = {"EPICS_PVA_ADDR_LIST": config.search, "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
         # p4p ends a monitor silently if an update cannot be converted: `_value_of` converts instead.
-        self._context = p4p.client.thread.Context("pva", conf=searched, useenv=False, nt=False)
+        self._context = p4p.client.thread.Context("pva", conf=client_settings, useenv=False, nt=False)
         self._monitors = [
             self._context.monitor(pv, partial(self._receive, name), notify_disconnect=True)
             for name, pv in config.bench.items()

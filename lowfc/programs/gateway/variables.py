@@ -1,7 +1,7 @@
 """Process variables of a gateway, independent of its protocol: readings, and writable variables that send requests.
 
-A request that changes something and has a `lowfc ctl` command is offered if it needs no value, numbers or one text. It
-applies to all modes.
+A request is offered if it changes something, has a `lowfc ctl` command, and needs no value, only numbers, or one text.
+It applies to all modes.
 """
 
 from collections.abc import Callable, Iterator
@@ -70,15 +70,15 @@ READINGS = (
     Variable("verdict", Kind.TEXT, "", "State of the loop in a sentence.", lambda view, _: view.verdict.headline),
     Variable("verdict_level", Kind.TEXT, "", "Level of the verdict.", lambda view, _: view.verdict.level.name.lower()),
     Variable("holding", Kind.TEXT, "", "Why a closed loop holds its command.", _status("holding", "")),
-    Variable("interlocks", Kind.TEXT, "", "Interlocks that are tripped.", lambda _, status: interlocks(status)),
+    Variable("interlocks", Kind.TEXT, "", "Interlocks that act.", lambda _, status: interlocks(status)),
     Variable("reserved_for", Kind.TEXT, "", "Holder of the loop's reservation.", _status("reserved_for", "")),
-    Variable("residual", Kind.NUMBER, "nm", "Modal error with noise, rms of 1 s.", _status("residual_rms_nm", nan)),
+    Variable("residual", Kind.NUMBER, "nm", "Modal error with noise, rms over 1 s.", _status("residual_rms_nm", nan)),
     Variable("flux", Kind.NUMBER, "", "Flux relative to the calibration.", _status("flux_fraction", nan)),
     Variable("rate", Kind.NUMBER, "Hz", "Frame rate.", _status("rate_hz", 0.0)),
     Variable("frames_missing", Kind.NUMBER, "", "Frames that never arrived.", _status("frames_missing", 0)),
-    Variable("latency_p50", Kind.NUMBER, "us", "Frame to command since the start, median.", _latency("p50")),
-    Variable("latency_p99", Kind.NUMBER, "us", "Frame to command since the start, 99th percentile.", _latency("p99")),
-    Variable("latency_max", Kind.NUMBER, "us", "Frame to command since the start, longest.", _latency("max")),
+    Variable("latency_p50", Kind.NUMBER, "us", "Frame-to-command latency since the start, p50.", _latency("p50")),
+    Variable("latency_p99", Kind.NUMBER, "us", "Frame-to-command latency since the start, p99.", _latency("p99")),
+    Variable("latency_max", Kind.NUMBER, "us", "Frame-to-command latency since the start, max.", _latency("max")),
     Variable("law", Kind.TEXT, "", "Control law in use.", lambda _, status: status["law"]["name"]),
     Variable("recording", Kind.TEXT, "", "Recording, stopped, failed or none.", _status("recording", "")),
     Variable("error", Kind.NUMBERS, "nm", "Modal error of the newest frame.", _step("error_nm")),
@@ -87,7 +87,7 @@ READINGS = (
     Variable("gain", Kind.NUMBERS, "", "Integrator gain of each mode.", _status("gain", [])),
     Variable("leak", Kind.NUMBERS, "", "Integrator leak of each mode.", _status("leak", [])),
     Variable("limit", Kind.NUMBERS, "nm", "Largest modal command of each mode.", _status("limit_nm", [])),
-    Variable("offset", Kind.NUMBERS, "nm", "Target of each mode.", _status("offset_nm", [])),
+    Variable("offset", Kind.NUMBERS, "nm", "Offset (target) of each mode.", _status("offset_nm", [])),
     Variable("frame", Kind.IMAGE, "DN", "The newest frame.", lambda view, _: view.frame),
 )
 
@@ -101,7 +101,7 @@ def _request(declared: Declaration) -> Variable | None:
     if declared.key.startswith("lowfc/record/"):
         starts = name == "start"
         name, kind, put = f"record_{name}", Kind.BOOLEAN, lambda loop, value: loop.record(starts)
-    elif "text" in fields and "modes" not in fields:  # for `gain`, the numbers rather than the text
+    elif "text" in fields and "modes" not in fields:  # `gain` has both: its numbers are used
         kind, put = Kind.TEXT, lambda loop, value: loop.ask(declared.name, text=value)
     elif "values" in fields:
         kind, put = Kind.NUMBERS, lambda loop, value: loop.ask(declared.name, values=value)

@@ -10,7 +10,7 @@ from lowfc.programs.view.verdicts.tile import Verdict
 from lowfc.programs.view.verdicts.verdict import judge
 
 SILENT_NS = 2_000_000_000
-"""Longest time without a Health, sent twice a second; a process other than the controller is then left out."""
+"""Time without a Health (sent twice a second) after which a process other than the controller is left out."""
 
 
 class RunView(NamedTuple):
@@ -25,7 +25,7 @@ class RunView(NamedTuple):
 
 
 class Watch(Monitor):
-    """Receives as a monitor, through ring buffers that do not burden the loop."""
+    """Receives a run's messages as a monitor, and makes a `RunView` of them."""
 
     def update(self) -> RunView:
         """Process the messages since the last call."""

@@ -15,7 +15,7 @@ def sim_loop(
     config: ConfigFile = None,
     duration: Annotated[
         float | None,
-        typer.Option(min=0.01, max=1e7, help="Seconds, with --lockstep simulated ones; default: until Ctrl-C."),
+        typer.Option(min=0.01, max=1e7, help="Duration, s, in simulated time with --lockstep; default: until Ctrl-C."),
     ] = None,
     rate: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
     disturbance: Annotated[Preset | None, typer.Option(help="Preset of the disturbance.")] = None,

@@ -108,22 +108,22 @@ def prepare(config: Configuration, run: Run, console: Console) -> None:
 
 def children_of(config: Configuration, run: Run, duration_s: float | None, record: bool) -> list[Child]:
     """The processes in the order of the data flow, in which they are stopped; the camera ends by itself."""
-    shared = ["--run", run.run_id, "--config", str(run.path / "config.toml")]
+    common_options = ["--run", run.run_id, "--config", str(run.path / "config.toml")]
     calibration = ["--calibration", str(run.path / "calibration.fits")]
     mirror = mirror_role(config.mirror.name)
     awaited = [Role.CONTROLLER, mirror, *([Role.RECORDER] if record else [])]
-    camera = ["-m", "sim_camera", *shared, *(word for name in awaited for word in ("--wait-for", str(name)))]
+    camera = ["-m", "sim_camera", *common_options, *(word for name in awaited for word in ("--wait-for", str(name)))]
     if duration_s is not None:
         camera += ["--frames", str(max(1, math.ceil(duration_s * config.camera.rate_hz)))]
     # In lockstep, recording starts before the controller: all logs of one seed start with the same message.
     after_recorder = ["--wait-for", str(Role.RECORDER)] if record and config.lockstep else []
     commands = {
         str(Role.CAMERA): camera,
-        str(Role.CONTROLLER): ["-m", "lowfc", "controller", *shared, *calibration, *after_recorder],
-        mirror: ["-m", "sim_dm", *shared],
+        str(Role.CONTROLLER): ["-m", "lowfc", "controller", *common_options, *calibration, *after_recorder],
+        mirror: ["-m", "sim_dm", *common_options],
     }
     if record:
-        commands[str(Role.RECORDER)] = ["-m", "lowfc", "record", *shared, *calibration]
+        commands[str(Role.RECORDER)] = ["-m", "lowfc", "record", *common_options, *calibration]
     return [program(name, arguments, run.path / f"{name}.stderr") for name, arguments in commands.items()]
 
 
@@ -173,18 +173,18 @@ def _supervise(
             continue
         if child.name == Role.RECORDER and watch.health_of(Role.RECORDER).recording.failure:
             continue  # the loop ended normally without a recorder; the summary gives the reason
-        if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # not 0: stopped before it was ready
+        if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # the last two: stopped before it was ready
             raise died(child)
 
 
 def died(child: Child) -> ProcessDiedError:
-    """The error for a process that ended."""
+    """The error for a process that ended, with the end of its output."""
     tail = child.stderr_tail()
     return ProcessDiedError(child.exit_description() + (f"; the end of its output:\n{tail}" if tail else ""))
 
 
 def check(children: list[Child]) -> None:
-    """Raise if a process ended unexpectedly; the view may end at any time, the camera after its last frame."""
+    """Raise ProcessDiedError if a process ended unexpectedly; a view may end at any time, a camera after its frames."""
     for child in children:
         may_end = child.name == Role.VIEWER or (child.name == Role.CAMERA and child.status == 0)
         if child.status is not None and not may_end:
@@ -202,7 +202,7 @@ def _report_view_ended(view: Child, console: Console) -> None:
 
 @contextlib.contextmanager
 def deferred_signals() -> Iterator[Callable[[], bool]]:
-    """Yield a function: whether Ctrl-C or SIGTERM was received. A second one raises KeyboardInterrupt at once."""
+    """Yield a function that tells whether Ctrl-C or SIGTERM was received; a second signal raises KeyboardInterrupt."""
     caught: list[int] = []
 
     def catch(number: int, frame: FrameType | None) -> None:

@@ -22,7 +22,7 @@ _RECENT_S = 2.5
 """Span of the recent wavefront statistics, plus the delay of their report."""
 _EVENTS_SHOWN = 4
 _LEAST = {"p99": 100, "p99_9": 1000}
-"""Least number of durations of which a percentile is not simply the largest."""
+"""Least number of durations for which a percentile is shown: of fewer, it would be the largest."""
 _STYLES: dict[int, str] = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
 
 
@@ -38,7 +38,7 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     silent = _silence_notice(watch)
     live = f"{hertz(camera.rate_hz)} of {config.camera.rate_hz:g} Hz"
     rate = silent or _rate(live, camera.rate_hz, config.lockstep_hz)
-    table.add_row("loop", Text(f"{mode(controller)}, {rate}"))  # a string would be read as rich's markup
+    table.add_row("loop", Text(f"{mode(controller)}, {rate}"))  # rich would read a string as markup
     table.add_row("wavefront", silent or _wavefront_in_words(camera))
     table.add_row("frame to command", latency(controller.frame_to_command))
     table.add_row("frame to mirror", latency(camera.frame_to_mirror))
@@ -112,7 +112,7 @@ def mode(controller: wire.Health) -> str:
 
 
 def latency(durations: wire.Latency) -> str:
-    """Percentiles in one line."""
+    """Percentiles of a latency in one line."""
     if not durations.count:
         return "-"
     p50, p99, largest = (value / 1e3 for value in (durations.p50_ns, durations.p99_ns, durations.max_ns))
@@ -123,8 +123,8 @@ def recording(recorder: wire.Health) -> str:
     """Text of the recorder's messages, bytes and losses."""
     if not recorder.process:
         return "not recording"
-    done = recorder.recording
-    return f"{counted(done.messages, 'message')}, {done.bytes / 1e6:.1f} MB, {done.lost} lost"
+    recorded = recorder.recording
+    return f"{counted(recorded.messages, 'message')}, {recorded.bytes / 1e6:.1f} MB, {recorded.lost} lost"
 
 
 def _loop_in_words(results: dict[str, Any]) -> str:
@@ -156,7 +156,7 @@ def _contrast_lines(results: dict[str, Any]) -> list[str]:
     own = "" if results["dark_zone_contrast"] is None else f"coronagraph alone {results['dark_zone_contrast']:.1e}; "
     beyond = ("residual",) if results["beyond_quadratic"] else ()
     how = QUADRATIC if results["beyond_quadratic"] is None else "; computed from full images of the true wavefront"
-    most = None if beyond else costliest_modes(results)  # a share in the quadratic form
+    most = None if beyond else costliest_modes(results)  # the share is of the quadratic form
     return [f"contrast           {own}{contrast_in_words(contrast_cases(added), most, beyond, how)}"]
 
 
@@ -182,8 +182,8 @@ def summary_text(results: dict[str, Any], lockstep_hz: float | None = None) -> s
     def percentiles(values: dict[str, float], count: int) -> str:
         if not values["max"]:
             return "-"
-        known = {name: value for name, value in values.items() if count >= _LEAST.get(name, 1)}
-        return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in known.items())
+        shown = {name: value for name, value in values.items() if count >= _LEAST.get(name, 1)}
+        return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in shown.items())
 
     live = f"{results['rate_hz']:.1f} Hz" if results["rate_hz"] else "-"
     lines = [

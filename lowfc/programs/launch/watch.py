@@ -89,30 +89,30 @@ def summary(watch: Watch, record: bool, lockstep_hz: float | None = None) -> dic
     return results
 
 
-def wavefront(known: wire.WavefrontFigures) -> dict[str, Any]:
+def wavefront(figures: wire.WavefrontFigures) -> dict[str, Any]:
     """Statistics of the true wavefront: continuous in time if available, and sampled at the exposure starts."""
     names = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas")
-    kind = "continuous_" if known.instants else ""
+    kind = "continuous_" if figures.instants else ""
     return {
-        **{name: round(getattr(known, kind + name), 4) for name in names},
-        "sampled_residual_rms_nm": round(known.residual_rms_nm, 4),
-        "sampled_tilt_residual_mas": round(known.tilt_residual_mas, 4),
-        "instants_per_frame": known.instants or 1,
-        "added_contrast": {"open": known.added_contrast_flat, "closed": known.added_contrast}
-        if known.added_contrast_flat
+        **{name: round(getattr(figures, kind + name), 4) for name in names},
+        "sampled_residual_rms_nm": round(figures.residual_rms_nm, 4),
+        "sampled_tilt_residual_mas": round(figures.tilt_residual_mas, 4),
+        "instants_per_frame": figures.instants or 1,
+        "added_contrast": {"open": figures.added_contrast_flat, "closed": figures.added_contrast}
+        if figures.added_contrast_flat
         else None,
-        "costliest_modes": {"modes": known.costliest_modes, "share": round(known.costliest_share, 3)}
-        if known.costliest_modes
+        "costliest_modes": {"modes": figures.costliest_modes, "share": round(figures.costliest_share, 3)}
+        if figures.costliest_modes
         else None,
-        "beyond_quadratic": beyond_quadratic(known.quadratic_added_contrast, known.added_contrast)
-        if known.science_images
+        "beyond_quadratic": beyond_quadratic(figures.quadratic_added_contrast, figures.added_contrast)
+        if figures.science_images
         else None,
-        "dark_zone_contrast": known.dark_zone_contrast or None,
+        "dark_zone_contrast": figures.dark_zone_contrast or None,
     }
 
 
 def mode_name(mode: wire.LoopMode) -> str | None:
-    """Loop mode; None before a controller reported one."""
+    """Name of the loop mode; None before a controller has reported a mode."""
     return name_of_mode(mode) if mode else None
 
 
