@@ -1,4 +1,4 @@
-"""A bare loop: an idle loop beside a process of the control loop. The host is the cause of a delay of both.
+"""A bare loop: an idle loop beside a process of the control loop. If both are late, the host is the cause.
 
 It runs on the processors of that process, in real-time scheduling at a higher priority, so that lowfc does not delay
 it. Halfway between two frames it wakes, notes how late it is, and reads the kernel's counters of processor and process.
@@ -56,8 +56,8 @@ def bare_loop(
     settings = configuration(config)
     cpus = settings.realtime.controller_cpus if role is Role.CONTROLLER else settings.realtime.camera_cpus
     priority = settings.realtime.priority
-    above = settings.realtime.model_copy(update={"priority": priority + 1 if priority else 0})
-    prepare(settings.model_copy(update={"realtime": above}), role, cpus)
+    higher_priority = settings.realtime.model_copy(update={"priority": priority + 1 if priority else 0})
+    prepare(settings.model_copy(update={"realtime": higher_priority}), role, cpus)
     folder = open_run(run, (settings.mirror.name,)).path
     pid = json.loads(_wait_and_read(folder / PROCESSES_FILE))[role]
     begin_ns = int(_wait_and_read(folder / BEGIN_FILE))
@@ -86,7 +86,7 @@ def _record_wakings(config: Configuration, counters: Counters, begin_ns: int, se
 
 
 def _wait_and_read(file: Path) -> str:
-    """The text of a file once it exists; BusError if it does not within `_TIMEOUT_S`."""
+    """The text of a file once it exists; BusError if it does not exist within `_TIMEOUT_S`."""
     deadline_s = time.monotonic() + _TIMEOUT_S
     while not file.exists():
         if time.monotonic() > deadline_s:

@@ -29,7 +29,7 @@ class ControlStep:
         self.state, _ = advance(self._settings, State(), Load(now_ns, calibration, "the run's"))
 
     def __call__(self, payload: bytes) -> bytes:
-        """The command for a frame, which counts as the next one whatever its time."""
+        """The command for a frame; it counts as the next frame, whatever its time."""
         frame = codec.decode_frame(payload, self.state.frame_sequence + 1, 0)
         self.state, outputs = advance(self._settings, self.state, frame)
         assert outputs.command is not None  # noqa: S101  # each of these frames yields a command
@@ -41,7 +41,7 @@ def time_alone(
 ) -> tuple[Long, Long]:
     """Time the control step for `seconds`: once per period after a sleep, or back to back if `period_ns` is None.
 
-    Returns the wake-up latencies of the host's timer, empty without a period, and the durations of the step, ns.
+    Returns the wake-up latencies of the host's timer, ns (empty without a period), and the durations of the step, ns.
     """
     timer_ns: list[int] = []
     step_ns: list[int] = []

@@ -1,6 +1,6 @@
 """A bare zenoh echo, the reference for a loop's latency: a frame out, a command back, no work in between.
 
-Two processes with one plain zenoh session each use the loop's links and its settings of session, publishers and
+Two processes, each with a plain zenoh session, use the loop's links and its settings of session, publishers and
 scheduling. The process that answers is set up like the controller; afterwards it times the control step and the host's
 timer.
 """
@@ -61,7 +61,7 @@ def ask(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 
 
 @app.command()
 def answer(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 10.0) -> None:
-    """Answer frames in place of the controller until an empty one; then time control step and timer alone."""
+    """Answer frames in place of the controller until an empty frame; then time control step and timer alone."""
     from lowfc.adapters.files import calibration_file
     from lowfc.programs.measure.control_step import ControlStep, time_alone
 
@@ -143,7 +143,7 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
 
 
 def _join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Run:
-    """Set this process up like the loop's process with this role; return the run with only camera and controller."""
+    """Set this process up like the loop's process of this role; return the run, with camera and controller only."""
     prepare(config, role, cpus)
     run = open_run(run_id, (config.mirror.name,))
     ports = {str(role): run.links.ports[role] for role in (Role.CAMERA, Role.CONTROLLER)}

@@ -1,7 +1,7 @@
 """A camera that sends prepared frames on an absolute schedule.
 
 It replaces the simulated camera when the loop is timed, so that the simulation does not load the host. At its end it
-writes a file with the time at which each frame was due and sent.
+writes a file with the times at which each frame was due and was sent.
 """
 
 import math
@@ -33,11 +33,11 @@ SENT_FILE = "sent.npz"
 BEGIN_FILE = "begin"
 """File in the run's directory: time at which the first frame is due, ns."""
 
-_COUNT = 32  # different frames, sent in turns
+_COUNT = 32  # number of different frames, sent in turns
 _TILT_NM, _OTHER_NM = 3.0, 1.0  # amplitudes, nm rms
 _MAX_CYCLES = 3  # oscillations of a mode in _COUNT frames
 _WAIT_S = 60.0  # a view may have to load
-_FIRST_FRAME_PERIODS = 10  # from the start to the first frame
+_FIRST_FRAME_PERIODS = 10  # periods from the start to the first frame
 
 app = new_app("A camera that sends prepared frames.")
 
@@ -80,9 +80,9 @@ def frame_source(
     seconds: Annotated[float, typer.Option(help="Duration, seconds.")] = 10.0,
     wait_for: Annotated[list[str] | None, typer.Option(help="Process to wait for; repeat for several.")] = None,
 ) -> None:
-    """Send the frames in the run's directory as its camera, and write there when each was due and sent.
+    """Send the frames in the run's directory as the run's camera, and write there when each was due and sent.
 
-    Each frame is sent when it is due, or at once if that is past; none is left out.
+    Each frame is sent when it is due, or at once if it is overdue; none is left out.
     """
     settings = configuration(config)
     folder, period_ns = open_run(run, (settings.mirror.name,)).path, settings.period_ns

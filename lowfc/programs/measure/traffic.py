@@ -1,4 +1,4 @@
-"""The messages of a loop without the loop: one process sends those of camera, controller and mirror at any rate."""
+"""A loop's messages without the loop: one process sends what camera, controller and mirror send, at any rate."""
 
 import time
 from typing import Any
@@ -30,14 +30,14 @@ _FRAME_SHAPE = (80, 80)
 _MIRROR = "dm"
 _TIME_NS = 1_767_225_600_000_000_000
 
-_VARIETY = 32  # different frames: a payload repeats only beyond the window of the log's compression
+_VARIETY = 32  # number of different frames: a payload repeats only beyond the window of the log's compression
 _TIMING_HZ = 10.0
 _BEAT_FRAMES = 50
 _WAIT_S = 0.05
 
 
 class Traffic:
-    """Sender of the messages of three roles of a run, frame after frame."""
+    """Sends the messages of three roles of a run, frame after frame."""
 
     def __init__(self, run: Run, rate_hz: float) -> None:
         """Join `run` as camera, controller and mirror of a loop of `rate_hz`."""
@@ -79,7 +79,7 @@ class Traffic:
         return True
 
     def run(self, seconds: float) -> None:
-        """Send a loop's messages at its rate; late ones are sent at once, so that none is left out."""
+        """Send a loop's messages at its rate for `seconds`; overdue ones are sent at once, so that none is left out."""
         due_ns = begun_ns = self._clock.host_ns()
         while due_ns - begun_ns < seconds * 1e9:
             self._clock.sleep_until_ns(due_ns)
@@ -118,16 +118,16 @@ def _messages(rng: np.random.Generator) -> tuple[Message, ...]:
     pixels = (100 + rng.poisson(rng.gamma(2.0, 30.0, _FRAME_SHAPE))).astype(np.uint16)
     error, pol, command, disturbance = (rng.normal(0.0, 5.0, _MODES).tolist() for _ in range(4))
     actuators = rng.normal(0.0, 20.0, _GRID).astype(np.float32).tobytes()
-    of_frame: dict[str, Any] = {"timestamp": timestamp(_TIME_NS), "frame_sequence": sequence}
+    frame_fields: dict[str, Any] = {"timestamp": timestamp(_TIME_NS), "frame_sequence": sequence}
     shape: dict[str, Any] = {"rows": _GRID[0], "columns": _GRID[1], "actuators": actuators, "command_nm": command}
     modes: dict[str, Any] = {"error_nm": error, "pol_nm": pol, "command_nm": command}
     rms: dict[str, Any] = {"disturbance_rms_nm": 20.0, "residual_rms_nm": 2.0}
     return (
         image(pixels, _TIME_NS, "sensor"),
-        wire.MirrorCommand(channel="loop", valid_for_ns=200_000_000, **of_frame, **shape),
-        wire.ControlStep(mode=wire.LOOP_MODE_CLOSED, flux_dn=float(pixels.sum()), **of_frame, **modes),
-        wire.MirrorState(status=wire.MIRROR_STATUS_FOLLOWING, channels=["loop"], **of_frame, **shape),
-        wire.Truth(disturbance_nm=disturbance, residual_nm=error, **of_frame, **rms),
+        wire.MirrorCommand(channel="loop", valid_for_ns=200_000_000, **frame_fields, **shape),
+        wire.ControlStep(mode=wire.LOOP_MODE_CLOSED, flux_dn=float(pixels.sum()), **frame_fields, **modes),
+        wire.MirrorState(status=wire.MIRROR_STATUS_FOLLOWING, channels=["loop"], **frame_fields, **shape),
+        wire.Truth(disturbance_nm=disturbance, residual_nm=error, **frame_fields, **rms),
     )
 
 

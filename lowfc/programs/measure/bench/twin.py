@@ -36,7 +36,7 @@ def twin(as_json: Json = False) -> None:
 def bench_twin(seconds: float = 1.0) -> dict[str, Any]:
     """Measure three twins; the results of the first, the default of the live loop, are also at the top level.
 
-    A time is the median for one frame, from the wavefront to the binned image; the models are timed one by one.
+    Each time is the median for one frame, from the wavefront to the binned image; the models are timed one by one.
     `relative_l2` is the worst of 20 random wavefronts of radial degrees 1 to 5 within the bounds of Subedi et al. 2015,
     Sect. 3.1.
     """
@@ -58,12 +58,12 @@ def bench_twin(seconds: float = 1.0) -> dict[str, Any]:
             twin = load_or_build(optics, spec, band)
             load_s = time.perf_counter() - begin
             evaluator = Evaluator(twin)
-            at_nodes = (coefficients_nm @ zernikes(NOLLS_20, *node_radii(twin))).astype(np.float32)
+            node_opds_nm = (coefficients_nm @ zernikes(NOLLS_20, *node_radii(twin))).astype(np.float32)
             errors = []
-            for truth, nodes_nm in zip(truths[band], at_nodes, strict=True):
+            for truth, nodes_nm in zip(truths[band], node_opds_nm, strict=True):
                 errors.append(float(np.linalg.norm(evaluator.image(nodes_nm) - truth) / np.linalg.norm(truth)))
             full_us = _median_us(partial(image, optics, band=band), opds_nm, seconds)
-            twin_us = _median_us(evaluator.image, at_nodes, seconds)
+            twin_us = _median_us(evaluator.image, node_opds_nm, seconds)
             results.append(
                 {
                     "name": name,

@@ -33,7 +33,7 @@ def latency(
     context: typer.Context,
     logs: LogsOrMeasure = None,
     duration: Annotated[float, typer.Option(min=0.5, max=1e5, help="Duration of each repeat, seconds.")] = 10.0,
-    rate: Annotated[float | None, typer.Option(help="Frames per second; default: the file's, or 1000.")] = None,
+    rate: Annotated[float | None, typer.Option(help="Frames per second; default: as configured, or 1000.")] = None,
     camera: Annotated[Camera, typer.Option(help="Prepared frames, or the simulated camera.")] = "prepared",
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="Number of repeats of loop and references.")] = 1,
     record: Annotated[bool, typer.Option("--record/--no-record", help="Run the recorder, too.")] = False,

@@ -43,10 +43,10 @@ ALONE = {
     "timer_us": "timer wake-up",
 }
 """Labels of the host's reference times, by their names in the results."""
-RATIOS = {"ratio": ("step_us", ""), "ratio_hot": ("hot_step_us", " of those back to back")}
+RATIOS = {"ratio": ("step_us", ""), "ratio_hot": ("hot_step_us", ", timed back to back")}
 """Ratios of the latency from frame to command to half a bare echo plus one control step.
 
-By the name of the ratio: the name of that step in `ALONE`, and the end of the ratio's label.
+For each name of a ratio: the name of the step's duration in `ALONE`, and the end of the ratio's label.
 """
 RATIOS_AT = ("p50", "p99")
 COUNTS = {
@@ -71,7 +71,7 @@ _TIME_PARTS = 200
 _PAUSE = 1000
 """Multiple of the median period above which the camera paused, as when it waits for its trigger."""
 _BURST = 0.5
-"""Fraction of the mean period: frames closer together came in a burst."""
+"""Fraction of the mean period; frames less than this apart came in a burst."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,12 +128,12 @@ def frame_outcomes(
 
 
 def percentiles(values: npt.NDArray[Any]) -> dict[str, float] | None:
-    """The `PERCENTILES` of the finite values, not interpolated: each is one of the values; None without any."""
-    known = np.sort(values[np.isfinite(values)])
-    if not known.size:
+    """The `PERCENTILES` of the finite values, not interpolated: each is one of the values; None if there is none."""
+    finite = np.sort(values[np.isfinite(values)])
+    if not finite.size:
         return None
-    indices = {name: -(-known.size * thousandths // 1000) - 1 for name, thousandths in PERCENTILES.items()}
-    return {name: round(float(known[index]), 3) for name, index in indices.items()}
+    indices = {name: -(-finite.size * thousandths // 1000) - 1 for name, thousandths in PERCENTILES.items()}
+    return {name: round(float(finite[index]), 3) for name, index in indices.items()}
 
 
 def edges_us() -> Array:
@@ -144,8 +144,8 @@ def edges_us() -> Array:
 def histogram(values_us: Array) -> Long:
     """Counts in the bins of `edges_us`."""
     edges = edges_us()
-    known = values_us[np.isfinite(values_us)]
-    return np.histogram(np.clip(known, edges[0], edges[-1]), edges)[0].astype(np.int64)
+    finite = values_us[np.isfinite(values_us)]
+    return np.histogram(np.clip(finite, edges[0], edges[-1]), edges)[0].astype(np.int64)
 
 
 def repeat_statistics(frames: FrameOutcomes) -> dict[str, Any]:
@@ -154,9 +154,9 @@ def repeat_statistics(frames: FrameOutcomes) -> dict[str, Any]:
     A frame without a command counts as crowded out (superseded) if the next frame was published within half the mean
     period. Untimed frames have a command but no timing.
     """
-    counted = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
-    put_ns, commanded = frames.put_ns[counted], frames.commanded[counted]
-    spans = {span: column[counted] for span, column in frames.spans_us.items()}
+    after_warm_up = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
+    put_ns, commanded = frames.put_ns[after_warm_up], frames.commanded[after_warm_up]
+    spans = {span: column[after_warm_up] for span, column in frames.spans_us.items()}
     count = put_ns.size
     between_ns = np.diff(put_ns)
     until_next_ns = np.append(between_ns, np.iinfo(np.int64).max)[:count]
@@ -191,9 +191,9 @@ def controller_counts(health: wire.Health) -> dict[str, Any]:
 
 
 def _over_time(put_ns: Long, command_us: Array) -> dict[str, list[float]]:
-    """Median and largest `frame_to_command` of up to `_TIME_PARTS` parts of equally many frames; start of each part."""
-    known = np.flatnonzero(np.isfinite(command_us))
-    parts = np.array_split(known, min(_TIME_PARTS, known.size)) if known.size else []
+    """Start, median and maximum of `frame_to_command` in each of up to `_TIME_PARTS` parts of equally many frames."""
+    finite = np.flatnonzero(np.isfinite(command_us))
+    parts = np.array_split(finite, min(_TIME_PARTS, finite.size)) if finite.size else []
     return {
         "seconds": [round(float(put_ns[part[0]] - put_ns[0]) / 1e9, 6) for part in parts],
         "p50_us": [round(float(np.median(command_us[part])), 3) for part in parts],

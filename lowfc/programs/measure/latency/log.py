@@ -16,7 +16,7 @@ _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
 
 
 def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Latency statistics of a log, as those of one repeat of `lowfc latency`; and its path, missing parts and host.
+    """Latency statistics of a log, like those of one repeat of `lowfc latency`; and the log's path, gaps and host.
 
     For a run on several hosts, `clock_error_us` is the largest error of a latency between two of them.
 
@@ -37,7 +37,7 @@ def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tup
         )
     if MIRROR_STATE in log.selection.excluded:
         statistics["frames_without_mirror_state"] = None
-    statistics["rate_hz"] *= log.selection.interval_frames  # of the loop, not of the recorded frames
+    statistics["rate_hz"] *= log.selection.interval_frames  # rate of the loop, not of the recorded frames
     controller = history.health.get(Role.CONTROLLER, wire.Health())
     host: dict[str, Any] = dict(log.metadata.get("lowfc", {}))
     host |= {"granted": list(controller.realtime_granted), "refused": list(controller.realtime_refused)}

@@ -64,7 +64,7 @@ class LatencyOptions:
 
 def write_shared_files(config: Configuration, run: Run) -> None:
     """Write the files that the processes share to the run's directory: calibration, configuration, frames."""
-    with threadpool_limits(limits=1):  # of more threads, some would spin until others get a processor
+    with threadpool_limits(limits=1):  # with more threads, some would spin until others get a processor
         prepare(config, run, Console(stderr=True))
         with being_written(run.path / FRAMES_FILE) as part, part.open("wb") as file:
             np.save(file, prepared_frames(config))
@@ -89,12 +89,12 @@ def run_repeats(options: LatencyOptions, run: Run, progress: Callable[[str], Non
     for number in range(options.repeats):
         for kernel in kernels[:: -1 if number % 2 else 1]:  # in alternating order
             realtime = options.config.realtime.model_copy(update={"kernel": kernel})
-            turn = replace(options, config=options.config.model_copy(update={"realtime": realtime}))
-            write_whole(run.path / "config.toml", turn.config.to_toml().encode())
+            kernel_options = replace(options, config=options.config.model_copy(update={"realtime": realtime}))
+            write_whole(run.path / "config.toml", kernel_options.config.to_toml().encode())
             progress(f"{number + 1} of {options.repeats}: the loop with kernel {kernel}")
-            loop = one_loop(turn, run)
+            loop = one_loop(kernel_options, run)
             progress(f"{number + 1} of {options.repeats}: the bare echo, the step with kernel {kernel}, and the timer")
-            repeats.append(loop | _references(turn, run) | {"kernel": kernel})
+            repeats.append(loop | _references(kernel_options, run) | {"kernel": kernel})
     return repeats
 
 
@@ -116,7 +116,7 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
     watch, timings = Watch({}, []), TimingRows()
     states, frames = (Columns(sequence="Q", publish_ns="q") for _ in range(2))
 
-    def time_frames(sample: Sample) -> None:
+    def add_timing(sample: Sample) -> None:
         timings.add(wire.ControlTiming.FromString(sample.payload))
 
     def drain() -> None:
@@ -134,7 +134,7 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
         bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())
         stack.callback(bus.close)
         bus.subscribe(HEALTH, watch.add_health)
-        bus.subscribe(TIMING, time_frames)
+        bus.subscribe(TIMING, add_timing)
         state_ring = bus.ring(MIRROR_STATE, _RING)
         frame_ring = bus.ring(FRAME, _RING) if options.simulated else None
         stack.callback(stop_all, children)
@@ -183,7 +183,7 @@ def _children(options: LatencyOptions, run: Run) -> list[Child]:
         waits = [word for child in children[1:] for word in ("--wait-for", child.name)]
         arguments = ["-m", "lowfc.programs.measure.frame_source", *_options(run), "--seconds", str(seconds), *waits]
         children[0] = program(str(Role.CAMERA), arguments, run.path / f"{Role.CAMERA}.stderr")
-    elif options.view:  # the simulated camera's command has the other processes already
+    elif options.view:  # the simulated camera already waits for the others
         children[0].command += ["--wait-for", str(Role.VIEWER)]
     if options.trace:
         for role in reversed(TRACED):

@@ -66,7 +66,7 @@ class Stall(Result):
 
 
 class BareLoop(Result):
-    """An idle loop beside a process of the control loop; `stalled` counts its wakings more than a period late."""
+    """An idle loop beside a process of the control loop; `stalled`: number of wakings more than a period late."""
 
     beside: str = result_field("bare loop beside the")
     wakings: int = result_field("wakings")
@@ -144,7 +144,7 @@ def combine(repeats: Sequence[Stalls]) -> Stalls:
 
 
 def _ends_ns(frames: FrameOutcomes, period_ns: int) -> Array:
-    """Time of each frame's command or, if it has none, of the next one, at most a period after the last frame."""
+    """Time of each frame's command, ns; without a command, of the next one, at most a period after the last frame."""
     sent_ns = frames.put_ns + frames.spans_us["frame_to_command"] * 1e3
     next_ns = np.fmin.accumulate(sent_ns[::-1])[::-1]  # without the NaN of frames that have no command
     return np.where(np.isfinite(sent_ns), sent_ns, np.fmin(next_ns, frames.put_ns.max(initial=0) + period_ns))
@@ -171,7 +171,7 @@ def _stall(frames: FrameOutcomes, index: int, end_ns: float, period_ns: int, tra
 
 
 def _counted(trace: Trace, begin_ns: int, end_ns: float) -> CountChanges:
-    """Changes of the counts of a bare loop's trace over a stall."""
+    """Changes of the counts in a bare loop's trace over a stall, `begin_ns` to `end_ns`."""
     last = trace.woke_ns.size - 1
     before = max(int(np.searchsorted(trace.woke_ns, begin_ns, side="right")) - 1, 0)
     after = min(int(np.searchsorted(trace.woke_ns, end_ns)), last)

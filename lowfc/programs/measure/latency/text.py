@@ -47,10 +47,10 @@ def compared(comparison: Mapping[str, Any]) -> str:
         spread = "-" if row["spread"] is None else f"{row['spread']:.{digits}f}"
         verdict = row["better"] if row["beyond_spread"] is not False else f"{row['better']}, within the spread"
         label = _COMPARED.get(row["name"], row["name"]).strip()
-        over = "-" if row["ratio"] is None else f"{row['ratio']:.3f}"
+        ratio = "-" if row["ratio"] is None else f"{row['ratio']:.3f}"
         lines.append(
             f"{label:<22}{row['at'].replace('_', '.'):>7}{row['a']:>10.{digits}f}"
-            f"{row['b']:>10.{digits}f}{over:>8}{row['difference']:>+10.{digits}f}{spread:>10}   {verdict}"
+            f"{row['b']:>10.{digits}f}{ratio:>8}{row['difference']:>+10.{digits}f}{spread:>10}   {verdict}"
         )
     lines += [f"{COUNTS[name]}: a {a}, b {b}" for name, (a, b) in comparison["counts"].items() if a or b]
     lines.append(
@@ -112,12 +112,12 @@ def _remarks(results: Mapping[str, Any]) -> list[str]:
     for name, (_, suffix) in RATIOS.items():
         if results[name]:
             ratios = ", ".join(_ratios(results, name))
-            lines.append(f"frame to command over half a bare echo and one control step{suffix}: {ratios}")
+            lines.append(f"ratio of frame to command to half a bare echo plus one control step{suffix}: {ratios}")
     if results.get("kernel_ratio"):
         each = zip(_ratios(results, "kernel_ratio"), results["kernel_ratio_spread"], strict=True)
         ratios = ", ".join(f"{ratio}, numpy {results['numpy_us'][at]:.1f} us" for ratio, at in each)
         lines.append(
-            f"all results are of the fused step; its frame to command over that of numpy, measured in turns: {ratios}"
+            f"all results are of the fused step; ratio of its frame to command to numpy's, measured in turns: {ratios}"
         )
     counts = {name: results.get(name) for name in COUNTS}
     shown = [name for name, count in counts.items() if count or (name in _ALWAYS and count is not None)]
