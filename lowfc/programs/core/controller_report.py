@@ -97,7 +97,7 @@ class LastSecond:
     """
 
     def __init__(self, period_ns: int) -> None:
-        self._rows = np.zeros((SECOND_NS // period_ns + 1, 3))
+        self._rows = np.zeros((SECOND_NS // period_ns + 1, 3))  # time, ns; squared modal error, nm^2; flux, DN
         self._count = 0
 
     def add(self, step: Step, now_ns: int) -> None:

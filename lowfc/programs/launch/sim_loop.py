@@ -32,8 +32,8 @@ from lowfc.programs.launch.watch import Watch, summary
 POLL_S = 0.02
 SETTLE_S = 0.02
 """Time from the last frame to the stop of the controller, for the last command to arrive."""
-LINE_PERIOD_S = 5.0
-SHOW_S = 0.1
+LINE_PERIOD_S = 5.0  # between two status lines, if the output is not a terminal
+SHOW_S = 0.1  # between two updates of the status on a terminal; also the wait for the last Health
 
 
 class ProcessDiedError(LowfcError):

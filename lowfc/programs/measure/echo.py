@@ -37,11 +37,11 @@ ECHO_FILE = "echo.npz"
 ALONE_FILE = "alone.npz"
 """File in the run's directory: timer_ns and step_ns as from `time_alone`, and hot_step_ns of steps back to back."""
 
-_READY_S = 30.0
+_READY_S = 30.0  # longest wait for the answering process
 _POLL_S = 0.02
 _SETTLE_S = 0.1
 _HOT_S = 0.3  # time for which steps are run back to back
-_LOST = -1
+_LOST = -1  # round trip of a frame without an answer
 
 Seconds = Annotated[float, typer.Option(help="Duration, seconds.")]
 

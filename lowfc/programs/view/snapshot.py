@@ -199,7 +199,7 @@ class Accumulator:
         self._health: dict[str, LastHealth] = {}
         self._sent_ns: dict[Topic, int] = {}
         self._sequences: dict[str, int] = {}
-        self._data_ns = self._data_host_ns = 0
+        self._data_ns = self._data_host_ns = 0  # newest time of the data, and publish time of its message
 
     def add(self, message: Sample) -> None:
         """Add a message of one of the topics `SHOWN`; a state older than the last one is left out."""

@@ -84,7 +84,7 @@ class Recorder:
         self._paused = self._stopping = self._skip_drain = False
         self._failure = ""
         self._flush_due_ns = self._max_starts = 0
-        self._begun_ns = self._oldest_ns = 0
+        self._begun_ns = self._oldest_ns = 0  # start of the first recording; arrival of the oldest unflushed message
         self._messages_before, self._lost_before = 0, dict[str, int]()  # of earlier recordings
         self._longest_wait_ns = self._longest_unflushed_ns = self._slowest_ns = 0
         # The service subscribes to Health after these: a peer that knows of that subscription knows of all these.

@@ -18,12 +18,12 @@ from lowfc.programs.cli.output import print_result
 
 RATES_HZ = (1000.0, 2000.0, 5000.0)
 
-_READY_S = 30.0
-_STOP_S = 60.0
+_READY_S = 30.0  # longest wait until the recorder is ready
+_STOP_S = 60.0  # longest wait until the recorder has stopped
 _POLL_S = 0.5
 _WARM_UP_S = 0.5
-_COPY_S = 0.5
-_COPY_BYTES = 256 * 1024
+_COPY_S = 0.5  # duration of the copying that is timed
+_COPY_BYTES = 256 * 1024  # buffer of the copied file
 _RECORDER_KEYS = ("messages_recorded", "messages_lost", "longest_wait_ms", "longest_unflushed_ms", "longest_write_ms")
 """Values that the recorder prints at its end."""
 

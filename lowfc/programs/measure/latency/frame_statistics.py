@@ -67,7 +67,7 @@ COUNTS = {
 
 _BINS_PER_OCTAVE = 8
 _LOWEST_US, _OCTAVES = 1.0, 20
-_TIME_PARTS = 200
+_TIME_PARTS = 200  # most parts of a repeat whose latency is given against time
 _PAUSE = 1000
 """Multiple of the median period above which the camera paused, as when it waits for its trigger."""
 _BURST = 0.5

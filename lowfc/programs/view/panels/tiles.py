@@ -29,7 +29,7 @@ MIN_PERIOD_NS = 250_000_000
 more cannot be read, and each stays in the viewer's memory."""
 
 _GAP, _INSET, _BAND, _CLOCK = 6, 9, 46, 190  # gap of boxes, inset of text, height of headline, width of clock, px
-_TILES_END = 196
+_TILES_END = 196  # lower edge of the tiles, px
 _FACTS = (3, 4, 4, 4)  # relative widths of the facts below the tiles
 _MIN_FONT = 8
 _SHADES = 16

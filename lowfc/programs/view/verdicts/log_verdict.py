@@ -37,7 +37,7 @@ class LogVerdict:
         self._means = SpanMeans()
         self._closed = SpanMeans()
         self._modes = np.zeros((2, 0), np.uint64)  # sequence and loop mode of the last steps
-        self._waiting = np.zeros(0, np.uint64), np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
+        self._without_step = np.zeros(0, np.uint64), np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
         self._mode_ns: Counter[LoopMode | None] = Counter()
         self._first_ns = self._last_ns = 0
         self._latency = Durations()
@@ -73,14 +73,14 @@ class LogVerdict:
     def _add_closed(self, steps: Steps, wavefronts: Wavefronts) -> None:
         """Add the wavefronts of the closed loop; step and true wavefront of a frame may be in different snapshots."""
         self._modes = np.hstack([self._modes, np.stack([steps.sequence, steps.mode.astype(np.uint64)])])[:, -_MAX_KEPT:]
-        waiting_sequence, waiting_ns, waiting_nm = self._waiting
+        waiting_sequence, waiting_ns, waiting_nm = self._without_step
         sequence = np.concatenate([waiting_sequence, wavefronts.sequence])
         time_ns = np.concatenate([waiting_ns, wavefronts.time_ns])
         rms_nm = np.concatenate([waiting_nm, wavefronts.rms_nm])
         closed = np.isin(sequence, self._modes[0, self._modes[1] == LoopMode.CLOSED.value])
         self._closed.add_wavefronts(time_ns[closed], rms_nm[closed], true=self._means.true)
         waiting = np.flatnonzero(~np.isin(sequence, self._modes[0]))[-_MAX_KEPT:]
-        self._waiting = sequence[waiting], time_ns[waiting], rms_nm[waiting]
+        self._without_step = sequence[waiting], time_ns[waiting], rms_nm[waiting]
 
     def _add_modes(self, steps: Steps, period_ns: int) -> None:
         """Add the time before each step to its loop mode; a gap that a live view would report has no frames."""
