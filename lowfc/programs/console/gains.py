@@ -49,7 +49,7 @@ class Gains(Lines):
         self._draw()
 
     def choose(self, by: int) -> None:
-        """Choose the knob this many lines below."""
+        """Choose the knob `by` lines below the present one."""
         self._chosen = (self._chosen + by) % max(1, len(groups(self._noll)))
         self._draw()
 

@@ -316,7 +316,7 @@ class GainWatch:
         return [PendingEvent("LOOP_HARMS", details)]
 
     def _reaction(self, loop: ActiveLoop) -> str:
-        """Name of the request if the loop does harm; empty for none."""
+        """Name of the request that reacts to harm by the loop; empty for none."""
         if self._on_harm == "integrator" and loop.law_runner is not None:
             return "law"
         return "" if self._on_harm == "warn" else "open"

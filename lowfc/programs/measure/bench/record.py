@@ -107,7 +107,7 @@ def render(results: dict[str, Any]) -> str:
 
 
 def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
-    """Record at one rate; the results of `measure` for it, without `ratio`."""
+    """Record at one rate; return the results of `measure` for this rate, without `ratio`."""
     from lowfc.adapters.bus.run import new_run_id, open_run
     from lowfc.programs.launch.processes import program
     from lowfc.programs.measure.traffic import Traffic

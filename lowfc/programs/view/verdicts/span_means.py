@@ -55,7 +55,7 @@ class SpanMeans:
         return residual_nm, flat_nm
 
     def light(self) -> Array:
-        """Light (spans,) of used frames as a fraction of the calibration's; NaN in a span without one."""
+        """Light (spans,) of used frames as a fraction of the calibration's; NaN in a span without a used frame."""
         return _means(self._sums[:, _LIGHT])[:, 0]
 
     def add(self, time_ns: Long, columns: slice, values: npt.NDArray[np.floating]) -> None:

@@ -192,7 +192,7 @@ def _mirror(state: RunState) -> Tile:
 
 
 def stroke_used_nm(mirror: wire.MirrorState) -> float:
-    """Largest deviation of an actuator from flat; 0 if its message cannot be read."""
+    """Largest deviation of an actuator from flat; 0 if the mirror's message cannot be read."""
     surface_nm = actuators(mirror)
     return float(np.abs(surface_nm).max(initial=0.0)) if surface_nm is not None else 0.0
 

@@ -239,7 +239,7 @@ class Watcher:
 
 
 def _rms(samples: list[_Sample]) -> tuple[Rms | None, bool]:
-    """Rms of the truth, or without it of the measurement, and whether it is the truth; None without either."""
+    """Rms of the true or, without a true one, of the measured wavefront, and whether it is the true one."""
     for column in (0, 1):
         total: Array = sum((one.squares[column] for one in samples), np.zeros(5))
         if total[0]:
