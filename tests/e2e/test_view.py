@@ -87,7 +87,7 @@ def test_a_log_without_an_end_is_saved_as_a_valid_rrd_file(tmp_path: Path) -> No
         ({"foxglove": True, "web_port": 15999}, "--foxglove"),
         ({"foxglove": True, "tab": Tab.OPTICS}, "--foxglove"),
         ({"native": True, "web_port": 15999}, "add --web"),
-        ({"logs": [Path("nothing.mcap")], "save": Path("x.rrd"), "port": 15999}, "--save writes a file"),
+        ({"logs": [Path("nothing.mcap")], "save": Path("x.rrd"), "port": 15999}, "--save starts no viewer"),
         ({"run": "nosuch", "web": True}, "there is no run"),
         ({"logs": [Path("nothing.mcap")], "save": Path("x.rrd")}, "nothing.mcap"),
         ({"logs": [Path("nothing.mcap")], "save": Path("nowhere/x.rrd")}, "nowhere"),

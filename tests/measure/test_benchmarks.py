@@ -425,7 +425,7 @@ def test_streams_and_the_direct_link_are_compared_turn_by_turn(monkeypatch: pyte
     assert found_p50[3:] == ["1.42 (0.83 to 2.00)", "1.83 (0.67 to 3.00)"]
     _, between, _, ratio, _ = by_heading(lines)
     assert (between["without a command"], ratio["frame to command, us: p99"]) == ("2 of 1000", "1.00 (1.00 to 1.00)")
-    assert "ImageStreamIO, 350 (200 to 500) us (p50)" in streams.about(found)
+    assert "includes 350 (200 to 500) us (p50)" in streams.about(found)
     assert "reads the stream itself, 350 (300 to 400) us" in streams.about(found)
 
 

@@ -181,7 +181,7 @@ def test_damaged_pupil_files_are_named(tmp_path):
         (np.zeros((4, 4)), "must exceed one half somewhere"),
         (np.full((4, 4), 0.45), "got at most 0.45"),
         (np.ones((4, 4)) + 0j, "real numbers"),
-        (np.eye(4), r"pupil\.npz: .* 0 beyond .* radius is its 4 cells, got up to 1 in 1 cell: set these to 0"),
+        (np.eye(4), r"pupil\.npz: .* 0 beyond .* a radius of 4 cells, got up to 1 in 1 cell: set these to 0"),
         (np.float64(1.0), "square"),
         (np.ones((0, 0)), "square"),
     ):
