@@ -86,7 +86,7 @@ def test_access_control_denies_by_default_and_refers_to_defined_names_only() -> 
 def test_the_best_clock_exchange_is_the_recent_one_with_the_shortest_round_trip() -> None:
     offset = ClockOffset()
     assert offset.offset_ns == 0
-    offset.exchanged(1000, 5600, 2000)  # asymmetric: 4100 instead of 4000
+    offset.exchanged(1000, 5600, 2000)  # unequal ways: offset 4100 ns instead of the true 4000 ns
     assert offset.best == (4100, 1000)
     offset.exchanged(3000, 7050, 3100)
     assert offset.best == (4000, 100)
@@ -184,13 +184,13 @@ def test_message_times_are_converted_to_the_receiving_hosts_clock(hosts: Hosts) 
     frames = camera.publisher(FRAME)
     until(lambda: len(arrived) > 3, each=lambda: frames.put(b"frame"))
     for bus, shift_ns in ((camera, 3 * second_ns), (recorder, -7 * second_ns)):
-        assert abs(bus.offset.offset_ns + shift_ns) < second_ns  # accuracy: tests/e2e/test_hosts.py
+        assert abs(bus.offset.offset_ns + shift_ns) < second_ns  # tests/e2e/test_hosts.py checks the accuracy
     assert all(abs(sample.receive_time_ns - sample.publish_time_ns) < second_ns for sample in arrived)
     assert Service("camera", "hosts", camera.clock, camera).health().router_round_trip_ns > 0
 
 
 def test_a_camera_that_waits_for_the_mirror_across_hosts_starts(hosts: Hosts) -> None:
-    """Each of the two needs the other's Health, also the mirror, whose commands come under its own name only."""
+    """Camera and mirror wait for each other's Health. The mirror may receive commands under its own name only."""
     hosts.join(ROUTER)
     camera, mirror = (
         Service(role, "hosts", bus.clock, bus)
@@ -255,7 +255,7 @@ def test_a_lost_router_is_reported_with_the_reason(hosts: Hosts, capfd: pytest.C
     await_report("camera: the router is back\n")
 
 
-def test_an_unknown_name_of_the_router_and_a_session_that_does_not_open_are_errors_without_a_wait(
+def test_an_unknown_host_name_of_the_router_and_a_session_that_does_not_open_are_reported_at_once(
     hosts: Hosts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hosts.join(ROUTER)
@@ -271,7 +271,7 @@ def test_an_unknown_name_of_the_router_and_a_session_that_does_not_open_are_erro
 
 
 def test_a_roles_certificate_is_not_accepted_as_the_routers(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
-    # As if another program were the router, which does not check its own certificate.
+    # The router's check of its own certificate is off, as in a program that poses as the router.
     monkeypatch.setattr("lowfc.adapters.bus.zenoh_bus.require_certificate", lambda *_: None)
     folder = hosts.folder / "false"
     folder.mkdir()

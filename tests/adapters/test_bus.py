@@ -1,4 +1,4 @@
-"""The bus: common behaviour of the memory bus and zenoh's, links, passwords, stopped readers, ends of sessions."""
+"""Behaviour common to the memory bus and the zenoh bus; zenoh's links, passwords, stopped readers and session ends."""
 
 import itertools
 import json
@@ -283,7 +283,7 @@ def test_a_monitor_receives_every_truth_and_frames_at_display_rate(join: Join) -
 
 
 # A recorder that drains its ring on request, and prints how many messages it received so far, how many of these are
-# complete, and the number in the last complete one.
+# complete, and the number in the last complete message.
 READER = """
 import sys
 from lowfc.adapters.bus.run import open_run
@@ -339,7 +339,7 @@ def test_a_stopped_subscriber_does_not_delay_the_others(reader: Reader, join: Jo
     join("controller").subscribe(FRAME, box.put)
     until(lambda: box.take(0.01), each=reader.put)
     reader.process.send_signal(signal.SIGSTOP)
-    for _ in range(1500):  # 19 MB, more than the link buffers; a blocking put would close it
+    for _ in range(1500):  # 19 MB, more than the link buffers; a blocking put would close the link
         reader.put()
         assert box.take(PATIENCE_S)
     reader.process.send_signal(signal.SIGCONT)
@@ -357,7 +357,7 @@ def test_closing_a_session_leaves_a_slow_reader_only_complete_messages(reader: R
     reader.camera.close()
     received, complete, _ = reader.drain()
     assert received == complete
-    assert complete > 15  # content of queue and socket
+    assert complete > 15  # the queue and the socket hold more than 15 messages
 
 
 def test_a_session_ends_although_a_handler_never_returns(join: Join, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -375,13 +375,13 @@ def test_a_session_ends_although_a_handler_never_returns(join: Join, monkeypatch
     free.set()
 
 
-def test_a_session_ends_soon_beside_a_process_that_is_stopped(run: Run) -> None:
-    """As `lowfc ctl safe` while the camera's process is stopped: the host accepts connections for it."""
+def test_a_session_ends_soon_while_another_process_is_stopped(run: Run) -> None:
+    """The host accepts connections for the camera's stopped process; `lowfc ctl safe` must end all the same."""
     with socket.create_server(("127.0.0.1", run.links.ports["camera"])):
         operator = ZenohBus(run.links, "operator", HostClock())
         begun_s = time.monotonic()
         operator.close()
-    assert time.monotonic() - begun_s < CLOSE_S, "it ended by itself, and was not left to end"
+    assert time.monotonic() - begun_s < CLOSE_S, "the session closed before the timeout of `close`"
 
 
 def test_each_use_of_a_key_on_a_closed_bus_raises_a_bus_error(run: Run) -> None:
@@ -389,7 +389,7 @@ def test_each_use_of_a_key_on_a_closed_bus_raises_a_bus_error(run: Run) -> None:
     bus.close()
     for use in (
         lambda: bus.publisher(COMMAND, "dm"),
-        lambda: bus.subscribe(FRAME, Mailbox().put),  # over a direct link, too
+        lambda: bus.subscribe(FRAME, Mailbox().put),  # subscribes over a direct link, too
         lambda: bus.subscribe(HEALTH, Mailbox().put),
         lambda: bus.ring(HEALTH, 1),
         lambda: bus.queryable(REQUEST_KEY.format(name="*"), Mailbox().put),

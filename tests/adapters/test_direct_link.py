@@ -24,7 +24,7 @@ PATIENCE_S = 30.0
 
 
 class LinkedRun:
-    """A run with its buses, and the counts, sizes and threads of the messages that `receive` received."""
+    """A run with its buses; `receive` keeps each message's sequence count, size and receiving thread."""
 
     def __init__(self, base: Path) -> None:
         self.run: Run = open_run("direct-link", base=base)
@@ -64,9 +64,9 @@ class LinkedRun:
 
 @pytest.fixture
 def linked(tmp_path: Path) -> Iterator[LinkedRun]:
-    both = LinkedRun(tmp_path)
-    yield both
-    both.close()
+    linked_run = LinkedRun(tmp_path)
+    yield linked_run
+    linked_run.close()
 
 
 def test_the_direct_subscriber_receives_over_the_direct_link_and_others_over_the_bus(linked: LinkedRun) -> None:
@@ -94,7 +94,7 @@ def test_a_reader_in_the_same_process_receives_each_message_by_a_call(linked: Li
     linked.publish(frames, 100)
     until(lambda: recorded[-1:] == [99])
     camera.close()
-    assert linked.received == list(range(100)), "none twice, although the bus carried them too"
+    assert linked.received == list(range(100)), "each message once, although the bus carried it too"
     assert set(linked.threads) == {threading.current_thread().name}
     del linked.threads[:]
     again = linked.bus("camera").publisher(FRAME)  # as in a separate process
@@ -109,7 +109,7 @@ def test_switching_to_the_direct_link_loses_and_repeats_nothing(linked: LinkedRu
     until(lambda: controller.peers() and camera.peers())
     linked.publish(frames, 250)
     until(lambda: linked.received[-1:] == [frames.published - 1])
-    first = min(linked.received)  # by the socket, it may arrive after the next ones by the bus
+    first = min(linked.received)  # over the socket, it may arrive after later ones over the bus
     assert sorted(linked.received) == list(range(first, frames.published))
     assert [number for number in linked.received if number != first] == list(range(first + 1, frames.published))
     assert "direct-link" in linked.threads
@@ -120,7 +120,7 @@ class ReaderOnTwoPaths:
 
     Attributes:
         delivered: sequences of the messages that the reader delivered.
-        unsubscribed: number of times that it left the bus.
+        unsubscribed: number of times that the reader left the bus.
     """
 
     def __init__(self, path: Path, *, shared: bool = False) -> None:
@@ -187,7 +187,7 @@ def test_messages_that_a_publisher_repeats_or_reorders_are_delivered_as_they_wer
         reader.by_socket(sequence, time_ns)
         if not direct_only:
             reader.by_bus(sequence, time_ns)
-    # The same envelope twice: a repetition without the bus; in parallel with the bus it counts as a copy.
+    # The same envelope twice: without the bus both are delivered; in parallel with it, the second counts as a copy.
     copies = 2 if direct_only else 1
     for _ in range(copies):
         reader.by_socket(13, 9)
@@ -307,7 +307,7 @@ def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct
         assert counts[-100:] == list(range(last_count - 99, last_count + 1))
         assert len(counts) == len(set(counts))
     direct = [name == "direct-link" for sample, name in by_publisher if sample.payload == b"controller"]
-    assert any(direct)  # the bus may be faster
+    assert any(direct)  # for some commands the bus may be faster
     assert all(name != "direct-link" for sample, name in by_publisher if sample.payload == b"operator")
     copied = next(sample for sample in reversed(mirror.received) if sample.payload == b"controller")
     mirror.operator.put(b"a copy", publish_time_ns=copied.publish_time_ns, sequence=copied.sequence)
@@ -341,6 +341,6 @@ def test_after_a_stall_with_the_bus_ahead_nothing_is_delivered_twice(tmp_path: P
 
 def test_with_a_router_there_is_no_direct_link(linked: LinkedRun) -> None:
     assert linked.run.links.direct_link("mirror-dm") is not None
-    across = replace(linked.run.links, network=Network(router="tls/localhost:7447", certificates="certs"))
-    assert across.direct_link("mirror-dm") is None
-    assert across.direct_link("controller") is None
+    with_router = replace(linked.run.links, network=Network(router="tls/localhost:7447", certificates="certs"))
+    assert with_router.direct_link("mirror-dm") is None
+    assert with_router.direct_link("controller") is None

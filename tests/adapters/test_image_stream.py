@@ -16,7 +16,7 @@ from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, Stream
 from tests.support.image_streams.plain import FLOAT32, NUMPY_TYPES, UINT16, PlainStream
 
 ROWS, COLUMNS = 6, 9
-"""Size of the images; numbers in `get` and `pack` are byte offsets in the published layout."""
+"""Size of the images. Offsets in `get` and `pack` are bytes in the published layout."""
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ except OSError:
 
 
 class Image:
-    """An IMAGE of the C library, which has the pointer `md` at byte 120 and `array` at byte 128."""
+    """An IMAGE structure of the C library: its pointer `md` is at byte 120, its pointer `array` at byte 128."""
 
     def __init__(self, name: str) -> None:
         self.memory = ctypes.create_string_buffer(512)
@@ -85,7 +85,7 @@ def test_the_c_library_respects_our_semaphore(path: Path) -> None:
     child = context.Process(target=lambda: queue.put(LIBRARY.ImageStreamIO_getsemwaitindex(library.memory, 0)))
     child.start()
     child.join()
-    assert queue.get() == 1  # 0 is the reader's
+    assert queue.get() == 1  # the reader holds semaphore 0
     reader.close()
 
 

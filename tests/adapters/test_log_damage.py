@@ -73,13 +73,13 @@ def test_a_damaged_log_yields_no_false_message_and_no_silent_loss(tmp_path: Path
         assert bool(strict_error) == bool(error or reader.damage or reader.unreadable), case
         assert strict_error or not (finished and reader.complete), f"{case}: it counts as intact"
         if read != SENT and (finished or kind not in MISPLACED):
-            broken_off = not reader.complete and read == SENT[: len(read)]
-            assert strict_error or broken_off, f"{case}: an unreported loss"
+            truncated = not reader.complete and read == SENT[: len(read)]
+            assert strict_error or truncated, f"{case}: an unreported loss"
     assert delivered > 0.5 * len(SENT) * MUTATIONS / 2, "too little was read for a meaningful test"
 
 
 def chunk_headers(size: int, content: bytes) -> bytes:
-    """A chunk header every 64 bytes, each of a chunk with `content` that fills almost the rest of the file."""
+    """A chunk header every 64 bytes; each chunk begins with `content` and claims almost the rest of the file."""
     file = b""
     for at in range(0, size, 64):
         length = max(size - at - 9, 43)
@@ -199,7 +199,7 @@ def test_a_log_is_recovered_on_a_file_system_without_permissions(
 
 
 @pytest.mark.parametrize("compression", CompressionType)
-@pytest.mark.parametrize("at", [8, 60])  # in the chunk: a byte of its length, and one of its content
+@pytest.mark.parametrize("at", [8, 60])  # offset in the chunk's record: in its length, in its content
 @pytest.mark.parametrize("finished", [True, False])
 def test_only_the_damaged_chunk_of_a_rewritten_log_is_lost(
     tmp_path: Path, source: Path, compression: CompressionType, at: int, finished: bool
@@ -240,21 +240,21 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
         assert list(file.index()) == []
 
 
-@pytest.mark.parametrize("cuts", [(0, 0), (0, 500), (40_000, 0), (40_000, 500), (60_000, 100_000)])
+@pytest.mark.parametrize("bytes_cut", [(0, 0), (0, 500), (40_000, 0), (40_000, 500), (60_000, 100_000)])
 def test_of_two_logs_in_one_file_the_first_is_read_and_the_second_reported(
-    tmp_path: Path, source: Path, cuts: tuple[int, int]
+    tmp_path: Path, source: Path, bytes_cut: tuple[int, int]
 ) -> None:
-    """The second is not read with the channels of the first, even if the first was cut off when its recorder died."""
-    first = (whole := source.read_bytes())[: len(whole) - cuts[0]]
+    """The second is not read with the channels of the first, even if the first was truncated when its recorder died."""
+    first = (whole := source.read_bytes())[: len(whole) - bytes_cut[0]]
     second = rewritten(source, tmp_path / "second.mcap", {}).read_bytes()
-    second = second[: len(second) - cuts[1]]
+    second = second[: len(second) - bytes_cut[1]]
     source.write_bytes(first)
     expected = list(LogReader(source))
     source.write_bytes(first + second)
     reader = LogReader(source, skip_damaged=True)
     assert list(reader) == expected
     damage = reader.damage[-1]
-    assert len(reader.damage) == 1 + bool(cuts[0])
+    assert len(reader.damage) == 1 + bool(bytes_cut[0])
     assert (damage.position, damage.length) == (len(first), len(second))
     command = f"`tail -c +{len(first) + 1} {source.name} > second.mcap`"
     assert damage.why == f"it is another log, appended to this one; {command} copies it"

@@ -184,8 +184,8 @@ def test_the_summary_replaces_the_declarations_of_a_damaged_chunk(tmp_path: Path
         (25, bytes(12)),  # size and checksum of an empty chunk
         (32, b"\xff"),  # size: more than the memory
         (33, bytes(4)),  # checksum 0, which means none
-        (41, b"zzz"),
-        (44, b"\x00\x01"),
+        (41, b"zzz"),  # name of the compression
+        (44, b"\x00\x01"),  # length of the compressed content
     ],
 )
 @pytest.mark.parametrize("finished", [True, False])
@@ -215,7 +215,7 @@ def test_a_damaged_attachment_is_left_out_and_damaged_metadata_are_reported(tmp_
     path = written(tmp_path / "a.mcap", SENT[:8])
     data = path.read_bytes()
     flipped(path, data.index(b"[loop]"))
-    path.write_bytes(path.read_bytes()[: chunks_of(path)[-1][1]])  # without the summary, which detects it, too
+    path.write_bytes(path.read_bytes()[: chunks_of(path)[-1][1]])  # without the summary, which also detects the damage
     with pytest.raises(DataFileError, match="the checksum of an attachment is wrong"):
         list(LogReader(path))
     reader = LogReader(path, skip_damaged=True)
@@ -223,13 +223,13 @@ def test_a_damaged_attachment_is_left_out_and_damaged_metadata_are_reported(tmp_
     assert (list(reader.attachments), len(reader.damage)) == (["h.fits"], 1)
     path.write_bytes(data)
     flipped(path, data.index(b"night"))  # metadata have no checksum of their own
-    for sparse in (False, True):  # no chunk is skipped: all have messages of the topics
+    for sparse in (False, True):  # `sparse` skips no chunk here: each has messages of the topics
         with pytest.raises(DataFileError, match="its parts are intact, but"):
             list(LogReader(path, sparse=sparse))
 
 
 DECLARED = chunk(STEPS, CHANNEL, message(0))
-DIFFERENT = [
+DIFFERENT_DECLARATIONS = [
     dataclasses.replace(CHANNEL, topic="/lowfc/camera/frame"),
     dataclasses.replace(CHANNEL, metadata={"start_s": "8"}),
     dataclasses.replace(STEPS, name="lowfc.v1.Truth"),
@@ -250,7 +250,7 @@ INVALID_LENGTHS = [
     [
         *(
             ([DECLARED, chunk(record, message(1)), chunk(message(2))], "1 is declared a second", [0, 2])
-            for record in DIFFERENT
+            for record in DIFFERENT_DECLARATIONS
         ),
         *(
             ([chunk(STEPS, dataclasses.replace(CHANNEL, metadata={"start_s": start}), message(0))], "1 has start_s", [])
@@ -373,11 +373,11 @@ def test_the_path_of_a_log_finished_meanwhile_is_not_reused(tmp_path: Path, monk
     log = LogWriter(log_path(tmp_path, START_NS), START_NS, {})
     exists = Path.exists
 
-    def then_finished(path: Path) -> bool:
+    def finish_after_check(path: Path) -> bool:
         exists_now = exists(path)
         if not exists(log.path):
             log.finish({})
         return exists_now
 
-    monkeypatch.setattr(Path, "exists", then_finished)
+    monkeypatch.setattr(Path, "exists", finish_after_check)
     assert log_path(tmp_path, START_NS).name == "20260101T000000Z-2.mcap"

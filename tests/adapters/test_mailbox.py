@@ -86,7 +86,7 @@ def test_every_message_is_taken_skipped_missing_or_waiting(actions: list[str]) -
             box.put(sample(len(published)))
         published += "x" if action == "put" else " "
     waiting = box.take(0.0) is not None
-    # No message reveals that others were lost before the first or after the last one that arrived.
+    # Messages that were lost before the first or after the last arrival cannot be detected.
     assert len(published.strip()) == taken + waiting + box.skipped + box.missing
 
 

@@ -33,19 +33,20 @@ def test_other_lengths_are_refused_as_envelopes(data: bytes, read: Callable[[byt
         read(data)
 
 
-@pytest.mark.parametrize("year_start_s", [1_767_225_600, 2_177_452_800, 4_102_444_800, 2**32 - 4])
-def test_sequences_grow_past_2_to_the_32_messages_in_any_year(year_start_s: int) -> None:
-    before, after = sequence_of(year_start_s, 2**32 - 1), sequence_of(year_start_s, 2**32)
+@pytest.mark.parametrize("start_s", [1_767_225_600, 2_177_452_800, 4_102_444_800, 2**32 - 4])
+def test_sequences_grow_past_2_to_the_32_messages_in_any_year(start_s: int) -> None:
+    before, after = sequence_of(start_s, 2**32 - 1), sequence_of(start_s, 2**32)
     assert after == before + 1
-    assert sequence_of(year_start_s, 2**32 + 7) < sequence_of(year_start_s + 2, 0)
+    assert sequence_of(start_s, 2**32 + 7) < sequence_of(start_s + 2, 0)
     for sequence in (before, after):
         assert Envelope.decode_checked(Envelope(sequence, 2**62).encode()) == (sequence, 2**62)
 
 
-@pytest.mark.parametrize("numbers", [(2**64 - 2**33, 0), (2**64 - 1, 0), (0, 2**62 + 1), (0, 2**64 - 1)])
-def test_numbers_that_would_overflow_are_refused(numbers: tuple[int, int]) -> None:
-    with pytest.raises(BadMessageError, match=f"below 2.64 - 2.33.*got {numbers[0]} and {numbers[1]} ns"):
-        Envelope.decode_checked(Envelope(*numbers).encode())
+@pytest.mark.parametrize("sequence_and_time_ns", [(2**64 - 2**33, 0), (2**64 - 1, 0), (0, 2**62 + 1), (0, 2**64 - 1)])
+def test_sequences_and_times_that_would_overflow_are_refused(sequence_and_time_ns: tuple[int, int]) -> None:
+    sequence, time_ns = sequence_and_time_ns
+    with pytest.raises(BadMessageError, match=f"below 2.64 - 2.33.*got {sequence} and {time_ns} ns"):
+        Envelope.decode_checked(Envelope(sequence, time_ns).encode())
 
 
 NOW_S = SIMULATED_START_NS // 10**9
@@ -58,10 +59,10 @@ def test_starts_far_ahead_are_refused_with_both_clocks() -> None:
     check = StartCheck(clock, 24.0, lambda start, here: reported.append((start, here)))
     assert not check.ahead(sequence_of(NOW_S, 5))
     assert not check.ahead(sequence_of(NOW_S + DAY_S - 5, 0))
-    year = sequence_of(NOW_S + 365 * DAY_S, 0)
-    assert check.ahead(year)
+    next_year = sequence_of(NOW_S + 365 * DAY_S, 0)
+    assert check.ahead(next_year)
     clock.advance(2 * 10**9)
-    assert check.ahead(year + 7)
+    assert check.ahead(next_year + 7)
     assert reported == [("2027-01-01T00:00:00Z", "2026-01-01T00:00:00Z")], "reported once"
     assert check.ahead((1 << 64) - (1 << 33) - 1), "the largest sequence that an envelope may have"
     later = sequence_of(NOW_S + DAY_S + 60, 0)

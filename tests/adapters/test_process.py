@@ -131,7 +131,7 @@ REPORT = """
 import gc, json, os, sys
 import numpy
 from threadpoolctl import threadpool_info
-{limits}
+{setup}
 from lowfc.adapters.process.realtime import set_up, set_up_below_loop, use_huge_pages
 granted = {call}
 print(json.dumps({{
@@ -161,10 +161,10 @@ lowfc.adapters.process.realtime._LATENCY_DEVICE = "/no/such/device"
 """
 
 
-def report(call: str, limits: str = "") -> dict[str, object]:
-    words = [sys.executable, "-c", REPORT.format(call=call, limits=limits)]
+def report(call: str, setup: str = "") -> dict[str, object]:
+    arguments = [sys.executable, "-c", REPORT.format(call=call, setup=setup)]
     environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
-    return json.loads(subprocess.run(words, env=environment, capture_output=True, text=True, check=True).stdout)
+    return json.loads(subprocess.run(arguments, env=environment, capture_output=True, text=True, check=True).stdout)
 
 
 def test_set_up_changes_only_blas_threads_and_garbage_collection_by_default() -> None:
@@ -209,8 +209,8 @@ def test_locking_memory_does_not_allocate_reserved_memory() -> None:
 
 
 def test_memory_is_moved_to_huge_pages() -> None:
-    used = "memory = bytearray(b'1' * (16 << 20))"
-    reported = report("use_huge_pages()", used)
+    allocate = "memory = bytearray(b'1' * (16 << 20))"
+    reported = report("use_huge_pages()", allocate)
     if reported["refused"]:
         pytest.skip(str(reported["refused"]))
     assert reported["granted"] == ["huge pages"]
@@ -218,16 +218,16 @@ def test_memory_is_moved_to_huge_pages() -> None:
 
 
 def test_a_host_without_huge_pages_refuses_them(tmp_path: Path) -> None:
-    disabled = "import ctypes; assert ctypes.CDLL(None).prctl(41, 1, 0, 0, 0) == 0  # PR_SET_THP_DISABLE"
-    reported = report("use_huge_pages()", disabled)
+    disable = "import ctypes; assert ctypes.CDLL(None).prctl(41, 1, 0, 0, 0) == 0  # PR_SET_THP_DISABLE"
+    reported = report("use_huge_pages()", disable)
     ((measure, cost),) = reported["refused"]
     assert measure == "huge pages (Invalid argument)"
     assert "Linux 6.1" in cost
     assert (reported["granted"], reported["huge_kb"]) == ([], 0)
     (tmp_path / "bytes").write_text(str(1 << 40))  # larger than any memory here
     for file, why in (("bytes", "no memory fills one"), ("none", "not in this kernel")):
-        other = f"import lowfc.adapters.process.realtime as it; it._HUGE_PAGE_BYTES = {str(tmp_path / file)!r}"
-        assert report("use_huge_pages()", other)["refused"][0][0] == f"huge pages ({why})"
+        setup = f"import lowfc.adapters.process.realtime as it; it._HUGE_PAGE_BYTES = {str(tmp_path / file)!r}"
+        assert report("use_huge_pages()", setup)["refused"][0][0] == f"huge pages ({why})"
 
 
 def fifo_permitted() -> bool:
@@ -254,16 +254,16 @@ def test_cpu_idle_stays_disabled_while_the_process_lives() -> None:
 
 def test_the_recorder_does_not_keep_the_real_time_class_of_its_parent() -> None:
     real_time, cpu = fifo_permitted(), min(os.sched_getaffinity(0))
-    limits = "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))" if real_time else ""
-    reported = report(f"set_up_below_loop(None, {{{cpu}}})", limits)
-    lowest = os.sched_getscheduler(0) == os.SCHED_IDLE and not real_time
-    assert (reported["policy"], reported["cpus"]) == (os.SCHED_IDLE if lowest else os.SCHED_BATCH, [cpu])
-    assert reported["granted"] == [*([] if lowest else ["batch scheduling class"]), f"processors [{cpu}]"]
+    setup = "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))" if real_time else ""
+    reported = report(f"set_up_below_loop(None, {{{cpu}}})", setup)
+    below_batch = os.sched_getscheduler(0) == os.SCHED_IDLE and not real_time
+    assert (reported["policy"], reported["cpus"]) == (os.SCHED_IDLE if below_batch else os.SCHED_BATCH, [cpu])
+    assert reported["granted"] == [*([] if below_batch else ["batch scheduling class"]), f"processors [{cpu}]"]
 
 
 def test_a_host_without_the_batch_class_refuses_it() -> None:
-    other = "os.sched_getscheduler = lambda _: os.SCHED_OTHER; os.SCHED_BATCH = 99"
-    ((measure, _),) = report("set_up_below_loop(None, None)", other)["refused"]
+    setup = "os.sched_getscheduler = lambda _: os.SCHED_OTHER; os.SCHED_BATCH = 99"
+    ((measure, _),) = report("set_up_below_loop(None, None)", setup)["refused"]
     assert measure == "batch scheduling class (Invalid argument)"
 
 
@@ -305,5 +305,5 @@ def test_zenohs_errors_are_shown_without_source_locations() -> None:
     assert plain(zenoh.ZError("invalid configuration at zenoh/src/api/session.rs:12.\nmore")) == "invalid configuration"
     timeout = "Unable to connect to any of [Single(tcp/127.0.0.1:99)]. Timeout!"
     assert plain(zenoh.ZError(f"{timeout} at /root/zenoh/orchestrator.rs:388.")) == timeout
-    for whole in ("no peer among [tcp/127.0.0.1:99]", "an invalid key: [a/**b] cannot be used"):
-        assert plain(zenoh.ZError(whole)) == whole
+    for unchanged in ("no peer among [tcp/127.0.0.1:99]", "an invalid key: [a/**b] cannot be used"):
+        assert plain(zenoh.ZError(unchanged)) == unchanged

@@ -40,7 +40,9 @@ def test_a_run_has_free_ports_below_those_of_outgoing_connections_a_secret_and_p
             probe.bind(("127.0.0.1", port))
     assert len(run.links.secret) == 64
     assert run.path.stat().st_mode & 0o777 == 0o700
-    assert {path.stat().st_mode & 0o7777 for path in run.path.iterdir()} == {0o1600}, "kept by systemd-tmpfiles"
+    assert {path.stat().st_mode & 0o7777 for path in run.path.iterdir()} == {0o1600}, (
+        "the sticky bit keeps them from removal by systemd-tmpfiles"
+    )
     assert run.links.secret_file.read_text() == f"lowfc:{run.links.secret}\n"
     assert run.links.secret not in repr(run)
     other = open_run(new_run_id())
@@ -223,7 +225,7 @@ def test_a_latch_under_its_former_name_counts(files: tuple[Path, Path]) -> None:
     assert not files[0].with_name("safed").exists(), "cleared under either name"
 
 
-def test_a_latch_is_kept_in_one_place_while_the_other_is_missing_and_written_there_again_later(
+def test_a_latch_is_kept_in_one_place_while_the_other_is_missing_and_later_in_both_again(
     files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(latch_module, "RETRY_S", 0.01)
@@ -277,7 +279,7 @@ def test_the_latch_of_a_launchers_run_is_in_its_directory_only(tmp_path: Path, m
     assert latch_files(launched) == (tmp_path / "launched" / "safe",)
 
 
-def test_a_file_that_cannot_be_written_is_an_error_before_and_at_the_writing(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_written_is_an_error_both_when_checked_and_when_written(tmp_path: Path) -> None:
     pipe, loop = tmp_path / "pipe", tmp_path / "loop"
     os.mkfifo(pipe)
     loop.symlink_to("loop")

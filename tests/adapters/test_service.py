@@ -1,4 +1,4 @@
-"""What every process does: health, events, unreadable messages, and its end by a signal."""
+"""Behaviour of every process: health, events, unreadable messages, and end by a signal."""
 
 import os
 import signal
@@ -74,10 +74,10 @@ def test_the_time_before_the_first_work_is_not_in_the_rate(
 
 
 @pytest.mark.parametrize("rate_hz", [0.1, 0.7, 1.6, 5.0, 1000.0])
-def test_the_rate_of_slow_work_is_measured_over_several_units(
+def test_the_rate_of_slow_work_is_measured_over_several_units_of_work(
     listener: Listener, clock: FakeClock, rate_hz: float
 ) -> None:
-    """Also with a Health between the usual ones; after a silence the rate is 0."""
+    """The rate also holds with an extra Health between two regular ones; after a silence it is 0."""
     camera = listener.service("camera")
     for number in range(300):
         camera.work = int(number * 0.5 * rate_hz)
@@ -261,8 +261,8 @@ if {stuck}:
 
 @pytest.mark.parametrize(("number", "stuck", "status"), [("SIGTERM", False, 0), ("SIGINT", True, 128 + signal.SIGINT)])
 def test_a_signal_ends_the_loop_and_a_second_interrupt_the_process(number: str, stuck: bool, status: int) -> None:
-    words = [sys.executable, "-c", LOOP.format(stuck=stuck)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+    arguments = [sys.executable, "-c", LOOP.format(stuck=stuck)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "up\n"
         begun_s = time.monotonic()
         process.send_signal(signal.Signals[number])

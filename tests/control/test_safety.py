@@ -49,10 +49,10 @@ def shape_of(seed: int, special: float = 0.0) -> Single:
 def within_limits(shape: Single) -> Single:
     """The shape, clipped at the stroke limit and scaled down to the neighbour limit."""
     shape = np.clip(shape, -np.float32(LIMITS.stroke_nm), np.float32(LIMITS.stroke_nm))
-    apart = neighbour_difference_nm(shape.astype(np.float64))
-    while apart > LIMITS.neighbour_nm:
-        shape = (shape * np.float32(LIMITS.neighbour_nm / apart * (1 - 1e-7))).astype(np.float32)
-        apart = neighbour_difference_nm(shape.astype(np.float64))
+    difference_nm = neighbour_difference_nm(shape.astype(np.float64))
+    while difference_nm > LIMITS.neighbour_nm:
+        shape = (shape * np.float32(LIMITS.neighbour_nm / difference_nm * (1 - 1e-7))).astype(np.float32)
+        difference_nm = neighbour_difference_nm(shape.astype(np.float64))
     return shape
 
 
@@ -76,8 +76,10 @@ def test_the_limits_hold_for_any_requested_shape(previous: Single, requested: Si
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(stroke=st.floats(5, 2e5), slew=st.floats(0.05, 1), neighbour=st.floats(0.05, 1), seed=st.integers(0, 2**32 - 1))
 @example(stroke=2e5, slew=0.05, neighbour=0.05, seed=1)
-def test_the_limits_hold_for_any_limits(stroke: float, slew: float, neighbour: float, seed: int) -> None:
-    """Over many steps, also for strokes at which float32 rounding exceeds the default margin."""
+def test_steps_are_within_the_limits_for_any_values_of_the_limits(
+    stroke: float, slew: float, neighbour: float, seed: int
+) -> None:
+    """This holds over many steps, also for strokes at which float32 rounding exceeds the default margin."""
     limits = Limits(stroke, slew * stroke, neighbour * stroke)
     rng = np.random.default_rng(seed)
     shape = np.zeros(GRID, np.float32)
@@ -150,13 +152,13 @@ def test_a_shape_outside_the_limits_comes_back(previous: Single, requested: Sing
     while violations(LIMITS, shape, shape):
         after = limit(LIMITS, shape, requested).actuators_nm
         assert np.isfinite(after).all()
-        largest, apart = np.abs(shape).max(), neighbour_difference_nm(shape.astype(np.float64))
+        largest, difference_nm = np.abs(shape).max(), neighbour_difference_nm(shape.astype(np.float64))
         assert np.abs(after.astype(np.float64) - shape).max() <= LIMITS.slew_nm
         assert np.abs(after).max() <= max(largest, LIMITS.stroke_nm)
         if largest > LIMITS.stroke_nm:
             assert np.abs(after).max() < largest
-        if largest <= LIMITS.stroke_nm and apart > LIMITS.neighbour_nm:
-            assert neighbour_difference_nm(after.astype(np.float64)) < apart
+        if largest <= LIMITS.stroke_nm and difference_nm > LIMITS.neighbour_nm:
+            assert neighbour_difference_nm(after.astype(np.float64)) < difference_nm
         shape, steps = after, steps + 1
         assert steps < 200
     assert violations(LIMITS, shape, limit(LIMITS, shape, requested).actuators_nm) == []
