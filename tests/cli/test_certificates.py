@@ -23,7 +23,7 @@ make, CA_DAYS = certificates.make_certificates, certificates.CA_DAYS
 
 
 def handshake(server: Path, client: Path, role: str, name: str = "localhost") -> None:
-    """Mutual TLS handshake, in memory, between a router and a client in a role, with the certificates of two folders.
+    """Mutual TLS handshake in memory: router with the certificates in `server`, client `role` with those in `client`.
 
     Raises:
         ssl.SSLError: router or client does not accept the other.
@@ -80,25 +80,25 @@ def test_existing_certificates_are_kept_unless_renewed(tmp_path: Path) -> None:
     handshake(tmp_path, tmp_path, "viewer")
 
 
-GONE = ((), ("camera.key",), ("camera.pem",), ("camera.key", "camera.pem"))
-"""Files that are missing before a renewal, which writes all certificates, but a key only if there is none."""
+MISSING_FILES = ((), ("camera.key",), ("camera.pem",), ("camera.key", "camera.pem"))
+"""Files that are missing before a renewal. A renewal writes all certificates, but a key only if there is none."""
 
 
 @pytest.mark.parametrize(
-    ("file", "gone"),
+    ("file", "missing"),
     [
-        (file, gone)
+        (file, missing)
         for file in ("camera.key", "camera.pem", "viewer.pem")
-        for gone in GONE
-        if file[-3:] == "pem" or file in gone
+        for missing in MISSING_FILES
+        if file[-3:] == "pem" or file in missing
     ],
 )
 def test_an_interruption_leaves_no_certificate_that_does_not_fit_its_key(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, gone: tuple[str, ...]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, missing: tuple[str, ...]
 ) -> None:
     roles = (ROUTER, "camera", "viewer")
     make(tmp_path, roles, ["localhost"])
-    for name in gone:
+    for name in missing:
         (tmp_path / name).unlink()
     replace = Path.replace
 
@@ -153,7 +153,7 @@ def test_the_routers_certificate_is_accepted_under_the_strict_verification_of_py
     with listening.wrap_socket(socket.create_server(("127.0.0.1", 0)), server_side=True) as server:
 
         def serve() -> None:
-            with contextlib.suppress(ssl.SSLError):  # a refusal is the client's to report
+            with contextlib.suppress(ssl.SSLError):  # the client reports a refusal
                 server.accept()[0].close()
 
         thread = threading.Thread(target=serve)
@@ -208,7 +208,7 @@ def test_another_authority_in_the_file_does_not_end_a_certificate(
     assert not certificate.ends_with_authority
 
 
-def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
+def test_certificates_are_warned_about_before_they_expire(tmp_path: Path) -> None:
     now, day = datetime.datetime.now(datetime.UTC), datetime.timedelta(days=1)
     network = Network(router="tls/localhost:7447", certificates=str(tmp_path))
     make(tmp_path, (ROUTER, "camera"), ["localhost"], 100)
@@ -262,7 +262,7 @@ def test_errors_name_the_file_or_option_at_fault(tmp_path: Path) -> None:
         make(tmp_path / "one", ("viewer",), [])
 
 
-def test_nothing_is_signed_by_an_authority_that_has_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_signed_by_an_expired_authority(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(certificates, "CA_DAYS", 0)
     with pytest.raises(DataFileError, match=r"ca\.pem expired on .*: make all certificates anew in an empty folder"):
         make(tmp_path, ("camera",), [])
@@ -278,8 +278,8 @@ def test_a_name_that_no_mirror_can_have_is_refused(tmp_path: Path, name: str) ->
 
 
 def test_the_command_makes_a_certificate_for_every_role(tmp_path: Path) -> None:
-    words = ["certs", str(tmp_path / "certs"), "--router", "localhost", "--mirror", "dm", "--mirror", "tip"]
-    done = lowfc(*words)
+    arguments = ["certs", str(tmp_path / "certs"), "--router", "localhost", "--mirror", "dm", "--mirror", "tip"]
+    done = lowfc(*arguments)
     assert done.exit_code == 0, done.output
     roles = {"router", "bench", "camera", "controller", "mirror-dm", "mirror-tip", "operator", "recorder", "viewer"}
     folder = tmp_path / "certs"

@@ -115,7 +115,7 @@ def test_a_run_whose_router_does_not_answer_is_not_called_absent() -> None:
 
 @pytest.mark.usefixtures("toml")
 @pytest.mark.parametrize("command", ["record", "sim-loop", "config zenoh --role x", "config zenoh --role x --make"])
-def test_a_name_of_a_run_that_is_too_long_or_empty_is_refused(command: str) -> None:
+def test_a_run_name_that_is_too_long_or_empty_is_refused(command: str) -> None:
     for name in ("x" * 300, ""):
         fault = refusal(*command.split(), "--run", name, kind=BusError)
         assert "--make" not in fault

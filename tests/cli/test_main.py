@@ -61,21 +61,21 @@ def test_the_error_of_an_unknown_command_suggests_the_nearest() -> None:
 
 
 def test_the_error_of_a_wrong_argument_names_what_was_expected_and_found() -> None:
-    for words, expected in (
+    for command_line, expected in (
         ("calibrate --method foo", "'--method': 'foo' is not one of 'analytic'"),
         ("sim-loop --rate fast", "'--rate': must be a valid number, got 'fast'\n"),
         ("sim-loop --duration 0", "'--duration': must be greater than or equal to 0.01, got '0'\n"),
         ("ctl dark --frames 3", "'--frames': must be greater than or equal to 16, got '3'\n"),
     ):
-        assert expected in CliRunner().invoke(app, words.split()).output
+        assert expected in CliRunner().invoke(app, command_line.split()).output
 
 
 def test_a_run_named_before_the_request_is_the_run_of_every_command_of_ctl() -> None:
     group: Any = typer.main.get_command(ctl_app)
     with group.make_context("ctl", ["--run", "other", "status"]) as context:
         context.invoke(group.callback, **context.params)
-    _, *below = contexts(context)
-    runs = {each.command_path: each.lookup_default("run") for each in below}
+    _, *subcommands = contexts(context)
+    runs = {subcommand.command_path: subcommand.lookup_default("run") for subcommand in subcommands}
     assert {"ctl bench", "ctl dark", "ctl safe", "ctl record stop"} <= runs.keys()
     assert [path for path, run in runs.items() if run != "other"] == []
 

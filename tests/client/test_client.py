@@ -60,10 +60,10 @@ from tests.support.loops import json_of, lowfc, until
 from tests.support.recording import Bench, bodies_of, put
 from tests.support.toy import NOLL, calibration
 
-KNOWN = identified(calibration())
+LOADED = identified(calibration())
 LAW = law_from_blocks([integrator_block(0.2, 0.01, "pol", 1.5)] * 3, "pol", "leaky", NOLL, 1.5, 1000.0)
 LEASE = {"text": "a test", "lease_id": 7}
-SHAPE = np.arange(20.0).reshape(KNOWN.grid)
+SHAPE = np.arange(20.0).reshape(LOADED.grid)
 
 
 class FakeController:
@@ -74,9 +74,9 @@ class FakeController:
         self.bus = MemoryBus(self.hub, "controller", HostClock())
         self.bus.queryable(REQUEST_KEY.format(name="*"), self._answer)
         self.calibrations = self.bus.publisher(CALIBRATION)
-        self.calibrations.put(encode_calibration(KNOWN, 0))
+        self.calibrations.put(encode_calibration(LOADED, 0))
         self.states = self.bus.publisher(CONTROLLER_STATE)
-        self.states.put(wire.ControllerState(calibration_id=KNOWN.id).SerializeToString())
+        self.states.put(wire.ControllerState(calibration_id=LOADED.id).SerializeToString())
         self.requests: list[Request] = []
         self.reply = Reply(True, "done", 77)
         self.configuration = ""
@@ -120,7 +120,7 @@ CALLS: tuple[tuple[Callable[[Client], object], Request], ...] = (
     (lambda loop: loop.channel("dark-hole", SHAPE), Request(0, "channel", text="dark-hole")),
     (lambda loop: loop.play(np.stack([SHAPE]), [[1], [3]]), Request(0, "play", text="mirror")),
     (lambda loop: loop.law(), Request(0, "law")),
-    (lambda loop: loop.load(KNOWN), Request(0, "load", calibration=KNOWN)),
+    (lambda loop: loop.load(LOADED), Request(0, "load", calibration=LOADED)),
     (lambda loop: loop.note("höher"), Request(0, "note", text="höher")),
     *(
         (partial(Client.ask, name=name, values=10, text="a test", lease_id=7), Request(0, name, (), (10.0,), **LEASE))
@@ -208,7 +208,7 @@ def test_arrays_arrive_unchanged(controller: FakeController, loop: Client) -> No
     loop.play(np.stack([SHAPE, -SHAPE]), [[1, 2], [3, 4], [5, 6]])
     loop.play_offset(np.ones((4, 3)))
     loop.law(LAW)
-    loop.load(KNOWN)
+    loop.load(LOADED)
     shape, removed, played, offset, law, load = controller.requests
     assert np.array_equal(shape.actuators_nm, SHAPE.ravel())
     assert removed.actuators_nm.size == 0
@@ -216,7 +216,7 @@ def test_arrays_arrive_unchanged(controller: FakeController, loop: Client) -> No
     assert np.array_equal(played.table, [[1, 2], [3, 4], [5, 6]])
     assert (offset.text, offset.table.tolist()) == ("offset", np.ones((4, 3)).tolist())
     assert law.law.id == LAW.id
-    assert load.calibration.id == KNOWN.id
+    assert load.calibration.id == LOADED.id
 
 
 def test_a_refusal_raises_with_the_controllers_reply(controller: FakeController, loop: Client) -> None:
@@ -299,7 +299,7 @@ def test_the_configuration_of_a_loop_is_read_and_another_versions_is_refused(
 
 @pytest.fixture
 def listen(own_runtime: Path) -> Iterator[Callable[..., None]]:
-    """Open the ports of a run's processes, as if they were running."""
+    """Return a function that opens the ports of a run's processes, as if they were running."""
     with contextlib.ExitStack() as open_sockets:
 
         def begin(name: str, *roles: str) -> None:
@@ -384,14 +384,15 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
     arguments is not reported.
     """
     name = f"night-{os.getpid()}"
-    words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", name]
-    wrapped = ["/bin/sh", "-c", 'echo; read end; "$@"', *words[3:]]
-    parent = [sys.executable, "-c", "import subprocess, sys; subprocess.run(sys.argv[3:])", "lowfc", "sim-loop", *words]
+    arguments = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", name]
+    shell = ["/bin/sh", "-c", 'echo; read end; "$@"', *arguments[3:]]
+    program = "import subprocess, sys; subprocess.run(sys.argv[3:])"
+    parent = [sys.executable, "-c", program, "lowfc", "sim-loop", *arguments]
     for runtime_dir, command in (
-        ("/run/elsewhere", words),
-        ("", words),
-        (str(own_runtime), [*words[:-2], f"--run={name}"]),
-        (str(own_runtime), wrapped),
+        ("/run/elsewhere", arguments),
+        ("", arguments),
+        (str(own_runtime), [*arguments[:-2], f"--run={name}"]),
+        (str(own_runtime), shell),
         ("/run/elsewhere", parent),
     ):
         environment = os.environ | {"XDG_RUNTIME_DIR": runtime_dir}
@@ -401,7 +402,7 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
             message = no_loop_message()
             with monkeypatch.context() as patch:
                 patch.setattr("lowfc.adapters.bus.other_loops._START_S", 0.0)
-                late = no_loop_message()
+                later_message = no_loop_message()
                 patch.setattr(os, "geteuid", lambda: 4_000_000_000)
                 patch.setenv("XDG_RUNTIME_DIR", runtime_dir)
                 theirs = list(other_loops())
@@ -409,11 +410,11 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
         program = "sim-loop" if command is parent else "controller"
         loop = f"`lowfc {program} --run {name}` (process {process.pid})"
         where = f", with XDG_RUNTIME_DIR={runtime_dir}" if runtime_dir else ", without XDG_RUNTIME_DIR"
-        is_loop, starting = command is not wrapped, runtime_dir == str(own_runtime)
+        is_loop, starting = command is not shell, runtime_dir == str(own_runtime)
         assert ours == [(f"you run {loop}{'' if starting else where}", starting)] * is_loop
         assert ((f"user {own_runtime.owner()} runs {loop}{where}", False) in theirs) == is_loop
         assert message.endswith("starting or ending: try again in a few seconds") == (is_loop and starting)
-        assert (f"{loop}, but its directory is gone" in late) == (is_loop and starting)
+        assert (f"{loop}, but its directory is gone" in later_message) == (is_loop and starting)
 
 
 # The mirror.
@@ -458,7 +459,7 @@ def test_mirror_watch_reports_a_mirror_that_stopped_following(refused: int, why:
     watch = Client(bus=ReportingBus(hub, lambda: report(wire.MIRROR_STATUS_EXPIRED))).mirror_watch()
     report(wire.MIRROR_STATUS_FOLLOWING)
     watch.read()
-    assert watch.interruption == "", "it did not follow before"
+    assert watch.interruption == "", "an expired state before the first following one is no interruption"
     report(wire.MIRROR_STATUS_EXPIRED, refused)
     report(wire.MIRROR_STATUS_FOLLOWING)
     watch.read()
@@ -495,11 +496,11 @@ def test_lost_frames_are_counted_but_not_restarts_or_duplicates() -> None:
         broken = frame_sample(9)._replace(payload=payload)
         frames = stream(frame_sample(5), frame_sample(8), broken, frame_sample(10), *restarted, count=5)
         assert len(list(frames)) == 5
-        assert frames.lost == 2 + 1 + 1, "6 and 7, the unreadable 9, and 1 after the restart"
-    of_earlier_start = frame_sample(2, 1_699_999_000)
-    frames = stream(*map(frame_sample, (5, 7, 7, 6)), of_earlier_start, *map(frame_sample, (8, 8, 11, 10)), count=9)
+        assert frames.lost == 2 + 1 + 1, "frames 6 and 7, the unreadable frame 9, and frame 1 after the restart"
+    earlier_start = frame_sample(2, 1_699_999_000)
+    frames = stream(*map(frame_sample, (5, 7, 7, 6)), earlier_start, *map(frame_sample, (8, 8, 11, 10)), count=9)
     assert [frame.number for frame in frames] == [5, 7, 7, 6, 2, 8, 8, 11, 10]
-    assert frames.lost == 1, "only 9 is missing"
+    assert frames.lost == 1, "only frame 9 is missing"
 
 
 def test_a_silent_stream_raises_also_at_its_start() -> None:
@@ -539,7 +540,7 @@ def test_a_slow_reader_loses_the_oldest_frames(controller: FakeController, loop:
         publisher.put(payload)
     assert first.number == 30
     assert len(list(frames)) == WAITING - 1
-    assert frames.lost == 0, "frames before the first one do not count"
+    assert frames.lost == 0, "frames lost before the first one that was read do not count"
 
 
 @pytest.mark.parametrize("payload", [b"\xff", b""])
@@ -622,8 +623,8 @@ def test_mode_lists_are_parsed() -> None:
 
 
 def test_an_invalid_number_is_quoted_in_the_error() -> None:
-    for words in (["gain", "0,3"], ["limit", "60", "0,3"], ["offset", "-5", "0,3"]):
-        done = lowfc("ctl", *words)
+    for arguments in (["gain", "0,3"], ["limit", "60", "0,3"], ["offset", "-5", "0,3"]):
+        done = lowfc("ctl", *arguments)
         assert done.exit_code == 2
         assert "'0,3' is not a number: write 0.3" in done.output
     assert "'4=-5' is not a number: write -5 --modes 4" in lowfc("ctl", "offset", "4=-5").output
@@ -665,14 +666,14 @@ def test_the_status_shows_the_whole_state() -> None:
     }
     shown = json_object(state)
     assert {name: shown[name] for name in expected} == expected
-    words = ["closed, opens after 12 frames", "dark-hole 3.54 nm rms", "12 of 20", "acting: slew", "integrator only"]
-    assert [each for each in words if each not in text(shown)] == []
+    phrases = ["closed, opens after 12 frames", "dark-hole 3.54 nm rms", "12 of 20", "acting: slew", "integrator only"]
+    assert [phrase for phrase in phrases if phrase not in text(shown)] == []
     assert text(shown).splitlines()[-1].endswith("abc, provisional: from the first steps of commissioning")
     assert json_object(wire.ControllerState())["mode"] == "starting"
     assert "provisional" not in text(json_object(wire.ControllerState(calibration_id="abc")))
     counts = [wire.ReasonCount(reason=42, count=3)]
-    of_a_newer_version = wire.ControllerState(mode=9, refused=40, limits_hit=[41], counts=counts)
-    shown = json_object(of_a_newer_version)
+    state_of_newer_version = wire.ControllerState(mode=9, refused=40, limits_hit=[41], counts=counts)
+    shown = json_object(state_of_newer_version)
     assert [shown[key] for key in ("mode", "refused", "limits_hit", "counts")] == ["mode 9", "40", ["41"], {"42": 3}]
     assert "reason 42 3 times" in text(shown)
 
@@ -730,10 +731,10 @@ def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
     assert summary.messages == sum(counts)
     for log, count in zip(logs, counts, strict=True):
         account = {"messages": str(count), "messages_lost": "1", f"lost {FRAME.key}": "1"}
-        assert log.metadata["recording"] == account, "of this recording, not of the recorder"
+        assert log.metadata["recording"] == account, "the account is of this recording, not of all recordings"
 
 
-def test_a_log_that_cannot_be_created_is_refused_and_the_answer_for_the_next_one_estimates_its_growth(
+def test_a_log_that_cannot_be_created_is_refused_and_the_answer_to_the_next_start_estimates_the_growth(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.start(bytes_per_s=1e6)
