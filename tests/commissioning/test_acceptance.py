@@ -131,13 +131,15 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, Prob
 
 
 def test_an_interrupted_probe_sequence_is_repeated_in_the_same_mode(capsys: pytest.CaptureFixture[str]) -> None:
-    once = InProcessLoop(noiseless(), lose=lambda index: index == 60 and once.silence_camera())
-    (response,) = responses_of(once, linearity, hold_frames=7, cycles=3, modes=(2,))
-    assert linearity.judge([response], once.config).passed
+    once_silent = InProcessLoop(noiseless(), lose=lambda index: index == 60 and once_silent.silence_camera())
+    (response,) = responses_of(once_silent, linearity, hold_frames=7, cycles=3, modes=(2,))
+    assert linearity.judge([response], once_silent.config).passed
     assert capsys.readouterr().out.count("NO_FRAMES no frame for 60 ms; holding the command) during a probe") == 1
-    often = InProcessLoop(noiseless(), lose=lambda index: index > 20 and not index % 30 and often.silence_camera())
+    often_silent = InProcessLoop(
+        noiseless(), lose=lambda index: index > 20 and not index % 30 and often_silent.silence_camera()
+    )
     with pytest.raises(AcceptanceError, match=r"in 3 attempts no probe sequence was undisturbed; .*NO_FRAMES"):
-        responses_of(often, linearity, hold_frames=7, cycles=3, modes=(2,))
+        responses_of(often_silent, linearity, hold_frames=7, cycles=3, modes=(2,))
 
 
 def test_a_probe_sequence_waits_for_a_mirror_that_has_just_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,16 +212,18 @@ def test_the_noise_floor_matches_photon_and_read_noise() -> None:
         assert mode.closed_nm == pytest.approx(mode.expected_nm, rel=0.2)
         assert 0 < mode.residual_floor_nm < mode.closed_nm
     brighter = configured(star__magnitude=-2.0)
-    four_times = replace(calibration, flux_dn=4 * calibration.flux_dn)
-    of_brighter_star = [replace(each, loop=replace(each.loop, calibration=four_times)) for each in responses]
-    failed = noise.judge(of_brighter_star, brighter)
+    four_times_flux = replace(calibration, flux_dn=4 * calibration.flux_dn)
+    responses_to_brighter_star = [
+        replace(response, loop=replace(response.loop, calibration=four_times_flux)) for response in responses
+    ]
+    failed = noise.judge(responses_to_brighter_star, brighter)
     assert not failed.passed
     assert "FAILED" in failed.text()
     assert drawn(noise, result).startswith(b"\x89PNG")
     figure = figure_class()()
     noise.draw(result.json_object(), figure)
     [axes] = figure.axes
-    assert "per frame" not in axes.get_ylabel()  # the residual is not of one frame
+    assert "per frame" not in axes.get_ylabel()  # the residual is not a value per frame
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
     assert labels == ["expected per frame", "open per frame", "closed per frame", "residual from noise"]
     with pytest.raises(AcceptanceError, match="found open; the test was ended, or the log begins or ends within it"):
@@ -286,8 +290,8 @@ def test_a_disturbed_test_that_was_repeated_does_not_count(tmp_path: Path) -> No
 
 def test_a_log_that_ends_within_a_test_is_refused_with_what_is_missing(tmp_path: Path) -> None:
     log = SyntheticLog().frames(20).request("note", text=CLOSED).frames(40).write(tmp_path / "night.mcap")
-    cut = r"ends 10 of 50 frames before the end of a measurement \(noise-floor, loop closed\): give all files"
-    with pytest.raises(DataFileError, match=cut):
+    error = r"ends 10 of 50 frames before the end of a measurement \(noise-floor, loop closed\): give all files"
+    with pytest.raises(DataFileError, match=error):
         responses_in(log)
 
 
@@ -314,5 +318,5 @@ def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_of_its_
 
 def test_malformed_modes_and_options_without_effect_on_a_log_are_refused() -> None:
     for test in ("rejection", "linearity", "capture-range"):
-        for words, why in (("--modes", "11-4"), "takes Noll indices"), (("x.mcap", "--modes", "4"), "--modes is for a"):
-            assert why in refusal("acceptance", test, *words, kind=ConfigurationError)
+        for given, why in (("--modes", "11-4"), "takes Noll indices"), (("x.mcap", "--modes", "4"), "--modes is for a"):
+            assert why in refusal("acceptance", test, *given, kind=ConfigurationError)

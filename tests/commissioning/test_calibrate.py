@@ -71,7 +71,7 @@ def calibrated(loop: InProcessLoop, method: str) -> tuple[Calibration, Calibrati
 
 
 @pytest.mark.parametrize(
-    ("method", "delay", "modes", "lost"),
+    ("method", "delay_frames", "modes", "frames_lost"),
     [
         pytest.param("hadamard", 1.0, 14, False, marks=pytest.mark.slow),
         ("hadamard", 1.5, 3, True),
@@ -80,18 +80,18 @@ def calibrated(loop: InProcessLoop, method: str) -> tuple[Calibration, Calibrati
     ],
 )
 def test_a_measured_calibration_reads_the_true_modes(
-    monkeypatch: pytest.MonkeyPatch, method: str, delay: float, modes: int, lost: bool
+    monkeypatch: pytest.MonkeyPatch, method: str, delay_frames: float, modes: int, frames_lost: bool
 ) -> None:
     """Lost frames do not bias the calibration."""
     monkeypatch.setattr(pokes, "HOLD", 4)
-    config = configured(camera__delay_frames=delay, sensor__modes=modes)
-    loop = InProcessLoop(config, lose=lambda index: lost and index > 300 and index % 41 == 0)
+    config = configured(camera__delay_frames=delay_frames, sensor__modes=modes)
+    loop = InProcessLoop(config, lose=lambda index: frames_lost and index > 300 and index % 41 == 0)
     if method == "in-loop":
         loop.close_loop()
         loop.run(30)
     before = loop.calibration()
     calibration, data = calibrated(loop, method)
-    assert abs(data.delay.delay_frames - delay) < 0.05
+    assert abs(data.delay.delay_frames - delay_frames) < 0.05
     assert data.measured.error.max() < 0.02
     talk = np.abs(cross_talk(calibration.reconstructor, before.response))
     assert (talk - 4 * data.measured.error[:, None]).max() < 0.02
@@ -143,7 +143,7 @@ def test_the_loop_holds_a_zero_point_that_is_not_flat() -> None:
     loop = InProcessLoop(config, world=configured(**NOISELESS, disturbance__static_nm=zero_point_nm))
     calibration, _ = calibrated(loop, "hadamard")
     zero = loop.residual_nm(0, 1)[0]
-    moved = configured(**NOISELESS, disturbance__static_nm={"2": 20.0, "3": -10.0, "4": 35.0})  # Z2 and Z4 by 20 nm
+    moved = configured(**NOISELESS, disturbance__static_nm={"2": 20.0, "3": -10.0, "4": 35.0})  # Z2, Z4: +20 nm
     difference = closed_residual_nm(config, calibration, moved) - zero
     assert np.abs(difference).max() < 0.02 * 20.0
 
@@ -204,14 +204,14 @@ class FaultyLoop(InProcessLoop):
     """
 
     def __init__(
-        self, faults: Mapping[int, tuple[Action, Action]], before_the_end: int | None = None, **changes: Any
+        self, faults: Mapping[int, tuple[Action, Action]], frames_before_end: int | None = None, **changes: Any
     ) -> None:
-        """Inject faults: by number of the probe sequence, the fault and the recovery.
+        """Inject `faults`: number of a probe sequence -> (fault, recovery).
 
-        A fault occurs 50 frames after the start of the sequence, or `before_the_end` frames before its end.
+        A fault occurs 50 frames after the start of the sequence, or `frames_before_end` frames before its end.
         """
         self.begun: list[int] = []
-        self._faults, self._before_the_end = faults, before_the_end
+        self._faults, self._frames_before_end = faults, frames_before_end
         self._due: dict[int, Action] = {}
         super().__init__(configured(**NOISELESS, **changes))
 
@@ -219,7 +219,7 @@ class FaultyLoop(InProcessLoop):
         answer = super().play(basis_nm, table)
         self.begun.append(len(self.surfaces_nm))
         if len(self.begun) in self._faults:
-            after = 50 if self._before_the_end is None else len(np.asarray(table)) - self._before_the_end
+            after = 50 if self._frames_before_end is None else len(np.asarray(table)) - self._frames_before_end
             for wait, action in zip((after, after + 20), self._faults[len(self.begun)], strict=True):
                 self._due[self.begun[-1] + wait] = action
         return answer
@@ -267,7 +267,7 @@ def test_a_sequence_during_a_device_restart_is_stopped_at_once_and_repeated() ->
         assert re.search(why, report)
     assert (len(loop.begun), loop.stops) == (1 + 4 + 4, 4)
     for play in faults:
-        assert loop.begun[play] < loop.begun[play - 1] + 80, "a sequence ends soon after the fault, 50 frames in"
+        assert loop.begun[play] < loop.begun[play - 1] + 80, "a sequence ends soon after the fault in its frame 50"
     assert np.abs(cross_talk(loop.calibration().reconstructor, data.measured.response)).max() < 0.05
 
 
@@ -344,10 +344,10 @@ def test_another_operators_request_ends_a_calibration_and_stays_in_force(
     assert reports[-1].startswith(f"warning: the loop was not closed again: {cause}")
 
 
-@pytest.mark.parametrize("before_the_end", [None, 3])
-def test_a_dead_mirror_ends_the_calibration(monkeypatch: pytest.MonkeyPatch, before_the_end: int | None) -> None:
+@pytest.mark.parametrize("frames_before_end", [None, 3])
+def test_a_dead_mirror_ends_the_calibration(monkeypatch: pytest.MonkeyPatch, frames_before_end: int | None) -> None:
     monkeypatch.setattr(mirror_watch, "SILENT_S", 0.0)
-    loop, reports = FaultyLoop({3: (kill_mirror, ignore)}, before_the_end), list[str]()
+    loop, reports = FaultyLoop({3: (kill_mirror, ignore)}, frames_before_end), list[str]()
     calibrator = calibrator_of(loop, "hadamard", report=reports.append)
     with pytest.raises(BusError, match=r"no mirror state came .* is the mirror's process running"):
         calibrator.run()

@@ -67,16 +67,16 @@ def noiseless_loop(monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
 
 
 def connected(loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
-    """The loop, to which the commands now connect."""
+    """Let the commands connect to the loop; return the loop."""
     for module in (tasks, calibrate_align):
         monkeypatch.setattr(module, "Client", lambda run: loop)
     return loop
 
 
-def compute(config: Configuration, out: str, *words: object) -> dict[str, Any]:
+def compute(config: Configuration, out: str, *options: object) -> dict[str, Any]:
     """Result of `lowfc calibrate --method analytic` with a configuration."""
     Path("test.toml").write_text(config.to_toml())
-    return json_of("calibrate", "--method", "analytic", "--config", "test.toml", "--out", out, *words)
+    return json_of("calibrate", "--method", "analytic", "--config", "test.toml", "--out", out, *options)
 
 
 def frames_to_go(stderr: str) -> float:
@@ -90,11 +90,11 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
 ) -> None:
     loop = noiseless_loop
     check = Calibrator.check
-    delay_measurement_frames = DELAY_FRAMES + 16  # with some at its ends; before the first report of the time to go
+    delay_measurement_frames = DELAY_FRAMES + 16  # before the first report of the time to go; 16 frames are at its ends
     monkeypatch.setattr(Calibrator, "check", Mock(side_effect=KeyboardInterrupt))
     before = loop.calibration()
-    words = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]
-    done = lowfc("calibrate", *words)
+    arguments = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]
+    done = lowfc("calibrate", *arguments)
     assert done.exit_code == 130
     assert done.stderr.splitlines()[-1].startswith("kept in night.fits.part.npz: 4 cycles; the same command")
     assert "4 cycles of 146 frames and 3 check cycles; about" in done.stderr
@@ -102,7 +102,7 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
     assert loop.calibration().id == before.id
     monkeypatch.setattr(Calibrator, "check", check)
     cycle_frames = len(loop.surfaces_nm) - delay_measurement_frames
-    resumed = lowfc("calibrate", *words, "--resume", "--json")
+    resumed = lowfc("calibrate", *arguments, "--resume", "--json")
     check_frames = len(loop.surfaces_nm) - cycle_frames - 2 * delay_measurement_frames
     assert frames_to_go(resumed.stderr) == pytest.approx(check_frames, abs=0.6 * RATE_HZ)
     assert frames_to_go(done.stderr) == pytest.approx(cycle_frames + check_frames, abs=0.6 * RATE_HZ)
@@ -151,13 +151,13 @@ def test_a_calibration_in_closed_loop_is_loaded_and_the_loop_closed_again(
     monkeypatch.setattr(loop, "load", load_calibration)
     monkeypatch.setattr(command, "print_result", lambda *_, **__: None)
     loop.close_loop()
-    words = ["--method", "in-loop", "--out", "night.fits", "--load"]
-    done = lowfc("calibrate", *words)
+    arguments = ["--method", "in-loop", "--out", "night.fits", "--load"]
+    done = lowfc("calibrate", *arguments)
     assert "the loop is opened to load the calibration and closed again afterwards" in done.stderr
     assert (loop.calibration().id, loop.status().state.mode) == (new_calibration.id, wire.LOOP_MODE_CLOSED)
     assert not part.exists()
     refuse = True
-    done = lowfc("calibrate", *words)
+    done = lowfc("calibrate", *arguments)
     assert "load refused" in str(done.exception)
     assert "kept in night.fits.part.npz: 4 cycles" in done.stderr
     assert part.exists()
@@ -181,14 +181,14 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(monkeyp
     """First the star is faint; then its image also moves before R is checked, and R is noisier than accepted."""
     loop = connected(InProcessLoop(load(None, CONFIG | {"star.magnitude": 3.0})), monkeypatch)
     before = loop.calibration()
-    words = ["--cycles", "4", "--snr", "200", "--out", "night.fits", "--load"]
-    done = lowfc("calibrate", *words, "--json")
+    arguments = ["--cycles", "4", "--snr", "200", "--out", "night.fits", "--load"]
+    done = lowfc("calibrate", *arguments, "--json")
     assert done.exit_code == 1
     result = json.loads(done.stdout)
     assert not result["recommended"]
     assert result["snr_reached"] < 200
     assert "200 required: find what disturbs this mode, or measure about" in result["faults"][0]
-    assert "--resume --snr 200 --cycles " in result["faults"][0]  # --cycles alone would require 20
+    assert "--resume --snr 200 --cycles " in result["faults"][0]  # --cycles alone would require a ratio of 20
     assert result["file"] == "night.rejected.fits"
     assert calibration_file.load(Path("night.rejected.fits")).id != before.id
     assert not Path("night.fits").exists(), "an existing calibration would be overwritten"
@@ -205,7 +205,7 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(monkeyp
     assert "cross-talk on separate frames" not in str(result["faults"])
     monkeypatch.setattr(Calibrator, "check", check_shifted)
     monkeypatch.setattr(calibrate_result, "MAX_NOISE_RATIO", 0.5)
-    done = lowfc("calibrate", *words, "--resume")
+    done = lowfc("calibrate", *arguments, "--resume")
     assert done.exit_code == 1
     assert "verdict: NOT RECOMMENDED" in done.stdout
     assert "cross-talk on separate frames" in done.stdout
@@ -251,8 +251,8 @@ def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:
     done = lowfc("calibrate", "reference", "--frames", "16")
     assert "the new reference image contains the offset" in " ".join(done.stderr.split())
     loop.ask("lease", values=60.0, text="somebody", lease_id=2)
-    words = ("calibrate", "reference", "--frames", "200", "--out", "there.fits")
-    assert "reserved for somebody" in refusal(*words, kind=RequestRefusedError)
+    arguments = ("calibrate", "reference", "--frames", "200", "--out", "there.fits")
+    assert "reserved for somebody" in refusal(*arguments, kind=RequestRefusedError)
 
 
 def test_a_saturated_image_is_no_reference(loop: InProcessLoop) -> None:
@@ -288,16 +288,16 @@ def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
     assert result["hot"] < 5
 
 
-@pytest.mark.parametrize("words", ["", "reference", "align", "dark --star-blocked", "dark --file cube.npy"])
+@pytest.mark.parametrize("arguments", ["", "reference", "align", "dark --star-blocked", "dark --file cube.npy"])
 def test_frames_of_another_size_than_the_calibration_are_refused(
-    loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch, words: str
+    loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch, arguments: str
 ) -> None:
     other = replace(loop.calibration(), shape=(64, 100))
     monkeypatch.setattr(loop, "calibration", lambda: other)
     monkeypatch.setattr(loop, "camera", lambda: CameraSettings(0, (80, 80), 100.0, 40100.0))
     np.save("cube.npy", np.full((16, 64, 100), 100))
-    frames = ["--frames", "16"] if words and "--file" not in words else []
-    error = refusal("calibrate", *words.split(), *frames, kind=CalibrationError)
+    frames = ["--frames", "16"] if arguments and "--file" not in arguments else []
+    error = refusal("calibrate", *arguments.split(), *frames, kind=CalibrationError)
     assert re.search(r"80 x 80 pixels and are refused as WRONG_SIZE: .* is for 64 x 100: load", error)
 
 
@@ -347,7 +347,7 @@ def test_pokes_resolve_a_reflection_or_rotation_that_does_not_change_the_image(
     image = first.reference.astype(float).reshape(80, 80)
     alignment = align(onto(image, geometry, (80, 80)), image)
     H = onto(first.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
-    alignment = replace(alignment, residual=0.1, other_parity=0.2)  # the better parity may be the wrong one
+    alignment = replace(alignment, residual=0.1, other_parity=0.2)  # the wrong parity may fit better
     found, calibration, correlation = oriented(config, first, alignment, first, lambda mode: H[:, mode])
     assert (found.geometry.rotation_deg, found.geometry.parity) == (pytest.approx(-168, abs=0.1), geometry.parity)
     assert found.residual == (0.1 if alignment.geometry.parity == geometry.parity else 0.2)
@@ -407,7 +407,7 @@ def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop)
 
 
 @pytest.mark.parametrize(
-    ("words", "why"),
+    ("arguments", "why"),
     [
         ("--out there.fits dark --star-blocked", "--out is before `dark`: .* after it"),
         ("--json reference", "--json is before `reference`"),
@@ -419,9 +419,9 @@ def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop)
         ("dark --file cube.fits --frames 50", "--frames has no effect with --file"),
     ],
 )
-def test_an_option_without_effect_is_refused(words: str, why: str) -> None:
+def test_an_option_without_effect_is_refused(arguments: str, why: str) -> None:
     before = {path.name for path in Path().iterdir()}
-    assert re.search(why, refusal("calibrate", *words.split(), kind=ConfigurationError))
+    assert re.search(why, refusal("calibrate", *arguments.split(), kind=ConfigurationError))
     assert {path.name for path in Path().iterdir()} == before
 
 
@@ -495,11 +495,11 @@ def test_the_option_at_takes_a_mirror_shape_for_the_wavefront_that_it_makes(conf
         (SMALL_MIRROR | {"control.limit_nm": 1e5, "control.tilt_limit_nm": 1e5}, ""),  # limits that never act
         ({"star.magnitude": 6.0, "camera.bias_dn": 0.0}, "which distorts the modes: dark pixels are cut off at 0 DN"),
         ({"star.magnitude": 6.0, "camera.gain_e_per_dn": 10.0}, "distorts the modes: faint pixels are rounded down"),
-        ({"star.magnitude": 6.0, "control.limit_nm": 1e5}, ""),  # else with a warning of noise
+        ({"star.magnitude": 6.0, "control.limit_nm": 1e5}, ""),  # the default limit would give a warning of noise
     ],
 )
 def test_a_computed_calibration_warns_of_its_configuration(keys: dict[str, Any], warned: str) -> None:
-    """Of noise above the modal limit, of a mirror that does not span the pupil, and of frames with another flux."""
+    """It warns of noise above the modal limit, a mirror that does not span the pupil, and frames with another flux."""
     analytic(load(None, keys), Console(file=(printed := StringIO())))
     assert warned in printed.getvalue()
     assert ("warning" in printed.getvalue()) is bool(warned)
@@ -516,7 +516,7 @@ def test_a_loop_with_a_calibration_at_a_wavefront_converges_to_it() -> None:
     assert held == pytest.approx([0, 0, 15, 0, 0, -10], abs=0.02 * 20)
 
 
-def test_an_invalid_wavefront_for_at_is_an_error(config: Configuration, tmp_path: Path) -> None:
+def test_an_invalid_wavefront_for_the_option_at_is_an_error(config: Configuration, tmp_path: Path) -> None:
     assert zero_point(config, " 4=15, 7 = -1e1")[0] == "4=15,7=-10"
     for text, why in {
         "4:15": "as in 4=15,7=-10, or a file; got '4:15'",

@@ -57,7 +57,7 @@ class Bench:
         self.actions: dict[str, Callable[[], None]] = {}
 
     def report(self, text: str) -> None:
-        """Store a report and the number of frames before it, and carry out the actions for its first words."""
+        """Store a report and the number of frames exposed before it; run each action whose key begins the report."""
         self.reports.append(text)
         self.exposed.setdefault(text, len(self.loop.surfaces_nm))
         for start, action in self.actions.items():
@@ -111,9 +111,8 @@ def test_commissioning_closes_a_loop_with_another_frame_size(bench: Bench) -> No
     assert list(state.automatic) == [True, True, False]
     calibration = calibration_file.load(bench.out)
     assert calibration.shape == (64, 64)
-    modelled = computed(
-        DISTURBED.to_toml()
-    ).actuators_to_modes  # for every shape of the mirror, not only for those of the modes
+    # They agree for every mirror shape, not only for the shapes of the modes.
+    modelled = computed(DISTURBED.to_toml()).actuators_to_modes
     assert np.linalg.norm(calibration.actuators_to_modes - modelled) < 0.2 * np.linalg.norm(modelled)
     assert calibration.saturation_dn == 2**14 - 1
     assert not provisional_path(bench.out).exists()
@@ -141,7 +140,9 @@ def test_the_loop_holds_the_wavefront_of_the_reference_image(bench: Bench) -> No
     measured = bench.loop.residual_nm(bench.exposed["[7/10] response"], bench.exposed["[8/10] verdict"])
     assert np.abs(measured.mean(axis=0)).max() > 5, "far from flat"
     assert true.mean(axis=0) == pytest.approx(measured.mean(axis=0), abs=1.0)  # the tilts scatter by 3 nm
-    assert float(np.sqrt(true.var(axis=0).sum())) < bench.results["measured_error_nm"]  # which includes noise
+    assert (
+        float(np.sqrt(true.var(axis=0).sum())) < bench.results["measured_error_nm"]
+    )  # the measured error includes noise
 
 
 def test_without_close_the_residual_is_only_predicted(bench: Bench) -> None:
@@ -183,7 +184,7 @@ def test_a_wrong_sign_fails_the_check_with_automatic_gains(bench: Bench, reverse
     bench.loop.run(20)
 
 
-def test_with_a_linear_law_its_own_residual_is_predicted(bench: Bench) -> None:
+def test_the_residual_of_a_loaded_linear_law_is_predicted(bench: Bench) -> None:
     bench.loop.open_loop()
     law = replace(LAWS["pi"], rate_hz=100.0)
     bench.loop.law(law)

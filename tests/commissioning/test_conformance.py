@@ -61,7 +61,7 @@ def envelope(sequence: int, time_ns: int) -> bytes | None:
 
 
 class Device:
-    """A simulated device that is also its own connection; correct except for `changes`, functions or values by name.
+    """A simulated device that is also its own connection. It is correct except for `changes`: functions or values.
 
     Time advances in milliseconds, and only in `wait`.
     """
@@ -96,9 +96,9 @@ class Device:
     def ask(self, key: str) -> list[Received]:
         return self.changed("answer", [self.last[key]] if key in self.last else [])
 
-    def changed(self, name: str, value: Any, *what: Any) -> Any:
+    def changed(self, name: str, value: Any, *arguments: Any) -> Any:
         change = self.changes.get(name)
-        return value if change is None else change(value, *what)
+        return value if change is None else change(value, *arguments)
 
     def publish(self, key: str, message: Message | bytes, now_ns: int) -> None:
         count = self.changed("count", self.counts[key], key)
@@ -166,7 +166,7 @@ class Mirror(Device):
     def receive(self, payload: bytes, now_ns: int) -> None:
         self._received += 1
         period = self.changes.get("drops")
-        if self.changes.get("deaf") or (period and self._received % period == 0):
+        if self.changes.get("ignores") or (period and self._received % period == 0):
             return
         try:
             command = wire.MirrorCommand.FromString(payload)
@@ -177,7 +177,7 @@ class Mirror(Device):
         if refused is None:
             self._publish(self.status.time_ns, now_ns)
         elif self.changes.get("loses"):
-            self._received = -1  # of the next command, which `drops` then skips
+            self._received = -1  # the next command is number 0, which `drops` skips
         elif self.changes.get("renews"):
             self.status = self.status._replace(received_ns=now_ns)
 
@@ -226,7 +226,7 @@ def setting(**values: Any) -> Callable[..., Any]:
     return change
 
 
-def stamped(shift_ns: int) -> Callable[..., RawImage]:
+def shifted(shift_ns: int) -> Callable[..., RawImage]:
     def change(frame: RawImage, _: int) -> RawImage:
         frame.timestamp.FromNanoseconds(frame.timestamp.ToNanoseconds() + shift_ns)
         return frame
@@ -234,16 +234,16 @@ def stamped(shift_ns: int) -> Callable[..., RawImage]:
     return change
 
 
-def put_at(function: Callable[[int], int]) -> Callable[[int, int], bytes | None]:
+def publish_at(function: Callable[[int], int]) -> Callable[[int, int], bytes | None]:
     return lambda sequence, time_ns: envelope(sequence, function(time_ns))
 
 
-def growing(state: wire.CameraState, index: int) -> wire.CameraState:
+def growing_exposure(state: wire.CameraState, index: int) -> wire.CameraState:
     state.exposure_ns += index
     return state
 
 
-def halved(frame: RawImage, _: int) -> RawImage:
+def eight_bits(frame: RawImage, _: int) -> RawImage:
     frame.data, frame.step = frame.data[::2], frame.width
     return frame
 
@@ -255,7 +255,8 @@ def cropped(frame: RawImage, index: int) -> RawImage:
 
 
 WRONG, WARNING = "wrong", "warning"
-CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
+# By fault: changes of the device, and the expected status of each check that is not ok.
+CAMERA_FAULTS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "nothing": ({}, {}),
     "no envelope": ({"attach": lambda *_: None}, {"envelope": WRONG, "settings on request": WRONG}),
     "a short envelope": ({"attach": lambda s, t: b"12345678"}, {"envelope": WRONG, "settings on request": WRONG}),
@@ -265,16 +266,16 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "a constant count": ({"count": lambda count, _: 7}, {"sequence": WRONG}),
     "a count of all topics": ({"count": lambda count, _: 3 * count}, {"sequence": WRONG}),
     "a gap": ({"count": lambda count, _: count + 4 * (count > 100)}, {"sequence": WARNING}),
-    "a publish time in us": ({"attach": put_at(lambda t: t // 1000)}, {"publish time": WRONG}),
-    "a monotonic clock": ({"attach": put_at(lambda t: t - OFFSET_NS)}, {"publish time": WRONG}),
-    "another clock": ({"attach": put_at(lambda t: t - 35 * MS)}, {"publish time": WRONG}),
-    "a clock that steps": ({"attach": put_at(lambda t: t - t % (25 * MS))}, {"publish time": WRONG}),
+    "a publish time in us": ({"attach": publish_at(lambda t: t // 1000)}, {"publish time": WRONG}),
+    "a monotonic clock": ({"attach": publish_at(lambda t: t - OFFSET_NS)}, {"publish time": WRONG}),
+    "another clock": ({"attach": publish_at(lambda t: t - 35 * MS)}, {"publish time": WRONG}),
+    "a clock that steps": ({"attach": publish_at(lambda t: t - t % (25 * MS))}, {"publish time": WRONG}),
     "no frame time": ({"frame": lambda frame, _: frame.ClearField("timestamp") or frame}, {"frame time": WRONG}),
-    "a frame time ahead": ({"frame": stamped(20 * MS)}, {"frame time": WRONG}),
-    "a frame time an hour ago": ({"frame": stamped(-3600 * 1000 * MS)}, {"frame time": WRONG}),
-    "the start of the exposure": ({"frame": stamped(-5 * MS)}, {"frame time": WARNING}),
+    "a frame time ahead": ({"frame": shifted(20 * MS)}, {"frame time": WRONG}),
+    "a frame time an hour ago": ({"frame": shifted(-3600 * 1000 * MS)}, {"frame time": WRONG}),
+    "the start of the exposure": ({"frame": shifted(-5 * MS)}, {"frame time": WARNING}),
     "undecodable bytes": ({"frame": lambda *_: b"\xff\xff\xff"}, {"frames": WRONG}),
-    "eight bits": ({"frame": halved}, {"bytes": WRONG}),
+    "eight bits": ({"frame": eight_bits}, {"bytes": WRONG}),
     "another encoding": ({"frame": setting(encoding="16UC1")}, {"encoding": WRONG}),
     "no step": ({"frame": setting(step=0)}, {"bytes": WRONG}),
     "rows for columns": ({"frame": setting(width=12, height=16, step=24)}, {"settings' size": WRONG}),
@@ -299,7 +300,7 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "undecodable settings": ({"state": lambda *_: b"\xff\xff\xff"}, {"settings": WRONG, "settings on request": WRONG}),
     "settings once": ({"state": lambda state, i: state if i == 0 else None}, {"settings": WARNING}),
     "empty settings": ({"state": lambda *_: wire.CameraState()}, {"settings' values": WRONG, "settings' size": WRONG}),
-    "settings that change": ({"state": growing}, {"settings kept": WARNING}),
+    "settings that change": ({"state": growing_exposure}, {"settings kept": WARNING}),
     "settings of another region": ({"state": setting(rows=16, columns=12)}, {"settings' size": WRONG}),
     "ten bits": ({"state": setting(bit_depth=10)}, {"settings' values": WRONG, "settings' range": WRONG}),
     "saturation too low": ({"state": setting(saturation_dn=2000)}, {"settings' range": WRONG}),
@@ -314,9 +315,9 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
 }
 
 
-@pytest.mark.parametrize("fault", CAMERAS)
+@pytest.mark.parametrize("fault", CAMERA_FAULTS)
 def test_a_fault_of_a_camera_is_found_and_nothing_else(fault: str) -> None:
-    changes, expected = CAMERAS[fault]
+    changes, expected = CAMERA_FAULTS[fault]
     assert camera_faults(**changes) == expected
 
 
@@ -351,12 +352,15 @@ def careless(check: str) -> Callable[..., Command]:
     return change
 
 
-WIDE = Limits(10_000.0, 10_000.0, 10_000.0)
+WIDE_LIMITS = Limits(10_000.0, 10_000.0, 10_000.0)
 UNTRIED = {"limits": WARNING}
 NEVER_EXPIRED = {"dead-man": WRONG, "longest command": WARNING} | UNTRIED
-MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
-    "silent and deaf": ({"silent": lambda *_: 1, "deaf": True}, {"idle state": WRONG, "answers": WRONG} | UNTRIED),
-    "no answers": ({"deaf": True}, {"answers": WRONG} | UNTRIED),
+MIRROR_FAULTS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
+    "silent, no answers": (
+        {"silent": lambda *_: 1, "ignores": True},
+        {"idle state": WRONG, "answers": WRONG} | UNTRIED,
+    ),
+    "no answers": ({"ignores": True}, {"answers": WRONG} | UNTRIED),
     "one command in three unanswered": ({"drops": 3}, {"answers": WRONG} | UNTRIED),
     "one command in 15 skipped after a stall": ({"drops": 15}, {"answers": WARNING}),
     "loses what follows a bad command": ({"drops": 999, "loses": True}, {"after bad commands": WRONG} | UNTRIED),
@@ -381,7 +385,7 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
         {"state": shaped(lambda shape: np.where(np.abs(shape) > 1, np.float32(3e38), shape))},
         {"applied": WRONG} | UNTRIED,
     ),
-    "its own time": ({"state": lambda state: stamped(3 * MS)(state, 0)}, {"time": WARNING}),
+    "its own time": ({"state": lambda state: shifted(3 * MS)(state, 0)}, {"time": WARNING}),
     "no modal command": ({"state": lambda state: state.ClearField("command_nm") or state}, {"modal command": WARNING}),
     "NaN replaced by zero": (
         {"command": careless("finite")},
@@ -404,7 +408,7 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
         },
         {"relaxing": WRONG} | UNTRIED,
     ),
-    "no limits": ({"protection": {"limits": WIDE}}, {"stroke": WRONG, "slew": WRONG, "neighbours": WRONG}),
+    "no limits": ({"protection": {"limits": WIDE_LIMITS}}, {"stroke": WRONG, "slew": WRONG, "neighbours": WRONG}),
     "no stroke limit": ({"protection": {"limits": Limits(10_000.0, 150.0, 500.0)}}, {"stroke": WRONG}),
     "no neighbour limit": ({"protection": {"limits": Limits(750.0, 150.0, 10_000.0)}}, {"neighbours": WRONG}),
     "a shorter stroke": ({"protection": {"limits": Limits(400.0, 150.0, 500.0)}}, {"stroke": WARNING}),
@@ -423,12 +427,12 @@ def test_a_correct_mirror_passes_and_returns_to_its_shape() -> None:
     mirror.status, _ = mirror.mirror.apply_command(mirror.status, command, mirror.now_ns())
     assert mirror_faults(mirror) == {}
     np.testing.assert_allclose(mirror.status.surface_nm, start, atol=0.03)
-    assert 5 < mirror.status.frame_sequence < 5000  # below the sequences of a camera, which are not refused later
+    assert 5 < mirror.status.frame_sequence < 5000, "below a camera's sequences: later commands are accepted"
 
 
-@pytest.mark.parametrize("fault", MIRRORS)
+@pytest.mark.parametrize("fault", MIRROR_FAULTS)
 def test_a_fault_of_a_mirror_is_found(fault: str) -> None:
-    changes, expected = MIRRORS[fault]
+    changes, expected = MIRROR_FAULTS[fault]
     assert mirror_faults(Mirror(**changes)) == expected
 
 
@@ -442,10 +446,10 @@ def test_an_answer_that_is_read_late_because_this_host_stalls_is_no_fault() -> N
 
 
 def test_a_command_that_expires_once_because_of_a_stall_is_tried_again() -> None:
-    early = [MS]
+    first_timeout_ns = [MS]
 
     def tick(tick: Any) -> Any:
-        valid = mirror.status.valid_for_ns == EXPIRES_NS and early and early.pop()
+        valid = mirror.status.valid_for_ns == EXPIRES_NS and first_timeout_ns and first_timeout_ns.pop()
         mirror.status = mirror.status._replace(valid_for_ns=valid or mirror.status.valid_for_ns)
         return tick
 
@@ -544,8 +548,8 @@ def test_the_report_has_advice_for_failed_checks(capsys: pytest.CaptureFixture[s
 
 @pytest.mark.usefixtures("own_runtime")
 def test_conformance_refuses_runs_that_it_cannot_check(tmp_path: Path) -> None:
-    def complaint(*words: object) -> str:
-        return refusal("conformance", *words)
+    def complaint(*arguments: object) -> str:
+        return refusal("conformance", *arguments)
 
     assert "lowfc config zenoh --role camera" in complaint("camera")
     assert "lowfc config zenoh --role mirror-dm" in complaint("mirror")

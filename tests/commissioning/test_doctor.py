@@ -44,7 +44,7 @@ NO_RIGHTS = [
 CPUS = "sys/devices/system/cpu"
 CLOCKSOURCE = "sys/devices/system/clocksource/clocksource0/current_clocksource"
 HUGE_PAGES = "sys/kernel/mm/transparent_hugepage/enabled"
-METAL = {
+SUITABLE_HOST = {
     "proc/self/cgroup": "0::/user.slice/loop.scope\n",
     "proc/sys/kernel/sched_rt_runtime_us": "950000\n",
     "proc/sys/kernel/sched_rt_period_us": "1000000\n",
@@ -86,11 +86,11 @@ HOST_CHECKS = [
 """Checks that pass on the suitable host and need its data."""
 DMI = ("sys/class/dmi/id/sys_vendor", "sys/class/dmi/id/product_name")
 DYNAMIC = {"proc/version": "Linux version 6.1.0 (gcc) #1 SMP PREEMPT_DYNAMIC Thu"}
-NAMED: dict[str, object] = {
+PINNED: dict[str, object] = {
     "realtime.camera_cpus": [4],
     "realtime.controller_cpus": [5],
     "realtime.mirror_cpus": [6],
-    "realtime.recorder_cpus": [0],  # not one of the isolated: the recorder can wait
+    "realtime.recorder_cpus": [0],  # not an isolated processor: the recorder can wait
 }
 NOTHING_REQUESTED = load(None, {"realtime.priority": 0, "realtime.recorder_priority": 0, "realtime.lock_memory": False})
 REFUSED = {
@@ -99,7 +99,7 @@ REFUSED = {
     "huge_pages": ("huge pages (no)", "frames take longer"),
     "disable_cpu_idle": ("processors awake (no)", "it wakes late"),
 }
-DEEP = {f"{CPUS}/cpu0/cpuidle/state2/disable": "0\n"}
+C6_ON = {f"{CPUS}/cpu0/cpuidle/state2/disable": "0\n"}
 
 
 def trial(refused: dict[str, tuple[str, str]] | None = None, cpus: int = 8, **late_ns: list[int]) -> Trial:
@@ -110,7 +110,7 @@ def trial(refused: dict[str, tuple[str, str]] | None = None, cpus: int = 8, **la
 def machine(root: Path, changes: dict[str, object]) -> Host:
     """The suitable host with some files and readings changed; None removes one."""
     host, unreadable = Host(root), Mock(side_effect=OSError("not readable"))
-    for name, value in {**METAL, **changes}.items():
+    for name, value in {**SUITABLE_HOST, **changes}.items():
         if "/" not in name:
             setattr(host, name, unreadable if value is None else lambda value=value: value)
         elif value is not None:
@@ -120,7 +120,9 @@ def machine(root: Path, changes: dict[str, object]) -> Host:
 
 
 def facts(root: Path, changes: dict[str, object] | None = None, **others: object) -> Facts:
-    config = others.pop("config", load(None, {"recorder.folder": "/logs", "realtime.disable_cpu_idle": False, **NAMED}))
+    config = others.pop(
+        "config", load(None, {"recorder.folder": "/logs", "realtime.disable_cpu_idle": False, **PINNED})
+    )
     return Facts(**{"host": machine(root, changes or {}), "config": config, "trial": trial(), "busy": (), **others})
 
 
@@ -155,7 +157,7 @@ def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
         ("frequency", "warning", "powersave", {f"{CPUS}/cpu2/cpufreq/scaling_governor": "powersave\n"}),
         ("frequency", "ok", "turbo on", {f"{CPUS}/intel_pstate/no_turbo": None, f"{CPUS}/cpufreq/boost": "1\n"}),
         ("frequency", "note", "not shown", {f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor": None for cpu in range(4)}),
-        ("idle states", "warning", "may wait 133 us", DEEP),
+        ("idle states", "warning", "may wait 133 us", C6_ON),
         ("idle states", "note", "no states shown", {f"{CPUS}/cpuidle/current_driver": "none\n"}),
         ("kernel", "warning", "no preemption", {"proc/version": "Linux version 6.1.0 (gcc) #1 SMP Thu"}),
         ("kernel", "ok", "PREEMPT", {"proc/version": "Linux version 6.1.0 (gcc) #1 SMP PREEMPT Thu"}),
@@ -196,8 +198,8 @@ def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
         ("locked memory", "warning", "stalls", {"trial": trial(REFUSED)}),
         ("huge pages", "warning", "frames take longer", {"trial": trial(REFUSED)}),
         ("swap", "warning", "memory is not locked", {"trial": trial(REFUSED), "swap": (1 << 31, 0)}),
-        ("idle states", "ok", "133 us to wake; kept awake", DEEP | {"config": load(None, NAMED)}),
-        ("idle states", "warning", "it wakes late", DEEP | {"config": load(None, NAMED), "trial": trial(REFUSED)}),
+        ("idle states", "ok", "133 us to wake; kept awake", C6_ON | {"config": load(None, PINNED)}),
+        ("idle states", "warning", "it wakes late", C6_ON | {"config": load(None, PINNED), "trial": trial(REFUSED)}),
         ("load", "warning", "busy now: chromium 60 %", {"busy": (("chromium", 0.6), ("sshd", 0.05))}),
         ("locked memory", "note", "lock_memory = false", {"config": NOTHING_REQUESTED}),
     ],
@@ -212,7 +214,7 @@ def test_each_property_of_a_host_has_its_status_and_text(
 
 
 def test_unreadable_data_gives_a_note(tmp_path: Path) -> None:
-    unreadable = dict.fromkeys(METAL)
+    unreadable = dict.fromkeys(SUITABLE_HOST)
     failed = OSError("the trial's process ended with exit status 1: no")
     checks = examine(facts(tmp_path, unreadable, trial=failed))
     unknown = {name for name, check in checks.items() if check.got.startswith("not known: ")}
@@ -220,7 +222,7 @@ def test_unreadable_data_gives_a_note(tmp_path: Path) -> None:
     assert {checks[name].status for name in unknown} == {"note"}
     assert checks["scheduling class"].got == f"not known: {failed}"
     assert command.measured(facts(tmp_path, unreadable, trial=failed))["wake_up_us"] == {}
-    files = {path: "\x00 ?" for path in METAL if "/" in path}
+    files = {path: "\x00 ?" for path in SUITABLE_HOST if "/" in path}
     nonsense = examine(facts(tmp_path, files))
     assert {nonsense[name].status for name in ("isolation", "huge pages")} == {"note"}
 
@@ -229,19 +231,19 @@ def test_the_check_of_the_disk_uses_the_recorders_volume(tmp_path: Path, monkeyp
     usage = SimpleNamespace(free=0)
     monkeypatch.setattr(host_module.psutil, "disk_usage", lambda path: usage)
     keys = {"recorder.folder": "~/not/yet", "recorder.min_free_mb": 500, "camera.rate_hz": 1000}
-    of_disk = facts(tmp_path, config=load(None, {**keys, "mirror.rows": 10, "mirror.columns": 10}))
-    assert of_disk.bytes_per_s == 1000 * (80 * 80 * 2 + 2 * 100 * 4)
-    growth = bytes_per_s(of_disk.config, EVERYTHING)
-    an_hour = 500_000_000 + round(growth * 3600) + 1
-    for free, status in ((an_hour, "ok"), (an_hour - 10**6, "warning"), (10**6, "warning")):
+    facts_with_disk = facts(tmp_path, config=load(None, {**keys, "mirror.rows": 10, "mirror.columns": 10}))
+    assert facts_with_disk.bytes_per_s == 1000 * (80 * 80 * 2 + 2 * 100 * 4)
+    log_gb_per_h = bytes_per_s(facts_with_disk.config, EVERYTHING) * 3600 / 1e9
+    bytes_in_an_hour = 500_000_000 + round(log_gb_per_h * 1e9) + 1
+    for free, status in ((bytes_in_an_hour, "ok"), (bytes_in_an_hour - 10**6, "warning"), (10**6, "warning")):
         usage.free = free
-        check = examine(of_disk)["disk"]
+        check = examine(facts_with_disk)["disk"]
         assert check.status == status
         assert check.got.startswith(f"{Path.home()}/not/yet: ")
-        assert (f"enough for 1.0 h at 1000 Hz, {growth * 3600 / 1e9:.1f} GB an hour" in check.got) == (free > 10**9)
+        assert (f"enough for 1.0 h at 1000 Hz, {log_gb_per_h:.1f} GB an hour" in check.got) == (free > 10**9)
     monkeypatch.setattr(host_module.os, "access", lambda path, mode: False)
-    usage.free = an_hour
-    assert "not writable" in examine(of_disk)["disk"].got
+    usage.free = bytes_in_an_hour
+    assert "not writable" in examine(facts_with_disk)["disk"].got
 
 
 @pytest.mark.parametrize(("behind_ms", "status"), [(50, "ok"), (1000, "warning"), (-1000, "warning")])
@@ -261,7 +263,7 @@ def test_expiring_or_absent_certificates_are_a_warning(tmp_path: Path, monkeypat
     certificates = pytest.importorskip("lowfc.adapters.bus.certificates")
     folder = tmp_path / "certs"
     monkeypatch.setenv("HOME", str(tmp_path))
-    routed = load(None, {"network.router": "tls/bench:7447", "network.certificates": "~/certs", **NAMED})
+    routed = load(None, {"network.router": "tls/bench:7447", "network.certificates": "~/certs", **PINNED})
     absent = examine(facts(tmp_path, config=routed))["certificates"]
     assert (absent.status, f"{folder} has no certificate" in absent.got) == ("warning", True)
     certificates.make_certificates(folder, ("camera",), [])
@@ -276,7 +278,7 @@ def test_expiring_or_absent_certificates_are_a_warning(tmp_path: Path, monkeypat
 def test_the_kernels_clock_state_is_read_from_the_right_fields() -> None:
     timex = Timex(modes=0)
     assert ctypes.CDLL(None).adjtimex(ctypes.byref(timex)) >= 0
-    seconds = timex.rest[3]  # the time, after constant, precision and tolerance
+    seconds = timex.rest[3]  # the field `time`, after constant, precision and tolerance
     assert abs(seconds - time.time()) < 60
     assert Host().synchronisation().error_s >= 0
 
@@ -329,7 +331,7 @@ def test_a_trial_ends_after_an_interrupt() -> None:
 
 
 def test_a_failed_trial_names_its_cause(monkeypatch: pytest.MonkeyPatch) -> None:
-    multiprocessing.resource_tracker.ensure_running()  # now, as the program below cannot run it
+    multiprocessing.resource_tracker.ensure_running()  # started now, because the program below cannot start it
     monkeypatch.setattr(multiprocessing.spawn, "get_executable", lambda: b"/bin/false")
     with pytest.raises(OSError, match="the trial's process ended"):
         try_out(Realtime(), set(), 0.01)
@@ -339,13 +341,13 @@ def test_a_failed_trial_names_its_cause(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_busy_finds_a_process_that_uses_the_cpu() -> None:
-    host, here = Host(), f"({os.getpid()})"
+    host, own_pid = Host(), f"({os.getpid()})"
     with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as process:
         try:
             until(lambda: any(share > 0.1 and f"({process.pid})" in name for name, share in host.busy()))
         finally:
             process.kill()
-    assert not any(name.endswith(here) for name, _ in host.busy())
+    assert not any(name.endswith(own_pid) for name, _ in host.busy())
 
 
 def test_doctor_checks_this_host(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -406,7 +408,7 @@ def test_real_time_rights_are_shown_applied_and_removed(tmp_path: Path, monkeypa
     with pytest.raises(OSError, match="exit 6: no such user"):
         permissions._run("sh", "-c", "echo no such user >&2; exit 6")
     calls: list[tuple[str, ...]] = []
-    monkeypatch.setattr(permissions, "_run", lambda *words: calls.append(words) or " ".join(words))
+    monkeypatch.setattr(permissions, "_run", lambda *arguments: calls.append(arguments) or " ".join(arguments))
     monkeypatch.setattr(permissions.shutil, "chown", lambda path, group: calls.append((str(group),)))
     monkeypatch.setattr(permissions.os, "geteuid", lambda: 1000)
     for change in (lambda: permissions.apply(tmp_path, "me"), lambda: permissions.undo(tmp_path)):
@@ -421,7 +423,7 @@ def test_real_time_rights_are_shown_applied_and_removed(tmp_path: Path, monkeypa
         assert (tmp_path / name).read_text() == text
         assert text in lowfc("doctor", "--setup").stdout
     assert device.stat().st_mode & 0o777 == 0o660
-    assert [words[0] for words in calls] == ["groupadd", "lowfc", "usermod"]
+    assert [arguments[0] for arguments in calls] == ["groupadd", "lowfc", "usermod"]
     assert "exclude each other" in refusal("doctor", "--apply", "--undo")
     assert "leave out --json" in refusal("doctor", "--setup", "--json")
     assert "leave out --device" in refusal("doctor", "--apply", "--device", "isio")

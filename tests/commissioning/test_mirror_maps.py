@@ -135,7 +135,7 @@ def test_each_unusable_file_is_a_line_of_the_error(tmp_path: Path) -> None:
     assert "unstable with a delay of 3" in complaint({"control.law": str(law), "control.delay_frames": 3})
     several = complaint({"mirror.flat": small, "control.law": small, "sensor.sam": "none.json"}).splitlines()
     assert len(several) == 3
-    assert all(words in line for words, line in zip(("none.json", "mirror.flat", "control.law"), several, strict=True))
+    assert all(text in line for text, line in zip(("none.json", "mirror.flat", "control.law"), several, strict=True))
 
 
 def test_inactive_actuators_get_no_command_and_modes_and_actuators_stay_inverse(
@@ -174,7 +174,7 @@ def test_a_registration_error_affects_the_mirror_but_not_the_computed_calibratio
 
 
 def started(config: Configuration, calibration: Calibration, shape: MirrorShape | None) -> tuple[State, list[Request]]:
-    """Start a controller: load the calibration, report the mirror, carry out the configured requests; all accepted."""
+    """Start a controller: load the calibration, report the mirror, apply the configured requests (all accepted)."""
     settings = factory.settings(config)
     reported = () if shape is None else (shape,)
     state, _ = feed(settings, State(), Load(0, calibration, "test"), *reported)
@@ -187,7 +187,7 @@ def started(config: Configuration, calibration: Calibration, shape: MirrorShape 
 
 
 def commands(config: Configuration, state: State, frames: int = 10) -> tuple[list[Single], list[str]]:
-    """Commands over some frames of uniform light in open loop, and the names of the channels at their end."""
+    """Commands of an open loop for frames of uniform light, and names of the channels after the last frame."""
     settings = replace(factory.settings(config), min_flux_fraction=0.0, max_identical_frames=0)
     calibration, sent = state.loop.calibration, []
     pixels = np.rint(calibration.dark + 100).reshape(calibration.shape).astype(np.uint16)
@@ -210,7 +210,7 @@ def test_the_flat_map_is_applied_at_the_start(tmp_path: Path, calibration: Calib
 
 
 @pytest.mark.parametrize("age_s", [1, 6])
-def test_the_flat_map_is_applied_during_a_permit_from_before_the_mirror_was_known(
+def test_the_flat_map_is_applied_during_a_permit_that_began_before_the_mirror_reported(
     tmp_path: Path, calibration: Calibration, age_s: int
 ) -> None:
     """If the request were refused, the controller would end, as it does not run without its configured flat map."""

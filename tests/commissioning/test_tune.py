@@ -1,4 +1,4 @@
-"""`lowfc tune`: results, files and errors, on a log made by the live loop's own `advance`; and law files."""
+"""`lowfc tune`: results, files and errors, on a log computed by the controller's `advance`. Law files."""
 
 import json
 import re
@@ -225,7 +225,8 @@ PROBE = wire.Play(first_sequence=frame_sequence(3050), frames=100, id="probe")
 class SteppedLoop(InProcessLoop):
     """A loop with these steps, whose mirror reports each command `report_periods` after the end of the exposure.
 
-    With a `later_gain`, the state has the probe sequence only at the request after 3100 steps, and this gain from then.
+    With a `later_gain`, only the state requested after 3100 steps has the probe sequence; it and later ones have the
+    gain.
     """
 
     lost, offset = 0, None  # number of steps that the client lost, and offset of the clock of the mirror's host
@@ -255,7 +256,7 @@ class SteppedLoop(InProcessLoop):
 
 
 def noisy_steps() -> list[Step]:
-    """Noise, and 20 Hz in tip; one step in a thousand is missing, one frame in a hundred was refused."""
+    """Steps with noise, and 20 Hz in tip; one step in a thousand is missing, one frame in a hundred was refused."""
     noise = np.random.default_rng(3).standard_normal((6000, 3)).astype(np.float32)
     noise[:, 0] += (10 * np.sin(2 * np.pi * 20 * np.arange(6000) * PERIOD_NS * 1e-9)).astype(np.float32)
     measured_nm = [None if index % 100 == 99 else row for index, row in enumerate(noise)]
@@ -291,7 +292,7 @@ def test_tuning_uses_the_steps_of_a_running_loop() -> None:
 
 
 def test_the_mirrors_reports_give_the_time_of_application() -> None:
-    """Here the mirror's clock is 2 periods behind that of the router, the camera's 9."""
+    """The mirror's clock is 2 frame periods behind the router's clock, the camera's is 9 behind."""
     loop = SteppedLoop(noisy_steps(), 7.2)
     loop.offset = SimpleNamespace(offset_ns=2 * PERIOD_NS)
     loop.processes = lambda: {"camera": wire.Health(router_offset_ns=9 * PERIOD_NS)}
@@ -320,7 +321,7 @@ def test_a_longer_delay_is_measured_on_a_running_loop(report_periods: float, del
     assert [warning.startswith(warned) for warning in run.warnings] == [True] * (delay_frames - 1)
 
 
-@pytest.mark.parametrize(("gain", "settling"), [(0.3, 500), (1 / 160, 800)])  # 0.5 s, or five time constants
+@pytest.mark.parametrize(("gain", "settling"), [(0.3, 500), (1 / 160, 800)])  # frames: 0.5 s, or five time constants
 def test_probe_sequences_on_a_running_loop_are_excluded(gain: float, settling: int) -> None:
     """The loop settles again after the sequence."""
     disturbance_nm = np.random.default_rng(5).standard_normal((6000, 3)).astype(np.float32)
@@ -388,7 +389,7 @@ def test_the_previous_law_stays_active_if_the_gains_are_refused() -> None:
     assert loop.law_and_gains() == before
 
 
-def test_the_previous_law_is_restored_without_an_answer_or_the_error_says_that_it_is_not() -> None:
+def test_without_an_answer_the_previous_law_is_restored_or_the_error_says_that_it_is_not() -> None:
     loop = RequestedLoop()
     loop.law(LAWS["pi"])
     before = loop.law_and_gains()
