@@ -357,13 +357,13 @@ def test_the_console_replaces_commands_by_keys_and_long_lists_by_ranges() -> Non
 def test_tasks_are_commands_with_the_options_of_their_form(screen: Screen, monkeypatch: pytest.MonkeyPatch) -> None:
     task = Mock(side_effect=lambda name, _: SimpleNamespace(status=0, status_line=f"{name}: done"))
     monkeypatch.setattr(application, "Task", task)
-    for name, words in TASKS.items():
+    for name, expected_command in TASKS.items():
         screen.press(ALL_ACTIONS[name].key)
         screen.until(screen.form_is_open)
         screen.press("enter")
         screen.until(lambda name=name: screen.text("answer") == f"{name}: done")
         command = " ".join(task.call_args.args[1])
-        assert command.startswith(f"{words} calibration-")
+        assert command.startswith(f"{expected_command} calibration-")
         assert command.endswith(f".fits --load --run {RUN}")
 
 
@@ -456,7 +456,7 @@ def test_a_disconnected_console_reports_it_and_hides_the_values(
         screen.until(lambda: not screen.app.screen.query_one("#tiles").visible)
         screen.until(lambda: not screen.app.screen.query_one("#gains").visible)
     screen.until(lambda: not screen.text("verdict").startswith("NOT CONNECTED"))
-    # seven tiles, CONTRAST and VIEW, once they are laid out again
+    # Nine rows after the new layout: seven tiles, CONTRAST and VIEW.
     screen.until(lambda: screen.app.screen.query_one("#tiles").size.height == 9)
 
 
@@ -497,7 +497,7 @@ def test_pictures_and_sparklines_have_a_fixed_size() -> None:
     assert sparkline([1.0, float("nan"), 0.5, 0.0]) == "█ ▅▁"
     assert sparkline([]) == ""
     assert sparkline([1.0, float("inf")]) == "▁█"
-    assert sparkline([-0.01, -0.02]) == "▁▁"  # less than no light: the dark is subtracted
+    assert sparkline([-0.01, -0.02]) == "▁▁"  # negative flux, after subtraction of the dark
     for shape in ((6, 7), (34, 34), (1, 300)):
         small = reduced(np.full(shape, 4.0))
         assert small.shape == (_PIXELS, _PIXELS)

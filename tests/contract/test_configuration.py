@@ -203,7 +203,7 @@ def test_config_show_sets_only_keys_that_were_set(tmp_path: Path) -> None:
     assert load(write(tmp_path, uncommented)) == Configuration(), "each key can be uncommented unchanged"
 
 
-def test_a_quoted_key_with_dots_is_not_said_to_be_nearest_to_itself(tmp_path: Path) -> None:
+def test_a_quoted_key_with_dots_is_not_suggested_as_its_own_correction(tmp_path: Path) -> None:
     message = error_of(write(tmp_path, '"camera.rate_hz" = 100'))
     assert message.endswith("unknown key 'camera.rate_hz'; write it without quotes, which make it one name")
 
@@ -218,7 +218,7 @@ def test_each_error_has_its_own_line_and_names_file_and_key_as_written(tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "words"),
+    ("overrides", "phrases"),
     [
         ({"safety.stroke_nm": 800.0}, ("safety.stroke_nm", "800", "750")),
         ({"mirror.dead": [34 * 34]}, ("1156", "1155")),
@@ -233,9 +233,9 @@ def test_each_error_has_its_own_line_and_names_file_and_key_as_written(tmp_path:
         ({"disturbance.drift_nm": {"4": 3.0}, "sensor.modes": 2}, ("disturbance", "Z4", "Z3")),
     ],
 )
-def test_contradicting_values_are_refused(overrides: dict[str, Any], words: tuple[str, ...]) -> None:
+def test_contradicting_values_are_refused(overrides: dict[str, Any], phrases: tuple[str, ...]) -> None:
     message = error_of(None, overrides)
-    assert all(word in message for word in words), message
+    assert all(phrase in message for phrase in phrases), message
     assert "\n" not in message
 
 

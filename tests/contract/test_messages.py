@@ -76,23 +76,23 @@ def test_the_generated_code_matches_the_proto_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("enum", "prefix"), [(LoopMode, "LOOP_MODE_"), (REASONS, "REASON_")])
 def test_enums_have_the_numbers_of_the_wire(enum: Iterable[IntEnum], prefix: str) -> None:
-    theirs = dict((wire.LoopMode if enum is LoopMode else wire.Reason).items())
-    assert theirs == {f"{prefix}UNSPECIFIED": 0} | {f"{prefix}{member.name}": member.value for member in enum}
+    numbers = dict((wire.LoopMode if enum is LoopMode else wire.Reason).items())
+    assert numbers == {f"{prefix}UNSPECIFIED": 0} | {f"{prefix}{member.name}": member.value for member in enum}
 
 
 def test_levels_have_the_numbers_of_foxgloves_schema() -> None:
-    theirs = {value.name: value.number for value in Log.DESCRIPTOR.enum_types_by_name["Level"].values}
-    assert theirs == {"UNKNOWN": 0} | {level.name: level.value for level in Level}
+    numbers = {value.name: value.number for value in Log.DESCRIPTOR.enum_types_by_name["Level"].values}
+    assert numbers == {"UNKNOWN": 0} | {level.name: level.value for level in Level}
 
 
 def test_every_message_and_every_field_has_a_comment() -> None:
     file = declared()
     sentences = comments(file)
-    bare = [message.name for index, message in enumerate(file.message_type) if not sentences.get((4, index))]
-    bare += [
+    without_comment = [message.name for index, message in enumerate(file.message_type) if not sentences.get((4, index))]
+    without_comment += [
         line for line in schema() if line.endswith("|") and " | timestamp | " not in line and " | 0 | " not in line
     ]
-    assert bare == []
+    assert without_comment == []
 
 
 def test_topics_are_unique_and_found_by_their_keys() -> None:

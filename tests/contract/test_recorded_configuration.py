@@ -21,7 +21,7 @@ from tests.support.loops import lowfc
 from tests.support.report_log import SyntheticLog
 from tests.support.stage import Tape
 
-OTHER = "[camera]\nrate_hz = 300.0\nshutter = 'rolling'\n[control]\nleak = 7.0\n[weather]\nwind = 3\n"
+OTHER_VERSION = "[camera]\nrate_hz = 300.0\nshutter = 'rolling'\n[control]\nleak = 7.0\n[weather]\nwind = 3\n"
 """Two unknown keys and an invalid value."""
 REMARKS = [
     "unknown key 'camera.shutter'; the nearest known one is 'camera.noise'; it is ignored",
@@ -31,13 +31,15 @@ REMARKS = [
 
 
 def test_known_keys_are_used_and_unknown_or_invalid_ones_cause_remarks() -> None:
-    config, remarks = recorded(OTHER.encode())
+    config, remarks = recorded(OTHER_VERSION.encode())
     assert config == load(None, {"camera.rate_hz": 300.0})
     assert remarks == REMARKS
     assert recorded(Configuration().to_toml().encode()) == (Configuration(), [])
-    of_later_version = b"[[interlocks]]\nname = 'flow'\nvalue = 'on'\ntest = 'above'\naction = 'explode'\nfoo = 1\n"
-    with_unknown_keys = b"[[interlocks]]\nname = 'dome'\nvalue = 1.0\naction = 'open'\nfoo = 1\nbar = 2\n"
-    config, _ = recorded(of_later_version + with_unknown_keys + b"[[more]]\n")
+    interlock_of_later_version = (
+        b"[[interlocks]]\nname = 'flow'\nvalue = 'on'\ntest = 'above'\naction = 'explode'\nfoo = 1\n"
+    )
+    interlock_with_unknown_keys = b"[[interlocks]]\nname = 'dome'\nvalue = 1.0\naction = 'open'\nfoo = 1\nbar = 2\n"
+    config, _ = recorded(interlock_of_later_version + interlock_with_unknown_keys + b"[[more]]\n")
     assert [interlock.name for interlock in config.interlocks] == ["dome"]
 
 
@@ -108,7 +110,7 @@ def night() -> SyntheticLog:
 
 @pytest.fixture(scope="module")
 def written(night: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], bytes]:
-    """Function that returns the content of the log with a configuration, which is given as TOML text."""
+    """Function that returns the content of the log for a configuration in TOML."""
     return cache(lambda toml: night.write(tmp_path_factory.mktemp("night") / "night.mcap", toml=toml).read_bytes())
 
 
@@ -123,12 +125,12 @@ def log_with(tmp_path: Path, written: Callable[[str], bytes]) -> Callable[[str],
 
 @pytest.fixture
 def log(log_with: Callable[[str], Path]) -> Path:
-    return log_with(OTHER)
+    return log_with(OTHER_VERSION)
 
 
 @pytest.mark.usefixtures("without_drawings")
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         ("info", "--json"),
         ("report",),
@@ -139,17 +141,17 @@ def log(log_with: Callable[[str], Path]) -> Path:
     ],
     ids=" ".join,
 )
-def test_every_reader_reads_the_log_and_reports_the_remarks(log: Path, words: tuple[str, ...]) -> None:
-    done = lowfc(*words, log)
+def test_every_reader_reads_the_log_and_reports_the_remarks(log: Path, arguments: tuple[str, ...]) -> None:
+    done = lowfc(*arguments, log)
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-    assert done.exit_code == (1 if "acceptance" in words and "FAILED" in done.output else 0), done.output
+    assert done.exit_code == (1 if "acceptance" in arguments and "FAILED" in done.output else 0), done.output
     output = "".join(done.output.split())
     for remark in remarks_on(log):
         assert "".join(remark.split()) in output
     assert tempfile.gettempdir() not in output.replace("".join(str(log.parent).split()), "")
-    if "--json" in words:
+    if "--json" in arguments:
         assert json.loads(done.stdout)
-    if words == ("report",):
+    if arguments == ("report",):
         assert log.with_suffix(".html").read_text().count("its config.toml:") == len(REMARKS)
 
 
@@ -168,7 +170,7 @@ def test_a_replay_does_not_depend_on_the_configuration(log: Path) -> None:
     assert "commands identical" in done.stdout
 
 
-@pytest.mark.parametrize(("toml", "rate_hz"), [(OTHER, 300.0), ("[camera", Configuration().camera.rate_hz)])
+@pytest.mark.parametrize(("toml", "rate_hz"), [(OTHER_VERSION, 300.0), ("[camera", Configuration().camera.rate_hz)])
 def test_a_view_uses_the_recorded_or_the_default_configuration(
     log_with: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch, toml: str, rate_hz: float
 ) -> None:
@@ -177,7 +179,7 @@ def test_a_view_uses_the_recorded_or_the_default_configuration(
     drawn = draw_logs([log], None, Tape())  # type: ignore[arg-type]
     assert [call.args[0].camera.rate_hz for call in renderer.call_args_list] == [rate_hz]
     assert str(log) in drawn.remarks[0]
-    assert toml != OTHER or drawn.remarks == remarks_on(log)
+    assert toml != OTHER_VERSION or drawn.remarks == remarks_on(log)
 
 
 def test_an_acceptance_test_needs_a_configuration(log_with: Callable[[str], Path]) -> None:
