@@ -40,14 +40,14 @@ def ask(name: str, *values: float, modes: tuple[int, ...] = ()) -> Request:
     return Request(0, name, modes, values)
 
 
-def hot(pixels: int) -> Pixels:
+def image_with_saturated(pixels: int) -> Pixels:
     """An image with this number of pixels at full well."""
     image = TOY.pixels(SOME)
     image.flat[:pixels] = SATURATION_DN
     return image
 
 
-BAD: dict[Reason, Callable[[int], Frame]] = {
+BAD_FRAMES: dict[Reason, Callable[[int], Frame]] = {
     Rejection.WRONG_SIZE: lambda count: frame(count, pixels=np.full((7, 6), 5000, np.uint16)),
     Rejection.LATE: lambda count: frame(count, SOME, age_ns=DEFAULTS.max_frame_age_ns + 1),
     Rejection.SATURATED: lambda count: frame(count, pixels=np.full(SHAPE, SATURATION_DN, np.uint16)),
@@ -57,10 +57,10 @@ BAD: dict[Reason, Callable[[int], Frame]] = {
 }
 
 
-@pytest.mark.parametrize("reason", BAD)
+@pytest.mark.parametrize("reason", BAD_FRAMES)
 def test_a_bad_frame_is_refused_with_an_event_and_the_command_holds(reason: Reason) -> None:
     before = running()
-    state, all_outputs = feed(DEFAULTS, before, *(BAD[reason](count) for count in range(6, 9)))
+    state, all_outputs = feed(DEFAULTS, before, *(BAD_FRAMES[reason](count) for count in range(6, 9)))
     held = before.loop
     for outputs in all_outputs:
         assert outputs.step.reasons == (reason,)
@@ -71,10 +71,10 @@ def test_a_bad_frame_is_refused_with_an_event_and_the_command_holds(reason: Reas
     assert state.counts == {reason: 3}
     assert state.frames_used == before.frames_used
     next_count = 6 if reason in (Rejection.OUT_OF_ORDER, Rejection.REPEATED) else 9
-    state, back = feed(DEFAULTS, state, frame(next_count, SOME), frame(next_count + 1, SOME))
-    assert names(all_outputs + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
+    state, later_outputs = feed(DEFAULTS, state, frame(next_count, SOME), frame(next_count + 1, SOME))
+    assert names(all_outputs + later_outputs) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert all_outputs[0].events[0].details == {"reason": reason.name}
-    assert back[0].events[0].details == {"refused": 3, "reason": reason.name}
+    assert later_outputs[0].events[0].details == {"refused": 3, "reason": reason.name}
     assert state.frames_used == before.frames_used + 2
 
 
@@ -87,8 +87,8 @@ def test_frames_of_a_stuck_camera_are_refused_until_the_image_changes() -> None:
     assert np.array_equal(state.loop.actuators_nm, used.actuators_nm)
     pixels = frame(8, SOME).pixels.copy()
     pixels.flat[0] += 1
-    state, back = feed(setup, state, frame(8, pixels=pixels), frame(9, SOME))
-    assert names(all_outputs + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
+    state, later_outputs = feed(setup, state, frame(8, pixels=pixels), frame(9, SOME))
+    assert names(all_outputs + later_outputs) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert state.counts == {Rejection.STUCK: 3}
     assert state.frames_used == 6
 
@@ -112,8 +112,8 @@ def test_without_a_calibration_a_frame_gives_a_step_and_no_command() -> None:
         ({"age_ns": DEFAULTS.max_frame_age_ns + 1}, (Rejection.LATE,)),
         ({"age_ns": -(10**12)}, ()),
         ({"pixels": None}, (Rejection.WRONG_SIZE,)),
-        ({"pixels": hot(8)}, ()),
-        ({"pixels": hot(9)}, (Rejection.SATURATED,)),
+        ({"pixels": image_with_saturated(8)}, ()),
+        ({"pixels": image_with_saturated(9)}, (Rejection.SATURATED,)),
     ],
 )
 def test_a_frame_is_used_up_to_each_limit(changes: dict[str, object], reasons: tuple[Reason, ...]) -> None:
@@ -124,7 +124,7 @@ def test_a_frame_is_used_up_to_each_limit(changes: dict[str, object], reasons: t
 
 def test_consecutive_frames_refused_for_one_reason_raise_one_event() -> None:
     reasons = Rejection.LATE, Rejection.LATE, Rejection.DARK
-    inputs = [BAD[reason](count) for count, reason in enumerate(reasons, start=6)]
+    inputs = [BAD_FRAMES[reason](count) for count, reason in enumerate(reasons, start=6)]
     state, all_outputs = feed(DEFAULTS, running(), *inputs, frame(9, SOME))
     assert names(all_outputs) == ["FRAMES_REFUSED", "FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert state.counts == {Rejection.LATE: 2, Rejection.DARK: 1}
@@ -140,7 +140,7 @@ def test_missing_and_refused_frames_advance_the_command_history(delay: float) ->
     assert names(all_outputs) == ["FRAMES_MISSING"]
     assert all_outputs[0].events[0].details == {"count": 6, "number": 12}
     assert np.array_equal(all_outputs[0].step.pol_nm, all_outputs[0].step.error_nm - held)
-    refused, _ = feed(setup, before, *(BAD[Rejection.LATE](count) for count in range(6, 12)))
+    refused, _ = feed(setup, before, *(BAD_FRAMES[Rejection.LATE](count) for count in range(6, 12)))
     assert all(np.array_equal(command, held) for command in refused.loop.history_nm)
     assert missing.loop.history_nm[0] is not held
 
@@ -168,15 +168,14 @@ def test_a_frame_timeout_raises_an_event_at_its_start_and_at_its_end() -> None:
     before = running()
     short = Tick(0, DEFAULTS.frame_timeout_ns)
     long = Tick(0, DEFAULTS.frame_timeout_ns + 1)
-    state, all_outputs = feed(
-        DEFAULTS, before, short, long, Tick(0, 10 * DEFAULTS.frame_timeout_ns), BAD[Rejection.REPEATED](5), short, long
-    )
+    longest, repeated = Tick(0, 10 * DEFAULTS.frame_timeout_ns), BAD_FRAMES[Rejection.REPEATED](5)
+    state, all_outputs = feed(DEFAULTS, before, short, long, longest, repeated, short, long)
     assert [name for name in names(all_outputs) if name != "FRAMES_REFUSED"] == ["NO_FRAMES"]
     for outputs in all_outputs:
         assert np.array_equal(outputs.command.actuators_nm, before.loop.actuators_nm)
         assert outputs.command.frame_sequence == before.frame_sequence
-    state, back = feed(DEFAULTS, state, frame(500, SOME), frame(501, SOME))
-    assert names(back) == ["FRAMES_BACK", "FRAMES_MISSING", "FRAMES_ACCEPTED"]
+    state, later_outputs = feed(DEFAULTS, state, frame(500, SOME), frame(501, SOME))
+    assert names(later_outputs) == ["FRAMES_BACK", "FRAMES_MISSING", "FRAMES_ACCEPTED"]
     assert state.counts[Rejection.NO_FRAME] == 1
 
 
@@ -225,7 +224,7 @@ def test_safe_mode_relaxes_the_mirror_frame_by_frame_within_the_limits() -> None
     largest = np.abs(state.loop.actuators_nm).max()
     for count in range(31, 70):
         before = state.loop.actuators_nm
-        input_ = BAD[Rejection.DARK](count) if count % 3 == 0 else frame(count, SOME)
+        input_ = BAD_FRAMES[Rejection.DARK](count) if count % 3 == 0 else frame(count, SOME)
         state, (outputs,) = feed(setup, state, input_)
         assert violations(setup.limits, before, outputs.command.actuators_nm) == []
         assert np.abs(outputs.command.actuators_nm).max() <= np.abs(before).max()
@@ -239,7 +238,7 @@ def test_safe_mode_flattens_the_mirror_while_frames_are_refused(reason: Reason) 
     state, _ = feed(DEFAULTS, running(), ask("safe"))
     newest = state.frame_sequence
     for _ in range(200):
-        state, (outputs,) = feed(DEFAULTS, state, BAD[reason](6))
+        state, (outputs,) = feed(DEFAULTS, state, BAD_FRAMES[reason](6))
         assert outputs.command.frame_sequence == newest
     assert not state.loop.actuators_nm.any()
 
@@ -421,14 +420,14 @@ def test_after_saturation_the_stored_command_is_the_limited_one() -> None:
 
 
 def test_saturated_pixels_hardly_affect_the_estimate() -> None:
-    """Also for a star that is brighter than expected."""
+    """This also holds for a star that is brighter than expected."""
     plain = TOY.pixels(SOME, 1.3 * FLUX_DN)
-    hit = plain.copy()
-    hit.flat[[3, 17]] = SATURATION_DN
+    saturated = plain.copy()
+    saturated.flat[[3, 17]] = SATURATION_DN
     errors = []
-    for pixels in (plain, hit):
+    for pixels in (plain, saturated):
         _, (outputs,) = feed(DEFAULTS, loaded(DEFAULTS), frame(1, pixels=pixels))
         errors.append(outputs.step.error_nm)
-        assert outputs.step.saturated_pixels == 2 * (pixels is hit)
+        assert outputs.step.saturated_pixels == 2 * (pixels is saturated)
     difference_nm = np.abs(errors[1] - errors[0]).max()
     assert 0 < difference_nm < np.abs(errors[0]).max() / 2

@@ -36,7 +36,7 @@ from tests.support.toy import (
 )
 
 DEFAULTS = settings(rate_hz=1000.0)
-WRONG = replace(CAMERA, bias_dn=DARK_DN + 60)
+WRONG_BIAS = replace(CAMERA, bias_dn=DARK_DN + 60)
 
 
 def ask(state: State, name: str, **fields: object) -> tuple[State, Reply]:
@@ -55,11 +55,11 @@ def test_changed_camera_settings_open_the_loop() -> None:
     state, all_outputs = feed(DEFAULTS, loaded(DEFAULTS), frame(1), CAMERA)
     assert (state.mode, names(all_outputs)) == (LoopMode.CLOSED, [])
     assert feed(DEFAULTS, state, replace(CAMERA, time_ns=9)) == (state, [Outputs()])
-    state, all_outputs = feed(DEFAULTS, state, WRONG)
+    state, all_outputs = feed(DEFAULTS, state, WRONG_BIAS)
     assert (state.mode, names(all_outputs)) == (LoopMode.OPEN, ["CAMERA_CHANGED", "MODE_CHANGED"])
     assert "bias_dn" in str(all_outputs[0].events[0].details["what"])
     measuring = replace(DEFAULTS, auto_gain=(True, True))
-    for not_closed in (state, feed(measuring, loaded(measuring), CAMERA, WRONG)[0]):
+    for not_closed in (state, feed(measuring, loaded(measuring), CAMERA, WRONG_BIAS)[0]):
         assert not_closed.conditions.mode_cause.startswith(f"{CAMERA_MISFIT}: ")
 
 
@@ -67,7 +67,7 @@ def test_changed_camera_settings_open_the_loop() -> None:
 def test_the_loop_is_not_closed_with_changed_camera_settings(name: str) -> None:
     law = linear(DEFAULTS.integrator((2, 3, 4)))
     fields: dict[str, object] = {"close": {}, "step": {"values": (9.0,)}, "law": {"law": law}}[name]
-    state = opened(CAMERA, frame(1), WRONG)
+    state = opened(CAMERA, frame(1), WRONG_BIAS)
     after, reply = ask(state, name, **fields)
     assert not reply.accepted
     assert "bias_dn is 160, calibrated 60" in reply.text
@@ -78,9 +78,9 @@ def test_the_loop_is_not_closed_with_changed_camera_settings(name: str) -> None:
 
 def test_the_camera_is_compared_with_the_calibrations_settings() -> None:
     measured = replace(calibration(), camera=CAMERA)
-    state, _ = feed(DEFAULTS, State(), Load(0, measured, "test"), WRONG)
+    state, _ = feed(DEFAULTS, State(), Load(0, measured, "test"), WRONG_BIAS)
     assert state.mode is LoopMode.OPEN
-    state, _ = feed(DEFAULTS, State(), WRONG, Load(0, measured, "test"))
+    state, _ = feed(DEFAULTS, State(), WRONG_BIAS, Load(0, measured, "test"))
     assert state.mode is LoopMode.OPEN
     assert "bias_dn" in state.conditions.mode_cause
 
@@ -112,8 +112,8 @@ def test_after_a_camera_restart_frames_are_refused_until_its_settings_arrive() -
     assert [outputs.step.reasons for outputs in all_outputs] == [(Rejection.CAMERA_UNKNOWN,)] * 4
     assert (state.loop.history_nm[0] == before_nm).all()
     assert not ask(ask(state, "open")[0], "close")[1].accepted
-    known = replace(CAMERA, start_s=START + 9)
-    state, all_outputs = feed(DEFAULTS, state, known, frame(1, sequence=frame_sequence(9, START + 9)))
+    new_settings = replace(CAMERA, start_s=START + 9)
+    state, all_outputs = feed(DEFAULTS, state, new_settings, frame(1, sequence=frame_sequence(9, START + 9)))
     assert all_outputs[-1].step.reasons == ()
 
 
@@ -174,20 +174,20 @@ def test_after_a_clear_the_settings_of_a_restarted_camera_are_awaited() -> None:
     assert outputs.step.reasons == (Rejection.CAMERA_UNKNOWN,)
 
 
-ODD = np.full((8, 9), 5000, np.uint16)
+MISFIT_IMAGE = np.full((8, 9), 5000, np.uint16)
 BASIS = np.arange(GRID[0] * GRID[1], dtype=np.float32)
 
 
-def odd(count: int) -> Frame:
+def misfit_frame(count: int) -> Frame:
     """A frame of a size that is not the calibration's."""
-    return frame(count, pixels=ODD)
+    return frame(count, pixels=MISFIT_IMAGE)
 
 
 def idle(shape_nm: float = 0.0) -> State:
     """A controller without a calibration, whose mirror has reported its shape."""
     actuators = np.full(GRID, shape_nm, np.float32)
     state, _ = feed(DEFAULTS, State(), MirrorShape(0, actuators, np.zeros(0, np.float32)))
-    return feed(DEFAULTS, state, *(odd(count) for count in range(1, 4)))[0]
+    return feed(DEFAULTS, state, *(misfit_frame(count) for count in range(1, 4)))[0]
 
 
 def play(state: State, table: Single, basis: Single = BASIS) -> State:
@@ -201,19 +201,21 @@ def surfaces(all_outputs: list[Outputs]) -> Single:
     return np.array([outputs.command.actuators_nm.reshape(-1) for outputs in all_outputs])
 
 
-def other_size() -> State:
+def misfit_camera() -> State:
     """A controller with a calibration computed from the model, and a camera of another frame size."""
     computed = replace(calibration(), operator_hash="model")
-    state, _ = feed(DEFAULTS, State(), Load(0, computed, "the configuration"), replace(CAMERA, shape=ODD.shape))
-    return feed(DEFAULTS, state, *(odd(count) for count in range(1, 4)))[0]
+    state, _ = feed(
+        DEFAULTS, State(), Load(0, computed, "the configuration"), replace(CAMERA, shape=MISFIT_IMAGE.shape)
+    )
+    return feed(DEFAULTS, state, *(misfit_frame(count) for count in range(1, 4)))[0]
 
 
-@pytest.mark.parametrize("begin", [idle, other_size])
+@pytest.mark.parametrize("begin", [idle, misfit_camera])
 def test_a_probe_sequence_plays_without_a_calibration(begin: Callable[[], State]) -> None:
     state = begin()
     assert state.mode is LoopMode.IDLE
     table = np.array([[1], [-2], [3]], np.float32)
-    state, all_outputs = feed(DEFAULTS, play(state, table), *(odd(count) for count in range(4, 9)))
+    state, all_outputs = feed(DEFAULTS, play(state, table), *(misfit_frame(count) for count in range(4, 9)))
     assert np.allclose(surfaces(all_outputs), np.vstack([table * BASIS, 0 * BASIS, 0 * BASIS]))
     for outputs in all_outputs:
         assert outputs.step.error_nm is None
@@ -227,24 +229,24 @@ def test_a_limit_ends_the_probe_sequence() -> None:
     state = play(idle(), table, steep.reshape(-1))
     before = surfaces([advance(DEFAULTS, state, Tick(0, 0))[1]])[0].reshape(GRID)
     for count in range(4, 30):
-        state, outputs = advance(DEFAULTS, state, odd(count))
+        state, outputs = advance(DEFAULTS, state, misfit_frame(count))
         now = outputs.command.actuators_nm
         assert violations(DEFAULTS.limits, before, now) == []
         before = now
     assert state.limits_hit == ()
     assert not before.any()
     state = play(state, table, steep.reshape(-1))
-    _, all_outputs = feed(DEFAULTS, state, odd(40))
+    _, all_outputs = feed(DEFAULTS, state, misfit_frame(40))
     assert "PLAY_ENDED" in names(all_outputs)
     assert Limit.SLEW in all_outputs[0].step.reasons
 
 
 def test_an_idle_loop_holds_the_mirror_and_safe_relaxes_it() -> None:
-    state, all_outputs = feed(DEFAULTS, idle(shape_nm=30.0), odd(4))
+    state, all_outputs = feed(DEFAULTS, idle(shape_nm=30.0), misfit_frame(4))
     assert np.allclose(surfaces(all_outputs), 30)
     state, outputs = advance(DEFAULTS, state, Request(0, "safe"))
     check_reply(outputs, True)
-    state, all_outputs = feed(DEFAULTS, state, odd(5), odd(6))
+    state, all_outputs = feed(DEFAULTS, state, misfit_frame(5), misfit_frame(6))
     assert not surfaces(all_outputs)[-1].any()
     state, _ = advance(DEFAULTS, state, Request(0, "clear"))
     assert state.mode is LoopMode.IDLE
@@ -254,7 +256,7 @@ def test_safe_mode_from_before_the_start_remains() -> None:
     safe = settings(start_mode=LoopMode.SAFE)
     state, all_outputs = feed(safe, State(), MirrorShape(0, np.full(GRID, 30, np.float32), np.zeros(0, np.float32)))
     assert names(all_outputs) == ["NOT_CALIBRATED", "MODE_CHANGED", "SAFED"]
-    _, all_outputs = feed(safe, state, odd(1))
+    _, all_outputs = feed(safe, state, misfit_frame(1))
     assert not surfaces(all_outputs).any()
     for load in (Load(0, calibration(), "a file"), Request(0, "load", calibration=calibration())):
         state, (outputs,) = feed(safe, State(), load)
@@ -263,7 +265,7 @@ def test_safe_mode_from_before_the_start_remains() -> None:
         assert causes == {state.conditions.mode_cause} == {LATCHED}
 
 
-@pytest.mark.parametrize("begin", [idle, other_size])
+@pytest.mark.parametrize("begin", [idle, misfit_camera])
 @pytest.mark.parametrize("name", ["close", "step"])
 def test_closing_an_idle_loop_is_refused_with_advice(begin: Callable[[], State], name: str) -> None:
     _, outputs = advance(DEFAULTS, begin(), Request(0, name, values=(3.0,) if name == "step" else ()))
@@ -280,14 +282,14 @@ def test_a_calibration_ends_the_idle_mode_and_the_mirror_keeps_its_shape() -> No
 
 
 def test_a_matching_camera_ends_the_idle_mode() -> None:
-    state, all_outputs = feed(DEFAULTS, other_size(), CAMERA)
+    state, all_outputs = feed(DEFAULTS, misfit_camera(), CAMERA)
     assert state.mode is LoopMode.OPEN
     assert names(all_outputs) == ["MODE_CHANGED"]
 
 
 def test_a_measured_calibration_of_another_frame_size_opens_the_loop() -> None:
-    """As for any other camera that does not fit the calibration."""
-    state, _ = feed(DEFAULTS, State(), Load(0, calibration(), "a file"), replace(CAMERA, shape=ODD.shape))
+    """So does every other camera that does not fit the calibration."""
+    state, _ = feed(DEFAULTS, State(), Load(0, calibration(), "a file"), replace(CAMERA, shape=MISFIT_IMAGE.shape))
     assert state.mode is LoopMode.OPEN
 
 
@@ -306,7 +308,7 @@ def test_a_probe_sequence_advances_with_refused_frames() -> None:
 
 def test_a_frame_timeout_ends_the_probe_sequence() -> None:
     state = play(idle(), np.ones((5, 1), np.float32))
-    state, all_outputs = feed(DEFAULTS, state, odd(4), Tick(0, DEFAULTS.frame_timeout_ns + 1))
+    state, all_outputs = feed(DEFAULTS, state, misfit_frame(4), Tick(0, DEFAULTS.frame_timeout_ns + 1))
     assert "PLAY_ENDED" in names(all_outputs)
     state = play(state, np.ones((5, 1), np.float32))
     tick = Tick(0, DEFAULTS.frame_timeout_ns + 2)
@@ -316,10 +318,10 @@ def test_a_frame_timeout_ends_the_probe_sequence() -> None:
 
 @pytest.mark.parametrize(("rows", "request_", "events"), [(5, "status", 1), (5, "stop", 0), (1, "status", 0)])
 def test_the_early_end_of_a_probe_sequence_is_one_event(rows: int, request_: str, events: int) -> None:
-    restarted = frame(0, pixels=ODD, sequence=frame_sequence(0, START + 60))
+    restarted = frame(0, pixels=MISFIT_IMAGE, sequence=frame_sequence(0, START + 60))
     ends = Tick(0, DEFAULTS.frame_timeout_ns + 1), MirrorReport(0, "does not answer"), restarted
     state = play(idle(), np.ones((rows, 1), np.float32))
-    _, all_outputs = feed(DEFAULTS, state, odd(4), Request(0, request_), *ends)
+    _, all_outputs = feed(DEFAULTS, state, misfit_frame(4), Request(0, request_), *ends)
     assert "CAMERA_RESTARTED" in names(all_outputs)
     assert names(all_outputs).count("PLAY_ENDED") == events
 
@@ -329,7 +331,7 @@ def test_a_decoded_state_continues_identically() -> None:
     table = state.loop.command_channels.play.table
     message = controller_state(state, DEFAULTS, 0)
     _, decoded = decode_state(message, None, {}, {table.id: table})
-    later_frames = [odd(count) for count in range(4, 12)]
+    later_frames = [misfit_frame(count) for count in range(4, 12)]
     assert np.array_equal(
         surfaces(feed(DEFAULTS, state, *later_frames)[1]), surfaces(feed(DEFAULTS, decoded, *later_frames)[1])
     )

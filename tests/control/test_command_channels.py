@@ -386,7 +386,7 @@ def test_a_calibration_loaded_in_safe_mode_leaves_nothing_on_the_mirror() -> Non
     loop.run(60)
     assert loop.ask("safe").accepted
     assert loop.process_input(LOAD_OTHER).reply.accepted
-    assert loop.surfaces[-1].any(), "it has not reached flat yet"
+    assert loop.surfaces[-1].any(), "the mirror has not reached flat yet"
     loop.run(60)
     assert loop.ask("clear").accepted
     loop.run(60)
@@ -395,7 +395,7 @@ def test_a_calibration_loaded_in_safe_mode_leaves_nothing_on_the_mirror() -> Non
 
 @pytest.mark.parametrize("signal", [None, "error", "pol"])
 def test_an_offset_moves_the_loop_but_not_the_pseudo_open_loop_modes(signal: Signal | None) -> None:
-    """For the integrator, and for laws of the error and of pseudo-open-loop modes."""
+    """This holds for the integrator, for a law of the error, and for a law of pseudo-open-loop modes."""
     loop, target = ToyLoop(), (4.0, 0.0, -2.0)
     if signal is not None:
         assert loop.ask("law", law=linear(law_of(0.4)) if signal == "error" else SMOOTH).accepted

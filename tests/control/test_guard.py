@@ -37,7 +37,7 @@ NOISE_NM = 2 * np.random.default_rng(1).standard_normal((3_000, len(NOLL)))
 SWAY_NM = 20 * np.sin(2 * np.pi * 7 / RATE_HZ * np.arange(3_000)[:, None] + [0, 1, 2])
 
 
-def known_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
+def law_from_exact_lines(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
     """LQG law and integrator gains from the simulation's exact lines, without identification."""
     width = LINE_WIDTH if config.disturbance.preset == "reaction-wheel" else LINE_WIDTH / 1000
     variances_nm2 = (np.array(LINES_MAS) * bench.nm_per_mas) ** 2
@@ -135,7 +135,7 @@ def test_the_waiting_time_doubles_until_a_takeover_is_final() -> None:
     assert group.overruled
 
 
-@pytest.mark.parametrize(("pol_nm2", "final"), [(39.0, True), (41.0, False)], ids=["amplified", "grown"])
+@pytest.mark.parametrize(("pol_nm2", "final"), [(39.0, True), (41.0, False)], ids=["amplified", "larger disturbance"])
 def test_a_loop_is_judged_to_amplify_if_its_error_is_large_and_not_due_to_a_larger_disturbance(
     pol_nm2: float, final: bool
 ) -> None:
@@ -165,8 +165,8 @@ def test_the_law_returns_once_it_would_be_far_better() -> None:
     steps, _, state = run_toy(setup, quiet, NOISE_NM[: len(quiet)], state, frames + 1)
     assert [group.takeovers for group in state.loop.law_runner.guard.groups] == [1, 0]
     assert state.loop.law_runner.alone()
-    by_the_integrator = [step.reasons for step in steps].count((Limit.LAW_OVERRULED,))
-    assert spans.better * spans.block <= by_the_integrator < len(steps)
+    overruled_steps = [step.reasons for step in steps].count((Limit.LAW_OVERRULED,))
+    assert spans.better * spans.block <= overruled_steps < len(steps)
 
 
 def test_closing_and_loading_reset_the_guard() -> None:
@@ -215,7 +215,7 @@ def test_probe_sequences_resets_and_limits_suspend_the_comparison() -> None:
 
 
 def test_a_decoded_guard_continues_identically() -> None:
-    """In every phase: compared, in the cross-fade, overruled with a virtual law."""
+    """It does so in every phase: compared, in the cross-fade, overruled with a virtual law."""
     state, frames_done = with_law(BAD_TILT), 0
     for until in (
         BEFORE + 150,
@@ -237,19 +237,19 @@ def test_a_decoded_guard_continues_identically() -> None:
 
 
 @lru_cache
-def case(preset: str, magnitude: float = 0.0, *, known: bool = False) -> Case:
-    return Case(preset, magnitude, known_law if known else identified_law)
+def case(preset: str, magnitude: float = 0.0, *, exact_lines: bool = False) -> Case:
+    return Case(preset, magnitude, law_from_exact_lines if exact_lines else identified_law)
 
 
 @pytest.fixture
 def short_settling(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A loop that is closed after 1 s, and whose lines move 1 s later."""
+    """The loop closes after 1 s, and the lines move 1 s later."""
     monkeypatch.setattr("tools.guard._SETTLE", 1_000)
     monkeypatch.setattr("tools.guard._BEFORE", 1_000)
 
 
 def test_modal_noise_agrees_with_images() -> None:
-    """For an open loop without a disturbance, and for the residual tilt of the integrator on the reaction wheel."""
+    """They agree on the noise of an open loop, and on the residual tilt of the integrator with the reaction wheel."""
     config = configured(**{"disturbance.preset": "quiet"}, **SMALL_MIRROR)
     calibration_ = calibrated(config)
     bench = Bench(config, calibration_)
@@ -269,18 +269,18 @@ def test_modal_noise_agrees_with_images() -> None:
 
 def test_with_shifted_lines_the_residual_is_at_most_a_tenth_above_the_integrators(short_settling: None) -> None:
     preset, factor = MOVED[0]
-    residual_mas, overruled_s = tilt_after_move(case(preset, known=True), factor, 1)
+    residual_mas, overruled_s = tilt_after_move(case(preset, exact_lines=True), factor, 1)
     assert len(overruled_s) == 1
-    assert residual_mas < 1.1 * tilt_after_move(case(preset, known=True), factor, 1, with_law=False)[0]
+    assert residual_mas < 1.1 * tilt_after_move(case(preset, exact_lines=True), factor, 1, with_law=False)[0]
 
 
 def test_steps_of_the_disturbance_do_not_overrule_the_law(short_settling: None) -> None:
-    assert times_overruled(case("reaction-wheel", known=True), 1, minutes=0.07) == 0
+    assert times_overruled(case("reaction-wheel", exact_lines=True), 1, minutes=0.07) == 0
 
 
 def test_a_wrong_delay_is_detected_as_amplification() -> None:
     """The law and the pseudo-open-loop modes assume one frame of delay; the true delay is two."""
-    wheel = case("reaction-wheel", known=True)
+    wheel = case("reaction-wheel", exact_lines=True)
     config = wheel.configured(1, **{"control.delay_frames": 1.0, "camera.delay_frames": 2.0})
     bench = ModalBench(config, wheel.covariance_nm2, watch=False)
     bench.settle(1000)
@@ -310,5 +310,5 @@ def test_with_shifted_lines_the_residual_is_at_most_a_tenth_above_the_integrator
 @pytest.mark.slow
 @pytest.mark.parametrize("magnitude", [0.0, 2.0, 5.0])
 def test_a_good_law_is_never_overruled(magnitude: float) -> None:
-    """For ten minutes; `python -m tools.measure guard` measures ten minutes for each of twenty seeds in some hours."""
+    """In ten minutes; `python -m tools.measure guard` measures ten minutes for each of twenty seeds in some hours."""
     assert times_overruled(case("reaction-wheel", magnitude), 21) == 0

@@ -20,7 +20,7 @@ MOVER = 7
 """Identity of the lease of the client that moves the mask."""
 
 
-def under(action: Action, test: str = "equal", value: Value = True, *, acts_when_old: bool = True) -> Settings:
+def settings_under(action: Action, test: str = "equal", value: Value = True, *, acts_when_old: bool = True) -> Settings:
     """Settings with one interlock, on the value `mask`."""
     return settings(rate_hz=1000.0, interlocks=(Interlock("mask", test, value, action, 2 * SECOND_NS, acts_when_old),))
 
@@ -67,8 +67,8 @@ def test_an_interlock_acts_on_its_condition_and_if_configured_on_a_missing_or_ol
 
 
 def test_an_interlock_holds_and_releases_the_command_at_the_next_frame() -> None:
-    """At random times; bench reports are encoded as in a log, and the replay of all inputs gives the same steps."""
-    setup, rng = under(Action.HOLD), np.random.default_rng(5)
+    """It acts at random times. Bench reports are encoded as in a log; a replay of all inputs gives the same steps."""
+    setup, rng = settings_under(Action.HOLD), np.random.default_rng(5)
     state = replayed_state = running(setup)
     count, acting, flips, logged = 5, False, 0, []
     while flips < 100:
@@ -108,7 +108,7 @@ def test_an_interlock_holds_and_releases_the_command_at_the_next_frame() -> None
     ],
 )
 def test_each_action_takes_effect_and_is_not_undone_when_the_interlock_clears(action: Action, mode: LoopMode) -> None:
-    setup = under(action)
+    setup = settings_under(action)
     state, all_outputs = feed(setup, running(setup), mask(True), mask(True))
     assert state.mode is mode
     changed = ["MODE_CHANGED"] if mode is not LoopMode.CLOSED else []
@@ -131,7 +131,7 @@ def test_each_action_takes_effect_and_is_not_undone_when_the_interlock_clears(ac
 
 @pytest.mark.parametrize("action", [Action.REFUSE_CLOSE, Action.OPEN, Action.SAFE])
 def test_an_interlock_that_refuses_to_close_opens_a_loop_that_starts_closed(action: Action) -> None:
-    setup = under(action)
+    setup = settings_under(action)
     for value in (None, True):
         state, _ = feed(setup, loaded(setup), mask(value))
         assert state.mode is (LoopMode.SAFE if action is Action.SAFE else LoopMode.OPEN)
@@ -143,7 +143,7 @@ def test_an_interlock_that_refuses_to_close_opens_a_loop_that_starts_closed(acti
 
 
 def test_a_loop_that_starts_closed_is_held_if_an_interlock_acts_before_or_after_its_calibration_is_loaded() -> None:
-    setup = under(Action.HOLD)
+    setup = settings_under(Action.HOLD)
     before, _ = feed(setup, State(), mask(True), Load(0, calibration(), "test"))
     after, _ = feed(setup, loaded(setup), mask(True))
     for state in (before, after):
@@ -154,7 +154,7 @@ def test_a_loop_that_starts_closed_is_held_if_an_interlock_acts_before_or_after_
 
 
 def test_only_a_change_of_the_condition_is_a_logged_input() -> None:
-    setup = under(Action.HOLD, "above", 3.0)
+    setup = settings_under(Action.HOLD, "above", 3.0)
     state = running(setup)
     acting, _ = advance(setup, state, mask(4.0))
     assert acting.input_number == state.input_number + 1
@@ -167,7 +167,7 @@ def test_only_a_change_of_the_condition_is_a_logged_input() -> None:
 
 def test_a_value_that_is_too_old_acts_as_configured() -> None:
     for acting in (True, False):
-        setup = under(Action.HOLD, acts_when_old=acting)
+        setup = settings_under(Action.HOLD, acts_when_old=acting)
         state, all_outputs = feed(setup, running(setup), mask(False, 2 * SECOND_NS + 1), frame(6, SOME))
         assert bool(state.conditions.acting) is acting
         assert all_outputs[-1].step.reasons == ((Rejection.HELD,) if acting else ())
@@ -185,7 +185,7 @@ def permit(setup: Settings, state: State, seconds: float = 0.0, **fields: object
 
 
 def test_a_permit_holds_a_closed_loop_for_its_duration() -> None:
-    setup = under(Action.WARN)
+    setup = settings_under(Action.WARN)
     state = running(setup)
     _, outputs = permit(setup, state)
     check_reply(outputs, False, "the loop is closed", "with `--hold 5`")
@@ -201,7 +201,7 @@ def test_a_permit_holds_a_closed_loop_for_its_duration() -> None:
 
 
 def test_a_permit_can_be_released_and_ended_by_open() -> None:
-    setup = under(Action.WARN)
+    setup = settings_under(Action.WARN)
     held, _ = permit(setup, running(setup), 5.0)
     _, outputs = applied(setup, held, "gain", values=(0.1,))
     check_reply(outputs, False, "reserved for moving the mask (for at most 5 s more)")
@@ -213,7 +213,7 @@ def test_a_permit_can_be_released_and_ended_by_open() -> None:
 
 
 def test_a_permit_is_granted_while_the_loop_is_not_closed() -> None:
-    setup = under(Action.WARN)
+    setup = settings_under(Action.WARN)
     for name in ("open", "safe"):
         state, _ = applied(setup, running(setup), name)
         for seconds in (0.0, 5.0):
@@ -227,7 +227,7 @@ def test_a_permit_is_granted_while_the_loop_is_not_closed() -> None:
 
 
 def test_a_permit_is_refused_during_a_lease_or_a_probe_sequence() -> None:
-    setup = under(Action.WARN)
+    setup = settings_under(Action.WARN)
     reserved, _ = applied(setup, running(setup), "lease", text="a calibration", values=(10.0,), lease_id=3)
     shape, table = np.full(GRID, 3, np.float32).reshape(-1), np.ones((50, 1), np.float32)
     played, outputs = applied(setup, running(setup), "play", text=MIRROR, actuators_nm=shape, table=table)
@@ -243,7 +243,7 @@ def test_a_permit_is_refused_during_a_lease_or_a_probe_sequence() -> None:
 
 
 def test_a_renewed_permit_still_holds() -> None:
-    setup = under(Action.WARN)
+    setup = settings_under(Action.WARN)
     state, _ = permit(setup, running(setup), 5.0)
     state, outputs = applied(setup, state, "renew", text="moving the mask", values=(5.0,), lease_id=MOVER)
     check_reply(outputs, True)

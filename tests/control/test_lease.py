@@ -59,7 +59,7 @@ def test_requests_of_other_clients_are_refused_with_the_holders_name(name: str) 
     state = held()
     after, outputs = applied(state, Request(4 * SECOND_NS, name))
     check_reply(outputs, False, HOLDER, "6 s", "lowfc ctl stop")
-    assert all(now is was for now, was in zip(after[:-1], state[:-1], strict=True))
+    assert all(new is old for new, old in zip(after[:-1], state[:-1], strict=True))
 
 
 def test_the_holders_requests_are_granted() -> None:
@@ -165,7 +165,7 @@ def test_a_lease_ends_after_its_number_of_frames() -> None:
 @pytest.mark.parametrize("period_ns", [250_000, 500_000, 999_999, 2_000_000, 15_000_000])
 @pytest.mark.parametrize("ahead_ns", [0, 3600 * SECOND_NS])
 def test_a_lease_lasts_its_seconds_at_any_frame_rate(period_ns: int, ahead_ns: int) -> None:
-    """The configured rate is 1 kHz, and the camera's clock may be another one."""
+    """The configured rate is 1 kHz; the camera's clock may differ from the controller's."""
     first, _ = feed(DEFAULTS, loaded(DEFAULTS), frame(1, SOME, time_ns=ahead_ns + period_ns))
     state, _ = applied(first, Request(0, "lease", values=(1.0,), text=HOLDER, lease_id=MINE))
     count = 1

@@ -47,7 +47,7 @@ def test_moving_back_keeps_the_slew_limit() -> None:
     moved_nm = np.abs(outputs.command.actuators_nm - state.loop.actuators_nm).max()
     assert 0 < moved_nm < DEFAULTS.limits.slew_nm
     np.testing.assert_array_equal(after.loop.actuators_nm, outputs.command.actuators_nm)
-    far = MirrorShape(0, np.zeros((2, 2), np.float32), np.zeros(0, np.float32))  # of another grid
+    far = MirrorShape(0, np.zeros((2, 2), np.float32), np.zeros(0, np.float32))  # a shape of another grid
     after, _ = feed(DEFAULTS, state, MirrorReport(0, LOST.fault, far))
     np.testing.assert_array_equal(after.loop.actuators_nm, state.loop.actuators_nm)
 

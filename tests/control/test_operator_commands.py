@@ -32,7 +32,7 @@ CALIBRATION = identified(calibration())
 TO_MODES = np.linalg.pinv(CALIBRATION.modes_to_actuators)
 OTHERS = tuple(identified(calibration(noll, scale)) for noll, scale in ((NOLL, 1.1), ((2, 3), 1.0), ((2,), 0.9)))
 OTHER_MIRROR = identified(replace(CALIBRATION, grid=(5, 4)))
-KNOWN = {each.id: each for each in (CALIBRATION, *OTHERS, OTHER_MIRROR)}
+CALIBRATIONS_BY_ID = {each.id: each for each in (CALIBRATION, *OTHERS, OTHER_MIRROR)}
 HUGE = 3e38
 STATIC_NM = (12.0, -8.0, 5.0)
 """Static part of the disturbance of each mode."""
@@ -209,7 +209,7 @@ def checked_advance(setup: Settings, run: Run, input_: Input) -> Outputs:
         assert outputs.reply.frame_sequence == state.frame_sequence + 1
         assert outputs.command is None, "the next frame moves the mirror, not a request"
         if not outputs.reply.accepted:
-            assert all(now is was for now, was in zip(after[:-1], state[:-1], strict=True)), (
+            assert all(new is old for new, old in zip(after[:-1], state[:-1], strict=True)), (
                 "a refusal changes nothing but `input_number`, the last field"
             )
         if state.loop is not None and after.loop is not None and after.loop.actuators_nm.size:
@@ -262,7 +262,7 @@ def replayed(setup: Settings, state: State, inputs: list[Input]) -> tuple[State,
         resent = input_
         if isinstance(input_, Request):
             logged = wire.Request.FromString(codec.encode_request(input_, Reply(True, "", 0), 1, None))
-            resent = codec.request(logged, logged.name, 7, KNOWN)
+            resent = codec.request(logged, logged.name, 7, CALIBRATIONS_BY_ID)
         state, outputs = advance(setup, state, resent)
         sent.append(serialised(resent, outputs, state))
     return state, sent
@@ -284,7 +284,7 @@ def check(setup: Settings, names: list[str], pauses: list[int], seed: int) -> Ru
     requests = [prepared(setup, input_) for input_ in run.inputs[:middle] if isinstance(input_, Request)]
     decoded, resumed = decode_state(
         wire.ControllerState.FromString(message),
-        KNOWN[state.loop.calibration.id],
+        CALIBRATIONS_BY_ID[state.loop.calibration.id],
         {request.law.id: request.law for request in requests if request.law is not None},
         {request.played.id: request.played for request in requests if request.played is not None},
     )
