@@ -498,7 +498,7 @@ def test_an_exception_in_frame_processing_ends_the_controller(
 
 
 def test_of_frames_that_waited_only_the_newest_is_integrated(calibration: Calibration, scene: Scene) -> None:
-    """All were exposed with the same mirror shape: together they may change the command by one gain, not by ten."""
+    """All saw the same mirror shape: the command may change by gain times error once, not ten times."""
     # 5 Hz, so that a stall of this host is shorter than a period.
     config = configured(lockstep=False, camera__rate_hz=5.0, control__start_mode="closed")
     with running(config, calibration, scene) as rig:

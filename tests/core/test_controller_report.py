@@ -116,8 +116,8 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
     expected = "; not closed during the run: the camera does not fit"
     assert first_line(mode=wire.LOOP_MODE_OPEN, **not_closed) == f"open{expected}"
     assert first_line(mode=wire.LOOP_MODE_CLOSED, **not_closed) == f"closed at the end{expected}"
-    just = first_line(mode=wire.LOOP_MODE_CLOSED, not_closed_ns=SECOND // 25)
-    assert just == "closed; not closed for 0.04 s in total"
+    short = first_line(mode=wire.LOOP_MODE_CLOSED, not_closed_ns=SECOND // 25)
+    assert short == "closed; not closed for 0.04 s in total"
     assert screen(Watch({}, [Log(message="without a level")]), Configuration(), None, 1.0)
     assert first_line() == "no controller reported", "no time is shown before the controller reports a mode"
     state, _ = feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1), replace(CAMERA, bias_dn=DARK_DN + 300))
@@ -162,16 +162,16 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
     state, _ = feed(SETTINGS, state, Request((START + 2) * SECOND, "offset", (2,), (20.0,)))
     assert "residual 2.50 nm rms, noise included (true 2.00 over 2 s, with offset and channels) ·" in first_line()
     state = before
-    words = ("paused", "open", "open", "closed", "in safe mode")  # `pause` of an open loop leaves it open
-    for name, word in zip(("pause", "open", "pause", "close", "safe"), words, strict=True):
+    mode_texts = ("paused", "open", "open", "closed", "in safe mode")  # `pause` of an open loop leaves it open
+    for name, mode_text in zip(("pause", "open", "pause", "close", "safe"), mode_texts, strict=True):
         state, (outputs,) = feed(SETTINGS, state, Request((START + 2) * SECOND, name))
         assert outputs.reply.accepted
-        assert first_line().startswith(f"{word} ·")
-        assert status.json_object(controller_state(state, SETTINGS, 0))["paused"] == (word == "paused")
+        assert first_line().startswith(f"{mode_text} ·")
+        assert status.json_object(controller_state(state, SETTINGS, 0))["paused"] == (mode_text == "paused")
 
 
 @pytest.mark.parametrize(("count", "names"), [(99, ("p50", "max")), (100, ("p50", "p99", "max"))])
-def test_a_summary_has_no_percentile_that_is_only_the_longest_of_few(count: int, names: tuple[str, ...]) -> None:
+def test_a_summary_has_no_percentile_that_is_only_the_maximum_of_few_values(count: int, names: tuple[str, ...]) -> None:
     latency = wire.Latency(count=count, p50_ns=1000, p99_ns=2000, p99_9_ns=2000, max_ns=2000)
     received = wire.TopicCount(topic=FRAME.key, received=count)
     controller = wire.Health(topics=[received], frame_to_command=latency)
@@ -180,7 +180,7 @@ def test_a_summary_has_no_percentile_that_is_only_the_longest_of_few(count: int,
     assert tuple(word for word in shown if word[0] in "pm") == names
 
 
-def test_the_rate_in_lockstep_is_simulated_and_the_computations_speed_is_called_that() -> None:
+def test_in_lockstep_the_simulated_rate_and_the_speed_of_the_computation_are_both_shown() -> None:
     camera = wire.Health(rate_hz=830.0, mean_rate_hz=831.25)
     camera.recent_wavefront.SetInParent()
     watch, config = Watch({"camera": camera}, []), Configuration(lockstep=True)

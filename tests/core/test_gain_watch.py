@@ -52,7 +52,7 @@ def bench(magnitude: float, preset: str = "bench", sensor: str = "sam", **change
 
 
 def modal_bench() -> ModalBench:
-    """A loop of modes with the noise that images would give them, for tests of requests."""
+    """A loop of modes with the noise of images, computed without images, for tests of requests."""
     config = configuration(2.0)
     return ModalBench(config, factory.frame_noise_nm2(config, calibration(2.0, "sam")))
 
@@ -102,19 +102,19 @@ def test_gains_are_measured_in_open_loop_before_the_loop_is_closed(faint: Bench)
 
 
 def test_closing_reduces_the_residual_on_a_faint_star(faint: Bench) -> None:
-    """With fixed gains of 0.5 and 0.05 at V = 6.5 and 250 Hz, a disturbance of 18 nm becomes one of some 47 nm."""
+    """With fixed gains of 0.5 and 0.05 at V = 6.5 and 250 Hz, the residual of 18 nm of disturbance is some 47 nm."""
     residual_nm, open_nm = rms_nm(faint, 500)
     assert residual_nm < open_nm
 
 
 @pytest.mark.parametrize("images", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_automatic_gains_leave_at_most_ten_percent_more_residual_than_fixed_gains(*, images: bool) -> None:
-    """`make sim-loop`, default star and disturbance, compared with gains of 0.5 and 0.05."""
-    residual_nm, known = [], calibrated(load(None))
+    """The loop is that of `make sim-loop`, with its default star and disturbance; the fixed gains are 0.5 and 0.05."""
+    residual_nm, computed = [], calibrated(load(None))
     for keys in ({}, FIXED_GAINS):
         config = load(None, {"control.start_mode": "closed"} | keys)
-        noise_nm2 = factory.frame_noise_nm2(config, known)
-        loop = Bench(config, known) if images else ModalBench(config, noise_nm2)
+        noise_nm2 = factory.frame_noise_nm2(config, computed)
+        loop = Bench(config, computed) if images else ModalBench(config, noise_nm2)
         frames = round(20 * config.camera.rate_hz)
         loop.run(frames - frames // 3, record=False)
         loop.run(frames // 3)
@@ -126,12 +126,12 @@ def test_automatic_gains_leave_at_most_ten_percent_more_residual_than_fixed_gain
 def test_the_noise_of_tip_falls_to_a_quarter_if_only_tip_and_tilt_are_corrected() -> None:
     """Default sensor, V = 5, 1 kHz; each uncorrected mode has 1 nm rms."""
     config = load(None, {"star.magnitude": 5.0, "camera.rate_hz": 1000.0})
-    known = calibrated(config)
+    computed = calibrated(config)
     prior_nm2 = 1.0 - np.isin(config.noll, TIP_TILT)
-    (rows,) = map_rows(known, prior_nm2, known.flux_dn, known.camera, known.reconstructor)
+    (rows,) = map_rows(computed, prior_nm2, computed.flux_dn, computed.camera, computed.reconstructor)
     noise_nm = [
-        float(np.sqrt(noise_covariance_nm2(calibration_, known.flux_dn, known.camera)[0, 0]))
-        for calibration_ in (known, replace(known, reconstructor=rows))
+        float(np.sqrt(noise_covariance_nm2(calibration_, computed.flux_dn, computed.camera)[0, 0]))
+        for calibration_ in (computed, replace(computed, reconstructor=rows))
     ]
     assert len(config.noll) == 14
     assert noise_nm == pytest.approx([42, 10], rel=0.02)
@@ -209,20 +209,20 @@ def test_closing_seldom_adds_contrast_on_a_faint_star_with_a_zernike_sensor() ->
 def test_a_decoded_state_has_the_same_reconstructor(faint: Bench) -> None:
     active_loop = faint.state.loop
     message = controller_state(faint.state, faint.settings, 1)
-    settings, again = decode_state(message, active_loop.calibration)
+    settings, decoded = decode_state(message, active_loop.calibration)
     assert settings == faint.settings
-    np.testing.assert_array_equal(again.loop.estimator.rows, active_loop.estimator.rows)
-    np.testing.assert_array_equal(again.loop.automatic, active_loop.automatic)
-    np.testing.assert_array_equal(again.loop.integrator.kept, active_loop.integrator.kept)
-    assert controller_state(again, settings, 1) == message
+    np.testing.assert_array_equal(decoded.loop.estimator.rows, active_loop.estimator.rows)
+    np.testing.assert_array_equal(decoded.loop.automatic, active_loop.automatic)
+    np.testing.assert_array_equal(decoded.loop.integrator.kept, active_loop.integrator.kept)
+    assert controller_state(decoded, settings, 1) == message
 
 
 def test_a_state_decoded_before_gains_are_measured_has_the_same_law() -> None:
-    """An operator may close the loop before they are measured: the replay must continue with the same command."""
+    """An operator may close the loop before the gains are measured: a replay must continue with the same command."""
     loop = bench(2.0)
     active_loop, message = loop.state.loop, controller_state(loop.state, loop.settings, 1)
-    again = decode_state(message, active_loop.calibration)[1].loop
-    np.testing.assert_array_equal(again.integrator.rows, active_loop.integrator.rows)
+    decoded_loop = decode_state(message, active_loop.calibration)[1].loop
+    np.testing.assert_array_equal(decoded_loop.integrator.rows, active_loop.integrator.rows)
 
 
 def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset() -> None:
@@ -236,7 +236,9 @@ def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset() -> N
 
 
 def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:
-    loop = bench(-1.0)  # at V = 2 the noise of a frame is some ten times the residual: the estimate scatters by 4
+    loop = bench(
+        -1.0
+    )  # at V = 2 the noise of a frame is some ten times the residual: the estimate scatters by a factor of 4
     form = np.diag(factory.contrast_of(loop.config).form)
 
     def true(name: str, frames: int) -> float:
@@ -307,7 +309,7 @@ def test_a_loop_opened_by_an_operator_while_gains_are_measured_stays_open(reques
     loop.ask(request_name)
     loop.run(500)
     assert {step.mode for step in loop.steps} == {LoopMode.OPEN}
-    assert gains(loop).any()  # measured nevertheless
+    assert gains(loop).any()  # the gains were measured nevertheless
 
 
 def test_a_mode_can_have_a_manual_gain_and_return_to_automatic() -> None:

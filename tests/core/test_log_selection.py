@@ -56,7 +56,7 @@ def small(whole: Path) -> Path:
     return out
 
 
-def on(messages: list[Sample], topic: Topic) -> list[Sample]:
+def messages_on(messages: list[Sample], topic: Topic) -> list[Sample]:
     return [message for message in messages if topic.matches(message.key)]
 
 
@@ -75,7 +75,7 @@ def test_steps_and_commands_are_never_left_out() -> None:
 
 
 def test_every_tenth_frame_is_recorded_and_the_others_do_not_count_as_lost(bench: Bench) -> None:
-    """The frame number selects mirror states too; a message not received counts as lost, selected or not."""
+    """Mirror states are selected by their frame's number. A message not received counts as lost, selected or not."""
     frames, commands = bench.camera.publisher(FRAME), bench.controller.publisher(COMMAND, "dm")
     mirror = bench.service("mirror-dm")
     states, surfaces = mirror.publisher(MIRROR_STATE, "dm"), mirror.publisher(SURFACE, "dm")
@@ -92,13 +92,14 @@ def test_every_tenth_frame_is_recorded_and_the_others_do_not_count_as_lost(bench
     mirror.finish()
     summary = bench.stop()
     messages = logged(summary)
-    assert [count_of(sample.sequence) for sample in on(messages, FRAME)] == [0, 10, 20, 30, 40, 50, 70, 80, 90]
+    assert [count_of(sample.sequence) for sample in messages_on(messages, FRAME)] == [0, 10, 20, 30, 40, 50, 70, 80, 90]
     state_numbers = [
-        count_of(wire.MirrorState.FromString(sample.payload).frame_sequence) for sample in on(messages, MIRROR_STATE)
+        count_of(wire.MirrorState.FromString(sample.payload).frame_sequence)
+        for sample in messages_on(messages, MIRROR_STATE)
     ]
     assert state_numbers == [number for number in range(0, 100, 10) for _ in range(2)]
-    assert len(on(messages, COMMAND)) == 95
-    assert not on(messages, SURFACE)
+    assert len(messages_on(messages, COMMAND)) == 95
+    assert not messages_on(messages, SURFACE)
     assert summary.lost == {FRAME.key: 2}
     (path,) = summary.files
     info = survey(path)
@@ -112,10 +113,10 @@ def test_every_tenth_frame_is_recorded_and_the_others_do_not_count_as_lost(bench
 def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
     before, after = list(LogReader(whole)), list(LogReader(small))
     assert bodies_of(after, STEP) == bodies_of(before, STEP)
-    assert len(on(after, COMMAND)) == len(on(before, COMMAND))
-    all_frames, frames = ([sample.sequence for sample in on(log, FRAME)] for log in (before, after))
+    assert len(messages_on(after, COMMAND)) == len(messages_on(before, COMMAND))
+    all_frames, frames = ([sample.sequence for sample in messages_on(log, FRAME)] for log in (before, after))
     assert frames == all_frames[::EVERY]
-    states = on(after, MIRROR_STATE)
+    states = messages_on(after, MIRROR_STATE)
     assert {wire.MirrorState.FromString(sample.payload).frame_sequence for sample in states} == set(frames)
     info = survey(small)
     assert (info["messages_missing"], info["state"], "recovery" in info["metadata"]) == (0, "complete", False)
@@ -124,7 +125,7 @@ def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
     assert again["selection"] == expected.description
     path = Path(again["file"])
     assert Selection.of(survey(path)["metadata"]) == expected
-    assert len(on(list(LogReader(path)), FRAME)) == FRAMES // 20
+    assert len(messages_on(list(LogReader(path)), FRAME)) == FRAMES // 20
     with pytest.raises(DataFileError, match="already exists"):
         thin((whole,), small, Selection(2))
 
@@ -140,12 +141,12 @@ def test_a_smaller_copy_has_all_messages_of_an_unknown_topic(tmp_path: Path, mon
     done = thin((log,), tmp_path / "small.mcap", Selection(EVERY))
     messages = list(LogReader(Path(done["file"])))
     assert [message.payload for message in messages if message.key == newer] == [b"newer"] * 3
-    assert len(on(messages, FRAME)) == 3
+    assert len(messages_on(messages, FRAME)) == 3
 
 
 def test_replay_refuses_a_log_without_all_frames_by_an_error_of_one_line(small: Path) -> None:
-    for words in (["--jobs", "1"], ["--jobs", "2"]):
-        error = refusal("replay", small, *words)
+    for options in (["--jobs", "1"], ["--jobs", "2"]):
+        error = refusal("replay", small, *options)
         assert "\n" not in error
         assert "1 in 10 frames and mirror states" in error
 
@@ -191,26 +192,24 @@ def test_an_export_contains_the_frames_of_a_smaller_copy(small: Path, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("words", "remedy"),
+    ("options", "remedy"),
     [(["--to", "csv", "--decimate", "3"], "leave these out"), (["--topics", FRAME.key], "add --decimate")],
 )
-def test_contradictory_export_options_are_refused(whole: Path, words: list[str], remedy: str) -> None:
-    assert remedy in refusal("export", whole, *words, kind=ConfigurationError)
+def test_contradictory_export_options_are_refused(whole: Path, options: list[str], remedy: str) -> None:
+    assert remedy in refusal("export", whole, *options, kind=ConfigurationError)
 
 
 def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -> None:
     keys = {"recorder.folder": str(tmp_path), "camera.rate_hz": 250.0}
     config = load(None, keys)
-    growth = bytes_per_s(config, configured_selection(config))
-    assert 3e6 < growth < 5e6
-    expected = (
-        f"about {growth * 3600 / 1e9:.0f} GB an hour at 250 Hz and 80 x 80 pixels (size of the simulated camera); "
-    )
+    log_bytes_per_s = bytes_per_s(config, configured_selection(config))
+    assert 3e6 < log_bytes_per_s < 5e6
+    expected = f"about {log_bytes_per_s * 3600 / 1e9:.0f} GB an hour at 250 Hz and 80 x 80 pixels (size of the simulated camera); "
     assert estimate(config).startswith(f"recording into {tmp_path}: {expected}")
     assert estimate(load(None, {"recorder.folder": ""})).startswith("recording into .: ")
     camera = wire.CameraState(rows=160, columns=120)
     assert " GB an hour at 250 Hz and 160 x 120 pixels; " in estimate(config, camera)
-    added_per_s = bytes_per_s(config, configured_selection(config), camera) - growth
+    added_per_s = bytes_per_s(config, configured_selection(config), camera) - log_bytes_per_s
     assert added_per_s == pytest.approx((160 * 120 - 80 * 80) * 2 * 0.6 * 250)
     assert estimate(config, wire.CameraState()) == estimate(config)
     lockstep = config.model_copy(update={"lockstep": True})
@@ -218,11 +217,11 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     assert " 40 x 40 pixels (size of the simulated camera); " in estimate(load(None, keys | {"sensor.kind": "zwfs"}))
     fields = *wire.ControlStep.DESCRIPTOR.fields, *wire.Truth.DESCRIPTOR.fields
     modal = sum(field.is_repeated and field.name.endswith("_nm") for field in fields)
-    added_per_s = bytes_per_s(load(None, keys | {"sensor.modes": 35}), EVERYTHING) - growth
+    added_per_s = bytes_per_s(load(None, keys | {"sensor.modes": 35}), EVERYTHING) - log_bytes_per_s
     assert added_per_s == pytest.approx(modal * (35 - 14) * 4 * 250)
-    assert bytes_per_s(load(None, keys | {"camera.rate_hz": 500.0}), EVERYTHING) > 1.8 * growth
+    assert bytes_per_s(load(None, keys | {"camera.rate_hz": 500.0}), EVERYTHING) > 1.8 * log_bytes_per_s
     fewer = load(None, keys | {"recorder.every": 10, "recorder.topics": [FRAME.key, "lowfc/mirror/{name}/state"]})
-    assert bytes_per_s(fewer, configured_selection(fewer)) < 0.5 * growth
+    assert bytes_per_s(fewer, configured_selection(fewer)) < 0.5 * log_bytes_per_s
     assert "1 in 10 frames" in estimate(fewer)
 
 

@@ -35,7 +35,7 @@ def calibration() -> Calibration:
 def test_the_limiting_gain_is_accurate_to_one_percent(
     delay: int, factor: float, stable: bool, calibration: Calibration
 ) -> None:
-    """It is 2 sin(pi / (2 (2d - 1))), d the delay in frames; noiseless diffraction images, tilt of less than 1 mas."""
+    """It is 2 sin(pi / (2 (2d - 1))), d the delay in frames. The images are noiseless, with a tilt below 1 mas."""
     gain = factor * 2 * np.sin(np.pi / (2 * (2 * delay - 1)))
     assert limiting_gain(delay) == pytest.approx(gain / factor, rel=1e-9)
     start_nm = 0.2 * tilt_nm_per_mas(2.0)

@@ -25,8 +25,8 @@ def test_only_a_saturating_star_is_recorded_as_such(why: str, recorded: bool, mo
 @pytest.mark.parametrize("magnitude", [0, 5, 8])
 @pytest.mark.parametrize("sensor", ["sam", "zwfs"])
 def test_closing_does_not_raise_the_contrast_of_the_dark_zone(sensor: str, magnitude: int, tmp_path: Path) -> None:
-    words = [*OPTIONS.split(), "--star-magnitude", str(magnitude), "--sensor", sensor]
-    results = loop(tmp_path, *words, timeout_s=230)
+    options = [*OPTIONS.split(), "--star-magnitude", str(magnitude), "--sensor", sensor]
+    results = loop(tmp_path, *options, timeout_s=230)
     added = results["added_contrast"]
     assert results["closed_fraction"] > 0.85
     assert added["closed"] < added["open"] + TOLERATED * results["dark_zone_contrast"]

@@ -185,7 +185,7 @@ def test_a_late_message_is_removed_from_the_losses() -> None:
 
 
 def reconcile(account: LossAccount, published: int, state: str = "", missing: int = 0, start_s: int = 100) -> None:
-    """Reconcile with a Health of the camera, which published and missed so many frames."""
+    """Reconcile with a Health of a camera that published and missed these numbers of frames."""
     message = wire.Health(process="camera", state=state)
     message.topics.add(topic=FRAME.key, published=published, missing=missing)
     message.topics.add(topic=STEP.key, received=9)
@@ -215,7 +215,7 @@ def test_duplicates_neither_count_as_losses_nor_hide_them() -> None:
     account.revert()
     for published, lost in ((7, 1), (8, 1), (9, 2)):
         reconcile(account, published, "stopped")
-        assert account.lost() == {FRAME.key: lost}, "frame 3 was lost; of nine published, another message too"
+        assert account.lost() == {FRAME.key: lost}, "frame 3 was lost; of nine published messages, one more"
     assert account.recorded() == {FRAME.key: 7}
 
 

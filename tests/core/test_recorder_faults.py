@@ -157,7 +157,7 @@ def test_messages_lost_while_the_disk_stalls_are_counted(bench: Bench, monkeypat
 
 
 def slow_disk(monkeypatch: pytest.MonkeyPatch, *, refuses: bool) -> tuple[threading.Event, threading.Event]:
-    """Block a log's flush; return an event that is set at its start, and one to end it (with a fault if `refuses`)."""
+    """Block a log's flush; return an event that reports its start, and one that ends it, in a fault if `refuses`."""
     reached, release, sync = threading.Event(), threading.Event(), os.fsync
 
     def slow(descriptor: int) -> None:

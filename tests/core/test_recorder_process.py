@@ -184,8 +184,8 @@ def test_a_recording_has_the_configuration_of_its_run(tmp_path: Path, monkeypatc
         return Summary((), 0, {}, "", 0, 0, 0)
 
     monkeypatch.setattr("lowfc.programs.core.recording.process.record", record)
-    of_launcher = open_run("launched", listeners=(Role.LAUNCHER,)).path / "config.toml"
-    of_launcher.write_text(load(None, {"star.magnitude": 3.0}).to_toml())
+    launcher_configuration = open_run("launched", listeners=(Role.LAUNCHER,)).path / "config.toml"
+    launcher_configuration.write_text(load(None, {"star.magnitude": 3.0}).to_toml())
     other = tmp_path / "other.toml"
     other.write_text("[star]\nmagnitude = 4.0\n")
     for options in (
@@ -198,7 +198,7 @@ def test_a_recording_has_the_configuration_of_its_run(tmp_path: Path, monkeypatc
         assert lowfc("record", "--run", *options).exit_code == 0
     default = Configuration().star.magnitude
     assert recorded == [(3.0, 5), (4.0, 1), (default, 1), (4.0, 5), (4.0, 1)]
-    assert load(of_launcher).star.magnitude == 3.0
+    assert load(launcher_configuration).star.magnitude == 3.0
 
 
 def test_the_provenance_identifies_processor_and_blas() -> None:
