@@ -24,8 +24,8 @@ from lowfc.optics.detector.photometry import electrons
 from tests.support.loops import json_of, refusal
 
 LIGHT_E = electrons(STAR, TABLE4_EXPOSURE_S)
-# Noise of 14 modes together, nm, and the median over modes of quantum limit over Cramer-Rao bound (variances), both
-# from an independent calculation; None: not compared.
+# By sensor: noise of 14 modes together, nm, and median over modes of the ratio (of variances) of the quantum limit to
+# the Cramer-Rao bound. Both are from an independent calculation; None: not compared.
 EXPECTED = {
     "sam": (None, 0.006),
     "sam18_sized": (None, 0.013),
@@ -60,11 +60,11 @@ def test_cramer_rao_bound_exceeds_the_quantum_limit(name, modes):
     bound = cramer_rao(H, variance_e(I0, 0.0))
     limit = np.linalg.inv(quantum_information(sensor.pupil, modes[:14], 550.0, LIGHT_E))
     assert np.linalg.eigvalsh(bound - limit).min() > 0
-    noise_nm, share = EXPECTED[name]
+    noise_nm, ratio = EXPECTED[name]
     if noise_nm is not None:
         assert np.sqrt(np.trace(bound)) == pytest.approx(noise_nm, rel=0.05)
-    if share is not None:
-        assert np.median(np.diag(limit) / np.diag(bound)) == pytest.approx(share, rel=0.1)
+    if ratio is not None:
+        assert np.median(np.diag(limit) / np.diag(bound)) == pytest.approx(ratio, rel=0.1)
 
 
 def test_quantum_information_of_two_holes_is_that_of_their_fringe_at_quadrature():
@@ -101,7 +101,7 @@ def test_sweep_finds_the_minimum_between_its_values():
 
 
 def test_the_command_writes_the_configuration_keys_of_the_best_sensor(focal_light, tmp_path, monkeypatch):
-    pupils = {sensor_named("zwfs").pupil.tobytes(): focal_light}  # the light on the mask depends on nothing else
+    pupils = {sensor_named("zwfs").pupil.tobytes(): focal_light}  # the light on the mask depends on the pupil only
     monkeypatch.setattr(FocalLight, "of", lambda sensor: pupils[sensor.pupil.tobytes()])
     monkeypatch.setattr("lowfc.programs.design.full_light._POINTS", 3)
     out = tmp_path / "clowfs.toml"
@@ -113,7 +113,7 @@ def test_the_command_writes_the_configuration_keys_of_the_best_sensor(focal_ligh
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("options", "message"),
     [
         (("zwfs", "--spot", "3:0.5"), "in order"),
         (("clowfs", "--defocus", "8:1.5"), "in order"),
@@ -127,9 +127,9 @@ def test_the_command_writes_the_configuration_keys_of_the_best_sensor(focal_ligh
         (("zwfs", "--out", "a.toml", "--plot", "./a.toml"), "must be different files"),
     ],
 )
-def test_impossible_options_are_refused_before_the_search(words, message, monkeypatch):
+def test_impossible_options_are_refused_before_the_search(options, message, monkeypatch):
     monkeypatch.setattr("lowfc.programs.design.full_light.FocalLight", None)
-    assert message in refusal("design", *words, kind=ConfigurationError)
+    assert message in refusal("design", *options, kind=ConfigurationError)
 
 
 def test_sampling_of_the_holes_changes_image_and_response_by_under_1_percent():

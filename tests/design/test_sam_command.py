@@ -29,14 +29,14 @@ from lowfc.programs.design.sam_files import read_state
 from lowfc.programs.design.sam_request import Search
 from tests.support.loops import json_of, lowfc, refusal, until
 
-RECORDED = {
+RECORDED_COMMANDS = {
     name: entry["command"] for name, entry in json.loads(SHIPPED.read_text())["layouts"].items() if "command" in entry
 }
 SMALL = {"merit": "table4", "holes": "4", "diameter": "0.1:0.2", "steps": BLOCK + 10, "chains": 2, "seed": 7}
 
 
 class Interrupted(InProcessExecutor):
-    """Executor that raises the user's Ctrl-C after a number of blocks."""
+    """Executor that raises KeyboardInterrupt, as at Ctrl-C, after a number of blocks."""
 
     def __init__(self, blocks: int) -> None:
         self.blocks = blocks
@@ -226,16 +226,16 @@ def test_command_is_recorded_and_reproduces_the_layout(tmp_path, monkeypatch):
     assert list(result["layouts"][0]["focal_masks"]) == ["disk", "bowtie"]
     first = json.loads((tmp_path / "sam.json").read_text())["layouts"]["sam"]
     assert (first["merit"], first["seed"], first["command"]) == ("condition", 1, result["command"])
-    words = shlex.split(first["command"])
-    assert words[:3] == ["lowfc", "design", "sam"]
-    again = lowfc(*words[1:], "--jobs", 1, "--out", "again.json")
+    arguments = shlex.split(first["command"])
+    assert arguments[:3] == ["lowfc", "design", "sam"]
+    again = lowfc(*arguments[1:], "--jobs", 1, "--out", "again.json")
     assert again.exit_code == 0, again.output
     assert json.loads((tmp_path / "again.json").read_text())["layouts"]["sam"] == first
     assert result["command"] in program.render(result)
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("options", "message"),
     [
         (("--merit", "beauty"), "merit must be one of paper, table3"),
         (("--estimator", "best"), "estimator must be one of"),
@@ -272,10 +272,10 @@ def test_command_is_recorded_and_reproduces_the_layout(tmp_path, monkeypatch):
         (("--out", "mask.json", "--front", "./mask.json"), "must be different files"),
     ],
 )
-def test_invalid_options_give_one_line_errors(tmp_path, monkeypatch, words, message):
+def test_invalid_options_give_one_line_errors(tmp_path, monkeypatch, options, message):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(executors, "DASK_TIMEOUT_S", 0.2)
-    error = refusal("design", "sam", *words, kind=(ConfigurationError, DataFileError))
+    error = refusal("design", "sam", *options, kind=(ConfigurationError, DataFileError))
     assert re.search(message, error)
     assert "\n" not in error
     assert list(tmp_path.iterdir()) == []
@@ -292,16 +292,16 @@ def test_missing_packages_are_reported_before_the_search(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize("name", RECORDED)
+@pytest.mark.parametrize("name", RECORDED_COMMANDS)
 def test_recorded_command_finds_a_layout_as_good_as_the_packaged_one(tmp_path, name):
-    """The merits agree within 3 %: those of one chain scatter by 2 % with the seed.
+    """The merits agree within 3 %: the merit of one chain scatters by 2 % with the seed.
 
     The layouts differ: the search that found the packaged ones overestimated the light through small holes, and the
     processor's rounding decides between steps of nearly equal merit.
     """
-    ran = lowfc(*shlex.split(RECORDED[name])[1:], "--jobs", 1, "--out", tmp_path / "mask.json")
+    ran = lowfc(*shlex.split(RECORDED_COMMANDS[name])[1:], "--jobs", 1, "--out", tmp_path / "mask.json")
     assert ran.exit_code == 0, ran.output
-    focal_mask = RECORDED[name].partition("--focal-mask ")[2].split()[0]
+    focal_mask = RECORDED_COMMANDS[name].partition("--focal-mask ")[2].split()[0]
     search = Search(merit="paper", weight=0.35, focal_mask=focal_mask)
     optics = program._optics(search.focal_masks)
 

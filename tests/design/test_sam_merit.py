@@ -69,7 +69,7 @@ def test_sum_over_holes_agrees_with_the_field_of_the_full_chain(sensor, modes, m
     three = Layout("three", "", ((0.2, -0.3, 0.07), (-0.414, 0.102, 0.12), (0.0, 0.05, 0.2)))
     fields = fields_of(build_optics(sensor.pupil), three.holes)
     u = pupil_axis(512)
-    # Fraction of each sample that a hole covers, by the sample's distance from an edge at which the area is the hole's.
+    # Fraction of each sample that a hole covers, from the sample's distance to an edge that keeps the hole's area.
     radii = {d: np.sqrt(d**2 / 4 - 1 / (12 * 512**2)) for *_, d in three.holes}
     covered = [np.clip((radii[d] - np.hypot(u[:, None] - y, u - x)) * 512 + 0.5, 0, 1) for x, y, d in three.holes]
     for mask, allowed in ((sum(covered), 1e-6), (transmission(three, 512), 5e-3)):
@@ -82,7 +82,7 @@ def test_sum_over_holes_agrees_with_the_field_of_the_full_chain(sensor, modes, m
 def test_predictions_agree_with_the_full_chain(sensor, modes, fields, optics):
     predicted = predictions(SamCandidate(optics, fields))
     I0, H = reference(sensor).ravel(), response(sensor, modes)
-    overlap = np.cov(modes[:, sensor.pupil > 0.5], bias=True)  # variances over the open pupil are its quadratic forms
+    overlap = np.cov(modes[:, sensor.pupil > 0.5], bias=True)  # its quadratic forms are variances over the open pupil
     for estimator in ("pinv", "weighted"):
         for count in (14, 20):
             C = noise_nm2(I0, H[:, :count], 40_000 / I0.max(), 3.0, estimator)
@@ -132,7 +132,7 @@ def test_merits_agree_with_their_definitions(optics, fields):
     for name, value in expected.items():
         weight = 0.25 if name == "pareto" else None
         assert merit(mask, Goal(name, "pinv", 20, weight)) == pytest.approx(value, rel=1e-6)
-    ratios = paper_ratios(mask)  # to the paper's values, 5.1e-4 waves and 0.36 mas
+    ratios = paper_ratios(mask)  # relative to the paper's values, 5.1e-4 waves and 0.36 mas
     assert ratios["table3 disk 14 modes"] == pytest.approx(predicted["table3_waves"]["pinv"]["14"] / 5.1e-4)
     assert ratios["table4"] == pytest.approx(tilt / 0.36)
     table4 = ratios.pop("table4")

@@ -47,7 +47,7 @@ def field_of(quarter, samples_per, extent):
 
 
 def in_zone(request, axis, margin=0.0):
-    """Whether each point of the grid of an axis, lambda/D, is in the dark zone, by at least a margin."""
+    """Whether each point of the grid of an axis is in the dark zone, at least a margin from its edge; in lambda/D."""
     radius, angle = np.hypot(axis[:, None], axis), np.rad2deg(np.arctan2(np.abs(axis)[:, None], np.abs(axis)))
     return (
         (radius >= request.inner + margin)
@@ -152,7 +152,7 @@ def test_infeasible_request_reports_the_nearest_feasible_one(tmp_path):
     assert is_feasible(replace(request, inner=inner))
     assert not is_feasible(replace(request, inner=inner - 0.1))
     assert is_feasible(replace(request, contrast=contrast))
-    assert not is_feasible(replace(request, contrast=contrast / 10**0.1))  # the steps of the search
+    assert not is_feasible(replace(request, contrast=contrast / 10**0.1))  # one step of the search beyond
     assert not path.exists()
 
 

@@ -31,14 +31,14 @@ def test_residual_of_a_drift_agrees_with_the_continuous_theory(gain):
     assert drift_residual_nm2(0.3, 2.0, EXPOSURE, gain) == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize("noise", [1e-3, 0.3, 30.0])
-def test_tolerated_drift_leaves_the_allowed_residual_at_the_best_gain(noise):
+@pytest.mark.parametrize("noise_nm2", [1e-3, 0.3, 30.0])
+def test_tolerated_drift_leaves_the_allowed_residual_at_the_best_gain(noise_nm2):
     for kind in ("integrator", "lqg"):
-        tolerated = tolerated_drift(0.5, noise, EXPOSURE, kind)
-        assert drift_residual_nm2(tolerated.step_nm2, noise, EXPOSURE, tolerated.gain) == pytest.approx(0.5)
-    best = best_gain(tolerated.step_nm2, noise, EXPOSURE)
+        tolerated = tolerated_drift(0.5, noise_nm2, EXPOSURE, kind)
+        assert drift_residual_nm2(tolerated.step_nm2, noise_nm2, EXPOSURE, tolerated.gain) == pytest.approx(0.5)
+    best = best_gain(tolerated.step_nm2, noise_nm2, EXPOSURE)
     assert tolerated.gain == pytest.approx(best)
-    assert min(drift_residual_nm2(tolerated.step_nm2, noise, EXPOSURE, best * f) for f in (0.9, 1.1)) > 0.5
+    assert min(drift_residual_nm2(tolerated.step_nm2, noise_nm2, EXPOSURE, best * f) for f in (0.9, 1.1)) > 0.5
 
 
 def test_margins_bound_the_gain_of_an_integrator_if_frames_are_exposed_all_the_time():
@@ -49,7 +49,7 @@ def test_margins_bound_the_gain_of_an_integrator_if_frames_are_exposed_all_the_t
 
 
 def test_residual_of_a_slow_loop_is_the_root_of_drift_times_noise():
-    """Kalman and Bucy: at low gain the residual variance is sqrt(D n)."""
+    """At low gain, a drift D per frame and a noise n leave a residual variance of sqrt(D n) (Kalman and Bucy)."""
     tolerated = tolerated_drift(1.0, 1e4, EXPOSURE)
     assert tolerated.step_nm2 * 1e4 == pytest.approx(1.0, rel=1e-3)
 
@@ -77,7 +77,7 @@ def test_star_colour_does_not_shift_the_zero_point_of_an_aperture_mask():
 
 @pytest.fixture
 def coarse(monkeypatch):
-    """Make one Zernike sensor of 16 x 16 pixels the only one of the check by simulation."""
+    """Make a Zernike sensor of 16 x 16 pixels the only sensor of the check by simulation."""
     sensor = Sensor(circle(64), phase_spot(samples_per=4), PupilImage(), samples_per=4, pixels=16)
     prepared = Prepared("coarse", SensorSection(), sensor)
     prepared.twin = build(sensor, TwinSpec(nodes=24, order=6, rank=40, guards=4))

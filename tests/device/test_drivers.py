@@ -105,8 +105,8 @@ def test_options_come_from_configuration_and_command_line() -> None:
     config = load(None, {"drivers.ramp.level": 3, "drivers.both.camera": {"level": 4}, "drivers.both.mirror": {}})
     assert plugins.opened("camera", "ramp", config, (), Ramp).level == 3
     assert plugins.opened("camera", "both:Class", config, (), Ramp).level == 4
-    for table, words in (({"level": 3}, ("--level", "5", "--ports=[1, 2]")), ({"level": 5, "ports": [1, 2]}, ())):
-        options = plugins.options(Ramp, table, words)
+    for table, arguments in (({"level": 3}, ("--level", "5", "--ports=[1, 2]")), ({"level": 5, "ports": [1, 2]}, ())):
+        options = plugins.options(Ramp, table, arguments)
         assert (options.level, options.ports) == (5, (1, 2))
     assert plugins.options(Ramp, {}, ("--binning", "2")).binning == 2
     assert ("--binning <1|2>", "") in plugins.options_help(Ramp)
@@ -117,7 +117,7 @@ def test_options_come_from_configuration_and_command_line() -> None:
         option_called_camera = {"camera": "a serial number, not the part for cameras"}
         config = load(None, {"drivers.basler": option_called_camera})
         assert plugins.table(config, kind, "basler") == option_called_camera
-    for table, words, why in [
+    for table, arguments, why in [
         ({"levle": 1}, (), "there is no 'levle'; there are level, ports, binning"),
         ({"level": 7, "camera": {"level": 1}}, (), "has options, or the parts camera and mirror"),
         ({"level": "7"}, (), "level = '7'"),
@@ -126,7 +126,7 @@ def test_options_come_from_configuration_and_command_line() -> None:
         ({}, ("--level",), "--name value"),
     ]:
         with pytest.raises(ConfigurationError, match=why):
-            plugins.options(Ramp, table, words)
+            plugins.options(Ramp, table, arguments)
 
 
 def test_a_driver_is_found_by_entry_point_or_by_module_and_class(
@@ -182,8 +182,8 @@ def test_driver_sections_of_a_configuration_are_checked(tmp_path: Path) -> None:
     unknown_option, unknown_driver, _ = plugins.faults(load(None, bad), tmp_path)
     assert "'falt'" in unknown_option
     assert "did you mean 'sim'" in unknown_driver
-    (of_the_camera_only,) = plugins.faults(load(None, {"drivers.sim.rows": 40}), tmp_path)
-    assert "belong in [drivers.sim.camera] or [drivers.sim.mirror]" in of_the_camera_only
+    (misplaced_option,) = plugins.faults(load(None, {"drivers.sim.rows": 40}), tmp_path)
+    assert "belong in [drivers.sim.camera] or [drivers.sim.mirror]" in misplaced_option
 
 
 class RequiredOption(Ramp):
@@ -212,9 +212,9 @@ class Own:
 def test_the_help_lists_the_drivers_options(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "own_driver.py").write_text(OWN)
-    words = [kind, "--run", "bench", f"{tmp_path}/own_driver.py:Own", "--help"]
-    *_, heading, peak, serial, wait, mode = lowfc(*words).output.rstrip().splitlines()
-    assert heading == f"Options of the driver {words[3]}:"
+    arguments = [kind, "--run", "bench", f"{tmp_path}/own_driver.py:Own", "--help"]
+    *_, heading, peak, serial, wait, mode = lowfc(*arguments).output.rstrip().splitlines()
+    assert heading == f"Options of the driver {arguments[3]}:"
     assert " ".join(peak.split()) == "--peak-dn <int> Brightest pixel. [default: 8000]"
     assert serial.split() == ["--serial", "<str>", "[required]"]
     assert (wait.split(), mode.split()) == (["--wait-s", "<float>"], ["--mode", "<slow|fast>"])

@@ -178,7 +178,7 @@ def test_a_driver_whose_settings_are_of_another_type_is_refused() -> None:
         CameraBench(settings={"rows": 3})
 
 
-def test_expose_returning_none_is_no_failure_and_settings_are_published_twice_a_second_however_often_it_does() -> None:
+def test_expose_may_return_none_and_settings_are_published_twice_a_second_meanwhile() -> None:
     bench = CameraBench(settings=replace(SETTINGS, period_ns=2000 * MS))
     results = iter([None] * 200 + [Exposure(GOOD)])
 
@@ -219,7 +219,9 @@ def test_frame_numbers_are_unwrapped_and_gaps_count_as_lost_frames() -> None:
     assert len({start_of(sample.sequence) for sample in listener.samples[FRAME]}) == 1
     frames = next(count for count in listener.messages(HEALTH)[-1].topics if count.topic == FRAME.key)
     assert (frames.published, frames.missing) == (9, 4)
-    assert listener.event_texts("FRAMES_LOST") == ["FRAMES_LOST 2 frames lost by the camera"] * 2, "one at the end"
+    assert listener.event_texts("FRAMES_LOST") == ["FRAMES_LOST 2 frames lost by the camera"] * 2, (
+        "the second event is published at the end"
+    )
 
 
 @pytest.mark.parametrize("kind", [np.uint32, np.uint64])
@@ -342,13 +344,13 @@ def test_a_failed_mirror_goes_flat_before_it_follows_commands_again(bad: Any, me
     assert (state.actuators, state.status, state.refused) == (b"", wire.MIRROR_STATUS_EXPIRED, Rejection.NO_MIRROR)
     assert bench.service.health().command_refused == Rejection.NO_MIRROR, "so that the controller holds"
     bench.command(300.0)
-    assert mirror.heights_nm == [0.0, 140.0, 280.0, 300.0], "it gets no further command"
+    assert mirror.heights_nm == [0.0, 140.0, 280.0, 300.0], "the mirror gets no further command"
     bench.tick()
     assert (len(mirror.heights_nm), bench.state().actuators) == (5, b""), "retried at once, and failed again"
     bench.tick()
     assert len(mirror.heights_nm) == 5, "no call during the pause"
     bench.tick(100)
-    assert bench.state().actuators, "it reports its position again"
+    assert bench.state().actuators, "the mirror reports its position again"
     assert bench.command(50.0).refused == Rejection.NO_MIRROR
     bench.tick()
     bench.tick()

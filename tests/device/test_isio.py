@@ -100,14 +100,14 @@ def test_the_stream_name_comes_from_command_line_or_configuration() -> None:
     assert options(IsioMirror, {"stream": "dm00disp03"}).stream == "dm00disp03"
     with pytest.raises(ConfigurationError, match="nm_per_unit = 1e-46"):  # the stream would get infinite values
         options(IsioMirror, {"stream": "dm00disp03", "nm_per_unit": 1e-46})
-    for table, words in (({}, ()), ({}, ("--atime", "end"))):
+    for table, arguments in (({}, ()), ({}, ("--atime", "end"))):
         with pytest.raises(ConfigurationError, match="stream"):
-            options(IsioCamera, table, words)
+            options(IsioCamera, table, arguments)
 
 
 def test_settings_come_from_options_keywords_and_configuration(folder: Path) -> None:
-    words: dict[str, float | str | int] = {"tint": 1.5e-3, "y0": 17, "name": "nsv"}
-    PlainStream.make(file_of(folder, "camnsv"), COLUMNS, ROWS, UINT16, keywords=words)
+    keywords: dict[str, float | str | int] = {"tint": 1.5e-3, "y0": 17, "name": "nsv"}
+    PlainStream.make(file_of(folder, "camnsv"), COLUMNS, ROWS, UINT16, keywords=keywords)
     driver, _ = camera(gain_e_per_dn=2.5, keywords={"exposure_s": "tint", "region_row": "y0", "bias_dn": "absent"})
     settings = driver.settings()
     expected = (ROWS, COLUMNS, 1_500_000, 17)
@@ -128,7 +128,9 @@ def test_settings_come_from_options_keywords_and_configuration(folder: Path) -> 
         ({"bit_depth": 12, "saturation_dn": 3000}, 3000),
     ],
 )
-def test_saturation_is_at_most_the_converters_end(folder: Path, options: dict[str, float], expected_dn: float) -> None:
+def test_saturation_is_at_most_the_converters_full_scale(
+    folder: Path, options: dict[str, float], expected_dn: float
+) -> None:
     PlainStream.make(file_of(folder, "camnsv"), COLUMNS, ROWS, UINT16)
     assert camera(**options)[0].settings().saturation_dn == expected_dn
 
@@ -303,7 +305,7 @@ def test_a_sum_that_is_absent_although_expected_counts_as_not_following(
     file_of(folder, "dm00disp").unlink()
     check_failure_without_sum(driver, "dm00disp")
     summing.total = channel(folder, "dm00disp", make=True)
-    assert driver.apply(shape_nm(1)) is None, "it follows again"
+    assert driver.apply(shape_nm(1)) is None, "the sum follows again"
     assert summing.total.count
     summing.running = False
     summing.join()
@@ -343,7 +345,7 @@ def test_a_shrunk_channel_is_no_longer_read(folder: Path) -> None:
     os.truncate(file_of(folder, "dm00disp04"), 0)
     assert np.allclose(1000 * others.sum(), shape_nm(1), atol=1e-3)
     channel(folder, "dm00disp00", make=True).write(shape_nm(3) / 1000)
-    assert np.allclose(1000 * others.sum(), shape_nm(3), atol=1e-3), "a recreated one is found at once"
+    assert np.allclose(1000 * others.sum(), shape_nm(3), atol=1e-3), "a recreated channel is found at once"
     os.truncate(file_of(folder, "dm00disp03"), 0)
     with pytest.raises(RuntimeError, match="stream 'dm00disp03' is being created"):
         driver.position()
@@ -360,13 +362,13 @@ def test_the_position_from_a_channel_whose_writer_died_is_its_present_content(fo
 
 
 def test_the_mirror_writes_zeros_over_a_channel_that_is_not_finite(folder: Path) -> None:
-    def poisoned() -> PlainStream:
+    def filled_with_nan() -> PlainStream:
         stream = channel(folder)
         stream.write(np.full(GRID, np.nan))
         return stream
 
     channel(folder, make=True)
-    stream, clock = poisoned(), FakeClock()
+    stream, clock = filled_with_nan(), FakeClock()
     listener = Listener(clock, MIRROR_STATE)
     loop = MirrorLoop(mirror()[0], listener.service("mirror-dm"), CONFIG)
     assert not stream.pixels.any(), "at the start"
@@ -375,7 +377,7 @@ def test_the_mirror_writes_zeros_over_a_channel_that_is_not_finite(folder: Path)
     commands = listener.bus.publisher(COMMAND, "dm")
     commands.put(command.SerializeToString())
     assert stream.pixels.any()
-    poisoned()
+    filled_with_nan()
     commands.put(command.SerializeToString())
     for _ in range(2):  # the last shape, then flat
         clock.advance(10_000_000)

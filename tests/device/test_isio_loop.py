@@ -73,13 +73,13 @@ class Bench:
         self.start()
 
     def start(self) -> None:
-        words = [sys.executable, "-m", "tests.support.image_streams.cacao", self.folder / "bench.toml", self.folder]
+        arguments = [sys.executable, "-m", "tests.support.image_streams.cacao", self.folder / "bench.toml", self.folder]
         pipe = subprocess.PIPE
-        self.process = subprocess.Popen(words, cwd=ROOT, stdin=pipe, stdout=pipe, text=True)
+        self.process = subprocess.Popen(arguments, cwd=ROOT, stdin=pipe, stdout=pipe, text=True)
         until(lambda: file_of(self.folder, CAMERA).exists())
 
-    def send(self, word: str) -> None:
-        self.process.stdin.write(f"{word}\n")
+    def send(self, request: str) -> None:
+        self.process.stdin.write(f"{request}\n")
         self.process.stdin.flush()
 
     def stop(self) -> dict[str, float]:
@@ -103,8 +103,8 @@ class Bench:
             bus.subscribe(STEP, step)
             yield
 
-    def has_event(self, *words: str) -> bool:
-        return any(all(word in event for word in words) for event in list(self.events))
+    def has_event(self, *texts: str) -> bool:
+        return any(all(text in event for text in texts) for event in list(self.events))
 
     def converged(self) -> bool:
         """Whether the mean error of the last 100 steps is below 2 nm rms."""
@@ -186,7 +186,7 @@ def _other_channels_are_not_undone(bench: Bench) -> None:
         dark_hole = np.random.default_rng(3).standard_normal(GRID) * 0.02
         before = bench.stream(CHANNEL).pixels[0].copy()
         bench.stream(f"{TOTAL}00").write(dark_hole)
-        until(lambda: any(one.name == "external" for one in client.status().state.channels))
+        until(lambda: any(channel.name == "external" for channel in client.status().state.channels))
         bench.errors_nm.clear()
         until(bench.converged)
         correction_nm = calibration.actuators_to_modes @ (bench.stream(CHANNEL).pixels[0] - before).reshape(-1)
@@ -194,7 +194,7 @@ def _other_channels_are_not_undone(bench: Bench) -> None:
         # A loop that undid the shape would give a ratio of 1; noise gives less than 0.3.
         assert np.linalg.norm(correction_nm) < 0.3 * np.linalg.norm(external_nm)
         state = client.status().state
-        (external,) = (one for one in state.channels if one.name == "external")
+        (external,) = (channel for channel in state.channels if channel.name == "external")
         assert np.allclose(np.frombuffer(external.actuators, "f4"), dark_hole.reshape(-1) * 1000, atol=0.01)
 
 
@@ -211,7 +211,7 @@ def test_a_minute_at_500_hz_loses_no_frame_and_matches_the_simulated_loop(folder
             with Client("bench") as client:
                 state = client.status().state
         assert not [event for event in bench.events if "FRAMES" in event and "LATE" not in event]
-        assert sum(one.count for one in state.counts) < 0.01 * state.frames_used  # late frames
+        assert sum(entry.count for entry in state.counts) < 0.01 * state.frames_used  # late frames
         results = bench.stop()
     config = '[disturbance]\npreset = "bench"\n[control]\ntilt_gain = 0.5\ngain = 0.2\n'
     direct = loop(folder, "--no-record", "--rate", "500", "--duration", "60", config=config)

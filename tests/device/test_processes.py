@@ -46,13 +46,13 @@ class Dying:
 
 def test_a_restarted_camera_process_is_a_new_start(tmp_path: Path) -> None:
     (tmp_path / "dying.py").write_text(DYING)
-    words = ("camera", "dying.py:Dying", "--run", "dying")
+    arguments = ("camera", "dying.py:Dying", "--run", "dying")
     starts: list[int] = []
     with closing(ZenohBus(open_run("dying").links, Role.RECORDER, HostClock())) as bus:
         bus.subscribe(FRAME, lambda sample: starts.append(start_of(sample.sequence)))
-        died = subprocess.run([*LOWFC, *words], cwd=tmp_path, timeout=60, check=False)
+        died = subprocess.run([*LOWFC, *arguments], cwd=tmp_path, timeout=60, check=False)
         assert died.returncode == 7, "a failure: the units in deploy restart it"
-        with in_background(tmp_path, f"lowfc {' '.join(words)}"):
+        with in_background(tmp_path, f"lowfc {' '.join(arguments)}"):
             until(lambda: len(set(starts)) == 2)
     assert starts == sorted(starts)
 
@@ -206,8 +206,8 @@ def test_a_mirror_hang_of_five_seconds_blocks_commands_and_the_mirror_goes_flat_
 @pytest.mark.exclusive
 def test_a_hanging_camera_in_the_controllers_process_does_not_block_the_controller(folder: Path) -> None:
     bench = Bench(folder)
-    both = f"{CONTROLLER} --camera faulty.py:Camera"
-    with bench.listening(), in_background(folder, MIRROR, both), ExitStack() as stack:
+    controller_with_camera = f"{CONTROLLER} --camera faulty.py:Camera"
+    with bench.listening(), in_background(folder, MIRROR, controller_with_camera), ExitStack() as stack:
         bench.wait_until_settled()
         client = stack.enter_context(Client("bench"))
         processes = client.processes()

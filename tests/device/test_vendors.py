@@ -81,7 +81,7 @@ def test_settings_default_to_the_configuration() -> None:
 class Buffers:
     """Stand-in for a stream of aravis: buffers of 2 x 3 pixels with the given frame numbers; 0 for a failed buffer.
 
-    All but the last `later` are in the queue at first. By default none is: each arrives when the driver waits for it.
+    At first, all but the last `later` are in the queue. By default none is: each arrives when the driver waits for it.
     """
 
     def __init__(self, *numbers: int, later: int = 99) -> None:
@@ -115,7 +115,7 @@ def test_gige_frame_numbers_wrap_to_one_and_buffers_are_returned() -> None:
     driver._settings, driver._stream = GenicamOptions(rows=2, columns=3).settings(CONFIG), stream
     driver._camera = SimpleNamespace(start_acquisition=lambda: None, stop_acquisition=lambda: None)
     listener, counts = run(driver, 3)
-    assert counts == [0, 1, 3], "one lost at the wrap: number 1"
+    assert counts == [0, 1, 3], "frame number 1 was lost, at the wrap"
     assert listener.messages(FRAME)[0].data == np.arange(6, dtype="<u2").tobytes()
     assert stream.pushed == 7
 
@@ -206,8 +206,8 @@ def fake_camera(request: pytest.FixtureRequest) -> Iterator[None]:
         library = aravis._aravis()
     except ConfigurationError as fault:
         pytest.skip(str(fault))
-    words = [program, "-i", "127.0.0.1", "-s", "LOWFC", "-r", str(getattr(request, "param", 5))]
-    with subprocess.Popen(words) as process:
+    arguments = [program, "-i", "127.0.0.1", "-s", "LOWFC", "-r", str(getattr(request, "param", 5))]
+    with subprocess.Popen(arguments) as process:
         try:
             for _ in range(50):
                 library.update_device_list()
@@ -376,9 +376,9 @@ def _conforms(folder: Path, driver: str, options: str, rate_hz: float) -> None:
         f"[camera]\nrate_hz = {rate_hz}\n{exposure}"
         f"[drivers.{plugins.section(driver)}]\nrows = 80\ncolumns = 80\n{options}"
     )
-    words = "--run vendor --config bench.toml"
-    with _healths("vendor") as health, in_background(folder, f"lowfc camera {driver} {words}"):
+    arguments = "--run vendor --config bench.toml"
+    with _healths("vendor") as health, in_background(folder, f"lowfc camera {driver} {arguments}"):
         until(lambda: "camera" in health and health["camera"].state == "running")
-        results = json.loads(command(folder, f"lowfc conformance camera {words} --json"))
+        results = json.loads(command(folder, f"lowfc conformance camera {arguments} --json"))
     wrong = [check for check in results["checks"] if check["status"] == "wrong"]
     assert not wrong

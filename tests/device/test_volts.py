@@ -1,4 +1,4 @@
-"""Mirrors driven by voltages: conversion from surface to values, and the example driver of a vendor's library."""
+"""Mirrors driven by voltages: conversion from surface to drive values, and the example driver of a vendor's library."""
 
 import sys
 from pathlib import Path
@@ -25,7 +25,7 @@ def stored(path: Path, values: Any) -> str:
 def test_a_surface_is_converted_to_clipped_values_in_channel_order(tmp_path: Path) -> None:
     options = VoltOptions(
         zero_map=stored(tmp_path / "zero.npy", [[0.5, 0.4, 0.5], [0.3, 0.5, 0.5]]),
-        gain_map=stored(tmp_path / "gain.npy", [[1, 2, 0], [1, 1, 1]]),  # the third has no channel
+        gain_map=stored(tmp_path / "gain.npy", [[1, 2, 0], [1, 1, 1]]),  # the third actuator has no channel
         order=stored(tmp_path / "order.npy", [[5, 0, -1], [2, 3, 4]]),
         highest=0.9,
     )
