@@ -398,21 +398,21 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
         environment = os.environ | {"XDG_RUNTIME_DIR": runtime_dir}
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
             process.stdout.readline()
-            ours = [other for other in other_loops() if f"(process {process.pid})" in other[0] or name in other[0]]
+            own_loops = [other for other in other_loops() if f"(process {process.pid})" in other[0] or name in other[0]]
             message = no_loop_message()
             with monkeypatch.context() as patch:
                 patch.setattr("lowfc.adapters.bus.other_loops._START_S", 0.0)
                 later_message = no_loop_message()
                 patch.setattr(os, "geteuid", lambda: 4_000_000_000)
                 patch.setenv("XDG_RUNTIME_DIR", runtime_dir)
-                theirs = list(other_loops())
+                seen_by_other_user = list(other_loops())
             process.communicate(b"\n")
         program = "sim-loop" if command is parent else "controller"
         loop = f"`lowfc {program} --run {name}` (process {process.pid})"
         where = f", with XDG_RUNTIME_DIR={runtime_dir}" if runtime_dir else ", without XDG_RUNTIME_DIR"
         is_loop, starting = command is not shell, runtime_dir == str(own_runtime)
-        assert ours == [(f"you run {loop}{'' if starting else where}", starting)] * is_loop
-        assert ((f"user {own_runtime.owner()} runs {loop}{where}", False) in theirs) == is_loop
+        assert own_loops == [(f"you run {loop}{'' if starting else where}", starting)] * is_loop
+        assert ((f"user {own_runtime.owner()} runs {loop}{where}", False) in seen_by_other_user) == is_loop
         assert message.endswith("starting or ending: try again in a few seconds") == (is_loop and starting)
         assert (f"{loop}, but its directory is gone" in later_message) == (is_loop and starting)
 

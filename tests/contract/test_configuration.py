@@ -72,7 +72,7 @@ def test_a_configuration_round_trips_through_toml(tmp_path: Path) -> None:
     config = load(None, {"seed": 7, "mirror.stuck_nm": {"3": 25.0}, "mirror.dead": [1, 2], "camera.delay_frames": 1.5})
     assert load(write(tmp_path, config.to_toml())) == config
     many = load(None, {"mirror.stuck_nm": {str(actuator): 0.5 for actuator in range(150)}})
-    assert load(write(tmp_path, commented(many))) == many, "also 150 numbers with a dot in one line"
+    assert load(write(tmp_path, commented(many))) == many, "a line of 150 floats is read back too"
     options = {"tables": [{"a b": 1.5}, {"c": [[1, 2], []]}], "text": 'quoted "\n', "none": {}}
     odd = load(None, {"drivers": {"own": options}, "recorder.on_event": "a\N{LINE SEPARATOR}b"})
     assert load(write(tmp_path, commented(odd))) == load(write(tmp_path, odd.to_toml())) == odd

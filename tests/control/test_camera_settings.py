@@ -44,7 +44,7 @@ def ask(state: State, name: str, **fields: object) -> tuple[State, Reply]:
     return state, outputs.reply
 
 
-def opened(*inputs: Input) -> State:
+def open_loop_after(*inputs: Input) -> State:
     """An open loop after these inputs."""
     state, _ = ask(loaded(DEFAULTS), "open")
     return feed(DEFAULTS, state, *inputs)[0]
@@ -67,7 +67,7 @@ def test_changed_camera_settings_open_the_loop() -> None:
 def test_the_loop_is_not_closed_with_changed_camera_settings(name: str) -> None:
     law = linear(DEFAULTS.integrator((2, 3, 4)))
     fields: dict[str, object] = {"close": {}, "step": {"values": (9.0,)}, "law": {"law": law}}[name]
-    state = opened(CAMERA, frame(1), WRONG_BIAS)
+    state = open_loop_after(CAMERA, frame(1), WRONG_BIAS)
     after, reply = ask(state, name, **fields)
     assert not reply.accepted
     assert "bias_dn is 160, calibrated 60" in reply.text
@@ -125,7 +125,7 @@ def test_settings_received_before_the_first_frame_of_a_restarted_camera_are_acce
 
 def test_the_loop_is_not_closed_while_frames_are_refused() -> None:
     dark = [frame(count, pixels=frame(1).pixels * 0) for count in range(2, 5)]
-    state = opened(CAMERA, frame(1), *dark[:2])
+    state = open_loop_after(CAMERA, frame(1), *dark[:2])
     assert ask(state, "close")[1].accepted, "two refused frames are ignored"
     state, _ = feed(DEFAULTS, state, dark[2])
     _, reply = ask(state, "close")

@@ -113,7 +113,7 @@ def test_an_external_shape_is_neither_undone_nor_commanded() -> None:
     seen_nm = DISTURBED + loop.to_modes @ external.reshape(-1)
     loop.run(20, seen_nm)
     assert np.allclose(loop.surfaces[-1], before, atol=0.02)
-    assert max(np.abs(surface - before).max() for surface in loop.surfaces[-20:]) < 0.02  # not even for a frame
+    assert max(np.abs(surface - before).max() for surface in loop.surfaces[-20:]) < 0.02  # no transient
     loop.ask("safe")
     loop.run(40, seen_nm)
     assert not loop.surfaces[-1].any()

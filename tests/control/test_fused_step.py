@@ -188,7 +188,9 @@ def _numbers(outputs: Outputs) -> list[Single]:
     return [np.zeros(0, np.float32) if array is None else array for array in arrays]
 
 
-def compared(frames: int, frames_per_bench: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Counter[str], float]:
+def compare_random_frames(
+    frames: int, frames_per_bench: int, monkeypatch: pytest.MonkeyPatch
+) -> tuple[Counter[str], float]:
     """Counts of fused steps, reasons and disagreements in random frames, and the largest difference of commands, nm."""
     counts: Counter[str] = Counter()
     largest_nm, original = 0.0, stepping._fused
@@ -245,7 +247,7 @@ def test_several_threads_give_the_same_bytes(monkeypatch: pytest.MonkeyPatch) ->
     for threads in (2, 3):
         shared = Tables.of(compiled.kernel(FUSED, threads), calibration, reference_nm)
         shared.sums_nm[:] = np.nan
-        for shared_bytes in (shared.tiles.nbytes, shared.tiles.nbytes + 1):  # by all threads, and by one
+        for shared_bytes in (shared.tiles.nbytes, shared.tiles.nbytes + 1):  # shared by all threads, then left to one
             monkeypatch.setattr(compiled, "SHARED_BYTES", shared_bytes)
             measured = shared.estimate(pixels, 0.0)
             assert (measured[0].tobytes(), measured[1]) == (expected[0].tobytes(), expected[1])
@@ -253,7 +255,7 @@ def test_several_threads_give_the_same_bytes(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_fused_step_agrees_on_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    counts, _ = compared(4_000, 500, monkeypatch)
+    counts, _ = compare_random_frames(4_000, 500, monkeypatch)
     assert counts["fused"] > 1000
     assert counts["limits in one of the two steps only"] <= 2
     for reason in (Rejection.SATURATED, Rejection.DARK, Rejection.STUCK, Limit.SLEW, Limit.MODAL_LIMIT, Limit.STROKE):
@@ -263,7 +265,7 @@ def test_the_fused_step_agrees_on_random_frames_and_states(monkeypatch: pytest.M
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_the_fused_step_agrees_on_a_million_random_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    counts, largest_nm = compared(1_000_000, 1000, monkeypatch)
+    counts, largest_nm = compare_random_frames(1_000_000, 1000, monkeypatch)
     print(dict(counts), f"largest difference {largest_nm:.3g} nm")
     assert counts["fused"] > 200_000
     assert counts["limits in one of the two steps only"] < 200

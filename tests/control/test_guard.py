@@ -310,5 +310,5 @@ def test_with_shifted_lines_the_residual_is_at_most_a_tenth_above_the_integrator
 @pytest.mark.slow
 @pytest.mark.parametrize("magnitude", [0.0, 2.0, 5.0])
 def test_a_good_law_is_never_overruled(magnitude: float) -> None:
-    """In ten minutes; `python -m tools.measure guard` measures ten minutes for each of twenty seeds in some hours."""
+    """This run has ten minutes; `python -m tools.measure guard` runs as long for each of twenty seeds (some hours)."""
     assert times_overruled(case("reaction-wheel", magnitude), 21) == 0

@@ -23,7 +23,7 @@ MINE = 11
 SECOND_NS = 1_000_000_000
 
 
-def held(seconds: float = 10.0, frames: int = 3) -> State:
+def reserved_loop(seconds: float = 10.0, frames: int = 3) -> State:
     """A closed loop that is reserved from time 0."""
     state, _ = feed(DEFAULTS, loaded(DEFAULTS), *(frame(count, SOME) for count in range(1, frames + 1)))
     state, outputs = applied(state, Request(0, "lease", values=(seconds,), text=HOLDER, lease_id=MINE))
@@ -56,14 +56,14 @@ GRANTED = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", 
 
 @pytest.mark.parametrize("name", sorted({*REQUESTS} - GRANTED))
 def test_requests_of_other_clients_are_refused_with_the_holders_name(name: str) -> None:
-    state = held()
+    state = reserved_loop()
     after, outputs = applied(state, Request(4 * SECOND_NS, name))
     check_reply(outputs, False, HOLDER, "6 s", "lowfc ctl stop")
     assert all(new is old for new, old in zip(after[:-1], state[:-1], strict=True))
 
 
 def test_the_holders_requests_are_granted() -> None:
-    state, outputs = applied(held(), Request(SECOND_NS, "gain", values=(0.3,), lease_id=MINE))
+    state, outputs = applied(reserved_loop(), Request(SECOND_NS, "gain", values=(0.3,), lease_id=MINE))
     check_reply(outputs, True)
     state, outputs = applied(state, Request(SECOND_NS, "open", lease_id=MINE))
     assert state.mode is LoopMode.OPEN
@@ -73,7 +73,7 @@ def test_the_holders_requests_are_granted() -> None:
 
 @pytest.mark.parametrize("name", ["safe", "open", "pause", "stop"])
 def test_safe_open_pause_and_stop_of_another_client_end_a_lease_and_its_probe_sequence(name: str) -> None:
-    state, outputs = applied(played(held()), Request(SECOND_NS, name))
+    state, outputs = applied(played(reserved_loop()), Request(SECOND_NS, name))
     check_reply(outputs, True)
     assert "LEASE_ENDED" in names([outputs])
     assert not remaining_rows(state)
@@ -99,13 +99,13 @@ def test_close_reports_whether_the_loop_was_closed_already() -> None:
 @pytest.mark.parametrize("name", ["close", "gain", "play", "load"])
 @pytest.mark.parametrize("ended", [True, False])
 def test_a_former_holder_is_refused_with_the_reason(name: str, ended: bool) -> None:
-    state = applied(held(), Request(SECOND_NS, "pause"))[0] if ended else loaded(DEFAULTS)
+    state = applied(reserved_loop(), Request(SECOND_NS, "pause"))[0] if ended else loaded(DEFAULTS)
     _, outputs = applied(state, Request(2 * SECOND_NS, name, values=(0.1,), lease_id=MINE))
     check_reply(outputs, False, ("operator asked to pause" if ended else "did the controller restart"))
 
 
 def test_safe_mode_ends_and_refuses_a_lease() -> None:
-    state, outputs = applied(held(), Request(SECOND_NS, "safe", lease_id=MINE))
+    state, outputs = applied(reserved_loop(), Request(SECOND_NS, "safe", lease_id=MINE))
     assert outputs.reply.text == f"loop in safe mode; this ended the reservation for {HOLDER}"
     _, outputs = applied(state, Request(SECOND_NS, "lease", values=(5.0,), text=HOLDER, lease_id=12))
     assert "safe mode" in outputs.reply.text
@@ -115,13 +115,13 @@ def test_safe_mode_ends_and_refuses_a_lease() -> None:
 
 @pytest.mark.parametrize("name", ["status", "note"])
 def test_status_and_note_do_not_end_a_lease(name: str) -> None:
-    state, outputs = applied(held(), Request(SECOND_NS, name, text="cloud"))
+    state, outputs = applied(reserved_loop(), Request(SECOND_NS, name, text="cloud"))
     check_reply(outputs, True)
     assert not state.conditions.lease.ended
 
 
 def test_a_lease_has_one_holder_who_alone_can_release_it() -> None:
-    state = held()
+    state = reserved_loop()
     after, outputs = applied(state, Request(SECOND_NS, "lease", values=(5.0,), text="somebody", lease_id=12))
     check_reply(outputs, False)
     after, outputs = applied(after, Request(SECOND_NS, "release", lease_id=12))
@@ -153,7 +153,7 @@ def test_an_invalid_lease_is_refused(fields: dict[str, object], why: str) -> Non
 
 def test_a_lease_ends_after_its_number_of_frames() -> None:
     """A lease of 1 s is in force for 1000 frames at 1 kHz."""
-    state = played(held(1.0), 5000)
+    state = played(reserved_loop(1.0), 5000)
     state, all_outputs = feed(DEFAULTS, state, *(frame(count) for count in range(4, 1004)))
     assert names(all_outputs) == []
     assert remaining_rows(state) == 4000
@@ -178,16 +178,16 @@ def test_a_lease_lasts_its_seconds_at_any_frame_rate(period_ns: int, ahead_ns: i
 @pytest.mark.parametrize("time_ns", [0, frame(3).time_ns + 10 * SECOND_NS])
 def test_each_frame_counts_as_one_period_after_a_silence_and_if_frame_times_do_not_increase(time_ns: int) -> None:
     *lasting, last = (frame(count, SOME, time_ns=time_ns) for count in range(4, 1005))
-    state, all_outputs = feed(DEFAULTS, held(1.0), *lasting)
+    state, all_outputs = feed(DEFAULTS, reserved_loop(1.0), *lasting)
     assert "LEASE_ENDED" not in names(all_outputs)
     assert "LEASE_ENDED" in names(feed(DEFAULTS, state, last)[1])
 
 
 def test_without_frames_a_lease_ends_by_the_clock_and_before_the_next_request() -> None:
-    state, all_outputs = feed(DEFAULTS, played(held(1.0)), Tick(SECOND_NS, 0), Tick(SECOND_NS + 1, 0))
+    state, all_outputs = feed(DEFAULTS, played(reserved_loop(1.0)), Tick(SECOND_NS, 0), Tick(SECOND_NS + 1, 0))
     assert names(all_outputs) == ["LEASE_ENDED"]
     assert not remaining_rows(state)
-    _, outputs = applied(held(1.0), Request(SECOND_NS + 1, "gain", values=(0.3,)))
+    _, outputs = applied(reserved_loop(1.0), Request(SECOND_NS + 1, "gain", values=(0.3,)))
     check_reply(outputs, True)
     assert names([outputs]) == ["LEASE_ENDED"]
 
@@ -196,7 +196,7 @@ def test_without_frames_a_lease_ends_by_the_clock_and_before_the_next_request() 
 def test_a_lease_keeps_its_number_of_frames_when_the_camera_starts(frames: int) -> None:
     start = 1_800_000_000
     *lasting, last = (frame(count, SOME, sequence=frame_sequence(count, start)) for count in range(1, 1003))
-    state, all_outputs = feed(DEFAULTS, held(1.0, frames), *lasting)
+    state, all_outputs = feed(DEFAULTS, reserved_loop(1.0, frames), *lasting)
     assert "LEASE_ENDED" not in names(all_outputs)
     assert "LEASE_ENDED" in names(feed(DEFAULTS, state, last)[1])
 

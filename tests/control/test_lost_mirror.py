@@ -24,7 +24,7 @@ def test_a_lost_mirror_moves_the_command_back_to_its_last_shape() -> None:
     assert np.abs(wound_up.loop.history_nm[0] - last_seen.loop.history_nm[0]).max() > 20
     lost = MirrorReport(0, LOST.fault, MirrorShape(0, last_seen.loop.actuators_nm, last_seen.loop.history_nm[0]))
     moved_nm = np.abs(wound_up.loop.actuators_nm - last_seen.loop.actuators_nm).max()
-    assert moved_nm > DEFAULTS.limits.slew_nm, "it takes more than one step"
+    assert moved_nm > DEFAULTS.limits.slew_nm, "moving back takes more than one step"
     state, all_outputs = feed(DEFAULTS, wound_up, lost, lost)
     assert names(all_outputs) == ["MIRROR_LOST"]
     assert feed(DEFAULTS, state, lost)[0] is state

@@ -146,7 +146,9 @@ class Rig(ThreadedRun):
         assert not any(bus.faults.counts for bus in self.hub.buses)
 
 
-def alone(calibration: Calibration | None, latch: Latch, config: Configuration) -> tuple[Listener, Service, Controller]:
+def lone_controller(
+    calibration: Calibration | None, latch: Latch, config: Configuration
+) -> tuple[Listener, Service, Controller]:
     """A controller without camera and mirror."""
     listener = Listener(SimulatedClock() if config.lockstep else HostClock())
     service = listener.service("controller")
@@ -300,7 +302,7 @@ def test_frames_with_wrong_times_do_not_stop_the_controller(calibration: Calibra
 def test_a_loop_whose_latch_cannot_be_written_starts_open(calibration: Calibration, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     warnings: list[str] = []
-    _, service, controller = alone(calibration, Latch([tmp_path / "file" / "safe"], warnings.append), CLOSED)
+    _, service, controller = lone_controller(calibration, Latch([tmp_path / "file" / "safe"], warnings.append), CLOSED)
     assert service.awaited() == "a camera"
     assert service.state == "starting", "opening a camera may take longer than the watchdog waits"
     assert (mode_of(controller), len(warnings)) == (LoopMode.OPEN, 1)
@@ -367,7 +369,7 @@ def test_safe_mode_outlives_the_controller(calibration: Calibration, tmp_path: P
 
     def mode(first: Calibration | None = calibration) -> LoopMode:
         latch = Latch([file])
-        controller = alone(first, latch, CLOSED)[2]
+        controller = lone_controller(first, latch, CLOSED)[2]
         controller._update_latch()
         latch.close()  # otherwise it would write the file again
         if first is None:
@@ -383,7 +385,7 @@ def test_safe_mode_outlives_the_controller(calibration: Calibration, tmp_path: P
 
 
 def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration: Calibration, tmp_path: Path) -> None:
-    listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
+    listener, _, controller = lone_controller(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     report_shape(listener, 20, 20)
     with pytest.raises(CalibrationError, match="20, 20"):
         controller.run()
@@ -393,7 +395,7 @@ def test_start_requests_wait_for_the_mirror_and_the_cameras_settings(calibration
     np.save(tmp_path / "flat.npy", np.ones(GRID, np.float32))
     flat = configured(lockstep=False, mirror__flat=str(tmp_path / "flat.npy"))
     for first in (None, calibration):
-        listener, _, controller = alone(first, Latch([tmp_path / "safe"]), flat)
+        listener, _, controller = lone_controller(first, Latch([tmp_path / "safe"]), flat)
         controller._report_mirror()
         controller._send_start_requests()
         assert controller._start_pending
@@ -412,7 +414,7 @@ def test_without_a_calibration_the_configured_law_is_not_in_force(tmp_path: Path
     noll = CONFIG.noll
     law_file.save(integrator([0.3] * len(noll), [0.0] * len(noll), noll, 1.0, CONFIG.camera.rate_hz), tmp_path / "law")
     config = configured(lockstep=False, control__law=str(tmp_path / "law"))
-    listener, _, controller = alone(None, Latch([tmp_path / "safe"]), config)
+    listener, _, controller = lone_controller(None, Latch([tmp_path / "safe"]), config)
     report_shape(listener)
     controller._report_mirror()
     controller._between_frames(None)
@@ -426,7 +428,7 @@ def test_start_requests_refused_because_clients_changed_the_loop_do_not_end_the_
     np.save(tmp_path / "flat.npy", shape)
     law_file.save(integrator([0.3] * 2, [0.0] * 2, noll, 1.0, CONFIG.camera.rate_hz), tmp_path / "law")
     config = configured(lockstep=False, mirror__flat=str(tmp_path / "flat.npy"), control__law=str(tmp_path / "law"))
-    listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), config)
+    listener, _, controller = lone_controller(calibration, Latch([tmp_path / "safe"]), config)
     controller._mirror_adopted = True  # as in `run` if the mirror has not reported within `MIRROR_PATIENCE_S`
     controller._carry_out_internal(Request(0, "channel", text="dig", actuators_nm=shape.reshape(-1)))
     controller._send_start_requests()
@@ -436,14 +438,14 @@ def test_start_requests_refused_because_clients_changed_the_loop_do_not_end_the_
 def test_an_automatic_gain_request_dated_by_the_cameras_clock_ends_no_reservation(
     calibration: Calibration, tmp_path: Path
 ) -> None:
-    _, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
+    _, _, controller = lone_controller(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     assert controller._carry_out_internal(Request(0, "lease", (), (5.0,), "somebody", lease_id=1)).accepted
     reply = controller._carry_out_internal(Request(2**62, "gain", (), (0.1,), "auto"))  # the frame's time
     assert (reply.accepted, "the loop is reserved for somebody" in reply.text) == (False, True)
 
 
 def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: Calibration, tmp_path: Path) -> None:
-    listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
+    listener, _, controller = lone_controller(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     report_shape(listener)
     assert controller._mirror.first() is not None
     healths = listener.bus.publisher(HEALTH, "mirror-dm")
@@ -487,7 +489,7 @@ def test_an_exception_in_frame_processing_ends_the_controller(
 ) -> None:
     """If the bus's thread only counted the exception, the loop would stop silently."""
     monkeypatch.setattr("lowfc.programs.core.controller.MIRROR_PATIENCE_S", 0.01)
-    listener, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
+    listener, _, controller = lone_controller(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     monkeypatch.setattr(controller, "_control_step", Mock(side_effect=ArithmeticError("one and one is three")))
     frames = listener.service("camera").publisher(FRAME)
     late = threading.Timer(0.2, frames.put, [b""])

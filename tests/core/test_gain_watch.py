@@ -145,7 +145,9 @@ def test_modes_not_corrected_reduce_the_noise_of_the_others(faint: Bench) -> Non
     state = controller_state(faint.state, faint.settings, 0)
     in_use = calibration_in_use(state, active_loop.calibration).reconstructor
     np.testing.assert_array_equal(in_use, active_loop.estimator.rows[:-1])
-    measured_modes = active_loop.to_modes @ active_loop.calibration.modes_to_actuators  # of the shape of each mode
+    measured_modes = (
+        active_loop.to_modes @ active_loop.calibration.modes_to_actuators
+    )  # modes measured for the shape of each mode
     np.testing.assert_allclose(measured_modes, in_use @ active_loop.calibration.response, atol=0.02)
     assert np.abs(measured_modes - np.eye(len(measured_modes))).max() > 0.1
     flux_dn, camera = faint.steps[-1].flux_dn, active_loop.camera
@@ -236,9 +238,8 @@ def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset() -> N
 
 
 def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:
-    loop = bench(
-        -1.0
-    )  # at V = 2 the noise of a frame is some ten times the residual: the estimate scatters by a factor of 4
+    # At V = 2 the noise of a frame is some ten times the residual: the estimate would scatter by a factor of 4.
+    loop = bench(-1.0)
     form = np.diag(factory.contrast_of(loop.config).form)
 
     def true(name: str, frames: int) -> float:
@@ -272,7 +273,7 @@ def test_manual_gains_are_kept_and_harm_is_reported_before_and_after_closing() -
     assert residual_nm > open_nm
 
 
-def harmful(on_harm: str) -> ModalBench:
+def harmful_loop(on_harm: str) -> ModalBench:
     """A closed loop that increases the residual; three windows end after 1000 frames."""
     config = configuration(6.5, **FIXED_GAINS | {"control.on_harm": on_harm})
     return ModalBench(config, factory.frame_noise_nm2(config, calibration(6.5, "sam")))
@@ -280,7 +281,7 @@ def harmful(on_harm: str) -> ModalBench:
 
 @pytest.mark.parametrize("on_harm", ["open", "integrator"])
 def test_a_harmful_loop_without_a_law_opens_if_configured(on_harm: str) -> None:
-    loop = harmful(on_harm)
+    loop = harmful_loop(on_harm)
     loop.run(1150)
     assert [event["action"] for event in details_of(loop, "LOOP_HARMS")] == ["the loop opens"]
     assert loop.state.mode is LoopMode.OPEN
@@ -288,7 +289,7 @@ def test_a_harmful_loop_without_a_law_opens_if_configured(on_harm: str) -> None:
 
 
 def test_the_integrator_takes_over_from_a_harmful_law_once_the_loop_is_not_reserved() -> None:
-    loop = harmful("integrator")
+    loop = harmful_loop("integrator")
     law = loop.settings.integrator(loop.config.noll)
     loop.ask("law", law=integrator(law.gain, law.leak, loop.config.noll, loop.settings.delay_frames, 250.0))
     loop.run(100)
@@ -333,7 +334,7 @@ def test_a_truncated_reconstructor_is_weighted_without_an_inverse_of_its_respons
     assert GainWatch(setup, "warn").observe(all_outputs[-1].step, state).requests == ()
 
 
-def watched(*inputs: Input) -> list[str]:
+def requests_of_watch(*inputs: Input) -> list[str]:
     """Names of the requests of the gain watch for these inputs to a toy loop with automatic gains."""
     setup = settings(auto_gain=(True, True), start_mode=LoopMode.OPEN)
     watch, state, requested = GainWatch(setup, "warn"), loaded(setup), []
@@ -356,7 +357,7 @@ def watched(*inputs: Input) -> list[str]:
 def test_frames_out_of_sequence_do_not_prevent_the_measurement_of_gains(between: list[Input]) -> None:
     first = [frame(count) for count in range(1, 11)]
     later = [frame(count) for count in range(11, 11 + MIN_FRAMES)]
-    assert "gain" in watched(*first, *between, *later)
+    assert "gain" in requests_of_watch(*first, *between, *later)
 
 
 def test_a_fainter_star_lowers_the_gains_and_restarts_their_measurement() -> None:

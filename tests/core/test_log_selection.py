@@ -204,7 +204,8 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     config = load(None, keys)
     log_bytes_per_s = bytes_per_s(config, configured_selection(config))
     assert 3e6 < log_bytes_per_s < 5e6
-    expected = f"about {log_bytes_per_s * 3600 / 1e9:.0f} GB an hour at 250 Hz and 80 x 80 pixels (size of the simulated camera); "
+    gb_per_hour = log_bytes_per_s * 3600 / 1e9
+    expected = f"about {gb_per_hour:.0f} GB an hour at 250 Hz and 80 x 80 pixels (size of the simulated camera); "
     assert estimate(config).startswith(f"recording into {tmp_path}: {expected}")
     assert estimate(load(None, {"recorder.folder": ""})).startswith("recording into .: ")
     camera = wire.CameraState(rows=160, columns=120)

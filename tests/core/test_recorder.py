@@ -128,7 +128,7 @@ def test_every_lost_message_is_counted(bench: Bench, tmp_path: Path, monkeypatch
     bench.start()
     started_in.rmdir()  # the recorder does not need its working directory
     put(frames, 50)  # the last one is lost too: only the camera's Health reveals it
-    put(steps, 5)  # none arrives
+    put(steps, 5)  # no step arrives
     summary = bench.stop()
     assert summary.lost == {FRAME.key: 4, STEP.key: 5}
     assert bench.losses() == summary.lost
@@ -181,7 +181,7 @@ def test_a_late_message_is_removed_from_the_losses() -> None:
     account.enter(*entry(FRAME, 8), recorded=False)  # not written to the disk
     assert (account.lost(), account.newly_lost(), account.recorded()) == ({FRAME.key: 1}, {}, {FRAME.key: 4})
     account.enter(*entry(FRAME, 12), recorded=True)
-    assert (account.lost(), account.newly_lost()) == ({FRAME.key: 3}, {FRAME.key: 1}), "two were reported already"
+    assert (account.lost(), account.newly_lost()) == ({FRAME.key: 3}, {FRAME.key: 1}), "two losses were reported"
 
 
 def reconcile(account: LossAccount, published: int, state: str = "", missing: int = 0, start_s: int = 100) -> None:
@@ -203,7 +203,7 @@ def test_frames_that_the_camera_missed_before_publishing_are_not_losses() -> Non
     account.enter(*entry(FRAME, 56), recorded=True)
     assert account.newly_lost() == {}, "the camera may still report that it missed them"
     reconcile(account, 57, missing=10)
-    assert (account.newly_lost(), account.newly_lost()) == ({FRAME.key: 1}, {}), "one was lost on the bus"
+    assert (account.newly_lost(), account.newly_lost()) == ({FRAME.key: 1}, {}), "one frame was lost on the bus"
 
 
 def test_duplicates_neither_count_as_losses_nor_hide_them() -> None:

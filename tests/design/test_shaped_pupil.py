@@ -152,7 +152,7 @@ def test_infeasible_request_reports_the_nearest_feasible_one(tmp_path):
     assert is_feasible(replace(request, inner=inner))
     assert not is_feasible(replace(request, inner=inner - 0.1))
     assert is_feasible(replace(request, contrast=contrast))
-    assert not is_feasible(replace(request, contrast=contrast / 10**0.1))  # one step of the search beyond
+    assert not is_feasible(replace(request, contrast=contrast / 10**0.1))  # one step of the search further
     assert not path.exists()
 
 

@@ -131,7 +131,7 @@ def test_a_hanging_camera_is_reported_while_it_hangs() -> None:
     reported: list[bool] = []
 
     def hang() -> Exposure:
-        for _ in range(11):  # a check each 0.1 s: one notes the call, ten are the timeout of 1 s
+        for _ in range(11):  # a check each 0.1 s: the first notes the call, ten reach the timeout of 1 s
             bench.loop.watch.check()
             reported.append("DRIVER_HANGS" in bench.listener.events())
         return Exposure(GOOD)
@@ -342,7 +342,7 @@ def test_a_failed_mirror_goes_flat_before_it_follows_commands_again(bad: Any, me
     mirror.plan = [bad, bad]
     state = bench.command(300.0)
     assert (state.actuators, state.status, state.refused) == (b"", wire.MIRROR_STATUS_EXPIRED, Rejection.NO_MIRROR)
-    assert bench.service.health().command_refused == Rejection.NO_MIRROR, "so that the controller holds"
+    assert bench.service.health().command_refused == Rejection.NO_MIRROR, "the controller holds because of this"
     bench.command(300.0)
     assert mirror.heights_nm == [0.0, 140.0, 280.0, 300.0], "the mirror gets no further command"
     bench.tick()
@@ -381,7 +381,7 @@ def test_a_hanging_mirror_reports_no_position_and_goes_flat_before_the_next_comm
     bench.command(100.0)
 
     def hang(shape: Single) -> Single:
-        for _ in range(5):  # one notes the call, five are the timeout of 0.5 s
+        for _ in range(5):  # the first notes the call, five reach the timeout of 0.5 s
             bench.loop.watch.check()
         assert bench.listener.events() == ["STARTED"]
         bench.loop.watch.check()

@@ -371,7 +371,7 @@ def test_the_mirror_writes_zeros_over_a_channel_that_is_not_finite(folder: Path)
     stream, clock = filled_with_nan(), FakeClock()
     listener = Listener(clock, MIRROR_STATE)
     loop = MirrorLoop(mirror()[0], listener.service("mirror-dm"), CONFIG)
-    assert not stream.pixels.any(), "at the start"
+    assert not stream.pixels.any(), "zeros are written at the start"
     command = wire.MirrorCommand(frame_sequence=1, rows=GRID[0], columns=GRID[1], valid_for_ns=10**9)
     command.actuators = shape_nm(1).tobytes()
     commands = listener.bus.publisher(COMMAND, "dm")
@@ -382,7 +382,7 @@ def test_the_mirror_writes_zeros_over_a_channel_that_is_not_finite(folder: Path)
     for _ in range(2):  # the last shape, then flat
         clock.advance(10_000_000)
         loop._idle()
-    assert not stream.pixels.any(), "after another process wrote it"
+    assert not stream.pixels.any(), "zeros are written after another process wrote NaN"
     (failed,) = listener.event_texts("DRIVER_FAILED")
     assert "another process writes stream 'dm00disp03'" in failed
     commands.put(command.SerializeToString())

@@ -179,7 +179,7 @@ def test_a_camera_hang_of_five_seconds_is_reported_and_the_loop_holds_and_resume
         until(lambda: bench.count_of("controller", "FRAMES_BACK") and bench.count_of("camera", "DRIVER_BACK"))
         assert bench.count_of("camera", "DRIVER_HANGS") == 1
         bench.wait_until_settled()
-    assert len(bench.starts) == 1, "its process has not restarted"
+    assert len(bench.starts) == 1, "the camera's process has not restarted"
 
 
 @pytest.mark.slow
@@ -198,7 +198,7 @@ def test_a_mirror_hang_of_five_seconds_blocks_commands_and_the_mirror_goes_flat_
         assert time.monotonic() - begun_s > 4, "no command arrived while it hung"
         until(lambda: bench.count_of("mirror-dm", "DRIVER_BACK") and bench.count_of("controller", "MIRROR_BACK"))
         repeated_nm, idle_nm = bench.calls_nm()[len(before) :][:2]
-        assert (repeated_nm, idle_nm) == (pytest.approx(before[-1], abs=1), 0), "its last shape, then flat"
+        assert (repeated_nm, idle_nm) == (pytest.approx(before[-1], abs=1), 0), "the mirror's last shape, then flat"
         assert bench.count_of("mirror-dm", "DRIVER_HANGS") == bench.count_of("controller", "MIRROR_LOST") == 1
         bench.wait_until_settled()
 
@@ -244,7 +244,7 @@ def test_a_dead_mirror_process_is_reported_and_the_loop_holds_until_its_restart(
     calls = len(bench.calls_nm())
     with in_background(bench.folder, MIRROR):
         until(lambda: bench.count_of("controller", "MIRROR_BACK"))
-        assert bench.calls_nm()[calls] == 0, "it goes flat before it follows commands"
+        assert bench.calls_nm()[calls] == 0, "the mirror goes flat before it follows commands"
         bench.wait_until_settled()
         assert bench.is_commanded(before_nm)
     assert bench.count_of("controller", "MIRROR_LOST") == 1

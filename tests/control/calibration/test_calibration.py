@@ -76,13 +76,13 @@ def cramer_rao(flux_e: float, read_noise_e: float) -> np.ndarray:
     return np.linalg.inv(information)[:3, :3]
 
 
-@pytest.mark.parametrize(("flux_e", "read_noise_e", "above"), [(1e5, 0.0, 1e-9), (1e4, 5.0, 0.01)])
-def test_the_weighted_estimator_reaches_the_cramer_rao_bound(flux_e: float, read_noise_e: float, above: float) -> None:
-    """For photon noise; with read noise it is within one percent."""
+@pytest.mark.parametrize(("flux_e", "read_noise_e", "excess"), [(1e5, 0.0, 1e-9), (1e4, 5.0, 0.01)])
+def test_the_weighted_estimator_reaches_the_cramer_rao_bound(flux_e: float, read_noise_e: float, excess: float) -> None:
+    """It does so for photon noise; with read noise it is within one percent."""
     R = reconstructor(I0, H, GOOD, flux_e, read_noise_e)
     ratio = noise_nm(R, I0, flux_e, read_noise_e) ** 2 / np.diag(cramer_rao(flux_e, read_noise_e))
     assert (ratio >= 1 - 1e-9).all()
-    assert (ratio <= 1 + above).all()
+    assert (ratio <= 1 + excess).all()
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)

@@ -60,8 +60,8 @@ def test_a_cycle_has_rest_frames_and_settling_after_each_change() -> None:
     assert np.count_nonzero(plan.used[:6]) == 4
     assert not plan.table[:6].any()
     changed = np.flatnonzero(np.diff(plan.table, axis=0).any(axis=1)) + 1
-    for late in (0, 1):
-        assert not plan.used[changed + late].any()
+    for frames_after in (0, 1):
+        assert not plan.used[changed + frames_after].any()
     with pytest.raises(ValueError, match="hold must be 1 frame or more"):
         cycle(poke_patterns(2, 8.0), hold=0, settle=2, rest=4)
 
@@ -99,8 +99,8 @@ def test_without_a_command_the_mirror_keeps_the_previous_row() -> None:
     weights = np.array([0.0, 1.0])
     commanded = np.array([True, True, False, True, True, True, True])
     assert seen(table, weights, np.arange(7), commanded)[:, 0].tolist() == [0, 1, 2, 2, 4, 5, 0]
-    missing = np.array([0, 1, 3, 4, 5, 6])
-    assert seen(table, weights, missing, np.ones(6, np.bool_))[:, 0].tolist() == [0, 1, 2, 4, 5, 0]
+    without_frame_2 = np.array([0, 1, 3, 4, 5, 6])
+    assert seen(table, weights, without_frame_2, np.ones(6, np.bool_))[:, 0].tolist() == [0, 1, 2, 4, 5, 0]
 
 
 def test_only_exposures_affected_by_a_missing_frame_are_unusable() -> None:
@@ -168,10 +168,10 @@ def test_the_noise_of_h_neither_biases_r_nor_adds_noise() -> None:
     """H is measured so briefly that the noise of its pixels is as strong as the modes."""
     fit = measured(poke_patterns(MODES, 0.3), 10)
     variance = I0 / FLUX_E
-    of_noisy_h = reconstruct(I0, fit.response, None, GOOD, FLUX_E, 0.0)
+    from_noisy_h = reconstruct(I0, fit.response, None, GOOD, FLUX_E, 0.0)
     inverse = reconstruct(I0, fit.response, fit.initial.matrix, GOOD, FLUX_E, 0.0)
     least = np.sqrt(fit.initial.matrix**2 @ variance)
-    assert np.diag(cross_talk(of_noisy_h.matrix, H)).mean() < -0.3
+    assert np.diag(cross_talk(from_noisy_h.matrix, H)).mean() < -0.3
     assert abs(np.diag(cross_talk(inverse.matrix, H)).mean()) < 3 * fit.error.max() / np.sqrt(MODES)
     assert (np.sqrt(inverse.matrix**2 @ variance) / least).max() < 1 + 3 * fit.error.max()
     # an initial reconstructor with wrong weights and mixed modes is unbiased too, with its own noise
@@ -197,15 +197,15 @@ def test_r_ignores_what_the_initial_reconstructor_ignores() -> None:
 
 
 def test_the_initial_reconstructor_with_the_least_noise_is_chosen() -> None:
-    of_sensor = initial_of_sensor()
-    blind = Initial(np.zeros_like(of_sensor.matrix), "blind")
-    of_another = Initial(initial_of_sensor(2).matrix, "of another sensor")
-    scaled = Initial(of_sensor.matrix * 3.0, "again")
+    own = initial_of_sensor()
+    blind = Initial(np.zeros_like(own.matrix), "blind")
+    other = Initial(initial_of_sensor(2).matrix, "of another sensor")
+    scaled = Initial(own.matrix * 3.0, "again")
     for candidates, best in (
-        ([of_sensor, blind], of_sensor),
-        ([of_another, of_sensor], of_sensor),
-        ([blind, of_sensor, scaled], of_sensor),
-        ([scaled, of_sensor], scaled),
+        ([own, blind], own),
+        ([other, own], own),
+        ([blind, own, scaled], own),
+        ([scaled, own], scaled),
     ):
         assert best_initial(candidates, -0.8 * H[:, 1], 1, I0 / FLUX_E) is best
 
@@ -227,10 +227,10 @@ def test_independent_frames_reveal_a_wrong_reconstructor() -> None:
     rng = np.random.default_rng(4)
     error = np.linspace(0.01, 0.04, 8)
     products = np.eye(8) + rng.standard_normal((400, 4, 8, 8)) * error[:, None]
-    of_right = [check(each, np.eye(8), error) for each in products]
-    assert np.mean([each.within(0.012, 0.04) for each in of_right]) > 0.99
-    assert np.sqrt(np.mean([each.rms**2 for each in of_right])) < 0.01
-    largest = max(of_right, key=lambda each: each.largest)
+    right_checks = [check(each, np.eye(8), error) for each in products]
+    assert np.mean([each.within(0.012, 0.04) for each in right_checks]) > 0.99
+    assert np.sqrt(np.mean([each.rms**2 for each in right_checks])) < 0.01
+    largest = max(right_checks, key=lambda each: each.largest)
     assert largest.bound(0.04) > largest.largest > 0.04, "the noise of these frames is allowed for"
     wrong = np.eye(8)
     wrong[2, 5] = 0.3
@@ -338,8 +338,8 @@ def test_poorly_measured_combinations_can_be_truncated_or_damped() -> None:
         reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, truncate=1.0)
     with pytest.raises(ValueError, match="weighted"):
         reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, "best")
-    of_measured = reconstruct(I0, faint, whole.matrix, GOOD, FLUX_E, 0.0, truncate=0.05)
-    assert np.allclose(of_measured.matrix, truncated.matrix, rtol=1e-6, atol=1e-6)
+    from_measured = reconstruct(I0, faint, whole.matrix, GOOD, FLUX_E, 0.0, truncate=0.05)
+    assert np.allclose(from_measured.matrix, truncated.matrix, rtol=1e-6, atol=1e-6)
 
 
 def test_too_few_usable_frames_are_an_error() -> None:
@@ -378,15 +378,15 @@ def test_a_new_dark_or_reference_keeps_a_fitted_background_and_a_truncation() ->
     truncated = replace(
         before, reconstructor=before.reconstructor * single([[1], [1], [0]]), estimator="pinv+regularised"
     )
-    for known in (fitted, truncated):
-        dark = with_dark(known, np.full(good.size, 7.0), good, 1.0, 1.0)
-        moved = with_reference(known, I0, 2 * before.flux_dn, 1.0, 1.0)
+    for original in (fitted, truncated):
+        dark = with_dark(original, np.full(good.size, 7.0), good, 1.0, 1.0)
+        moved = with_reference(original, I0, 2 * before.flux_dn, 1.0, 1.0)
         for changed in (dark, moved):
-            np.testing.assert_allclose(changed.reconstructor, known.reconstructor, atol=1e-3)
+            np.testing.assert_allclose(changed.reconstructor, original.reconstructor, atol=1e-3)
     good[3] = 0
-    masked, plain = (with_dark(known, np.zeros(good.size), good, 1.0, 1.0) for known in (fitted, before))
+    masked, plain = (with_dark(original, np.zeros(good.size), good, 1.0, 1.0) for original in (fitted, before))
     background = normalise_flux(masked.reference.astype(float), np.ones((I0.size, 1)), good)[1]
-    errors_nm = [np.abs(known.reconstructor @ background).max() for known in (masked, plain)]
+    errors_nm = [np.abs(original.reconstructor @ background).max() for original in (masked, plain)]
     assert errors_nm[0] < 0.3 * errors_nm[1]  # one pixel of 42 is masked
 
 

@@ -34,7 +34,7 @@ def verdicts(
     *,
     closed: bool = False,
 ) -> list[Verdict]:
-    """Verdicts of a loop whose gains follow them."""
+    """Verdicts of a bank whose loop applies the gains of each verdict."""
     all_verdicts = []
     for index, modes_nm in enumerate(open_nm.astype(np.float32)):
         tilt_of_frame = None if tilt_nm is None else single(tilt_nm[index])
@@ -51,7 +51,7 @@ def drift(frames: int, step_nm: float, noise_nm: float, seed: int) -> Array:
 
 
 def test_white_noise_gets_no_gain() -> None:
-    """40 first windows of 30 modes; the noise has long tails, as from few photons: two standard errors would not do."""
+    """40 first windows of 30 modes; the noise has long tails, as from few photons: two standard errors are too few."""
     rng, granted = np.random.default_rng(1), 0
     for _ in range(40):
         noise = rng.normal(0, 10, (300, MODES)) * (1 + 4 * (rng.random((300, 1)) < 0.02))
@@ -203,16 +203,16 @@ def test_tilt_cross_talk_does_not_favour_a_gain() -> None:
 def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
     """With another R, mode 7 contains minus twice mode 4, and so the cross-talk of tilt, which it lacked before."""
     tilt_nm, modes_nm = _vibrating(5200, 22)
-    from_own = np.eye(MODES)
-    from_own[7, 4] = -2
-    mixed = (modes_nm @ from_own.T).astype(np.float32)
+    mixing = np.eye(MODES)
+    mixing[7, 4] = -2
+    mixed = (modes_nm @ mixing.T).astype(np.float32)
     gains = []
     for updated in (True, False):
         bank_ = bank(windows=(200, 1000))
         verdicts(bank_, modes_nm[:5000], ZEROS, 1.0, tilt_nm[:5000], closed=True)
         bank_.begin_first_window()
         if updated:
-            bank_.use_reconstructor(from_own)
+            bank_.use_reconstructor(mixing)
         gains.append(verdicts(bank_, mixed[5000:], ZEROS, 1.0, tilt_nm[5000:], closed=True)[0].gain[7])
     assert gains[0] == 0
     assert gains[1] > 0
@@ -247,8 +247,8 @@ def _calibration() -> tuple[Calibration, CameraSettings]:
     R = reconstruct(reference, response, None, good, 1e5, 2.0).matrix
     camera = CameraSettings(0, (20, 20), 0.0, 65535.0, 2.0, 1.0, 2.0)
     arrays = [array.astype(np.float32) for array in (reference, response, R, good, np.zeros(pixels))]
-    others = np.zeros((4, modes), np.float32), (20, 20), (2, 2), 5e4, 65535.0, "weighted", 550.0, "", "id"
-    return Calibration((2, 3, 4, 5, 6), *arrays, *others), camera
+    other_fields = np.zeros((4, modes), np.float32), (20, 20), (2, 2), 5e4, 65535.0, "weighted", 550.0, "", "id"
+    return Calibration((2, 3, 4, 5, 6), *arrays, *other_fields), camera
 
 
 def test_rows_of_corrected_modes_are_the_map_estimate() -> None:
@@ -270,8 +270,8 @@ def test_rows_of_corrected_modes_are_the_map_estimate() -> None:
 
 def test_r_is_unchanged_if_all_or_no_modes_are_corrected_or_the_camera_is_unknown() -> None:
     calibration, camera = _calibration()
-    for prior, seen_by in ((np.zeros(5), camera), (np.ones(5), camera), (np.array([1.0, 0, 0, 0, 0]), None)):
-        assert map_rows(calibration, prior, 5e4, seen_by, calibration.reconstructor)[0] is calibration.reconstructor
+    for prior, settings in ((np.zeros(5), camera), (np.ones(5), camera), (np.array([1.0, 0, 0, 0, 0]), None)):
+        assert map_rows(calibration, prior, 5e4, settings, calibration.reconstructor)[0] is calibration.reconstructor
 
 
 def test_the_prior_of_uncorrected_modes_is_their_power_minus_noise_plus_two_standard_errors() -> None:

@@ -48,7 +48,7 @@ def test_the_residual_power_of_a_wave_agrees_with_a_fine_simulation(timing: Timi
 
 @pytest.mark.parametrize(("delay", "exposure"), [(1.0, 0.5), (1.5, 0.5), (2.3, 0.2), (1.4, 1.0)])
 def test_the_mirror_moves_within_the_exposure_that_sees_parts_of_two_commands(delay: float, exposure: float) -> None:
-    """Simulated in fine steps, in which an exposure sees what the mirror does."""
+    """In the simulation with fine steps, an exposure sees the motion of the mirror."""
     frames, omega, timing = 800, 0.11, Timing.of(delay, exposure)
     wave = np.sqrt(2) * np.cos(omega * np.arange(frames * FINE) / FINE + 1)
     mirror, c = np.zeros(frames * FINE), 0.0
@@ -71,7 +71,7 @@ def test_the_floor_is_the_residual_of_the_best_held_value() -> None:
 
 
 def test_the_residuals_on_the_ideal_wheel_are_known_and_the_best_law_reaches_the_floor() -> None:
-    """Mas per axis, without noise; at one instant of each frame the integrator leaves 2.26 and the best law nothing."""
+    """Mas per axis, without noise. At one instant of each frame the integrator leaves 2.26 and the best law nothing."""
     instant, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
     assert residual_mas(integrator_of_tip(1.11, 1), instant) == pytest.approx(3.528, abs=0.002)
     assert residual_mas(integrator_of_tip(1.11, 1), blurred) == pytest.approx(2.944, abs=0.002)
@@ -95,7 +95,7 @@ def test_the_noise_of_the_command_has_a_closed_form() -> None:
 
 @pytest.mark.parametrize("timing", [Timing(1, 1, 0), Timing(1, 1, 0.5), Timing(2, 2, 0.9), Timing(1.3, 1.3, 0.5)])
 def test_means_are_interpolated_from_measurements(timing: Timing) -> None:
-    """For waves up to a quarter of the frame rate."""
+    """This holds for waves up to a quarter of the frame rate."""
     k = np.arange(400)
     for omega in (0.0, 0.04, 0.5, 1.5):
         wave = np.exp(1j * (omega * k + 0.3))
@@ -109,7 +109,7 @@ def test_means_are_interpolated_from_measurements(timing: Timing) -> None:
 
 
 def test_the_continuous_residual_is_recovered_from_instants() -> None:
-    """For a wave and a mirror that holds; the residual at the instants alone is smaller."""
+    """The disturbance is a wave, and the mirror holds its shape. The residual at the instants alone is smaller."""
     timing, law, k, omega = Timing.of(1, 0.0), integrator_of_tip(0.5, 1), np.arange(3000), 0.3
     wave = np.sqrt(2) * np.cos(omega * k + 1)
     mirror, c = np.zeros_like(wave), 0.0

@@ -35,21 +35,21 @@ def weights(delay_frames: float) -> np.ndarray:
     return delay_weights(delay_frames).astype(np.float32)
 
 
-def live(setup: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def live_run(setup: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Errors, pseudo-open-loop modes and commands (steps, modes) of the live loop on a walk, and missing exposures."""
     steps, _, _ = run_toy(setup, WALK, missing=MISSING, dark=DARK)
-    nothing = np.full(3, np.nan, np.float32)
-    error = np.array([nothing if step.error_nm is None else step.error_nm for step in steps])
-    pol = np.array([nothing if step.pol_nm is None else step.pol_nm for step in steps])
+    no_modes = np.full(3, np.nan, np.float32)
+    error = np.array([no_modes if step.error_nm is None else step.error_nm for step in steps])
+    pol = np.array([no_modes if step.pol_nm is None else step.pol_nm for step in steps])
     sequence = np.array([step.frame_sequence for step in steps], np.uint64)
     return error, pol, np.array([step.command_nm for step in steps]), missing_before(sequence)
 
 
 @pytest.mark.parametrize("delay", DELAYS)
 def test_the_logged_gains_reproduce_the_logged_run(delay: float) -> None:
-    """Up to float32 rounding in pol = error - seen, with missing and refused frames and acting modal limits."""
+    """They do so up to float32 rounding in pol = error - seen, with missing and refused frames and modal limits."""
     setup = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0), limit_nm=(12.0, 50.0))
-    error, pol, command, missing = live(setup)
+    error, pol, command, missing = live_run(setup)
     assert missing.sum() == 9
     assert np.isnan(error).any(axis=1).sum() == len(DARK)
     assert (np.abs(command[:, 0]) == 12.0).any()
@@ -61,11 +61,11 @@ def test_the_logged_gains_reproduce_the_logged_run(delay: float) -> None:
 
 @pytest.mark.parametrize("delay", DELAYS)
 def test_other_gains_reproduce_a_run_with_these_gains(delay: float) -> None:
-    """For a sensor that is linear up to the rounding to DN, here 0.01 nm."""
+    """This holds for a sensor that is linear up to the rounding to DN, here 0.01 nm."""
     before = settings(delay_frames=delay, gain=(0.3, 0.1), **WIDE)
     after = settings(delay_frames=delay, gain=(0.1, 0.25), leak=(0.02, 0.01), **WIDE)
-    _, pol, _, missing = live(before)
-    error, _, command, _ = live(after)
+    _, pol, _, missing = live_run(before)
+    error, _, command, _ = live_run(after)
     law = limited_integrator(after.integrator((2, 3, 4)))
     other_error, other_command = counterfactual(law, weights(delay), pol, missing)
     np.testing.assert_allclose(other_error, error, atol=0.05)

@@ -166,12 +166,12 @@ def test_a_quadratic_response_is_nonlinearity() -> None:
 def test_too_few_frames_give_no_measurement_error() -> None:
     few = [one_piece(part.joined()[:45]) for part in run(lambda residual, index: residual + NOISE[index], 600)]
     assert measurement_error(law_of_two_modes(), *few, np.ones(2)) is None
-    nothing = TimeSeries((), 0)
-    assert measurement_error(law_of_two_modes(), nothing, nothing, nothing, np.ones(2)) is None
+    empty = TimeSeries((), 0)
+    assert measurement_error(law_of_two_modes(), empty, empty, empty, np.ones(2)) is None
 
 
 def test_the_terms_add_up_to_the_residual_of_a_simulated_loop() -> None:
-    """Within 6 % of the total rms and 12 % for tip and tilt; in 1.5 s noise alone scatters by 3 to 5 %."""
+    """They agree within 6 % of the total rms and 12 % for tip and tilt; in 1.5 s noise alone scatters by 3 to 5 %."""
     keys = {"control.start_mode": "closed", "camera.rate_hz": RATE_HZ, "disturbance.scale": 2.0}
     config = load(None, keys | FIXED_GAINS | SMALL_MIRROR)
     calibration = calibrated(config)

@@ -29,7 +29,7 @@ def wheel(**keys: Any) -> tuple[Configuration, Bench]:
 
 
 def residual_mas(bench: Bench, run: TimeSeries, timing: Timing, *, continuous: bool = True) -> float:
-    """Residual in mas, over all time or only at the starts of exposures, with the law tuned from a run for a timing."""
+    """Residual in mas of the law tuned from `run` for a timing: over all time, or only at the starts of exposures."""
     bench.ask("law", law=tuned(run, bench.config, timing=timing)["lqg"].law)
     bench.new_record()
     bench.run(SETTLE + MEASURE)
@@ -46,7 +46,7 @@ def residual_between_instants_mas(bench: Bench) -> float:
 
 
 def test_an_image_of_one_instant_hides_the_residual_between_instants() -> None:
-    """For an integrator, and for the law that nulls the residual at the instants."""
+    """It does so for an integrator, and for the law that nulls the residual at the instants."""
     _, bench = wheel(**{"camera.instants": 1})
     bench.run(IDENTIFY)
     assert bench.tilt_mas(MEASURE, continuous=False) == pytest.approx(2.3, rel=0.03)

@@ -95,10 +95,10 @@ def test_an_integrator_of_pseudo_open_loop_modes_equals_one_of_the_error(delay_f
     disturbance = np.random.default_rng(2).standard_normal((300, 3))
     modes = list(zip(GAIN / 2, LEAK, strict=True))
     pol, error = integrators(modes, "pol", delay_frames), integrators(modes, "error", delay_frames)
-    for of_pol, of_error in zip(
+    for from_pol, from_error in zip(
         run(pol, disturbance, delay_frames), run(error, disturbance, delay_frames), strict=True
     ):
-        np.testing.assert_allclose(of_pol, of_error, atol=1e-4)
+        np.testing.assert_allclose(from_pol, from_error, atol=1e-4)
 
 
 def test_a_pi_law_follows_its_difference_equation() -> None:
@@ -295,7 +295,7 @@ def test_a_law_unstable_without_frames_or_in_open_loop_is_refused() -> None:
 
 
 def test_margins_of_coupled_modes_are_those_of_the_rotated_loop() -> None:
-    """Rotating the modes and back leaves the loop unchanged: poles and |S| of a rotated law are known."""
+    """Rotating the modes and back leaves the loop unchanged: poles and |S| of the rotated law stay the same."""
     law = linear(law_of(modes=2), (4, 5))
     rotation = np.array([[0.8, -0.6], [0.6, 0.8]], np.float32)
     rotated = replace(

@@ -36,7 +36,7 @@ def tilts_of(config: Configuration, noise_nm: Array, frames: int = FRAMES) -> Ti
 
 @pytest.mark.slow
 def test_an_identified_law_is_nearly_optimal() -> None:
-    """At a noise level at which the margins are no constraint."""
+    """The noise level is one at which the margins are no constraint."""
     config = configured()
     calibration = calibrated(config)
     law = tuned(tilts_of(config, frame_noise_nm(config, calibration)[:2], 8000), config)["lqg"].law
@@ -55,9 +55,10 @@ def test_laws_are_nearly_optimal_within_the_margins(width: float, magnitude: flo
     best_mas = laws.optimum_mas(config, calibration, robust=True)
     assert laws.optimum_mas(config, calibration) <= 1.001 * best_mas
     for seed in range(1, 11):
-        own = configured(delay_frames=delay, seed=seed, **keys)
-        law = tuned(tilts_of(own, frame_noise_nm(own, calibration)[:2]), own)["lqg"].law
-        assert np.hypot(*laws.theory_mas(own, calibration, law)) < 1.06 * best_mas
+        config_of_seed = configured(delay_frames=delay, seed=seed, **keys)
+        noise_nm = frame_noise_nm(config_of_seed, calibration)[:2]
+        law = tuned(tilts_of(config_of_seed, noise_nm), config_of_seed)["lqg"].law
+        assert np.hypot(*laws.theory_mas(config_of_seed, calibration, law)) < 1.06 * best_mas
 
 
 @pytest.mark.parametrize("noise_nm", [0.05, 2.0])
@@ -66,13 +67,13 @@ def test_laws_are_nearly_optimal_within_the_margins(width: float, magnitude: flo
 def test_a_filter_keeps_the_margins_at_any_noise(noise_nm: float, width: float, delay: float) -> None:
     """With less noise a filter has more gain and smaller margins, so the tuning overestimates the noise as needed."""
     timing = Timing.of(delay, 0.5)
-    known = tuple(Line(hz, width * hz, (2.4 * mas) ** 2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
-    model = Model(0.02, 2.0, known, noise_nm**2, RATE_HZ)
+    exact = tuple(Line(hz, width * hz, (2.4 * mas) ** 2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
+    model = Model(0.02, 2.0, exact, noise_nm**2, RATE_HZ)
     blocks = within_margins(model, timing), lqg_block(model, timing)
     law, unconstrained = (law_from_blocks([block], "pol", "lqg", (2,), delay, RATE_HZ) for block in blocks)
 
     def ratio(filter_: LinearLaw) -> float:
-        """Smallest ratio of a margin to its limit; for a filter the phase margin may be 0.7 times as large."""
+        """Smallest ratio of a margin to its limit; for a filter the limit of the phase margin is 0.7 times as large."""
         kept = margins(filter_, delay)
         gain = min(kept.gain_margin[0], 1 / max(kept.gain_reduction[0], 1e-9)) / MIN_GAIN_MARGIN
         return float(min(gain, kept.phase_margin_deg[0] / (0.7 * MIN_PHASE_MARGIN_DEG)))

@@ -160,21 +160,22 @@ def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: fl
         lines_of_mode.tolist() for lines_of_mode in places
     ]
     theory, rows = linear(law(), NOLL, delay_frames, 1.0), np.arange(measured.mode.size)
-    S, T = (of(theory, measured.frequency)[rows, measured.mode] for of in (margins.rejection, margins.noise_transfer))
-    of_s = departure(measured.rejection, S, measured.error, TOLERANCE_DB)
-    of_t = departure(measured.noise_transfer, T, measured.error, TOLERANCE_DB)
-    assert of_s.judged.sum() > 0.8 * rows.size
-    assert of_t.judged.sum() > 0.5 * rows.size
-    for compared in (of_s, of_t):
+    transfer = margins.rejection, margins.noise_transfer
+    S, T = (function(theory, measured.frequency)[rows, measured.mode] for function in transfer)
+    from_s = departure(measured.rejection, S, measured.error, TOLERANCE_DB)
+    from_t = departure(measured.noise_transfer, T, measured.error, TOLERANCE_DB)
+    assert from_s.judged.sum() > 0.8 * rows.size
+    assert from_t.judged.sum() > 0.5 * rows.size
+    for compared in (from_s, from_t):
         judged = compared.judged
         assert np.array_equal(judged, compared.within)
         assert 0.6 < np.sqrt(np.mean((compared.db[judged] / compared.error_db[judged]) ** 2)) < 1.6
-    assert (np.abs(of_s.db[of_s.judged & (measured.frequency > 0.02)]) < 0.5).all()
+    assert (np.abs(from_s.db[from_s.judged & (measured.frequency > 0.02)]) < 0.5).all()
 
     other_theory = linear(law((0.6, 0.15)), NOLL, delay_frames, 1.0)
     S = margins.rejection(other_theory, measured.frequency)[rows, measured.mode]
-    of_other_gain = departure(measured.rejection, S, measured.error, TOLERANCE_DB)
-    assert not of_other_gain.within[of_other_gain.judged].all()
+    from_other_gain = departure(measured.rejection, S, measured.error, TOLERANCE_DB)
+    assert not from_other_gain.within[from_other_gain.judged].all()
 
 
 def test_lines_are_odd_ascending_and_not_shared_by_modes() -> None:
@@ -246,7 +247,7 @@ def test_a_staircase_limits_its_steps_and_holds_its_levels() -> None:
     assert stairs[-1] == 0
     for start, level, previous in zip(starts, levels_nm, np.roll(levels_nm, 1), strict=True):
         assert (stairs[start : start + 6] == level).all()
-        assert start == 0 or level == previous or stairs[start - 1] != level, "it starts when the level is reached"
+        assert start == 0 or level == previous or stairs[start - 1] != level, "a start is the first frame at its level"
 
 
 def test_known_gain_and_crosstalk_are_recovered() -> None:

@@ -33,8 +33,8 @@ def test_the_highest_gain_has_exactly_the_least_allowed_margins(delay_frames: fl
     margins_ = margins(integrators([(highest_gain(delay_frames), 0.0)], "error", delay_frames), delay_frames)
     assert margins_.gain_margin[0] >= MIN_GAIN_MARGIN * 0.999
     assert margins_.phase_margin_deg[0] >= MIN_PHASE_MARGIN_DEG * 0.999
-    at_a_limit = (margins_.gain_margin[0] / MIN_GAIN_MARGIN, margins_.phase_margin_deg[0] / MIN_PHASE_MARGIN_DEG)
-    assert min(at_a_limit) == pytest.approx(1, rel=0.01)
+    ratios_to_limits = (margins_.gain_margin[0] / MIN_GAIN_MARGIN, margins_.phase_margin_deg[0] / MIN_PHASE_MARGIN_DEG)
+    assert min(ratios_to_limits) == pytest.approx(1, rel=0.01)
 
 
 def test_the_best_gain_agrees_with_theory() -> None:
@@ -46,7 +46,7 @@ def test_the_best_gain_agrees_with_theory() -> None:
     hz = omega * RATE_HZ / (2 * np.pi)
 
     def residual(gain: float) -> float:
-        S, T = (of(hz, RATE_HZ, gain, 0.0, 1.0) ** 2 for of in (rejection, noise_transfer))
+        S, T = (function(hz, RATE_HZ, gain, 0.0, 1.0) ** 2 for function in (rejection, noise_transfer))
         return float(np.trapezoid(S * model.spectrum_nm2(omega) + T, omega) / np.pi)
 
     gains = np.linspace(0.02, 0.6, 59)
@@ -70,14 +70,14 @@ def test_the_residual_of_a_leaky_integrator_follows_from_the_log(leak: float) ->
 
 
 @pytest.mark.parametrize(
-    ("delay", "at_least_mas", "at_most_mas", "lqg_over_notch"),
+    ("delay", "at_least_mas", "at_most_mas", "lqg_to_notch"),
     [
         (1.0, {"integrator": 2.0}, {"integrator": 2.6, "pi-notch": 0.8, "lqg": 0.7}, 1.0),
         pytest.param(2.0, {"integrator": 5.0}, {}, 0.8, marks=pytest.mark.slow),
     ],
 )
 def test_laws_on_the_reaction_wheel_leave_the_predicted_residual(
-    delay: float, at_least_mas: dict[str, float], at_most_mas: dict[str, float], lqg_over_notch: float
+    delay: float, at_least_mas: dict[str, float], at_most_mas: dict[str, float], lqg_to_notch: float
 ) -> None:
     """LQG leaves less than a notch filter, which leaves less than the integrator."""
     pol, truth = wheel(10_000)
@@ -90,7 +90,7 @@ def test_laws_on_the_reaction_wheel_leave_the_predicted_residual(
         assert residual_mas[best.law.name] == pytest.approx(predicted_mas, rel=0.05), best.law.name
         assert best.margins.stable
         assert best.margins.gain_margin.min() >= MIN_GAIN_MARGIN * 0.999
-    assert residual_mas["lqg"] < lqg_over_notch * residual_mas["pi-notch"]
+    assert residual_mas["lqg"] < lqg_to_notch * residual_mas["pi-notch"]
     assert residual_mas["pi-notch"] < residual_mas["integrator"]
     assert all(residual_mas[name] > least for name, least in at_least_mas.items())
     assert all(residual_mas[name] < most for name, most in at_most_mas.items())
@@ -118,7 +118,7 @@ def test_too_few_frames_are_refused() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", [1.0, 2.0])
 def test_lqg_agrees_with_theory_and_adapts_to_shifted_lines(delay: float) -> None:
-    """At most 15 % above the law's theory and the best LQG law; for shifted lines, a new law is as good within 15 %."""
+    """It leaves at most 15 % more than theory and the best LQG law. For shifted lines, a new law is as good to 15 %."""
     config = configured(delay_frames=delay)
     calibration = calibrated(config)
     bench = Bench(config, calibration)

@@ -62,7 +62,7 @@ def test_no_line_is_identified_in_noise() -> None:
 
 
 def test_the_spectrum_of_a_model_agrees_with_its_states() -> None:
-    """Computed from the states' transfer function, which shares no code with the spectrum."""
+    """The expected values are from the states' transfer function, which shares no code with `spectrum_nm2`."""
     model = Model(0.01, 5.0, (Line(20, 0.8, 25.0), Line(60, 2.5, 9.0)), 0.5, RATE_HZ)
     F, Q, C = model.states()
     omega = np.array([0.01, 0.1257, 0.3, 0.377, 2.0])
@@ -102,7 +102,7 @@ def test_the_drift_is_identified_down_to_the_lowest_frequencies(
 
 
 def test_drift_is_not_identified_as_a_line() -> None:
-    """With a bright star, and a drift up to 1 Hz that hardly exceeds the noise above this band."""
+    """The star is bright; the drift, up to 1 Hz, hardly exceeds the noise above this band."""
     simulated = preset_disturbance("thermal", tuple(range(2, 16)), 1, NM_PER_MAS, 550.0)
     drift = modes_nm(simulated, 0, 15_000, 250.0)
     noise = 0.2 * np.random.default_rng(1).standard_normal(drift.shape)
@@ -124,7 +124,7 @@ MODEL = Model(0.02, 5.0, (Line(18, 0.3, 60.0), Line(71, 0.5, 20.0)), 0.7, RATE_H
 def minimum_variance_nm2(spectrum_nm2: Array, noise_nm2: float, whole_frames: int) -> float:
     """Least residual variance of any linear law, for a known spectrum of the disturbance and a delay of whole frames.
 
-    By Kolmogorov: the spectrum of the measurements is factored into white innovations, of variance
+    Kolmogorov's method: the spectrum of the measurements is factored into white innovations, of variance
     exp(mean(log(spectrum + noise))), and a filter 1 + h1/z + ...; innovations after the command are lost.
     The spectrum (frequencies,) is at even steps from 0 to pi rad per frame, both included.
     """
@@ -172,7 +172,7 @@ def test_a_constant_is_rejected() -> None:
 @pytest.mark.parametrize("noise_nm2", [1e-4, 0.7, 100.0])
 @pytest.mark.parametrize("width_hz", [1e-9, 1e-6, 1e-2, 3.0])
 def test_the_covariance_solves_the_riccati_equation(width_hz: float, noise_nm2: float) -> None:
-    """With poles at any distance from the unit circle."""
+    """It does so with poles at any distance from the unit circle."""
     lines = tuple(Line(frequency, width_hz, 1e-3 * frequency) for frequency in (0.3, 6, 6.5, 18, 117))
     model = Model(1e-8, 0.2, lines, noise_nm2, RATE_HZ)
     A, Q, C = model.states()

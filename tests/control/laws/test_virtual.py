@@ -8,7 +8,7 @@ from lowfc.control.laws.virtual import VirtualIntegrators
 
 def test_each_row_equals_a_loop_with_its_gain() -> None:
     rng = np.random.default_rng(1)
-    half = np.float32(0.5)  # of each of two commands: a delay of 1.5 frames
+    half = np.float32(0.5)  # weight of each of two commands: a delay of 1.5 frames
     gain = np.array([[0, 0], [0.1, 0.4], [0.3, 0.2]], np.float32)
     leak, limit = np.array([0, 0.01], np.float32), np.array([2.0, 100], np.float32)
     rows = VirtualIntegrators.at_rest(gain, 1 - leak, limit, ((0, half), (1, half)))
@@ -29,7 +29,7 @@ def test_each_row_equals_a_loop_with_its_gain() -> None:
 
 
 def test_differences_of_squared_errors_equal_those_of_true_residuals() -> None:
-    """For 20,000 frames of a slow drift with several times stronger noise."""
+    """They do so over 20,000 frames of a slow drift with several times stronger noise."""
     rng = np.random.default_rng(2)
     gain = np.array([0, 0.02, 0.5], np.float32)[:, None] * np.ones((1, 40), np.float32)
     ones = np.ones(40, np.float32)
@@ -46,5 +46,5 @@ def test_differences_of_squared_errors_equal_those_of_true_residuals() -> None:
     difference = (measured - true)[1:].mean(axis=1) / len(drift)
     spread = (measured - true)[1:].std(axis=1) / len(drift) / np.sqrt(40)
     assert (np.abs(difference) < 4 * spread).all()
-    assert (true[1] < 0).mean() > 0.5  # the low gain corrects
-    assert (true[2] > 0).all()  # the high one adds noise
+    assert (true[1] < 0).mean() > 0.5  # the low gain reduces the residual
+    assert (true[2] > 0).all()  # the high gain adds noise
