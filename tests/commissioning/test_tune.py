@@ -1,4 +1,4 @@
-"""`lowfc tune`: results, files and errors, on a log computed by the controller's `advance`. Law files."""
+"""`lowfc tune` on a log computed by the controller's `advance`: results, files and errors; and law files."""
 
 import json
 import re

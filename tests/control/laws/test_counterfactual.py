@@ -1,4 +1,4 @@
-"""What-ifs against the live loop's `advance`, and against hand calculations."""
+"""Loops recomputed by `lowfc what-if`, against the live loop's `advance` and against hand calculations."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Tuned laws: Gendron and Lena against theory, LQG and notches on the reaction wheel, with images and without."""
+"""Tuned laws: best integrator gains against theory; LQG and notches on the reaction wheel, with and without images."""
 
 import numpy as np
 import pytest
