@@ -11,8 +11,8 @@ from typing import Any
 
 def report(log: str) -> dict[str, Any]:
     """Return the output of `lowfc report LOG --json`."""
-    words = [sys.executable, "-m", "lowfc", "report", log, "--json"]
-    done = subprocess.run(words, check=True, stdout=subprocess.PIPE)  # noqa: S603  # this Python's own lowfc
+    command = [sys.executable, "-m", "lowfc", "report", log, "--json"]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE)  # noqa: S603  # this Python's own lowfc
     found: dict[str, Any] = json.loads(done.stdout)
     return found
 
