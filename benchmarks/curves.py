@@ -87,7 +87,7 @@ def timed(work: Callable[[], object], seconds: float) -> dict[str, float]:
 
 
 def loop_latency(size: Size, rate_hz: float, seconds: float) -> Result:
-    """Latency of the loop of that size, and half a round trip of a bare echo of its messages; or `failure`, why not.
+    """Latency of the loop of that size, and half a round trip of a bare echo of its messages; or `failure`, its reason.
 
     cpu is the processor time of the controller for each frame.
     """
@@ -166,11 +166,11 @@ HEADINGS = (
     "bytes, MB",
     "read rate, GB/s",
     "memory limit, us",
-    "step over limit",
+    "step / memory limit",
     "loop p50, us",
     "p99",
-    "controller's cpu",
-    "half a bare echo",
+    "controller's cpu, us",
+    "half a bare echo, us",
     "frames without a command",
 )
 
@@ -224,8 +224,8 @@ def about(result: Result) -> str:
     )
     failed = "".join(f" Failed, {fault}." for fault in result["failed"])
     return (
-        f"us; medians over {result['repeats']} repeats of {result['seconds']:g} s each, in brackets the lowest and "
-        f"highest p50. Sizes not on the axis: {default.pixels} pixels, {default.modes} modes, {default.actuators} "
+        f"Times in us, medians over {result['repeats']} repeats of {result['seconds']:g} s each; in brackets the range "
+        f"of p50. Sizes not on the axis: {default.pixels} pixels, {default.modes} modes, {default.actuators} "
         "actuators. The step: one thread, back to back, normal scheduling, warm caches. The memory limit: one read of "
         "as many bytes as a step must touch, by a float32 dot product of one half with the other. "
         f"{loops}{failed}"

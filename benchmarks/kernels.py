@@ -71,7 +71,7 @@ def about(found: Result) -> str:
         ", ".join(f"{name} {median(turn[name] for turn in one['turns']):.1f}" for name in one["turns"][0])
         for one in found["sizes"]
     ]
-    return f"us, p50, medians over {len(found['sizes'][0]['turns'])} turns: {'; '.join(each)}."
+    return f"p50 in us, medians over {len(found['sizes'][0]['turns'])} turns: {'; '.join(each)}."
 
 
 def _timed_calls(size: Size) -> dict[str, Callable[[], object]]:

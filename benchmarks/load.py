@@ -68,7 +68,7 @@ def watched() -> Iterator[list[Moment]]:
 def _moment() -> Moment:
     moment = Moment(time.monotonic(), {})
     for process in psutil.Process().children(recursive=True):
-        with contextlib.suppress(psutil.Error):  # ended meanwhile
+        with contextlib.suppress(psutil.Error):  # the process has ended meanwhile
             role = role_of(process.cmdline())
             if role is not None:
                 times, cpus = process.cpu_times(), ",".join(map(str, process.cpu_affinity()))
@@ -97,15 +97,15 @@ def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
     }
 
 
-def role_of(words: Sequence[str]) -> str | None:
+def role_of(arguments: Sequence[str]) -> str | None:
     """Role of a process in the loop, from its command line; None if it has none."""
-    module = words[words.index("-m") + 1 :] if "-m" in words else []
+    module = arguments[arguments.index("-m") + 1 :] if "-m" in arguments else []
     return MODULES.get(" ".join(module[:1])) or MODULES.get(" ".join(module[:2]))
 
 
-def run_lowfc(words: Sequence[str], seconds: float) -> dict[str, Any]:
+def run_lowfc(arguments: Sequence[str], seconds: float) -> dict[str, Any]:
     """JSON of `lowfc` with these arguments, and usage (`shares`); or failure: its last stderr line, or the timeout."""
-    command = [sys.executable, "-P", "-m", "lowfc", *words, "--duration", f"{seconds:g}", "--json"]
+    command = [sys.executable, "-P", "-m", "lowfc", *arguments, "--duration", f"{seconds:g}", "--json"]
     timeout_s = _START_S + _TIMEOUT_RATIO * seconds
     with tempfile.TemporaryDirectory() as folder, watched() as moments:
         where: dict[str, Any] = {"cwd": folder, "env": os.environ | {"XDG_RUNTIME_DIR": folder}}

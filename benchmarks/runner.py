@@ -36,7 +36,7 @@ class Benchmark(Protocol):
         """Explanation of the tables: conditions and definitions."""
 
 
-def run(name: str, benchmark: Benchmark, words: Sequence[str]) -> int:
+def run(name: str, benchmark: Benchmark, arguments: Sequence[str]) -> int:
     """Run a benchmark from its command line; returns the exit status."""
     parser = argparse.ArgumentParser(
         f"python -m benchmarks {name}",
@@ -45,7 +45,7 @@ def run(name: str, benchmark: Benchmark, words: Sequence[str]) -> int:
     )
     benchmark.options(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args(words)
+    options = parser.parse_args(arguments)
     if not 0.01 <= options.seconds <= 1e5 or getattr(options, "repeats", 1) < 1:
         parser.error("--seconds must be 0.01 to 100000, --repeats at least 1")
     where = host()

@@ -54,7 +54,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, report: Report) -> Result:
-    """Time the stages: percentiles by stage, and the whole step over the product; back to back and paced."""
+    """Time the stages: percentiles by stage, and the ratio of the step to the product; back to back and paced."""
     size = Size()
     config = configuration(size, RATE_HZ)
     calibration, frames = random_calibration(size, config)

@@ -29,7 +29,7 @@ LOOPS = {
 }
 """Options of `lowfc latency` for each loop."""
 MAX_WITHOUT_COMMAND = 0.001
-RATE_WITHIN = 0.01
+RATE_TOLERANCE = 0.01
 COMPARED_HZ = 1000.0
 
 _ROLES = ("camera", "controller", "mirror", "recorder")
@@ -41,29 +41,29 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lowest", type=float, default=500.0, help="lowest rate of the grid, Hz (%(default)g)")
     parser.add_argument("--highest", type=float, default=10_000.0, help="upper end of the grid, Hz (%(default)g)")
     parser.add_argument("--step", type=float, default=1.1, help="ratio of one rate to the one before (%(default)g)")
-    parser.add_argument("--loop", action="append", choices=LOOPS, help="only this one; the option may be repeated")
+    parser.add_argument("--loop", action="append", choices=LOOPS, help="only this loop; the option may be repeated")
 
 
 def measure(options: argparse.Namespace, report: Report) -> Result:
-    """Find the highest rate of each loop: loops (results of `find`), seconds and rates_hz."""
+    """Find the highest rate of each loop: loops (results of `highest_rate`), seconds and rates_hz."""
     if not (0 < options.lowest <= options.highest < math.inf and options.step > 1):
         raise ConfigurationError("--lowest must be above 0 and at most --highest, which is finite; --step above 1")
     rates = grid(options.lowest, options.highest, options.step)
     loops = {}
     for name in options.loop or LOOPS:
         report(name)
-        loops[name] = find(LOOPS[name], rates, options.seconds, report)
+        loops[name] = highest_rate(LOOPS[name], rates, options.seconds, report)
     return {"loops": loops, "seconds": options.seconds, "rates_hz": rates}
 
 
-def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> Result:
+def run_once(loop_options: Sequence[str], rate_hz: float, seconds: float) -> Result:
     """Run a loop once with these options of `lowfc latency`.
 
     `failure` has the last line of its standard error, or the timeout, if it failed. messages_lost is None without a
     recorder. commands_late_fraction is the number of late commands over the number of frames, warm-up included; only
     with a simulated camera.
     """
-    found = run_lowfc(["latency", *words, "--rate", f"{rate_hz:g}"], seconds)
+    found = run_lowfc(["latency", *loop_options, "--rate", f"{rate_hz:g}"], seconds)
     if "failure" in found:
         return {"requested_hz": rate_hz, "failure": found["failure"]}
     values = {
@@ -85,7 +85,7 @@ def complaints(run: Result) -> list[str]:
     if "failure" in run:
         return [run["failure"]]
     reasons = []
-    if abs(run["rate_hz"] - run["requested_hz"]) > RATE_WITHIN * run["requested_hz"]:
+    if abs(run["rate_hz"] - run["requested_hz"]) > RATE_TOLERANCE * run["requested_hz"]:
         reasons.append(f"{run['rate_hz']:.0f} frames a second")
     if run["without_command"] > MAX_WITHOUT_COMMAND * run["frames"]:
         reasons.append(f"{100 * run['without_command'] / run['frames']:.2g} % of the frames without a command")
@@ -110,21 +110,21 @@ def search(sustains: Callable[[int], bool], count: int) -> int:
     return bisect_left(range(count), True, key=fails) - 1
 
 
-def find(words: Sequence[str], rates: Sequence[float], seconds: float, report: Report) -> Result:
+def highest_rate(loop_options: Sequence[str], rates: Sequence[float], seconds: float, report: Report) -> Result:
     """Find the highest rate of one loop.
 
     highest_hz: None if not even the lowest is sustained; run: a sustained run at that rate; above: a run one step
-    faster that was not (None at the end of the grid); compared: a run at `COMPARED_HZ`.
+    faster that was not sustained (None at the end of the grid); compared: a run at `COMPARED_HZ`.
     """
-    command = shlex.join(["lowfc", "latency", *words])
+    command = shlex.join(["lowfc", "latency", *loop_options])
     runs: list[Result] = []
 
     def sustains(index: int) -> bool:
         report(f"{command}: {rates[index]:g} Hz")
-        runs.append(run_once(words, rates[index], seconds))
+        runs.append(run_once(loop_options, rates[index], seconds))
         return not complaints(runs[-1])
 
-    def one_at(index: int, *, sustained: bool) -> Result | None:
+    def run_at(index: int, *, sustained: bool) -> Result | None:
         if not 0 <= index < len(rates):
             return None
         at_rate = (run for run in runs if run["requested_hz"] == rates[index])
@@ -135,14 +135,14 @@ def find(words: Sequence[str], rates: Sequence[float], seconds: float, report: R
     return {
         "command": command,
         "highest_hz": rates[index] if index >= 0 else None,
-        "run": one_at(index, sustained=True),
-        "above": one_at(index + 1, sustained=False),
-        "compared": run_once(words, COMPARED_HZ, seconds),
+        "run": run_at(index, sustained=True),
+        "above": run_at(index + 1, sustained=False),
+        "compared": run_once(loop_options, COMPARED_HZ, seconds),
         "runs": runs,
     }
 
 
-HEADINGS = ("loop", "highest rate, Hz", "frame to command p50, us", "p99", "commands late", "fails one step faster")
+HEADINGS = ("loop", "highest rate, Hz", "frame to command p50, us", "p99", "commands late", "why the next rate fails")
 USE_HEADINGS = ("loop", "rate, Hz", *_ROLES, "by processor")
 
 
@@ -166,13 +166,13 @@ def _latency(run: Result | None) -> list[str]:
 
 def _use(name: str, run: Result) -> list[str]:
     used = run.get("usage", {})
-    together: dict[str, float] = {}
+    by_processor: dict[str, float] = {}
     for one in used.values():
         if one["processors"].isdecimal():
-            together[one["processors"]] = together.get(one["processors"], 0) + 100 * one["share"]
+            by_processor[one["processors"]] = by_processor.get(one["processors"], 0) + 100 * one["share"]
     each = [used.get(role) for role in _ROLES]
     cells = [f"{100 * one['share']:.0f} % ({one['processors']})" if one else "" for one in each]
-    sums = ", ".join(f"{where}: {share:.0f} %" for where, share in sorted(together.items()))
+    sums = ", ".join(f"{where}: {share:.0f} %" for where, share in sorted(by_processor.items()))
     return [name, f"{run['requested_hz']:.0f}", *cells, sums]
 
 
@@ -182,7 +182,7 @@ def about(result: Result) -> str:
     runs = sum(len(loop["runs"]) for loop in result["loops"].values())
     return (
         f"Sustained over {result['seconds']:g} s: at most {100 * MAX_WITHOUT_COMMAND:g} % of the frames without a "
-        f"command, no message lost by the recorder, the rate within {100 * RATE_WITHIN:g} % of the requested one; "
+        f"command, no message lost by the recorder, the rate within {100 * RATE_TOLERANCE:g} % of the requested one; "
         f"{runs} runs on a grid of {len(rates)} rates from {rates[0]:g} to {rates[-1]:g} Hz. Latencies are of one "
         "sustained run at the highest rate. A command is late if it arrives after the start of the next exposure "
         "(known for the simulated camera). Processor time is a percentage of one processor, all threads of the "

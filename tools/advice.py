@@ -115,8 +115,8 @@ ADVICE: dict[str, tuple[str, str]] = {
         "`lowfc ctl close`, if the residual fell.",
     ),
     "MIRROR_LOST": (
-        "the mirror's process died, hangs, or does not follow. The command of a closed loop stays at the mirror's last "
-        "known shape, so that it does not wind up.",
+        "the mirror's process died, hangs, or does not follow. A closed loop returns its command to the last "
+        "shape that the mirror confirmed, and holds it, so that the command does not wind up.",
         "check the mirror's process and its driver's events; restart it. The loop resumes by itself.",
     ),
     "MIRROR_BACK": ("the mirror follows again.", _NOTHING),
@@ -148,8 +148,8 @@ ADVICE: dict[str, tuple[str, str]] = {
     ),
     "LATCH_FAILED": (
         "a file that keeps safe mode across restarts cannot be read or written.",
-        "make the directory named in the event writable; the loop mode does not change. At its start a controller "
-        "takes an unreadable file for safe mode, and starts open if it can write none.",
+        "make the directory named in the event writable; the loop mode does not change. A controller "
+        "that cannot read a file at its start is in safe mode; one that can write none of its files starts open.",
     ),
     "COMMANDS_LATE": (
         "in the simulated camera, more than a quarter of the last 500 commands were applied after the next exposure "
@@ -174,7 +174,7 @@ ADVICE: dict[str, tuple[str, str]] = {
     "RECORDING": ("a log is being written.", _NOTHING),
     "RECORDING_STOPPED": ("the log is finished.", "`lowfc ctl record start` begins the next one."),
     "MESSAGES_LOST": (
-        "the recorder did not receive or could not write this number of messages of a topic.",
+        "the recorder did not receive or could not write messages of a topic; the event gives their number.",
         "give the recorder its own processor or a faster disk; `replay` names the steps that it cannot check.",
     ),
     "RECORDING_FAILED": (
@@ -202,17 +202,17 @@ REASONS: dict[str, tuple[str, str]] = {
     "NO_CALIBRATION": ("no calibration is loaded", "load or measure one"),
     "WRONG_SIZE": ("rows, columns, encoding or bytes differ from the calibration", "set the camera's region"),
     "OUT_OF_ORDER": (
-        "an older frame than the last one",
+        "the frame or command is older than the newest one",
         "nothing, if rare; stop a second camera; if the camera's clock was set back, `lowfc ctl safe`, then `clear`",
     ),
-    "REPEATED": ("the frame was used before", "nothing, unless frequent"),
+    "REPEATED": ("the newest frame arrived again", "nothing, unless frequent"),
     "LATE": (
-        "older than `control.max_frame_age_ms`, or than both 5 ms and three periods, or superseded by a newer frame",
+        "its age is above `control.max_frame_age_ms`, or above both 5 ms and three periods; or it was superseded",
         "`lowfc doctor`; check the clocks of the hosts",
     ),
-    "SATURATED": ("more than `control.max_saturated_pixels` at full well", "shorter exposure, lower gain"),
+    "SATURATED": ("more than `control.max_saturated_pixels` pixels are at full well", "shorter exposure, lower gain"),
     "DARK": (
-        "less light than `control.min_flux_fraction` of the calibration's",
+        "the flux is less than `control.min_flux_fraction` of the calibration's flux",
         "centre the star on the mask; for a fainter star `lowfc calibrate reference`, or a lower fraction",
     ),
     "NO_FRAME": ("no frame in time", "as for NO_FRAMES"),
@@ -230,11 +230,11 @@ REASONS: dict[str, tuple[str, str]] = {
         "an actuator reached its slew limit in one command",
         "nothing if the loop has just closed or been reset; else lower gains",
     ),
-    "NEIGHBOUR": ("neighbouring actuators would be too far apart", "smaller channels; look for a stuck actuator"),
+    "NEIGHBOUR": ("neighbours would differ too much in height", "smaller channels; look for a stuck actuator"),
     "NOT_FINITE": ("a value was not finite; the previous command is kept", "check calibration and law"),
     "WRONG_GRID": ("the grid differs from the mirror's", "load the calibration of this mirror"),
     "CHANNEL": (
-        "the name of a command's channel has more than 32 characters, or it would be the mirror's seventeenth",
+        "the name of a command's channel has more than 32 characters, or the channel would be the mirror's seventeenth",
         "a shorter name, or fewer programs that command this mirror",
     ),
     "LAW_OVERRULED": ("the integrator has taken over modes from the law", "as for LAW_OVERRULED"),

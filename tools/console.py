@@ -16,24 +16,24 @@ SLOW = {"camera.rate_hz": 100.0}
 """At this rate the pictures do not need a quiet host."""
 LOOK_S = 6.0
 """Wait before the change of state, and again between its display and the picture."""
-PATIENCE_S = 60
+DISPLAY_TIMEOUT_S = 60
 
 
-def picture(run: PictureRun, name: str, word: str, meanwhile: Callable[[], object]) -> None:
-    """Change the state of a run by `meanwhile`, wait until the console shows `word`, and store the picture."""
+def picture(run: PictureRun, name: str, word: str, change_state: Callable[[], object]) -> None:
+    """Change the state of a run, wait until the console shows `word`, and store the picture."""
     from lowfc.programs.console.app import Console
 
     async def take_picture() -> None:
         app = Console(bus, run.run.run_id, HostClock())
         async with app.run_test(size=(100, 30)) as pilot:
             await pilot.pause(LOOK_S)
-            await asyncio.to_thread(meanwhile)
-            for _ in range(PATIENCE_S):
+            await asyncio.to_thread(change_state)
+            for _ in range(DISPLAY_TIMEOUT_S):
                 await pilot.pause(1.0)
                 if any(word in str(app.query_one(where).render()) for where in ("#verdict", "#tiles")):
                     break
             else:
-                raise SystemExit(f"the console did not show {word!r} within {PATIENCE_S} s")
+                raise SystemExit(f"the console did not show {word!r} within {DISPLAY_TIMEOUT_S} s")
             await pilot.pause(LOOK_S)
             shown = app.export_screenshot(title=f"lowfc console, {name.replace('-', ' ')}")
             (PICTURES / f"console-{name}.svg").write_text(shown)

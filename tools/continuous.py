@@ -40,7 +40,7 @@ def table() -> str:
         for name, by_timing in laws.items()
     ]
     rows.append(("lower bound for a command held for a period", *(f"{floor_mas():.3f}" for _ in _CASES)))
-    head = f"continuous-time residual of {np.linalg.norm(LINES_MAS):.3g} mas, mas rms per axis"
+    head = f"law; residual of a disturbance of {np.linalg.norm(LINES_MAS):.3g} mas, mas rms per axis, continuous time"
     return markdown((head, *(f"delay {t.delay:g}, exposure {t.exposure:g}" for t in _CASES)), rows)
 
 

@@ -15,7 +15,7 @@ __all__ = ["COMMAND", "measure", "render"]
 
 
 def measure() -> Results:
-    """Fractions undone of small and of large steps."""
+    """Fraction of the steps that the loop undoes, for small and for large steps."""
     runs = {}
     for step_rms_nm in track(STEP_RMS_NM, "dark holes"):
         with tempfile.TemporaryDirectory() as folder:
@@ -48,9 +48,9 @@ def render(results: Results) -> str:
     ]
     return (
         f"{markdown(head, rows)}\n{STEPS} random steps, {SETTLE} frames apart, each added to those before it; "
-        f"without the shift, {STEPS_COMBINED} steps at a time. Undone: the fraction of the channel's shape, as seen by "
-        "the sensor, that the loop removes. It is the slope of (command + disturbance) against the channel's modes, "
-        "sign reversed; least squares over all steps and modes, with its standard error. A negative value means "
-        "that the loop adds to the steps. The true residual is the rms of all modes about their mean, over the circle, "
-        "before the first step and after the last."
+        f"without the shift, {STEPS_COMBINED} steps are added at a time. Undone: the fraction of the channel's shape, "
+        "as seen by the sensor, that the loop removes. It is the slope of (command + disturbance) against the "
+        "channel's modes, sign reversed; least squares over all steps and modes, with its standard error. A negative "
+        "value means that the loop adds to the steps. The true residual is the rms of all modes about their mean, over "
+        "the circle, before the first step and after the last."
     )

@@ -87,7 +87,7 @@ def packages() -> str:
     return markdown(("package", "holds"), rows)
 
 
-def offered(package: str) -> str:
+def exported_names(package: str) -> str:
     """Exported names of a package of the Python API, or its modules, with the first paragraph of their docstrings."""
     root = import_module(package)
     if hasattr(root, "__all__"):
@@ -160,9 +160,9 @@ def fields(message: str) -> str:
     rows = []
     for place, field in enumerate(file.message_type[index].field):
         kind = field.type_name.rpartition(".")[2] or type(field).Type.Name(field.type).removeprefix("TYPE_").lower()
-        many = "repeated " if field.label == type(field).LABEL_REPEATED else ""
+        repeated = "repeated " if field.label == type(field).LABEL_REPEATED else ""
         comment = comments.get((_MESSAGES, index, _FIELDS, place)) or _UNCOMMENTED[field.name]
-        rows.append((f"`{field.name}`", many + kind, field.number, comment))
+        rows.append((f"`{field.name}`", repeated + kind, field.number, comment))
     return markdown(("field", "type", "number", ""), rows)
 
 
@@ -225,6 +225,6 @@ DECLARED: dict[str, Callable[[], str]] = {
     "mirror topics": partial(topics, Role.MIRROR, COMMAND, MIRROR_STATE, SURFACE),
     **{name: partial(fields, name) for name in ("CameraState", "MirrorCommand", "MirrorState")},
     "agreement": agreement,
-    **{f"names {one}": partial(offered, f"lowfc.{one}") for one in API},
+    **{f"names {one}": partial(exported_names, f"lowfc.{one}") for one in API},
 }
 """The tables by their names in the pages."""

@@ -102,10 +102,10 @@ def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw) 
     """Continuous-time tilt residual of the disturbance's known spectrum, and the noise part, mas rms per axis."""
     frequency_hz, variance_nm2 = variances_nm2(disturbance_of(config))
     passed = residual_power(law, 2 * np.pi * frequency_hz / config.camera.rate_hz, timing_of(config))[:, :2]
-    waves = np.mean(np.sum(variance_nm2[:, :2] * passed, axis=0))
-    noise = np.mean(frame_noise_nm(config, calibration)[:2] ** 2 * noise_gain(law, config.camera.delay_frames)[:2])
+    disturbance_nm2 = np.mean(np.sum(variance_nm2[:, :2] * passed, axis=0))
+    noise_nm2 = np.mean(frame_noise_nm(config, calibration)[:2] ** 2 * noise_gain(law, config.camera.delay_frames)[:2])
     nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
-    return float(np.sqrt(waves) / nm_per_mas), float(np.sqrt(noise) / nm_per_mas)
+    return float(np.sqrt(disturbance_nm2) / nm_per_mas), float(np.sqrt(noise_nm2) / nm_per_mas)
 
 
 def tilt_residual_mas(config: Configuration) -> float:
@@ -137,13 +137,13 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
 
     def best_nm2(axis: int) -> float:
         power, variance = variance_nm2[:, axis], float(noise_nm[axis] ** 2)
-        known = tuple(
+        exact_lines = tuple(
             Line(line.frequency_hz, line.width_hz, float(line.rms_nm[axis] ** 2)) for line in disturbance.lines
         )
 
         def residual(drift: Any) -> float:
             step, cutoff_hz = 10.0 ** np.asarray(drift)
-            model = Model(step, cutoff_hz, known, variance, RATE_HZ)
+            model = Model(step, cutoff_hz, exact_lines, variance, RATE_HZ)
             block = within_margins(model, timing) if robust else lqg_block(model, timing)
             if block is None:
                 return np.inf
@@ -163,8 +163,8 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
 def render(results: Results) -> str:
     """A row for each case and law, and a note for each case."""
     head = (
-        *("sensor", "law", "residual tilt, mas rms per axis", "predicted from the log"),
-        *("disturbance and noise parts (theory)", "gain margin", "phase margin, deg"),
+        *("sensor", "law", "residual tilt, mas rms per axis", "predicted from the log, mas"),
+        *("in theory, mas: disturbance part, noise part", "gain margin", "phase margin, deg"),
     )
     rows, notes = [], []
     for name, one in results["cases"].items():

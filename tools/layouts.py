@@ -36,12 +36,12 @@ RMS = {
 
 
 def make(folder: Path = LAYOUTS) -> None:
-    """Write both layouts, whose bytes differ each time."""
+    """Write both layouts; their bytes differ at every call."""
     layout().save(APPLICATION, folder / "lowfc.rbl")
-    _of_messages().save(APPLICATION, folder / "log.rbl")
+    _log_layout().save(APPLICATION, folder / "log.rbl")
 
 
-def _of_messages() -> rrb.Blueprint:
+def _log_layout() -> rrb.Blueprint:
     """Views of a log's images, events and messages, with the default configuration's modes and mirror."""
     columns = rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"])
     states = rr.StateConfiguration(

@@ -48,7 +48,7 @@ LOOP_COLUMNS = {
     "rate": "{rate_hz:.1f} Hz",
     "tilt disturbance, mas rms per axis": "{tilt_disturbance_mas:.1f}",
     "tilt residual, mas rms per axis": "{tilt_residual_mas:.2f}",
-    "predicted residual": "{tilt_predicted_mas:.2f}",
+    "predicted residual, mas": "{tilt_predicted_mas:.2f}",
     **{
         f"{title}, us": " / ".join(f"{{latency_us[{stage}][{p}]:.0f}}" for p in ("p50", "p99", "p99_9"))
         for title, stage in (("frame to command", "frame_to_command"), ("frame to mirror", "frame_to_mirror"))
@@ -124,15 +124,15 @@ def measure_logs() -> Results:
     return {"recording": recording, "logs": logs}
 
 
-def _json_and_peak_bytes(folder: str, words: str) -> tuple[Results, int]:
+def _json_and_peak_bytes(folder: str, arguments: str) -> tuple[Results, int]:
     """JSON printed by a command with --json, and its peak memory, bytes."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "lowfc", *words.split()], cwd=folder, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-m", "lowfc", *arguments.split()], cwd=folder, stdout=subprocess.PIPE, text=True
     )
     printed = process.stdout.read() if process.stdout else ""
     _, status, used = os.wait4(process.pid, 0)
     if status:
-        raise RuntimeError(f"`lowfc {words}` failed")
+        raise RuntimeError(f"`lowfc {arguments}` failed")
     return json.loads(printed), used.ru_maxrss * 1024
 
 
@@ -151,11 +151,11 @@ LOG_COLUMNS = {
 RECORDER_COLUMNS = {
     "recorder at": "{offered_hz:.0f} Hz",
     "processor time": "{cpu_percent:.0f} %",
-    "relative to copying the payloads": "{ratio:.0f} x",
+    "processor time / time to copy the payloads": "{ratio:.0f} x",
     "messages": "{messages_published}",
     "lost": "{messages_lost}",
-    "longest time to write": "{longest_wait_ms:.0f} ms",
-    "to flush": "{longest_unflushed_ms:.0f} ms",
+    "longest time to write a message": "{longest_wait_ms:.0f} ms",
+    "longest time to flush a message": "{longest_unflushed_ms:.0f} ms",
     "longest write call": "{longest_write_ms:.1f} ms",
 }
 

@@ -1,7 +1,7 @@
 """Generate the tables and pictures of the documentation, from measurements and from the code.
 
 A table is generated between `]]]` and `[[[end]]]`; the line with `[[[cog` names it. Measured tables come from the JSON
-files in `tools/measured`, the others from the code; a test compares every page with them.
+files in `tools/measured`, the others from the code; a test checks that every page is up to date.
 
 Example:
     python -m tools.measure                # regenerate the pages from stored measurements and the code

@@ -36,8 +36,8 @@ def picture(name: str, source: str, *more: str, meanwhile: Callable[[], object] 
     """Take a picture of a run or a log while `meanwhile` runs, and store it in the documentation."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / f"{name}.png"
-        words = [sys.executable, "-m", "lowfc", "view", *source.split(), "--headless-screenshot", str(out), *more]
-        view = subprocess.Popen(words)
+        command = [sys.executable, "-m", "lowfc", "view", *source.split(), "--headless-screenshot", str(out), *more]
+        view = subprocess.Popen(command)
         if meanwhile is not None:
             time.sleep(LOOK_S * 0.55)
             meanwhile()
@@ -64,7 +64,7 @@ class PictureRun(ChaosBench):
         self.restart(Role.CAMERA, [*self.children[Role.CAMERA].command, "--config", str(file)], ready=False)
 
     def stop_controller_repeatedly(self) -> None:
-        """Stop the controller repeatedly for 40 ms."""
+        """Stop the controller twelve times, for 40 ms each."""
         for _ in range(12):
             with self.stopped(Role.CONTROLLER):
                 time.sleep(0.04)

@@ -42,7 +42,7 @@ def _run(cases: str, seed: int) -> Results:
 
 
 def measure_again(results: Results, seed: int, names: Sequence[str]) -> Results:
-    """Run cases with a seed, those named or those without a result; return all results of that seed."""
+    """Run the named cases with a seed, or all without a result; return all results of that seed."""
     run: Results = next(one for one in results["runs"] if one["seed"] == seed)
     kept = {case["name"]: case for case in run["cases"] if case["name"] in CASES}
     if missing := list(names) or [name for name in CASES if name not in kept]:
@@ -180,7 +180,7 @@ def render_soak(results: Results) -> str:
 
 def render_fuzz(results: Results) -> str:
     """A row for each decoder and reader."""
-    head = ("reader", "inputs", "error raised", "crashes", "hangs", "memory growth, MB")
+    head = ("reader", "inputs", "inputs refused with an error", "crashes", "hangs", "memory growth, MB")
     rows, totals = [], [0, 0, 0]
     for one in results["targets"]:
         numbers = one["inputs"], len(one["crashes"]), len(one["hangs"])
@@ -189,7 +189,7 @@ def render_fuzz(results: Results) -> str:
     inputs, crashes, hangs = totals
     return (
         f"{inputs} inputs, {crashes} crashes, {hangs} hangs, in {results['seconds'] / 60:.0f} minutes.\n\n"
-        f"{markdown(head, rows)}\nReaders with 0 errors refuse damaged input with a reason or an event, or return "
+        f"{markdown(head, rows)}\nReaders that raise no error refuse damaged input with a reason or event, or return "
         "the readable part.\n"
     )
 

@@ -50,7 +50,7 @@ def measure() -> Results:
 
 
 def alone(name: str) -> Results:
-    """Light, condition and noise of a sensor, and the speed of its twin."""
+    """Light, condition number and noise of a sensor, and the time of its twin for an image."""
     config = configured(name)
     optics = factory.sensor(config, sys.exit)  # a warning ends the measurement
     modes = zernikes(config.noll, *pupil_radii(optics))
@@ -134,5 +134,5 @@ def render(results: Results) -> str:
         "The last columns are open loop -> closed loop for two disturbances: true wavefront over the open pupil, and "
         "true tilt, "
         f"in the second half of {DURATION_S} simulated seconds at "
-        f"{RATE_HZ} Hz with gains of 0.5 for tilt and 0.05 for the rest, in FILE."
+        f"{RATE_HZ} Hz with gains of 0.5 for tilt and 0.05 for the other modes, set in FILE."
     )

@@ -40,9 +40,9 @@ def json_of(command: str, folder: Path | str = ROOT) -> Results:
     Raises:
         RuntimeError: the command printed nothing.
     """
-    words = shlex.split(command.removeprefix("python -m "))
+    arguments = shlex.split(command.removeprefix("python -m "))
     completed = subprocess.run(
-        [sys.executable, "-m", *words, "--json"], cwd=folder, stdout=subprocess.PIPE, text=True, check=False
+        [sys.executable, "-m", *arguments, "--json"], cwd=folder, stdout=subprocess.PIPE, text=True, check=False
     )
     if not completed.stdout:
         raise RuntimeError(f"`{command}` ended with {completed.returncode} and printed nothing")

@@ -21,7 +21,7 @@ def render(measured: Callable[[str], Results]) -> str:
 
 
 def _row(quantity: str, limit: float, values: Sequence[float], form: str, bound: str, excess: str) -> Row:
-    """Row of a quantity with one value for each turn; `bound` holds for any program of this kind."""
+    """Row of a quantity with one value for each turn; `bound` holds for any such program; `excess`: work above it."""
     reached, shown = median(values), form.format
     spread = f" ({shown(min(values))} to {shown(max(values))})" if len(values) > 1 else ""
     met = "yes" if reached <= limit else "no"
@@ -33,10 +33,10 @@ def _steps(results: Results) -> Iterator[Row]:
         results["sizes"], (("product", 2.4), ("memory", 1.4), ("memory", 1.3)), strict=True
     ):
         side = round(size["pixels"] ** 0.5)
-        unit = "products R x" if other == "product" else "reads of its bytes"
+        unit = "product R x" if other == "product" else "read of the step's bytes"
         excess = OBJECTS if other == "product" else "two copies of the frame's bytes by protobuf; " + OBJECTS
         ratios = size["ratios"][f"fused over {other}"]
-        yield _row(f"step, fused, {side} x {side}, in {unit}", limit, ratios, "{:.2f}", "1", excess)
+        yield _row(f"fused step, {side} x {side}: time / that of one {unit}", limit, ratios, "{:.2f}", "1", excess)
 
 
 def _comparison(results: Results) -> Iterator[Row]:
@@ -44,7 +44,7 @@ def _comparison(results: Results) -> Iterator[Row]:
     shared = "the parts common to both: transport of the frame, wake-up, transport of the command"
     for at, limit in (("p50", 0.72), ("p99", 0.75)):
         ratios = [mine[at] / its[at] for mine, its in pairs(runs, NUMPY)]
-        yield _row(f"frame to command, fused over numpy, {at}", limit, ratios, "{:.2f}", shared, OBJECTS)
+        yield _row(f"frame to command, ratio fused / numpy, {at}", limit, ratios, "{:.2f}", shared, OBJECTS)
     sockets = "sockets wake two Python processes"
     ways = f"{sockets}; the C chain waits on semaphores in shared memory"
     for other, targets in (("C chain", {"p50": 40.0, "p99": 80.0}), ("pyrtcao, fused", {"p50": 0.0, "p99": 0.0})):

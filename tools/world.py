@@ -17,7 +17,7 @@ from tools.shared import Results, markdown
 
 SENSORS, MAGNITUDES = ("sam27d10_bal14", "zwfs"), (2, 5)
 PRESET, RATE_HZ, SECONDS = "bench", 500.0, 4.0
-_UNTIL_GAINS_S = 2.5  # run before the automatic gains are read: past their first window
+_UNTIL_GAINS_S = 2.5  # simulated before the automatic gains are read; longer than their first window
 _FRAMES = 2000  # averaged for the dark and for the reference image
 WHEEL = {"disturbance.wheel_hz": 12.0}
 CASES: dict[str, dict[str, Any]] = {
@@ -75,7 +75,7 @@ def _gains(sensor: str, magnitude: float) -> tuple[float, ...]:
 
 
 def _residual(sensor: str, magnitude: float, keys: dict[str, Any], calibrate_detector: bool) -> Results:
-    """Residual wavefront over the open pupil and added contrast, continuous, over the second half of the run.
+    """Residual wavefront over the open pupil, nm rms, and added contrast, in continuous time; second half of the run.
 
     With `calibrate_detector`, dark and reference image are measured on the detector of the case.
     """
@@ -103,8 +103,8 @@ def _calibrated_on_detector(config: Configuration, calibration: Calibration) -> 
     means = []
     for magnitude in (20.0, config.star.magnitude):
         star = config.star.model_copy(update={"magnitude": magnitude})
-        lit = scene(config.model_copy(update={"disturbance": quiet, "star": star}))
-        means.append(np.mean([lit.expose(index, flat).ravel() for index in range(_FRAMES)], axis=0))
+        simulated = scene(config.model_copy(update={"disturbance": quiet, "star": star}))
+        means.append(np.mean([simulated.expose(index, flat).ravel() for index in range(_FRAMES)], axis=0))
     light = means[1] - means[0]
     reference = light / light.sum() * calibration.reference.sum()
     return replace(calibration, dark=means[0].astype(np.float32), reference=reference.astype(np.float32))

@@ -145,19 +145,19 @@ static void answer(const struct role *role, int semaphore, int64_t *time_stamps)
     }
 }
 
-int main(int count, char **words)
+int main(int count, char **arguments)
 {
     check(count == 7, "ROLE FOLDER RATE_HZ FRAMES PROCESSOR PRIORITY");
     const struct role *role = ROLES;
-    while (strcmp(role->name, words[1]) != 0)
+    while (strcmp(role->name, arguments[1]) != 0)
         role++;
     cpu_set_t processors;
     CPU_ZERO(&processors);
-    CPU_SET(atoi(words[5]), &processors);
-    struct sched_param priority = {atoi(words[6])};
-    check(chdir(words[2]) == 0, words[2]);
+    CPU_SET(atoi(arguments[5]), &processors);
+    struct sched_param priority = {atoi(arguments[6])};
+    check(chdir(arguments[2]) == 0, arguments[2]);
     check(sched_setaffinity(0, sizeof processors, &processors) == 0, "sched_setaffinity");
-    check(sched_setscheduler(0, atoi(words[6]) ? SCHED_FIFO : SCHED_OTHER, &priority) == 0, "sched_setscheduler");
+    check(sched_setscheduler(0, atoi(arguments[6]) ? SCHED_FIFO : SCHED_OTHER, &priority) == 0, "sched_setscheduler");
 
     frames = shared_file("frames");
     I0 = shared_file("I0");
@@ -180,6 +180,6 @@ int main(int count, char **words)
     if (role->reads)
         answer(role, semaphore, time_stamps);
     else
-        send_frames(atof(words[3]), atol(words[4]), time_stamps);
+        send_frames(atof(arguments[3]), atol(arguments[4]), time_stamps);
     return 0;
 }

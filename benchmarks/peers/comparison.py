@@ -231,14 +231,14 @@ def fifo_granted() -> bool:
 
 @contextlib.contextmanager
 def _processes(
-    implementation: Implementation, options: argparse.Namespace, folder: Path, words: list[str], priority: int
+    implementation: Implementation, options: argparse.Namespace, folder: Path, arguments: list[str], priority: int
 ) -> Iterator[dict[str, Child]]:
     start = program(implementation, options, folder)
     environment = os.environ | _ONE_THREAD | {"PYTHONPATH": str(ROOT), "MILK_SHM_DIR": str(folder)}
 
     def command(role: str) -> list[str]:
         processor = processors()[role not in _FIRST_CPU_ROLES]
-        return [*start, role, str(folder), *words, str(processor), str(priority)]
+        return [*start, role, str(folder), *arguments, str(processor), str(priority)]
 
     children = {role: Child(role, command(role), folder / f"{role}.txt", environment) for role in implementation.roles}
     try:
@@ -276,7 +276,7 @@ def tables(result: Result) -> list[Lines]:
     return [
         latencies,
         [
-            [f"{FUSED} minus this implementation, us", "p50", "p99", "turns with lower p50", "turns with lower p99"],
+            [f"{FUSED} minus the other, us", "p50", "p99", "turns with lower p50", "turns with lower p99"],
             *(_difference(runs, name) for name in others),
         ],
         [["implementation", "processes", "log", "safety", "other machines"], *features],
@@ -324,8 +324,8 @@ def about(result: Result) -> str:
     lines.append(f"{late} of all {sent} frames were sent more than a period late.")
     if command_errors := [turn["command_error"] for turn in done if turn["command_error"] is not None]:
         lines.append(
-            f"In the {len(command_errors)} runs with a command for every frame, the final mirror command agrees with "
-            f"the numpy reference within {max(command_errors):.1g} of its largest actuator; lowfc is left out, because "
+            f"In the {len(command_errors)} runs with a command for every frame, the final mirror command differs "
+            f"from numpy's by at most {max(command_errors):.1g} of the largest actuator's value; lowfc is left out: "
             "its step also divides by the flux."
         )
     lines += [f"{name}: {why}." for name, why in result["missing"].items()]

@@ -104,10 +104,10 @@ def program(implementation: Implementation, options: argparse.Namespace, folder:
         python = options.pyrtcao if implementation.program == PYRTCAO else sys.executable
         return [python, "-m", f"{__package__}.{implementation.program}"]
     constants = {name: getattr(shared, name) for name in _CONSTANTS} | {"DIFFERENT": FRAMES}
-    words = ["cc", "-O3", "-march=native", "-ffast-math", *(f"-D{name}={value}" for name, value in constants.items())]
+    command = ["cc", "-O3", "-march=native", "-ffast-math", *(f"-D{name}={value}" for name, value in constants.items())]
     sources = [Path(__file__).with_name(CHAIN), options.isio / "ImageStreamIO.c"]
-    words += [f"-I{options.isio}", *map(str, sources), "-o", str(folder / "chain"), "-lpthread", "-lrt", "-lm"]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603  # the user's own compiler
+    command += [f"-I{options.isio}", *map(str, sources), "-o", str(folder / "chain"), "-lpthread", "-lrt", "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603  # the user's own compiler
     if done.returncode:
         raise ComparisonError(f"cc failed: {done.stderr}")
     return [str(folder / "chain")]
@@ -132,9 +132,9 @@ def missing(implementation: Implementation, options: argparse.Namespace) -> str:
 def versions(options: argparse.Namespace) -> dict[str, str]:
     """Versions of the software compared; pyrtcao's and ImageStreamIO's if present."""
     found = {name: importlib.metadata.version(name) for name in ("lowfc", "eclipse-zenoh", "numpy")}
-    words = [options.pyrtcao, "-c", "import importlib.metadata as m; print(m.version('pyrtcao'))"]
+    command = [options.pyrtcao, "-c", "import importlib.metadata as m; print(m.version('pyrtcao'))"]
     with contextlib.suppress(OSError):
-        done = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603  # an interpreter
+        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603  # an interpreter
         if not done.returncode:
             found["pyrtcao"] = done.stdout.strip()
     with contextlib.suppress(OSError, TypeError):

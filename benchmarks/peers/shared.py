@@ -37,8 +37,8 @@ _LAST_COMMAND_S = 0.05
 class RoleProcess:
     """A role of a run, in its own process."""
 
-    def __init__(self, words: Sequence[str]) -> None:
-        self.role, folder, rate_hz, frames, cpu, priority = words
+    def __init__(self, arguments: Sequence[str]) -> None:
+        self.role, folder, rate_hz, frames, cpu, priority = arguments
         self.folder = Path(folder)
         self.rate_hz, self.count = float(rate_hz), int(frames)
         self.cpu, self.priority = int(cpu), int(priority)
@@ -118,9 +118,9 @@ class RunData:
 
 
 class NumpyStep:
-    """Bytes of pixels to bytes of actuators in plain numpy, with preallocated arrays.
+    """Computes the bytes of actuators from the bytes of pixels in plain numpy, with preallocated arrays.
 
-    y = R (I - I0); command = (1 - leak) command - gain y, cut to the limit; actuators of the command.
+    y = R (I - I0); command = (1 - leak) command - gain y, clipped to the limit; actuators = to_actuators x command.
     """
 
     def __init__(self, run_data: RunData) -> None:
@@ -131,7 +131,7 @@ class NumpyStep:
         self._actuators = np.empty(ACTUATORS, np.float32)
 
     def command(self, payload: bytes) -> bytes:
-        """The actuators for a frame."""
+        """The actuators (float32 bytes) for the pixels of a frame (uint16 bytes)."""
         run_data, command = self._run_data, self._command
         np.subtract(np.frombuffer(payload, np.uint16), run_data.I0, out=self._difference)
         np.matmul(run_data.R, self._difference, out=self._error)

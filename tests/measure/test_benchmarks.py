@@ -33,15 +33,17 @@ def by_heading(lines: runner.Lines) -> list[dict[str, str]]:
     return [dict(reversed(list(zip(lines[0], line, strict=True)))) for line in lines[1:]]
 
 
-@pytest.mark.parametrize("words", ["--seconds 0", "--seconds nan", "--repeats 0"])
-def test_a_measurement_without_duration_or_repeats_is_refused(capsys: pytest.CaptureFixture[str], words: str) -> None:
+@pytest.mark.parametrize("arguments", ["--seconds 0", "--seconds nan", "--repeats 0"])
+def test_a_measurement_without_duration_or_repeats_is_refused(
+    capsys: pytest.CaptureFixture[str], arguments: str
+) -> None:
     with pytest.raises(SystemExit):
-        runner.run("kernels", kernels, words.split())
+        runner.run("kernels", kernels, arguments.split())
     assert "--seconds must be 0.01 to 100000, --repeats at least 1" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("benchmark", "words", "message"),
+    ("benchmark", "arguments", "message"),
     [
         (curves, "--pixels 16 --modes 0", "at least one pixel and one mode"),
         (throughput, "--highest inf", "--highest, which is finite"),
@@ -50,9 +52,9 @@ def test_a_measurement_without_duration_or_repeats_is_refused(capsys: pytest.Cap
         (comparison, "--only nothing", "--only: none of"),
     ],
 )
-def test_impossible_options_are_refused(benchmark: runner.Benchmark, words: str, message: str) -> None:
+def test_impossible_options_are_refused(benchmark: runner.Benchmark, arguments: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        runner.run("one", benchmark, words.split())
+        runner.run("one", benchmark, arguments.split())
 
 
 # The control step
@@ -144,7 +146,7 @@ def test_a_point_has_the_median_of_its_repeats_and_the_memory_limit() -> None:
     assert first["pixels"] == "1024 (32 x 32)"
     assert modes[1][0] == "20"
     assert first["step p50, us"] == "25.0 (20.0 to 30.0)"
-    assert first["step over limit"] == "2.5"
+    assert first["step / memory limit"] == "2.5"
     assert first["read rate, GB/s"] == f"{Size(side=32).bytes / 10.0 / 1e3:.0f}"
     assert first["frames without a command"] == "2 of 300"
     assert second["loop p50, us"] == "failed"
@@ -153,8 +155,8 @@ def test_a_point_has_the_median_of_its_repeats_and_the_memory_limit() -> None:
 
 
 def test_the_curves_of_a_few_sizes_are_measured_from_the_command_line() -> None:
-    words = "--pixels 32 --modes 20 --actuators --no-loop --seconds 0.02 --repeats 2 --json"
-    command = [sys.executable, "-m", "benchmarks", "curves", *words.split()]
+    arguments = "--pixels 32 --modes 20 --actuators --no-loop --seconds 0.02 --repeats 2 --json"
+    command = [sys.executable, "-m", "benchmarks", "curves", *arguments.split()]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
@@ -220,16 +222,16 @@ def test_a_loop_has_its_highest_rate_and_the_reason_for_its_limit(monkeypatch: p
     shares = {"camera": (0.5, "0"), "controller": (0.6, "1"), "mirror": (0.3, "1"), "recorder": (0.2, "0,1")}
     usage = {role: {"share": share, "processors": where} for role, (share, where) in shares.items()}
 
-    def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> dict[str, Any]:
+    def run_once(loop_options: Sequence[str], rate_hz: float, seconds: float) -> dict[str, Any]:
         lost = 0 if rate_hz <= 1300 else 7
         changed = {"messages_lost": lost, "usage": usage, "commands_late_fraction": 0.25}
         return sustained(requested_hz=rate_hz, rate_hz=rate_hz, **changed)
 
     monkeypatch.setattr(throughput, "run_once", run_once)
     rates = throughput.grid(1000, 2000, 1.1)
-    loop = throughput.find([], rates, 1.0, lambda _: None)
+    loop = throughput.highest_rate([], rates, 1.0, lambda _: None)
     assert (loop["highest_hz"], loop["run"]["rate_hz"], loop["above"]["requested_hz"]) == (1210, 1210, 1331)
-    none = throughput.find([], [1400.0], 1.0, lambda _: None)
+    none = throughput.highest_rate([], [1400.0], 1.0, lambda _: None)
     assert none["highest_hz"] is None
     result = {"loops": {"simulated": loop, "none": none}, "seconds": 1.0, "rates_hz": rates}
     speeds, use = throughput.tables(json.loads(json.dumps(result)))
@@ -283,10 +285,10 @@ def test_roles_of_processes_are_found_from_their_command_lines() -> None:
 # The comparison with other implementations
 
 
-def parsed(*words: str | Path) -> Namespace:
+def parsed(*arguments: str | Path) -> Namespace:
     parser = ArgumentParser()
     comparison.options(parser)
-    return parser.parse_args(list(map(str, words)))
+    return parser.parse_args(list(map(str, arguments)))
 
 
 def run_result(p50: float, p99: float, without: int = 0) -> dict[str, Any]:

@@ -329,8 +329,8 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
     folder = tmp_path_factory.mktemp("latency")
     (folder / "loop.toml").write_text(f'[recorder]\nfolder = "{folder}"\nmin_free_mb = 0\n')
     before = runs()
-    words = f"--duration {SECONDS} --rate {RATE_HZ} --trace --record --json".split()
-    done = lowfc("latency", *words, "--config", folder / "loop.toml", "--plot", folder / "latency.png")
+    options = f"--duration {SECONDS} --rate {RATE_HZ} --trace --record --json".split()
+    done = lowfc("latency", *options, "--config", folder / "loop.toml", "--plot", folder / "latency.png")
     assert done.exit_code == 0, (done.output, done.exception)
     assert runs() == before
     (folder / "a.json").write_text(done.stdout)
@@ -419,7 +419,7 @@ def test_files_that_are_no_results_or_logs_are_errors(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("arguments", "message"),
     [
         (("--compare", "a.json", "b.json", "--plot", "c.png"), "--plot has no effect with --compare: omit it"),
         (("--compare", "a.json", "b.json", "log.mcap"), "logs has no effect with --compare"),
@@ -427,8 +427,8 @@ def test_files_that_are_no_results_or_logs_are_errors(tmp_path: Path) -> None:
         (("log.mcap", "--duration", "10", "--json"), "--duration has no effect with logs"),
     ],
 )
-def test_options_without_effect_are_refused(words: tuple[str, ...], message: str) -> None:
-    assert message in refusal("latency", *words, kind=ConfigurationError)
+def test_options_without_effect_are_refused(arguments: tuple[str, ...], message: str) -> None:
+    assert message in refusal("latency", *arguments, kind=ConfigurationError)
 
 
 LATENCY_PROGRAM = (
