@@ -37,7 +37,7 @@ from lowfc.programs.commissioning.calibrate.result import comparison
 from lowfc.programs.commissioning.calibrate.run import Calibrator
 from lowfc.programs.commissioning.calibrate.tasks import zero_point
 from tests.support import toy
-from tests.support.in_process_loop import BRIGHT, SMALL_MIRROR, InProcessLoop, computed
+from tests.support.in_process_loop import BRIGHT, SMALL_MIRROR, InProcessLoop, calibration_of
 from tests.support.loops import json_of, lowfc, refusal
 
 CONFIG = BRIGHT | {"sensor.modes": 3}
@@ -343,7 +343,7 @@ def test_pokes_resolve_a_reflection_or_rotation_that_does_not_change_the_image(
 ) -> None:
     """Without a mask, the image of a circular pupil is circular, that of the other pupil symmetric about both axes."""
     config = load(None, SMALL_MIRROR | {"sensor.kind": "clowfs", "sensor.modes": 3} | pupil)
-    first = computed(config.to_toml())
+    first = calibration_of(config.to_toml())
     image = first.reference.astype(float).reshape(80, 80)
     alignment = align(onto(image, geometry, (80, 80)), image)
     H = onto(first.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)

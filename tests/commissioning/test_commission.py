@@ -29,7 +29,7 @@ from lowfc.programs.commissioning.commission.commissioning import Commissioning,
 from lowfc.programs.commissioning.commission.first_calibration import aligned, linear_nm
 from lowfc.programs.commissioning.commission.first_light import Sensor, calibration_with_reference
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, Agreement, agreement_checks
-from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop, computed, configuration
+from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop, calibration_of, configuration
 from tests.support.loops import refusal
 from tests.support.theory import LAWS
 
@@ -69,7 +69,7 @@ class Bench:
         return Commissioning(
             self.loop,
             self.config,
-            computed((model or self.config).to_toml()),
+            calibration_of((model or self.config).to_toml()),
             CommissionOptions(self.out, **{**defaults, "close": True, **options}),
             self.report,
             lambda what, done, total: None,
@@ -112,7 +112,7 @@ def test_commissioning_closes_a_loop_with_another_frame_size(bench: Bench) -> No
     calibration = calibration_file.load(bench.out)
     assert calibration.shape == (64, 64)
     # They agree for every mirror shape, not only for the shapes of the modes.
-    modelled = computed(DISTURBED.to_toml()).actuators_to_modes
+    modelled = calibration_of(DISTURBED.to_toml()).actuators_to_modes
     assert np.linalg.norm(calibration.actuators_to_modes - modelled) < 0.2 * np.linalg.norm(modelled)
     assert calibration.saturation_dn == 2**14 - 1
     assert not provisional_path(bench.out).exists()
@@ -122,7 +122,7 @@ def test_commissioning_closes_a_loop_with_another_frame_size(bench: Bench) -> No
 @pytest.mark.parametrize(("scatter", "chosen_nm"), [(0.0, 1.5), (0.2, 3.0)])
 def test_disturbance_of_a_mode_is_not_mistaken_for_nonlinearity(scatter: float, chosen_nm: float) -> None:
     """The gain of Z3 is 20 % lower for the larger poke; whether that is significant depends on the scatter."""
-    first, gains = computed(CONFIG.to_toml()), np.ones((4, 14))
+    first, gains = calibration_of(CONFIG.to_toml()), np.ones((4, 14))
     gains[:, 1] = 0.8 + scatter / 2, 0.8 - scatter / 2, 1 + scatter / 2, 1 - scatter / 2
     answers = iter(gains)
 
@@ -213,7 +213,7 @@ def test_a_given_number_of_cycles_changes_only_the_default_signal_to_noise_ratio
 @pytest.mark.parametrize(("noise", "poked"), [(0.0, [1]), (0.3, [])], ids=["the configured sensor", "another"])
 def test_tilt_is_poked_to_find_a_reflection_unless_the_sensor_is_another_one(noise: float, poked: list[int]) -> None:
     config = configured(sensor__kind="clowfs", sensor__modes=3)
-    first, geometry = computed(config.to_toml()), Geometry(1.0, 40.2, 39.5, 12.0, -1)
+    first, geometry = calibration_of(config.to_toml()), Geometry(1.0, 40.2, 39.5, 12.0, -1)
     H = onto(first.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
     image = onto(first.reference.astype(float).reshape(80, 80), geometry, (80, 80)).reshape(-1)
     image *= 1 + noise * np.random.default_rng(1).standard_normal(image.size)
@@ -273,8 +273,11 @@ def test_a_resumed_commissioning_continues_and_reports_an_operator_who_opens_the
 
 
 def test_a_commissioning_is_not_resumed_with_other_modes_or_commands(tmp_path: Path) -> None:
-    bench, same = Bench(tmp_path, NOISELESS), computed(NOISELESS.to_toml())
-    for other in (computed(CONFIG.to_toml()), identified(replace(same, modes_to_actuators=-same.modes_to_actuators))):
+    bench, same = Bench(tmp_path, NOISELESS), calibration_of(NOISELESS.to_toml())
+    for other in (
+        calibration_of(CONFIG.to_toml()),
+        identified(replace(same, modes_to_actuators=-same.modes_to_actuators)),
+    ):
         calibration_file.save(other, provisional_path(bench.out))
         with pytest.raises(CalibrationError, match="other modes or mirror commands than the configuration"):
             bench.commission(resume=True)
@@ -316,9 +319,9 @@ def test_a_hot_pixel_at_full_well_is_not_the_star() -> None:
     camera, frames = camera_settings(configured_camera(CONFIG)), np.full((16, 80, 80), 200)
     frames[:, 0, 0] = camera.saturation_dn
     sensor = Sensor(camera, np.full(6400, 100.0), (np.arange(6400) > 0).astype(float), measured=False)
-    assert calibration_with_reference(sensor, frames, computed(CONFIG.to_toml()), str).flux_dn == 6399 * 100
+    assert calibration_with_reference(sensor, frames, calibration_of(CONFIG.to_toml()), str).flux_dn == 6399 * 100
     with pytest.raises(CalibrationError, match="the brightest good pixel is at 16383 of 16383 DN"):
-        calibration_with_reference(sensor._replace(good=np.ones(6400)), frames, computed(CONFIG.to_toml()), str)
+        calibration_with_reference(sensor._replace(good=np.ones(6400)), frames, calibration_of(CONFIG.to_toml()), str)
 
 
 def test_a_camera_that_differs_from_the_configuration_is_refused(tmp_path: Path) -> None:

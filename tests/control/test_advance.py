@@ -19,9 +19,9 @@ from tests.support.toy import (
     NOLL,
     SATURATION_DN,
     SHAPE,
-    SOME,
     START,
     TOY,
+    WAVE_NM,
     calibration,
     check_reply,
     feed,
@@ -42,18 +42,18 @@ def ask(name: str, *values: float, modes: tuple[int, ...] = ()) -> Request:
 
 def image_with_saturated(pixels: int) -> Pixels:
     """An image with this number of pixels at full well."""
-    image = TOY.pixels(SOME)
+    image = TOY.pixels(WAVE_NM)
     image.flat[:pixels] = SATURATION_DN
     return image
 
 
 BAD_FRAMES: dict[Reason, Callable[[int], Frame]] = {
     Rejection.WRONG_SIZE: lambda count: frame(count, pixels=np.full((7, 6), 5000, np.uint16)),
-    Rejection.LATE: lambda count: frame(count, SOME, age_ns=DEFAULTS.max_frame_age_ns + 1),
+    Rejection.LATE: lambda count: frame(count, WAVE_NM, age_ns=DEFAULTS.max_frame_age_ns + 1),
     Rejection.SATURATED: lambda count: frame(count, pixels=np.full(SHAPE, SATURATION_DN, np.uint16)),
     Rejection.DARK: lambda count: frame(count, pixels=np.full(SHAPE, DARK_DN + 10, np.uint16)),
-    Rejection.OUT_OF_ORDER: lambda count: frame(count, SOME, sequence=frame_sequence(3)),
-    Rejection.REPEATED: lambda count: frame(count, SOME, sequence=frame_sequence(5)),
+    Rejection.OUT_OF_ORDER: lambda count: frame(count, WAVE_NM, sequence=frame_sequence(3)),
+    Rejection.REPEATED: lambda count: frame(count, WAVE_NM, sequence=frame_sequence(5)),
 }
 
 
@@ -71,7 +71,7 @@ def test_a_bad_frame_is_refused_with_an_event_and_the_command_holds(reason: Reas
     assert state.counts == {reason: 3}
     assert state.frames_used == before.frames_used
     next_count = 6 if reason in (Rejection.OUT_OF_ORDER, Rejection.REPEATED) else 9
-    state, later_outputs = feed(DEFAULTS, state, frame(next_count, SOME), frame(next_count + 1, SOME))
+    state, later_outputs = feed(DEFAULTS, state, frame(next_count, WAVE_NM), frame(next_count + 1, WAVE_NM))
     assert names(all_outputs + later_outputs) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert all_outputs[0].events[0].details == {"reason": reason.name}
     assert later_outputs[0].events[0].details == {"refused": 3, "reason": reason.name}
@@ -80,14 +80,14 @@ def test_a_bad_frame_is_refused_with_an_event_and_the_command_holds(reason: Reas
 
 def test_frames_of_a_stuck_camera_are_refused_until_the_image_changes() -> None:
     setup = settings(max_identical_frames=3)
-    state, all_outputs = feed(setup, loaded(setup), *(frame(count, SOME) for count in range(1, 8)))
+    state, all_outputs = feed(setup, loaded(setup), *(frame(count, WAVE_NM) for count in range(1, 8)))
     reasons = [outputs.step.reasons for outputs in all_outputs]
     assert reasons == [()] * 4 + [(Rejection.STUCK,)] * 3
     used = running(setup, 4).loop
     assert np.array_equal(state.loop.actuators_nm, used.actuators_nm)
-    pixels = frame(8, SOME).pixels.copy()
+    pixels = frame(8, WAVE_NM).pixels.copy()
     pixels.flat[0] += 1
-    state, later_outputs = feed(setup, state, frame(8, pixels=pixels), frame(9, SOME))
+    state, later_outputs = feed(setup, state, frame(8, pixels=pixels), frame(9, WAVE_NM))
     assert names(all_outputs + later_outputs) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert state.counts == {Rejection.STUCK: 3}
     assert state.frames_used == 6
@@ -117,7 +117,7 @@ def test_without_a_calibration_a_frame_gives_a_step_and_no_command() -> None:
     ],
 )
 def test_a_frame_is_used_up_to_each_limit(changes: dict[str, object], reasons: tuple[Reason, ...]) -> None:
-    _, (outputs,) = feed(DEFAULTS, running(), frame(6, SOME, **changes))
+    _, (outputs,) = feed(DEFAULTS, running(), frame(6, WAVE_NM, **changes))
     assert outputs.step.reasons == reasons
     assert (outputs.step.error_nm is None) is bool(reasons)
 
@@ -125,7 +125,7 @@ def test_a_frame_is_used_up_to_each_limit(changes: dict[str, object], reasons: t
 def test_consecutive_frames_refused_for_one_reason_raise_one_event() -> None:
     reasons = Rejection.LATE, Rejection.LATE, Rejection.DARK
     inputs = [BAD_FRAMES[reason](count) for count, reason in enumerate(reasons, start=6)]
-    state, all_outputs = feed(DEFAULTS, running(), *inputs, frame(9, SOME))
+    state, all_outputs = feed(DEFAULTS, running(), *inputs, frame(9, WAVE_NM))
     assert names(all_outputs) == ["FRAMES_REFUSED", "FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert state.counts == {Rejection.LATE: 2, Rejection.DARK: 1}
 
@@ -136,7 +136,7 @@ def test_missing_and_refused_frames_advance_the_command_history(delay: float) ->
     setup = settings(delay_frames=delay)
     before = running(setup)
     held = before.loop.history_nm[0]
-    missing, all_outputs = feed(setup, before, frame(12, SOME))
+    missing, all_outputs = feed(setup, before, frame(12, WAVE_NM))
     assert names(all_outputs) == ["FRAMES_MISSING"]
     assert all_outputs[0].events[0].details == {"count": 6, "number": 12}
     assert np.array_equal(all_outputs[0].step.pol_nm, all_outputs[0].step.error_nm - held)
@@ -149,18 +149,18 @@ def test_one_missing_frame_advances_the_history_by_one() -> None:
     setup = settings(delay_frames=3.0)
     before = running(setup)
     newest, middle, _ = before.loop.history_nm
-    _, (outputs,) = feed(setup, before, frame(7, SOME))  # frame 6 is missing: exposure 7 sees the command of frame 4
+    _, (outputs,) = feed(setup, before, frame(7, WAVE_NM))  # frame 6 is missing: exposure 7 sees the command of frame 4
     assert np.array_equal(outputs.step.pol_nm, outputs.step.error_nm - middle)
     assert not np.array_equal(newest, middle)
 
 
 def test_frames_of_a_restarted_camera_are_used_with_an_event() -> None:
     before = running()
-    restarted = frame(0, SOME, sequence=frame_sequence(0, START + 60), time_ns=(START + 60) * 10**9)
+    restarted = frame(0, WAVE_NM, sequence=frame_sequence(0, START + 60), time_ns=(START + 60) * 10**9)
     state, all_outputs = feed(DEFAULTS, before, restarted)
     assert names(all_outputs) == ["CAMERA_RESTARTED"]
     assert state.frames_used == before.frames_used + 1
-    _, all_outputs = feed(DEFAULTS, state, frame(6, SOME))
+    _, all_outputs = feed(DEFAULTS, state, frame(6, WAVE_NM))
     assert all_outputs[0].step.reasons == (Rejection.OUT_OF_ORDER,)
 
 
@@ -174,7 +174,7 @@ def test_a_frame_timeout_raises_an_event_at_its_start_and_at_its_end() -> None:
     for outputs in all_outputs:
         assert np.array_equal(outputs.command.actuators_nm, before.loop.actuators_nm)
         assert outputs.command.frame_sequence == before.frame_sequence
-    state, later_outputs = feed(DEFAULTS, state, frame(500, SOME), frame(501, SOME))
+    state, later_outputs = feed(DEFAULTS, state, frame(500, WAVE_NM), frame(501, WAVE_NM))
     assert names(later_outputs) == ["FRAMES_BACK", "FRAMES_MISSING", "FRAMES_ACCEPTED"]
     assert state.counts[Rejection.NO_FRAME] == 1
 
@@ -188,7 +188,7 @@ def test_a_frame_timeout_relaxes_the_mirror_if_configured() -> None:
         assert violations(setup.limits, before, outputs.command.actuators_nm) == []
     assert not state.loop.actuators_nm.any()
     assert not any(command.any() for command in state.loop.history_nm)
-    state, (outputs,) = feed(setup, state, frame(400, SOME))
+    state, (outputs,) = feed(setup, state, frame(400, WAVE_NM))
     assert outputs.command.actuators_nm.any()
 
 
@@ -224,7 +224,7 @@ def test_safe_mode_relaxes_the_mirror_frame_by_frame_within_the_limits() -> None
     largest = np.abs(state.loop.actuators_nm).max()
     for count in range(31, 70):
         before = state.loop.actuators_nm
-        input_ = BAD_FRAMES[Rejection.DARK](count) if count % 3 == 0 else frame(count, SOME)
+        input_ = BAD_FRAMES[Rejection.DARK](count) if count % 3 == 0 else frame(count, WAVE_NM)
         state, (outputs,) = feed(setup, state, input_)
         assert violations(setup.limits, before, outputs.command.actuators_nm) == []
         assert np.abs(outputs.command.actuators_nm).max() <= np.abs(before).max()
@@ -322,7 +322,7 @@ def test_a_mode_that_a_request_names_twice_has_one_value() -> None:
 
 
 def test_the_first_step_after_closing_is_gain_times_error() -> None:
-    state, _ = feed(DEFAULTS, running(), ask("open"), *(frame(count, SOME) for count in range(6, 20)), ask("close"))
+    state, _ = feed(DEFAULTS, running(), ask("open"), *(frame(count, WAVE_NM) for count in range(6, 20)), ask("close"))
     before = state.loop.history_nm[0]
     _, (outputs,) = feed(DEFAULTS, state, frame(20, (1.0, 0, 0)))
     assert outputs.step.command_nm - before == pytest.approx([-0.5, 0, 0], abs=0.02)
@@ -330,7 +330,7 @@ def test_the_first_step_after_closing_is_gain_times_error() -> None:
 
 def test_in_open_loop_the_command_holds() -> None:
     state, _ = feed(DEFAULTS, running(), ask("open"))
-    after, all_outputs = feed(DEFAULTS, state, *(frame(count, SOME) for count in range(6, 12)))
+    after, all_outputs = feed(DEFAULTS, state, *(frame(count, WAVE_NM) for count in range(6, 12)))
     assert after.loop.actuators_nm is state.loop.actuators_nm
     assert all(outputs.step.error_nm is not None for outputs in all_outputs)
 
@@ -421,7 +421,7 @@ def test_after_saturation_the_stored_command_is_the_limited_one() -> None:
 
 def test_saturated_pixels_hardly_affect_the_estimate() -> None:
     """This also holds for a star that is brighter than expected."""
-    plain = TOY.pixels(SOME, 1.3 * FLUX_DN)
+    plain = TOY.pixels(WAVE_NM, 1.3 * FLUX_DN)
     saturated = plain.copy()
     saturated.flat[[3, 17]] = SATURATION_DN
     errors = []

@@ -23,8 +23,8 @@ from tests.support.toy import (
     DARK_DN,
     GRID,
     SHAPE,
-    SOME,
     START,
+    WAVE_NM,
     calibration,
     check_reply,
     feed,
@@ -276,7 +276,7 @@ def test_a_calibration_ends_the_idle_mode_and_the_mirror_keeps_its_shape() -> No
     state, _ = advance(DEFAULTS, idle(shape_nm=30.0), Request(0, "load", calibration=calibration()))
     assert DEFAULTS.start_mode is LoopMode.CLOSED
     assert state.mode is LoopMode.OPEN, "a loaded calibration does not close the loop"
-    state, all_outputs = feed(DEFAULTS, state, frame(4, SOME))
+    state, all_outputs = feed(DEFAULTS, state, frame(4, WAVE_NM))
     assert np.allclose(surfaces(all_outputs), 30, atol=1e-3)
     assert all_outputs[0].step.error_nm is not None
 

@@ -13,7 +13,7 @@ from lowfc.control.loop.loading import holding_cause
 from lowfc.control.loop.safety import LoopMode, Rejection
 from lowfc.control.loop.state import Settings, State
 from lowfc.control.loop.wording import MEASURED_FIRST
-from tests.support.toy import GRID, SOME, calibration, check_reply, feed, frame, loaded, names, settings
+from tests.support.toy import GRID, WAVE_NM, calibration, check_reply, feed, frame, loaded, names, settings
 
 SECOND_NS = 1_000_000_000
 MOVER = 7
@@ -32,7 +32,7 @@ def mask(value: Value | None, age_ns: int = 0) -> BenchReport:
 def running(setup: Settings) -> State:
     """A closed loop without an acting interlock."""
     quiet = mask(type(setup.interlocks[0].value)())  # False, or 0
-    return feed(setup, loaded(setup), quiet, *(frame(count, SOME) for count in range(1, 6)))[0]
+    return feed(setup, loaded(setup), quiet, *(frame(count, WAVE_NM) for count in range(1, 6)))[0]
 
 
 def applied(setup: Settings, state: State, name: str, **fields: object) -> tuple[State, Outputs]:
@@ -149,7 +149,7 @@ def test_a_loop_that_starts_closed_is_held_if_an_interlock_acts_before_or_after_
     for state in (before, after):
         assert state.mode is LoopMode.CLOSED
         assert holding_cause(state) == "an interlock acts: mask is true"
-    _, all_outputs = feed(setup, after, Request(0, "open"), frame(6, SOME))
+    _, all_outputs = feed(setup, after, Request(0, "open"), frame(6, WAVE_NM))
     assert all_outputs[-1].step.error_nm is not None
 
 
@@ -168,7 +168,7 @@ def test_only_a_change_of_the_condition_is_a_logged_input() -> None:
 def test_a_value_that_is_too_old_acts_as_configured() -> None:
     for acting in (True, False):
         setup = settings_under(Action.HOLD, acts_when_old=acting)
-        state, all_outputs = feed(setup, running(setup), mask(False, 2 * SECOND_NS + 1), frame(6, SOME))
+        state, all_outputs = feed(setup, running(setup), mask(False, 2 * SECOND_NS + 1), frame(6, WAVE_NM))
         assert bool(state.conditions.acting) is acting
         assert all_outputs[-1].step.reasons == ((Rejection.HELD,) if acting else ())
         state, all_outputs = feed(setup, running(setup), mask(True), mask(True, 2 * SECOND_NS + 1))
@@ -193,7 +193,7 @@ def test_a_permit_holds_a_closed_loop_for_its_duration() -> None:
     check_reply(permit(setup, state._replace(mode=LoopMode.OPEN, conditions=waiting))[1], False, "closes once")
     state, outputs = permit(setup, state, 0.01)
     check_reply(outputs, True, "granted for 0.01 s: the loop holds its command")
-    state, all_outputs = feed(setup, state, *(frame(count, SOME) for count in range(6, 18)))
+    state, all_outputs = feed(setup, state, *(frame(count, WAVE_NM) for count in range(6, 18)))
     assert [outputs.step.reasons for outputs in all_outputs] == [(Rejection.HELD,)] * 10 + [()] * 2
     assert names(all_outputs) == ["FRAMES_REFUSED", "LEASE_ENDED", "FRAMES_ACCEPTED"]
     assert state.conditions.lease.ended == "its time is over"
@@ -206,7 +206,7 @@ def test_a_permit_can_be_released_and_ended_by_open() -> None:
     _, outputs = applied(setup, held, "gain", values=(0.1,))
     check_reply(outputs, False, "reserved for moving the mask (for at most 5 s more)")
     state, outputs = applied(setup, held, "release", lease_id=MOVER)
-    _, all_outputs = feed(setup, state, frame(6, SOME))
+    _, all_outputs = feed(setup, state, frame(6, WAVE_NM))
     assert all_outputs[-1].step.reasons == ()
     state, outputs = applied(setup, held, "open")
     check_reply(outputs, True, "this ended the reservation for moving the mask")
@@ -247,4 +247,4 @@ def test_a_renewed_permit_still_holds() -> None:
     state, _ = permit(setup, running(setup), 5.0)
     state, outputs = applied(setup, state, "renew", text="moving the mask", values=(5.0,), lease_id=MOVER)
     check_reply(outputs, True)
-    assert feed(setup, state, frame(6, SOME))[1][-1].step.reasons == (Rejection.HELD,)
+    assert feed(setup, state, frame(6, WAVE_NM))[1][-1].step.reasons == (Rejection.HELD,)

@@ -14,7 +14,7 @@ from lowfc.control.loop.lease import MAX_S
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
-from tests.support.toy import GRID, NOLL, SOME, check_reply, feed, frame, frame_sequence, loaded, names, settings
+from tests.support.toy import GRID, NOLL, WAVE_NM, check_reply, feed, frame, frame_sequence, loaded, names, settings
 
 DEFAULTS = settings(rate_hz=1000.0)
 HOLDER = "lowfc calibrate (anna, pid 7)"
@@ -25,7 +25,7 @@ SECOND_NS = 1_000_000_000
 
 def reserved_loop(seconds: float = 10.0, frames: int = 3) -> State:
     """A closed loop that is reserved from time 0."""
-    state, _ = feed(DEFAULTS, loaded(DEFAULTS), *(frame(count, SOME) for count in range(1, frames + 1)))
+    state, _ = feed(DEFAULTS, loaded(DEFAULTS), *(frame(count, WAVE_NM) for count in range(1, frames + 1)))
     state, outputs = applied(state, Request(0, "lease", values=(seconds,), text=HOLDER, lease_id=MINE))
     check_reply(outputs, True)
     assert names([outputs]) == ["LEASE_TAKEN"]
@@ -166,18 +166,18 @@ def test_a_lease_ends_after_its_number_of_frames() -> None:
 @pytest.mark.parametrize("ahead_ns", [0, 3600 * SECOND_NS])
 def test_a_lease_lasts_its_seconds_at_any_frame_rate(period_ns: int, ahead_ns: int) -> None:
     """The configured rate is 1 kHz; the camera's clock may differ from the controller's."""
-    first, _ = feed(DEFAULTS, loaded(DEFAULTS), frame(1, SOME, time_ns=ahead_ns + period_ns))
+    first, _ = feed(DEFAULTS, loaded(DEFAULTS), frame(1, WAVE_NM, time_ns=ahead_ns + period_ns))
     state, _ = applied(first, Request(0, "lease", values=(1.0,), text=HOLDER, lease_id=MINE))
     count = 1
     while not state.conditions.lease.ended:
         count += 1
-        state, _ = applied(state, frame(count, SOME, time_ns=ahead_ns + count * period_ns))
+        state, _ = applied(state, frame(count, WAVE_NM, time_ns=ahead_ns + count * period_ns))
     assert abs((count - 1) * period_ns - SECOND_NS) <= period_ns + 1_000_000
 
 
 @pytest.mark.parametrize("time_ns", [0, frame(3).time_ns + 10 * SECOND_NS])
 def test_each_frame_counts_as_one_period_after_a_silence_and_if_frame_times_do_not_increase(time_ns: int) -> None:
-    *lasting, last = (frame(count, SOME, time_ns=time_ns) for count in range(4, 1005))
+    *lasting, last = (frame(count, WAVE_NM, time_ns=time_ns) for count in range(4, 1005))
     state, all_outputs = feed(DEFAULTS, reserved_loop(1.0), *lasting)
     assert "LEASE_ENDED" not in names(all_outputs)
     assert "LEASE_ENDED" in names(feed(DEFAULTS, state, last)[1])
@@ -195,7 +195,7 @@ def test_without_frames_a_lease_ends_by_the_clock_and_before_the_next_request() 
 @pytest.mark.parametrize("frames", [0, 3])
 def test_a_lease_keeps_its_number_of_frames_when_the_camera_starts(frames: int) -> None:
     start = 1_800_000_000
-    *lasting, last = (frame(count, SOME, sequence=frame_sequence(count, start)) for count in range(1, 1003))
+    *lasting, last = (frame(count, WAVE_NM, sequence=frame_sequence(count, start)) for count in range(1, 1003))
     state, all_outputs = feed(DEFAULTS, reserved_loop(1.0, frames), *lasting)
     assert "LEASE_ENDED" not in names(all_outputs)
     assert "LEASE_ENDED" in names(feed(DEFAULTS, state, last)[1])

@@ -7,14 +7,14 @@ from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.inputs import Command, Frame, MirrorReport, MirrorShape, Request, Tick
 from lowfc.control.loop.safety import LoopMode, Rejection
 from lowfc.control.loop.state import LawRunner
-from tests.support.toy import GRID, NOLL, SOME, check_reply, feed, frame, loaded, names, running, settings
+from tests.support.toy import GRID, NOLL, WAVE_NM, check_reply, feed, frame, loaded, names, running, settings
 
 DEFAULTS = settings()
 LOST, BACK = MirrorReport(0, "does not answer"), MirrorReport(0, "")
 
 
 def frames(*counts: int) -> list[Frame]:
-    return [frame(count, SOME) for count in counts]
+    return [frame(count, WAVE_NM) for count in counts]
 
 
 def test_a_lost_mirror_moves_the_command_back_to_its_last_shape() -> None:

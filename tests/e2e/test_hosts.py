@@ -24,7 +24,7 @@ from tools.law_bench import calibrated
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.exclusive,
-    pytest.mark.skipif(not networks.possible(), reason="network namespaces cannot be created here"),
+    pytest.mark.skipif(not networks.namespaces_permitted(), reason="network namespaces cannot be created here"),
 ]
 
 RUN = "across"
@@ -42,7 +42,7 @@ certificates = "CERTIFICATES"
 """
 SHIFTS_NS = {"camera": 37_000_000, "controller": -250_000_000, "mirror": 3_000_000_000, "desk": -1_000_000}
 """Offset of each host's clock."""
-PLACES = {"camera": "camera", "controller": "controller", "mirror-dm": "mirror", "recorder": "desk"}
+HOST_OF = {"camera": "camera", "controller": "controller", "mirror-dm": "mirror", "recorder": "desk"}
 """Host of each process."""
 SUPPORT = Path(__file__).parents[1] / "support"
 ROLES = roles(["mirror-dm"])
@@ -74,7 +74,7 @@ class Bench:
         for name in ("camera", "controller"):
             copy_certificates(self.lab[name], self.authority, name)
         copy_certificates(self.lab["mirror"], self.authority, "mirror-dm")
-        self.words = {
+        self.arguments = {
             "router": ["-m", "lowfc", "router"],
             "camera": ["-m", "sim_camera"],
             "mirror-dm": ["-m", "sim_dm"],
@@ -83,15 +83,15 @@ class Bench:
         }
 
     def start(self) -> None:
-        for name, place in PLACES.items():  # before the router: processes may start in any order
+        for name, place in HOST_OF.items():  # before the router: processes may start in any order
             self.begin(self.lab[place], name)
         self.begin(self.lab.middle, "router")
         config = str(self.lab.middle.folder / "lowfc.toml")
         self.lab.middle.start("observer", str(SUPPORT / "host_observer.py"), RUN, config, "viewer")
 
     def begin(self, host: Host, name: str) -> None:
-        words = [word.format(folder=host.folder) for word in self.words[name]]
-        host.start(name, *words, "--run", RUN, "--config", str(host.folder / "lowfc.toml"))
+        arguments = [argument.format(folder=host.folder) for argument in self.arguments[name]]
+        host.start(name, *arguments, "--run", RUN, "--config", str(host.folder / "lowfc.toml"))
 
     def reports(self) -> list[dict[str, Any]]:
         """Every report of the observer so far, one each tenth of a second."""
@@ -133,8 +133,8 @@ class Bench:
                 assert child.status is None, f"{name} on {host.name} ended: {host.stderr(name)}"
 
     def stderr_tail(self) -> str:
-        everybody = [(host, name) for host in self.lab.hosts.values() for name in host.children if name != "observer"]
-        return "\n".join(f"{name}: {host.stderr(name)[-400:]}" for host, name in everybody)
+        processes = [(host, name) for host in self.lab.hosts.values() for name in host.children if name != "observer"]
+        return "\n".join(f"{name}: {host.stderr(name)[-400:]}" for host, name in processes)
 
 
 @pytest.fixture(scope="module")
@@ -173,8 +173,8 @@ def test_clock_offsets_are_measured_and_requests_and_a_view_work_from_another_ho
     done = desk.run("-m", "lowfc", "hosts", "--run", RUN, "--json")
     assert done.returncode == 0, done.stderr
     rows = {row["process"]: row for row in json.loads(done.stdout)["processes"]}
-    assert {*PLACES, ROUTER} <= set(rows)
-    for process, place in PLACES.items():
+    assert {*HOST_OF, ROUTER} <= set(rows)
+    for process, place in HOST_OF.items():
         truth_us = (clock_offset_ns(bench.lab.middle) - clock_offset_ns(bench.lab[place])) / 1e3
         assert rows[process]["clock_error_us"] > 0
         assert abs(rows[process]["clock_offset_us"] - truth_us) <= rows[process]["clock_error_us"] + 0.001

@@ -1,10 +1,10 @@
-"""Every reader of external bytes, with damaged inputs: it raises its errors; it does not crash, hang or grow."""
+"""Every reader of external bytes, with damaged inputs: it raises only its errors, and does not crash, hang or leak."""
 
 from contextlib import suppress
 
 import pytest
 
-from tests.support.fuzzing import MAX_GROWTH_BYTES, fuzz, shares
+from tests.support.fuzzing import MAX_GROWTH_BYTES, fuzz, inputs_by_target
 from tests.support.targets import Target, targets
 
 
@@ -44,7 +44,7 @@ def test_crashes_and_hangs_of_a_reader_are_found(monkeypatch: pytest.MonkeyPatch
     def read(data: bytes) -> None:
         if data.startswith(b"\xff"):
             raise KeyError(data)
-        with suppress(Exception):  # of a reader that turns every error into an event
+        with suppress(Exception):  # like a reader that turns every error into an event
             while data.startswith(b"\0"):
                 pass
 
@@ -57,7 +57,7 @@ def test_crashes_and_hangs_of_a_reader_are_found(monkeypatch: pytest.MonkeyPatch
     "inputs", [8_000, pytest.param(1_000_000, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])]
 )
 def test_damaged_inputs_neither_crash_nor_hang_a_reader(all_targets: list[Target], inputs: int) -> None:
-    counts = shares(all_targets, inputs)
+    counts = inputs_by_target(all_targets, inputs)
     for target in all_targets:
         results = fuzz(target, range(counts[target.name]))
         assert results["crashes"] == [], target.name

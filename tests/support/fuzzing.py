@@ -1,4 +1,4 @@
-"""Feed damaged inputs to readers, detect crashes, hangs and memory growth: python -m tests.support.fuzzing --help."""
+"""Feed damaged inputs to readers; detect crashes, hangs and memory growth: python -m tests.support.fuzzing --help."""
 
 import argparse
 import json
@@ -21,7 +21,7 @@ from tests.support.targets import Target, targets
 HANG_S = 10.0
 """Time after which an input counts as a hang."""
 MAX_GROWTH_BYTES = 200_000_000
-"""Largest permitted growth of the process by one target's inputs."""
+"""Largest permitted growth of the process's peak memory by one target's inputs."""
 
 
 class HungError(BaseException):
@@ -59,7 +59,7 @@ def fuzz(target: Target, numbers: range) -> dict[str, Any]:
     }
 
 
-def shares(all_targets: list[Target], inputs: int) -> dict[str, int]:
+def inputs_by_target(all_targets: list[Target], inputs: int) -> dict[str, int]:
     """Number of inputs of each target: fewer for slower ones."""
     weights = {target.name: target.cost**-0.75 for target in all_targets}
     total = sum(weights.values())
@@ -86,7 +86,7 @@ def _peak_bytes() -> int:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--inputs", type=int, default=1_000_000, help="total of all targets")
+    parser.add_argument("--inputs", type=int, default=1_000_000, help="number of inputs, all targets together")
     parser.add_argument("--first", type=int, default=0, help="number of the first input of each target")
     parser.add_argument("--only", help="targets whose name contains this")
     parser.add_argument("--json", action="store_true")
@@ -96,7 +96,7 @@ def main() -> int:
         all_targets = [one for one in targets(Path(folder)) if not options.only or options.only in one.name]
         if not all_targets:
             parser.error(f"no target's name contains {options.only!r}")
-        counts = shares(all_targets, options.inputs)
+        counts = inputs_by_target(all_targets, options.inputs)
         results = []
         for target in all_targets:
             found = fuzz(target, range(options.first, options.first + counts[target.name]))

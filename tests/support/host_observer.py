@@ -1,7 +1,7 @@
 """Print what one host of a multi-host run receives, ten times a second as a line of JSON on standard error.
 
-`good` counts the last steps in a row that are closed, without a reason, and with errors below 5 nm; `following` counts
-the last states in a row of a mirror that follows commands.
+`good`: number of newest consecutive steps with the loop closed, no reason, and errors below 5 nm. `following`: number
+of newest consecutive states in which the mirror follows commands.
 """
 
 import json

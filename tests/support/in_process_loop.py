@@ -1,4 +1,4 @@
-"""A loop in one process: with the interface of `lowfc.client`, in threads, or run for a number of frames."""
+"""Loops in one process: one with the interface of `lowfc.client`, one in threads, one for a number of frames."""
 
 import contextlib
 import itertools
@@ -40,7 +40,7 @@ from tools.law_bench import Bench, calibrated
 PATIENCE_S = 20.0
 FIRST = 1 << 32  # sequence of the first frame of a camera
 SMALL_MIRROR = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 10}
-"""For tests that do not depend on the number of actuators: a calibration is computed several times as fast."""
+"""Configuration keys for tests that do not depend on the number of actuators: calibrations are computed faster."""
 
 BRIGHT = (
     FIXED_GAINS
@@ -52,7 +52,7 @@ BRIGHT = (
         "camera.instants": 1,  # sufficient without a disturbance
     }
 )
-"""For calibrations: a bright star without a disturbance."""
+"""Configuration keys for tests of calibrations: a bright star without a disturbance."""
 
 
 def configuration(keys: dict[str, Any], **changes: Any) -> Configuration:
@@ -61,7 +61,7 @@ def configuration(keys: dict[str, Any], **changes: Any) -> Configuration:
 
 
 @lru_cache(maxsize=4)
-def computed(toml: str) -> Calibration:
+def calibration_of(toml: str) -> Calibration:
     return calibrated(Configuration.model_validate(tomllib.loads(toml)))
 
 
@@ -105,7 +105,7 @@ class InProcessLoop(Client):
         grid = (config.mirror.rows, config.mirror.columns)
         flat = MirrorShape(0, np.zeros(grid, np.float32), np.zeros(0, np.float32))
         if cut is None and calibration is None:
-            calibration = computed(config.to_toml())
+            calibration = calibration_of(config.to_toml())
         self._bench = Bench(config, flat if calibration is None else calibration, world=world)
         self.scene = self._bench.scene
         self.hub = MemoryHub()

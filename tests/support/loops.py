@@ -44,43 +44,43 @@ FIXED = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
 
 def run(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120) -> "subprocess.CompletedProcess[str]":
     """Run `lowfc` with these arguments in a folder."""
-    words = [*LOWFC, *arguments]
+    command_line = [*LOWFC, *arguments]
     if config:
         (folder / "test.toml").write_text(config)
-        words += ["--config", "test.toml"]
-    return subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=timeout_s, check=False)
+        command_line += ["--config", "test.toml"]
+    return subprocess.run(command_line, cwd=folder, capture_output=True, text=True, timeout=timeout_s, check=False)
 
 
-def mount(*words: object) -> None:
+def mount(*arguments: object) -> None:
     """Mount a file system; skip the test where this is not permitted."""
-    if subprocess.run(["mount", *map(str, words)], check=False).returncode:
+    if subprocess.run(["mount", *map(str, arguments)], check=False).returncode:
         pytest.skip("mounting a file system is not permitted")
 
 
-def lowfc(*words: object) -> Result:
-    """Run `lowfc` with these words in this process; an error that ended it is its `exception`."""
-    return CliRunner().invoke(app, [*map(str, words)])
+def lowfc(*arguments: object) -> Result:
+    """Run `lowfc` with these arguments in this process; the result's `exception` is the error that ended it."""
+    return CliRunner().invoke(app, [*map(str, arguments)])
 
 
-def json_of(*words: object, status: int = 0) -> Any:
-    """JSON printed by `lowfc` with these words and --json, run in this process."""
-    done = lowfc(*words, "--json")
+def json_of(*arguments: object, status: int = 0) -> Any:
+    """JSON printed by `lowfc` with these arguments and --json, run in this process."""
+    done = lowfc(*arguments, "--json")
     assert done.exit_code == status, (done.output, done.exception)
     return json.loads(done.stdout)
 
 
-def refusal(*words: object, kind: type[LowfcError] | tuple[type[LowfcError], ...] = LowfcError) -> str:
-    """Text of the error with which `lowfc` refuses these words, run in this process."""
-    error = lowfc(*words).exception
+def refusal(*arguments: object, kind: type[LowfcError] | tuple[type[LowfcError], ...] = LowfcError) -> str:
+    """Text of the error with which `lowfc` refuses these arguments, run in this process."""
+    error = lowfc(*arguments).exception
     assert isinstance(error, kind), error
     return str(error)
 
 
 def output_of(folder: Path, line: str) -> str:
     """Output of a documented command that starts no loop, run in this process with this working directory."""
-    words, _, output = line.partition(" > ")
+    command_line, _, output = line.partition(" > ")
     with contextlib.chdir(folder):
-        done = lowfc(*shlex.split(words)[1:])
+        done = lowfc(*shlex.split(command_line)[1:])
     assert done.exit_code == 0, f"{line}: {done.output} {done.exception}"
     if output:
         (folder / output).write_text(done.stdout)
@@ -113,11 +113,11 @@ def children(launcher: int) -> dict[str, int]:
     pids = {}
     listed = Path(f"/proc/{launcher}/task/{launcher}/children").read_text().split()
     for pid in map(int, listed):
-        words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
-        if "-m" not in words:  # between fork and exec
+        arguments = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+        if "-m" not in arguments:  # between fork and exec
             continue
-        module = words[words.index("-m") + 1]
-        pids[module if module != "lowfc" else words[words.index("-m") + 2]] = pid
+        module = arguments[arguments.index("-m") + 1]
+        pids[module if module != "lowfc" else arguments[arguments.index("-m") + 2]] = pid
     return pids
 
 
@@ -145,8 +145,8 @@ def started(folder: Path, *arguments: object) -> Iterator["subprocess.Popen[str]
 
 def command(folder: Path, line: str, timeout_s: float = 120, statuses: tuple[int, ...] = (0,)) -> str:
     """Output of a documented command, which must end with one of the statuses; a redirection is also carried out."""
-    words, _, output = line.partition(" > ")
-    program, *rest = shlex.split(words, comments=True)
+    command_line, _, output = line.partition(" > ")
+    program, *rest = shlex.split(command_line, comments=True)
     done = subprocess.run(
         [PROGRAMS / program, *rest], cwd=folder, capture_output=True, text=True, timeout=timeout_s, check=False
     )

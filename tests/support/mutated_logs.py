@@ -86,7 +86,7 @@ def changed(path: Path, at: int, new: bytes) -> Path:
 
 
 def flipped(path: Path, at: int, bit: int = 0) -> Path:
-    """Flip a bit of a file."""
+    """Flip bit `bit` of byte `at` of a file; `at` may be negative, from its end."""
     return changed(path, at, bytes([path.read_bytes()[at] ^ 1 << bit]))
 
 

@@ -20,7 +20,7 @@ SUBNET = "10.77.0"
 ROUTER_ADDRESS = f"{SUBNET}.1"
 
 
-def possible() -> bool:
+def namespaces_permitted() -> bool:
     """Whether this machine permits network namespaces with a bridge."""
     if shutil.which("unshare") is None or shutil.which("nsenter") is None or shutil.which("ip") is None:
         return False
@@ -50,15 +50,15 @@ class Host:
     def environment(self) -> Mapping[str, str]:
         return os.environ | {"XDG_RUNTIME_DIR": str(self.folder / "runtime"), "OMP_NUM_THREADS": "1"}
 
-    def inside(self, *words: str) -> list[str]:
-        return ["nsenter", f"--net=/proc/{self.holder.pid}/ns/net", *words]
+    def inside(self, *arguments: str) -> list[str]:
+        return ["nsenter", f"--net=/proc/{self.holder.pid}/ns/net", *arguments]
 
-    def ip(self, *words: str) -> None:
-        subprocess.run(self.inside("ip", *words), check=True, capture_output=True)
+    def ip(self, *arguments: str) -> None:
+        subprocess.run(self.inside("ip", *arguments), check=True, capture_output=True)
 
-    def run(self, *words: str, timeout_s: float = 60) -> "subprocess.CompletedProcess[str]":
+    def run(self, *arguments: str, timeout_s: float = 60) -> "subprocess.CompletedProcess[str]":
         return subprocess.run(
-            self.inside(sys.executable, "-P", *words),
+            self.inside(sys.executable, "-P", *arguments),
             capture_output=True,
             text=True,
             timeout=timeout_s,
@@ -67,10 +67,10 @@ class Host:
             cwd=self.folder,
         )
 
-    def start(self, name: str, *words: str) -> Child:
+    def start(self, name: str, *arguments: str) -> Child:
         child = Child(
             name,
-            self.inside(sys.executable, "-P", *words),
+            self.inside(sys.executable, "-P", *arguments),
             self.folder / f"{name}.stderr",
             self.environment,
             death_signal=signal.SIGKILL,

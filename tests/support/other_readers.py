@@ -17,13 +17,13 @@ def foxglove(paths: Iterable[Path]) -> list[dict[str, Any]]:
     """Content of each finished log according to @mcap/core, with checksums checked."""
     if shutil.which("node") is None or not (NODE / "node_modules").is_dir():
         pytest.skip("node or its packages are missing: make node")
-    words = ["node", "count.mjs", *map(str, paths)]
-    done = subprocess.run(words, cwd=NODE, capture_output=True, text=True, timeout=60, check=False)
+    command = ["node", "count.mjs", *map(str, paths)]
+    done = subprocess.run(command, cwd=NODE, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def rerun(word: str, path: Path) -> str:
+def rerun(subcommand: str, path: Path) -> str:
     """Output of `rerun mcap info` or `rerun mcap check` for a log."""
     import rerun_cli
 
@@ -31,7 +31,7 @@ def rerun(word: str, path: Path) -> str:
     folder = str(path.parent)
     home = os.environ | {"HOME": folder, "XDG_CONFIG_HOME": folder, "XDG_DATA_HOME": folder}
     done = subprocess.run(
-        [binary, "mcap", word, path], env=home, capture_output=True, text=True, timeout=20, check=False
+        [binary, "mcap", subcommand, path], env=home, capture_output=True, text=True, timeout=20, check=False
     )
     assert done.returncode == 0, f"{path.name}: {done.stderr}"
     return done.stdout

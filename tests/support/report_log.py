@@ -53,7 +53,7 @@ METADATA = {"lowfc": {"lowfc": "0.1.0", "numpy": "2.0", "host": "bench", "run": 
 
 
 class SyntheticLog:
-    """Messages of a run, appended frame by frame; the tip disturbance is a sine of 12 nm at 7 Hz."""
+    """Messages of a run, appended frame by frame; the x tilt disturbance is a sine of 12 nm amplitude, 7 Hz."""
 
     def __init__(self, *, truth: bool = True, calibration: Calibration = TOY_CALIBRATION, **changes: object) -> None:
         """Start a loop with `changes` to its settings."""
@@ -215,8 +215,8 @@ class SyntheticLog:
     def _publish(self, advanced: tuple[State, Outputs], late_ns: int = 0) -> None:
         """Append the messages of the controller's outputs, and of the mirror that follows its command."""
         self._state, outputs = advanced
-        for raised in outputs.events:
-            self.event(raised.name, **raised.details)
+        for event in outputs.events:
+            self.event(event.name, **event.details)
         if outputs.command is not None:
             command = outputs.command
             self._moved_nm = self._to_modes @ command.actuators_nm.ravel()

@@ -18,14 +18,14 @@ LIMITS = Limits(stroke_nm=700.0, slew_nm=100.0, neighbour_nm=400.0)
 
 @dataclass(frozen=True)
 class Case:
-    """From `previous_nm`, `wanted_nm` is commanded `steps` times; the result is `expected_nm` to 0.01 nm, if given.
+    """A shape commanded `steps` times from a previous shape; the result is `expected_nm` to 0.01 nm, if given.
 
     `reasons` are those of the last step.
     """
 
     name: str
     previous_nm: Single
-    wanted_nm: Single
+    commanded_nm: Single
     reasons: tuple[str, ...]
     expected_nm: Single | None = None
     steps: int = 1
@@ -108,7 +108,7 @@ def check_case(limit: Callable[[Limits, Single, Single], Limited], case: Case) -
     shape = case.previous_nm
     outside = bool(violations(LIMITS, shape, shape))
     for _ in range(case.steps):
-        limited = limit(LIMITS, shape, case.wanted_nm)
+        limited = limit(LIMITS, shape, case.commanded_nm)
         after: Single = limited.actuators_nm
         broken = violations(LIMITS, shape, after)
         if outside:

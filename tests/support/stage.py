@@ -35,7 +35,7 @@ from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
 from tests.support.toy import FLUX_DN, NOLL, SATURATION_DN, START, TOY, calibration
 
-MAS = tilt_nm_per_mas(2.0)
+NM_PER_MAS = tilt_nm_per_mas(2.0)
 
 
 def tile(verdict: Verdict, title: str) -> Tile:
@@ -66,13 +66,13 @@ class Stage:
         flux: light in every frame, relative to the calibration.
         residual_nm, open_nm: residual, and disturbance, rms of the first mode.
         behind_s: time by which the view is behind the run.
-        each: called with every snapshot.
+        on_snapshot: called with every snapshot.
     """
 
     def __init__(self, *, data_ns: int = START * 10**9) -> None:
         self.host_ns, self.data_ns = START * 10**9, data_ns
         self.accumulator, self.watcher = Accumulator(), Watcher()
-        self.each: Callable[[Snapshot], object] = lambda snapshot: None
+        self.on_snapshot: Callable[[Snapshot], object] = lambda snapshot: None
         self.silent: set[str] = set()
         self.states = dict.fromkeys(("camera", "controller", "mirror-dm", "recorder"), "running")
         self.health: dict[str, dict[str, object]] = {"recorder": {"recording": wire.Recording(file="logs/a.mcap")}}
@@ -110,9 +110,9 @@ class Stage:
             if self.frames % 5 == 0:
                 snapshot = self.accumulator.snapshot(self.host_ns, behind_s=self.behind_s)
                 self.watcher.feed(snapshot)
-                self.each(snapshot)
+                self.on_snapshot(snapshot)
         assert not self.accumulator.unreadable
-        return judge(self.watcher.state(), MAS)
+        return judge(self.watcher.state(), NM_PER_MAS)
 
     def _runs(self, name: str) -> bool:
         return name not in self.silent and self.states.get(name) == "running"

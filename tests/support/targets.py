@@ -87,7 +87,7 @@ class Target:
 
 
 class Loop:
-    """A controller that takes any input; checks the limits of its commands."""
+    """A controller that is given any input; its commands are checked against the limits."""
 
     def __init__(self) -> None:
         self.state = loaded(NORMAL)
@@ -104,7 +104,7 @@ class Loop:
         controller_state(self.state, NORMAL, 0).SerializeToString()
 
     def frame(self, payload: bytes) -> None:
-        """Take a frame preceded by the 16 bytes of its envelope."""
+        """Process a frame preceded by the 16 bytes of its envelope."""
         self.count += 1
         sequence, time_ns = Envelope.decode_checked(payload[:16])
         self.process_input(codec.decode_frame(payload[16:], sequence, 0 - time_ns))  # age at time 0
@@ -301,7 +301,7 @@ def _requests() -> list[Target]:
     ]
 
 
-def _of_file(name: str, corpus: tuple[bytes, ...], read: Callable[[Path], object], path: Path, cost: int) -> Target:
+def _file_target(name: str, corpus: tuple[bytes, ...], read: Callable[[Path], object], path: Path, cost: int) -> Target:
     """Target whose inputs are written to a file, which is then read."""
 
     def run(data: bytes) -> object:
@@ -325,11 +325,11 @@ def _files(folder: Path) -> list[Target]:
     sams = tuple(json.dumps(one).encode() for one in (sam, {"layouts": {"a": sam}}))
     toml = Configuration().to_toml().encode()
     return [
-        _of_file("calibration file", fits, calibration_file.load, folder / "input.fits", 300),
-        _of_file("law file", laws, law_file.load, folder / "input.fits", 300),
-        _of_file("configuration file", (toml,), configuration.load, folder / "input.toml", 60),
-        _of_file("layout file", sams, lambda path: layouts.load_layout(f"{path}"), folder / "input.json", 20),
-        _of_file("pupil file", pupils, lambda path: load_pupil(256, path), folder / "input.npz", 30),
+        _file_target("calibration file", fits, calibration_file.load, folder / "input.fits", 300),
+        _file_target("law file", laws, law_file.load, folder / "input.fits", 300),
+        _file_target("configuration file", (toml,), configuration.load, folder / "input.toml", 60),
+        _file_target("layout file", sams, lambda path: layouts.load_layout(f"{path}"), folder / "input.json", 20),
+        _file_target("pupil file", pupils, lambda path: load_pupil(256, path), folder / "input.npz", 30),
     ]
 
 
@@ -346,7 +346,7 @@ def _logs(folder: Path) -> list[Target]:
 
     path = folder / "input.mcap"
     return [
-        _of_file("log, read", small_logs, lambda path: list(LogReader(path, skip_damaged=True)), path, 300),
-        _of_file("log, its history", loop_log, lambda path: read_history(LogReader(path)), path, 300),
-        _of_file("log, recovered", small_logs, recovered, path, 600),
+        _file_target("log, read", small_logs, lambda path: list(LogReader(path, skip_damaged=True)), path, 300),
+        _file_target("log, its history", loop_log, lambda path: read_history(LogReader(path)), path, 300),
+        _file_target("log, recovered", small_logs, recovered, path, 600),
     ]

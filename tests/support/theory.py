@@ -44,12 +44,12 @@ def one_piece(values: Array) -> TimeSeries:
 
 
 def rejection(frequency_hz: Array, rate_hz: float, gain: float, leak: float, delay_frames: float) -> Array:
-    """|S|: true residual over disturbance."""
+    """|S|: amplitude of the true residual relative to that of the disturbance."""
     return np.abs(1 / (1 + open_loop(2 * np.pi * frequency_hz / rate_hz, gain, leak, delay_frames)))
 
 
 def noise_transfer(frequency_hz: Array, rate_hz: float, gain: float, leak: float, delay_frames: float) -> Array:
-    """|T|: true residual over measurement noise."""
+    """|T|: amplitude of the true residual relative to that of the measurement noise."""
     loop = open_loop(2 * np.pi * frequency_hz / rate_hz, gain, leak, delay_frames)
     return np.abs(loop / (1 + loop))
 

@@ -18,7 +18,7 @@ SHAPE, GRID, NOLL = (6, 7), (4, 5), (2, 3, 4)
 FLUX_DN, DARK_DN, SATURATION_DN = 200_000.0, 100.0, 60_000.0
 START = 1_700_000_000  # of every process, s since 1970
 PERIOD_NS = 1_000_000
-SOME = (10.0, -5.0, 3.0)  # modes of a wavefront, nm
+WAVE_NM = (10.0, -5.0, 3.0)  # modes of a wavefront, nm
 # Clock-induced charge and dark current lift the dark above the bias.
 CAMERA = CameraSettings(0, SHAPE, DARK_DN - 40, SATURATION_DN, 1.0, 1.0, 3.0, start_s=START)
 
@@ -117,7 +117,7 @@ def feed(settings: Settings, state: State, *inputs: Input) -> tuple[State, list[
 def running(setup: Settings | None = None, frames: int = 5) -> State:
     """State of a closed loop after frames of one wavefront; the mirror is not flat."""
     setup = setup or settings()
-    return feed(setup, loaded(setup), *(frame(count, SOME) for count in range(1, frames + 1)))[0]
+    return feed(setup, loaded(setup), *(frame(count, WAVE_NM) for count in range(1, frames + 1)))[0]
 
 
 def names(all_outputs: list[Outputs]) -> list[str]:
@@ -125,11 +125,11 @@ def names(all_outputs: list[Outputs]) -> list[str]:
     return [event.name for outputs in all_outputs for event in outputs.events]
 
 
-def check_reply(outputs: Outputs, accepted: bool, *words: str) -> None:
-    """Assert that a request was accepted or refused with a reply that contains these words."""
+def check_reply(outputs: Outputs, accepted: bool, *texts: str) -> None:
+    """Assert that a request was accepted or refused with a reply that contains these texts."""
     assert outputs.reply.accepted is accepted, outputs.reply.text
-    for word in words:
-        assert word in outputs.reply.text
+    for text in texts:
+        assert text in outputs.reply.text
 
 
 def run_toy(

@@ -51,7 +51,7 @@ def pixels(png: bytes) -> Pixels:
 
 
 def share_of(picture: Pixels, colour: tuple[int, int, int]) -> float:
-    """Fraction of an image with a colour, 0 to 1."""
+    """Fraction of the pixels within 12 of 255 of a colour in each channel, 0 to 1."""
     return float(np.all(np.abs(picture.astype(int) - colour) <= 12, axis=2).mean())
 
 
@@ -131,7 +131,7 @@ class Page:
 
 @contextlib.contextmanager
 def browser(folder: Path, size_px: tuple[int, int], *, webgl: bool = False) -> Iterator[Page]:
-    """Run a headless Chromium with its own profile; it can connect to this host only. Software WebGL draws slowly."""
+    """Run a headless Chromium with its own profile; it can connect to this host only. `webgl`: in software, slow."""
     quiet = ("quic", "background-networking", "component-update", "sync", "default-apps", "extensions", "dev-shm-usage")
     options = ["headless", "no-sandbox", "no-first-run", "hide-scrollbars", "remote-debugging-port=0"]
     drawing = ("use-angle=swiftshader", "enable-unsafe-swiftshader", "ignore-gpu-blocklist")
@@ -140,8 +140,8 @@ def browser(folder: Path, size_px: tuple[int, int], *, webgl: bool = False) -> I
     options += ["proxy-server=http://127.0.0.1:9", f"user-data-dir={folder / 'profile'}"]  # no proxy listens there
     options += [f"window-size={size_px[0]},{size_px[1]}"]
     with (folder / "browser.txt").open("wb") as output:
-        words = [str(CHROMIUM), *(f"--{option}" for option in options)]
-        process = subprocess.Popen(words, stdout=output, stderr=output, start_new_session=True)
+        command = [str(CHROMIUM), *(f"--{option}" for option in options)]
+        process = subprocess.Popen(command, stdout=output, stderr=output, start_new_session=True)
     try:
         active = folder / "profile" / "DevToolsActivePort"
         until(lambda: active.exists() and active.read_text().count("\n"), CALL_S)

@@ -102,9 +102,9 @@ class Client:
 
 
 @contextlib.contextmanager
-def connected(port: int, most_waiting: int | None = None) -> Iterator[Client]:
+def connected(port: int, max_queued: int | None = None) -> Iterator[Client]:
     address, protocols = f"ws://127.0.0.1:{port}", ["foxglove.sdk.v1"]
-    with connect(address, subprotocols=protocols, max_size=None, max_queue=most_waiting, compression=None) as link:
+    with connect(address, subprotocols=protocols, max_size=None, max_queue=max_queued, compression=None) as link:
         yield Client(link)
 
 
@@ -178,7 +178,7 @@ def test_a_client_that_does_not_read_loses_messages_and_blocks_nobody(bridge: Fo
     truth = bus.publisher(TRUTH)
     payload = wire.Truth(residual_nm=[1.0] * 4000).SerializeToString()
     count = 3000  # 48 MB: more than the sockets hold
-    with connected(bridge.port, most_waiting=1) as frozen, connected(bridge.port) as reading:
+    with connected(bridge.port, max_queued=1) as frozen, connected(bridge.port) as reading:
         frozen.subscribe("/" + TRUTH.key)
         reading.subscribe("/" + STEP.key)
         until(lambda: len(bridge.subscriptions) == 2)

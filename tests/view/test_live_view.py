@@ -61,7 +61,7 @@ class FakeViewer:
 
 
 class ViewBench(Listener):
-    """A live view on an in-memory bus, in a thread, of a run that started before it; the first `stuck` viewers hang."""
+    """A live view, in a thread, of a run that started before it on an in-memory bus; the first `stuck` viewers hang."""
 
     memory_mb = 100.0
 

@@ -1,4 +1,4 @@
-"""Drawing of a log: the verdict on all of it, the trend, and the events from before the start of a view."""
+"""Drawing of a log: the verdict on the whole log, the trend, and the events from before the start of a view."""
 
 import platform
 import re
@@ -138,18 +138,18 @@ def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) ->
 
 
 @pytest.mark.parametrize(
-    ("gain", "of_view", "of_report"),
+    ("gain", "in_view", "in_report"),
     [(0.5, Level.GOOD, "good"), (0.02, Level.NEUTRAL, "unknown"), (1.95, Level.WARNING, "look")],
 )
 def test_view_and_report_judge_the_residual_of_a_log_alike(
-    tmp_path: Path, shown: Shown, gain: float, of_view: Level, of_report: str
+    tmp_path: Path, shown: Shown, gain: float, in_view: Level, in_report: str
 ) -> None:
     log = SyntheticLog(gain=(gain, gain)).frames(500).write(tmp_path / "night.mcap")
     drawn(log)
     check = next(one for one in report_of(read_run(log)).results["verdict"]["checks"] if one["name"] == "residual")
-    assert (shown[-1].level, tile(shown[-1], "WAVEFRONT").level, check["level"]) == (of_view, of_view, of_report)
+    assert (shown[-1].level, tile(shown[-1], "WAVEFRONT").level, check["level"]) == (in_view, in_view, in_report)
     harm = r"residual while closed \S+ nm rms, worse than \S+ nm with a flat mirror"
-    assert bool(re.search(harm, shown[-1].headline)) is (of_view is Level.WARNING)
+    assert bool(re.search(harm, shown[-1].headline)) is (in_view is Level.WARNING)
 
 
 def test_the_verdict_on_a_log_says_that_its_residual_includes_a_shape(tmp_path: Path, shown: Shown) -> None:
@@ -216,9 +216,9 @@ def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: S
 def test_the_residual_in_closed_loop_includes_wavefronts_that_were_recorded_apart_from_their_steps(late: Topic) -> None:
     night = SyntheticLog().frames(200).request("open").frames(100)
     verdict, accumulator = LogVerdict(), Accumulator()
-    for part in (False, True):
+    for is_late in (False, True):
         for one in night.samples:
-            if late.matches(one.key) is part:
+            if late.matches(one.key) is is_late:
                 accumulator.add(one)
         verdict.feed(accumulator.snapshot(night.samples[-1].publish_time_ns))
     closed = {one.frame_sequence for one in night.messages(STEP) if one.mode == wire.LOOP_MODE_CLOSED}

@@ -20,7 +20,7 @@ from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
 from lowfc.programs.view.verdicts.wavefront_verdict import merit, reduction_of
 from tests.support.report_log import SyntheticLog
-from tests.support.stage import MAS, Stage, Tape, tile
+from tests.support.stage import NM_PER_MAS, Stage, Tape, tile
 from tests.support.toy import START
 from tests.support.viewers import Pixels, pixels
 
@@ -40,7 +40,7 @@ def begun(seconds: float = 0.0, **values: object) -> Stage:
     return stage
 
 
-def staged(change: Callable[[Stage], object], after_s: float = 4.0) -> Verdict:
+def verdict_after(change: Callable[[Stage], object], after_s: float = 4.0) -> Verdict:
     """Verdict on a run that is healthy for a second, then changed for `after_s`."""
     stage = begun(1)
     change(stage)
@@ -177,7 +177,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
 
 @pytest.fixture(scope="module")
 def verdicts() -> dict[str, Verdict]:
-    return {name: staged(change, 4 if "dead" in name else 2) for name, (change, *_) in STATES.items()}
+    return {name: verdict_after(change, 4 if "dead" in name else 2) for name, (change, *_) in STATES.items()}
 
 
 @pytest.mark.parametrize("name", STATES)
@@ -206,7 +206,7 @@ def test_no_two_states_have_the_same_headline(verdicts: dict[str, Verdict]) -> N
     ],
 )
 def test_the_advice_at_a_limit_is_that_for_this_limit(limit: Limit, remedy: str) -> None:
-    headline = staged(setting(reasons=(limit,)), 2).headline
+    headline = verdict_after(setting(reasons=(limit,)), 2).headline
     assert remedy in headline
     assert limit is Limit.MODAL_LIMIT or "raise" not in headline  # the others protect the mirror
 
@@ -232,8 +232,8 @@ def test_a_harmful_linear_law_has_no_gain_to_lower() -> None:
 
 def test_a_contrast_from_the_sensor_is_called_estimated() -> None:
     figures = {"recent_wavefront": wire.WavefrontFigures(costliest_modes="tip and tilt", added_contrast_flat=1e-8)}
-    assert "estimated" not in tile(staged(health("camera", **figures), 2), "CONTRAST").detail
-    assert "estimated from the sensor" in tile(staged(health("controller", **figures), 2), "CONTRAST").detail
+    assert "estimated" not in tile(verdict_after(health("camera", **figures), 2), "CONTRAST").detail
+    assert "estimated from the sensor" in tile(verdict_after(health("controller", **figures), 2), "CONTRAST").detail
 
 
 def test_a_closed_loop_without_usable_frames_is_shown_as_holding(verdicts: dict[str, Verdict]) -> None:
@@ -263,7 +263,7 @@ def test_the_wavefront_is_called_not_corrected_only_if_no_loop_corrects_it(
 
 @pytest.mark.parametrize("after_s", [0.5, 20.0])
 def test_values_of_an_ended_run_are_labelled_last_and_are_neutral(after_s: float) -> None:
-    verdict = staged(stop(*ALL_PROCESSES), after_s=after_s)
+    verdict = verdict_after(stop(*ALL_PROCESSES), after_s=after_s)
     last = [tile(verdict, title).value for title in ("WAVEFRONT", "STAR", "LATENCY")]
     assert last == ["last: 5.0 nm", "last: 100 %", "last: 500 us"]
     assert set(levels(verdict).values()) == {Level.NEUTRAL}
@@ -311,7 +311,7 @@ def test_a_dead_mirror_is_shown_even_if_another_runs_or_was_stopped() -> None:
 
 def test_without_truth_the_wavefront_tile_is_labelled_measured() -> None:
     found = tile(begun(truth=False).run(3), "WAVEFRONT")
-    tilt = f"tilt {5 / np.sqrt(2) / MAS:.1f} of {40 / np.sqrt(2) / MAS:.1f} mas per axis"
+    tilt = f"tilt {5 / np.sqrt(2) / NM_PER_MAS:.1f} of {40 / np.sqrt(2) / NM_PER_MAS:.1f} mas per axis"
     assert found.value == "5.0 nm rms"
     assert found.detail == f"8.0 x better than 40.0 nm with a flat mirror; {tilt}; measured, with noise"
 
@@ -419,7 +419,7 @@ def test_an_idle_loop_names_the_cause(verdicts: dict[str, Verdict]) -> None:
     "why", ["the camera's frames fit the calibration", "an interlock acts: camera_temp is 41", "camera exchange"]
 )
 def test_a_loop_that_opened_for_another_reason_is_not_blamed_on_the_camera(why: str) -> None:
-    verdict = staged(to_mode(LoopMode.OPEN, why), 2)
+    verdict = verdict_after(to_mode(LoopMode.OPEN, why), 2)
     assert tile(verdict, "LOOP").detail.startswith(why)
     assert (tile(verdict, "LOOP").level, verdict.level) == (Level.NEUTRAL, Level.NEUTRAL)
 
@@ -511,8 +511,8 @@ def test_levels_differ_in_lightness() -> None:
 
 
 def test_a_picture_is_drawn_each_second_and_when_the_verdict_changes() -> None:
-    tape, panel, stage = Tape(), Tiles(MAS), Stage()
-    stage.each = lambda snapshot: panel.draw(tape, snapshot)
+    tape, panel, stage = Tape(), Tiles(NM_PER_MAS), Stage()
+    stage.on_snapshot = lambda snapshot: panel.draw(tape, snapshot)
     stage.begin()
     stage.run(3)
     assert 1 <= len(tape.logged[TILES]) <= 4 * 3

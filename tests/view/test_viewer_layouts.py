@@ -172,6 +172,6 @@ def test_the_documented_rrd_route_writes_the_name_of_a_log_into_its_layout(tmp_p
     import rerun_cli
 
     routed = tmp_path / "log.rbl"
-    words = ("rrd", "route", "--application-id", "night", LAYOUTS / "log.rbl", "-o", routed)
-    subprocess.run([Path(rerun_cli.__file__).parent / "rerun", *words], capture_output=True, check=True)
+    arguments = ("rrd", "route", "--application-id", "night", LAYOUTS / "log.rbl", "-o", routed)
+    subprocess.run([Path(rerun_cli.__file__).parent / "rerun", *arguments], capture_output=True, check=True)
     assert rerun_layout(routed) == ("night", *rerun_layout(LAYOUTS / "log.rbl")[1:])

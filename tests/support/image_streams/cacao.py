@@ -86,12 +86,12 @@ def main() -> None:
     driver.join(service)
     states = MemoryBus(hub, f"mirror-{config.mirror.name}", clock).publisher(MIRROR_STATE, config.mirror.name)
 
-    def moved(surface_nm: np.ndarray) -> None:
+    def publish_shape(surface_nm: np.ndarray) -> None:
         state = wire.MirrorState(timestamp=timestamp(clock.now_ns()), rows=surface_nm.shape[0])
         state.columns, state.actuators = surface_nm.shape[1], surface_nm.astype("<f4").tobytes()
         states.put(state.SerializeToString())
 
-    comb = Comb(folder, config.mirror.rows, config.mirror.columns, moved)
+    comb = Comb(folder, config.mirror.rows, config.mirror.columns, publish_shape)
     settings, rows = driver.settings(), driver.settings().rows
     stream = PlainStream.make(file_of(folder, CAMERA), settings.columns, rows, UINT16)
     driver.start()
@@ -108,14 +108,14 @@ def main() -> None:
         count += 1
         if not select.select([sys.stdin], [], [], 0)[0]:
             continue
-        word = sys.stdin.readline().strip()
-        if word == "die":
+        command = sys.stdin.readline().strip()
+        if command == "die":
             stream.begin(exposure.pixels[:rows] // 2)
             os._exit(9)
-        if word in ("renew", "region"):
-            rows = settings.rows - (REGION if word == "region" else 0)
+        if command in ("renew", "region"):
+            rows = settings.rows - (REGION if command == "region" else 0)
             stream = PlainStream.make(file_of(folder, CAMERA), settings.columns, rows, UINT16)
-        if word in ("stop", ""):
+        if command in ("stop", ""):
             break
     comb.running = False
     driver.finish()

@@ -55,8 +55,8 @@ class PlainStream:
         kind: int = 2,
         axes: int = 2,
     ) -> Self:
-        """Create a stream as the C library does: unlink a former one; size, header, semaphores, version last."""
-        words = keywords or {}
+        """Create a stream as the C library does: unlink an existing file; write header, semaphores, last version."""
+        keyword_values = keywords or {}
         itemsize = np.dtype(NUMPY_TYPES.get(number, "f8")).itemsize
         elements = columns * rows * planes
         length = (elements * itemsize + 7) // 8 * 8
@@ -65,22 +65,22 @@ class PlainStream:
         path.unlink(missing_ok=True)
         with path.open("wb") as file:
             os.fchmod(file.fileno(), 0o666)
-            tail = KEYWORD * len(words) + 11 * SEMAPHORE + 4 * 40 + 10 * TRACE + ring_times
+            tail = KEYWORD * len(keyword_values) + 11 * SEMAPHORE + 4 * 40 + 10 * TRACE + ring_times
             file.truncate(header_bytes + length + tail)
-        stream = cls(path, columns, rows, number if number in NUMPY_TYPES else 10, planes, len(words))
+        stream = cls(path, columns, rows, number if number in NUMPY_TYPES else 10, planes, len(keyword_values))
         stream.pack("80s", 32, path.name.removesuffix(".im.shm").encode())
         stream.pack("<B3xIII", 112, axes, columns, rows, planes if axes == 3 else 0)  # number of axes, sizes
         stream.pack("<QB7xQ", 128, elements, number, kind)
         stream.pack("<iiB", 216, os.getpid(), 0, 1)  # creator, owner, shared
         stream.pack("<Qb", 232, os.fstat(stream.file).st_ino, location)
         stream.pack("<HH", 258, 10, 10)  # numbers of semaphores and of traces
-        stream.pack("<BxH", 288, 0, len(words))  # write flag, number of keywords
+        stream.pack("<BxH", 288, 0, len(keyword_values))  # write flag, number of keywords
         stream.pack("<Q", 312, elements * itemsize)
-        for index, (name, value) in enumerate(words.items()):
-            at = stream.keywords + KEYWORD * index
-            stream.pack("16s", at, name.encode())
-            code, form = {int: ("L", "q"), float: ("D", "d"), str: ("S", "16s")}[type(value)]
-            stream.pack(f"s7x{form}", at + 16, code.encode(), value.encode() if isinstance(value, str) else value)
+        for index, (name, value) in enumerate(keyword_values.items()):
+            offset = stream.keywords + KEYWORD * index
+            stream.pack("16s", offset, name.encode())
+            code, layout = {int: ("L", "q"), float: ("D", "d"), str: ("S", "16s")}[type(value)]
+            stream.pack(f"s7x{layout}", offset + 16, code.encode(), value.encode() if isinstance(value, str) else value)
         for index in range(10):
             LIBC.sem_init(stream.semaphore(index), 1, 0)
             stream.pack("<i", stream.readers + 4 * index, -1)
@@ -88,11 +88,11 @@ class PlainStream:
         stream.pack("32s", 0, version)
         return stream
 
-    def pack(self, form: str, offset: int, *values: object) -> None:
-        struct.pack_into(form, self.map, offset, *values)
+    def pack(self, layout: str, offset: int, *values: object) -> None:
+        struct.pack_into(layout, self.map, offset, *values)
 
-    def get(self, form: str, offset: int) -> int:
-        return struct.unpack_from(form, self.map, offset)[0]
+    def get(self, layout: str, offset: int) -> int:
+        return struct.unpack_from(layout, self.map, offset)[0]
 
     def semaphore(self, index: int) -> ctypes.c_void_p:
         return ctypes.c_void_p(self.address + self.semaphores + SEMAPHORE * index)
@@ -118,8 +118,8 @@ class PlainStream:
         """Begin to write an image: set the flag, write the pixels."""
         self.pack("B", 288, 1)  # write flag
         raw = np.ascontiguousarray(image, self.type).tobytes()
-        at = self.data + plane * len(raw)
-        self.map[at : at + len(raw)] = raw
+        offset = self.data + plane * len(raw)
+        self.map[offset : offset + len(raw)] = raw
         self.pack("<Q", 272, plane)  # cnt1
 
     def end(self, acquired_ns: int | None = None) -> None:
