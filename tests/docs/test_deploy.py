@@ -53,8 +53,8 @@ def settings(name: str) -> dict[str, list[str]]:
 
 def processors(name: str) -> set[int]:
     """Processors of a unit on a host with sixteen."""
-    (words,) = settings(name)["CPUAffinity"]
-    ends = [[int(end) for end in word.split("-")] for word in words.split()]
+    (affinity,) = settings(name)["CPUAffinity"]
+    ends = [[int(end) for end in span.split("-")] for span in affinity.split()]
     return {cpu for first, *last in ends for cpu in range(first, max([first, *last]) + 1) if cpu < 16}
 
 
@@ -65,16 +65,16 @@ def command(name: str) -> list[str]:
     return line.removeprefix(INSTALLED).replace("$CALIBRATION", "").split()
 
 
-def program(words: list[str]) -> str:
+def program(arguments: list[str]) -> str:
     """Name of the program in a command line; typer ends the test on an unknown option."""
     import sim_camera.__main__ as camera
     import sim_dm.__main__ as mirror
     from lowfc.programs.cli import main
 
     apps = {"lowfc": main.app, "sim-camera": camera.app, "sim-dm": mirror.app}
-    with typer.main.get_command(apps[words[0]]).make_context(words[0], words[1:]) as context:
-        if words[0] != "lowfc":
-            return words[0]
+    with typer.main.get_command(apps[arguments[0]]).make_context(arguments[0], arguments[1:]) as context:
+        if arguments[0] != "lowfc":
+            return arguments[0]
         name, part, rest = context.command.resolve_command(context, [*context._protected_args, *context.args])
         part.make_context(name, rest, parent=context).close()
         return str(name)
@@ -90,8 +90,8 @@ def units(tmp_path: Path) -> Path:
     return folder
 
 
-def analyze(folder: Path, *words: str) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(["systemd-analyze", *words], cwd=folder, capture_output=True, text=True, check=False)
+def analyze(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(["systemd-analyze", *arguments], cwd=folder, capture_output=True, text=True, check=False)
 
 
 def exposure_score(folder: Path, name: str) -> float:
@@ -122,10 +122,10 @@ def test_the_units_are_hardened(units: Path, tmp_path: Path) -> None:
 @needs_systemd
 def test_user_and_folders_are_created(tmp_path: Path) -> None:
     (tmp_path / "etc").mkdir()
-    for words in (["systemd-sysusers"], ["systemd-tmpfiles", "--create"]):
-        kind = words[0].removeprefix("systemd-")
+    for tool in (["systemd-sysusers"], ["systemd-tmpfiles", "--create"]):
+        kind = tool[0].removeprefix("systemd-")
         done = subprocess.run(
-            [*words, f"--root={tmp_path}", DEPLOY / f"{kind}.d" / "lowfc.conf"],
+            [*tool, f"--root={tmp_path}", DEPLOY / f"{kind}.d" / "lowfc.conf"],
             capture_output=True,
             text=True,
             check=False,
@@ -243,8 +243,8 @@ def test_the_containers_run_the_commands_of_the_units() -> None:
 class Manager:
     """Stand-in for systemd: receives a process's notifications; the short queue of its socket may drop some."""
 
-    def __init__(self, path: Path, wait_s: float) -> None:
-        self.environment = {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": str(round(wait_s * 1e6))}
+    def __init__(self, path: Path, watchdog_s: float) -> None:
+        self.environment = {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": str(round(watchdog_s * 1e6))}
         self.begun_s = time.monotonic()
         self._received: list[str] = []
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -268,7 +268,7 @@ class Manager:
         )
 
 
-WAIT_S = 0.2
+WATCHDOG_S = 0.2
 HANGING = """
 import os, sys, time
 import lowfc.programs.core.controller as process
@@ -290,16 +290,16 @@ class Supervised:
     def __init__(self, name: str, folder: Path) -> None:
         unit = f"lowfc-{name}.service"
         self.name = name
-        self.manager = Manager(folder / f"{name}.notify", WAIT_S)
-        program, *words = [str(DEPLOY / "lowfc.toml") if word == CONFIGURED else word for word in command(unit)]
-        words += ["--run", "supervised"]
+        self.manager = Manager(folder / f"{name}.notify", WATCHDOG_S)
+        program, *arguments = [str(DEPLOY / "lowfc.toml") if word == CONFIGURED else word for word in command(unit)]
+        arguments += ["--run", "supervised"]
         start = [str(Path(sys.executable).parent / program)]
         if name == "controller":
             start = [sys.executable, "-c", HANGING.replace("HANGS", repr(str(folder / "hang")))]
         self.stderr_file = folder / f"{name}.stderr"
         with self.stderr_file.open("wb") as stderr:
             environment = os.environ | self.manager.environment | {"PYTHONFAULTHANDLER": "1"}
-            self.process = subprocess.Popen([*start, *words], cwd=folder, stderr=stderr, env=environment)
+            self.process = subprocess.Popen([*start, *arguments], cwd=folder, stderr=stderr, env=environment)
 
     def close(self) -> None:
         self.process.kill()
@@ -315,7 +315,7 @@ def test_processes_notify_ready_watchdog_and_stopping(tmp_path: Path) -> None:
         for one in processes.values():
             until(lambda one=one: "READY=1" in one.manager.notifications and one.manager.beats > 5)
             # One per half of the timeout, as systemd advises; two more are tolerated.
-            most_beats = (time.monotonic() - one.manager.begun_s) / (WAIT_S / 2) + 2
+            most_beats = (time.monotonic() - one.manager.begun_s) / (WATCHDOG_S / 2) + 2
             assert one.manager.beats <= most_beats, f"{one.name} sends WATCHDOG=1 too often"
         controller, mirror = processes["controller"], processes["sim-mirror"]
         until(lambda: re.fullmatch(r"running, open, \d+ Hz", controller.manager.status()))

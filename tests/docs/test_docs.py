@@ -1,4 +1,4 @@
-"""Every documented command is run here, or named as tested elsewhere; every link leads to a file."""
+"""Every documented command is run here or in a test that is named here; every link leads to a file."""
 
 import json
 import re

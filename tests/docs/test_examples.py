@@ -18,8 +18,8 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
 
     def in_this_process(name: str, log: str = "") -> list[str]:
         script = ROOT / "examples" / f"{name}.py"
-        (words,) = re.findall(rf"^Example: python examples/{name}.py (.*)$", script.read_text(), re.MULTILINE)
-        monkeypatch.setattr(sys, "argv", [str(script), *(log or words).split()])
+        (arguments,) = re.findall(rf"^Example: python examples/{name}.py (.*)$", script.read_text(), re.MULTILINE)
+        monkeypatch.setattr(sys, "argv", [str(script), *(log or arguments).split()])
         runpy.run_path(str(script), run_name="__main__")
         return capsys.readouterr().out.splitlines()
 

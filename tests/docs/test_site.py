@@ -24,14 +24,14 @@ _ROWS = re.compile(r"((?:^\|.*\n){4})(?:^\|.*\n)+", re.MULTILINE)
 
 
 def first_rows(_app: object, name: str, source: list[str]) -> None:
-    """Keep the first rows of the tables of measured values: they are most rows, and hold no links."""
+    """Drop all but the first rows of tables of measured values: these have most rows of the site, and no links."""
     if name.startswith("measured/"):
         source[0] = _ROWS.sub(r"\1", source[0])
 
 
 @pytest.fixture
 def without_collector() -> Iterator[None]:
-    """Do not search for garbage in the trees of the pages again and again."""
+    """No garbage collection: it would search the trees of the pages repeatedly."""
     gc.disable()
     yield
     gc.enable()
@@ -73,9 +73,9 @@ def test_the_site_has_every_page_and_every_declared_name(
         "reference/requests": [request.key for request in DECLARED],
         "howto/troubleshooting": [*EVENTS, *REASONS],
     }
-    for page, words in declared.items():
+    for page, names in declared.items():
         text = unescape((site / f"{page}.html").read_text())
-        assert [word for word in words if word not in text] == []
+        assert [name for name in names if name not in text] == []
 
 
 def test_typed_json_objects_name_the_commands_that_print_them() -> None:

@@ -30,7 +30,7 @@ NOT_FOLLOWED = re.compile(
 _IN_THIS_PROCESS = re.compile(r"lowfc (?!sim-loop)")
 
 
-def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str]:
+def page_outputs(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str]:
     """Output of each command of a page except those of `NOT_FOLLOWED`, in order; only loops are separate processes."""
     text = (PAGES / f"{page}.md").read_text()
     for name, content in re.findall(r"Save this as `(\S+)`.*?```\w+\n(.*?)```", text, re.DOTALL):
@@ -55,7 +55,7 @@ def test_the_first_loop_tutorial_runs_as_written(tmp_path: Path, shorter: bool, 
         request.getfixturevalue("without_drawings")
     page = (PAGES / "first_loop.md").read_text()
     assert page.index("install -e '.[plots]'") < page.index("lowfc report last"), "the extra comes before its use"
-    first, info, report, replay, what_if, digest = followed(tmp_path, "first_loop", shorter=shorter).values()
+    first, info, report, replay, what_if, digest = page_outputs(tmp_path, "first_loop", shorter=shorter).values()
     assert "frame to command" in first
     assert "lowfc/camera/frame" in info
     assert ".html" in report
@@ -66,7 +66,7 @@ def test_the_first_loop_tutorial_runs_as_written(tmp_path: Path, shorter: bool, 
 
 @pytest.mark.slow
 def test_the_tuned_law_tutorial_gives_the_pages_numbers(tmp_path: Path) -> None:
-    computed, integrator, tuned, law = followed(tmp_path, "tuned_law").values()
+    computed, integrator, tuned, law = page_outputs(tmp_path, "tuned_law").values()
     assert "computed.fits" in computed
     assert "written: lqg.fits" in tuned
     assert (tilt_mas(integrator), tilt_mas(law)) == pytest.approx((3.1, 1.2), rel=0.15), "the page's numbers"
@@ -74,7 +74,7 @@ def test_the_tuned_law_tutorial_gives_the_pages_numbers(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_design_mask_tutorial_runs_as_written(tmp_path: Path) -> None:
-    design, *loops = followed(tmp_path, "design_mask").values()
+    design, *loops = page_outputs(tmp_path, "design_mask").values()
     assert "written to mask.json" in design
     assert len(loops) == 3
     assert all("frame to command" in one for one in loops)
@@ -83,7 +83,7 @@ def test_the_design_mask_tutorial_runs_as_written(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("without_drawings")  # `test_golden` tests the drawings of this log
 def test_the_bad_night_tutorial_runs_as_written(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "tests" / "golden", tmp_path / "tests" / "golden")
-    info, report, replay, killed, recovered, recovered_info = followed(tmp_path, "bad_night").values()
+    info, report, replay, killed, recovered, recovered_info = page_outputs(tmp_path, "bad_night").values()
     assert "FRAMES_REFUSED 6, NO_FRAMES 3" in info
     assert report.startswith("Not a good run: ")
     assert (tmp_path / "night.html").is_file()

@@ -32,7 +32,7 @@ disable_cpu_idle = false
 @pytest.mark.slow
 def test_an_interrupted_calibration_of_a_running_loop_is_resumed(tmp_path: Path) -> None:
     (tmp_path / "test.toml").write_text(CONFIG)
-    options = ("--config", "test.toml", "--no-record", "--open", "--lockstep")  # a busy host delays nothing
+    options = ("--config", "test.toml", "--no-record", "--open", "--lockstep")  # independent of the host's load
     loop = start(tmp_path, "sim-loop", *options)
     try:
         until(running)
@@ -55,14 +55,14 @@ def test_an_interrupted_calibration_of_a_running_loop_is_resumed(tmp_path: Path)
         calibration = calibration_file.load(tmp_path / "night.fits")
         with Client() as client:
             assert flat(client)
-            talk = cross_talk(calibration.reconstructor, client.calibration().response)
-            assert np.abs(talk).max() == np.float64(results["cross_talk"])
+            matrix = cross_talk(calibration.reconstructor, client.calibration().response)
+            assert np.abs(matrix).max() == np.float64(results["cross_talk"])
             client.load(calibration)
             assert client.calibration().id == calibration.id
             client.close_loop()
             time.sleep(0.5)
             state = client.status().state
-            assert np.abs(np.array(state.command_history_nm)).max() < 5, "without a disturbance there is little to do"
+            assert np.abs(np.array(state.command_history_nm)).max() < 5, "without a disturbance the command stays small"
     finally:
         interrupt(loop)
 
@@ -92,11 +92,11 @@ lowest_hz = 1.5
 @pytest.mark.slow
 def test_rejection_of_a_running_loop_and_of_its_log(tmp_path: Path) -> None:
     (tmp_path / "loop.toml").write_text(REJECTION_CONFIG)
-    words = ("--duration", "4", "--lines", "8", "--json", "--plot", "live.png")
-    loop = start(tmp_path, "sim-loop", "--config", "loop.toml", "--lockstep")  # a busy host delays nothing
+    options = ("--duration", "4", "--lines", "8", "--json", "--plot", "live.png")
+    loop = start(tmp_path, "sim-loop", "--config", "loop.toml", "--lockstep")  # independent of the host's load
     try:
         until(lambda: recorded_bytes(tmp_path) > 4_000_000)
-        done = run(tmp_path, "acceptance", "rejection", *words)
+        done = run(tmp_path, "acceptance", "rejection", *options)
     finally:
         _, stderr = interrupt(loop)
     assert done.returncode == 0, done.stdout + done.stderr + stderr

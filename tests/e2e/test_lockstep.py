@@ -41,8 +41,8 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
     for name in ("first", "second"):
         folder = tmp_path / name
         folder.mkdir()
-        length = ("--rate", str(rate_hz), "--duration", "2.4", "--seed", "7")
-        results = loop(folder, "--lockstep", *length, "--disturbance", "bench")
+        options = ("--rate", str(rate_hz), "--duration", "2.4", "--seed", "7")
+        results = loop(folder, "--lockstep", *options, "--disturbance", "bench")
         assert results["frames_published"] == results["commands_applied"] == frames
         assert results["messages_lost"] == 0
         logs.append(payloads(results["log"]))
@@ -65,7 +65,7 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
 
 @pytest.mark.parametrize("frames", [1_200, pytest.param(20_000, marks=pytest.mark.slow)])
 def test_the_residual_is_the_predicted_one(tmp_path: Path, frames: int) -> None:
-    """|S|^2 P_d + |T|^2 P_n for 5 mas rms of tilt per axis and half the limiting gain: within 10 %.
+    """The prediction |S|^2 P_d + |T|^2 P_n holds within 10 % for 5 mas rms of tilt per axis and half the limiting gain.
 
     Beyond 10 mas the sensor's optical gain drops (0.92 at 14 mas), so this holds for small tilts only.
     """

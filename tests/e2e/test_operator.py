@@ -49,8 +49,10 @@ class Night:
     logs: list[Path] = field(default_factory=list)
 
     def ctl(self, command: str) -> str:
-        words = [str(self.folder / word) if (self.folder / word).is_file() else word for word in shlex.split(command)]
-        done = lowfc(*words[1:], "--run", self.name)
+        _, *arguments = [
+            str(self.folder / one) if (self.folder / one).is_file() else one for one in shlex.split(command)
+        ]
+        done = lowfc(*arguments, "--run", self.name)
         assert done.exit_code == 0, (done.output, done.exception)
         self.outputs[command] = done.stdout
         return done.stdout
@@ -68,8 +70,8 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
     folder = tmp_path_factory.mktemp("night")
     before = set(running())
     (folder / "test.toml").write_text(FIXED)
-    words = ("--config", "test.toml", "--rate", "100", "--json", "--disturbance", "bench", "--seed", "4")
-    with started(folder, "sim-loop", *words) as process:
+    options = ("--config", "test.toml", "--rate", "100", "--json", "--disturbance", "bench", "--seed", "4")
+    with started(folder, "sim-loop", *options) as process:
         night = Night(folder, process)
         until(lambda: "controller" in children(process.pid) and set(running()) - before)
         (night.name,) = set(running()) - before
@@ -101,10 +103,10 @@ def _prepare(night: Night) -> None:
 def _run_program(night: Night, program: str) -> str:
     """Run a program of the document in this process, for this run and with this Python's `lowfc`; return its output."""
     printed = io.StringIO()
-    words = program.replace('"bench"', repr(night.name)).replace("Client()", f"Client({night.name!r})")
-    words = words.replace('"lowfc", "config"', f"{sys.executable!r}, '-m', 'lowfc', 'config'")
+    source = program.replace('"bench"', repr(night.name)).replace("Client()", f"Client({night.name!r})")
+    source = source.replace('"lowfc", "config"', f"{sys.executable!r}, '-m', 'lowfc', 'config'")
     with contextlib.redirect_stdout(printed):
-        exec(compile(words, DOCUMENT.name, "exec"), {"__name__": "example"})  # noqa: S102  # our own document's
+        exec(compile(source, DOCUMENT.name, "exec"), {"__name__": "example"})  # noqa: S102  # our own document's
     return printed.getvalue()
 
 
@@ -237,7 +239,7 @@ def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
     assert refused == {"gain", "offset", "channel", "load", "note", "renew", "dance"}
     commanded = Counter(command.split()[2] for command in COMMANDS)
     for name, count in commanded.items():
-        assert name in ("record", "bench") or sum(counts[name, good] for good in (True, False)) >= count
+        assert name in ("record", "bench") or sum(counts[name, accepted] for accepted in (True, False)) >= count
     input_numbers = [request.input_number for request in requests if request.input_number]
     assert input_numbers == sorted(input_numbers)
     events = [Log.FromString(body).message for log in messages for body in log[f"/{EVENT.key}"]]

@@ -74,7 +74,7 @@ def started(folder: Path, line: str) -> "subprocess.Popen[str]":
     )
 
 
-def listening() -> closing[ZenohBus]:
+def operator_bus() -> closing[ZenohBus]:
     return closing(ZenohBus(open_run("bench").links, Role.OPERATOR, HostClock()))
 
 
@@ -101,7 +101,7 @@ def conformance(folder: Path, *commands: str) -> None:
 
 
 def test_the_loop_closes_with_a_users_camera_and_mirror(folder: Path) -> None:
-    with in_background(folder, *DEVICES), listening() as bus:
+    with in_background(folder, *DEVICES), operator_bus() as bus:
         wait_for_devices(bus)
         conformance(folder, *CONFORMANCE)
         errors_nm: list[list[float]] = []
@@ -135,7 +135,7 @@ def test_the_simulated_devices_and_a_camera_in_plain_zenoh_pass_conformance(fold
     HostClock()  # creates this boot's clock, which the program below only reads
     command(folder, PLAIN[0].replace("bench", "plain"))
     with in_background(folder, *SIMULATED, PLAIN[1]):
-        with listening() as bus:
+        with operator_bus() as bus:
             wait_for_devices(bus)
         conformance(folder, *CONFORMANCE, CONFORMANCE[0].partition(" --config")[0].replace("bench", "plain"))
 
@@ -197,7 +197,7 @@ def test_a_loop_with_a_camera_of_another_size_is_commissioned(folder: Path, own:
         devices = [line.replace(a, b) for line, a, b in zip(devices, sim, drivers, strict=True)]
         assert not any(" sim " in line for line in devices)
     with in_background(folder, *devices, CONTROLLER):
-        with listening() as bus:
+        with operator_bus() as bus:
             wait_for_devices(bus)
         process = started(folder, f"{COMMISSION} --json")
         out, shown = process.communicate(timeout=400)

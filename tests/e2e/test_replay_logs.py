@@ -1,4 +1,4 @@
-"""Replay of what real processes recorded: operators, a restart, dropped frames, rotation."""
+"""Replay of logs of real processes: requests of an operator, a restart, dropped frames, rotation."""
 
 import signal
 import subprocess
@@ -115,10 +115,10 @@ def test_operators_a_restart_dropped_frames_and_rotation(night: Night, tmp_path:
 
 
 def test_a_minute_at_a_kilohertz_is_lossless_and_identical(tmp_path: Path) -> None:
-    words = ("--rate", "1000", "--duration", "60", "--disturbance", "reaction-wheel")
-    results = loop(tmp_path, *words, timeout_s=200)
+    options = ("--rate", "1000", "--duration", "60", "--disturbance", "reaction-wheel")
+    results = loop(tmp_path, *options, timeout_s=200)
     assert results["messages_lost"] == 0
-    again = json_of("replay", results["log"])
-    assert again["identical"]
-    assert again["frames"] == results["frames_processed"]
-    assert again["unchecked"] == 0
+    replayed = json_of("replay", results["log"])
+    assert replayed["identical"]
+    assert replayed["frames"] == results["frames_processed"]
+    assert replayed["unchecked"] == 0

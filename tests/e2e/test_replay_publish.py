@@ -41,8 +41,8 @@ pytestmark = pytest.mark.exclusive
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    words = ("--lockstep", "--rate", "100", "--duration", "1")
-    return Path(loop(tmp_path_factory.mktemp("night"), *words, config=FIXED)["log"])
+    options = ("--lockstep", "--rate", "100", "--duration", "1")
+    return Path(loop(tmp_path_factory.mktemp("night"), *options, config=FIXED)["log"])
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +72,8 @@ def tool(run: Run) -> Iterator[Tool]:
 
 
 def start(log: Path, run: Run, *options: str) -> "subprocess.Popen[str]":
-    words = [*LOWFC, "publish", str(log), "--run", run.run_id, "--json", *options]
-    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    command = [*LOWFC, "publish", str(log), "--run", run.run_id, "--json", *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def results_of(process: "subprocess.Popen[str]", status: int = 0) -> dict[str, Any]:
@@ -166,7 +166,9 @@ def test_a_live_controller_computes_the_recorded_errors(
     assert len(tool.received[COMMAND.at("dm")]) >= len(steps)
 
 
-def test_ctrl_c_prints_the_summary_and_the_mirrors_role_is_taken_until_then(log: Path, run: Run, tool: Tool) -> None:
+def test_publishing_holds_the_mirrors_role_until_ctrl_c_and_then_prints_the_summary(
+    log: Path, run: Run, tool: Tool
+) -> None:
     playing = start(log, run, "--speed", "0.05", "--topics", FRAME.key)
     until(lambda: tool.received[FRAME.key] or playing.poll() is not None)
     with pytest.raises(BusError, match="mirror-dm"):

@@ -67,29 +67,29 @@ def page(folder: Path, results: dict[str, Any]) -> Iterator[Page]:
 
 
 @pytest.fixture(scope="module")
-def seen(page: Page) -> dict[str, Any]:
+def measurements(page: Page) -> dict[str, Any]:
     return measured(page)
 
 
-def test_the_report_has_no_browser_errors_and_fetches_nothing_remote(page: Page, seen: dict[str, Any]) -> None:
-    assert seen["pictures"]
+def test_the_report_has_no_browser_errors_and_fetches_nothing_remote(page: Page, measurements: dict[str, Any]) -> None:
+    assert measurements["pictures"]
     assert page.complaints == []
     assert {address.partition(":")[0] for address in page.fetched.values()} <= {"file", "data"}
 
 
-def test_every_picture_is_drawn_within_the_page(seen: dict[str, Any]) -> None:
-    assert set(seen["pictures"]) == PICTURES
-    for name, (left, _, width, height) in seen["pictures"].items():
+def test_every_picture_is_drawn_within_the_page(measurements: dict[str, Any]) -> None:
+    assert set(measurements["pictures"]) == PICTURES
+    for name, (left, _, width, height) in measurements["pictures"].items():
         assert width > 600, name
         assert height > 100, name
         assert left >= 0, name
-    assert len(seen["images"]) >= 2  # the mirror's map and its scale
-    assert min(seen["images"]) > 0
-    assert seen["overflow"] <= 0
+    assert len(measurements["images"]) >= 2  # the mirror's map and its scale
+    assert min(measurements["images"]) > 0
+    assert measurements["overflow"] <= 0
 
 
-def test_the_text_contains_the_values_of_the_json(seen: dict[str, Any], results: dict[str, Any]) -> None:
-    text, budget = seen["text"], results["error_budget"]
+def test_the_text_contains_the_values_of_the_json(measurements: dict[str, Any], results: dict[str, Any]) -> None:
+    text, budget = measurements["text"], results["error_budget"]
     headings = ("Wavefront", "Timing", "Spectra", "Error budget", "Light", "Mirror", "Events and requests", "What ran")
     expected = [results["verdict"]["heading"], *headings, results["run"]["calibration"]["id"]]
     expected += [check["text"] for check in results["verdict"]["checks"]]
@@ -104,18 +104,18 @@ def test_the_text_contains_the_values_of_the_json(seen: dict[str, Any], results:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_pictures_are_visible_in_light_and_dark_mode(
-    page: Page, seen: dict[str, Any], artefacts: Path, scheme: str
+    page: Page, measurements: dict[str, Any], artefacts: Path, scheme: str
 ) -> None:
     page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
-    size = {"width": WIDTH, "height": seen["height"], "deviceScaleFactor": 1, "mobile": False}
+    size = {"width": WIDTH, "height": measurements["height"], "deviceScaleFactor": 1, "mobile": False}
     page.call("Emulation.setDeviceMetricsOverride", **size)
     picture = page.screenshot_when(lambda shown: (float(shown[2, 2].mean()) < 40) == (scheme == "dark"), 20)
     (artefacts / f"report-{scheme}.png").write_bytes(picture)
     shown = pixels(picture)
-    assert shown.shape == (seen["height"], WIDTH, 3)
+    assert shown.shape == (measurements["height"], WIDTH, 3)
     background = float(shown[2, 2].mean())
     assert (background < 40) == (scheme == "dark")
-    for name, (left, top, width, height) in seen["pictures"].items():
+    for name, (left, top, width, height) in measurements["pictures"].items():
         region = shown[int(top) : int(top + height), int(left) : int(left + width)]
         brightness = region.mean(axis=2, dtype=np.float32)
         # Lines and letters, brighter or darker than the background, cover a part of the picture.

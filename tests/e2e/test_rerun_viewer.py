@@ -24,7 +24,7 @@ from tests.support.report_log import SyntheticLog
 from tests.support.viewers import complaints, listening, on_screen, pixels, share_of
 
 ORANGE, BLUE = (214, 110, 20), (20, 90, 214)
-SHARE = 0.05  # least fraction of the viewer's pixels with each colour of an image of two colours
+MIN_SHARE = 0.05  # fraction of the viewer's pixels with each colour of an image of two colours
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_an_image_that_was_logged_is_on_the_screen(headless: RerunViewer, tmp_pa
     assert path.read_bytes() == picture
     shown = pixels(picture)
     assert shown.shape == (400, 640, 3)
-    assert min(share_of(shown, colour) for colour in (ORANGE, BLUE)) > SHARE
+    assert min(share_of(shown, colour) for colour in (ORANGE, BLUE)) > MIN_SHARE
     assert _mean_row(shown, ORANGE) < _mean_row(shown, BLUE), "it is upside down"
     assert [view.origin for view in headless.state().views] == ["/image"]
     assert complaints(headless) == []
@@ -108,9 +108,9 @@ def test_a_new_viewer_on_the_same_port_takes_a_new_stream(web: RerunViewer) -> N
     web.stop()
     assert not Path(f"/proc/{web.pid}").exists()
     web.stop()
-    with RerunViewer(Show.WEB, port=web.port, web_port=web.web_port) as again:
-        assert (again.url, again.web_address) == (web.url, web.web_address)
-        _two_colours(again).disconnect()
+    with RerunViewer(Show.WEB, port=web.port, web_port=web.web_port) as replacement:
+        assert (replacement.url, replacement.web_address) == (web.url, web.web_address)
+        _two_colours(replacement).disconnect()
     before.disconnect()
 
 
@@ -154,7 +154,7 @@ def test_the_content_security_policy_allows_this_host_only(web: RerunViewer) -> 
     with urlopen(web.web_address) as page:  # noqa: S310
         policy = page.headers["Content-Security-Policy"]
     addresses = set(re.findall(r"https?://\S+", policy))
-    assert addresses == {f"http://127.0.0.1:{web.port}"}, "without it, the page sends usage statistics"
+    assert addresses == {f"http://127.0.0.1:{web.port}"}, "without this policy, the page sends usage statistics"
 
 
 def _two_colours(viewer: RerunViewer) -> rr.RecordingStream:

@@ -147,10 +147,10 @@ def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_log_at_the_file_size_limit_does_not_stop_the_loop(tmp_path: Path) -> None:
-    words = [*LOWFC, "sim-loop", "--rate", "200", "--duration", "1", "--json"]
+    command = [*LOWFC, "sim-loop", "--rate", "200", "--duration", "1", "--json"]
     file_size_limit = (3_000_000, 3_000_000)
     done = subprocess.run(
-        words,
+        command,
         cwd=tmp_path,
         capture_output=True,
         text=True,

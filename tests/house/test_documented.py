@@ -20,7 +20,7 @@ UNIT = re.compile(
     r"radii|(their|any) unit|without unit|variance|sequence|"
     r"fractions?|factors?|relative|transmissions?|weights|amplitudes?|indices|contrast|0 or 1|1 where|whether)\b"
 )
-"""A word for a unit; the s of a possessive is none."""
+"""A word for a unit; the s of a possessive does not count as seconds."""
 
 Definition = ast.FunctionDef | ast.ClassDef
 

@@ -1,4 +1,4 @@
-"""Imports point downward, numerical modules are pure, and no product module and no folder is too large."""
+"""Imports point downward, numerical modules are pure, and no product module or folder is too large."""
 
 import ast
 import tomllib

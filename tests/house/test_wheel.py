@@ -1,7 +1,7 @@
-"""The wheel: it is complete, and the installed programs run the loop.
+"""The wheel is complete, and the installed programs run the loop.
 
-It is installed into its own virtual environment. Its dependencies are not installed again, since that would require the
-network: those of this environment are appended to the path.
+The wheel is installed into its own virtual environment. Its dependencies are not installed again, since that would
+require the network: those of this environment are appended to the path.
 """
 
 import json
@@ -33,10 +33,10 @@ REQUIRED = {
 }
 
 
-def succeed(*words: str | Path, folder: Path) -> str:
+def succeed(*argv: str | Path, folder: Path) -> str:
     """Run a program that must succeed, without this environment's PYTHONPATH; return its standard output."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120, check=False, env=environment)
+    done = subprocess.run(argv, cwd=folder, capture_output=True, text=True, timeout=120, check=False, env=environment)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -97,8 +97,8 @@ def test_installed_programs_run_the_loop(installed: Path, tmp_path: Path) -> Non
     assert all(Path(path).is_relative_to(installed.parent) for path in paths)
     assert succeed(installed / "lowfc", "--version", folder=tmp_path).strip() == lowfc.__version__
     assert {"lowfc", "sim-camera", "sim-dm"} <= {path.name for path in installed.iterdir()}
-    words = ("sim-loop", "--lockstep", "--duration", "0.2", "--json")
-    results = json.loads(succeed(installed / "lowfc", *words, folder=tmp_path))
+    arguments = ("sim-loop", "--lockstep", "--duration", "0.2", "--json")
+    results = json.loads(succeed(installed / "lowfc", *arguments, folder=tmp_path))
     frames = round(0.2 * Configuration().camera.rate_hz)
     assert results["frames_processed"] == results["commands_applied"] == frames > 0
     assert results["messages_lost"] == 0

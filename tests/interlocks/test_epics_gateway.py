@@ -98,7 +98,7 @@ def pvs(monkeypatch: pytest.MonkeyPatch) -> Variables:
 
 
 def received(value: Any, kind: str = "epics:nt/NTScalar:1.0", severity: int = 0, **fields: Any) -> Any:
-    """Update of a monitor."""
+    """An update as p4p passes it to a monitor."""
 
     class Raw(dict[str, Any]):
         def getID(self) -> str:

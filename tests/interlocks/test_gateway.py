@@ -217,10 +217,10 @@ def test_ioc_drives_an_interlock_and_scan_changes_a_gain(tmp_path: Path, ioc: tu
     process, search = ioc
     (port,) = free_ports(1)
     (tmp_path / "bench.toml").write_text(CONFIG.format(port=port, search=search))
-    words = ("--run", "epics", "--config", "bench.toml")
-    with started(tmp_path, "sim-loop", *words, "--duration", "600", "--no-record") as loop:
+    options = ("--run", "epics", "--config", "bench.toml")
+    with started(tmp_path, "sim-loop", *options, "--duration", "600", "--no-record") as loop:
         until(lambda: "epics" in running(), 60)
-        with started(tmp_path, "gateway", "epics", *words) as gateway:
+        with started(tmp_path, "gateway", "epics", *options) as gateway:
             run_scan(loop, gateway, process, f"127.0.0.1:{port + 1} 127.0.0.1:{search}")
 
 
@@ -256,6 +256,6 @@ def run_scan(loop: Process, gateway: Process, ioc: Process, addresses: str) -> N
         until(lambda: read("interlocks") == "no value of mask for more than 2 s (hold)")
         interrupt(loop)
         until(lambda: read("mode").severity == 3)
-    _, complaints = interrupt(gateway)
-    assert gateway.returncode == 0, complaints
-    assert "Traceback" not in complaints
+    _, stderr = interrupt(gateway)
+    assert gateway.returncode == 0, stderr
+    assert "Traceback" not in stderr

@@ -43,11 +43,11 @@ when_old = "passes"
 def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) -> None:
     """Values act within a period, a flood of values loses no frame, and an old value acts as a missing one."""
     (tmp_path / "night.toml").write_text(CONFIG)
-    words = ("--json", "--config", "night.toml", "--run", RUN, "--duration", "600")
-    with started(tmp_path, "sim-loop", *words) as process:
+    options = ("--json", "--config", "night.toml", "--run", RUN, "--duration", "600")
+    with started(tmp_path, "sim-loop", *options) as process:
         _publish()
-        out, complaints = interrupt(process)
-    assert process.returncode == 0, complaints
+        out, stderr = interrupt(process)
+    assert process.returncode == 0, stderr
     results = json.loads(out)
     assert results["frames_missing"] == results["messages_lost"] == 0
     assert results["frames_skipped"] < FLOOD_S * RATE_HZ / 5, "stalls of the host skip some, a flood would skip most"
@@ -75,7 +75,7 @@ def _publish() -> None:
                     loop.bench("mask", False)
                     loop.bench("shutter", "shut" if acts else "open")
                     if not acts:
-                        until(lambda: _closed(loop))
+                        until(lambda: _try_to_close(loop))
         begun_s = time.monotonic()
         for number in range(FLOOD_HZ * FLOOD_S):
             loop.bench("mask", False)
@@ -92,7 +92,7 @@ def _has_frames(loop: Client) -> bool:
         return False
 
 
-def _closed(loop: Client) -> bool:
+def _try_to_close(loop: Client) -> bool:
     """Try to close the loop; the request is refused until the values have been received."""
     loop.bench("mask", False)
     try:

@@ -61,9 +61,9 @@ def test_the_golden_files_of_the_present_version_can_be_made_and_replayed(tmp_pa
 
 
 def test_another_blas_kernel_differs_only_by_rounding() -> None:
-    words = [sys.executable, "-m", "lowfc", "replay", str(NIGHT), "--json", "--tolerance", "1e-3"]
+    command = [sys.executable, "-m", "lowfc", "replay", str(NIGHT), "--json", "--tolerance", "1e-3"]
     environment = os.environ | {"OPENBLAS_CORETYPE": "Prescott"}  # SSE3: every x86-64 processor has it
-    done = subprocess.run(words, capture_output=True, text=True, env=environment, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     results = json.loads(done.stdout)
     assert (done.returncode, results["different"], results["first_difference"]) == (0, 0, None)
     if "blas" in results["host_differs"]:
@@ -71,7 +71,7 @@ def test_another_blas_kernel_differs_only_by_rounding() -> None:
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         *(["info", log] for log in (NIGHT, KILLED)),
         *(["report", NIGHT, "--out", "page.html"], ["report", KILLED]),
@@ -79,9 +79,9 @@ def test_another_blas_kernel_differs_only_by_rounding() -> None:
         ["what-if", NIGHT, "--set", "gain=0.3"],
     ],
 )
-def test_a_command_reads_a_log_of_0_1(words: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_command_reads_a_log_of_0_1(arguments: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert json_of(*words)
+    assert json_of(*arguments)
 
 
 def test_a_killed_recorders_log_is_recovered_and_replays_as_before(tmp_path: Path) -> None:
@@ -99,14 +99,14 @@ def test_a_log_of_0_1_is_drawn(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("arguments", "message"),
     [
         (["tune", NIGHT, "--out", "law.fits"], "tuning requires at least"),
         (["acceptance", "linearity", NIGHT], "no `lowfc acceptance"),
     ],
 )
-def test_a_command_for_which_the_log_is_unsuitable_refuses_it(words: list[object], message: str) -> None:
-    assert message in refusal(*words)
+def test_a_command_for_which_the_log_is_unsuitable_refuses_it(arguments: list[object], message: str) -> None:
+    assert message in refusal(*arguments)
 
 
 def test_the_log_of_0_1_has_every_kind_of_input() -> None:

@@ -156,9 +156,9 @@ def ten_files_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sa
     """Folder with the same log in ten files and in one: with all samples (True) or with the first quarter of them."""
 
     @cache
-    def recorded_folder(all_of_it: bool) -> Path:
+    def recorded_folder(all_samples: bool) -> Path:
         folder = tmp_path_factory.mktemp("recorded")
-        chosen = samples if all_of_it else samples[: len(samples) // 4]
+        chosen = samples if all_samples else samples[: len(samples) // 4]
         calibration_file.save(SyntheticLog().calibration, folder / "other.fits")
         recorded(folder / "logs", samples[:9], 1)  # an older log
         recorded(folder / "logs", chosen, 10)
@@ -168,12 +168,12 @@ def ten_files_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sa
     return recorded_folder
 
 
-@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+@pytest.mark.parametrize("arguments", COMMANDS, ids=" ".join)
 def test_a_command_gives_the_same_results_for_ten_files_as_for_one(
-    ten_files_and_one: Callable[[bool], Path], monkeypatch: pytest.MonkeyPatch, words: list[str]
+    ten_files_and_one: Callable[[bool], Path], monkeypatch: pytest.MonkeyPatch, arguments: list[str]
 ) -> None:
-    monkeypatch.chdir(ten_files_and_one(words[0] == "tune"))  # tuning needs some two thousand frames
-    ten, one = (without_files(json_of(words[0], log, *words[1:])) for log in (LAST, f"one/{LAST}"))
+    monkeypatch.chdir(ten_files_and_one(arguments[0] == "tune"))  # tuning needs some two thousand frames
+    ten, one = (without_files(json_of(arguments[0], log, *arguments[1:])) for log in (LAST, f"one/{LAST}"))
     assert ten == one
 
 
@@ -191,33 +191,35 @@ def test_a_report_says_that_a_file_between_two_others_is_missing(folder: Path, s
 def test_acceptance_reads_several_files(folder: Path, samples: list[Sample]) -> None:
     """The log contains no acceptance test; the error is about the whole log and not about one of its files."""
     files = recorded(folder, samples[:1500], 3)
-    for words in ([LAST], [str(path) for path in files]):
-        assert "contains no `lowfc acceptance rejection`" in refusal("acceptance", "rejection", *words)
+    for arguments in ([LAST], [str(path) for path in files]):
+        assert "contains no `lowfc acceptance rejection`" in refusal("acceptance", "rejection", *arguments)
 
 
 ONE_BY_ONE = [["info"], ["report"], ["export", "--to", "csv", "--force"], ["recover"]]
 
 
 @pytest.mark.usefixtures("without_drawings")
-@pytest.mark.parametrize("words", ONE_BY_ONE, ids=lambda words: words[0])
-def test_several_logs_are_processed_one_by_one(folder: Path, words: list[str]) -> None:
+@pytest.mark.parametrize("arguments", ONE_BY_ONE, ids=lambda arguments: arguments[0])
+def test_several_logs_are_processed_one_by_one(folder: Path, arguments: list[str]) -> None:
     night = SyntheticLog().frames(3)
     first, second = (str(night.write(Path(f"{name}.mcap"))) for name in "ab")
-    several = lowfc(*words, first, second)
-    alone = [lowfc(*words, log).stdout for log in (first, second)]
+    several = lowfc(*arguments, first, second)
+    alone = [lowfc(*arguments, log).stdout for log in (first, second)]
     assert several.exit_code == 0, several.exception
     assert several.stdout.replace("\n", "") == "".join(alone).replace("\n", "")
-    for more in [["--json"], *([["--out", "c"]] if words != ["info"] else [])]:
+    for more in [["--json"], *([["--out", "c"]] if arguments != ["info"] else [])]:
         assert f"name one log, not 2 ({Path(first).name}, {Path(second).name})" in refusal(
-            *words, first, second, *more, kind=ConfigurationError
+            *arguments, first, second, *more, kind=ConfigurationError
         )
 
 
-@pytest.mark.parametrize("words", [*ONE_BY_ONE, ["replay"], ["what-if", "--set", "gain=1"]], ids=lambda words: words[0])
-def test_a_file_that_is_not_a_log_is_an_error(tmp_path: Path, words: list[str]) -> None:
+@pytest.mark.parametrize(
+    "arguments", [*ONE_BY_ONE, ["replay"], ["what-if", "--set", "gain=1"]], ids=lambda arguments: arguments[0]
+)
+def test_a_file_that_is_not_a_log_is_an_error(tmp_path: Path, arguments: list[str]) -> None:
     (tmp_path / "text").write_text("this is not an MCAP file, by far")
     for name, expected in (("text", "is not an MCAP file"), ("gone", "cannot be read: No such file")):
-        done = lowfc(*words, tmp_path / name)
+        done = lowfc(*arguments, tmp_path / name)
         assert isinstance(done.exception, DataFileError)
         assert expected in str(done.exception)
         assert done.stdout == ""

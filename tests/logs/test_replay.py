@@ -339,7 +339,7 @@ OTHER = identified(calibration(NOLL, 2.0))
         (None, Request(0, "gain", values=(0.2,)), Request(0, "gain", values=(9.0,))),  # refused in the log
     ],
 )
-def test_an_input_of_a_former_version_whose_rule_has_changed_is_named_unless_it_was_refused_and_replay_continues(
+def test_the_replay_continues_after_an_accepted_input_under_a_former_rule_and_names_the_rule(
     rule: str | None, logged: Request, applied: Request
 ) -> None:
     night = night_of([Request(0, "open"), *frames(30)], interlocks=())

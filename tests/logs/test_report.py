@@ -446,7 +446,7 @@ def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
     stretch = results_of(night.write(tmp_path / "x.mcap"))["closed_stretch"]
     assert stretch["from_s"] > 0.549
     assert stretch["frames"] + stretch["steps_settling"] == 300
-    assert results_of(tmp_path / "x.mcap")["residual"]["steps_open"] == 0, "the earlier calibration's do not count"
+    assert results_of(tmp_path / "x.mcap")["residual"]["steps_open"] == 0, "no open step under the last calibration"
     night.start_controller()  # with the first calibration; the first state that has a frame follows after 50 frames
     results = results_of(night.request("gain", (0.2,)).frames(300).write(tmp_path / "restarted.mcap"))
     assert results["requests"][-1]["time_s"] == pytest.approx(0.85)

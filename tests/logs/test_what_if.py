@@ -67,7 +67,7 @@ def settled_rms(values: np.ndarray) -> np.ndarray:
     return rms(values, np.arange(len(values)) >= RATE_HZ)
 
 
-def as_if(run: SimpleNamespace, config: Configuration) -> np.ndarray:
+def predicted_errors(run: SimpleNamespace, config: Configuration) -> np.ndarray:
     """Errors (frames, modes) of the run under the law of another configuration."""
     settings = factory.settings(config)
     weights = delay_weights(settings.delay_frames).astype(np.float32)
@@ -80,7 +80,7 @@ BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}
 
 
 @pytest.mark.parametrize(
-    ("frames", "pair", "delay", "within_nm", "overrides"),
+    ("frames", "pair", "delay", "tolerance_nm", "overrides"),
     [
         # Noise alone makes two such runs differ by 2.5 % rms, in one of the 14 modes by 6 %.
         (1000, (SOFT, LEAKY), 2, 0.0, {}),
@@ -98,19 +98,19 @@ BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}
     ],
 )
 def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_those_gains(
-    frames: int, pair: tuple[Gains, Gains], delay: float, within_nm: float, overrides: dict[str, Any]
+    frames: int, pair: tuple[Gains, Gains], delay: float, tolerance_nm: float, overrides: dict[str, Any]
 ) -> None:
-    """A what-if of one run with the law of the other predicts each mode within 10 %, with its own law to rounding."""
+    """The what-if of a run with another run's law predicts each mode's rms to 10 %; with its own, to rounding."""
     configs = [configured(gains, delay, **overrides) for gains in pair]
     calibration = calibrated(configs[0])  # independent of the gains
     runs = [run_loop(config, frames, calibration) for config in configs]
     for run, config in zip(runs, configs, strict=True):
         tilt_mas = settled_rms(run.disturbance_nm)[:2] / tilt_nm_per_mas(config.star.diameter_m)
         assert tilt_mas.max() < 5
-        np.testing.assert_allclose(as_if(run, config), run.error_nm, atol=2e-5, rtol=0)
+        np.testing.assert_allclose(predicted_errors(run, config), run.error_nm, atol=2e-5, rtol=0)
     for run, other, config in ((runs[0], runs[1], configs[1]), (runs[1], runs[0], configs[0])):
         expected = settled_rms(other.error_nm)
-        np.testing.assert_allclose(settled_rms(as_if(run, config)), expected, rtol=0.1, atol=within_nm)
+        np.testing.assert_allclose(settled_rms(predicted_errors(run, config)), expected, rtol=0.1, atol=tolerance_nm)
         # The two runs differ.
         assert np.abs(settled_rms(run.error_nm) / expected - 1).max() > 0.08
 
@@ -314,7 +314,7 @@ def test_frames_that_are_not_in_the_log_are_counted(
 
 
 def test_commands_are_converted_to_modes_of_another_scale(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
-    """A calibration in which every mode is twice as large measures half of everything."""
+    """A calibration in which every mode is twice as large measures half of each modal error."""
     calibration = toy.calibration()
     twice = replace(
         calibration,
