@@ -40,7 +40,7 @@ def test_rows_and_columns_may_differ():
     assert np.corrcoef(surface[8], u)[0, 1] > 0.9  # a tilt along x
 
 
-def test_the_driven_actuators_are_the_pupil_and_one_ring():
+def test_active_actuators_are_those_in_the_pupil_and_one_ring_around_it():
     active = active_actuators(MIRROR)
     assert active.sum() == 912
     np.testing.assert_array_equal(active, active.T)

@@ -35,7 +35,7 @@ def test_image_is_normalised_to_the_light_in_the_open_circle():
 
 def test_a_quadrant_starts_at_the_centre_with_rows_along_y():
     quarter = np.zeros((2, 2))
-    quarter[1, 0] = 1.0  # y far, x near
+    quarter[1, 0] = 1.0  # far from the centre in y, near in x
     expected = np.array([[0, 1, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 1, 1, 0]])
     np.testing.assert_array_equal(from_quarter(quarter, 4), expected)
     np.testing.assert_array_equal(from_quarter(quarter, 8), np.kron(expected, np.ones((2, 2))))
@@ -98,7 +98,7 @@ def apodised():
 
 
 def encircled(pupil, radius):
-    """Fraction of a pupil's light within a radius in the image plane, and the field there, from fine samples."""
+    """Fraction of a pupil's light within a radius (lambda/D) in the image plane, and the field there."""
     samples_per = 32
     x = image_axis(2 * int(np.ceil(radius * samples_per)), samples_per)
     field = to_image(pupil.astype(complex), x.size, samples_per, 1.0) * (np.hypot(x[:, None], x) <= radius)

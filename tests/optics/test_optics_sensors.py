@@ -51,7 +51,7 @@ def test_the_chain_agrees_with_hcipy(hcipy, sensor, opd_nm, wavelength_nm):
 
 
 def test_the_chain_agrees_with_prysm(prysm, sensor, opd_nm):
-    # Table 1 in prysm's units (mm and um). prysm's grids have a sample on the axis: the ramp shifts by half a sample.
+    # The paper's Table 1 in prysm's units (mm, um). prysm's grids have a sample on the axis: `ramp` shifts by half.
     u = (np.arange(512) - 256) / 512
     ramp = np.exp(-2j * np.pi * (u + u[:, None]) / 16)
     pupil_mm, focal_mm, wavelength_um = 10.0, 200.0, 0.55

@@ -94,7 +94,7 @@ def test_operator_hash_depends_on_every_input(sensor):
 
 
 def test_operator_hash_has_not_changed_since_the_first_release(sensor):
-    """It is part of the identity of computed calibrations. Arrays of ones have the same bits on all hosts."""
+    """The hash is part of the identity of computed calibrations. Arrays of ones have the same bits on all hosts."""
     ones = np.ones((512, 512))
     plain = replace(sensor, pupil=ones, focal_mask=np.ones_like(sensor.focal_mask), relay=ApertureMask(ones))
     assert operator_hash(plain, SMALL, monochromatic(550.0)) == HASH_OF_ONES

@@ -1,4 +1,4 @@
-"""The tables `tolerance` and `anchors`, which are not the paper's, and their pages."""
+"""The tables `tolerance` and `anchors`, which the paper does not have, and their pages."""
 
 import json
 from itertools import pairwise
@@ -65,7 +65,7 @@ def test_every_published_value_has_a_verdict_and_no_noise_is_below_the_quantum_l
 
 
 def agree(rows: list[Row], name: str) -> int:
-    """Assert that rows in a committed table have its values, up to rounding errors; returns how many there are."""
+    """Assert that the rows that a committed table also has agree with it to 0.1 %; returns their number."""
     references = {(row["name"], row["estimator"], row["quantity"]): row for row in committed(name)["rows"]}
     common = [row for row in map(plain, rows) if (row["name"], row["estimator"], row["quantity"]) in references]
     for row in common:
@@ -78,7 +78,7 @@ def agree(rows: list[Row], name: str) -> int:
 
 
 def test_tolerances_of_a_sensor_have_the_committed_values(monkeypatch):
-    for module, name in ((tolerance, "_checked"), (star_pair, "pair_rows")):  # have tests of their own
+    for module, name in ((tolerance, "_checked"), (star_pair, "pair_rows")):  # other tests cover these
         monkeypatch.setattr(module, name, lambda argument: [])
     rows = tolerance.tolerance(Context(sensors=(SMALLEST,)))
     assert len(rows) == len(tolerance.MAGNITUDES) * 14 * len(tolerance.ALLOWED) * 2 * len(KINDS)
@@ -138,9 +138,9 @@ class Loops:
         self.commands = []
 
     def run(self, command, cwd, **_):
-        name, *words, as_json = command[4:]
+        name, *arguments, as_json = command[4:]
         assert (command[3], as_json) == ("lowfc", "--json")
-        options = dict(pairwise(words))
+        options = dict(pairwise(arguments))
         config = load(cwd / options["--config"] if "--config" in options else None)
         assert name == "tune" or config.sensor == section_of(SMALLEST)
         self.commands.append((name, options.get("--disturbance", ""), bool(config.control.law)))
@@ -166,7 +166,7 @@ def test_loops_are_judged_by_the_published_pointing(monkeypatch):
         row = rows[f"tilt, {preset}"]
         assert (row.measured, row.paper) == (0.3, anchors.ROMAN_MAS)
         assert rows[f"verdict, tilt, {preset}"].measured == anchors.REACHED
-        assert 0 < row.limit * tilt_nm_per_mas(2.0) < 2.0, "nm of a line of 14 nm rms, which the law has in its model"
+        assert 0 < row.limit * tilt_nm_per_mas(2.0) < 2.0, "limit in nm; the law's model has the line of 14 nm rms"
     for where, verdict in (("sky", anchors.REACHED), ("laboratory", anchors.NOT_REACHED)):
         row = rows[f"std of means over 2 s, {where}"]
         # Ten means of +-0.05 mas, in 24 s without the first four.

@@ -179,7 +179,7 @@ def test_a_layout_of_a_file_is_compared_with_the_paper(tmp_path, few):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("arguments", "message"),
     [
         (("tabel3",), "did you mean 'table3'"),
         (("table2", "--sensor", "sam27d07_bal15"), "did you mean"),
@@ -194,8 +194,8 @@ def test_a_layout_of_a_file_is_compared_with_the_paper(tmp_path, few):
         (("anchors", "--sensor", "sam", "--docs", "."), "--docs writes complete pages"),
     ],
 )
-def test_user_errors_are_one_line(words, message):
-    error = refusal("validate", *words, kind=ConfigurationError)
+def test_user_errors_are_one_line(arguments, message):
+    error = refusal("validate", *arguments, kind=ConfigurationError)
     assert message in error
     assert "\n" not in error
 
@@ -352,7 +352,7 @@ def test_zernike_sensor_beats_sparse_apertures_and_sized_holes_beat_equal_ones_i
 
 
 def test_fitting_flux_and_shear_adds_noise_for_clowfs_but_not_for_sam(committed):
-    """For sam, flux and shear change the image evenly, and modes oddly: fitting flux and shear costs nothing."""
+    """For sam, the image change of flux and shear is even and that of modes odd, so that fitting both adds no noise."""
     without_nuisances, with_nuisances = (
         {name: find(committed["table3"], name, RMS, 14, kind)["measured"] for name in ("sam", "clowfs")}
         for kind in ("weighted", WITH_NUISANCES)

@@ -140,7 +140,7 @@ class ToyBench(ChaosBench):
         self.outcome.ended.append(ProcessEnd(name, -signal.SIGKILL, 0.0, True))
 
     def restart(self, name: str, command: list[str] | None = None, *, ready: bool = True) -> None:
-        """Start a controller; its calibration file is the last word of the command."""
+        """Start a controller; its calibration file is the last argument of the command."""
         try:
             loaded = calibration_file.load(Path((command or self.children[Role.CONTROLLER].command)[-1]))
         except LowfcError as fault:
@@ -171,7 +171,7 @@ class ToyBench(ChaosBench):
         self.health[Role.RECORDER] = wire.Health(recording=wire.Recording(messages=self._recorder.messages))
 
     def expose(self) -> None:
-        """Expose one frame, and let the processes do what they do until the next."""
+        """Expose one frame, and let the processes handle it and what was sent before."""
         self.clock.advance(self.config.period_ns)
         disturbance_nm = DRIFT_NM * np.sin(2 * np.pi * DRIFT_HZ * self._index / self.config.camera.rate_hz)
         surface_nm = self._mirror._status.surface_nm.reshape(-1)

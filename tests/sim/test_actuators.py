@@ -12,7 +12,7 @@ GRID = (2, 3)
 SETTLED, AT_ONCE = np.inf, 0.0  # elapsed time, ns
 
 
-def even(height_nm: float) -> np.ndarray:
+def uniform(height_nm: float) -> np.ndarray:
     """Shape with all actuators at one height."""
     return np.full(GRID, height_nm, np.float32)
 
@@ -27,13 +27,13 @@ def test_gain_errors_differ_between_actuators_and_depend_on_the_seed() -> None:
 
 def play(width_nm: float, heights_nm: list[float]) -> list[float]:
     """Play operator: a block in a slot, which moves only when an end of the slot pushes it."""
-    positions_nm, at_nm = [], 0.0
+    positions_nm, position_nm = [], 0.0
     for height_nm in heights_nm:
-        if height_nm - at_nm > width_nm:
-            at_nm = height_nm - width_nm
-        elif at_nm - height_nm > width_nm:
-            at_nm = height_nm + width_nm
-        positions_nm.append(at_nm)
+        if height_nm - position_nm > width_nm:
+            position_nm = height_nm - width_nm
+        elif position_nm - height_nm > width_nm:
+            position_nm = height_nm + width_nm
+        positions_nm.append(position_nm)
     return positions_nm
 
 
@@ -43,7 +43,7 @@ def test_hysteresis_agrees_with_play_operators_and_encloses_their_area() -> None
     cycle = swing_nm * np.sin(np.linspace(0, 2 * np.pi, 4001))
     heights = [*cycle, *cycle[1:]]
     actuators = Actuators(GRID, 0, share, 0, 1)
-    reached = [float(actuators.reach(even(height), AT_ONCE)[0, 0]) for height in heights]
+    reached = [float(actuators.reach(uniform(height), AT_ONCE)[0, 0]) for height in heights]
     plays = np.mean([play(width, heights) for width in PLAY_NM], axis=0)
     np.testing.assert_allclose(reached, (1 - share) * np.array(heights) + share * plays, atol=1e-3)
     # The second of the two cycles; the first begins inside the loop.
@@ -55,9 +55,9 @@ def test_hysteresis_agrees_with_play_operators_and_encloses_their_area() -> None
 
 def test_creep_grows_with_the_logarithm_of_time() -> None:
     actuators = Actuators(GRID, 0, 0, 0.01, 1)
-    actuators.reach(even(0), SETTLED)
+    actuators.reach(uniform(0), SETTLED)
     times_s = np.geomspace(1e-3, 1000, 600)
-    reached = [float(actuators.reach(even(100), 1e9 * step_s)[1, 2]) for step_s in np.diff(times_s, prepend=0.0)]
+    reached = [float(actuators.reach(uniform(100), 1e9 * step_s)[1, 2]) for step_s in np.diff(times_s, prepend=0.0)]
     for decade_s in (0.3, 1.0, 3.0):
         grown = np.interp([decade_s, 10 * decade_s], times_s, reached)
         assert np.diff(grown)[0] == pytest.approx(1.0, abs=0.06)

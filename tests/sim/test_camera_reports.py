@@ -140,9 +140,9 @@ def test_a_call_of_a_slow_camera_waits_half_a_second_at_most() -> None:
     assert [camera.expose() is None for _ in range(5)] == [False, True, True, True, False]
 
 
-@pytest.mark.parametrize(("lockstep", "at_once"), [(True, 1), (False, 10)])
+@pytest.mark.parametrize(("lockstep", "truths_per_block"), [(True, 1), (False, 10)])
 def test_every_frame_has_its_truth_in_order_and_at_once_in_lockstep(
-    monkeypatch: pytest.MonkeyPatch, lockstep: bool, at_once: int
+    monkeypatch: pytest.MonkeyPatch, lockstep: bool, truths_per_block: int
 ) -> None:
     """At 1 kHz the truths of ten frames are computed together; the end of the run publishes the rest."""
     config = load(None, {"camera.rate_hz": 1000.0, "lockstep": lockstep})
@@ -158,7 +158,7 @@ def test_every_frame_has_its_truth_in_order_and_at_once_in_lockstep(
     for sequence in range(1, 26):
         assert camera.expose() is not None
         camera.sent(Envelope(sequence, 0))
-        assert len(sequences) == (sequence - 1) // at_once * at_once
+        assert len(sequences) == (sequence - 1) // truths_per_block * truths_per_block
     camera.finish()
     assert sequences == list(range(1, 26))
     assert blocks.call_count == 4, "no disturbance is computed twice"

@@ -63,7 +63,7 @@ def test_number_of_shapes_is_bounded(settling: float) -> None:
     assert heights(path, 1000) == pytest.approx(1 - np.exp(-(1000 + INSTANTS) / settling), abs=1e-4)
 
 
-def test_a_shape_with_an_earlier_time_than_the_previous_one_applies_at_the_time_of_that() -> None:
+def test_a_shape_with_an_earlier_time_than_the_previous_shape_applies_at_the_previous_time() -> None:
     """As after a stall of the host, when frames restart: the weights of the shapes still sum to 1."""
     path = MirrorPath(FLAT, settling=0.001)
     for moment, shape in ((0.7, ONE), (0.2, TWO), (0.75, ONE)):

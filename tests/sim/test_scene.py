@@ -30,7 +30,7 @@ GRID, MODES = (34, 34), 14
 FLAT = np.zeros(GRID, np.float32)
 BIAS_DN, FINE_E_PER_DN = 100.0, 0.01
 FINE = {"camera__noise": False, "camera__gain_e_per_dn": FINE_E_PER_DN, "camera__full_well_e": 600.0}
-"""No noise, and little rounding."""
+"""Configuration keys for frames without noise and with little rounding."""
 
 configured = partial(configuration, {"disturbance.preset": "quiet"})
 

@@ -30,7 +30,7 @@ def command(actuators_nm: Single | None, index: int = 1, **changes: object) -> C
     return valid._replace(**changes)
 
 
-def even(height_nm: float) -> Single:
+def uniform(height_nm: float) -> Single:
     """Shape with all actuators at one height."""
     return np.full(GRID, height_nm, np.float32)
 
@@ -39,46 +39,46 @@ def follow(device: Simulated, status: Status, *heights_nm: float) -> Status:
     """Status after commands to these heights, which must be accepted."""
     for height_nm in heights_nm:
         index = status.frame_sequence + 1
-        status, refused = device.apply_command(status, command(even(height_nm), index), START_NS + index * MS)
+        status, refused = device.apply_command(status, command(uniform(height_nm), index), START_NS + index * MS)
         assert refused is None
     return status
 
 
 def test_clear_id_resets_the_newest_sequence_of_the_mirror() -> None:
     device = mirror()
-    status, _ = device.apply_command(device.initial, command(even(5.0), (1 << 63)), START_NS)
-    unchanged, refused = device.apply_command(status, command(even(9.0), 3), START_NS)
+    status, _ = device.apply_command(device.initial, command(uniform(5.0), (1 << 63)), START_NS)
+    unchanged, refused = device.apply_command(status, command(uniform(9.0), 3), START_NS)
     assert (refused, unchanged) == (Rejection.OUT_OF_ORDER, status)
-    status, refused = device.apply_command(status, command(even(9.0), 3, clear_id=77), START_NS)
+    status, refused = device.apply_command(status, command(uniform(9.0), 3, clear_id=77), START_NS)
     assert (refused, status.frame_sequence) == (None, 3)
-    _, refused = device.apply_command(status, command(even(9.0), 2, clear_id=77), START_NS)
+    _, refused = device.apply_command(status, command(uniform(9.0), 2, clear_id=77), START_NS)
     assert refused is Rejection.OUT_OF_ORDER, "a clear_id resets the sequence only once"
-    assert device.apply_command(status, command(even(9.0), 2, clear_id=78), START_NS)[1] is None
+    assert device.apply_command(status, command(uniform(9.0), 2, clear_id=78), START_NS)[1] is None
 
 
 def test_mirror_accepts_sixteen_channels() -> None:
     device = mirror()
     status = device.initial
     for number in range(16):
-        status, refused = device.apply_command(status, command(even(1.0), channel=f"c{number}"), START_NS)
+        status, refused = device.apply_command(status, command(uniform(1.0), channel=f"c{number}"), START_NS)
         assert refused is None
-    assert device.apply_command(status, command(even(1.0), channel="another"), START_NS) == (status, Limit.CHANNEL)
-    assert device.apply_command(status, command(even(1.0), channel="c3"), START_NS)[1] is None
-    assert device.apply_command(device.initial, command(even(1.0), channel="x" * 33), START_NS)[1] is Limit.CHANNEL
+    assert device.apply_command(status, command(uniform(1.0), channel="another"), START_NS) == (status, Limit.CHANNEL)
+    assert device.apply_command(status, command(uniform(1.0), channel="c3"), START_NS)[1] is None
+    assert device.apply_command(device.initial, command(uniform(1.0), channel="x" * 33), START_NS)[1] is Limit.CHANNEL
 
 
 def test_safe_mode_is_stored_by_channel() -> None:
     device = mirror()
-    status, _ = device.apply_command(device.initial, command(even(1.0), safe=True), START_NS)
-    status, _ = device.apply_command(status, command(even(1.0), channel="other"), START_NS)
+    status, _ = device.apply_command(device.initial, command(uniform(1.0), safe=True), START_NS)
+    status, _ = device.apply_command(status, command(uniform(1.0), channel="other"), START_NS)
     assert status.safe == {"lowfc"}
     assert device.tick(status, START_NS + 10 * MAX_VALID_NS).safe == {"lowfc"}
-    assert device.apply_command(status, command(even(1.0), 2), START_NS)[0].safe == frozenset()
+    assert device.apply_command(status, command(uniform(1.0), 2), START_NS)[0].safe == frozenset()
 
 
 def test_command_with_a_time_in_the_far_future_still_times_out_to_flat() -> None:
     device = mirror(settling_us=50.0)
-    ahead = command(even(100.0), time_ns=1 << 62)
+    ahead = command(uniform(100.0), time_ns=1 << 62)
     status, _ = device.apply_command(device.initial, ahead, START_NS)
     for number in range(1, 5):
         status = device.tick(status, START_NS + MAX_VALID_NS + number * 10 * MS)
@@ -133,7 +133,7 @@ def test_a_command_is_rounded_to_the_drivers_steps(bits: int) -> None:
 def test_mirror_at_the_neighbour_limit_does_not_oscillate() -> None:
     """Rounding must not exceed the limit by itself, which would make the mirror fall back towards flat."""
     device = mirror(driver_bits=8)
-    shape_nm = even(0)
+    shape_nm = uniform(0)
     shape_nm[:2] = 740
     shape_nm[2:] = -740
     status = device.initial
@@ -147,13 +147,13 @@ def test_mirror_at_the_neighbour_limit_does_not_oscillate() -> None:
 
 def test_limits_of_the_mirror_are_reported_and_its_modal_command_is_then_empty() -> None:
     device = mirror()
-    status, _ = device.apply_command(device.initial, command(even(100)), START_NS)
+    status, _ = device.apply_command(device.initial, command(uniform(100)), START_NS)
     assert status.limits_hit == ()
     assert status.command_nm.tolist() == [1, 2]
-    status, _ = device.apply_command(status, command(even(900), 2), START_NS + MS)
+    status, _ = device.apply_command(status, command(uniform(900), 2), START_NS + MS)
     assert status.limits_hit == (Limit.STROKE, Limit.SLEW)
     assert status.command_nm.size == 0
-    status, _ = device.apply_command(status, command(even(300), 3), START_NS + 2 * MS)
+    status, _ = device.apply_command(status, command(uniform(300), 3), START_NS + 2 * MS)
     assert status.limits_hit == ()
 
 
@@ -162,10 +162,10 @@ def test_limits_of_the_mirror_are_reported_and_its_modal_command_is_then_empty()
     [
         (command(None, 6), Limit.WRONG_GRID),
         (command(np.zeros((5, 4), np.float32), 6), Limit.WRONG_GRID),
-        (command(even(np.nan), 6), Limit.NOT_FINITE),
-        (command(even(-np.inf), 6), Limit.NOT_FINITE),
-        (command(even(5), 6, command_nm=np.array([np.nan], np.float32)), Limit.NOT_FINITE),
-        (command(even(5), 4), Rejection.OUT_OF_ORDER),
+        (command(uniform(np.nan), 6), Limit.NOT_FINITE),
+        (command(uniform(-np.inf), 6), Limit.NOT_FINITE),
+        (command(uniform(5), 6, command_nm=np.array([np.nan], np.float32)), Limit.NOT_FINITE),
+        (command(uniform(5), 4), Rejection.OUT_OF_ORDER),
     ],
 )
 def test_invalid_command_changes_nothing_and_does_not_restart_the_timeout(invalid: Command, reason: Reason) -> None:
@@ -179,7 +179,7 @@ def test_invalid_command_changes_nothing_and_does_not_restart_the_timeout(invali
 def test_repeated_command_renews_the_timeout() -> None:
     device = mirror()
     status = follow(device, device.initial, 10)
-    after, refused = device.apply_command(status, command(even(10), 1), START_NS + 150 * MS)
+    after, refused = device.apply_command(status, command(uniform(10), 1), START_NS + 150 * MS)
     assert refused is None
     assert after.received_ns == START_NS + 150 * MS
     assert np.array_equal(after.surface_nm, status.surface_nm)
@@ -192,7 +192,7 @@ def test_repeated_command_renews_the_timeout() -> None:
 )
 def test_command_expires_just_after_its_validity(valid_ns: int, held_ns: int) -> None:
     device = mirror()
-    status, _ = device.apply_command(device.initial, command(even(50), valid_for_ns=valid_ns), START_NS)
+    status, _ = device.apply_command(device.initial, command(uniform(50), valid_for_ns=valid_ns), START_NS)
     held = device.tick(status, START_NS + held_ns)
     assert held.following
     assert np.array_equal(held.surface_nm, status.surface_nm)
@@ -203,7 +203,7 @@ def test_command_expires_just_after_its_validity(valid_ns: int, held_ns: int) ->
 
 def test_command_expires_if_the_clock_goes_back() -> None:
     device = mirror()
-    status, _ = device.apply_command(device.initial, command(even(50)), START_NS)
+    status, _ = device.apply_command(device.initial, command(uniform(50)), START_NS)
     gone_back = device.tick(status, START_NS - 1)
     assert not gone_back.following
     assert gone_back.time_ns >= status.time_ns
@@ -221,7 +221,7 @@ def test_expired_mirror_relaxes_to_flat_within_the_slew_limit_and_follows_again(
     assert heights[0] == pytest.approx(350, abs=0.1)
     assert heights[3:] == [0, 0, 0]
     assert status.channels == {}
-    status, refused = device.apply_command(status, command(even(100), 700), now_ns)
+    status, refused = device.apply_command(status, command(uniform(100), 700), now_ns)
     assert refused is None
     assert status.following
     assert status.surface_nm.max() == pytest.approx(100, abs=STEP_NM)
@@ -245,12 +245,12 @@ def test_channels_are_summed_and_the_sum_is_limited() -> None:
     device = mirror()
     status = device.initial
     for index, (channel, height_nm) in enumerate((("lowfc", 60), ("offset", -20), ("lowfc", 80)), start=1):
-        sent = command(even(height_nm), index, channel=channel)
+        sent = command(uniform(height_nm), index, channel=channel)
         status, _ = device.apply_command(status, sent, START_NS + index * MS)
     assert status.surface_nm.max() == pytest.approx(60, abs=STEP_NM)
     assert sorted(status.channels) == ["lowfc", "offset"]
-    status, _ = device.apply_command(status, command(even(3e38), 4, channel="lowfc"), START_NS + 4 * MS)
-    status, _ = device.apply_command(status, command(even(3e38), 5, channel="offset"), START_NS + 5 * MS)
+    status, _ = device.apply_command(status, command(uniform(3e38), 4, channel="lowfc"), START_NS + 4 * MS)
+    status, _ = device.apply_command(status, command(uniform(3e38), 5, channel="offset"), START_NS + 5 * MS)
     assert status.limits_hit == (Limit.NOT_FINITE,)
     assert np.abs(status.surface_nm).max() <= LIMITS.stroke_nm
 
@@ -272,8 +272,8 @@ def test_dead_and_stuck_actuators_stay_where_they_are() -> None:
 def test_settling_is_a_first_order_response() -> None:
     """One time constant after a command the surface has moved by 1 - 1/e."""
     device = mirror(settling_us=1000.0)
-    status, _ = device.apply_command(device.initial, command(even(0), 1), START_NS)
-    status, _ = device.apply_command(status, command(even(100), 2), START_NS)
+    status, _ = device.apply_command(device.initial, command(uniform(0), 1), START_NS)
+    status, _ = device.apply_command(status, command(uniform(100), 2), START_NS)
     assert status.surface_nm.max() == pytest.approx(100 * (1 - np.exp(-1)), abs=STEP_NM)
     status = device.tick(status, status.time_ns + 2 * MS)
     assert status.surface_nm.max() == pytest.approx(100 * (1 - np.exp(-3)), abs=STEP_NM)
@@ -284,8 +284,8 @@ def test_settling_is_a_first_order_response() -> None:
 def test_command_with_an_older_time_does_not_move_the_surface_back() -> None:
     device = mirror(settling_us=1000.0)
     status = follow(device, device.initial, 0, 100)
-    again, _ = device.apply_command(status, command(even(100), 2, time_ns=0), START_NS)
-    assert np.array_equal(again.surface_nm, status.surface_nm)
+    unmoved, _ = device.apply_command(status, command(uniform(100), 2, time_ns=0), START_NS)
+    assert np.array_equal(unmoved.surface_nm, status.surface_nm)
 
 
 def test_commands_of_the_same_frame_move_the_surface_within_the_slew() -> None:
@@ -295,7 +295,7 @@ def test_commands_of_the_same_frame_move_the_surface_within_the_slew() -> None:
     for number, height_nm in enumerate((200, 100, 0), start=1):
         before = status.surface_nm
         now_ns = status.received_ns + 10 * MS
-        status, _ = device.apply_command(status, command(even(height_nm), 3, time_ns=status.commanded_ns), now_ns)
+        status, _ = device.apply_command(status, command(uniform(height_nm), 3, time_ns=status.commanded_ns), now_ns)
         assert status.surface_nm.max() == pytest.approx(height_nm, abs=1), number
         assert np.abs(status.surface_nm - before).max() <= LIMITS.slew_nm
 
@@ -305,13 +305,13 @@ def test_apply_command_does_not_modify_its_arguments() -> None:
     status = follow(device, device.initial, 10)
     driven, surface = status.driven_nm.copy(), status.surface_nm.copy()
     channels = {name: shape_nm.copy() for name, shape_nm in status.channels.items()}
-    sent = command(even(700), 2, channel="other")
+    sent = command(uniform(700), 2, channel="other")
     device.apply_command(status, sent, START_NS)
     device.tick(status, START_NS + 10_000 * MS)
     assert np.array_equal(status.driven_nm, driven)
     assert np.array_equal(status.surface_nm, surface)
     np.testing.assert_equal(dict(status.channels), channels)
-    assert np.array_equal(sent.actuators_nm, even(700))
+    assert np.array_equal(sent.actuators_nm, uniform(700))
 
 
 def test_driver_step_too_coarse_for_the_slew_limit_is_refused() -> None:
