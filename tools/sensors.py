@@ -103,7 +103,7 @@ def render(results: Results) -> str:
     """A row for each sensor."""
     head = [
         *("`--sensor`", "light, %", "peak, %", "cond14", "quantum, %", "tilt noise, mas"),
-        *("in the band", "with shear", "shear, nm", "twin, us"),
+        *("noise in the band, mas", "noise, shear fitted, mas", "error from shear, nm", "twin, us"),
         *(column for preset in PRESETS for column in (f"`{preset}`: nm rms", "mas per axis")),
     ]
     rows = []
@@ -129,7 +129,7 @@ def render(results: Results) -> str:
         f"{star.exposure_ns / 1e6:g} ms of a star of V = {star.star.magnitude:g}, all {len(star.noll)} modes fitted, "
         "all photons at the central wavelength; then with "
         "the same photons over the band of 20 %, in four wavelengths; then with the shear of the beam as an additional "
-        f'fitted parameter. "Shear, nm" is the wavefront error, nm rms over the circle, from a shear of '
+        f'fitted parameter. "Error from shear" is the wavefront error, nm rms over the circle, from a shear of '
         f"{100 * SHEAR:g} % of the diameter that is not fitted. The twin's time is for one frame on one thread. "
         "The last columns are open loop -> closed loop for two disturbances: true wavefront over the open pupil, and "
         "true tilt, "
