@@ -1,7 +1,7 @@
 """Tutorials: the commands of each page in order, except real-time loops and views.
 
-The last tests here and `test_docs` run real-time loops and views. Only the short form of the first page and the bad
-night are fast.
+The last tests here and `test_docs` run real-time loops and views. Only the shortened first tutorial and the bad
+night are not marked slow.
 """
 
 import re

@@ -227,8 +227,8 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
     assert "nm after over the open pupil in the longest stretch under one law;" in text
 
 
-def uneventful(night: SyntheticLog, number: int = 300) -> SyntheticLog:
-    return night.health("camera", state="ready").frames(number).health("camera", state="stopped")
+def uneventful(night: SyntheticLog, frames: int = 300) -> SyntheticLog:
+    return night.health("camera", state="ready").frames(frames).health("camera", state="stopped")
 
 
 @pytest.fixture(scope="module")

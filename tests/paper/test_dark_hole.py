@@ -1,4 +1,4 @@
-"""Steps of a dark hole: the loop undoes those that do not shift the sensor's zero point. An interrupt ends the loop."""
+"""Steps of a dark hole: the loop undoes those that do not shift its zero point. An interrupt ends the loop."""
 
 from collections.abc import Iterator
 from pathlib import Path

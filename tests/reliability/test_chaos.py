@@ -198,8 +198,8 @@ def test_a_safe_case_requires_the_safe_mode_and_a_flat_mirror(outcome: Outcome, 
 def test_the_step_at_a_restart_is_the_largest_move_from_the_last_mirror_state(evidence: Evidence) -> None:
     assert restart_steps_nm(evidence) == []
     evidence.entries[COMMAND].append(shape(FRAMES, 40, START_S + 5))
-    at_nm = float(evidence.entries[MIRROR_STATE][-1].actuators_nm.max())
-    assert restart_steps_nm(evidence) == pytest.approx([40 - at_nm])
+    last_nm = float(evidence.entries[MIRROR_STATE][-1].actuators_nm.max())
+    assert restart_steps_nm(evidence) == pytest.approx([40 - last_nm])
 
 
 def test_the_time_to_recover_starts_with_the_first_frame_of_the_new_controller(

@@ -41,7 +41,7 @@ def fuzz(target: Target, numbers: range) -> dict[str, Any]:
         for number in numbers:
             data = target.input(number)
             try:
-                with _limited():
+                with _time_limit():
                     target.read(data)
             except target.errors:
                 refused += 1
@@ -67,7 +67,7 @@ def inputs_by_target(all_targets: list[Target], inputs: int) -> dict[str, int]:
 
 
 @contextmanager
-def _limited() -> Iterator[None]:
+def _time_limit() -> Iterator[None]:
     def hung(number: int, frame: FrameType | None) -> None:
         raise HungError
 

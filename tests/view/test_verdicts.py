@@ -355,7 +355,7 @@ def test_a_view_that_is_behind_does_not_report_the_run_as_dead() -> None:
 
 
 @pytest.mark.parametrize(
-    ("better", "comparison", "level"),
+    ("improvement", "comparison", "level"),
     [
         (1.5, None, Level.NEUTRAL),
         (2.5, None, Level.GOOD),
@@ -366,9 +366,9 @@ def test_a_view_that_is_behind_does_not_report_the_run_as_dead() -> None:
     ],
 )
 def test_a_loop_is_good_if_it_corrects_and_other_gains_would_not_do_better(
-    better: float, comparison: ResidualComparison | None, level: Level
+    improvement: float, comparison: ResidualComparison | None, level: Level
 ) -> None:
-    assert merit(better, comparison)[0] is level
+    assert merit(improvement, comparison)[0] is level
 
 
 def test_noise_is_subtracted_before_a_measured_wavefront_is_judged() -> None:
