@@ -112,12 +112,9 @@ def test_curves_against_magnitude_approach_but_do_not_cross_the_quantum_limit(ta
 
 def test_anchors_from_table_4_are_the_tilts_of_two_modes_with_the_published_values(monkeypatch):
     rows = [row for row in committed("anchors")["rows"] if "std of x tilt" in row["quantity"]]
-    table4_rows = [Row(**row | {"paper": 0.36}) for row in rows if row["unit"]]
-    others = [
-        Row("sam", table4_rows[0].quantity, "mas", 0.1, modes=14, estimator="weighted"),
-        Row("sam", "other", "", 1),
-    ]
-    monkeypatch.setattr(anchors.pointing, "table4", lambda context: [*others, *table4_rows])
+    tilts = [Row(**row | {"paper": 0.36}) for row in rows if row["unit"]]
+    others = [Row("sam", tilts[0].quantity, "mas", 0.1, modes=14, estimator="weighted"), Row("sam", "other", "", 1)]
+    monkeypatch.setattr(anchors.pointing, "table4", lambda context: [*others, *tilts])
     assert list(map(plain, anchors._table4(Context()))) == rows
 
 
