@@ -8,7 +8,7 @@ from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.zernike import NOLLS_14, zernikes
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, reference, response
 
-_INSTANTS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)  # imaged (Gauss-Legendre), in exposure times
+_INSTANTS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)  # instants imaged (Gauss-Legendre), in exposure times
 _SAMPLE_TIMES = (np.arange(8) + 0.5) / 8  # times at which the residual is sampled, in periods
 _SETTLING_TIME_CONSTANTS = 8.0  # settling, in time constants of the slowest mode
 

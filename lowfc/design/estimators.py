@@ -9,7 +9,7 @@ from lowfc.arrays import Array
 from lowfc.control.calibration.calibration import ESTIMATORS, reconstructor
 
 Model = Callable[[Array], Array]
-"""Function from modes in nm to the image (pixels,), fractions of the open circle's light, with the full exp(i phi)."""
+"""Function from modes in nm to the image (pixels,), fractions of the open circle's light, from the full exp(i phi)."""
 
 KINDS = ESTIMATORS[::-1]
 """Kinds of linear estimator; the paper's plain pseudo-inverse first."""

@@ -1,4 +1,4 @@
-"""Noise of a linear estimate: its covariance, and lower bounds of it.
+"""Covariance of the noise of a linear estimate, and lower bounds on it.
 
 The Cramer-Rao bound holds for a given sensor, the quantum limit for any measurement of the light.
 """

@@ -29,8 +29,9 @@ class Goal:
     """The figure of merit to minimise.
 
     Attributes:
-        merit: One of `MERITS`. "paper": the largest of `paper_ratios`, those of Table 3 to the power 2 x weight, that
-            of Table 4 to the power 2 x (1 - weight). "pareto": table3^(1 - weight) table4^weight.
+        merit: One of `MERITS`. "paper": the largest of `paper_ratios`, where the ratios of Table 3 are raised to the
+            power 2 x weight, and the ratio of Table 4 to the power 2 x (1 - weight).
+            "pareto": table3^(1 - weight) table4^weight.
             "contrast": contrast added to the dark zone by the noise of 14 modes in one exposure of Table 4's star.
         estimator: "pinv", or "weighted", whose noise is the Cramer-Rao bound.
         modes: Number of modes in "table3", "pareto" and "condition".
@@ -66,7 +67,7 @@ def merit(candidate: Candidate, goal: Goal) -> float:
 
 
 def paper_ratios(candidate: Candidate, estimator: str = "pinv") -> dict[str, float]:
-    """Ratios of predicted values to the paper's: rows of Table 3, and that of 1 mas in Table 4; below 1 is better."""
+    """Ratios of predicted values to the paper's, in Table 3 and for a tilt of 1 mas in Table 4; below 1 is better."""
     ratios = {}
     for name in candidate.paper_rows:
         for modes in MODES:

@@ -15,7 +15,7 @@ def maximise(rows: Array, weights: Array, multipliers: Array) -> tuple[Array, Ar
 
     scipy accepts no starting basis. Therefore each row with a multiplier gets its own slack variable and is added to
     the objective with its multiplier. The simplex then starts at the optimum that belongs to the multipliers, and needs
-    a sixth to three quarters of the steps. Presolving would undo this.
+    a sixth to three quarters of the steps of a cold start. Presolving would undo this.
 
     Args:
         rows: (m, n) constraints.

@@ -150,7 +150,7 @@ def exchange(request: Request) -> Iterator[Round]:
     points, signs = np.concatenate([points, points]), np.repeat([1.0, -1.0], len(points))
     multipliers = np.zeros(len(points))
     level = np.sqrt(request.limit * request.contrast)
-    for cells in _levels(request):
+    for cells in _cell_numbers(request):
         y, x, weights = _variables(cells, request.symmetry)
         for number in range(1, request.rounds + 1):
             rows = _rows(points, signs, cells, request.symmetry) - level * weights
@@ -229,7 +229,7 @@ def nearest_feasible(request: Request) -> tuple[float | None, float | None]:
         Inner angle, lambda/D (at most twice as large), and contrast (at most 1e5 times as large), each with everything
         else unchanged; None if even the largest is infeasible.
     """
-    coarse = replace(request, cells=_levels(request)[0])
+    coarse = replace(request, cells=_cell_numbers(request)[0])
     inners = [round(v, 6) for v in request.inner + 0.1 * np.arange(1, round(10 * request.inner) + 1)]
     contrasts = [float(f"{request.contrast * 10 ** (k / 10):.1e}") for k in range(1, 51)]
     return (
@@ -254,7 +254,7 @@ def _first(candidates: Sequence[float], feasible: Callable[[float], bool]) -> fl
     return candidates[place] if place < len(candidates) else None
 
 
-def _levels(request: Request) -> list[int]:
+def _cell_numbers(request: Request) -> list[int]:
     """Numbers of cells of successive programs; the last is the requested one."""
     finest = request.cells
     coarser = [cells for cells in (COARSEST_CELLS, 64, 128) if request.outer <= cells < finest]

@@ -59,7 +59,7 @@ def drift_residual_nm2(step_nm2: float, noise_nm2: float, exposure: float, gain:
 
 
 def best_gain(step_nm2: float, noise_nm2: float, exposure: float) -> float:
-    """Gain of the least residual, which is the Kalman gain."""
+    """Gain with the least residual, which is the Kalman gain."""
     measurement_nm2 = 2.0 * (step_nm2 * exposure / 3.0 + noise_nm2) - step_nm2 * exposure
     root = np.sqrt(step_nm2**2 + 2.0 * step_nm2 * measurement_nm2)
     return float(2.0 * step_nm2 / (step_nm2 + root))
@@ -78,10 +78,10 @@ def tolerated_drift(residual_nm2: float, noise_nm2: float, exposure: float, kind
     square = (exposure - 1.0) ** 2 / 4.0 - exposure / 3.0 + 0.5
     linear = (exposure - 2.0) * residual_nm2 - noise_nm2
     step = 2.0 * residual_nm2**2 / (-linear + np.sqrt(linear**2 - 4.0 * square * residual_nm2**2))
-    gain, most = best_gain(step, noise_nm2, exposure), highest_gain(DELAY)
-    if kind == "integrator" and gain > most:
-        from_noise_nm2 = drift_residual_nm2(0.0, noise_nm2, exposure, most)
-        step, gain = (residual_nm2 - from_noise_nm2) / drift_residual_nm2(1.0, 0.0, exposure, most), most
+    gain, highest = best_gain(step, noise_nm2, exposure), highest_gain(DELAY)
+    if kind == "integrator" and gain > highest:
+        from_noise_nm2 = drift_residual_nm2(0.0, noise_nm2, exposure, highest)
+        step, gain = (residual_nm2 - from_noise_nm2) / drift_residual_nm2(1.0, 0.0, exposure, highest), highest
     return Drift(float(step), gain)
 
 
@@ -106,9 +106,9 @@ def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> 
 
     if kind == "integrator":  # residual = A line + B noise at each gain
         laws = [integrator([gain], [0.0], (2,), DELAY, rate_hz) for gain in np.append(_GAINS, highest_gain(DELAY))]
-        of_noise = np.array([0.0, *(float(noise_gain(law)[0]) for law in laws)])  # the first value: without a loop
-        of_line = np.array([1.0, *(residual(law, 1.0) for law in laws)]) - of_noise
-        return lambda allowed: np.asarray(np.max((allowed[..., None] - of_noise) / of_line, axis=-1))
+        noise_factor = np.array([0.0, *(float(noise_gain(law)[0]) for law in laws)])  # the first value: without a loop
+        line_factor = np.array([1.0, *(residual(law, 1.0) for law in laws)]) - noise_factor
+        return lambda allowed: np.asarray(np.max((allowed[..., None] - noise_factor) / line_factor, axis=-1))
 
     def filtered(variance: float) -> float:
         return min(residual(lqg([model(variance)], (2,), timing), variance), variance)

@@ -9,8 +9,8 @@ from lowfc.arrays import Array
 from lowfc.optics.chain.zernike import noll_to_orders
 
 LITERAL_WAVES = (0.04, 0.016)
-"""Bounds in the paper's Sect. 3.1, for radial degrees 1 and 2, and for higher ones: coefficients lie between minus and
-plus these."""
+"""Bounds of the paper's Sect. 3.1, waves rms, for radial degrees 1 and 2, and for higher ones: a coefficient lies
+between minus and plus its bound."""
 
 _BLOCK = 100  # wavefronts in memory at once
 
@@ -44,7 +44,7 @@ def gram(basis: Array) -> Array:
 
 
 def input_rms(gram: Array, bounds: Array) -> float:
-    """Rms over the open pupil of coefficients uniform within plus or minus bounds (modes,), in their unit."""
+    """Rms over the open pupil, if coefficients are uniform between minus and plus bounds (modes,); in their unit."""
     return float(np.sqrt(np.sum(np.diag(gram) * bounds**2) / 3.0))
 
 
@@ -80,7 +80,7 @@ def expected_r_squared(variances: Array, bounds: Array) -> Array:
 
 
 def r_squared(estimates: Array, truth: Array) -> Array:
-    """Coefficient of determination (modes,), without unit, of estimates (n, modes), as defined below eq. (15)."""
+    """Coefficient of determination (modes,), without unit, of estimates (n, modes), as below the paper's eq. (15)."""
     residual = np.sum((estimates - truth) ** 2, axis=0)
     total = np.sum((estimates - estimates.mean(axis=0)) ** 2, axis=0)
     return np.asarray(1.0 - residual / total)

@@ -1,9 +1,9 @@
 """Contrast that a small wavefront adds to a coronagraph's dark zone: a quadratic form of its modes.
 
 With the field E = E0 + i k sum a_j E_j - k^2 / 2 sum a_j a_l E_jl, the intensity's second order in a has two terms:
-the squared first-order field, and the product of the second-order field with E0. For the shaped pupil the second
-cancels most of the first for tilt: without the second, tilt would add 7 (x) or 9 (y) times as much. The intensity's
-first order averages to zero over a dark zone on both sides of the star.
+the squared first-order field, and the product of the second-order field with E0. For tilt behind the shaped pupil the
+second term cancels most of the first: without it, tilt would add 7 (x) or 9 (y) times as much. The intensity's first
+order averages to zero over a dark zone on both sides of the star.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,7 +39,7 @@ class ModalContrast:
         self._camera = ScienceCamera(coronagraph, noll, wavelength_nm, int(np.ceil(self._zone.outer)))
 
     def by_image(self, modes_nm: Array | Single) -> float:
-        """Mean contrast of the dark zone with a wavefront (modes,), including that of the coronagraph itself."""
+        """Mean contrast of the dark zone with a wavefront (modes,), nm rms, including the coronagraph's own."""
         return self._camera.mean_contrast(self._camera.image(modes_nm), self._zone)
 
     def by_mode(self, covariance_nm2: Array) -> Array:

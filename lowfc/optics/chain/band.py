@@ -31,7 +31,7 @@ class Band:
 
 
 def monochromatic(wavelength_nm: float) -> Band:
-    """One wavelength."""
+    """A band of one wavelength."""
     return Band((float(wavelength_nm),), (1.0,))
 
 
@@ -40,7 +40,7 @@ def gauss_legendre(centre_nm: float, fraction: float = 0.2, count: int = 3) -> B
 
     For a band of 20 %, the relative rms error of an image is below 3e-3 with three wavelengths, and below 3e-4 with
     four, for any layout in the package with a disk behind a shaped or prolate pupil. With a bowtie or behind an open
-    circle it is up to 9e-3 and 1.3e-3.
+    circle it is up to 9e-3 with three and 1.3e-3 with four.
     """
     points, weights = np.polynomial.legendre.leggauss(count)
     wavelengths_nm = centre_nm * (1.0 + 0.5 * fraction * points)
@@ -48,7 +48,7 @@ def gauss_legendre(centre_nm: float, fraction: float = 0.2, count: int = 3) -> B
 
 
 def uniform(centre_nm: float, fraction: float = 0.2, count: int = 5) -> Band:
-    """Evenly spaced wavelengths including both ends, equal weights, as in Sect. 3.3 of the paper.
+    """Evenly spaced wavelengths including both ends, with equal weights, as in Sect. 3.3 of the paper.
 
     Five of these wavelengths have at least six times the error of three from `gauss_legendre`.
     """

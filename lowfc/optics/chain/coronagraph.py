@@ -1,7 +1,7 @@
 """The science image of a coronagraph: contrast for a given wavefront (Subedi et al. 2015, Fig. 1).
 
-A shaped pupil is imaged directly; a Lyot coronagraph has an opaque mask and a stop in between. Contrast is intensity
-over the peak intensity of the star off the mask with a flat wavefront; angles are in lambda / D (see `grid`).
+A shaped pupil is imaged directly; a Lyot coronagraph has an opaque mask and a stop in between. Contrast is
+intensity divided by the star's peak off the mask with a flat wavefront; angles are in lambda / D (see `grid`).
 """
 
 from dataclasses import dataclass
@@ -151,8 +151,8 @@ def mean_contrast(
 def contrast_curve(coronagraph: Coronagraph, opd_nm: Array, wavelength_nm: float, edges: Array) -> Array:
     """Contrast (rings,) averaged in azimuth within the opening of `DARK_ZONE`, Fig. 1(c); arguments as for `contrast`.
 
-    `edges` (rings + 1,) are the radii between the rings, in lambda / D: the first at least one sample, and spaced by at
-    least one; a ring without a sample is NaN.
+    `edges` (rings + 1,) are the radii between the rings, in lambda / D. The first radius and the spacing must be at
+    least one sample; a ring without a sample is NaN.
     """
     sector = Wedge(0.0, float(edges[-1]), DARK_ZONE.half_opening_deg)
     columns, rows = _extent(sector, SAMPLES_PER)

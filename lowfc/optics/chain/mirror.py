@@ -35,7 +35,7 @@ class Mirror:
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1 or not self.pitches_per_pupil > 0:
             raise ValueError(
-                f"a mirror needs at least one actuator each way and a positive pitch, got {self.rows} x {self.columns} "
+                f"a mirror needs at least one actuator per axis and a positive pitch, got {self.rows} x {self.columns} "
                 f"at {self.pitches_per_pupil} pitches per pupil"
             )
         if not 0.0 < self.coupling < 1.0:

@@ -1,4 +1,4 @@
-"""Pupils: the open circle, apodised pupils for coronagraphs, a circle with a bar for the relay; fields after them."""
+"""Pupils: open circle, apodised pupils for coronagraphs, circle with a bar for the relay; the field behind a pupil."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -108,6 +108,6 @@ def aberrated(pupil: Array, opd_nm: NDArray[np.floating], wavelength_nm: float) 
     """Field (n, n) after a pupil of a wavefront (n, n) in nm; ValueError if it is not sampled like the pupil."""
     if opd_nm.shape != pupil.shape:
         raise ValueError(f"a wavefront must be sampled like the pupil, {pupil.shape}, got {opd_nm.shape}")
-    field, transmits = np.zeros(pupil.shape, np.complex128), pupil != 0  # a shaped pupil transmits in a fifth
+    field, transmits = np.zeros(pupil.shape, np.complex128), pupil != 0  # only a fifth of a shaped pupil
     field[transmits] = pupil[transmits] * np.exp((2j * np.pi / wavelength_nm) * opd_nm[transmits])
     return field

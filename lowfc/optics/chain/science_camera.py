@@ -62,14 +62,14 @@ class ScienceCamera:
         self.samples = 2 * half_width * samples_per
         self.samples_per = samples_per
         self.wavelength_nm = wavelength_nm
-        of_samples = kernel(self.samples, samples_per, len(pupil), 1.0)
+        sample_kernel = kernel(self.samples, samples_per, len(pupil), 1.0)
         square = (2 if _in_squares(pupil) else 1) if lyot is None else _LYOT_SQUARE
         cells = _averaged(pupil, square)
         used = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
-        of_cells = of_samples.reshape(self.samples, len(cells), square).sum(axis=2)
+        cell_kernel = sample_kernel.reshape(self.samples, len(cells), square).sum(axis=2)
         self._lyot = None if lyot is None else _Lyot.of(lyot, square, used)
-        self._in_y = (of_cells[:, used[0]] / coronagraph.peak).astype(np.complex64)
-        self._in_x = of_cells[:, used[1]].T.astype(np.complex64)
+        self._in_y = (cell_kernel[:, used[0]] / coronagraph.peak).astype(np.complex64)
+        self._in_x = cell_kernel[:, used[1]].T.astype(np.complex64)
         cells = cells[np.ix_(*used)]
         rows, columns = np.nonzero(cells)
         radii = 2 * pupil_axis(len(pupil) // square)

@@ -62,8 +62,8 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
     """One frame (rows, columns) in DN.
 
     Electrons are drawn from the Poisson distribution. Multiplication draws from the gamma distribution of a long
-    register at a high gain, whose excess noise doubles the variance of the photons. At a gain g the factor is about
-    2 - 1 / g.
+    register at a high gain, whose excess noise doubles the variance of the photons. At a finite gain g, it
+    multiplies the variance by about 2 - 1 / g.
 
     If `noise_table_of` returns a table, it yields the digital numbers of pixels with a mean below `FAINT_E` electrons.
     Their distribution is exact at means that are multiples of 1/64 electron. Between these the mean is exact and the

@@ -19,7 +19,7 @@ from lowfc.arrays import Array, Complex, Integers, Single
 
 @dataclass(frozen=True)
 class TwinSpec:
-    """Degree of compression; the default is accurate to 1e-4 of the image for every named sensor.
+    """Degree of compression; by default, images differ by less than 1e-4 from the full chain (named sensors).
 
     For other combinations of pupil, focal-plane mask and relay, errors of up to 2e-3 were found.
 
@@ -226,7 +226,7 @@ class _Stage:
     def intensity(self, opds_nm: Single, weights: Single) -> Single:
         """The weighted sum of `|E|^2` (points, points) for wavefronts (wavefronts, used)."""
         phase = self._wavenumber * opds_nm
-        # The flat wavefront's field is added later, computed in float64: smaller rounding errors in the sums.
+        # The flat wavefront's field is added later, computed in float64, for smaller rounding errors in the sums.
         phasor = np.empty((*phase.T.shape, 2), np.float32)
         np.subtract(np.cos(phase).T, np.float32(1), out=phasor[..., 0])
         phasor[..., 1] = np.sin(phase).T
