@@ -19,7 +19,7 @@ def camera(
     frames: Frames = None,
     wait_for: WaitFor = None,
 ) -> None:
-    """Publish simulated frames of a run: mirror shape from the bus, disturbance from the seed, optics by digital twin.
+    """Publish simulated frames of a run, with the mirror's shape from the bus and a disturbance drawn from the seed.
 
     Example: sim-camera --run bench --wait-for controller --wait-for mirror-dm
     """

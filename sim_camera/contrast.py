@@ -10,7 +10,7 @@ IMAGES = 200
 
 
 class Contrast:
-    """Collects modes at instants evenly spread over a run of unknown length, and computes their contrast."""
+    """Collects modes at instants evenly spread over a run of unknown length; computes the contrast that they add."""
 
     def __init__(self, modal: ModalContrast) -> None:
         """Start without instants."""
@@ -32,10 +32,10 @@ class Contrast:
         return np.asarray(added / np.float32(modes_nm.shape[-2]), np.float32)
 
     def measure(self) -> dict[str, float]:
-        """Means at up to `IMAGES` instants of the run's second half, by field of `WavefrontFigures`; empty at first.
+        """Means at up to `IMAGES` instants of the run's second half, by field of `WavefrontFigures`.
 
         The contrast added with a flat mirror and by the residual, and the coronagraph's own, are from full images;
-        `quadratic_added_contrast` is from the quadratic form.
+        `quadratic_added_contrast` is from the quadratic form. Empty before the first frame.
         """
         half = self._kept[len(self._kept) // 2 :]
         instants = [half[int(place)] for place in np.linspace(0, len(half) - 1, min(IMAGES, len(half)))]

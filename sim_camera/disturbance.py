@@ -93,7 +93,7 @@ def preset_disturbance(
         seed: seed of all phases.
         nm_per_mas: wavefront rms of a milliarcsecond of tilt.
         wavelength_nm: central wavelength.
-        scale: factor on the amplitude.
+        scale: factor on the amplitudes of the preset.
         static_nm: constant wavefront, nm rms by Noll index.
         line_width: width of the reaction wheel's lines between half-power points, as a fraction of their frequency; 0
             for undamped lines.
@@ -278,7 +278,7 @@ class Sampler:
         """Modes (instants, modes) in the period of a frame, nm of wavefront rms."""
         first = index - index % BLOCK  # so that a frame does not depend on the order of the calls
         if first not in self._blocks:
-            # Keep two blocks before: a frame's truth is computed after the exposure of up to ten later frames.
+            # Keep the two blocks before: a frame's truth is computed after the exposure of up to ten later frames.
             self._blocks = {before: block for before, block in self._blocks.items() if 0 < first - before <= 2 * BLOCK}
             self._blocks[first] = self._block(first)
         row: Single = self._blocks[first][index - first]
@@ -322,10 +322,10 @@ def _end_weights(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) 
 
 
 def screen(seed: int, samples: int, spacing: float) -> Array:
-    """Kolmogorov screen (samples, samples) with spectrum f^-11/3, sampled at a spacing in pupil diameters; not scaled.
+    """Kolmogorov screen (samples, samples) with spectrum f^-11/3, sampled at a spacing in pupil diameters.
 
-    It has a period of four pupil diameters, and is cut off at 12 cycles per diameter, far beyond what the sensor's
-    focal-plane mask passes, so that coarse nodes do not alias fine structure.
+    It has a period of four pupil diameters and an arbitrary amplitude. It is cut off at 12 cycles per diameter, far
+    beyond what the sensor's focal-plane mask passes, so that coarse nodes do not alias fine structure.
     """
     rng = np.random.default_rng([seed, 2])
     side, finest = 4.0, 12.0  # pupil diameters, cycles per diameter
@@ -345,7 +345,7 @@ def _thermal_nm(noll: tuple[int, ...]) -> Array:
 
 
 def _drift(rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]) -> tuple[Array, Complex]:
-    """Sine waves, even in log frequency, with power per hertz falling as 1/f^2; `rms_nm` (modes,) is of their sum."""
+    """Sine waves, even in log(frequency), with power per hertz falling as 1/f^2; `rms_nm` (modes,) is of their sum."""
     frequencies = np.geomspace(*band_hz, _WAVES_PER_BAND) * rng.uniform(0.95, 1.05, _WAVES_PER_BAND)
     weights = frequencies**-0.5
     weights *= np.sqrt(2 / np.sum(weights**2))

@@ -159,7 +159,7 @@ class SimulatedCamera:
         self._path = MirrorPath(flat, applied - 1, settling)
         self._index, self._origin_ns = 0, 0
         self._exposing = self._exposed = _Exposed(-1, 0, 0, 0, flat)
-        # Frames whose truth is not computed yet, and the mirror in their periods.
+        # Frames whose truth is not computed yet, and the mirror's motion in their periods.
         self._waiting: list[tuple[_Exposed, MirrorMotion]] = []
         self._truths_at_once = 1 if config.lockstep else min(max(1, int(TRUTHS_S * config.camera.rate_hz)), MAX_TRUTHS)
         self._newest_state = self._last_frame = 0  # sequences
@@ -174,14 +174,14 @@ class SimulatedCamera:
     def join(self, service: Service) -> None:
         """Declare the publisher of the truth and subscribe to the mirror."""
         self._service = service
-        # Here, where the process is already limited to one BLAS thread.
+        # Made only here: by now the process is limited to one BLAS thread.
         self._contrast = Contrast(factory.contrast_of(self._config))
         self._truths = service.publisher(TRUTH)
         service.bus.subscribe(MIRROR_STATE, self._on_mirror_state, self._config.mirror.name)
         service.on_stop(self._arrived.wake)
 
     def through(self, publisher: Publisher) -> Puts:
-        """The publisher itself, or wrapped by the fault of the options."""
+        """The publisher, wrapped if the options name a fault."""
         if self._fault is None:
             return publisher
         highest = saturation_dn(factory.detector(self._config))
@@ -226,7 +226,7 @@ class SimulatedCamera:
         return Exposure(frame, end_ns)
 
     def sent(self, envelope: Envelope) -> None:
-        """Store the frame's publication time, and publish the truth of the frames before if enough wait for it."""
+        """Store the frame's publication time; publish the truths of earlier frames once enough of them wait."""
         self._published_ns[envelope.sequence % _REMEMBERED] = (envelope.sequence, envelope.publish_time_ns)
         self._last_frame = envelope.sequence
         self._end_period()
@@ -272,7 +272,7 @@ class SimulatedCamera:
     def _end_period(self) -> None:
         """Keep the last exposed frame for its truth; its period is over, so the mirror's motion in it is known."""
         if (index := self._exposed.frame) >= 0:
-            self._waiting.append((self._exposed, self._path.over(index, self._scene.instants)))
+            self._waiting.append((self._exposed, self._path.motion(index, self._scene.instants)))
 
     def _publish_truths(self) -> None:
         """Publish the truth of the frames that wait for it."""
@@ -327,7 +327,7 @@ class SimulatedCamera:
             except DecodeError as error:
                 self._service.unreadable(sample.key, error)
                 continue
-            if not state.actuators:  # its driver failed: the shape is unknown
+            if not state.actuators:  # the mirror's driver failed: the shape is unknown
                 continue
             shape = actuators(state)
             if shape is None or shape.shape != self._latched.shape or not np.isfinite(shape).all():

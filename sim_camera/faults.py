@@ -10,9 +10,9 @@ import numpy.typing as npt
 Frame = npt.NDArray[np.uint16]
 
 MAX_FRAMES_LATE = 50
-LOST_SHARE = 0.1  # of the frames
-HOT_SHARE = 0.1  # of the pixels
-COSMIC_SHARE = 0.2  # of the frames
+LOST_SHARE = 0.1  # fraction of the frames that is lost
+HOT_SHARE = 0.1  # fraction of the pixels that is hot
+COSMIC_SHARE = 0.2  # fraction of the frames with a cosmic-ray track
 TRACK_PIXELS = 6
 """Length of a cosmic-ray track, pixels: below the limit of saturated pixels, so that the frame is used."""
 
@@ -46,7 +46,9 @@ class Fault:
 
     def __post_init__(self) -> None:
         if self.first < 1 or self.frames < 1:
-            raise ValueError(f"a fault begins at frame 1 or later and has frames, got {self.first} and {self.frames}")
+            raise ValueError(
+                f"a fault needs a first frame and a number of frames of 1 or more, got {self.first} and {self.frames}"
+            )
         if not isinstance(self.seed, int) or self.seed < 0:
             raise ValueError(f"a fault's seed is a whole number of 0 or more, got {self.seed!r}")
 

@@ -14,7 +14,7 @@ from lowfc.contract.messages import RawImage, from_timestamp, image
 from sim_camera.faults import MAX_FRAMES_LATE, Fault, Frame, Kind
 
 EARLIER_S = 3600
-"""Time by which the camera's start in the sequences is too early with the fault "old-sequence"."""
+"""Time by which the fault "old-sequence" moves the camera's start, encoded in each sequence, into the past."""
 
 
 def read_fault(file: Path) -> Fault:
@@ -44,7 +44,7 @@ class FaultyFrames:
         self._index = self._start_s = 0
 
     def put(self, payload: bytes) -> Envelope:
-        """Publish the messages due at the end of an exposure; return the envelope of its frame, sent or not."""
+        """Publish the messages due at the end of an exposure; return the envelope of its frame, even if not sent."""
         index, now_ns = self._index, self._now_ns()
         self._index += 1
         message = self._message(index, RawImage.FromString(payload))

@@ -4,8 +4,8 @@ from collections import deque
 
 WINDOW = 500
 """Number of most recent commands in the statistics."""
-_ON = 0.25
-_OFF = 0.125
+_ON = 0.25  # fraction of the window above which late commands become habitual
+_OFF = 0.125  # fraction at and below which they no longer are
 
 
 class Lateness:

@@ -29,7 +29,7 @@ class MirrorPath:
         """Add a shape (rows, columns) applied at `moment`, but at most `latest` and not before the previous shape."""
         self._moves.append((max(min(moment, latest) + self._delay, self._moves[-1][0]), shape_nm))
 
-    def over(self, start: float, instants: Array) -> MirrorMotion:
+    def motion(self, start: float, instants: Array) -> MirrorMotion:
         """Shapes (rows, columns) in effect in the period from `start`, and the weight of each (instants, shapes).
 
         `instants` (instants,) are relative to `start`. Earlier shapes are dropped once the mirror has settled; those of

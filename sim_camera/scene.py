@@ -1,4 +1,4 @@
-"""The simulated optics in front of the detector: mirror and disturbance in, frame and true wavefront out.
+"""The simulated optics: compute frame and true wavefront from the mirror's shape and the disturbance.
 
 Time is continuous: the star moves while the mirror holds. An image is the mean over its exposure. The true wavefront
 is given at the start of the exposure, and as the root mean square over the period.

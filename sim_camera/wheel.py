@@ -17,7 +17,7 @@ _WALK_WAVES = 64
 
 
 def walk(rng: np.random.Generator, per_root_s: Array, slope: float = 2.0) -> tuple[Array, Complex]:
-    """Frequencies (waves,) and amplitudes (waves, n) of sine waves, 1e-4 to 10 Hz, nearly even in log frequency.
+    """Frequencies (waves,) and amplitudes (waves, n) of sine waves, 1e-4 to 10 Hz, nearly even in log(frequency).
 
     Their power density is per_root_s^2 / (2 pi^2 f^slope) per Hz, for each element of `per_root_s` (n,). Slope 2 is a
     random walk: its rms displacement after t seconds is per_root_s sqrt(t).

@@ -167,7 +167,7 @@ class Bench:
         for _ in range(frames):
             index = self._index
             exposed_nm, pixels = self.expose()
-            path = self._path.over(index, self.scene.instants)
+            path = self._path.motion(index, self.scene.instants)
             frame = self.frame(pixels)
             outputs = self.process_input(frame)
             if self._record_and_watch(outputs, record):

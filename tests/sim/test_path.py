@@ -11,7 +11,7 @@ INSTANTS = np.array([0.1, 0.5, 0.9])
 
 
 def heights(path: MirrorPath, start: float) -> list[float]:
-    shapes, weights = path.over(start, INSTANTS)
+    shapes, weights = path.motion(start, INSTANTS)
     return (weights @ np.array(shapes)[:, 0, 0]).tolist()
 
 
@@ -58,8 +58,8 @@ def test_number_of_shapes_is_bounded(settling: float) -> None:
     path = MirrorPath(FLAT, settling=settling)
     for moment in range(1000):
         path.applied(moment, ONE)
-        path.over(moment, INSTANTS)
-    assert len(path.over(1000, INSTANTS)[0]) < 5
+        path.motion(moment, INSTANTS)
+    assert len(path.motion(1000, INSTANTS)[0]) < 5
     assert heights(path, 1000) == pytest.approx(1 - np.exp(-(1000 + INSTANTS) / settling), abs=1e-4)
 
 
@@ -68,7 +68,7 @@ def test_a_shape_with_an_earlier_time_than_the_previous_shape_applies_at_the_pre
     path = MirrorPath(FLAT, settling=0.001)
     for moment, shape in ((0.7, ONE), (0.2, TWO), (0.75, ONE)):
         path.applied(moment, shape)
-    _, weights = path.over(0, np.linspace(0, 1, 50))
+    _, weights = path.motion(0, np.linspace(0, 1, 50))
     assert weights.sum(axis=1) == pytest.approx(np.ones(50), abs=1e-5)
     assert weights.min() >= 0
 
@@ -78,4 +78,4 @@ def test_shape_applied_during_a_host_stall_is_in_effect_at_the_next_frame() -> N
     path.applied(1004.2, ONE, latest=5)
     path.applied(5.2, TWO, latest=6)
     assert heights(path, 5) == pytest.approx([1, 2, 2], abs=1e-3)
-    assert len(path.over(6, INSTANTS)[0]) == 1
+    assert len(path.motion(6, INSTANTS)[0]) == 1
