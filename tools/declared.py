@@ -54,19 +54,19 @@ _GUARD = (
     ("duration of a block, s, unless the minimum number of frames takes longer", guard.BLOCK_S),
     ("minimum number of frames of a block", guard.MIN_BLOCK_FRAMES),
     ("consecutive worse blocks before the integrator takes over", guard.WORSE_BLOCKS),
-    ("law is worse: mean squared error / that of the integrator, above", guard.WORSE),
+    ("law is worse: mean squared error / that of the integrator, above", guard.WORSE_RATIO),
     ("loop amplifies: mean squared error / long-term mean square, above", guard.AMPLIFIED),
     ("time constant of the long-term mean square, s", guard.LONG_TERM_S),
     ("duration of a cross-fade, s", guard.FADED_S),
-    ("law is far better: mean squared error / that of the integrator, below", guard.BETTER),
+    ("law is far better: mean squared error / that of the integrator, below", guard.BETTER_RATIO),
     ("time for which the law must be far better, at first, s", guard.BETTER_S),
     ("takeovers after which only an operator reactivates the law", guard.MAX_TAKEOVERS),
 )
 _ACCEPTANCE = (
-    ("rejection: minimum ratio of tolerance to standard error for a line to be evaluated", transfer_function.SURE),
+    ("rejection: minimum ratio of tolerance to standard error for a line to be evaluated", transfer_function.SIGMAS),
     ("rejection: minimum fraction of a mode's lines that are evaluated", acceptance_rejection.MIN_JUDGED),
     ("linearity: amplitudes, times `linear_nm`", *acceptance_linearity.AMPLITUDES),
-    ("linearity: standard errors above the limit at which a value fails", linearity.SURE),
+    ("linearity: standard errors above the limit at which a value fails", linearity.SIGMAS),
     ("capture-range: amplitudes, times the required one", *acceptance_capture.SIZES),
     ("capture-range: maximum fraction of a shape that remains", linearity.MAX_RESIDUAL),
 )

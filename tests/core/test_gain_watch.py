@@ -14,7 +14,7 @@ from lowfc.contract.codecs.state_codec import calibration_in_use, controller_sta
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import map_rows, noise_covariance_nm2
-from lowfc.control.laws.automatic_gain import TOGETHER, GainBank, TiltCrossTalk
+from lowfc.control.laws.automatic_gain import FRAMES_PER_SUM, GainBank, TiltCrossTalk
 from lowfc.control.laws.integrator import RELAXING, TIP_TILT
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.advance import advance
@@ -232,7 +232,7 @@ def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset() -> N
     with patch.object(TiltCrossTalk, "add_frames", autospec=True, side_effect=TiltCrossTalk.add_frames) as added:
         loop = bench(2.0)
         loop.ask("offset", modes=(2,), values=(40.0,))
-        loop.run(2 * TOGETHER)
+        loop.run(2 * FRAMES_PER_SUM)
     _, tilt_nm, _ = added.call_args.args
     np.testing.assert_allclose(tilt_nm[-1], loop.steps[-1].error_nm[:2] + np.float32([40, 0]), atol=1e-3)
 

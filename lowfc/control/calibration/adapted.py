@@ -1,4 +1,4 @@
-"""Change the dark, pixel mask or reference image of a calibration; recompute I0, H and R, not `actuators_to_modes`."""
+"""Change dark, pixel mask or reference image of a calibration, and recompute I0, H and R, not `actuators_to_modes`."""
 
 from dataclasses import replace
 
@@ -15,8 +15,8 @@ _MIN_RESPONSE = 1e-3
 def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_e: float, gain_e: float) -> Calibration:
     """The calibration with another dark (pixels,), DN, and only the pixels (pixels,) that are 1 in `good`.
 
-    As `on_pixels`, but an R that was computed from I0 and H alone (`_is_plain`) is computed anew, for this read noise
-    of a pixel and these electrons per DN.
+    As `on_pixels`, but a plain R (see `_is_plain`) is recomputed with this read noise of a pixel and with `gain_e`
+    electrons per DN.
 
     Raises:
         ValueError: the remaining pixels have no light, or do not tell the modes apart.
@@ -26,7 +26,7 @@ def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_
 
 
 def on_pixels(calibration: Calibration, good: Array) -> Calibration:
-    """The calibration on fewer pixels (`good` (pixels,) is 1 where one stays), with an R that leaves R H unchanged.
+    """The calibration on fewer pixels (`good` (pixels,) is 1 where a pixel stays), with an R that leaves R H unchanged.
 
     Pixels that were bad stay bad. I0 and H are normalised to the flux on the remaining pixels. `operator_hash` and `id`
     of the result are empty.
@@ -47,10 +47,10 @@ def on_pixels(calibration: Calibration, good: Array) -> Calibration:
 def with_reference(
     calibration: Calibration, reference: Array, flux_dn: float, read_noise_e: float, gain_e: float
 ) -> Calibration:
-    """The calibration with another zero point (pixels,), in flux fractions, and mean flux, DN.
+    """The calibration with another reference image (pixels,), in flux fractions, and mean flux, DN.
 
-    H stays. An R that was computed from I0 and H alone (`_is_plain`) is computed anew, for this read noise of a pixel
-    and these electrons per DN; any other R stays.
+    H stays. A plain R (see `_is_plain`) is recomputed with this read noise of a pixel and with `gain_e` electrons per
+    DN; any other R stays.
     `operator_hash` and `id` of the result are empty.
 
     Raises:

@@ -20,9 +20,9 @@ from lowfc.arrays import Array, Complex, Mask
 _ANGLES = 72
 """Number of initial rotations, spread over 180 degrees."""
 _ALIKE, _EXACT = 2.0, 0.01
-"""The other parity is possible, too, if its residual is below this multiple of the better one's or below this value."""
+"""The other parity is possible, too, if its residual is below `_ALIKE` times the better parity's, or below `_EXACT`."""
 _CIRCULAR = 0.05
-"""Relative change by a rotation below which an image counts as circular; that of a circle on pixels is 0.01."""
+"""An image counts as circular if rotations change it by less than this fraction; a circle on pixels changes by 0.01."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class Alignment:
         residual: Rms of real minus fitted image, relative to the standard deviation of the real image.
         other_parity: The same residual for the other parity.
         orientations: Geometries that the image does not distinguish.
-        circular: Whether the image is the same at all rotations, so that those of `orientations` are arbitrary.
+        circular: Whether the image is the same at all rotations, so that the rotations in `orientations` are arbitrary.
     """
 
     geometry: Geometry
@@ -101,8 +101,8 @@ def align(real: Array, computed: Array, good: Mask | None = None) -> Alignment:
     background = float(np.median(np.concatenate([real[0], real[-1], real[:, 0], real[:, -1]])))
     light = np.where(used, real - background, 0.0)
     if not light.sum() > 0:
-        raise ValueError("the reference image has no light above its edge")
-    # Scale 1 as well: a detector region may cut off the image's wings. Rounded, so that no two scales are almost equal.
+        raise ValueError("the reference image has no light above the level of its edge pixels")
+    # Try scale 1, too: a detector region may cut off the image's wings. Rounding avoids two almost equal scales.
     scales = {round(_size(light) / _size(computed), 2), 1.0}
     spectrum = np.fft.rfft2(light, _doubled(light.shape))
     fits = []
@@ -144,13 +144,13 @@ def _doubled(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 def _placed(computed: Array, geometry: Geometry, shape: tuple[int, ...], spectrum: Complex) -> tuple[Array, Geometry]:
-    """The model, interpolated linearly, at the pixel where it best matches an image, and the geometry there.
+    """The computed image, centred on the pixel where it best matches the real image, and its geometry there.
 
     Args:
-        computed: The computed image.
+        computed: The computed image, to be interpolated linearly.
         geometry: Scale, rotation and parity.
-        shape: Rows and columns of the image.
-        spectrum: Fourier transform of the image, padded to twice its rows and columns.
+        shape: Rows and columns of the real image.
+        spectrum: Fourier transform of the real image, padded to twice its rows and columns.
     """
     rows, columns = shape
     model = _sample(computed, replace(geometry, row=rows, column=columns), _doubled(shape), order=1)
@@ -161,6 +161,7 @@ def _placed(computed: Array, geometry: Geometry, shape: tuple[int, ...], spectru
 
 
 def _sample(spline: Array, geometry: Geometry, shape: tuple[int, ...], order: Literal[1, 3] = 3) -> Array:
+    """Sample an image, given by its spline (rows, columns), at the real pixels (`shape`); flux is conserved."""
     angle, parity = np.deg2rad(geometry.rotation_deg), geometry.parity
     turn = np.array([[np.cos(angle), -np.sin(angle)], [parity * np.sin(angle), parity * np.cos(angle)]])
     turn /= geometry.scale
@@ -170,10 +171,10 @@ def _sample(spline: Array, geometry: Geometry, shape: tuple[int, ...], order: Li
 
 def _residual(model: Array, real: Array) -> tuple[float, float, float]:
     """Relative residual after a fit of flux and background, and the fitted flux and background."""
-    shape, light = model - model.mean(), real - real.mean()
-    square = float(np.vdot(shape, shape))
-    flux = float(np.vdot(shape, light)) / square if square else 0.0
-    residual = light - flux * shape
+    model_change, real_change = model - model.mean(), real - real.mean()
+    square = float(np.vdot(model_change, model_change))
+    flux = float(np.vdot(model_change, real_change)) / square if square else 0.0
+    residual = real_change - flux * model_change
     return float(np.sqrt(np.mean(residual**2)) / real.std()), flux, float(real.mean() - flux * model.mean())
 
 

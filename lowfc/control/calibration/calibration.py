@@ -18,7 +18,7 @@ FIRST = "+first"
 """Suffix of `Calibration.estimator` for the first calibration of a commissioning."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)  # equal if the same object, so that a cache can hold it
+@dataclass(frozen=True, slots=True, eq=False)  # compared by identity, so that a cache can hold it
 class Calibration:
     """Matrices from a frame to modes and from modes to actuators; single precision, as in the loop.
 
@@ -37,7 +37,7 @@ class Calibration:
         saturation_dn: highest value a pixel can have.
         estimator: how R was computed: weighted or pinv, and fitted nuisance parameters, as in weighted+shear.
         wavelength_nm: wavelength of H.
-        operator_hash: hash of its optical model; empty for a measured calibration.
+        operator_hash: hash of the optical model it was computed from; empty for a measured calibration.
         id: identity of the calibration.
         camera: camera settings with which it was made; None if unknown.
     """
@@ -72,7 +72,7 @@ class Calibration:
 
     @property
     def provisional(self) -> bool:
-        """Whether it is the first one of a commissioning, without a verdict."""
+        """Whether it is the first calibration of a commissioning, whose accuracy has not been checked."""
         return self.estimator.endswith(FIRST)
 
     @classmethod
@@ -148,11 +148,11 @@ def reconstructor(
     estimator: str = "weighted",
     nuisance: Array | None = None,
 ) -> Array:
-    """R (modes, pixels) from normalised I0 and H: error = R (I - I0), the least-squares solution of eq. (11).
+    """R (modes, pixels) from normalised I0 and H: error = R (I - I0), least squares as in the paper's eq. (11).
 
-    `weighted` is (H' W H)^-1 H' W with W = 1 / (I0 + read_noise^2) in electrons, the unbiased linear estimate with the
-    least noise, apart from the noise of the flux by which a frame is divided; `pinv` weights all pixels equally. Bad
-    pixels have zero weight.
+    `weighted` is (H' W H)^-1 H' W with W = 1 / (I0 + read_noise^2) in electrons. It is the unbiased linear estimate
+    with the least noise, if the noise of the flux by which a frame is divided is neglected. `pinv` weights all pixels
+    equally. Bad pixels have zero weight.
 
     Args:
         reference: (pixels,) I0, normalised.
@@ -162,7 +162,8 @@ def reconstructor(
         read_noise_e: Read noise of a pixel.
         estimator: One of `ESTIMATORS`.
         nuisance: (pixels, any) responses to other changes of the image, normalised like H, in any unit. They are fitted
-            with the modes, so that they are not measured as modes, and not returned. Flux changes need none.
+            together with the modes, so that these changes are not measured as modes; R has no rows for them. A change
+            of flux needs no nuisance response.
 
     Raises:
         ValueError: unknown estimator, or modes or nuisance parameters that this sensor cannot tell apart.
@@ -198,12 +199,12 @@ def condition_number(response: Array) -> float:
 
 
 def noise_nm(matrix: Array, reference: Array, flux_e: float, read_noise_e: float) -> Array:
-    """Standard deviation (modes,) of the modes of one frame, in nm; see `noise_nm2`."""
+    """Standard deviation (modes,), nm, of the noise of the modes measured from one frame; see `noise_nm2`."""
     return np.asarray(np.sqrt(np.diag(noise_nm2(matrix, reference, flux_e, read_noise_e))))
 
 
 def noise_nm2(matrix: Array, reference: Array, flux_e: float, read_noise_e: float) -> Array:
-    """Covariance (modes, modes) in nm2 of the modes of one frame: photon and read noise through R (modes, pixels).
+    """Covariance (modes, modes), nm^2, of the photon and read noise of one frame after R (modes, pixels).
 
     The normalisation divides by the frame's own noisy flux, so that each pixel's noise n acts as n - I0 sum(n).
     """

@@ -10,11 +10,11 @@ from lowfc.arrays import Array, Mask
 _SIGMAS = 8.0
 """Robust standard deviations above the median beyond which a pixel is bad; none of 6400 good pixels is that far."""
 _ROUNDING_DN = 0.6
-"""Largest noise that rounding to whole DN may add to a pixel, or remove from it, in many frames."""
+"""Largest noise that rounding to whole DN may add to a pixel, or remove from it, if there are many frames."""
 _MAX_LIGHT = 0.02
 """Largest allowed fraction of the star's light in dark frames."""
 _TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+"""Ratio of the standard deviation of a normal distribution to its median absolute deviation."""
 
 
 class Dark(NamedTuple):
@@ -55,7 +55,7 @@ def measure_dark(frames: npt.NDArray[np.number]) -> Dark:
     """
     count = len(frames)
     if count < 16:
-        raise ValueError(f"a dark takes at least 16 frames, got {count}")
+        raise ValueError(f"a dark needs at least 16 frames, got {count}")
     values = frames.astype(np.float64)
     if bad := int(np.count_nonzero(~np.isfinite(values).all(axis=0))):
         which = "1 pixel of the dark frames has" if bad == 1 else f"{bad} pixels of the dark frames have"
@@ -64,7 +64,7 @@ def measure_dark(frames: npt.NDArray[np.number]) -> Dark:
     level, typical = float(np.median(mean)), float(np.median(noise))
     mean_spread = max(_spread(mean), typical / np.sqrt(count), 1e-3)
     noise_spread = max(_spread(noise), typical / np.sqrt(2 * count), 1e-3)
-    rounding_dn = _ROUNDING_DN * (1 + 4 / np.sqrt(count))  # in few frames, a good pixel may keep one value
+    rounding_dn = _ROUNDING_DN * (1 + 4 / np.sqrt(count))  # a good pixel may have the same value in a few frames
     hot = mean > level + max(_SIGMAS * mean_spread, _SIGMAS * typical / 4, rounding_dn)
     if hot.mean() > 0.05:
         raise ValueError(
@@ -76,7 +76,7 @@ def measure_dark(frames: npt.NDArray[np.number]) -> Dark:
 
 
 def check_dark(dark_dn: Array, reference: Array, flux_dn: float) -> None:
-    """Refuse a dark (pixels,) that contains light of the star; the reference (pixels,) is in flux fractions.
+    """Refuse a dark (pixels,), DN, that contains light of the star; the reference (pixels,) is in flux fractions.
 
     Raises:
         ValueError: the dark contains too much light.

@@ -98,7 +98,7 @@ def _lagged(row: Array) -> Array:
 def _regressed(rows: Array, moved: Array, instruments: Array) -> tuple[Array, Array]:
     """Factors (lags, columns) of each lag in rows (frames, columns), and their standard errors.
 
-    With separate instruments, motion caused by the rows' own noise does not bias the factors (see `response_fit`).
+    With instrumental variables other than `moved`, motion caused by noise of the rows does not bias the factors.
     """
     rows, moved, z = (each - each.mean(axis=0) for each in (rows, moved, instruments))
     inverse = np.linalg.inv(z.T @ moved)

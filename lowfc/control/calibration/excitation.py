@@ -1,7 +1,7 @@
 """Probe signals to measure a loop: multisines, each line of which belongs to one mode, and staircases of one mode.
 
-All lines of a multisine are odd multiples of one over its period, so that products of a second-order nonlinearity fall
-between them. No two lines are neighbours, so that Hann's window separates them.
+All lines of a multisine are odd multiples of the inverse of its period, so that products of a second-order
+nonlinearity fall between them. No two lines are neighbours, so that Hann's window separates them.
 """
 
 import numpy as np
@@ -86,7 +86,7 @@ def build_staircase(levels_nm: npt.ArrayLike, hold_frames: int, largest_step_nm:
     """A staircase from zero over all levels and back to zero, in as few steps as the largest step allows.
 
     Args:
-        levels_nm: (levels,) in order.
+        levels_nm: (levels,) in the order in which they are reached.
         hold_frames: Frames at each level.
         largest_step_nm: Largest change from one frame to the next.
 

@@ -7,16 +7,16 @@ import numpy.typing as npt
 
 from lowfc.arrays import Array, Integers
 
-SURE = 3.0
+SIGMAS = 3.0
 """Standard errors by which a value must exceed a limit to count as beyond it."""
 MAX_RESIDUAL = 0.3
 """Largest residual of a captured shape, in any mode, as a fraction of its amplitude."""
 
-_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])  # so that a linear drift cancels
+_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])  # signs of one cycle, over which a linear drift cancels
 
 
 def levels(amplitudes_nm: npt.ArrayLike, cycles: int) -> Array:
-    """Levels of a staircase that pushes and pulls `cycles` times at each amplitude (amplitudes,) in turn."""
+    """Levels (levels,), nm, of a staircase that pushes and pulls `cycles` times at each amplitude (amplitudes,)."""
     return np.concatenate([np.tile(amplitude * _SIGNS, cycles) for amplitude in np.asarray(amplitudes_nm, float)])
 
 
@@ -26,7 +26,7 @@ class Gains:
 
     Attributes:
         amplitude_nm: (amplitudes,) amplitude of the mode.
-        gain: (amplitudes, modes) measured amplitude of each mode over the true amplitude of `mode`.
+        gain: (amplitudes, modes) ratio of the measured amplitude of each mode to the true one of `mode`.
         error: (amplitudes, modes) standard error of the gain, from the scatter of the cycles.
         mode: index of the mode.
     """
@@ -44,10 +44,10 @@ class Gains:
         return others
 
     def within(self, gain_error: float, crosstalk: float) -> list[bool | None]:
-        """Whether gain and cross-talk at each amplitude are within these limits; None if too noisy to tell."""
+        """Whether |gain - 1| and cross-talk are within these limits at each amplitude; None if too noisy to tell."""
         own = np.arange(self.gain.shape[1]) == self.mode
         limit = np.where(own, gain_error, crosstalk)
-        beyond = np.abs(self.gain - own) > limit + SURE * self.error
+        beyond = np.abs(self.gain - own) > limit + SIGMAS * self.error
         unsure = self.error > limit / 2
         rows = zip(beyond, unsure, strict=True)
         return [False if far.any() else None if vague.any() else True for far, vague in rows]
@@ -56,8 +56,8 @@ class Gains:
 def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Integers, frames: int) -> Gains:
     """Gain and cross-talk of a mode, from the open-loop errors (frames, modes) on a staircase of `levels` (levels,).
 
-    `starts` (levels,) are the first of the `frames` frames that saw each level. A standard error needs two cycles or
-    more.
+    The mean over `frames` frames is taken at each level, from the frame in `starts` (levels,) on. A standard error
+    needs two cycles or more.
     """
     means = np.stack([error_nm[start : start + frames].mean(axis=0) for start in starts])
     per_cycle = (means * np.sign(levels_nm)[:, None]).reshape(-1, len(_SIGNS), error_nm.shape[1]).mean(axis=1)

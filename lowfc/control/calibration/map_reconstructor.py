@@ -1,4 +1,4 @@
-"""Maximum-a-posteriori (MAP) reconstructor of the corrected modes: the uncorrected ones have a prior mean square."""
+"""Maximum-a-posteriori (MAP) reconstructor of the corrected modes, with a prior for the uncorrected ones."""
 
 from functools import lru_cache
 
@@ -13,7 +13,7 @@ from lowfc.control.loop.camera import CameraSettings
 def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: CameraSettings | None) -> Array | None:
     """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront rms, with the flux normalisation.
 
-    It includes photon noise of I0 and read noise; None if the camera's gain or the flux is unknown. Read-only.
+    It includes photon noise of I0 and read noise. None if the camera's gain or the flux is unknown. Read-only.
     """
     if camera is None or not camera.gain_e_per_dn > 0 or not flux_dn > 0:
         return None
@@ -37,7 +37,8 @@ def map_rows(
     """Matrices M (modes, any), such as R, with the rows M_c - C_cu (C_uu + P_u)^-1 M_u for corrected modes c.
 
     M_u are the rows of the uncorrected modes u, which stay as they are, P_u is their prior, and C the noise covariance
-    of the calibration's own R. If that is the weighted R for the same flux, its rows are (H'WH + P^-1)^-1 H'W.
+    of the calibration's own R. If this R is the weighted one for the same flux, the new rows of R are
+    (H'WH + P^-1)^-1 H'W.
 
     Args:
         calibration: The calibration in use.

@@ -23,8 +23,8 @@ class Plan:
     Attributes:
         table: (frames, columns) amplitudes of each frame's command, in the unit of its shapes: nm rms of wavefront for
             modes, nm of surface for single actuators.
-        used: (frames,) whether an exposure that sees this row alone may be used.
-        per_column: least number of used frames with a poke of a column.
+        used: (frames,) whether an exposure that sees only this row may be used.
+        per_column: number of used frames in which a column is poked: the least of all columns.
     """
 
     table: Array
@@ -94,7 +94,7 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
     Args:
         table: A row for each frame from the first one of the sequence; before and after it, zeros.
         weights: (lags,) fractions that an exposure sees of the rows 0, 1, ... frames before its own; they sum to 1.
-        sequence: (exposures,) ascending, counted from the frame whose command had the first row.
+        sequence: (exposures,) number of the frame, ascending, counted from the one whose command had the first row.
         commanded: (exposures,) whether the frame led to a command; if not, or if the frame is missing, the mirror kept
             the previous row.
 
@@ -115,11 +115,11 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
 
 
 def usable(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: int) -> Mask:
-    """Whether each exposure (exposures,) sees a usable row, and all frames from the row before it on led to commands.
+    """Whether each exposure (exposures,) sees a usable row, with no command missing since the frame before this row.
 
     Args:
         plan: The plan that was played.
-        sequence: (exposures,) ascending, counted from the frame whose command had the first row.
+        sequence: (exposures,) number of the frame, ascending, counted from the one whose command had the first row.
         commanded: (exposures,) whether the frame led to a command.
         lag: Whole frames from a row's frame to the exposure that sees it.
     """

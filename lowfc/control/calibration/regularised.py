@@ -131,6 +131,6 @@ def advice(reconstruction: Reconstruction, noll: tuple[int, ...], limit_nm: Sing
     cut = reconstruction.singular_values[bad[0]] / reconstruction.singular_values[0]
     drop = f", or drop them with --truncate {1.01 * cut:.3g}" if bad[0] else ""  # nothing would be left if all are bad
     return (
-        f"{bad.size} of {len(noll)} combinations of modes (mostly {names}) are measured with more noise than the "
-        f"{limits_nm[bad].min():g} nm of their limit: use fewer modes, lower their gains{drop}"
+        f"{bad.size} of {len(noll)} combinations of modes (mostly {names}) are measured with more noise than "
+        f"their limit of {limits_nm[bad].min():g} nm: use fewer modes, lower their gains{drop}"
     )

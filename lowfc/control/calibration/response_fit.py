@@ -16,11 +16,11 @@ import numpy.typing as npt
 from lowfc.arrays import Array, Integers, Mask
 
 MIN_CYCLES = 4
-"""Least number of cycles for a useful scatter."""
+"""Least number of cycles whose scatter gives a useful standard error."""
 MAX_ELEMENT_RMS = 1.2
 """Largest rms of the elements of R H - I of a good calibration, in units of 1 / snr."""
 MAX_ELEMENT = 4.0
-"""Largest element of R H - I of a good calibration, in the same units."""
+"""Largest element of R H - I of a good calibration, in units of 1 / snr."""
 WORST_CONDITION = 1e3
 """Condition number of R H above which a reconstructor does not tell the modes apart."""
 _WORST_INSTRUMENT = 1e6
@@ -30,11 +30,11 @@ _OUTLIER = 4.0
 _MEDIAN_NOISE = 1.2
 """Ratio of the noise of the median of a few values to that of their mean."""
 _BETTER = 0.95
-"""Ratio of noise to that of an earlier candidate below which a later one is chosen."""
+"""A later candidate is chosen if its noise is below this fraction of an earlier one's."""
 _MEAN_SQUARE_ERRORS = 3.0
-"""Allowed standard errors of the mean square of the elements."""
+"""Standard errors by which the mean square of the elements may exceed its limit."""
 _MAX_ELEMENT_ERRORS = 5.0
-"""Allowed standard errors of the largest of some hundred elements."""
+"""Standard errors by which the largest of some hundred elements may exceed its limit."""
 
 
 class Cycle(NamedTuple):
@@ -150,7 +150,7 @@ def cycle_response(
         seen: (frames, modes) modes of the mirror in each exposure, nm of wavefront.
         instruments: (frames, modes) instrumental variables: the poke alone in each exposure; `seen` in open loop.
         used: (frames,) whether a frame is usable.
-        slowest: Lowest frequency of the pokes that is used, cycles per frame: most of the disturbance is below.
+        slowest: Frequency, cycles per frame, below which pokes are not used: most of the disturbance is there.
 
     Raises:
         ValueError: the pokes in the usable frames do not tell the modes apart.
@@ -174,7 +174,7 @@ def cycle_response(
 
 
 def _slow(times: Integers, frames: int, slowest: float) -> Array:
-    """Orthonormal basis (times, any) of slow changes in a piece: the mean, and all cosines below a frequency."""
+    """Orthonormal basis (times, any) of slow changes in a piece: the mean, and all cosines below `slowest`."""
     orders = np.arange(1 + int(2 * frames * slowest))
     return np.linalg.qr(np.cos(np.pi * np.outer((times + 0.5) / frames, orders)))[0]
 
@@ -223,7 +223,7 @@ def row_error(products: Array) -> Array:
 
 
 def best_initial(candidates: list[Initial], response: Array, mode: int, variance: Array) -> Initial:
-    """The candidate with the least noise for a mode; a later one needs less than `_BETTER` of an earlier one's noise.
+    """The candidate with the least noise in a mode; a later one must have less than `_BETTER` of an earlier one's.
 
     The response (pixels,) to a poke of the mode is in flux fractions; the variance (pixels,) is that of a frame.
     """
@@ -257,7 +257,7 @@ class Check(NamedTuple):
 
     Attributes:
         rms: rms of the elements of R H - I, with the noise of these frames subtracted.
-        largest: largest element of R H - I, with that noise.
+        largest: largest element of R H - I, with the noise of these frames included.
         error: (modes,) standard error of the elements of each row, from the noise of these frames.
         cycles: number of cycles.
     """
@@ -274,7 +274,7 @@ class Check(NamedTuple):
         return bool(self.rms**2 <= rms**2 + unsure and self.largest <= self.bound(largest))
 
     def bound(self, largest: float) -> float:
-        """Largest element that these frames may show if none is above `largest`, with their noise."""
+        """Largest element that these frames may show, with their noise, if no true element is above `largest`."""
         return largest + _MAX_ELEMENT_ERRORS * float(self.error.max())
 
 

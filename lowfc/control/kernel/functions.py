@@ -1,7 +1,7 @@
 """The fused step: the arithmetic of a normal frame in plain functions, to be compiled.
 
-The functions suit a compiler: loops over existing arrays, without allocations, that call only simple functions of
-Python and numpy, and each other. Rows of R are processed ten at a time and the rest five at a time, so that each frame
+The functions suit a compiler: they loop over existing arrays, allocate nothing, and call only each other and simple
+functions of Python and numpy. Rows of R are processed ten at a time and the rest five at a time, so that each frame
 is read once for many rows and several sums run in parallel. `lowfc.adapters` compiles them.
 """
 
@@ -162,7 +162,7 @@ def respond(
     results: Single,
     actuators_nm: Single,
 ) -> bool:
-    """From modal errors to the command of a closed loop, provided that no limit acts; modes in nm of wavefront rms.
+    """Compute the command of a closed loop, provided that no limit acts; modes are in nm of wavefront rms.
 
     Args:
         measured_nm: (modes,) result of `measure`.
@@ -171,7 +171,7 @@ def respond(
         target_nm: (modes,) target of the loop.
         previous_command_nm: (modes,) last modal command.
         integrator: (3, modes) gain, fraction of the command that is kept, and limit, as in `Integrator.rows`.
-        x: (states,) state of a linear law; empty for the integrator, like the next two.
+        x: (states,) state of a linear law; empty for the integrator, like `transition` and `output`.
         transition: (states, states + 2 modes) F, G and U of a linear law, side by side.
         output: (modes, states) K.
         from_error: whether the law's signal is the error, not the pseudo-open-loop modes.

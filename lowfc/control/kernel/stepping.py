@@ -21,7 +21,7 @@ def respond(
     events: list[PendingEvent],
     tables: Tables | None,
 ) -> tuple[Single, Single, ActiveLoop, tuple[Reason, ...], bool]:
-    """Respond to the modal errors (modes,) of a frame; `tables` if the fused step computed the errors with them.
+    """Respond to the modal errors (modes,) of a frame; `tables` is not None if the fused step computed the errors.
 
     Returns:
         Error and pseudo-open-loop modes (modes,), nm of wavefront rms; the loop after the frame; the limits that acted
@@ -49,7 +49,7 @@ def _fused(
     """Error, pseudo-open-loop modes, command (modes,), x (states,) and actuators (rows, columns) of a normal frame.
 
     None if the frame is not normal: the loop is not closed, its command returns to zero, a channel moves or a probe
-    sequence is played, a law is in use but does not drive it alone, or a limit acts.
+    sequence is played, a law is in use but does not drive the loop alone, or a limit acts.
     """
     channels, law_runner = loop.command_channels, loop.law_runner
     if state.mode is not LoopMode.CLOSED or state.returning_to_zero or (channels is not None and channels.moving):

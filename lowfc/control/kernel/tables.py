@@ -22,7 +22,7 @@ reference step decides whether a frame is dark."""
 class Kernel(NamedTuple):
     """Implementation for normal frames: `measure` and `respond` of `lowfc.control.kernel.functions`, compiled.
 
-    Without them, the reference implementation is used, regardless of the name.
+    If one is None, the reference implementation is used, regardless of the name.
     """
 
     name: str

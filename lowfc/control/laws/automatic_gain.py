@@ -16,27 +16,27 @@ CONFIDENCE = 2.0
 """Standard errors by which one gain must beat another. A gain that is better in `WINNING_BLOCKS` blocks wins as well,
 since one block may outweigh all others when the open loop wanders."""
 WINNING_BLOCKS = 9
-GRANTED = 3.0
+GRANT_SIGMAS = 3.0
 """Standard errors of white noise by which a gain must beat the open loop, in a first window and later for a mode with a
 gain of 0: on a faint star, a single gain granted because of noise may add as much contrast as the dark zone has."""
-EARLY = 5
+EARLY_BLOCKS = 5
 """Blocks of a window after which a mode may get another gain before the window ends: from a gain of 0 if the other one
-is better by `GRANTED`, from the least gain if the other one was better in this many blocks in a row."""
-LONGEST = 16
+is better by `GRANT_SIGMAS`, from the least gain if the other one was better in this many blocks in a row."""
+MAX_GROWTH = 16
 """Largest factor by which a window grows while it decides nothing."""
-FEW = 3
+MIN_MAJORITY_MODES = 3
 """Number of modes below which each is judged by itself only; with more, the majority is evidence for each."""
 MAX_INJECTED = 0.1
 """Ratio of injected noise to correctable power below which a first window chooses the least gain instead of 0."""
-SURE = 4.0
+CERTAIN_SIGMAS = 4.0
 """Standard errors above which the cross-talk of tip and tilt into another mode counts as certain."""
-SUSPECTED = 2.0
+SUSPECTED_SIGMAS = 2.0
 """Standard errors above which cross-talk counts as suspected, so that a gain must tolerate it: on a faint star, even
 uncertain cross-talk may add ten times what the gain removes."""
 MARGIN = 5.0
 """Multiple of the measured cross-talk that a gain must tolerate: a sensor underestimates tilt beyond its range."""
-TOGETHER = 16
-"""Frames whose statistics are summed in one go: for a single one, the calls of numpy cost more than the arithmetic."""
+FRAMES_PER_SUM = 16
+"""Frames that are added to the sums at once: for a single frame, the calls of numpy take longer than the arithmetic."""
 _REGRESSORS = 5
 """Tip, tilt, their squares and their product."""
 
@@ -93,9 +93,9 @@ class GainBank:
         self._windows = windows
         self._closed = self._throughout = False
         self._waiting = 0  # frames in the arrays below that have not been summed
-        self._errors_nm = np.zeros((TOGETHER, *self.rows.shape), np.float32)
-        self._loop_nm = np.zeros((TOGETHER, leak.size), np.float32)
-        self._tilts_nm = np.zeros((TOGETHER, 2), np.float32)
+        self._errors_nm = np.zeros((FRAMES_PER_SUM, *self.rows.shape), np.float32)
+        self._loop_nm = np.zeros((FRAMES_PER_SUM, leak.size), np.float32)
+        self._tilts_nm = np.zeros((FRAMES_PER_SUM, 2), np.float32)
         self.use_reconstructor(np.eye(leak.size))
         self.restart()
 
@@ -137,7 +137,7 @@ class GainBank:
         self._waiting += 1
         self._frames += 1
         if self._frames < self._block:
-            if self._waiting == TOGETHER:
+            if self._waiting == FRAMES_PER_SUM:
                 self._add_up()
             return False
         self._add_up()
@@ -158,23 +158,23 @@ class GainBank:
     def early(self, gain: Single) -> Single:
         """Gains (modes,) before the window is complete.
 
-        A mode with a gain of 0 or the least gain gets a better one if there is one (see `EARLY`), a mode whose signal
-        proves to be cross-talk gets 0, and all others keep theirs.
+        A mode with a gain of 0 or the least gain gets a better one if there is one (see `EARLY_BLOCKS`). A mode whose
+        signal proves to be cross-talk gets 0. All others keep their gains.
         """
-        if self.first or len(self._excesses) < EARLY:
+        if self.first or len(self._excesses) < EARLY_BLOCKS:
             return gain
         now = self._row_of(gain)
-        cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts[-EARLY:])
+        cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts[-EARLY_BLOCKS:])
         if (now > 1).all() and not cross_talk_nm.any():
             return gain  # no mode can change: saves most of the time
         blocks = self._handicapped(suspected_nm)[:, :-1]
         own = blocks[:, now, np.arange(now.size)]
         beyond = blocks - own[:, None]
-        mean = np.where(now == 0, beyond.mean(axis=0), beyond[-EARLY:].mean(axis=0))
-        proven = np.where(now == 0, self._beyond_noise(mean), (beyond[-EARLY:] < 0).all(axis=0))
+        mean = np.where(now == 0, beyond.mean(axis=0), beyond[-EARLY_BLOCKS:].mean(axis=0))
+        proven = np.where(now == 0, self._beyond_noise(mean), (beyond[-EARLY_BLOCKS:] < 0).all(axis=0))
         proven_mean = np.where(proven, mean, np.inf)
         changed = (now <= 1) & proven.any(axis=0)
-        only_cross_talk = (cross_talk_nm != 0) & (own[-EARLY:] > 0).all(axis=0)
+        only_cross_talk = (cross_talk_nm != 0) & (own[-EARLY_BLOCKS:] > 0).all(axis=0)
         gain = np.where(changed, self.rows[np.argmin(proven_mean, axis=0), np.arange(now.size)], gain)
         return np.where(only_cross_talk, 0, gain).astype(np.float32)
 
@@ -185,7 +185,7 @@ class GainBank:
         self._cross_talk.held()
 
     def verdict(self, gain: Single, noise_nm2: Array | None) -> Verdict:
-        """Result of the window at gains (modes,), with a frame's noise (modes,) or None; then clear or lengthen it."""
+        """Result of the window at gains (modes,) with one frame's noise (modes,); then clear or lengthen the window."""
         means, power = (np.mean(values, axis=0, dtype=float) for values in (self._means, self._powers))
         cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts)
         power -= (2 * means - cross_talk_nm) * cross_talk_nm
@@ -198,7 +198,7 @@ class GainBank:
             noise_nm2 = np.maximum(noise_nm2, np.mean(self._changed, axis=0))
         if self.first and noise_nm2 is not None:
             scatter = _mean(np.subtract(self._powers, self._changed))[1]  # noise of a faint star has long tails
-            certain_power = power - noise_nm2 - GRANTED * np.maximum(noise_nm2 * np.sqrt(2 / frames), scatter)
+            certain_power = power - noise_nm2 - GRANT_SIGMAS * np.maximum(noise_nm2 * np.sqrt(2 / frames), scatter)
             little = injected(self.rows[1]) * noise_nm2 < MAX_INJECTED * certain_power
             chosen = np.where((chosen == 0) & little & (suspected_nm == 0), 1, chosen)
         verdict = Verdict(
@@ -222,7 +222,7 @@ class GainBank:
         """Certain and suspected cross-talk (modes,) of tip and tilt over these blocks, nm; 0 where there is none."""
         mean_nm, error_nm = self._cross_talk.mean_nm(np.mean(tilts, axis=0))
         accepted: list[Array] = [
-            np.where(np.abs(mean_nm) > errors * error_nm, mean_nm, 0) for errors in (SURE, SUSPECTED)
+            np.where(np.abs(mean_nm) > errors * error_nm, mean_nm, 0) for errors in (CERTAIN_SIGMAS, SUSPECTED_SIGMAS)
         ]
         return [self._from_own @ cross_talk_nm for cross_talk_nm in accepted]
 
@@ -263,12 +263,12 @@ class GainBank:
         Commands do not depend on the noise of later frames, so the differences of frames are independent.
         """
         return np.asarray(
-            mean < -GRANTED * np.sqrt(np.mean(self._spreads, axis=0) / (len(self._spreads) * self._block))
+            mean < -GRANT_SIGMAS * np.sqrt(np.mean(self._spreads, axis=0) / (len(self._spreads) * self._block))
         )
 
     def _median_of_modes(self, blocks: Array) -> Array:
-        """Median over the modes, in units of each mode's noise, scaled to each mode; 0 for fewer modes than `FEW`."""
-        if blocks.shape[-1] < FEW:
+        """Median over the modes of value / noise, times each mode's noise; 0 below `MIN_MAJORITY_MODES` modes."""
+        if blocks.shape[-1] < MIN_MAJORITY_MODES:
             return np.zeros_like(blocks)
         noise_nm2 = np.maximum(np.mean(self._changed, axis=0), 1e-12)
         return np.asarray(np.median(blocks / noise_nm2, axis=-1, keepdims=True) * noise_nm2)
@@ -301,7 +301,7 @@ class GainBank:
 
     def _clear(self, window: int) -> None:
         self._block = max(window // BLOCKS, 1)
-        self._longest = self._block * LONGEST
+        self._longest = self._block * MAX_GROWTH
         self._lists = tuple(list[Array]() for _ in range(6))
         self._excesses, self._powers, self._changed, self._means, self._tilts, self._spreads = self._lists
         self._throughout = True
@@ -309,7 +309,7 @@ class GainBank:
 
     def _begin_block(self) -> None:
         self._frames = self._changes_counted = self._waiting = 0
-        self._excess = np.zeros((len(self.rows) + 1, self._at_rest.kept.size))  # less the open loop's; last: real loop
+        self._excess = np.zeros((len(self.rows) + 1, self._at_rest.kept.size))  # last row: real loop
         self._spread = np.zeros((len(self.rows), self._at_rest.kept.size))
         self._power, self._changes, self._mean = np.zeros((3, self._at_rest.kept.size))
         self._tilt = np.zeros(_REGRESSORS)
@@ -378,7 +378,7 @@ def _mean(blocks: Array) -> tuple[Array, Array]:
 
 
 def _better(blocks: Array) -> tuple[Array, Mask]:
-    """Mean over the blocks, and whether it is below 0 beyond doubt."""
+    """Mean over the blocks, and whether it is below 0 by `CONFIDENCE` or in `WINNING_BLOCKS` blocks."""
     mean, error = _mean(blocks)
     return mean, (mean < -CONFIDENCE * error) | ((mean < 0) & (np.sum(blocks < 0, axis=0) >= WINNING_BLOCKS))
 

@@ -18,12 +18,12 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import sensitivity
 from lowfc.control.laws.stability import delay_weights
 
-_FILTER_POINTS = 4096  # of the transform from a response to its taps
+_FILTER_POINTS = 4096  # of the Fourier transform from the response of a filter to its taps
 _FILTER_OMEGA = np.linspace(0, np.pi, _FILTER_POINTS // 2 + 1)
 _FILTER_REACH = 48
 """Frames on either side from which a mean between measurements is interpolated."""
 
-_MOMENTS = 8  # instants of a period over which a mean square is taken
+_MOMENTS = 8  # instants of a frame period at which a mean square is sampled
 
 
 class Timing(NamedTuple):
@@ -32,7 +32,7 @@ class Timing(NamedTuple):
     Attributes:
         delay: in frames; a command computed from frame n first acts on the whole exposure of frame n + delay.
         applied: from the start of an exposure until the command computed from it is in force.
-        exposure: its length; 0 for an instant.
+        exposure: length of an exposure; 0 for an instant.
         held: time over which the residual counts, from `applied` on: a period, or 0 for that instant alone.
     """
 
@@ -45,7 +45,7 @@ class Timing(NamedTuple):
     def of(cls, delay: float, exposure: float) -> "Timing":
         """Timing in which a command is in force from the start of the first exposure that sees it alone.
 
-        With a fractional delay, the mirror moves when this fraction of the exposure before that one is over.
+        With a fractional delay, the mirror moves in the exposure before, when the fraction of the delay is over.
         """
         whole = delay // 1
         return cls(delay, whole + (delay - whole) * exposure, exposure)
@@ -64,7 +64,7 @@ class Timing(NamedTuple):
 
     @classmethod
     def sampled(cls, delay: float) -> "Timing":
-        """Only one instant of each frame counts; the residual between them is not included."""
+        """Timing in which only one instant of each frame counts; the residual between them is not included."""
         return cls(delay, delay, 0.0, 0.0)
 
 
@@ -76,12 +76,12 @@ def mean_over(omega: Array, length: float) -> Complex:
 
 
 def hold_floor(omega: Array, held: float = 1.0) -> Array:
-    """Residual power (frequencies,) of a wave of power 1 under the best held command; rad per frame."""
+    """Residual power (frequencies,) of a wave of power 1, omega in rad per frame, under the best held command."""
     return np.asarray(1 - np.abs(mean_over(omega, held)) ** 2)
 
 
 def residual_power(law: LinearLaw, omega: Array, timing: Timing) -> Array:
-    """Mean residual power over time (frequencies, modes) of a wave of power 1; rad per frame."""
+    """Mean residual power over time (frequencies, modes) of a wave of power 1 and frequency `omega`, rad per frame."""
     return _residual(sensitivity(law, omega, timing.delay), omega, timing)
 
 
@@ -110,13 +110,13 @@ def residual_spectrum(law: LinearLaw, omega: Array, measured: Array, noise_nm2: 
         timing: the loop's timing.
     """
     S = sensitivity(law, omega, timing.delay)
-    of_wave = _residual(S, omega, timing) / np.abs(mean_over(omega, timing.exposure))[:, None] ** 2
-    of_noise = np.abs(_commanded(S, omega, timing.delay)) ** 2
-    return np.asarray((measured - noise_nm2) * of_wave + noise_nm2 * of_noise)
+    disturbance_factor = _residual(S, omega, timing) / np.abs(mean_over(omega, timing.exposure))[:, None] ** 2
+    noise_factor = np.abs(_commanded(S, omega, timing.delay)) ** 2
+    return np.asarray((measured - noise_nm2) * disturbance_factor + noise_nm2 * noise_factor)
 
 
 def commanded(law: LinearLaw, omega: Array, delay: float) -> Complex:
-    """Command (frequencies, modes) from a frame that measures e^(i w t_k), relative to that wave; rad per frame."""
+    """Command (frequencies, modes) from a frame that measures e^(i w t_k), relative to it; omega in rad per frame."""
     return _commanded(sensitivity(law, omega, delay), omega, delay)
 
 

@@ -18,7 +18,7 @@ from lowfc.control.laws.spectra import Spectrum, TimeSeries, floor_nm2_hz, spect
 
 ROWS_PER_REGRESSOR = 10
 """Least number of frames per regressor; with fewer a fit mostly explains noise."""
-CERTAIN = 2.0
+DETECTED_SIGMAS = 2.0
 """Standard errors above which a difference of two variances counts as detected."""
 
 _DEGENERATE = 1e-7  # relative to the largest singular value of the regressors
@@ -35,9 +35,9 @@ class Term:
         """Rms in nm over some of the modes (modes,), and whether it was detected: otherwise it is an upper limit."""
         variance = float(self.variance_nm2[modes].sum())
         error = float(np.sqrt((np.broadcast_to(self.error_nm2, self.variance_nm2.shape)[modes] ** 2).sum()))
-        if error == 0 or variance > CERTAIN * error:
+        if error == 0 or variance > DETECTED_SIGMAS * error:
             return float(np.sqrt(max(variance, 0.0))), True
-        return float(np.sqrt(max(variance, 0.0) + CERTAIN * error)), False
+        return float(np.sqrt(max(variance, 0.0) + DETECTED_SIGMAS * error)), False
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,20 +150,20 @@ def measurement_error(
         ends = np.cumsum([len(piece) for piece in error.values])[:-1]
         return spectrum(TimeSeries(tuple(np.split(column, ends)), error.interpolated), law.rate_hz)
 
-    of_linear, of_nonlinear, of_basis = spectrum_of(linear), spectrum_of(nonlinear), spectrum_of(basis)
-    if of_linear is None or of_nonlinear is None or of_basis is None:
+    linear_psd, nonlinear_psd, basis_psd = spectrum_of(linear), spectrum_of(nonlinear), spectrum_of(basis)
+    if linear_psd is None or nonlinear_psd is None or basis_psd is None:
         return None
-    passed, at_0_hz = noise_transfer(law, of_nonlinear.frequency_hz) ** 2, noise_transfer(law, np.zeros(1))[0] ** 2
+    passed, at_0_hz = noise_transfer(law, nonlinear_psd.frequency_hz) ** 2, noise_transfer(law, np.zeros(1))[0] ** 2
     steady = linear.mean(axis=0) ** 2 * at_0_hz
     freedom = rows - basis.shape[1]
     # Residual from one unit of noise in each direction of the basis, (modes, directions).
-    by_chance = passed.T @ of_basis.power_nm2_hz * of_basis.spacing_hz + np.outer(at_0_hz, basis.mean(axis=0) ** 2)
+    by_chance = passed.T @ basis_psd.power_nm2_hz * basis_psd.spacing_hz + np.outer(at_0_hz, basis.mean(axis=0) ** 2)
     noise_nm2 = np.sum(nonlinear**2, axis=0) / freedom
-    nonlinear_nm2 = of_nonlinear.variance_nm2(passed) * rows / freedom - noise_nm**2 * noise_gain(law)
+    nonlinear_nm2 = nonlinear_psd.variance_nm2(passed) * rows / freedom - noise_nm**2 * noise_gain(law)
     return MeasurementError(
         Term(
-            of_linear.variance_nm2(passed) + steady - noise_nm2 * by_chance.sum(axis=1),
+            linear_psd.variance_nm2(passed) + steady - noise_nm2 * by_chance.sum(axis=1),
             noise_nm2 * np.sqrt(2 * np.sum(by_chance**2, axis=1)),
         ),
-        Term(nonlinear_nm2, of_nonlinear.error_nm2(passed)),
+        Term(nonlinear_nm2, nonlinear_psd.error_nm2(passed)),
     )

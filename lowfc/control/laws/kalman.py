@@ -17,7 +17,7 @@ _DOUBLINGS = 40  # largest number of iterations
 
 
 def lqg(models: Sequence[Model], noll: tuple[int, ...], timing: Timing) -> LinearLaw:
-    """The law for modes of which an exposure measures the mean; there is one model for each.
+    """The law from one model for each mode, if a frame measures the mean of a mode over the exposure.
 
     Raises:
         ValueError: the numbers of models and modes differ, models have different rates, or a filter does not converge.

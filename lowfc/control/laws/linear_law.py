@@ -13,7 +13,7 @@ from lowfc.control.laws.stability import delay_weights
 Signal = Literal["error", "pol"]
 
 _LARGEST_POLE = 0.99
-"""Largest pole of an integrator of pol in an open loop while frames are missing: below 1, for stability."""
+"""Largest pole of an integrator with signal pol, in an open loop while frames are missing: below 1, for stability."""
 MAX_STATES = 512
 """Most states of a law: a step with this number takes about 50 us."""
 SIGNALS: tuple[Signal, ...] = ("error", "pol")
@@ -118,7 +118,7 @@ def respond(law: LinearLaw, x: Single) -> Single:
 
 
 class Block(NamedTuple):
-    """The part of a law for one mode of s states: F (s, s), G (s,), U (s,), A (s, s), K (s,)."""
+    """The part of a law for one mode, which has s states: F (s, s), G (s,), U (s,), A (s, s), K (s,)."""
 
     transition: Array
     measurement_gain: Array
@@ -143,16 +143,16 @@ def law_from_blocks(
     G, U = np.zeros((states, len(noll))), np.zeros((states, len(noll)))
     K = np.zeros((len(noll), states))
     for mode, (block, end) in enumerate(zip(blocks, ends.tolist(), strict=True)):
-        here = slice(end - len(block.output), end)
-        F[here, here], A[here, here] = block.transition, block.predict_only
-        G[here, mode], U[here, mode], K[mode, here] = block.measurement_gain, block.command_gain, block.output
+        own = slice(end - len(block.output), end)
+        F[own, own], A[own, own] = block.transition, block.predict_only
+        G[own, mode], U[own, mode], K[mode, own] = block.measurement_gain, block.command_gain, block.output
     return LinearLaw(signal, single(F), single(G), single(U), single(A), single(K), name, noll, delay_frames, rate_hz)
 
 
 def integrator_block(gain: float, leak: float, signal: Signal, delay_frames: float) -> Block:
-    """c[k] = (1 - leak) c[k-1] - gain e[k], of the error or of pseudo-open-loop modes.
+    """The integrator c[k] = (1 - leak) c[k-1] - gain e[k], from the error or from pseudo-open-loop modes.
 
-    For the latter, e[k] = pol[k] + sum_j w_j c[k-1-j], for which the block stores commands. During missing frames pol
+    From the latter, e[k] = pol[k] + sum_j w_j c[k-1-j], for which the block stores commands. During missing frames pol
     is predicted to cancel the stored commands, so that the command keeps its value, apart from the leak. Above a gain
     of 0.99 / w_0 this prediction would be unstable in an open loop, so it is damped: the command then undoes part of
     its last change, at most a quarter at gains that keep the margins.

@@ -24,6 +24,7 @@ MAX_SETTLING_FRAMES = 4000
 
 _GRID = 2048  # frequencies of each regular grid
 _AROUND_POLE = np.concatenate([-np.geomspace(1e-2, 1e2, 33)[::-1], [0.0], np.geomspace(1e-2, 1e2, 33)])
+"""Frequencies relative to a pole's, in units of the pole's distance from the unit circle."""
 _LOWEST = 1e-6  # rad per frame: an integrator has no value at 0 Hz
 _ROUNDING = 1e-6  # poles other than those of a driven closed loop may exceed 1 by this, from single precision
 
@@ -127,7 +128,7 @@ def check_stable(law: LinearLaw, delay_frames: float) -> None:
                 true, own = (counted(float(delay), "frame") for delay in (delay_frames, law.delay_frames))
                 raise ValueError(
                     f"the law {law.name!r} is unstable with a delay of {true}: {state}, {modes} has a pole at "
-                    f"{radius:.4f}, it must be below 1 (it was made for {own} at {law.rate_hz:g} Hz)"
+                    f"{radius:.4f}, it must be below 1 (the law was made for {own} at {law.rate_hz:g} Hz)"
                 )
 
 
@@ -201,8 +202,8 @@ class _Part:
         response = self.K @ _solved(inside, np.broadcast_to(self.G.astype(complex), (z.size, *self.G.shape)))
         if not self.own_weights.size:
             return np.asarray(response)
-        believed = np.polynomial.polynomial.polyval(1 / z, self.own_weights) / z
-        return _solved(np.eye(len(self.modes)) + response * believed[:, None, None], response)
+        seen_by_law = np.polynomial.polynomial.polyval(1 / z, self.own_weights) / z
+        return _solved(np.eye(len(self.modes)) + response * seen_by_law[:, None, None], response)
 
     def sensitivity(self, omega: Array, weights: Array) -> Complex:
         """S (frequencies, modes, modes), frequencies in rad per frame."""

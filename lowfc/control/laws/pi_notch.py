@@ -19,8 +19,8 @@ smaller one wrong states last longer."""
 class Notch(NamedTuple):
     """A notch: at `frequency_hz`, the rejection is divided by `depth`.
 
-    `width_hz` is the width between its -3 dB points if it is deep (at a depth of 4, 6 % less). Neighbouring notches
-    deepen each other.
+    `width_hz` is the width between its -3 dB points if the notch is deep (at a depth of 4, that width is 6 % smaller).
+    Neighbouring notches deepen each other.
     """
 
     frequency_hz: float
@@ -49,7 +49,7 @@ def pi_notch(
         proportional: (modes,) proportional gain, without unit.
         leak: (modes,) leak of the integral, per frame.
         notches: Notches of each mode.
-        delay_frames: See `lowfc.control.laws.stability.delay_weights`.
+        delay_frames: Delay, as in `lowfc.control.laws.stability.delay_weights`.
         rate_hz: Frame rate.
 
     Raises:
@@ -58,14 +58,14 @@ def pi_notch(
     for name, values in (("gain", gain), ("proportional", proportional), ("leak", leak), ("notches", notches)):
         if len(values) != len(noll):
             raise ValueError(f"{name} must be given for each of {len(noll)} modes, got {len(values)}")
-    for notch in (notch for of_mode in notches for notch in of_mode):
+    for notch in (notch for mode_notches in notches for notch in mode_notches):
         if not (0 < notch.frequency_hz < rate_hz / 2 and 0 < notch.width_hz < rate_hz / 2 and notch.depth > 1):
             raise ValueError(
                 f"a notch lies between 0 and {rate_hz / 2:g} Hz, has a width in the same range and a depth above 1, "
                 f"got {notch}"
             )
     modes = zip(gain.tolist(), proportional.tolist(), leak.tolist(), notches, strict=True)
-    blocks = [_block(*of_mode, delay_frames, rate_hz) for of_mode in modes]
+    blocks = [_block(*mode, delay_frames, rate_hz) for mode in modes]
     name = "pi-notch" if any(notches) else "pi"
     return law_from_blocks(blocks, "error", name, noll, delay_frames, rate_hz)
 
@@ -73,7 +73,7 @@ def pi_notch(
 def _block(
     gain: float, proportional: float, leak: float, notches: Sequence[Notch], delay_frames: float, rate_hz: float
 ) -> Block:
-    """States: the integral, the error, and a rotating pair for each notch; u = C s, s[k] = P s[k-1] + B e[k]."""
+    """Block of one mode, u = C s, s[k] = P s[k-1] + B e[k]; s is the integral, the error, a rotating pair per notch."""
     weights = delay_weights(delay_frames)
     residues: list[tuple[complex, complex]] = []  # pole, residue
 
@@ -108,7 +108,7 @@ def _block(
 
 
 def _correction(P: Array, B: Array, C: Array) -> Array:
-    """M (states,): share of each state in the correction by a limit.
+    """M (states,): share of each state in the correction after a limit changed the command.
 
     C (s + M (c - C s)) = c for the limited command c. Without notches the integral takes all of it. Otherwise M is the
     steady Kalman gain of a law's states from its limited commands, for errors of variance 1 and small unknown changes.

@@ -153,7 +153,7 @@ def in_bins(frequency_hz: Array, columns: Sequence[Array]) -> tuple[Array, list[
 
 
 def interpolated(position: Integers, rows: Array, frames: int) -> Array:
-    """Rows (frames, columns) from those at increasing positions, interpolated where there is none."""
+    """Rows (frames, columns) at all positions: the given ones at `position`, and interpolated ones between them."""
     if frames == position.size:
         return rows
     return np.stack([np.interp(np.arange(frames), position, column) for column in rows.T], axis=1)

@@ -17,13 +17,13 @@ LOWEST_GAIN = 0.01
 SETTLING = 5.0
 """Time constants of the slowest mode after which a loop counts as settled."""
 
-_LONGEST_DELAY = 1000  # frames; a longer one, of a damaged file or message, could exceed the memory
+_LONGEST_DELAY = 1000  # frames; a longer one, from a damaged file or message, could exceed the memory
 _BISECTIONS = 50
 """Halvings of a 4096th of pi, down to double precision; scipy.optimize is not used, as its import takes 0.3 s."""
 
 
 def settling_frames(gain: Array | Single, leak: Array | Single, least: float = 0.0) -> int:
-    """Frames until the slowest mode has settled after closing, or `least` if more; gain, leak (modes,) without unit."""
+    """Frames until the slowest mode has settled after closing, at least `least`; gain, leak (modes,) without unit."""
     slowest = float((gain + leak)[gain + leak > 0].min(initial=1.0))
     return int(np.ceil(max(SETTLING / slowest, least)))
 
@@ -32,7 +32,7 @@ def delay_weights(delay_frames: float) -> Array:
     """Return w: the fraction of command[k-1-j], j = 0, 1, ..., seen in exposure k; sums to 1.
 
     A delay of d frames (d >= 1) is counted from the frame that a command is computed from to the first frame exposed
-    wholly with it. If d has a fraction f, an exposure sees (1 - f) of the newer and f of the older command.
+    wholly under it. If d has a fraction f, an exposure sees (1 - f) of the newer and f of the older command.
 
     Raises:
         ValueError: the delay is below 1 or above 1000 frames, or not a number.

@@ -13,10 +13,10 @@ from lowfc.arrays import Array, Complex, Integers, Mask
 
 _FAINTEST = 1e-3  # amplitude of a line, relative to the mode's highest; fainter ones are rounding to single precision
 _ADJACENT = np.array([*range(-16, -1), *range(2, 17)])  # bins from which a line's noise is measured
-_OF_FLANKS = 12 / 7  # white noise power of a bin under Hann's window, over that of `flanks`, which lack the line
+_BIN_TO_FLANK = 12 / 7  # ratio of a bin's white noise power under Hann's window to that of `flanks`, without the line
 _DB = 20 / np.log(10)
 
-SURE = 3.5
+SIGMAS = 3.5
 """Standard errors that must fit into the tolerance for a line to be judged."""
 
 
@@ -47,8 +47,8 @@ class Departure:
     """Departure of measured lines from theory.
 
     Attributes:
-        db: (lines,) measured over theory.
-        error_db: (lines,) its standard error.
+        db: (lines,) ratio of the measured size to theory, dB.
+        error_db: (lines,) standard error of `db`.
         judged: (lines,) whether its error is small enough for the tolerance.
         within: (lines,) whether it was judged and is within the tolerance.
     """
@@ -67,14 +67,14 @@ def measure_lines(error_nm: Array, added_nm: Array) -> Lines:
     includes cross-talk from other modes' lines.
 
     Args:
-        error_nm: (frames, modes) of one period.
-        added_nm: (frames, modes) in the same frames.
+        error_nm: (frames, modes) errors in one period.
+        added_nm: (frames, modes) signal added in the same frames.
 
     Raises:
-        ValueError: the frames differ, or nothing was added.
+        ValueError: the shapes differ, or nothing was added.
     """
     if error_nm.shape != added_nm.shape:
-        raise ValueError(f"errors {error_nm.shape} and added signal {added_nm.shape} must have the same frames")
+        raise ValueError(f"errors {error_nm.shape} and added signal {added_nm.shape} must have the same shape")
     frames = len(error_nm)
     response, added = _hann(error_nm), _hann(added_nm)
     by_mode: list[tuple[Integers, Integers, Complex, Array]] = []
@@ -91,7 +91,7 @@ def measure_lines(error_nm: Array, added_nm: Array) -> Lines:
         adjacent_power = np.where(excluded[adjacent], np.nan, np.abs(response[adjacent, mode]) ** 2)
         # A vibration on the line itself shows only in the adjacent bins, after subtraction of the line.
         flanks = response[bins[:, None] + np.array([-1, 1]), mode] + response[bins, mode][:, None] / 2
-        flank_power = _OF_FLANKS * np.mean(np.abs(flanks) ** 2, axis=1)
+        flank_power = _BIN_TO_FLANK * np.mean(np.abs(flanks) ** 2, axis=1)
         noise = np.sqrt(np.maximum(np.nanmean(adjacent_power, axis=1), flank_power) / 2)
         S = response[bins, mode] / added[bins, mode]
         by_mode.append((np.full(bins.size, mode), bins, S, noise / np.abs(added[bins, mode])))
@@ -114,7 +114,7 @@ def departure(value: Complex, theory: Array, error: Array, tolerance_db: float) 
     size = np.maximum(np.abs(value), 1e-30)
     db = _DB * np.log(size / np.maximum(theory, 1e-30))
     error_db = _DB * error / size
-    judged = error_db * SURE <= tolerance_db
+    judged = error_db * SIGMAS <= tolerance_db
     return Departure(db, error_db, judged, judged & (np.abs(db) <= tolerance_db))
 
 

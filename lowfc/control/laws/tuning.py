@@ -1,7 +1,7 @@
 """The best law for a log: integrator gains after Gendron and Lena, PI with notches, LQG, each with its margins.
 
 All start from pseudo-open-loop modes, pol = disturbance + white noise, and minimise the residual wavefront over all
-time. It exceeds the residual that the sensor sees: exposures average, and the star moves while the mirror holds.
+time. This residual exceeds the one that the sensor sees: exposures average, and the star moves while the mirror holds.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from lowfc.control.laws.what_if import counterfactual, driven_by
 _NARROWER = (0.1, 0.01, 1e-3)  # factors tried on the fitted width of a line that a log cannot resolve
 _WIDER = (10.0,)  # likewise, for lines that move
 _SETTLING_FRAMES = 5000
-_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # overestimates of the noise variance, tried until the margins suffice
+_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # log2 of factors on the noise, tried until the margins suffice
 _NEAR_ENOUGH = 0.25
 """Octaves between a filter with sufficient margins and one without at which the search between them ends: their
 residuals agree within half a percent."""
@@ -54,7 +54,7 @@ class Gains:
     """Integrator gains (modes,) and their residuals, nm rms.
 
     Attributes:
-        gain: gain of the least residual over all time.
+        gain: gain with the least residual over all time.
         predicted_nm: residual over all time.
         sensed_nm: residual of the means over the exposures.
         noise_nm: noise of one frame.
@@ -92,7 +92,7 @@ def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> 
     gains, residual_nm2, sensed_nm2 = np.zeros((3, len(leaks)))
 
     def law_of(gain: float, mode: int) -> LinearLaw:
-        return integrator([gain], [leaks[mode]], (2,), timing.delay, rate_hz)  # its Noll index does not matter
+        return integrator([gain], [leaks[mode]], (2,), timing.delay, rate_hz)  # the Noll index does not matter
 
     def steady_nm2(gain: float, mode: int) -> float:
         """A leak leaves a fraction of the mean: |S| at 0 Hz."""
@@ -174,9 +174,9 @@ def tune_pi_notch(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], 
     """
     rate_hz = models[0].rate_hz
     tuned = [_notched(*mode, timing) for mode in zip(models, gains.gain.tolist(), leak.tolist(), strict=True)]
-    gain, notches = np.array([g for g, _ in tuned]), [of_mode for _, of_mode in tuned]
+    gain, notches = np.array([g for g, _ in tuned]), [mode_notches for _, mode_notches in tuned]
     law = pi_notch(noll, gain, np.zeros(len(noll)), leak, notches, timing.delay, rate_hz)
-    return _tuned(law, timing, ["pi-notch" if of_mode else "integrator" for of_mode in notches], models)
+    return _tuned(law, timing, ["pi-notch" if mode_notches else "integrator" for mode_notches in notches], models)
 
 
 def _notched(model: Model, gain: float, leak: float, timing: Timing) -> tuple[float, tuple[Notch, ...]]:
@@ -268,7 +268,7 @@ def _scaled(model: Model, factor: float, finest_hz: float) -> Model:
 
 
 def within_margins(model: Model, timing: Timing) -> Block | None:
-    """Filter of a model, its noise overestimated as far as sufficient margins require; None if they cannot be reached.
+    """Filter of a model, with its noise overestimated until the margins suffice; None if they cannot be reached.
 
     A filter with less weight on its measurements predicts more smoothly; for a model with a known line little is lost.
     """
@@ -307,7 +307,7 @@ def _sufficient(found: margins.Margins) -> bool:
 
 
 def fine_frequencies(model: Model) -> Array:
-    """Rad per frame from nearly 0 to pi, ascending, densely around each line."""
+    """Frequencies (n,) from nearly 0 to pi rad per frame, ascending, dense around each line."""
     apart = np.geomspace(1e-3, 1e4, 120)
     grids = [np.linspace(0, np.pi, 2048), np.geomspace(1e-7, np.pi, 512)]
     for line in model.lines:

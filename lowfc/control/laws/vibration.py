@@ -21,14 +21,14 @@ FEWEST = 2048
 _LONGEST = 1 << 16  # frames of a segment
 _MAX_LINES = 12
 _SCALES = (3, 9, 27, 81)  # numbers of frequencies over which lines are searched
-_PENALTY = 2.5  # of a line: log-likelihood per log(frequencies); 1.5 for 3 parameters (BIC), 1 for the choice of place
-_SHARE = 0.3  # of the largest gain in likelihood, which a narrower line must reach to be preferred
-_HANN = 1.5  # neighbours are correlated: three count as two
+_PENALTY = 2.5  # log-likelihood per line and log(frequencies): 1.5 for 3 parameters (BIC), 1 for choosing a frequency
+_SHARE = 0.3  # part of the largest gain in likelihood that a narrower line must reach to be preferred
+_HANN = 1.5  # under Hann's window neighbouring frequencies are correlated: three count as two
 _LOBE = 12  # frequencies on either side of a line into which the window spreads it
 _FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
 _PER_DECADE = 48  # groups of averaged frequencies
 _MIN_DRIFT = 1e-8  # variance of the drift's step per variance of noise: a constant is followed in 10^4 frames
-_MIN_NOISE = 1e-3  # least noise over the level at high frequencies, which drift may explain: a filter needs some noise
+_MIN_NOISE = 1e-3  # least ratio of noise to the level at high frequencies: drift may explain it, but filters need noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ def resolution_hz(run: TimeSeries, rate_hz: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Whittle:
-    """A periodogram (frequencies,) without its first three and last frequencies; the number of averaged segments."""
+    """Fits to a periodogram (frequencies,), the mean of `segments`, without its first three and its last frequency."""
 
     omega: Array
     power: Array
@@ -142,7 +142,7 @@ class _Whittle:
                 values = piece[start : start + frames, 0]
                 power += np.abs(rfft(window * (values - values.mean()))) ** 2
                 segments += 1
-        keep = slice(3, -1)  # the window removes the lowest with the mean; half the frame rate has another distribution
+        keep = slice(3, -1)  # the lowest are removed with the mean, and at half the frame rate the distribution differs
         omega = 2 * np.pi * np.arange(power.size) / frames
         return cls(omega[keep], np.maximum(power[keep] / segments, 1e-300), segments, rate_hz)
 
@@ -169,8 +169,8 @@ class _Whittle:
 
     def cost(self, model: Model) -> float:
         """Negative log-likelihood with the penalty of each line, up to a constant."""
-        whole = self.misfit(self.power, model.spectrum_nm2(self.omega) + model.noise_nm2, 1.0)
-        return whole + float(_PENALTY * np.log(self.omega.size)) * len(model.lines)
+        misfit = self.misfit(self.power, model.spectrum_nm2(self.omega) + model.noise_nm2, 1.0)
+        return misfit + float(_PENALTY * np.log(self.omega.size)) * len(model.lines)
 
     def misfit(self, power: Array, spectrum: Array, counts: Array | float) -> float:
         """Negative log-likelihood, up to a constant."""
@@ -191,19 +191,19 @@ class _Whittle:
         omega, power = (np.add.reduceat(each, starts) / counts for each in (self.omega, self.power))
         if robust:  # medians: unknown lines hardly affect them
             parts = np.split(self.power, starts[1:])
-            median = 1 if self.segments > 1 else np.log(2)  # of exponentially distributed power, over its mean
+            median = 1 if self.segments > 1 else np.log(2)  # median / mean of exponentially distributed power
             power = np.array([np.median(part) / median if part.size > 4 else np.nan for part in parts])
-            there = np.isfinite(power)
-            return omega[there], power[there], counts[there].astype(float)
+            valid = np.isfinite(power)
+            return omega[valid], power[valid], counts[valid].astype(float)
         return omega, power, counts.astype(float)
 
     def fit_floor(self, model: Model, robust: bool) -> Model:
         """Refit drift and noise with fixed lines."""
         omega, power, counts = self.grouped(model.lines, robust)
-        known = replace(model, drift_nm2=0.0).spectrum_nm2(omega)
+        line_power = replace(model, drift_nm2=0.0).spectrum_nm2(omega)
         white = float(np.median(self.power[self.power.size // 2 :])) / (np.log(2) if self.segments == 1 else 1)
         low = slice(0, max(8, omega.size // 20))
-        step = float(np.median(np.maximum(power[low] - white - known[low], 1e-3 * white) * omega[low] ** 2))
+        step = float(np.median(np.maximum(power[low] - white - line_power[low], 1e-3 * white) * omega[low] ** 2))
         fits: list[tuple[float, tuple[float, float, float]]] = []
         for cutoff in (np.inf, 0.03, 0.003):  # cycles per frame to begin with
 
@@ -218,12 +218,12 @@ class _Whittle:
             def cost(parameters: Array) -> float:
                 drift_nm2, cutoff_hz, noise_nm2 = floor_of(parameters)
                 floor = _drift(omega, drift_nm2, cutoff_hz / self.rate_hz) + noise_nm2
-                return self.misfit(power, floor + known, counts)
+                return self.misfit(power, floor + line_power, counts)
 
             start = np.log([step, white] + ([cutoff] if np.isfinite(cutoff) else []))
             found = minimize(cost, start, method="Nelder-Mead", options={"maxiter": 300, "xatol": 1e-2, "fatol": 1e-2})
-            price = 0.5 * len(start) * np.log(self.omega.size)
-            fits.append((found.fun + price, floor_of(found.x)))
+            penalty = 0.5 * len(start) * np.log(self.omega.size)
+            fits.append((found.fun + penalty, floor_of(found.x)))
         _, (drift_nm2, cutoff_hz, noise_nm2) = min(fits, key=lambda fit: fit[0])
         noise_nm2 = max(noise_nm2, _MIN_NOISE * white)
         return replace(model, drift_nm2=drift_nm2, cutoff_hz=cutoff_hz, noise_nm2=noise_nm2)
@@ -252,7 +252,7 @@ class _Whittle:
         near = slice(max(place - max(_FULL, 3 * scale), 0), place + max(_FULL, 3 * scale) + 1)
         return self._fit_line(near, place, scale, spectrum[near])
 
-    def _fit_line(self, near: slice, place: int, scale: int, known: Array) -> Line:
+    def _fit_line(self, near: slice, place: int, scale: int, background: Array) -> Line:
         omega, power, step = self.omega[near], self.power[near], 2 * np.pi / self.rate_hz
         excess = self.power[max(place - scale, 0) : place + scale + 1].sum() / self.power.size
 
@@ -263,7 +263,7 @@ class _Whittle:
             return Line(centre, width, float(np.exp(parameters[2])))
 
         def cost(parameters: Array) -> float:
-            return self.misfit(power, known + _line(omega, *_per_frame(line_of(parameters), self.rate_hz)), 1.0)
+            return self.misfit(power, background + _line(omega, *_per_frame(line_of(parameters), self.rate_hz)), 1.0)
 
         start = np.array([0.0, np.log(0.3 * scale), np.log(excess)])
         return line_of(minimize(cost, start, method="Nelder-Mead", options={"maxiter": 400, "xatol": 1e-3}).x)
@@ -304,16 +304,16 @@ class _Whittle:
         floor = [np.log(model.drift_nm2), np.log(model.noise_nm2)] + ([np.log(model.cutoff_hz)] if corner else [])
         lines = [[0.0, np.log(line.width_hz), np.log(line.variance_nm2)] for line in model.lines]
         start = np.concatenate([floor, *lines])
-        wide = [(value - 3, value + 3) for value in start[: 2 + corner]]
+        bounds = [(value - 3, value + 3) for value in start[: 2 + corner]]
         for line, (_, width, variance) in zip(model.lines, start[2 + corner :].reshape(-1, 3), strict=True):
             reach = max(1.0, line.width_hz / spacing)
-            wide += [(-reach, reach), (np.log(1e-3 * spacing), width + 2), (variance - 2, variance + 2)]
-        found = minimize(cost, start, method="L-BFGS-B", bounds=wide, options={"maxiter": 60})
+            bounds += [(-reach, reach), (np.log(1e-3 * spacing), width + 2), (variance - 2, variance + 2)]
+        found = minimize(cost, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
         fitted = model_of(found.x if found.fun < cost(start) else start)
-        fitted = replace(fitted, lines=tuple(self._with_its_power(line, fitted) for line in fitted.lines))
+        fitted = replace(fitted, lines=tuple(self._with_measured_power(line, fitted) for line in fitted.lines))
         return replace(fitted, drift_nm2=max(fitted.drift_nm2, _MIN_DRIFT * fitted.noise_nm2))
 
-    def _with_its_power(self, line: Line, model: Model) -> Line:
+    def _with_measured_power(self, line: Line, model: Model) -> Line:
         """Set the variance of an unresolved line from the measured power: so far only its wings were fitted."""
         if line.width_hz > self.spacing_hz:
             return line

@@ -43,11 +43,11 @@ def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
 
 def limited_integrator(law: Integrator) -> Controller:
     """The live loop's integrator, with its limits, as a controller."""
-    noll = tuple(range(2, 2 + law.gain.size))  # these, delay and rate are not used
+    noll = tuple(range(2, 2 + law.gain.size))  # Noll indices, delay and rate are not used
     return driven_by(integrator(law.gain, law.leak, noll, 1.0, 1.0), law.limit_nm)
 
 
-def exposed(reasons: Long) -> Mask:
+def has_new_exposure(reasons: Long) -> Mask:
     """Mask (steps,): whether a step has a new exposure; `reasons` (steps,) has the bit `1 << reason` of each reason."""
     return np.asarray((reasons & _NOT_NEW) == 0)
 
@@ -64,7 +64,7 @@ def seen_nm(weights: Single, command_nm: Single, missing: Integers, first_nm: Si
     """Command (steps, modes) that each exposure saw; during exposures without a step the command is held.
 
     Args:
-        weights: see `lowfc.control.laws.stability.delay_weights`.
+        weights: from `lowfc.control.laws.stability.delay_weights`.
         command_nm: (steps, modes) after each step.
         missing: (steps,) from `missing_before`.
         first_nm: (modes,) command before the first step.
@@ -86,7 +86,7 @@ def counterfactual(controller: Controller, weights: Single, pol_nm: Single, miss
 
     Args:
         controller: the controller to fold; it is not called for refused frames, which hold the command.
-        weights: see `lowfc.control.laws.stability.delay_weights`.
+        weights: from `lowfc.control.laws.stability.delay_weights`.
         pol_nm: (steps, modes) disturbance and measurement noise; NaN for refused frames, whose error is then NaN too.
         missing: (steps,) from `missing_before`.
     """
@@ -138,7 +138,7 @@ def delay_from_times(
     """Mean delay in frames: from a command's frame to the first whose exposure began after the command was applied.
 
     Args:
-        sequence: (steps,) of the frames, ascending.
+        sequence: (steps,) sequence of each frame, ascending.
         exposure_start_ns: (steps,) on the clock of `applied_ns`.
         applied_sequence: (reports,) sequence of the frame of the command that the mirror reports as applied.
         applied_ns: (reports,) time of the report.
@@ -148,9 +148,9 @@ def delay_from_times(
     """
     commanding, first = np.unique(applied_sequence, return_index=True)  # a command may be applied repeatedly
     after = np.searchsorted(exposure_start_ns, applied_ns[first], side="right")
-    known = (after > 0) & (after < len(sequence))
-    commanding, after = commanding[known], after[known]
-    neighbours = sequence[after] - sequence[after - 1] == 1  # else an earlier frame may be missing here
+    inside = (after > 0) & (after < len(sequence))
+    commanding, after = commanding[inside], after[inside]
+    neighbours = sequence[after] - sequence[after - 1] == 1  # otherwise an earlier frame may be missing from the log
     delay = (sequence[after] - commanding).astype(np.int64)[neighbours]
     delay = delay[(delay >= 1) & (delay <= 2 * MAX_DELAY_FRAMES)]
     return float(delay.mean()) if len(delay) >= _FEWEST else None

@@ -47,6 +47,7 @@ from lowfc.control.loop.state import ActiveLoop, Settings, State
 UNMEASURED = frozenset({Rejection.NO_CALIBRATION, Rejection.WRONG_SIZE})
 """Rejections after which channels and probe sequences still move in open and idle loops."""
 STEPPED = "its last step is done"
+"""Cause of the open mode after the frames of a request `step`."""
 
 
 def advance(settings: Settings, state: State, input_: Input) -> tuple[State, Outputs]:
@@ -151,7 +152,7 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
         if loop is not None:  # a probe sequence's rows are numbered from the previous start
             loop = end_probe(loop, state.frame_sequence, "the camera restarted", events)
     camera = state.conditions.camera
-    if camera is not None and camera.start_s not in (0, frame.sequence >> COUNT_BITS):  # of another start
+    if camera is not None and camera.start_s not in (0, frame.sequence >> COUNT_BITS):  # settings of another start
         state = state._replace(conditions=state.conditions._replace(camera_awaited=True))
     return state, loop
 
@@ -256,12 +257,13 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
         return state, Outputs(events=tuple(events), changed=lease_ended)
     flatten = silent and settings.on_frame_timeout == "flat"
     counts = state.counts
-    begins = silent and not state.frame_timeout
-    if begins:
+    timeout_begins = silent and not state.frame_timeout
+    if timeout_begins:
         action = "relaxing the mirror to flat" if flatten else "holding the command"
         events.append(PendingEvent("NO_FRAMES", {"silent_ms": tick.silent_ns / 1e6, "action": action}))
         counts = _counted(counts, (Rejection.NO_FRAME,))
-    if begins or flatten:  # otherwise the command is held, and a probe sequence requested since waits for a frame
+    # Otherwise the command is held, and a probe sequence requested since then waits for a frame.
+    if timeout_begins or flatten:
         loop = end_probe(loop, state.frame_sequence, f"no frame for {tick.silent_ns / 1e6:.0f} ms", events)
     if flatten or safe:
         loop = step_to_flat(settings, loop)

@@ -53,6 +53,6 @@ def changes(now: CameraSettings, then: CameraSettings) -> list[str]:
     gains = (("gain_e_per_dn", now.gain_e_per_dn, then.gain_e_per_dn), ("em_gain", now.em_gain, then.em_gain))
     different: list[tuple[str, float, float]] = [(name, got, want) for name, got, want in exact if got != want]
     different += [(name, got, want) for name, got, want in levels if not abs(got - want) <= tolerance_dn]
-    known = ((name, got, want) for name, got, want in gains if min(got, want) > 0)
-    different += [(name, got, want) for name, got, want in known if abs(got / want - 1) > GAIN_TOLERANCE]
+    known_gains = ((name, got, want) for name, got, want in gains if min(got, want) > 0)
+    different += [(name, got, want) for name, got, want in known_gains if abs(got / want - 1) > GAIN_TOLERANCE]
     return [f"{name} is {got:g}, calibrated {want:g}" for name, got, want in different]

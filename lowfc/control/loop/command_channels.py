@@ -94,7 +94,7 @@ class Play(NamedTuple):
         """Number of rows for this and later frames."""
         return min(max(self.first_sequence + self.frames - sequence, 0), self.frames)
 
-    def over(self, sequence: int) -> bool:
+    def finished(self, sequence: int) -> bool:
         """Whether there is no row for this and later frames."""
         return not self.remaining(sequence)
 
@@ -143,7 +143,7 @@ class CommandChannels(NamedTuple):
 
     def moved(self, sequence: int, step_nm: float, to_modes: Single) -> "CommandChannels":
         """A copy for the next command: every channel moves towards its shape, all together by at most `step_nm`."""
-        play = None if self.play is not None and self.play.over(sequence) else self.play
+        play = None if self.play is not None and self.play.finished(sequence) else self.play
         moving = sum(channel.moving for channel in self.channels)
         if not moving:
             return self._replace(play=play)

@@ -1,4 +1,4 @@
-"""From a frame to modal errors: dark, flux normalisation, reference, reconstructor."""
+"""Modal errors of a frame: dark, flux normalisation, reference, reconstructor."""
 
 from typing import NamedTuple
 

@@ -28,13 +28,15 @@ BETTER_S = 10.0
 """Time for which the law must be better in every block before it drives again; doubles with each takeover."""
 MAX_TAKEOVERS = 4
 """Number of takeovers after which only an operator can let the law drive again."""
-WORSE, BETTER = 1.2, 0.25
-"""The law is worse if its mean squared error is above `WORSE` times the integrator's, and better if below `BETTER`."""
+WORSE_RATIO, BETTER_RATIO = 1.2, 0.25
+"""The law is worse if its mean squared error is above `WORSE_RATIO` times the integrator's, and better if it is below
+`BETTER_RATIO` times the integrator's."""
 LONG_TERM_S = 10.0
 """Time constant of the long-term mean square of the pseudo-open-loop modes."""
 AMPLIFIED = 2.5
 """The loop amplifies if its mean squared error is above this multiple of the long-term mean square of the
-pseudo-open-loop modes, unless it is below `BETTER` times their mean square in the block: the disturbance has grown."""
+pseudo-open-loop modes. If it is below `BETTER_RATIO` times their mean square in this block, however, the loop still
+corrects: the disturbance has grown."""
 
 NAMES = ("tip and tilt", "the other modes")  # of the groups
 LAW_RETURNS = "law returns"
@@ -85,18 +87,18 @@ class Group(NamedTuple):
             means_nm2: means over the block of the squares of errors, virtual errors and pseudo-open-loop modes.
             spans: durations.
             void: whether the comparison with the integrator is invalid. An amplifying loop is detected without that
-                comparison, and so even if a wrong delay falsifies the pseudo-open-loop modes that it uses.
+                comparison, and so even if a wrong delay falsifies the pseudo-open-loop modes used in it.
         """
         error_nm2, virtual_nm2, pol_nm2 = means_nm2
         after = self._replace(usual_nm2=self.usual_nm2 + (pol_nm2 - self.usual_nm2) / spans.long_term)
         if self.overruled:
-            better = not void and virtual_nm2 < BETTER * error_nm2
+            better = not void and virtual_nm2 < BETTER_RATIO * error_nm2
             after = after._replace(blocks=self.blocks + 1 if better else 0)
             if self.final or after.blocks < spans.better * 2 ** (self.takeovers - 1):
                 return after, ""
             return after._replace(overruled=False, blocks=0), LAW_RETURNS
-        worse = not void and error_nm2 > WORSE * virtual_nm2
-        amplified = error_nm2 > max(AMPLIFIED * self.usual_nm2, BETTER * pol_nm2)
+        worse = not void and error_nm2 > WORSE_RATIO * virtual_nm2
+        amplified = error_nm2 > max(AMPLIFIED * self.usual_nm2, BETTER_RATIO * pol_nm2)
         after = after._replace(blocks=self.blocks + 1 if worse or amplified else 0)
         if after.blocks < WORSE_BLOCKS:
             return after, ""
@@ -167,11 +169,11 @@ class LawGuard(NamedTuple):
 
         `frames` is the number of frames that the law has processed.
         """
-        part = 1 / min(frames, self.spans.long_term * self.spans.block)
+        weight = 1 / min(frames, self.spans.long_term * self.spans.block)
         squares = np.square(pol_nm).dot(self.members).tolist()
         return self.with_groups(
             [
-                group._replace(blocks=0, usual_nm2=group.usual_nm2 + part * (pol_nm2 - group.usual_nm2))
+                group._replace(blocks=0, usual_nm2=group.usual_nm2 + weight * (pol_nm2 - group.usual_nm2))
                 for group, pol_nm2 in zip(self.groups, squares, strict=True)
             ]
         )

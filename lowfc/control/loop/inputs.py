@@ -49,7 +49,7 @@ class Request:
         law: the law to drive the mirror; None for the integrator.
         calibration: the calibration to use.
         played: the checked table and shapes of a probe sequence.
-        refusal: reason to refuse it in any state of the loop.
+        refusal: reason to refuse the request in any state of the loop.
         prepared: whether the checks that need no state are done; see `lowfc.control.loop.requests.prepared`.
         lease_id: identity of the sender's lease, or of the requested one; 0 for none.
         requester: user and program that sent it, for people.

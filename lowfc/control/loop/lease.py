@@ -53,7 +53,7 @@ class Lease(NamedTuple):
         """The holder, without its remaining time."""
         return self.holder.rpartition(REMAINING_TIME_SEPARATOR)[0] or self.holder
 
-    def over(self, time_ns: int, frame_sequence: int) -> bool:
+    def expired(self, time_ns: int, frame_sequence: int) -> bool:
         """Whether its time is over, by the clock or by the times of frames."""
         return time_ns > self.until_ns or (self.same_start(frame_sequence) and self.last_sequence < frame_sequence)
 

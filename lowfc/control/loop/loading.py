@@ -243,7 +243,7 @@ def _step_back(settings: Settings, loop: ActiveLoop, shape_nm: Single) -> Active
 
 def end_probe(loop: ActiveLoop, sequence: int, why: str, events: list[PendingEvent]) -> ActiveLoop:
     """End the probe sequence after this frame, unless it has no further row."""
-    if loop.play is None or loop.play.over(sequence + 1):
+    if loop.play is None or loop.play.finished(sequence + 1):
         return loop
     events.append(PendingEvent("PLAY_ENDED", {"why": why}))
     return loop.stopped(sequence)
@@ -272,9 +272,9 @@ def camera_reported(settings: Settings, state: State, camera: CameraSettings) ->
 
 def _with_camera(state: State, camera: CameraSettings) -> State:
     """The state with newly received camera settings; the same object if they are unchanged."""
-    loop, known = state.loop, state.conditions
-    if camera != known.camera or known.camera_awaited:
-        state = state._replace(conditions=known._replace(camera=camera, camera_awaited=False))
+    loop, conditions = state.loop, state.conditions
+    if camera != conditions.camera or conditions.camera_awaited:
+        state = state._replace(conditions=conditions._replace(camera=camera, camera_awaited=False))
     if loop is not None and loop.calibration.noll and loop.camera is None and not misfit(state):
         state = state._replace(loop=loop._replace(camera=camera))
     return state

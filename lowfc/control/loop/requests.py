@@ -37,7 +37,7 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
         why = str(error)
         why = why if len(why) <= MAX_REPLY_LENGTH else f"{why[: MAX_REPLY_LENGTH - 3]}..."
         refused = Reply(False, why, state.frame_sequence + 1)
-        return state._replace(), Outputs(reply=refused)  # a copy: an unchanged state counts no input
+        return state._replace(), Outputs(reply=refused)  # a copy, since the same object is not counted
     by_another = lease_before is not None and lease_before.id != request.lease_id
     if request.name == "safe" or (request.name in ENDED_BY and by_another):
         after, lease_events = lease_ended(after, asked_by(lease_before, request))
@@ -181,11 +181,11 @@ def _integrator(settings: Settings, state: State, request: Request) -> Handled:
 def _offset(settings: Settings, state: State, request: Request) -> Handled:
     loop = _calibrated_loop(state)
     channels = loop.channels_or_empty()
-    or_zero = request if request.values else replace(request, values=(0.0,))
-    values = per_mode(loop.calibration.noll, or_zero, channels.offset_nm)
+    with_values = request if request.values else replace(request, values=(0.0,))
+    values = per_mode(loop.calibration.noll, with_values, channels.offset_nm)
     check_offset(loop, np.abs(values))
     text = " ".join(f"{value:g}" for value in values.tolist())
-    after = _with(state, loop, channels._replace(offset_nm=values))
+    after = _with_channels(state, loop, channels._replace(offset_nm=values))
     return after, f"offset is now {text} nm{offset_remark(loop, values)}"
 
 
@@ -208,7 +208,7 @@ def _channel(settings: Settings, state: State, request: Request) -> Handled:
     commanded = (channel.shape_nm for channel in channels.channels if channel.commanded)
     _check_shape(settings.limits, sum(commanded, np.zeros(grid, np.float32)), "with the other channels, ")
     rms_nm = float(np.sqrt(np.mean(np.square(shape_nm, dtype=np.float64))))
-    return _with(state, loop, channels), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
+    return _with_channels(state, loop, channels), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
 
 
 def _play(settings: Settings, state: State, request: Request) -> Handled:
@@ -220,7 +220,7 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
     if state.conditions.mirror_fault:
         raise ValueError(f"the mirror {state.conditions.mirror_fault}: it would not follow a probe sequence")
     channels = loop.channels_or_empty()
-    if channels.play is not None and not channels.play.over(state.frame_sequence + 1):
+    if channels.play is not None and not channels.play.finished(state.frame_sequence + 1):
         raise ValueError("a probe sequence is being played already: `lowfc ctl stop` ends it")
     table = request.played
     assert table is not None  # noqa: S101  # `prepared` has made it
@@ -241,13 +241,14 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
         check_offset(loop, table.largest)
     frames = len(table.rows)
     play = Play(table, state.frame_sequence + 1, frames)
-    return _with(state, loop, channels._replace(play=play)), f"playing {counted(frames, 'frame')} on the {table.target}"
+    after = _with_channels(state, loop, channels._replace(play=play))
+    return after, f"playing {counted(frames, 'frame')} on the {table.target}"
 
 
 def _stop(settings: Settings, state: State, request: Request) -> Handled:
     loop = state.loop
     play = None if loop is None else loop.play
-    if loop is None or play is None or play.over(state.frame_sequence + 1):
+    if loop is None or play is None or play.finished(state.frame_sequence + 1):
         return state, "no probe sequence is being played"
     remaining = play.remaining(state.frame_sequence + 1)
     text = f"probe sequence stopped on the {play.table.target}: {remaining} of {play.frames} frames were left"
@@ -305,7 +306,7 @@ def _calibrated_loop(state: State) -> ActiveLoop:
     return state.loop
 
 
-def _with(state: State, loop: ActiveLoop, command_channels: CommandChannels) -> State:
+def _with_channels(state: State, loop: ActiveLoop, command_channels: CommandChannels) -> State:
     return state._replace(loop=loop._replace(command_channels=command_channels))
 
 

@@ -21,7 +21,7 @@ def lease(settings: Settings, state: State, request: Request) -> tuple[State, st
         raise ValueError(before.refused_message(request.time_ns))
     granted = _extended(settings, state, request)
     event = PendingEvent("LEASE_TAKEN", {"holder": granted.holder})
-    return _with(state, granted), granted.reserved_message(request.time_ns), event
+    return _with_lease(state, granted), granted.reserved_message(request.time_ns), event
 
 
 def renew(settings: Settings, state: State, request: Request) -> tuple[State, str]:
@@ -32,7 +32,7 @@ def renew(settings: Settings, state: State, request: Request) -> tuple[State, st
     if before.ended:
         raise ValueError(f"{LEASE_OVER}{before.ended}")
     renewed = _extended(settings, state, request)._replace(holds=before.holds)
-    return _with(state, renewed), renewed.reserved_message(request.time_ns)
+    return _with_lease(state, renewed), renewed.reserved_message(request.time_ns)
 
 
 def release(settings: Settings, state: State, request: Request) -> tuple[State, str] | tuple[State, str, PendingEvent]:
@@ -40,7 +40,7 @@ def release(settings: Settings, state: State, request: Request) -> tuple[State, 
     held = state.conditions.lease
     if held is None or held.ended or held.id != request.lease_id:
         return state, "this lease is not in force"
-    after = _with(state, held._replace(ended="its holder released it"))
+    after = _with_lease(state, held._replace(ended="its holder released it"))
     return after, "released", PendingEvent("LEASE_RELEASED", {"holder": held.holder_name})
 
 
@@ -61,13 +61,13 @@ def counted_to_frame(settings: Settings, state: State, frame: Frame) -> State:
         if elapsed_ns <= 0 or (periods > frames and elapsed_ns > 2 * TICK_NS):
             return state
     last_sequence = max(held.last_sequence + frames - periods, frame.sequence - 1)
-    return _with(state, held._replace(last_sequence=last_sequence))
+    return _with_lease(state, held._replace(last_sequence=last_sequence))
 
 
 def lease_checked(state: State, time_ns: int, frame_sequence: int) -> tuple[State, list[PendingEvent]]:
     """End a lease that was not renewed by this time or frame (0: not compared); the state and the event."""
     held = state.conditions.lease
-    if held is None or held.ended or not held.over(time_ns, frame_sequence):
+    if held is None or held.ended or not held.expired(time_ns, frame_sequence):
         return state, []
     return lease_ended(state, "its time is over" if held.holds else "it was not renewed in time")
 
@@ -78,7 +78,7 @@ def lease_ended(state: State, why: str) -> tuple[State, list[PendingEvent]]:
     if held is None or held.ended:
         return state, []
     loop = None if state.loop is None else state.loop.stopped(state.frame_sequence)
-    after = _with(state, held._replace(ended=why))._replace(loop=loop)
+    after = _with_lease(state, held._replace(ended=why))._replace(loop=loop)
     return after, [PendingEvent("LEASE_ENDED", {"holder": held.holder_name, "why": why})]
 
 
@@ -92,7 +92,7 @@ def permit(settings: Settings, state: State, request: Request) -> tuple[State, s
     if before is not None and not before.ended and before.id != request.lease_id:
         raise ValueError(before.refused_message(request.time_ns))
     play = None if loop is None else loop.play
-    if play is not None and not play.over(state.frame_sequence + 1):
+    if play is not None and not play.finished(state.frame_sequence + 1):
         raise ValueError(
             "a probe sequence is being played, and the move would disturb its measurement; `lowfc ctl stop` ends that"
         )
@@ -104,7 +104,7 @@ def permit(settings: Settings, state: State, request: Request) -> tuple[State, s
     granted = _extended(settings, state, request)._replace(holds=True)
     what = "holds its command" if closed else f"is {state.mode.in_words} and stays so"
     text = f"granted for {request.values[0]:g} s: the loop {what}"
-    return _with(state, granted), text, PendingEvent("LEASE_TAKEN", {"holder": granted.holder})
+    return _with_lease(state, granted), text, PendingEvent("LEASE_TAKEN", {"holder": granted.holder})
 
 
 def _extended(settings: Settings, state: State, request: Request) -> Lease:
@@ -124,5 +124,5 @@ def _extended(settings: Settings, state: State, request: Request) -> Lease:
     return Lease(request.lease_id, holder, request.time_ns + round(duration_s * 1e9), last_sequence)
 
 
-def _with(state: State, lease: Lease) -> State:
+def _with_lease(state: State, lease: Lease) -> State:
     return state._replace(conditions=state.conditions._replace(lease=lease))

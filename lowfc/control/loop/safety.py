@@ -132,11 +132,11 @@ class Limited(NamedTuple):
 def limit(limits: Limits, previous_nm: Single, requested_nm: Single) -> Limited:
     """Limit the command `requested_nm` so that it may follow `previous_nm`.
 
-    Both are (rows, columns) float32, nm of surface; `previous_nm` must be finite. Stroke, then slew, clip each actuator
-    separately; the neighbour limit shortens the whole move. For any `requested_nm`, the result is finite, no actuator
-    moves further than the slew limit, and if `previous_nm` is within the stroke and neighbour limits, so is the result;
-    otherwise it returns to them at the slew limit. A requested shape of another grid, or with a value that is not
-    finite, leaves the previous command.
+    Both are (rows, columns) float32, nm of surface; `previous_nm` must be finite. The stroke limit, then the slew
+    limit, clip each actuator separately; the neighbour limit shortens the whole move. For any `requested_nm`, the
+    result is finite, and no actuator moves further than the slew limit. If `previous_nm` is within the stroke and
+    neighbour limits, so is the result; otherwise it returns to them at the slew limit. A requested shape of another
+    grid, or with a value that is not finite, leaves the previous command.
     """
     if requested_nm.shape != previous_nm.shape:
         return Limited(previous_nm, (Limit.WRONG_GRID,))
@@ -174,17 +174,17 @@ def _shorten(limits: Limits, previous_nm: Single, kept_nm: Single) -> Single:
     apart_nm, largest_nm = neighbour_difference_nm(previous_nm.astype(np.float64)), float(np.abs(previous_nm).max())
     if apart_nm > neighbour_nm or largest_nm > limits.stroke_nm:
         stroke_nm = limits.stroke_nm - margin_nm
-        enough = min(neighbour_nm / max(apart_nm, neighbour_nm), stroke_nm / max(largest_nm, stroke_nm))
-        slowest = 1.0 - (limits.slew_nm - margin_nm) / largest_nm
-        return previous_nm * np.float32(max(enough, slowest))
+        within_limits = min(neighbour_nm / max(apart_nm, neighbour_nm), stroke_nm / max(largest_nm, stroke_nm))
+        within_slew = 1.0 - (limits.slew_nm - margin_nm) / largest_nm
+        return previous_nm * np.float32(max(within_limits, within_slew))
     fraction = 1.0
     for axis in (0, 1):
         before = np.diff(previous_nm.astype(np.float64), axis=axis)
         after = np.diff(kept_nm.astype(np.float64), axis=axis)
-        over = np.abs(after) > neighbour_nm
-        if over.any():
-            room = neighbour_nm - np.sign(after[over]) * before[over]
-            fraction = min(fraction, float((room / np.abs(after[over] - before[over])).min()))
+        beyond = np.abs(after) > neighbour_nm
+        if beyond.any():
+            room = neighbour_nm - np.sign(after[beyond]) * before[beyond]
+            fraction = min(fraction, float((room / np.abs(after[beyond] - before[beyond])).min()))
     return previous_nm + np.float32(fraction) * (kept_nm - previous_nm)
 
 

@@ -38,13 +38,13 @@ class Settings:
 
     Attributes:
         limits: limits of the mirror, applied here and again by the mirror.
-        delay_frames: frames from the one measured to the first exposed entirely under the resulting command.
+        delay_frames: delay from the frame measured to the first exposed entirely under the resulting command.
         start_mode: mode once a calibration is loaded: open, closed, or safe if safe mode was latched.
         max_frame_age_ns: age above which a frame is refused.
         frame_timeout_ns: time without frames after which an event is raised and `on_frame_timeout` applies.
         on_frame_timeout: hold the command, or relax the mirror to flat.
         min_flux_fraction: fraction of the expected flux below which a frame is refused.
-        max_saturated_pixels: good pixels at full well above which a frame is refused.
+        max_saturated_pixels: number of good pixels at full well above which a frame is refused.
         max_identical_frames: consecutive frames that may give the same measurement as the one before; 0 for no limit.
         gain: gain of tip and tilt, then of the other modes; likewise `leak`, and `limit_nm`, nm.
         rate_hz: frame rate; 0 if unknown.
@@ -102,7 +102,7 @@ class LawRunner(NamedTuple):
         return cls(law, linear_law.at_rest(law), 0, LawGuard.of(law) if guarded else None)
 
     def restarted(self) -> "LawRunner":
-        """The same law, at rest; modes in which it is overruled stay so."""
+        """The same law, at rest; modes in which it is overruled stay overruled."""
         return LawRunner(self.law, linear_law.at_rest(self.law), 0, self.guard and self.guard.at_rest())
 
     def advanced(self, error_nm: Single, pol_nm: Single, command_nm: Single) -> "LawRunner":
@@ -155,7 +155,7 @@ class ActiveLoop(NamedTuple):
         calibration: the one in use; without modes or pixels if none was loaded.
         estimator: from frames to modal errors.
         integrator: gain, leak and limit of each mode; a law has these limits too.
-        to_actuators: (actuators, modes) as in the calibration, in the memory layout of the faster product.
+        to_actuators: (actuators, modes) as in the calibration, in the memory layout in which its product is faster.
         inverse: (modes, actuators) modal command of a mirror shape.
         to_modes: (modes, actuators) modes that R measures of a mirror shape, nm of wavefront rms per nm of surface.
         delay_weights: (index in `history_nm`, fraction) of each command that an exposure sees.

@@ -98,7 +98,7 @@ class StartUp:
         mirror's shape was known: the requests carry its identity, so that they are not refused.
         """
         lease = state.conditions.lease
-        lease_id = 0 if lease is None or lease.ended or lease.over(time_ns, 0) else lease.id
+        lease_id = 0 if lease is None or lease.ended or lease.expired(time_ns, 0) else lease.id
         request = partial(Request, time_ns, requester="the configuration", lease_id=lease_id)
         requests: list[Request] = []
         if self._law is not None:

@@ -38,7 +38,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.laws.what_if import exposed
+from lowfc.control.laws.what_if import has_new_exposure
 from lowfc.control.loop.inputs import Frame
 from lowfc.control.loop.safety import NOT_NEW
 
@@ -161,7 +161,7 @@ class Snapshot:
     @property
     def new_exposures(self) -> Mask:
         """Whether the frame of each step is a new exposure: only then is the step's time the time of an exposure."""
-        return exposed(self.steps.reasons)
+        return has_new_exposure(self.steps.reasons)
 
     @property
     def used(self) -> Mask:

@@ -7,7 +7,7 @@ from lowfc.arrays import Array, single
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import map_rows, noise_covariance_nm2
 from lowfc.control.calibration.regularised import pixel_variance, reconstruct
-from lowfc.control.laws.automatic_gain import SURE, GainBank, TiltCrossTalk, Verdict, uncorrected_prior_nm2
+from lowfc.control.laws.automatic_gain import CERTAIN_SIGMAS, GainBank, TiltCrossTalk, Verdict, uncorrected_prior_nm2
 from lowfc.control.laws.stability import delay_weights, highest_gain
 from lowfc.control.loop.camera import CameraSettings
 
@@ -232,7 +232,7 @@ def test_drifts_and_common_noise_are_not_tilt_cross_talk() -> None:
     tilt_nm = 40 + modes[:, :2] + noise[:, :2]
     cross_talk = TiltCrossTalk(MODES)
     mean_nm, error_nm = cross_talk.mean_nm(cross_talk.add_frames(single(tilt_nm), single(modes + noise[:, 2:])) / 2000)
-    assert np.count_nonzero(np.abs(mean_nm) > SURE * error_nm) <= 1
+    assert np.count_nonzero(np.abs(mean_nm) > CERTAIN_SIGMAS * error_nm) <= 1
 
 
 def _calibration() -> tuple[Calibration, CameraSettings]:

@@ -8,8 +8,8 @@ from lowfc.control.laws.what_if import (
     counterfactual,
     delay_from_times,
     delay_from_truth,
-    exposed,
     frames_since,
+    has_new_exposure,
     limited_integrator,
     missing_before,
     seen_nm,
@@ -103,7 +103,7 @@ def test_repeated_and_older_frames_are_not_exposures() -> None:
     counts = [5, 6, 6, 4, 9, 8]
     sequence = np.array([*map(frame_sequence, counts), frame_sequence(1, 1_800_000_000)], np.uint64)
     repeated, older = 1 << Rejection.REPEATED, 1 << Rejection.OUT_OF_ORDER
-    rows = exposed(np.array([0, 0, repeated, older, 0, older, 0]))
+    rows = has_new_exposure(np.array([0, 0, repeated, older, 0, older, 0]))
     assert rows.tolist() == [True, True, False, False, True, False, True]
     assert missing_before(sequence[rows]).tolist() == [0, 0, 2, 0]
 

@@ -235,7 +235,7 @@ def test_a_vibration_near_a_line_raises_its_error() -> None:
 def test_a_measurement_without_a_signal_is_refused() -> None:
     with pytest.raises(ValueError, match="nothing was added"):
         measure_lines(np.zeros((100, 3)), np.zeros((100, 3)))
-    with pytest.raises(ValueError, match="same frames"):
+    with pytest.raises(ValueError, match="same shape"):
         measure_lines(np.zeros((100, 3)), np.zeros((99, 3)))
 
 

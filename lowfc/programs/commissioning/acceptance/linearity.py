@@ -9,7 +9,7 @@ import numpy as np
 from lowfc.arrays import Array, Integers
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.excitation import build_staircase
-from lowfc.control.calibration.linearity import SURE, gains, levels
+from lowfc.control.calibration.linearity import SIGMAS, gains, levels
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import Result, result_field
@@ -67,7 +67,7 @@ class LinearityResult(AcceptanceResult):
 
     def remarks(self) -> Sequence[str]:
         """Key to the marks, and the verdict."""
-        key = f"amplitude, nm: gain - 1 (largest cross-talk); !: beyond the requirement by {SURE:g} standard errors"
+        key = f"amplitude, nm: gain - 1 (largest cross-talk); !: beyond the requirement by {SIGMAS:g} standard errors"
         unsure = any(row.within is None for mode in self.modes for row in mode.levels)
         noisy = ["?: too noisy to judge; use more cycles or longer levels"] if unsure else []
         return [key, *noisy, *super().remarks()]

@@ -26,7 +26,7 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.spectra import TimeSeries, time_series
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.laws.vibration import FEWEST
-from lowfc.control.laws.what_if import delay_from_times, exposed, missing_before
+from lowfc.control.laws.what_if import delay_from_times, has_new_exposure, missing_before
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
@@ -197,7 +197,7 @@ def _state(loop: Client) -> wire.ControllerState:
 
 
 def _from_first_used(run_id: str, steps: Steps) -> Steps:
-    rows = exposed(steps.reasons)
+    rows = has_new_exposure(steps.reasons)
     used = rows & np.isfinite(steps.error_nm).all(axis=1)
     if not used.any():
         raise DataFileError(f"run {run_id!r}: no frame was used; `lowfc ctl status` gives the reason")

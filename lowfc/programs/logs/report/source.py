@@ -17,7 +17,7 @@ from lowfc.contract.codecs.law_codec import driving, overruled
 from lowfc.contract.envelope import COUNT_BITS
 from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.laws.what_if import exposed
+from lowfc.control.laws.what_if import has_new_exposure
 from lowfc.control.loop import guard
 from lowfc.control.loop.safety import Rejection
 
@@ -94,7 +94,7 @@ def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None
     """Read a log, complete or not, to its end; damaged parts are skipped and listed by the history's reader."""
     history = read_history(WholeLog(files, progress))
     history.true  # noqa: B018  # joined and cached now, while the steps have their sequences of the log
-    steps, known = history.steps, np.flatnonzero(exposed(history.steps.reasons))
+    steps, known = history.steps, np.flatnonzero(has_new_exposure(history.steps.reasons))
     if 0 < known.size < steps.sequence.size:
         # A step whose frame is ahead of the clock gets the sequence and the time of the step before; a step with an
         # old frame gets only that time.

@@ -24,8 +24,8 @@ from lowfc.control.laws.what_if import (
     MAX_DELAY_FRAMES,
     delay_from_times,
     delay_from_truth,
-    exposed,
     frames_since,
+    has_new_exposure,
     missing_before,
     seen_nm,
 )
@@ -112,7 +112,7 @@ class LoggedRun:
     def __init__(self, history: History) -> None:
         """Extract the run from a history."""
         self.history = history
-        rows = exposed(history.steps.reasons)
+        rows = has_new_exposure(history.steps.reasons)
         used = rows & np.isfinite(history.steps.error_nm).all(axis=1)
         if history.calibration is None:
             raise DataFileError(f"{history.log.path}: it has no calibration")
