@@ -319,7 +319,7 @@ class SimulatedCamera:
         self._arrived.put(sample)
 
     def _drain(self) -> None:
-        """Process the received mirror states; the newest shape is that of the next exposure."""
+        """Process the received mirror states; the next exposure sees the newest shape."""
         while self._states:
             sample = self._states.popleft()
             try:

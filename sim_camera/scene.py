@@ -135,7 +135,7 @@ class Scene:
         fields_nm = np.vstack([self._basis, self._screen]).astype(np.float64)
         fields_nm -= (fields_nm @ optics.area_weights)[:, None]
         self._weighted = np.ascontiguousarray((fields_nm * optics.area_weights).T)
-        self._products_nm2 = fields_nm @ self._weighted  # of modes and screen, integrated over the open pupil
+        self._products_nm2 = fields_nm @ self._weighted  # products of modes and screen over the open pupil
         self._wavefronts: deque[tuple[Single, Single]] = deque(maxlen=2 * MAX_TRUTHS)
         self._sampler = Sampler(disturbance, np.concatenate([[0.0], exposure * nodes, self.instants]), rate_hz)
         self._disturbance, self._rate_hz, self._exposure = disturbance, rate_hz, exposure
@@ -177,7 +177,7 @@ class Scene:
                 (instants, shapes), or None if the mirror does not move.
         """
         modes, count = np.array([self._sampler.at(index) for index, *_ in frames]), len(self.instants)
-        # Axes of these: frames, times (the start of the exposure, then the instants), modes or shapes.
+        # Axes of these arrays: frames, times (the start of the exposure, then the instants), modes or shapes.
         disturbance_nm = np.concatenate([modes[:, :1], modes[:, modes.shape[1] - count :]], axis=1)
         shapes_nm, weights = self._weighted_shapes(frames)
         mean_squares_nm2 = self._mean_squares_nm2(disturbance_nm, shapes_nm, weights)

@@ -48,9 +48,9 @@ class WavefrontAccumulator:
         """Add a frame.
 
         Args:
-            truth: its true wavefront.
-            added_flat: contrast that its disturbance adds with a flat mirror.
-            added: (modes,) contrast that each mode of its residual adds.
+            truth: the frame's true wavefront.
+            added_flat: contrast that the disturbance adds with a flat mirror.
+            added: (modes,) contrast that each mode of the residual adds.
         """
         values = (added_flat, *added.tolist(), *self._squares(truth.sampled))
         if truth.continuous is not None:

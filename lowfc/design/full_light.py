@@ -98,7 +98,7 @@ class FullLight:
         return self._signal(BAND)
 
     def nonlinearity_waves(self, modes: int) -> float:
-        """Mean residual rms over the open pupil of random wavefronts without noise, by the plain pseudo-inverse."""
+        """Mean residual rms over the open pupil, waves, for random wavefronts without noise and the pseudo-inverse."""
         return _nonlinearity_waves(self, modes)
 
     def image(self, focal: Complex) -> Array:
@@ -132,7 +132,7 @@ def _nonlinearity_waves(candidate: FullLight, modes: int) -> float:
 
 
 def sweep(merit_of: Callable[[float], float], low: float, high: float, count: int) -> tuple[Array, float]:
-    """Minimise over a range; return evenly spaced values (count,) of it, and the refined value of least merit.
+    """Minimise a merit over a range; return evenly spaced values (count,), and the refined value of least merit.
 
     The refinement searches between the neighbours of the best evenly spaced value.
 

@@ -95,7 +95,7 @@ class Candidate(Protocol):
 
 
 def covariance_nm2(signal: Signal, light_e: float, read_noise_e: float, modes: int, estimator: str) -> Array:
-    """Covariance (modes, modes) of a fit of only the first modes to one frame with photon and read noise.
+    """Noise covariance (modes, modes), nm^2, of a fit of the first `modes` modes alone to one frame.
 
     Args:
         signal: I0 and H of the sensor.
@@ -138,7 +138,7 @@ def table4_mas(signal: Signal, modes: int, estimator: str) -> tuple[float, float
 
 
 def exposure_nm2(signal: Signal, modes: int, estimator: str) -> Array:
-    """Covariance (modes, modes) of a fit to one exposure of Table 4's star: our own photometry, 1 e- read noise."""
+    """Noise covariance (modes, modes), nm^2, in one exposure of Table 4's star: own photometry, 1 e- of read noise."""
     light_e = electrons(STAR, TABLE4_EXPOSURE_S)
     return covariance_nm2(signal, light_e, TABLE4_READ_NOISE_E, modes, estimator)
 

@@ -36,7 +36,7 @@ DELAY = 1.0
 """Delay of the loop, frames: a command takes effect at the next frame."""
 _MIN_DRIFT = 1e-12  # drift in the model of a filter for a line alone, nm^2 per frame
 _GAINS = np.geomspace(0.01, 1.0, 30)
-_LINE_RATIOS = np.geomspace(1e-15, 1e10, 76)  # variance of a line over that of a frame's noise
+_LINE_RATIOS = np.geomspace(1e-15, 1e10, 76)  # ratios of a line's variance to a frame's noise variance
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def tolerated_drift(residual_nm2: float, noise_nm2: float, exposure: float, kind
 def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> Callable[[Array], Array]:
     """Function from the allowed residual variance of a line to its tolerated variance.
 
-    Both variances are divided by that of a frame's noise.
+    Both variances are divided by the noise variance of a frame.
 
     Args:
         kind: Integrator with the best gain, or LQG with the line in its model.
@@ -104,7 +104,7 @@ def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> 
     def residual(law: LinearLaw, variance: float) -> float:
         return float(predicted_nm(law, [model(variance)], timing)[0] ** 2)
 
-    if kind == "integrator":  # residual = A line + B noise at each gain
+    if kind == "integrator":  # residual = line_factor x line + noise_factor x noise at each gain
         laws = [integrator([gain], [0.0], (2,), DELAY, rate_hz) for gain in np.append(_GAINS, highest_gain(DELAY))]
         noise_factor = np.array([0.0, *(float(noise_gain(law)[0]) for law in laws)])  # the first value: without a loop
         line_factor = np.array([1.0, *(residual(law, 1.0) for law in laws)]) - noise_factor

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 PHOTONS_PER_S_M2_NM = 1.005e8
-"""Photon flux above the telescope of a star of V = 0, near 550 nm."""
+"""Photon flux of a star of V = 0 before the telescope, near 550 nm."""
 
 _RADIANS_PER_MAS = np.pi / (180.0 * 3600.0 * 1000.0)
 

@@ -144,7 +144,7 @@ def projected_response(twin: Twin, projections: Array, opd_nm: Array | None = No
     """Projections (projections, used) of the image's slope per nm of wavefront at each node.
 
     They are `projections @ response(twin, eye)`, computed from the pixels back to the nodes: the cost depends on the
-    number of projections, not on that of nodes.
+    number of projections, not on the number of nodes.
 
     Args:
         twin: The twin.
