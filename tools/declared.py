@@ -57,7 +57,7 @@ _GUARD = (
     ("law is worse: mean squared error / that of the integrator, above", guard.WORSE_RATIO),
     ("loop amplifies: mean squared error / long-term mean square, above", guard.AMPLIFIED),
     ("time constant of the long-term mean square, s", guard.LONG_TERM_S),
-    ("duration of a cross-fade, s", guard.FADED_S),
+    ("duration of a cross-fade, s", guard.CROSS_FADE_S),
     ("law is far better: mean squared error / that of the integrator, below", guard.BETTER_RATIO),
     ("time for which the law must be far better, at first, s", guard.BETTER_S),
     ("takeovers after which only an operator reactivates the law", guard.MAX_TAKEOVERS),

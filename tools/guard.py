@@ -125,7 +125,7 @@ def cost_us(law: LinearLaw) -> dict[str, float]:
         (zeros,),
     )
     driving, x = LawGuard.of(law), at_rest(law)
-    virtual = LawGuard.of(law, [Group(True, driving.spans.faded, 1)] * 2)
+    virtual = LawGuard.of(law, [Group(True, driving.spans.cross_fade, 1)] * 2)
     found = {}
     for name, guard in (("driving", driving), ("virtual", virtual)):
         begun, _ = guard.judged(law, x, *integrator_and_history, value_nm, value_nm, limited=False)

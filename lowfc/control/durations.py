@@ -6,7 +6,7 @@ from math import log
 import numpy as np
 
 _MIN_NS = 1_000
-RATIO = 1.01  # upper over lower edge of a bin
+RATIO = 1.01  # ratio of the upper to the lower edge of a bin
 _BINS_PER_LOG = 1 / log(RATIO)
 _BINS = 2_000
 

@@ -96,7 +96,7 @@ def test_without_a_law_or_with_guard_off_nothing_is_guarded() -> None:
 
 @pytest.mark.parametrize(("rate_hz", "wait_s"), [(RATE_HZ, 10), (1.0, 100)])  # at 1 Hz a block takes 100 s
 def test_the_takeover_has_an_event_and_no_jump(rate_hz: float, wait_s: int) -> None:
-    setup, faded = replace(SETUP, rate_hz=rate_hz), Spans.at(rate_hz).faded
+    setup, faded = replace(SETUP, rate_hz=rate_hz), Spans.at(rate_hz).cross_fade
     state = with_law(replace(BAD_TILT, rate_hz=rate_hz), setup)
     _, state = run(state, BEFORE + WORSE_BLOCKS * SPANS.block - 1)
     assert not any(overruled(state))
@@ -156,7 +156,7 @@ def test_the_law_returns_once_it_would_be_far_better() -> None:
     setup = replace(SETUP, rate_hz=RATE_HZ / 5)
     spans = Spans.at(setup.rate_hz)
     law = integrator((0.01, 0.01, 0.3), (0.05, 0.05, 0.0), NOLL, 1.0, setup.rate_hz)
-    frames = BEFORE + WORSE_BLOCKS * spans.block + spans.faded
+    frames = BEFORE + WORSE_BLOCKS * spans.block + spans.cross_fade
     _, state = run(with_law(law, setup), frames, setup=setup)
     assert overruled(state) == [True, False]
     noisy = replace(state.loop.integrator, gain=np.array([1.9, 1.9, 0.3], np.float32))

@@ -22,7 +22,7 @@ class Dark(NamedTuple):
 
     Attributes:
         dark_dn: (pixels,) mean, DN.
-        noise_dn: (pixels,) standard deviation of one frame, DN.
+        noise_dn: (pixels,) standard deviation from frame to frame, DN.
         hot: (pixels,) whether a pixel is brighter than the others.
         noisy: (pixels,) whether it is noisier than the others.
         dead: (pixels,) whether it is stuck: without noise, unlike the others.
@@ -64,7 +64,7 @@ def measure_dark(frames: npt.NDArray[np.number]) -> Dark:
     level, typical = float(np.median(mean)), float(np.median(noise))
     mean_spread = max(_spread(mean), typical / np.sqrt(count), 1e-3)
     noise_spread = max(_spread(noise), typical / np.sqrt(2 * count), 1e-3)
-    rounding_dn = _ROUNDING_DN * (1 + 4 / np.sqrt(count))  # a good pixel may have the same value in a few frames
+    rounding_dn = _ROUNDING_DN * (1 + 4 / np.sqrt(count))  # in few frames, all values of a good pixel may be equal
     hot = mean > level + max(_SIGMAS * mean_spread, _SIGMAS * typical / 4, rounding_dn)
     if hot.mean() > 0.05:
         raise ValueError(

@@ -198,7 +198,7 @@ def without_outliers(products: Array) -> Array:
     A transient of the wavefront then affects one cycle, not the mean.
     """
     median = np.median(products, axis=0)
-    # 1.48: standard deviation over median deviation; per row, since all its elements have the same noise
+    # 1.48: ratio of standard to median absolute deviation; one scale per row, since its elements have the same noise
     scale = 1.48 * np.median(np.abs(products - median), axis=(0, 2))[:, None]
     return np.clip(products, median - _OUTLIER * scale, median + _OUTLIER * scale)
 
@@ -225,7 +225,7 @@ def row_error(products: Array) -> Array:
 def best_initial(candidates: list[Initial], response: Array, mode: int, variance: Array) -> Initial:
     """The candidate with the least noise in a mode; a later one must have less than `_BETTER` of an earlier one's.
 
-    The response (pixels,) to a poke of the mode is in flux fractions; the variance (pixels,) is that of a frame.
+    The response (pixels,) to a poke of the mode is in flux fractions; `variance` (pixels,) is a frame's noise variance.
     """
 
     def noise(initial: Initial) -> float:

@@ -50,9 +50,9 @@ class Verdict(NamedTuple):
         noise_nm2: noise in `power_nm2`: as computed, or half the mean square of the change between frames if that is
             larger; None if it was not computed.
         change_nm2: mean square with the current gain less that of the open loop; above 0, closing does harm.
-        change_error_nm2: its standard error.
+        change_error_nm2: standard error of `change_nm2`.
         loop_nm2: as `change_nm2`, of the real loop with any law; None if it was not closed throughout.
-        loop_error_nm2: its standard error.
+        loop_error_nm2: standard error of `loop_nm2`.
         frames: frames of the window.
     """
 

@@ -18,7 +18,7 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import sensitivity
 from lowfc.control.laws.stability import delay_weights
 
-_FILTER_POINTS = 4096  # of the Fourier transform from the response of a filter to its taps
+_FILTER_POINTS = 4096  # points of the Fourier transform from a filter's response to its taps
 _FILTER_OMEGA = np.linspace(0, np.pi, _FILTER_POINTS // 2 + 1)
 _FILTER_REACH = 48
 """Frames on either side from which a mean between measurements is interpolated."""

@@ -21,7 +21,7 @@ ROWS_PER_REGRESSOR = 10
 DETECTED_SIGMAS = 2.0
 """Standard errors above which a difference of two variances counts as detected."""
 
-_DEGENERATE = 1e-7  # relative to the largest singular value of the regressors
+_DEGENERATE = 1e-7  # regressors: singular values below this fraction of the largest are dropped
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class SensorNoise:
-    """Standard deviation (modes,) of one frame's modes, nm: from photon noise and from read noise."""
+    """Noise of the modes from one frame: standard deviations (modes,), nm, by photon noise and by read noise."""
 
     photon_nm: Array
     read_nm: Array
@@ -56,7 +56,7 @@ class SensorNoise:
 def sensor_noise(
     matrix: Array, reference: Array, flux_e: float, read_noise_e: float, excess: float = 1.0
 ) -> SensorNoise:
-    """Noise of one frame through R (modes, pixels), split in two.
+    """Noise of one frame after R (modes, pixels), split into photon noise and read noise.
 
     Args:
         matrix: (modes, pixels) R, nm per flux fraction.
@@ -130,8 +130,8 @@ def measurement_error(
         law: the loop's law, with the true delay.
         error: modal error of each frame.
         residual: true residual of the same frames.
-        seen: modal command seen in each of them.
-        noise_nm: standard deviation of one frame's modes.
+        seen: modal command seen in each of these frames.
+        noise_nm: standard deviation of the noise of one frame's modes.
 
     Returns:
         None if there are too few frames for the fit or a spectrum.

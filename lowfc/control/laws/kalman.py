@@ -34,7 +34,7 @@ def lqg_block(model: Model, timing: Timing) -> Block:
     A, _, C = model.states()
     covariance = covariance_nm2(model)
     L = covariance @ C / (C @ covariance @ C + model.noise_nm2)
-    # From the mean over an exposure to the mean over the period in which the command is in force.
+    # Matrix from the mean over an exposure to the mean over the period in which the command is in force.
     foreseen = model.mean_over(timing.applied, timing.held) @ np.linalg.inv(model.mean_over(0.0, timing.exposure))
     return Block(A - np.outer(L, C @ A), L, np.zeros(len(A)), A, -C @ foreseen)
 
@@ -42,9 +42,9 @@ def lqg_block(model: Model, timing: Timing) -> Block:
 def covariance_nm2(model: Model) -> Array:
     """Covariance (states, states) of the steady filter's prediction error before a frame.
 
-    Per variance of noise it is X = A (X - X C' C X / (1 + C X C')) A' + Q, solved by doubling: each iteration of this
-    structure-preserving algorithm doubles the number of filtered frames, from zero covariance. Nearly undamped lines
-    put poles next to the unit circle, which scipy's `solve_discrete_are` cannot separate.
+    It is n X, with the noise variance n and X = A (X - X C' C X / (1 + C X C')) A' + Q / n, solved by doubling: each
+    iteration of this structure-preserving algorithm doubles the number of filtered frames, from zero covariance. Nearly
+    undamped lines put poles next to the unit circle, which scipy's `solve_discrete_are` cannot separate.
 
     Raises:
         ValueError: the iteration does not converge.

@@ -84,7 +84,7 @@ def check_law(law: LinearLaw, delay_frames: float, rate_hz: float) -> None:
     """Refuse a law that was made for another loop; `rate_hz` is 0 if unknown.
 
     Raises:
-        ValueError: its rate differs, its delay differs (if its signal is "pol"), or `check_stable` refuses it.
+        ValueError: the law's rate or (if its signal is "pol") its delay differs, or `check_stable` refuses it.
     """
     if law.signal == "pol" and abs(law.delay_frames - delay_frames) > 1e-3:
         raise ValueError(
@@ -148,8 +148,8 @@ def noise_transfer(law: LinearLaw, frequency_hz: Array, delay_frames: float | No
 def noise_gain(law: LinearLaw, delay_frames: float | None = None, *, held: bool = False) -> Array:
     """Residual variance (modes,) caused by white measurement noise, per variance of that noise in one frame.
 
-    The residual is that of exposures, which see a mean of two commands if the delay is fractional; with `held`, it is
-    that over all time.
+    The residual is averaged over exposures, which see a mean of two commands if the delay is fractional; with `held`,
+    it is averaged over all time.
     """
     gain, weights = np.zeros(len(law.noll)), _weights(law, delay_frames)
     for part in _parts(law):

@@ -63,7 +63,7 @@ def measure_lines(error_nm: Array, added_nm: Array) -> Lines:
     """S at the lines of the signal added to the loop's input.
 
     Hann's window keeps high frequencies, which the loop does not reject, out of the low ones, where the error is small;
-    lines are at least two bins apart, so it does not mix them. The noise of a line is that of the adjacent bins, which
+    lines are at least two bins apart, so it does not mix them. The noise of a line is measured in the adjacent bins and
     includes cross-talk from other modes' lines.
 
     Args:

@@ -22,7 +22,7 @@ from lowfc.control.laws.vibration import FEWEST, Model, identify, resolution_hz
 from lowfc.control.laws.what_if import counterfactual, driven_by
 
 _NARROWER = (0.1, 0.01, 1e-3)  # factors tried on the fitted width of a line that a log cannot resolve
-_WIDER = (10.0,)  # likewise, for lines that move
+_WIDER = (10.0,)  # factors tried for lines that move
 _SETTLING_FRAMES = 5000
 _OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # log2 of factors on the noise, tried until the margins suffice
 _NEAR_ENOUGH = 0.25
@@ -36,7 +36,7 @@ class Tuned:
 
     Attributes:
         law: the law, ready to load.
-        margins: its margins at the delay that it was made for.
+        margins: margins of the law at the delay that it was made for.
         predicted_nm: (modes,) rms of the true residual.
         kinds: law of each mode: integrator, pi-notch or lqg.
         models: model of each mode.

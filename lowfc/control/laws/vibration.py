@@ -205,7 +205,7 @@ class _Whittle:
         low = slice(0, max(8, omega.size // 20))
         step = float(np.median(np.maximum(power[low] - white - line_power[low], 1e-3 * white) * omega[low] ** 2))
         fits: list[tuple[float, tuple[float, float, float]]] = []
-        for cutoff in (np.inf, 0.03, 0.003):  # cycles per frame to begin with
+        for cutoff in (np.inf, 0.03, 0.003):  # initial corner, cycles per frame
 
             def floor_of(parameters: Array, cutoff: float = cutoff) -> tuple[float, float, float]:
                 noise_nm2 = float(np.exp(parameters[1]))
@@ -245,9 +245,9 @@ class _Whittle:
         largest = max(gain for gain, _, _ in candidates)
         if largest < _PENALTY * np.log(ratio.size):
             return None
-        # The narrowest with a fair share of the gain: a wide one could be two separate lines.
+        # Take the narrowest line with a fair share of the gain: a wide one could be two separate lines.
         place, scale = next((place, scale) for gain, place, scale in candidates if gain >= _SHARE * largest)
-        if scale == _SCALES[0]:  # of its three frequencies, the one of the highest power
+        if scale == _SCALES[0]:  # take the one of the three frequencies that has the highest power
             place += int(np.argmax(self.power[place - 1 : place + 2])) - 1
         near = slice(max(place - max(_FULL, 3 * scale), 0), place + max(_FULL, 3 * scale) + 1)
         return self._fit_line(near, place, scale, spectrum[near])

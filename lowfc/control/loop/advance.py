@@ -250,7 +250,7 @@ def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]
     lease_ended = bool(events)
     loop = state.loop
     safe = state.mode is LoopMode.SAFE
-    silent = state.frame_timeout or tick.silent_ns > settings.frame_timeout_ns  # until a newer frame comes
+    silent = state.frame_timeout or tick.silent_ns > settings.frame_timeout_ns  # true until a newer frame comes
     if loop is None or not (state.commanded or safe):
         if silent is not state.frame_timeout:
             state = state._replace(frame_timeout=silent)

@@ -73,7 +73,7 @@ def _chosen(noll: tuple[int, ...], request: Request) -> Mask:
 
 
 def _modes(noll: tuple[int, ...], request: Request) -> tuple[int, ...]:
-    modes = tuple(dict.fromkeys(request.modes)) or noll  # each once
+    modes = tuple(dict.fromkeys(request.modes)) or noll  # without duplicates
     unknown = sorted(set(modes) - set(noll))
     if unknown:
         raise ValueError(f"Noll modes {unknown} are not controlled; there are {', '.join(map(str, noll))}")

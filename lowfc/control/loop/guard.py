@@ -22,7 +22,7 @@ BLOCK_S, MIN_BLOCK_FRAMES = 0.1, 100
 """Duration of a block, and its least number of frames."""
 WORSE_BLOCKS = 4
 """Blocks in a row after which the integrator takes over."""
-FADED_S = 0.1
+CROSS_FADE_S = 0.1
 """Duration of the cross-fade."""
 BETTER_S = 10.0
 """Time for which the law must be better in every block before it drives again; doubles with each takeover."""
@@ -38,7 +38,7 @@ AMPLIFIED = 2.5
 pseudo-open-loop modes. If it is below `BETTER_RATIO` times their mean square in this block, however, the loop still
 corrects: the disturbance has grown."""
 
-NAMES = ("tip and tilt", "the other modes")  # of the groups
+NAMES = ("tip and tilt", "the other modes")  # names of the groups
 LAW_RETURNS = "law returns"
 
 
@@ -46,7 +46,7 @@ class Spans(NamedTuple):
     """Durations at a frame rate: block and cross-fade in frames, the others in blocks."""
 
     block: int
-    faded: int
+    cross_fade: int
     better: int
     long_term: int
 
@@ -55,7 +55,7 @@ class Spans(NamedTuple):
         """The durations at a frame rate."""
         block = max(MIN_BLOCK_FRAMES, round(BLOCK_S * rate_hz))
         better, long_term = (max(1, round(seconds * rate_hz / block)) for seconds in (BETTER_S, LONG_TERM_S))
-        return cls(block, max(1, round(FADED_S * rate_hz)), better, long_term)
+        return cls(block, max(1, round(CROSS_FADE_S * rate_hz)), better, long_term)
 
 
 class Group(NamedTuple):
@@ -104,7 +104,7 @@ class Group(NamedTuple):
             return after, ""
         takeovers, rival_nm2 = self.takeovers + 1, virtual_nm2
         what = "the integrator would leave"
-        if not worse:  # it amplifies: the takeover is final
+        if not worse:  # the loop amplifies: the takeover is final
             takeovers, rival_nm2, what = MAX_TAKEOVERS, self.usual_nm2, "without correction there would be"
         after = after._replace(overruled=True, takeovers=takeovers, blocks=0)
         return after, f"it leaves {error_nm2**0.5:.3g} nm rms, {what} {rival_nm2**0.5:.3g}"
@@ -149,7 +149,7 @@ class LawGuard(NamedTuple):
     @property
     def weight(self) -> Single:
         """The law's share (modes,) of the command."""
-        shares = np.array([1 - group.faded / self.spans.faded for group in self.groups], np.float32)
+        shares = np.array([1 - group.faded / self.spans.cross_fade for group in self.groups], np.float32)
         return self.members @ shares
 
     def with_groups(self, groups: Sequence[Group]) -> "LawGuard":
@@ -215,7 +215,7 @@ class LawGuard(NamedTuple):
         """
         spans, groups = self.spans, self.groups
         overruled = self.overruled
-        if overruled and any(group.faded != (spans.faded if group.overruled else 0) for group in groups):
+        if overruled and any(group.faded != (spans.cross_fade if group.overruled else 0) for group in groups):
             return self.with_groups([_faded(group, spans) for group in groups]), []
         squares = np.empty((3, pol_nm.size), np.float32)
         squares[0], squares[1], squares[2] = error_nm, error_nm, pol_nm
@@ -252,7 +252,7 @@ class LawGuard(NamedTuple):
 
 def _faded(group: Group, spans: Spans) -> Group:
     """Advance by one frame the cross-fade to the controller that drives the group."""
-    faded = min(group.faded + 1, spans.faded) if group.overruled else max(group.faded - 1, 0)
+    faded = min(group.faded + 1, spans.cross_fade) if group.overruled else max(group.faded - 1, 0)
     return group._replace(faded=faded, blocks=0)
 
 

@@ -95,7 +95,7 @@ class MirrorReport:
 
     Attributes:
         fault: the fault, a phrase that continues "the mirror ..."; empty if there is none.
-        shape: its last known shape; None if unknown.
+        shape: last known shape of the mirror; None if unknown.
     """
 
     time_ns: int

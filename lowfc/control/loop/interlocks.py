@@ -41,7 +41,7 @@ class Interlock(NamedTuple):
         value: value to compare with.
         action: action while the condition holds.
         max_age_ns: age above which the bench value is too old.
-        acts_when_old: whether it acts if the value is too old, of another type, or was never received.
+        acts_when_old: whether the interlock acts if the value is too old, of another type, or was never received.
     """
 
     name: str
@@ -75,9 +75,9 @@ class Acting(NamedTuple):
     """An interlock that acts.
 
     Attributes:
-        number: its index in the interlocks of the settings.
-        action: its action.
-        why: its cause when it began to act; the value may change afterwards.
+        number: index of the interlock in the settings.
+        action: the interlock's action.
+        why: cause when the interlock began to act; the value may change afterwards.
     """
 
     number: int

@@ -1,7 +1,7 @@
 """A lease: the loop is reserved for one client, and other clients' requests that would change it are refused.
 
-A lease separates cooperating programs. It is no access control: its identity is in the controller's state, which every
-client can read.
+A lease separates cooperating programs. It is no access control: every client can read its identity in the
+controller's state.
 
 A lease ends when its holder releases it or does not renew it in time, on `safe` from any client, and on `open`, `pause`
 or `stop` from another client.
@@ -38,7 +38,7 @@ class Lease(NamedTuple):
         last_sequence: sequence of the last frame for which it is in force, if frames come at the configured rate; its
             duration in frames if it was granted before the first frame; 0 if the rate is unknown.
         ended: cause of its end; empty while it is in force.
-        holds: whether it is a permit: a closed loop holds its command while it is in force.
+        holds: whether it is a permit: a closed loop holds its command while the permit is in force.
     """
 
     id: int

@@ -60,7 +60,7 @@ def loaded(
             actuators_nm=before.actuators_nm,
             history_nm=(command_nm,) * len(loop.history_nm),
         )
-        if state.mode is not LoopMode.SAFE:  # in safe mode it relaxes to flat and stays there
+        if state.mode is not LoopMode.SAFE:  # in safe mode the mirror relaxes to flat and stays there
             loop, adoption_events = adopted(loop, shape_nm)
             events += adoption_events
     before_mode, cause = state.mode, "a calibration was loaded"
@@ -165,7 +165,7 @@ def bench_reported(settings: Settings, state: State, report: BenchReport) -> tup
             mode = LoopMode.SAFE
         elif interlock.action in opening and mode is LoopMode.CLOSED:
             mode = LoopMode.OPEN
-        elif interlock.action in opening and state.waits_for_gains:  # it no longer closes by itself
+        elif interlock.action in opening and state.waits_for_gains:  # the loop no longer closes by itself
             state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
         state = _changed(state, mode, report.time_ns, cause, events)
     return state, Outputs(events=events, changed=True)
@@ -197,7 +197,7 @@ def mirror_shape_reported(settings: Settings, state: State, shape: MirrorShape) 
     loop = loop._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(loop.history_nm))
     if command_nm.any():
         events.append(PendingEvent("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
-    if state.mode is not LoopMode.SAFE:  # in safe mode it relaxes to flat and stays there
+    if state.mode is not LoopMode.SAFE:  # in safe mode the mirror relaxes to flat and stays there
         channels = loop.command_channels  # clients may have set some before a late report
         loop, adoption_events = adopted(
             loop, shape.actuators_nm if channels is None else shape.actuators_nm - channels.sum_nm

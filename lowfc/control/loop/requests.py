@@ -314,7 +314,7 @@ def _check_shape(limits: Limits | None, shape_nm: Single, prefix: str = "") -> N
     """Refuse a channel, or a sum of channels, that exceeds the mirror's limits even without a command of the law."""
     if not (np.abs(shape_nm) <= MAX_LIMIT_NM).all():
         raise ValueError(f"every actuator of a channel must be finite, and at most {MAX_LIMIT_NM:g} nm from flat")
-    if limits is None:  # already on the mirror
+    if limits is None:  # the shape is already on the mirror
         return
     largest_nm, difference_nm = float(np.abs(shape_nm).max()), neighbour_difference_nm(shape_nm)
     if largest_nm > limits.kept_stroke_nm:

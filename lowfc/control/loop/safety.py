@@ -95,13 +95,13 @@ class Limits:
     """Limits of the mirror, in nm of surface; ValueError unless each is finite and above twice the margin.
 
     Attributes:
-        stroke_nm: largest deviation of an actuator from flat, either way.
+        stroke_nm: largest deviation of an actuator from flat, in either direction.
         slew_nm: largest change of an actuator from one command to the next.
         neighbour_nm: largest difference between actuators side by side.
         margin_nm: distance kept from stroke and slew limit, half of it from the neighbour limit: 1e-3 nm, or sixteen
             roundings of float32 for a long stroke.
         kept_stroke_nm: stroke minus the margin, a float32, so that a command clipped to it is not clipped again.
-        kept_slew_nm: slew minus the margin, likewise.
+        kept_slew_nm: slew minus the margin, also a float32.
     """
 
     stroke_nm: float

@@ -46,7 +46,7 @@ class Settings:
         min_flux_fraction: fraction of the expected flux below which a frame is refused.
         max_saturated_pixels: number of good pixels at full well above which a frame is refused.
         max_identical_frames: consecutive frames that may give the same measurement as the one before; 0 for no limit.
-        gain: gain of tip and tilt, then of the other modes; likewise `leak`, and `limit_nm`, nm.
+        gain: gain of tip and tilt, and gain of the other modes; `leak` and `limit_nm` (nm) have the same order.
         rate_hz: frame rate; 0 if unknown.
         guard: whether laws are guarded.
         auto_gain: whether the gains of tip and tilt, and of the other modes, are automatic.
@@ -159,7 +159,7 @@ class ActiveLoop(NamedTuple):
         inverse: (modes, actuators) modal command of a mirror shape.
         to_modes: (modes, actuators) modes that R measures of a mirror shape, nm of wavefront rms per nm of surface.
         delay_weights: (index in `history_nm`, fraction) of each command that an exposure sees.
-        camera: camera settings of the calibration: its own, or the first received that fit it; None until then.
+        camera: camera settings in the calibration, or else the first received that fit it; None until then.
         automatic: (modes,) whether the gain of a mode is automatic.
         weighting: weighting of R; None for the calibration's own R.
         law_runner: linear law in use instead of the integrator; None for the integrator.
