@@ -30,7 +30,7 @@ from lowfc.contract.messages import (
 from lowfc.programs.core.recording.volume import bytes_per_s, configured_selection, estimate
 from lowfc.programs.logs.survey import survey
 from lowfc.programs.logs.what_if.compare import what_if
-from lowfc.programs.logs.what_if.options import WhatIf, requested
+from lowfc.programs.logs.what_if.options import WhatIf, requested_changes
 from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support.loops import json_of, refusal
 from tests.support.recording import Bench, bodies_of, logged, put
@@ -158,7 +158,7 @@ def test_replay_needs_frames_but_no_other_optional_topic(whole: Path) -> None:
 
 
 def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: Path) -> None:
-    changes = requested("gain=0.3", None, None, None)
+    changes = requested_changes("gain=0.3", None, None, None)
     both_results = [what_if(LoggedRun(read_history(LogReader(log))), changes) for log in (whole, small)]
     for results in both_results:
         del results["log"]

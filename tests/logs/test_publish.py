@@ -43,5 +43,7 @@ def test_a_message_of_an_impossible_time_is_not_waited_for(run: Run, tmp_path: P
 
 def test_a_long_gap_in_a_log_is_announced(run: Run, tmp_path: Path) -> None:
     results, text = published(run, tmp_path / "x.mcap", (START + 3600) * 10**9)
-    assert re.fullmatch(r"the next message, of 2023-11-14 23:13:20.0Z, follows in 3600 s; Ctrl-C ends it\n", text)
+    assert re.fullmatch(
+        r"the next message, of 2023-11-14 23:13:20.0Z, follows in 3600 s; Ctrl-C ends the publication\n", text
+    )
     assert (results["messages"], results["interrupted"]) == (STEPS - 1, True)

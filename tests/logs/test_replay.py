@@ -140,7 +140,7 @@ def replay(
     run = Replay(tolerance_nm, **options)
     run.context.former = former
     for message in messages:
-        run.take(message)
+        run.add(message)
         if run.done:
             break
     return run.finish()
@@ -377,7 +377,7 @@ def tampered(night: Night, topic: Topic, number: int, change: str) -> Account:
         (STEP, "body.mode = 2", "mode: log 2, replay 3"),
         (STEP, "body.command_nm[0] = float('nan')", "command_nm: log [nan"),
         (STEP, "body.timestamp.nanos += 1", "timestamp.nanos: log"),
-        (STEP, "body.MergeFromString(bytes([0xA0, 0x06, 1]))", "the bytes, but no value"),
+        (STEP, "body.MergeFromString(bytes([0xA0, 0x06, 1]))", "the bytes differ, but no value"),
         (COMMAND, "body.valid_for_ns = 10**12", "valid_for_ns: log 1000000000000"),
         (CONTROLLER_STATE, "body.command_history_nm[0] += 0.5", "command_history_nm: [0] log"),
         (CONTROLLER_STATE, "body.settings.slew_nm += 1", "settings.slew_nm: [0] log"),
@@ -523,7 +523,7 @@ def test_a_forged_command_and_another_host_are_reported(tmp_path: Path, monkeypa
         "first difference   MirrorCommand of frame 400 ",
         "actuators: [13] log",
         "numpy              1.0 in the log",
-        "cpu_features       abacus in the log, none here",
+        "cpu_features       abacus in the log, none on this host",
     ):
         assert words in done.stdout
     assert lowfc("replay", forged, "--tolerance", 0.001).exit_code == 0

@@ -32,7 +32,7 @@ from lowfc.control.laws.error_budget import sensor_noise
 from lowfc.control.loop.state import State
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.report import closed_loop, drawings
-from lowfc.programs.logs.report.page import NOT_HERE, page
+from lowfc.programs.logs.report.page import NOT_IN_LOG, page
 from lowfc.programs.logs.report.results import report_of
 from lowfc.programs.logs.report.source import read_run
 from lowfc.programs.logs.report.verdict import verdict
@@ -224,7 +224,7 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
     before_nm = eventful["residual"]["open_pupil"]["disturbance_open_pupil_rms_nm"]
     text = check_of(eventful, "residual")["text"]
     assert text.startswith(f"{before_nm:.3g} nm before")
-    assert "nm after over the open pupil in the longest stretch under one law;" in text
+    assert "nm after correction over the open pupil, in the longest stretch under one law;" in text
 
 
 def uneventful(night: SyntheticLog, frames: int = 300) -> SyntheticLog:
@@ -392,7 +392,7 @@ def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(
     assert "true_over_theory" not in results["spectra"]["groups"][0]
     assert results["run"]["simulated"] is False
     assert (
-        "nm after in all modes over the circle in the longest stretch under one law;"
+        "nm after correction in all modes over the circle, in the longest stretch under one law;"
         in check_of(results, "residual")["text"]
     )
 
@@ -610,7 +610,7 @@ def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> Non
     text = out.read_text()
     assert text.lstrip().startswith("<!DOCTYPE html>")
     assert "No spectra: the longest gap-free stretch has 3 frames" in text
-    assert f'<td class="none">{NOT_HERE}</td>' in text
+    assert f'<td class="none">{NOT_IN_LOG}</td>' in text
     assert "gain nan inf" in text
     assert not re.search(r"""(src|href)=["'](?!#|data:)""", text)
     assert not re.search(r"url\((?!#)|@import|<script|<link|<iframe", text)

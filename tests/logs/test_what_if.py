@@ -32,7 +32,7 @@ from lowfc.optics.chain.coronagraph import Coronagraph
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words
 from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, render, what_if
-from lowfc.programs.logs.what_if.options import WhatIf, requested, user_controller
+from lowfc.programs.logs.what_if.options import WhatIf, requested_changes, user_controller
 from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support import toy
 from tests.support.in_process_loop import SMALL_MIRROR, configuration, run_loop
@@ -205,7 +205,7 @@ def test_the_continuous_residual_of_a_fractional_delay_is_that_of_the_moving_mir
 
 def test_a_what_if_predicts_the_residual_of_a_run_with_other_gains(runs: dict[str, LoggedRun]) -> None:
     """Measured residuals of two runs are compared mode by mode."""
-    predicted, run = results_of(runs["default"], requested(OTHER)), results_of(runs["other"])
+    predicted, run = results_of(runs["default"], requested_changes(OTHER)), results_of(runs["other"])
     np.testing.assert_allclose(column(predicted, "what_if"), column(run, "was"), rtol=0.1)
     np.testing.assert_allclose(column(predicted, "open"), column(run, "open"), rtol=0.1)
     assert np.abs(column(predicted, "was") / column(run, "was") - 1).max() > 0.1
@@ -235,8 +235,10 @@ def test_the_clock_of_the_cameras_host_does_not_change_the_measured_delay(tmp_pa
 def test_a_configuration_file_gives_the_same_as_the_options(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     path = tmp_path / "other.toml"
     path.write_text("[control]\ntilt_gain=0.2\ngain=0.9\nleak=0.01\ntilt_leak=0.01\n")
-    by_file = results_of(runs["default"], requested("gain=0.3,tilt_gain=0.2,limit_nm=150,tilt_limit_nm=150", path))
-    assert by_file == results_of(runs["default"], requested(OTHER + ",limit_nm=150"))
+    by_file = results_of(
+        runs["default"], requested_changes("gain=0.3,tilt_gain=0.2,limit_nm=150,tilt_limit_nm=150", path)
+    )
+    assert by_file == results_of(runs["default"], requested_changes(OTHER + ",limit_nm=150"))
     table = render(by_file).splitlines()
     titles = re.split(r"\s{2,}", next(line for line in table if line.startswith("residual, nm rms")).strip())
     assert len(set(titles)) == len(titles) == 9  # no two columns have the same title
@@ -255,7 +257,7 @@ def test_automatic_gains_of_a_configuration_file_are_the_logged_ones(
         ("tilt_gain=0.3", [0.3, 0.3, 0.2], "those of focus are the logged ones"),
         ("gain=0.3", [0.3, 0.3, 0.3], ""),
     ):
-        found = results_of(runs["default"], requested(given, path))
+        found = results_of(runs["default"], requested_changes(given, path))
         assert [mode["gain"] for mode in found["modes"]] == pytest.approx(gains)
         warnings = [one for one in found["warnings"] if "automatic" in one]
         assert len(warnings) == bool(kept)
@@ -266,7 +268,7 @@ def test_automatic_gains_of_a_configuration_file_are_the_logged_ones(
 
 def test_another_reconstructor_measures_the_same_frames(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     """pinv by name and from a file agree; `weighted`, computed from that file, is the logged reconstructor."""
-    by_name = results_of(runs["default"], requested("estimator=pinv"))
+    by_name = results_of(runs["default"], requested_changes("estimator=pinv"))
     assert by_name["estimator"] == "pinv"
     assert by_name["what_if_nm"] != pytest.approx(by_name["was_nm"], rel=1e-3)
     np.testing.assert_allclose(column(by_name, "open")[:2], column(results_of(runs["default"]), "open")[:2], rtol=0.1)
@@ -276,9 +278,9 @@ def test_another_reconstructor_measures_the_same_frames(runs: dict[str, LoggedRu
     R = reconstructor(I0, H, good, 1.0, 0.0, "pinv").astype(np.float32)
     path = tmp_path / "pinv.fits"
     calibration_file.save(identified(replace(calibration, reconstructor=R, estimator="pinv")), path)
-    by_file = results_of(runs["default"], requested(calibration=path))
+    by_file = results_of(runs["default"], requested_changes(calibration=path))
     np.testing.assert_allclose(column(by_file, "what_if"), column(by_name, "what_if"), rtol=1e-4)
-    back = results_of(runs["default"], requested("estimator=weighted", calibration=path))
+    back = results_of(runs["default"], requested_changes("estimator=weighted", calibration=path))
     np.testing.assert_allclose(column(back, "what_if"), column(back, "was"), rtol=1e-2)
 
 
@@ -295,7 +297,7 @@ def test_another_reconstructor_is_weighted_like_the_logged_one(
     monkeypatch.setattr(run.history, "controllers", [state])
     np.testing.assert_array_equal(run.measured_again(run.calibration), expected)
     for change, warned in (("estimator=pinv", True), ("gain=0.3", True), ("gain=0,tilt_gain=0.2", False)):
-        warnings = " ".join(results_of(run, requested(change))["warnings"])
+        warnings = " ".join(results_of(run, requested_changes(change))["warnings"])
         assert ("weighted the logged reconstructor for modes that they do not correct (focus)" in warnings) == warned
 
 
@@ -308,7 +310,7 @@ def test_frames_that_are_not_in_the_log_are_counted(
     np.testing.assert_allclose(found, run.steps.error_nm, atol=1e-4)
     found[1107::20] = np.nan
     monkeypatch.setattr(run, "measured_again", lambda *_: found)
-    results = what_if(run, requested("estimator=pinv"))
+    results = what_if(run, requested_changes("estimator=pinv"))
     assert results["frames_compared"] == FRAMES - SETTLING - 5
     assert "the log lacks 5 used frames" in results["warnings"][0]
 
@@ -323,7 +325,7 @@ def test_commands_are_converted_to_modes_of_another_scale(runs: dict[str, Logged
         modes_to_actuators=calibration.modes_to_actuators * 2,
     )
     calibration_file.save(identified(twice), tmp_path / "twice.fits")
-    results = results_of(runs["default"], requested(calibration=tmp_path / "twice.fits"))
+    results = results_of(runs["default"], requested_changes(calibration=tmp_path / "twice.fits"))
     np.testing.assert_allclose(column(results, "what_if"), column(results, "was") / 2, rtol=1e-4)
 
 
@@ -331,10 +333,10 @@ def test_calibrations_that_do_not_fit_are_refused(runs: dict[str, LoggedRun], tm
     path = tmp_path / "other.fits"
     calibration_file.save(identified(replace(toy.calibration(), noll=(2, 3, 11))), path)
     with pytest.raises(CalibrationError, match=r"its noll is \(2, 3, 11\), in the log it is \(2, 3, 4\)"):
-        results_of(runs["default"], requested(calibration=path))
+        results_of(runs["default"], requested_changes(calibration=path))
     (tmp_path / "shear.toml").write_text('[control]\nnuisance = ["shear"]\n')
     with pytest.raises(ConfigurationError, match=r"weighted\+shear: .* --calibration"):
-        results_of(runs["default"], requested(config=tmp_path / "shear.toml"))
+        results_of(runs["default"], requested_changes(config=tmp_path / "shear.toml"))
 
 
 INTEGRATOR = """
@@ -363,7 +365,9 @@ def test_a_users_controller_is_run_like_the_integrator(
 ) -> None:
     (tmp_path / "mine.py").write_text(INTEGRATOR)
     where = f"{tmp_path / 'mine.py'}:step"
-    users, integrator = (results_of(runs["default"], one) for one in (requested(controller=where), requested(OTHER)))
+    users, integrator = (
+        results_of(runs["default"], one) for one in (requested_changes(controller=where), requested_changes(OTHER))
+    )
     np.testing.assert_allclose(column(users, "what_if"), column(integrator, "what_if"), rtol=1e-4)
     assert users["controller"] == where
     assert "gain" not in users["modes"][0]
@@ -530,7 +534,7 @@ def test_a_loop_closed_on_refused_frames_only_is_not_called_never_closed() -> No
 def test_an_open_loop_beyond_the_linear_range_gives_warnings() -> None:
     far = np.full((40, 3), [20.0, -30.0, 12.0], np.float32)
     run = LoggedRun(history(error_nm=far, pol_nm=far.copy(), mode=np.full(40, LoopMode.OPEN, np.uint8)))
-    results = what_if(run, requested("tilt_gain=2.5"))
+    results = what_if(run, requested_changes("tilt_gain=2.5"))
     assert results["compared"] == "the loop was never closed"
     assert column(results, "was").tolist() == column(results, "open").tolist() == [20, 30, 12]
     _, linear, unstable, limits = results["warnings"]
@@ -566,14 +570,14 @@ def test_errors_of_a_users_controller_are_reported(tmp_path: Path, body: str | N
 
 
 def test_options_are_parsed() -> None:
-    parsed = requested(" gain=0.6, leak=0.01,tilt_limit_nm=80,estimator=pinv", controller=None)
+    parsed = requested_changes(" gain=0.6, leak=0.01,tilt_limit_nm=80,estimator=pinv", controller=None)
     assert parsed == WhatIf({"gain": 0.6, "leak": 0.01, "tilt_limit_nm": 80.0}, "pinv")
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("gian=0.6", r"unknown key 'gian' \(did you mean 'gain'\?\); known are gain, leak,"),
+        ("gian=0.6", r"unknown key 'gian' \(did you mean 'gain'\?\); the keys are gain, leak,"),
         ("gain", "gain requires one value"),
         ("gain=high", "gain must be a number, got 'high'"),
         ("gain=1,gain=2", "gain requires one value"),
@@ -586,6 +590,6 @@ def test_options_are_parsed() -> None:
 )
 def test_invalid_options_are_refused(text: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        what_if(LoggedRun(history()), requested(text))
+        what_if(LoggedRun(history()), requested_changes(text))
     with pytest.raises(ConfigurationError, match="gain apply to the integrator"):
-        requested("gain=0.3", controller="mine.py:step")
+        requested_changes("gain=0.3", controller="mine.py:step")

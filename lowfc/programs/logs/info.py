@@ -75,7 +75,7 @@ def _summary(contents: Mapping[str, Any]) -> dict[str, str]:
     lost = [f"{contents['messages_missing']} missing by their sequence numbers"]
     if "messages_lost" in recording:
         lost.append(f"{recording['messages_lost']} counted as lost by the recorder")
-    lost += [f"{count} of {key} (all)" for key, count in contents["missing_topics"].items()]
+    lost += [f"all {count} of {key}" for key, count in contents["missing_topics"].items()]
     if contents["unreadable"]:
         lost.append(f"{contents['unreadable']} unreadable, because their channel record was damaged")
     lines = {

@@ -26,11 +26,11 @@ def recover(
     from rich.console import Console
 
     from lowfc.adapters.logs.parts import named_files
-    from lowfc.adapters.logs.recovery import recover as run
+    from lowfc.adapters.logs.recovery import recover as recover_log
     from lowfc.adapters.logs.recovery import recovered_path
     from lowfc.adapters.process.progress import reading_bar
 
     for log in named_files(logs, out, as_json=as_json):
         with reading_bar(Console(stderr=True)) as count:
-            done = run(log, out or recovered_path(log), partial(count, f"recovering {log.name}"))
+            done = recover_log(log, out or recovered_path(log), partial(count, f"recovering {log.name}"))
         print_result(done.json_object, str(done), as_json=as_json)

@@ -91,7 +91,7 @@ def _time_ns(kind: Any, payload: bytes) -> int:
 
 
 @dataclass(slots=True)
-class _Line:
+class _TopicRow:
     """Row of the table of topics: the messages of one key; `starts` holds their publishers and start times."""
 
     schema: str
@@ -120,7 +120,7 @@ class _Account:
     def __init__(self, selection: Selection = EVERYTHING) -> None:
         self._selection = selection
         self._losses = LossAccount(selection)
-        self._lines: dict[str, _Line] = {}
+        self._lines: dict[str, _TopicRow] = {}
         self._events: Counter[str] = Counter()
         self._modes: list[str] = []
         self._begin_ns: int | None = None
@@ -129,7 +129,7 @@ class _Account:
     def enter(self, topic: Topic | None, message: Sample, schema: str) -> None:
         """Count a message."""
         now_ns = message.receive_time_ns
-        line = self._lines.setdefault(message.key, _Line(schema, now_ns, now_ns))
+        line = self._lines.setdefault(message.key, _TopicRow(schema, now_ns, now_ns))
         line.messages += 1
         line.size += len(message.payload)
         line.first_ns, line.last_ns = min(line.first_ns, now_ns), max(line.last_ns, now_ns)

@@ -10,12 +10,12 @@ AOT describes a telescope with a Shack-Hartmann or pyramid sensor. A log is mapp
       measurements        not in the file; they are (frame - dark) / flux - reference over the good pixels
       ref_measurements    I0, fraction of the flux
     Detector            the camera: dark, bad pixels, exposure, and the frames if requested
-    DeformableMirror    the mirror; actuator positions in m across the pupil, row by row; stroke in each direction
+    DeformableMirror    the mirror; actuator positions in m across the pupil, row by row; stroke in each direction, m
     ControlLoop         one row for each step, in the log's order
       time                end of the exposure, and frame count
       modal_coefficients  measured modal error, nm rms of wavefront; NaN if the frame was refused
       commands            surface at each actuator as sent, m; NaN if the log has no command for this frame
-      modes               Zernike polynomials of the calibration's modes, over the circle
+      modes               Zernike polynomials of the calibration's modes, over the unit circle
       measurements_to_modes, modes_to_measurements, modes_to_commands: R (as at the end of the log, weighted by
                           automatic gains), H and MODES2ACT
       time_filter_num, _den: the integrator g / (z - (1 - leak)) of each mode, at the end of the log
@@ -60,7 +60,7 @@ _NM = 1e-9
 
 
 def write_aot(files: list[Path], history: History, *, with_frames: bool) -> None:
-    """Write a run as AOT; `aotpy` checks the file, before commands and frames replace its empty images."""
+    """Write a run as AOT; `aotpy` checks the file before commands and frames replace its empty images."""
     step_columns(history)  # raises DataFileError without steps
     path = files[0]
     if history.calibration is None:
@@ -229,14 +229,14 @@ def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibrati
         except DecodeError:
             continue
         surface_nm = actuators(command)
-        if surface_nm is not None and surface_nm.size == shape[1]:  # of another size: a command of another mirror
+        if surface_nm is not None and surface_nm.size == shape[1]:  # another size: another mirror
             row = row_of.pop(command.frame_sequence, None)  # later commands of this frame only repeat the first
             if row is not None:
                 rows[row] = surface_nm.ravel() * np.float32(_NM)
 
 
 def _mode_images(noll: tuple[int, ...]) -> Single:
-    """Zernike polynomials (modes, rows, columns) over the circle, 0 outside."""
+    """Zernike polynomials (modes, rows, columns) over the unit circle, 0 outside."""
     axis = (np.arange(_MODES_PIXELS) + 0.5) / (_MODES_PIXELS / 2) - 1
     x, y = np.meshgrid(axis, axis)
     return np.asarray(zernikes(noll, x, y) * (np.hypot(x, y) <= 1), np.float32)

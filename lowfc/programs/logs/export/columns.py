@@ -20,7 +20,7 @@ class Column:
     """One quantity of every step or frame, or one array of the calibration.
 
     Attributes:
-        name: name; ends in the unit if there is one.
+        name: name of the column; ends in the unit if there is one.
         values: array (rows,) or (rows, modes); any shape for a calibration.
         unit: unit in FITS notation; empty for none.
         description: description of the quantity.

@@ -60,7 +60,7 @@ def export(
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Write the steps of a log with units, the calibration and, with --frames, the frames, for other tools.
+    """Convert a log for other tools: its steps with units, its calibration and, with --frames, its frames.
 
     With --decimate, write a smaller log.
 

@@ -30,8 +30,8 @@ _FITS_ZERO = 0x8000
 def fits_cube(path: Path, image: "fits.ImageHDU", shape: tuple[int, ...]) -> npt.NDArray[Any]:
     """Memory-mapped array ">f4" in a new extension at the end of a FITS file.
 
-    The header is that of `image`, whose data is not used but has the same number of axes. OSError if the disk has no
-    room for the array: a write to a memory map on a full disk would kill the process.
+    The header is that of `image`, which must have the same number of axes; its data is not used. OSError if the disk
+    has no room for the array: a write to a memory map on a full disk would kill the process.
     """
     with path.open("ab") as stream:
         stream.write(_header(image, shape, BITPIX=-32))
@@ -42,7 +42,7 @@ def fits_cube(path: Path, image: "fits.ImageHDU", shape: tuple[int, ...]) -> npt
 
 
 def copy_frames_to_fits(path: Path, image: "fits.ImageHDU", history: History) -> Columns:
-    """Copy the frames of a run into a new extension with the header of `image`; see `_frames`.
+    """Copy the frames of a run into a new extension with the header of `image`; DataFileError if a frame is unfit.
 
     Returns:
         `sequence` and `time_ns` of each frame in the order of recording.
@@ -60,7 +60,7 @@ def copy_frames_to_fits(path: Path, image: "fits.ImageHDU", history: History) ->
 
 
 def copy_frames_to_npy(path: Path, history: History) -> None:
-    """Copy the frames of a run into a .npy file, which `numpy.load` maps with `mmap_mode="r"`; see `_frames`."""
+    """Copy the frames of a run into a .npy file for `numpy.load(..., mmap_mode="r")`; DataFileError if one is unfit."""
     with path.open("wb") as stream:
         for _, pixels in _frames(history):
             if not stream.tell():
@@ -80,7 +80,7 @@ def _frames(history: History) -> Iterator[tuple[Frame, Pixels]]:
     """The frames of a log in the order of recording, with their pixels (rows, columns), all of one shape.
 
     Raises:
-        DataFileError: a frame cannot be copied.
+        DataFileError: a frame is unreadable or incomplete, or has another shape than the first one.
     """
     path, count = history.log.path, history.frame_sequence.size
     shape: tuple[int, ...] | None = None

@@ -1,4 +1,4 @@
-"""Republish a log on the bus at its own pace, for a viewer, a controller under test or a user's tool.
+"""Republish a log on the bus at the recorded rate or a multiple, for a viewer, a controller under test or another tool.
 
 Payloads and sequences are those of the log, so that frame, step, command and mirror state can be joined. Publication
 times are new, so that no message counts as late. Deadlines are absolute: timing errors do not accumulate.
@@ -31,7 +31,7 @@ from lowfc.control.loop.wording import counted
 from lowfc.programs.logs.publish.selection import PublishedKeys, role_of
 
 BEHIND_NS = 1_000_000
-"""Delay after which a message is counted as behind."""
+"""Delay beyond which a message counts as published behind its time."""
 LONG_WAIT_NS = 10_000_000_000
 """Time to the next message above which the wait is announced."""
 
@@ -57,8 +57,8 @@ def publish(
         run_id: name of the run; created if it does not exist.
         speed: 2 is twice as fast, a large number as fast as possible. Subscribers that do not keep up lose messages, as
             with a live camera.
-        topics: keys or shell patterns of keys; if empty, all topics of the loop's roles that are not live, except
-            commands.
+        topics: keys or shell patterns of keys; if empty, all topics, except commands, of those roles of the loop that
+            are not live.
         allow_commands: publish commands too, and frames even if they would move a live mirror.
         wait_for: roles that must be running and connected before the first message; their topics are not published.
 
@@ -150,7 +150,7 @@ class Player:
             return
         is_state = publisher.topic.queryable and publisher.topic is not HEALTH
         if is_state and not self._begun_ns and message.key not in self._initial_keys:
-            # A log begins with the calibration and the states then in force, which may be old.
+            # A log begins with the calibration and states then in force. They may be old, so they are not timed.
             self._initial_keys.add(message.key)
             publisher.put(message.payload, None, message.sequence)
         elif not is_state and message.receive_time_ns < self._last_log_ns - REORDERING_NS:
@@ -166,7 +166,7 @@ class Player:
         due_ns = self._begun_ns + round(min((self._last_log_ns - self._first_log_ns) / self._speed, LAST_NS))
         if (wait_ns := due_ns - self._clock.host_ns()) > LONG_WAIT_NS:
             when = _utc(self._last_log_ns)
-            text = f"the next message, of {when}, follows in {wait_ns / 1e9:.0f} s; Ctrl-C ends it"
+            text = f"the next message, of {when}, follows in {wait_ns / 1e9:.0f} s; Ctrl-C ends the publication"
             self._console.print(text, highlight=False)
         self._sleep_until(due_ns)
         if not self._service.running:
@@ -235,11 +235,13 @@ def _wait_for_receivers(service: Service, live: Collection[str], wait_for: Colle
     service.state = "ready"
     missing = service.wait_for(wait_for, _WAIT_FOR_S)
     if missing and service.running:
-        console.print(f"waiting for {', '.join(missing)} of run {service.run_id!r}; Ctrl-C ends it", highlight=False)
+        console.print(
+            f"waiting for {', '.join(missing)} of run {service.run_id!r}; Ctrl-C ends the publication", highlight=False
+        )
     while missing and service.running:
         missing = service.wait_for(missing, _WAIT_FOR_S)
     begun_s = time.monotonic()
-    service.wait_for(live, _WAIT_FOR_S)  # no longer, because a user's own program may not send Health
+    service.wait_for(live, _WAIT_FOR_S)  # at most this long: a user's program may send no Health
     while service.running and time.monotonic() - begun_s < _SETTLE_S:
         time.sleep(0.02)
     return service.running

@@ -17,8 +17,8 @@ class PublishedKeys:
     """Decides for every key of a log whether it is published.
 
     Attributes:
-        roles: roles to take over, in the order of the topics; if frames are selected and no live mirror may be moved,
-            also those of all mirrors, so that none can join.
+        roles: roles to take over, in the order of the topics. If frames are selected and no live mirror may be moved,
+            the roles of all mirrors are among them, so that no mirror can join the run.
         live: roles of live processes.
     """
 
@@ -29,7 +29,7 @@ class PublishedKeys:
 
         Args:
             links: links of the run.
-            patterns: keys or shell patterns of keys; if empty, everything.
+            patterns: keys or shell patterns of keys; if empty, all keys.
             live: roles of the run that live processes have or will have.
             allow_commands: whether a live mirror may be moved.
         """

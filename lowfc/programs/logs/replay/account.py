@@ -17,7 +17,7 @@ class Account(Result):
     """Result of a replay, and the state of the logs.
 
     Attributes:
-        frames: number of steps checked; `commands`, `states` and `requests` likewise.
+        frames: number of steps checked; `commands`, `states` and `requests` are the numbers of these that were checked.
         unchecked_because: number of steps that could not be checked, by reason.
         inputs_missing: number of controller inputs missing from the log, found by the input number of a later state.
         commands_missing: number of commands that the replay sends but the log does not have.
@@ -28,9 +28,9 @@ class Account(Result):
         rules_changed: number of inputs that this version handles differently on purpose, by rule.
         version: lowfc version of the first log.
         host_differs: versions and processor features that differ between the first log's host and this one.
-        log_s: time from the first frame to the last; `speed` is `log_s` over the time of the replay.
+        log_s: time from the first frame to the last; `speed` is `log_s` divided by the duration of the replay.
         complete: whether every log has its end and summary.
-        no_end: reason if the recorder did not end every log.
+        no_end: sentence on why a log has no end; empty if the recorder ended every log.
         damaged: parts of the logs that were left out.
         runs: names of the runs in the logs.
         stopped: reasons why a recording ended early.
@@ -96,12 +96,12 @@ class Account(Result):
         """All fields, whether set or not."""
         return self.model_dump()
 
-    def leave_out(self, why: str, steps: int) -> None:
+    def count_unchecked(self, why: str, steps: int) -> None:
         """Count steps that cannot be checked."""
         if steps:
             self.unchecked_because[why] += steps
 
-    def enter(self, found: Difference | None, tolerance_nm: float) -> None:
+    def add_difference(self, found: Difference | None, tolerance_nm: float) -> None:
         """Count the difference between two messages."""
         if found is None:
             return
@@ -134,7 +134,7 @@ class Account(Result):
         """Remarks on what could not be checked, what differs, and the speed."""
         missing = ((self.inputs_missing, "input"), (self.commands_missing, "command"))
         since = f"since {self.version or 'a former version'}"
-        lines = [f"rule changed       {counted(n, 'input')} {since}: {rule}" for rule, n in self.rules_changed.items()]
+        lines = [f"rule changed       {since}, {counted(n, 'input')}: {rule}" for rule, n in self.rules_changed.items()]
         lines += [f"unchecked          {counted(n, 'step')} {why}" for why, n in self.unchecked_because.items()]
         lines += [f"missing            the log lacks {counted(n, what)} of the controller" for n, what in missing if n]
         lines += faults(self.damaged, self.no_end)
@@ -147,7 +147,7 @@ class Account(Result):
                 f"(sequence {first.frame_sequence}), input {first.taken} of the controller"
             )
             lines += [f"                   {line}" for line in first.fields]
-        for key, (there, here) in self.host_differs.items():
-            lines.append(f"{key:18} {there or 'none'} in the log, {here or 'none'} here")
+        for key, (logged, present) in self.host_differs.items():
+            lines.append(f"{key:18} {logged or 'none'} in the log, {present or 'none'} on this host")
         speed = f"speed              {self.log_s:.1f} s of log, {self.speed:.1f} times as fast as recorded"
         return [*lines, speed] if self.frames else lines

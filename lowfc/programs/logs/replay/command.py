@@ -19,10 +19,10 @@ _HOST = ("lowfc", "git", "python", "numpy", "numba", "scipy", "blas", "processor
 """Versions and processor features on which bit-exact results may depend."""
 
 
-def _host_differences(there: dict[str, str]) -> dict[str, tuple[str, str]]:
+def _host_differences(logged: dict[str, str]) -> dict[str, tuple[str, str]]:
     """Differences in versions and processor between the log's host and this one."""
-    here = provenance()
-    both = {key: (there[key], here.get(key, "")) for key in _HOST if key in there}
+    present = provenance()
+    both = {key: (logged[key], present.get(key, "")) for key in _HOST if key in logged}
     differs = {key: (before, now) for key, (before, now) in both.items() if before != now}
     if "cpu_features" in differs:
         before, now = (set(features.split()) for features in differs["cpu_features"])

@@ -1,4 +1,4 @@
-"""Replay of one controller of a log: its inputs in their order, every result compared."""
+"""Replay one controller of a log: apply its inputs in their order, and compare every result with the log."""
 
 import contextlib
 from collections import deque
@@ -25,9 +25,9 @@ from lowfc.programs.logs.replay.former import FormerVersion, changed_rule
 from lowfc.programs.logs.replay.frames import Frames
 
 PATIENCE_NS = 2_000_000_000
-"""Longest time to wait in the log for a message of another publisher, because messages are in the order of arrival."""
+"""Longest log time to wait for a message of another publisher: a log is in the order of arrival."""
 _STATES_KEPT = 256
-_BEFORE = "recorded before the first complete state of the controller"
+_BEFORE_STATE = "recorded before the first complete state of the controller"
 
 
 @dataclass(slots=True)
@@ -107,18 +107,18 @@ class ControllerReplay:
         self._state: State | None = None
         self._recent_states: deque[State] = deque(maxlen=_STATES_KEPT)
         # Empty: the steps before the next state belong to another segment, which counts them.
-        self._unchecked_because = _BEFORE if begun_ns >= context.segment.from_ns else ""
+        self._unchecked_because = _BEFORE_STATE if begun_ns >= context.segment.from_ns else ""
         self._counts_earlier = bool(self._unchecked_because)  # whether steps before the adopted state are counted
 
-    def take(self, message: Sample, kind: type[Message]) -> None:
+    def add(self, message: Sample, kind: type[Message]) -> None:
         """Add one of the controller's messages, and replay as far as possible."""
         if self.done:
             return
         body = kind.FromString(message.payload)
         if isinstance(body, wire.ControllerState):
-            self._take_state(body, message.receive_time_ns)
+            self._add_state(body, message.receive_time_ns)
         else:
-            number: int = body.input_number  # type: ignore[attr-defined]  # all other messages have one
+            number: int = body.input_number  # type: ignore[attr-defined]  # all messages but states have it
             if not number:  # an unreadable request, or a command of another program
                 if kind is wire.ControlStep:
                     raise DataFileError(
@@ -145,12 +145,12 @@ class ControllerReplay:
         """Account for a message of a past input: from before the adopted state, or a duplicate."""
         if number <= self._start_number:
             if self._counts_earlier:
-                self._account.leave_out(_BEFORE, int(isinstance(body, wire.ControlStep)))
+                self._account.count_unchecked(_BEFORE_STATE, int(isinstance(body, wire.ControlStep)))
         elif not isinstance(body, wire.MirrorCommand) and self._state is not None:
             name = body.DESCRIPTOR.name
             duplicate = Difference(name, number, self._state.frame_sequence, [f"a second message of input {number}"])
             duplicate.otherwise = True  # no tolerance applies
-            self._account.enter(duplicate, self._context.tolerance_nm)
+            self._account.add_difference(duplicate, self._context.tolerance_nm)
             self._account.frames += isinstance(body, wire.ControlStep)
 
     def proceed(self, now_ns: int, *, ended: bool = False) -> None:
@@ -168,7 +168,7 @@ class ControllerReplay:
                 if waiting is None or not (ended or now_ns - waiting.receive_time_ns > PATIENCE_NS):
                     return
                 before_log = self._first_number is not None and number < self._first_number
-                self._reset(_BEFORE if before_log else "after an input that the log does not have")
+                self._reset(_BEFORE_STATE if before_log else "after an input that the log does not have")
                 continue
             overdue = ended or now_ns - entry.receive_time_ns > PATIENCE_NS
             if not overdue and entry.command is None and entry.leads_to_command and self._state.loop is not None:
@@ -188,7 +188,7 @@ class ControllerReplay:
             else:
                 return
 
-    def _take_state(self, message: wire.ControllerState, receive_time_ns: int) -> None:
+    def _add_state(self, message: wire.ControllerState, receive_time_ns: int) -> None:
         if receive_time_ns < self._context.segment.from_ns:
             return
         if receive_time_ns >= self._context.segment.until_ns:
@@ -217,7 +217,7 @@ class ControllerReplay:
             self._settings, self._state, self._start_number = settings, state, number
             self._recent_states.append(state)
             self._counts_earlier = bool(self._unchecked_because)
-            self._leave_out(number)
+            self._drop_entries(number)
             if self._lost_number is not None:
                 self._account.inputs_missing += number - self._lost_number - self._dropped
                 self._lost_number = None
@@ -226,9 +226,9 @@ class ControllerReplay:
         return False
 
     def _decoded(self, message: wire.ControllerState) -> tuple[Settings, State]:
-        known = self._context.published
-        calibration = known.calibrations.get(message.calibration_id)
-        return decode_state(message, calibration, known.laws, known.plays, self._kernel)
+        published = self._context.published
+        calibration = published.calibrations.get(message.calibration_id)
+        return decode_state(message, calibration, published.laws, published.plays, self._kernel)
 
     def _kernel(self, name: str) -> Kernel:
         """The kernel to replay with, renamed to the log's kernel, so that states can be compared."""
@@ -237,31 +237,32 @@ class ControllerReplay:
             self._account.other_kernel = found.name
         return found._replace(name=name)
 
-    def _leave_out(self, upto: int) -> None:
+    def _drop_entries(self, upto: int) -> None:
         for number in [number for number in self._entries if number <= upto]:
             logged = self._entries.pop(number).logged
             self._dropped += logged is not None
             if self._unchecked_because:  # otherwise the step belongs to another segment
-                self._account.leave_out(self._unchecked_because, int(isinstance(logged, wire.ControlStep)))
+                self._account.count_unchecked(self._unchecked_because, int(isinstance(logged, wire.ControlStep)))
 
     def _drop_old(self, now_ns: int, *, ended: bool) -> None:
         """Without a state to continue from, drop inputs that the next state will not need, and surplus states."""
         old = [number for number, entry in self._entries.items() if now_ns - entry.receive_time_ns > 2 * PATIENCE_NS]
-        self._leave_out(max(self._entries if ended else old, default=0))
+        self._drop_entries(max(self._entries if ended else old, default=0))
         while len(self._states) > _STATES_KEPT:
             del self._states[min(self._states)]
 
     def _reset(self, why: str) -> None:
         """Drop the state; steps are unchecked because of `why` until the next state is adopted."""
         self._unchecked_because = why
-        self._lost_number = self._state.input_number if self._state is not None and why not in ("", _BEFORE) else None
+        lost = self._state if why not in ("", _BEFORE_STATE) else None
+        self._lost_number = None if lost is None else lost.input_number
         self._dropped = 0
         self._state = None
         self.retry_pending = True
         self._recent_states.clear()
 
     def _input(self, entry: _Entry, *, overdue: bool) -> Input | None:
-        """The controller's input; None if the log does not have it (yet). If `overdue`, nothing more will arrive."""
+        """The input of an entry; None if the log does not have it (yet). If `overdue`, nothing more will arrive."""
         match entry.logged:
             case wire.ControlStep() as step:
                 age_ns = self._settings.max_frame_age_ns + 1 if wire.REASON_LATE in step.reasons else 0
@@ -274,8 +275,8 @@ class ControllerReplay:
                 return frame
             case wire.Request() as request:
                 with contextlib.suppress(ValueError):
-                    time_ns, known = from_timestamp(request.timestamp), self._context.published
-                    decoded = codec.request(request, request.name, time_ns, known.calibrations, known.laws, known.plays)
+                    time_ns, found = from_timestamp(request.timestamp), self._context.published
+                    decoded = codec.request(request, request.name, time_ns, found.calibrations, found.laws, found.plays)
                     if self._context.former is not None and not request.accepted:  # this version might accept it
                         decoded = replace(decoded, refusal=request.reply or "refused in the log")
                     return prepared(self._settings, decoded)
@@ -305,7 +306,7 @@ class ControllerReplay:
         self.done = state.input_number == self._end
 
     def _difference(self, state: State, logged: Message, replayed: Message | None) -> Difference | None:
-        """Difference between the compared fields; None without any."""
+        """Difference between a logged and a replayed message in the compared fields; None if these are equal."""
         if self._context.former is not None and type(replayed) is type(logged):
             if isinstance(logged, wire.ControllerState):
                 logged = self._reencoded(logged)
@@ -314,7 +315,7 @@ class ControllerReplay:
                 logged.state.CopyFrom(self._reencoded(logged.state))
             logged, replayed = self._context.former.compared(logged), self._context.former.compared(replayed)
         if replayed == logged and (self._context.former is not None or isinstance(logged, wire.ControllerState)):
-            return None  # other messages are compared byte by byte
+            return None  # steps, commands and requests of this version must be equal byte by byte
         return difference(state.input_number, state.frame_sequence, logged, replayed)
 
     def _reencoded(self, logged: wire.ControllerState) -> wire.ControllerState:
@@ -360,7 +361,7 @@ class ControllerReplay:
         found = self._difference(state, logged, replayed)
         if found is None:
             return
-        self._account.enter(found, self._context.tolerance_nm)
+        self._account.add_difference(found, self._context.tolerance_nm)
         if self._state is state and not self.done:
             # Continue from the logged state, or the difference would persist for the rest of the log.
             self._states[state.input_number] = logged
@@ -372,4 +373,4 @@ class ControllerReplay:
             return
         assert self._state is not None  # noqa: S101
         body = None if replayed is None else type(logged).FromString(replayed)
-        self._account.enter(self._difference(self._state, logged, body), self._context.tolerance_nm)
+        self._account.add_difference(self._difference(self._state, logged, body), self._context.tolerance_nm)

@@ -10,7 +10,7 @@ from google.protobuf.message import Message
 from lowfc.arrays import Array
 
 _FLOAT32_FIELD = "actuators"
-"""Field whose bytes hold little-endian float32, nm; that of channels (a repeated message) is compared exactly."""
+"""Field whose bytes hold little-endian float32, nm; in channels (a repeated message) it is compared exactly."""
 _IN_NM = ("_nm", "actuators", "law_state")
 """Endings of the names of fields in nm; the state of a user's linear law, whatever its unit, is treated like nm."""
 _MAX_SHOWN = 4
@@ -45,13 +45,13 @@ def difference(input_number: int, frame_sequence: int, logged: Message, replayed
     """Compare a message of the log with the replayed one, which is None if the replay sent nothing."""
     found = Difference(logged.DESCRIPTOR.name, input_number, frame_sequence)
     if replayed is None:
-        found.fields.append("the replay sends none")
+        found.fields.append("the replay sends no such message")
         found.otherwise = True
     else:
         _compare(found, "", logged, replayed)
         if not found.fields:
             found.fields.append(
-                "the bytes, but no value: the sign of a zero, an empty part, or a field of another version"
+                "the bytes differ, but no value: the sign of a zero, an empty part, or a field of another version"
             )
     return found
 

@@ -42,7 +42,7 @@ class Replay:
             self.context.frames = Frames()
         self._recording = recording
 
-    def take(self, message: Sample) -> None:
+    def add(self, message: Sample) -> None:
         """Add the next message."""
         context, topic = self.context, topic_of(message.key)
         self._last_ns = now_ns = message.receive_time_ns
@@ -60,11 +60,11 @@ class Replay:
         elif topic in TOPICS:
             context.account.steps += topic is STEP and inside
             with contextlib.suppress(DecodeError):  # the input of an unreadable message counts as missing
-                self._controller(message).take(message, topic.message)
+                self._controller(message).add(message, topic.message)
 
     @property
     def done(self) -> bool:
-        """Whether the segment has been replayed by every controller."""
+        """Whether every controller has replayed its part of the segment."""
         if self._last_ns - self.context.segment.until_ns <= PATIENCE_NS:
             return False
         newest = max(self._controllers, default=0)

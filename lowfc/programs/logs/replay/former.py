@@ -12,7 +12,7 @@ from lowfc.contract.messages import wire
 
 M = TypeVar("M", bound=Message)
 
-CAMERA_RULE = "the camera's settings are compared with the calibration's, instead of its bias with the dark frame"
+CAMERA_RULE = "the camera's settings are compared with the calibration's, instead of the bias with the dark frame"
 CHANNEL_RULE = "only a channel that exists is removed"
 CLOSE_RULE = "the loop is not closed while frames are refused, or on a camera that does not fit the calibration"
 CLEAR_RULE = "clear forgets the newest frame sequence"
@@ -43,12 +43,12 @@ class FormerVersion:
     """Fields of the messages of a former version, by number, as declared in its log."""
 
     def __init__(self, schemas: Mapping[int, Schema]) -> None:
-        """`schemas` are those of the log by number; more are added while the log is read."""
+        """Read the fields from the log's `schemas`, by number; the reader adds schemas while it reads the log."""
         self._schemas = schemas
         self._read: set[int] = set()
         self._fields: dict[str, set[int]] = {}
 
-    def _known(self, name: str) -> set[int] | None:
+    def _declared_fields(self, name: str) -> set[int] | None:
         """Numbers of the fields of a message; None if the log does not declare it."""
         if name in self._fields:
             return self._fields[name]
@@ -74,10 +74,10 @@ class FormerVersion:
 
     def _prune(self, message: Message) -> None:
         descriptor = message.DESCRIPTOR
-        known = self._known(descriptor.full_name)
+        declared = self._declared_fields(descriptor.full_name)
         for field, value in message.ListFields():
             ignored = field.name in _NOT_COMPARED.get(descriptor.full_name, ())
-            if ignored or (known is not None and field.number not in known):
+            if ignored or (declared is not None and field.number not in declared):
                 message.ClearField(field.name)
             elif field.message_type is not None:
                 for nested in value if field.is_repeated else (value,):

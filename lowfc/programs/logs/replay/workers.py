@@ -36,13 +36,13 @@ Progress = Callable[[int], None]
 def replay_files(
     paths: Sequence[Path], tolerance_nm: float, jobs: int, progress: Progress, kernel: str = ""
 ) -> Account:
-    """Replay consecutive logs in at most `jobs` processes, 0 for one per processor.
+    """Replay consecutive logs in at most `jobs` processes (0: one per processor).
 
     `progress` is called with the bytes replayed so far. ConfigurationError if a log is named twice or begins before the
     previous one ends, DataFileError if one cannot be replayed.
     """
     chunk_ends_ns = [_chunk_ends_ns(path) for path in paths]
-    ends_ns = sorted(end_ns for ends in chunk_ends_ns for end_ns in ends)  # a chunk may hold only an old calibration
+    ends_ns = sorted(end_ns for ends in chunk_ends_ns for end_ns in ends)  # a chunk of states alone may be older
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigurationError("a log is named twice; name each once, in the order they were recorded")
     if len(paths) > 1:
@@ -66,7 +66,7 @@ def replay_files(
     for account in accounts[1:]:
         total.add(account)
     unaccounted = total.steps - total.frames - total.unchecked
-    total.leave_out("without a state of the controller before them", max(0, unaccounted))
+    total.count_unchecked("without a state of the controller before them", max(0, unaccounted))
     total.log_s = (total.span_ns[1] - total.span_ns[0]) * 1e-9
     return total
 
@@ -108,7 +108,7 @@ def _replay_segment(
                     _refuse_thinned(part)
                     run.begin_file(part.metadata)
                     run.context.former = FormerVersion(part.schemas) if _is_former(part) else None
-                run.take(message)
+                run.add(message)
                 if number % _PROGRESS_EVERY == 0:
                     progress(log.position)
                 if run.done:

@@ -6,7 +6,8 @@ import numpy as np
 
 from lowfc.arrays import Mask
 from lowfc.control.laws.error_budget import SensorNoise, Term, lag, lag_under_noise, measurement_error, white_noise
-from lowfc.programs.logs.report.closed_loop import DISTURBANCE, ERROR, POL, SENSED, Spectra, Stretch, noise_of, why_none
+from lowfc.programs.logs.report import closed_loop
+from lowfc.programs.logs.report.closed_loop import DISTURBANCE, ERROR, POL, SENSED, Spectra, Stretch, noise_of
 from lowfc.programs.logs.report.source import Results, Run
 
 Masks = dict[str, Mask]
@@ -27,15 +28,15 @@ def budget_results(
     A true residual that is `shaped` by offset or channels is left out: it contains their shapes.
     """
     if stretch is None:
-        return {"why_not": why_none(run)}
+        return {"why_not": closed_loop.why_no_stretch(run)}
     noise = noise_of(run.history, stretch.rows)
     terms = _terms(stretch, spectra, noise, shaped=shaped)
     rows = [
         {"name": name, "how": how} | _columns(term, masks) | {"missing": term is None}
         for name, (term, how) in terms.items()
     ]
-    known = [term for term, _ in terms.values() if term is not None]
-    total = Term(np.sum([np.maximum(term.variance_nm2, 0) for term in known], axis=0)) if known else None
+    found = [term for term, _ in terms.values() if term is not None]
+    total = Term(np.sum([np.maximum(term.variance_nm2, 0) for term in found], axis=0)) if found else None
     missing = [name for name, (term, _) in terms.items() if term is None]
     true = None
     if stretch.residual_ms_nm2 is not None and stretch.frames.values and not shaped:

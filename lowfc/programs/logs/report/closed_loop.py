@@ -1,4 +1,4 @@
-"""The longest stretch of a run with the loop closed under one law: spectra, theory and budget."""
+"""The longest stretch of a run with the loop closed under one law: spectra, theory and sensor noise."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -18,7 +18,7 @@ from lowfc.control.laws.spectra import SHORTEST, Spectrum, TimeSeries, in_bins, 
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
-from lowfc.programs.logs.report.source import InForce, Results, Run
+from lowfc.programs.logs.report.source import LawInForce, Results, Run
 
 MAX_STEPS = 200_000
 """Only the last steps of a longer stretch are used, to bound the memory."""
@@ -35,10 +35,10 @@ class Stretch:
     Attributes:
         rows: steps of the stretch, after settling.
         settling: number of steps left out for settling.
-        earlier: number of further steps left out after these, see `MAX_STEPS`.
-        in_force: the law as it was in force.
-        law: the same law at the stretch's rate and delay; the integrator, too, as a linear law.
-        timing: timing of the loop; sampled if the log's truth is sampled.
+        earlier: number of steps after settling that are left out because the stretch is longer than `MAX_STEPS`.
+        in_force: the law as the controller's states report it.
+        law: the same law (also the integrator) as a linear law with the rate and delay of the stretch.
+        timing: timing of the loop; continuous if truth is continuous and the exposure known, otherwise sampled.
         frames: columns of error, pseudo-open-loop and, if the log has truth, disturbance, residual and the residual's
             mean over the exposure.
         residual_ms_nm2: (modes,) mean square of the true residual, over all times if the truth is continuous, otherwise
@@ -48,7 +48,7 @@ class Stretch:
     rows: slice
     settling: int
     earlier: int
-    in_force: InForce
+    in_force: LawInForce
     law: LinearLaw
     timing: Timing
     frames: TimeSeries
@@ -69,10 +69,10 @@ ERROR, POL, DISTURBANCE, RESIDUAL, SENSED = range(5)
 
 
 def longest_stretch(run: Run) -> Stretch | None:
-    """The longest stretch; None if there is none, for the reasons of `why_none`."""
+    """The longest stretch; None if there is none, for the reasons of `why_no_stretch`."""
     history, steps = run.history, run.history.steps
     law_of_step = np.searchsorted([law.first for law in run.laws], np.arange(steps.sequence.size), side="right") - 1
-    # Before the first law, the index is -1: the element False at the end.
+    # Before the first law, the index is -1, which selects the element False at the end.
     known = np.array([*(law.known for law in run.laws), False])[law_of_step]
     linear = np.array([*(law.linear is not None for law in run.laws), False])[law_of_step]
     # Until the next state names the overruled groups, only the steps show that there are any.
@@ -109,7 +109,7 @@ def longest_stretch(run: Run) -> Stretch | None:
     return Stretch(rows, settling, earlier, in_force, law, timing, frames, residual_ms_nm2)
 
 
-def why_none(run: Run) -> str:
+def why_no_stretch(run: Run) -> str:
     """Reason why there is no stretch."""
     closed = run.history.steps.mode == LoopMode.CLOSED
     if (closed & run.history.under_calibration).any():
@@ -157,7 +157,7 @@ Spectra = list[Spectrum]
 
 
 def spectra_of(stretch: Stretch | None) -> Spectra | None:
-    """Spectra of the signals of a stretch; None without one, or if it is too short."""
+    """Spectra of the signals of a stretch; None without a stretch, or if it is too short."""
     if stretch is None:
         return None
     found = [spectrum(stretch.signal(number), stretch.law.rate_hz) for number in range(4 if stretch.true else 2)]
@@ -167,7 +167,7 @@ def spectra_of(stretch: Stretch | None) -> Spectra | None:
 def spectra_results(run: Run, stretch: Stretch | None, found: Spectra | None) -> Results:
     """Spectra of tip, tilt and the sum of the others: in bins, by band, and compared with theory."""
     if stretch is None:
-        return {"why_not": why_none(run)}
+        return {"why_not": why_no_stretch(run)}
     if found is None:
         longest = stretch.frames.longest
         return {"why_not": f"the longest gap-free stretch has {longest} frames, but a spectrum requires {SHORTEST}"}
@@ -190,24 +190,24 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
 
     error, pol, *true = found
     frequency_hz = pol.frequency_hz
-    passed = rejection(law, frequency_hz)[:, modes] ** 2
+    power_rejection = rejection(law, frequency_hz)[:, modes] ** 2
     columns = {
         "pseudo_open_loop": total(pol),
         "error": total(error),
-        "error_predicted": (passed * pol.power_nm2_hz[:, modes]).sum(axis=1),
+        "error_predicted": (power_rejection * pol.power_nm2_hz[:, modes]).sum(axis=1),
     }
     if true:
         disturbance, residual = true
-        rejected = (passed * disturbance.power_nm2_hz[:, modes]).sum(axis=1)
+        rejected = (power_rejection * disturbance.power_nm2_hz[:, modes]).sum(axis=1)
         columns |= {"disturbance": total(disturbance), "residual": total(residual), "disturbance_left": rejected}
         if noise_nm2_hz is not None:
             added = noise_transfer(law, frequency_hz)[:, modes] ** 2 * noise_nm2_hz[modes]
             columns["residual_predicted"] = rejected + added.sum(axis=1)
     centres_hz, means = in_bins(frequency_hz, list(columns.values()))
     binned = dict(zip(columns, means, strict=True))
-    over = {"measured_over_theory": _amplitude_ratio(binned["error"], binned["error_predicted"])}
+    ratios = {"measured_over_theory": _amplitude_ratio(binned["error"], binned["error_predicted"])}
     if "residual_predicted" in binned:
-        over["true_over_theory"] = _amplitude_ratio(binned["residual"], binned["residual_predicted"])
+        ratios["true_over_theory"] = _amplitude_ratio(binned["residual"], binned["residual_predicted"])
     highest_hz = float(frequency_hz[-1])
     lowest_hz = float(frequency_hz[1])  # slower drift is mostly removed with the mean of each segment
     edges_hz = [lowest_hz, *(edge for edge in BANDS_HZ if lowest_hz < edge < highest_hz), highest_hz]
@@ -218,7 +218,7 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
     ]
     return {
         "name": name,
-        **over,
+        **ratios,
         "bands": bands,
         "frequency_hz": centres_hz.tolist(),
         "power_nm2_hz": {key: column.tolist() for key, column in binned.items()},
@@ -226,11 +226,11 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
 
 
 def _amplitude_ratio(measured: Array, theory: Array) -> Results:
-    """Ratio of measured to theoretical amplitude over all bins: median and the range of 90 % of them."""
-    known = (theory > 0) & (measured > 0)
-    if not known.any():
+    """Ratio of measured to theoretical amplitude from powers (bins,): median, 5th and 95th percentile over the bins."""
+    positive = (theory > 0) & (measured > 0)
+    if not positive.any():
         return {"median": None, "p5": None, "p95": None}
-    p5, median, p95 = np.percentile(np.sqrt(measured[known] / theory[known]), [5, 50, 95])
+    p5, median, p95 = np.percentile(np.sqrt(measured[positive] / theory[positive]), [5, 50, 95])
     return {"median": float(median), "p5": float(p5), "p95": float(p95)}
 
 
@@ -263,7 +263,7 @@ def noise_of(history: History, rows: slice) -> SensorNoise | None:
     in_use = calibration_in_use(history.controllers[count - 1], calibration) if count else calibration
     em_gain = max(camera.em_gain, 1.0)
     excess = 2.0 if em_gain > 1 else 1.0
-    readout_e2 = camera.read_noise_e**2 + camera.gain_e_per_dn**2 / 12  # after the EM gain; rounding to whole DN
+    readout_e2 = camera.read_noise_e**2 + camera.gain_e_per_dn**2 / 12  # after the EM gain; with rounding to whole DN
     return sensor_noise(
         in_use.reconstructor.astype(float),
         calibration.reference.astype(float),

@@ -52,7 +52,7 @@ def events(run: Run) -> list[Results]:
 
 
 def requests(run: Run) -> list[Results]:
-    """Requests, also the controller's own, and their answers, without periodic ones that change nothing."""
+    """Requests, also the controller's own, and their answers; without those that change nothing and are periodic."""
     if not run.history.steps.sequence.size:
         return []
     return [
@@ -84,7 +84,7 @@ def laws(run: Run) -> list[Results]:
 
 
 def light_results(history: History) -> Results:
-    """Flux, saturation of the used frames, and frames refused by reason."""
+    """Flux, saturation of the used frames, and the number of frames refused for each reason."""
     steps = history.steps
     flux = steps.flux_dn[steps.flux_dn > 0]
     counts = count_reasons(steps.reasons).items()
@@ -127,6 +127,6 @@ def _limits(reasons: Long) -> dict[str, int]:
 
 
 def _request_time_s(run: Run, request: wire.Request) -> float:
-    """Time of the first step with a request in force; if none follows the request, of the last step."""
+    """Time, since the log's first step, of the first step with a request in force; of the last step if none follows."""
     row = row_after(run.history, max(request.frame_sequence - 1, 0), request.timestamp)
     return float(run.step_s[min(row, run.history.steps.sequence.size - 1)])

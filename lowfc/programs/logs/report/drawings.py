@@ -24,7 +24,7 @@ _MODES = {"open": OPEN, "closed": CLOSED, "safe": COLOURS["safe"], "idle": FAINT
 _BESIDE_TRUTH: dict[str, Any] = {"linestyle": ":", "linewidth": 0.9, "alpha": 0.7}
 """Style of measured curves if the log also has the true ones."""
 _LIMIT_DRAWN_FROM = 0.25
-"""Fraction of the stroke limit used above which the limit is drawn."""
+"""The stroke limit is drawn if more than this fraction of it is used."""
 _MAX_MARKS = 300
 _SECONDS = "seconds since the first step"
 
@@ -57,8 +57,8 @@ def _overview(figure: "Figure", report: Report) -> bool:
     )
     for name, label, colour in names:
         if name in binned and np.isfinite(binned[name]).any():
-            look = _BESIDE_TRUTH if true and name in ("pseudo_open_loop", "error") else {}
-            plot.plot(time_s, binned[name], label=label, color=colour, **look)
+            style = _BESIDE_TRUTH if true and name in ("pseudo_open_loop", "error") else {}
+            plot.plot(time_s, binned[name], label=label, color=colour, **style)
     plot.set(ylabel="all modes, nm rms", xlabel=_SECONDS)
     plot.set_ylim(bottom=0)
     if plot.lines:
@@ -97,7 +97,7 @@ def _intervals(figure: "Figure", report: Report) -> bool:
         for (name, values), colour, style in zip(found.items(), (INK, COLOURS["other"]), ("-", "--"), strict=False):
             counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
             left.stairs(counts, edges, label=name, color=colour, linestyle=style, linewidth=1.2)
-        left.set(yscale="log", xlabel="interval, µs (the outer bins include all beyond)", ylabel="number")
+        left.set(yscale="log", xlabel="interval, µs (outer bins: all values beyond)", ylabel="intervals")
         left.legend()
     colours = (COLOURS["other"], COLOURS["another"], FAINT, COLOURS["error"], INK, INK)
     styles = ("-", "--", "-.", ":", "-", "--")
@@ -114,7 +114,7 @@ def _intervals(figure: "Figure", report: Report) -> bool:
 
 
 def _residual(figure: "Figure", report: Report) -> bool:
-    """Bars of each mode: before and after; true ones filled, measured ones hatched."""
+    """Bars of each mode, before and after correction; true values are filled, measured values hatched."""
     modes = report.results["residual"]["modes"]
     kinds = (
         ("disturbance", "true disturbance", OPEN, True),
@@ -133,10 +133,10 @@ def _residual(figure: "Figure", report: Report) -> bool:
     for place, (key, label, colour, filled) in enumerate(present):
         heights = [mode[f"{key}_rms_nm"] for mode in modes]
         left = np.arange(len(modes)) - 0.4 + (place + 0.5) * width
-        look: dict[str, Any] = {"facecolor": colour}
+        style: dict[str, Any] = {"facecolor": colour}
         if not filled:
-            look = {"facecolor": "none", "edgecolor": colour, "hatch": "//////"}
-        axes.bar(left, heights, 0.92 * width, label=label, **look)
+            style = {"facecolor": "none", "edgecolor": colour, "hatch": "//////"}
+        axes.bar(left, heights, 0.92 * width, label=label, **style)
     names = [f"Z{mode['noll']} {mode['name']}" for mode in modes]
     axes.set_xticks(range(len(modes)), names, rotation=35, ha="right", rotation_mode="anchor")
     axes.set_ylabel("nm rms")
@@ -205,10 +205,10 @@ def _budget(figure: "Figure", report: Report) -> bool:
                 continue
             colour = {"sum of the terms": INK, "true residual": CLOSED}.get(name, COLOURS["other"])
             limited = group in limits
-            look: dict[str, Any] = {"facecolor": colour}
+            style: dict[str, Any] = {"facecolor": colour}
             if limited:
-                look = {"facecolor": "none", "edgecolor": colour, "linestyle": "--"}
-            axes.barh(place, values[group], 0.6, **look)
+                style = {"facecolor": "none", "edgecolor": colour, "linestyle": "--"}
+            axes.barh(place, values[group], 0.6, **style)
             axes.text(values[group], place, f" {'< ' if limited else ''}{values[group]:.2g}", va="center", fontsize=8)
         axes.set(title=group, xlabel="nm rms")
         axes.grid(visible=False, axis="y")
@@ -229,8 +229,8 @@ def _light(figure: "Figure", report: Report) -> bool:
     refused = (steps.reasons & ((1 << Limit.MODAL_LIMIT) - 1)) != 0
     if refused.any():
         marks = time_s[refused][bin_starts(int(refused.sum()), _MAX_MARKS)]
-        look: dict[str, Any] = {"color": COLOURS["error"], "markersize": 5, "clip_on": False}
-        upper.plot(marks, np.zeros(marks.size), "x", label="frame refused", **look)
+        style: dict[str, Any] = {"color": COLOURS["error"], "markersize": 5, "clip_on": False}
+        upper.plot(marks, np.zeros(marks.size), "x", label="frame refused", **style)
     expected = report.results["light"]["flux_expected_dn"]
     if expected is not None:
         upper.axhline(expected, color=FAINT, linestyle="--", linewidth=1.0, label="expected by the calibration")
@@ -254,8 +254,8 @@ def _timeline(figure: "Figure", report: Report) -> bool:
     else:
         band.set_axis_off()
     levels = ("request", "info", "warning", "error")
-    looks = {"info": ("o", INK, "none"), "warning": ("^", INK, OPEN), "error": ("X", INK, COLOURS["error"])}
-    for level, (marker, edge, face) in looks.items():
+    markers = {"info": ("o", INK, "none"), "warning": ("^", INK, OPEN), "error": ("X", INK, COLOURS["error"])}
+    for level, (marker, edge, face) in markers.items():
         included = (level, "fatal") if level == "error" else (level,)
         found = [event["time_s"] for event in events if event["level"] in included]
         times_s = np.array(found)[bin_starts(len(found), _MAX_MARKS)]

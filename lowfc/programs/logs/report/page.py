@@ -14,7 +14,7 @@ from lowfc.programs.cli.contrast import added_contrast_in_words
 from lowfc.programs.logs.report.drawings import drawings
 from lowfc.programs.logs.report.results import Report
 
-NOT_HERE = "not in this log"
+NOT_IN_LOG = "not in this log"
 """Text in place of a missing number."""
 
 
@@ -39,9 +39,9 @@ def require_page() -> None:
 
 
 def number(value: float | str | None, digits: int = 3) -> str:
-    """A number in running text with this number of significant digits, or `NOT_HERE`."""
+    """A number in running text with this number of significant digits, or `NOT_IN_LOG`."""
     if value is None:
-        return NOT_HERE
+        return NOT_IN_LOG
     if isinstance(value, str | int):
         return str(value)
     text = f"{value:.{digits}g}"

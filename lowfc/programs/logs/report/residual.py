@@ -20,15 +20,15 @@ from lowfc.programs.logs.report.source import Results, Run, row_after
 def residual_results(run: Run, stretch: Stretch | None) -> Results:
     """Rms in nm of each mode and signal, and of tip and tilt per axis in mas; None for signals not in the log.
 
-    Closed loop: over the longest stretch under one law, after settling. Open loop: over all its steps under the last
-    calibration.
+    Closed loop: over the longest stretch under one law, after settling. Open loop: over all open-loop steps under the
+    last calibration.
     """
     history = run.history
     steps = history.steps
     opened = np.flatnonzero((steps.mode == LoopMode.OPEN) & history.under_calibration)
     rows = stretch.rows if stretch is not None else slice(0, steps.sequence.size)
     closed = np.arange(steps.sequence.size)[rows] if stretch is not None else opened[:0]
-    either = closed if closed.size else opened
+    closed_or_open = closed if closed.size else opened
     noll = history.calibration.noll if history.calibration is not None else ()
     true = history.true or TruthRows(0).values()
     values = {
@@ -53,14 +53,14 @@ def residual_results(run: Run, stretch: Stretch | None) -> Results:
     open_pupil = {
         f"{name}_open_pupil_rms_nm": _at(_rms(column[:, None], chosen), 0)
         for name, column, chosen in (
-            ("disturbance", true.disturbance_rms_nm, either),
+            ("disturbance", true.disturbance_rms_nm, closed_or_open),
             ("residual", true.residual_rms_nm, closed),
             ("sampled_residual", true.sampled_residual_rms_nm, closed),
         )
     }
     return {
         "modes": modes,
-        "added_contrast": _contrast(true, either, history.configuration),
+        "added_contrast": _contrast(true, closed_or_open, history.configuration),
         "tilt_mas": {signal: _tilt_mas(found, noll, history.configuration) for signal, found in values.items()},
         "total_rms_nm": {
             signal: float(np.sqrt(np.sum(found**2))) if found is not None else None for signal, found in values.items()
@@ -97,7 +97,7 @@ def bin_starts(rows: int, max_bins: int) -> Integers:
 
 
 def _shaped_in(run: Run, rows: slice) -> bool:
-    """Whether an offset or a channel had a shape in some of these steps."""
+    """Whether an offset or a shape of a channel was in force in some of these steps."""
     changes = [next(states) for _, states in groupby(run.history.controllers, holds_shape)]
     firsts = [row_after(run.history, state.frame_sequence, state.timestamp) for state in changes]
     return any(
@@ -135,7 +135,7 @@ def _at(values: Array | None, index: int) -> float | None:
 
 
 def _tilt_mas(values: Array | None, noll: tuple[int, ...], configuration: Configuration | None) -> Results | None:
-    """Tip, tilt and both per axis, sqrt((x^2 + y^2) / 2); None without telescope or without the two modes."""
+    """Tip, tilt and rms per axis, sqrt((x^2 + y^2) / 2), mas; None without configuration or one of the two modes."""
     if values is None or configuration is None or not {2, 3} <= set(noll):
         return None
     x, y = values[[noll.index(2), noll.index(3)]] / tilt_nm_per_mas(configuration.star.diameter_m)

@@ -26,12 +26,12 @@ Results = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class InForce:
+class LawInForce:
     """A control law in force: gain and leak (modes,) of the integrator, delay, and the linear law used instead.
 
     Attributes:
-        first: first step under the law; comparisons of laws ignore `first` and `linear`.
-        law_id: identity of the linear law, "unknown" if not in the log; empty without a linear law.
+        first: row of the first step under the law; comparisons of laws ignore `first` and `linear`.
+        law_id: identity of the linear law, "unknown" if the state has none; empty without a linear law.
         law_name: name of the linear law; "integrator" without one.
         overruled: groups of modes that the integrator drives instead of the law.
         linear: the linear law; None without one, or if it is not in the log, is overruled or has other modes.
@@ -62,7 +62,7 @@ class Run:
     """
 
     history: History
-    laws: tuple[InForce, ...]
+    laws: tuple[LawInForce, ...]
 
     def seconds(self, host_ns: npt.ArrayLike) -> Array:
         """Convert host times to frame time, seconds since the first step.
@@ -93,12 +93,12 @@ class Run:
 def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None) -> Run:
     """Read a log, complete or not, to its end; damaged parts are skipped and listed by the history's reader."""
     history = read_history(WholeLog(files, progress))
-    history.true  # noqa: B018  # joined and cached now, while the steps have their sequences of the log
-    steps, known = history.steps, np.flatnonzero(has_new_exposure(history.steps.reasons))
-    if 0 < known.size < steps.sequence.size:
+    history.true  # noqa: B018  # joined and cached now, while the steps still have the log's sequences
+    steps, timed = history.steps, np.flatnonzero(has_new_exposure(history.steps.reasons))
+    if 0 < timed.size < steps.sequence.size:
         # A step whose frame is ahead of the clock gets the sequence and the time of the step before; a step with an
         # old frame gets only that time.
-        rows = known[np.maximum(np.searchsorted(known, np.arange(steps.sequence.size), "right") - 1, 0)]
+        rows = timed[np.maximum(np.searchsorted(timed, np.arange(steps.sequence.size), "right") - 1, 0)]
         ahead = steps.reasons >> Rejection.AHEAD & 1 == 1
         time_ns = np.maximum(np.where(ahead, 0, steps.time_ns), steps.time_ns[rows])
         sequence = np.where(ahead, steps.sequence[rows], steps.sequence)
@@ -122,15 +122,15 @@ def row_after(history: History, frame_sequence: int, time: Timestamp) -> int:
     return int(rows[-1]) + 1 if rows.size else 0
 
 
-def _laws_in_force(history: History) -> tuple[InForce, ...]:
+def _laws_in_force(history: History) -> tuple[LawInForce, ...]:
     """The laws of a run, from the states that controllers publish at every change."""
     steps = history.steps
-    found: list[InForce] = []
+    found: list[LawInForce] = []
     for state in history.controllers:
         if len(state.gain) != steps.command_nm.shape[1] or not steps.sequence.size:
             continue
         first = row_after(history, state.frame_sequence, state.timestamp)
-        law = InForce(first, _shortest(state.gain), _shortest(state.leak), _shortest([state.delay_frames])[0])
+        law = LawInForce(first, _shortest(state.gain), _shortest(state.leak), _shortest([state.delay_frames])[0])
         if state.HasField("law"):
             law = _with_linear_law(law, state, history.published.laws)
         while found and found[-1].first >= first:
@@ -140,7 +140,7 @@ def _laws_in_force(history: History) -> tuple[InForce, ...]:
     return tuple(law for law in found if law.first < steps.sequence.size)
 
 
-def _with_linear_law(found: InForce, state: wire.ControllerState, laws: Mapping[str, LinearLaw]) -> InForce:
+def _with_linear_law(found: LawInForce, state: wire.ControllerState, laws: Mapping[str, LinearLaw]) -> LawInForce:
     groups, linear = tuple(overruled(state)), None
     with contextlib.suppress(ValueError):  # the log does not contain the law
         linear = driving(state, laws)

@@ -40,7 +40,7 @@ def intervals_ns(run: Run) -> dict[str, Long]:
 
 
 def latencies_ns(history: History) -> dict[str, Long]:
-    """Durations of the controller's stages, and from a frame's publication to the mirror's first state for it."""
+    """Durations of the controller's stages, and times from a frame's publication to the mirror's first state for it."""
     rows = rows_of(history.frame_sequence, history.mirror.sequence)
     applied = rows >= 0
     to_mirror = history.mirror.publish_time_ns[rows[applied]] - history.frame_publish_ns[applied]
@@ -68,16 +68,16 @@ def frame_counts(history: History) -> Results:
     which may be before the start of the log. Only the simulated camera counts late commands.
     """
     frames, rows = np.unique(history.frame_sequence, return_index=True)
-    without = rows_of(frames, history.stepped_sequence) < 0
-    at_the_end = np.zeros_like(without)
-    if not without.all():
+    without_step = rows_of(frames, history.stepped_sequence) < 0
+    at_the_end = np.zeros_like(without_step)
+    if not without_step.all():
         published_ns = history.frame_publish_ns[rows]
         at_the_end = (frames > history.stepped_sequence.max()) & (published_ns > published_ns[-1] - _END_NS)
     controller = history.health.get(Role.CONTROLLER, wire.Health())
     counts = next((topic for topic in controller.topics if topic.topic == FRAME.key), None)
     return {
         "recorded": int(frames.size),
-        "without_command": int((without & ~at_the_end).sum()),
+        "without_command": int((without_step & ~at_the_end).sum()),
         "at_the_end": int(at_the_end.sum()),
         "skipped_by_controller": None if counts is None else counts.skipped,
         "missing_at_controller": None if counts is None else counts.missing,

@@ -82,23 +82,23 @@ def _why_no_loop(messages: Mapping[str, int]) -> str:
 def _residual(results: Results) -> Results:
     """Wavefront before and after: true over the open pupil if the log has truth, otherwise the measured modes.
 
-    The measured modes also if the true residual contains the shapes of offset or channels, which the error does not.
+    The measured modes are also used if the true residual contains shapes of offset or channels; the error has none.
     """
     totals, tilts = results["residual"]["total_rms_nm"], results["residual"]["tilt_mas"]
     shaped = totals["residual"] is not None and results["residual"]["shaped"]
     true = totals["residual"] is not None and not shaped
     before, after = ("disturbance", "residual") if true else ("pseudo_open_loop", "error")
     before_nm, after_nm = totals[before], totals[after]
-    over = "in all modes over the circle"
+    area = "in all modes over the circle"
     open_pupil = results["residual"]["open_pupil"]
     pupil_nm = [open_pupil[f"{name}_open_pupil_rms_nm"] for name in ("disturbance", "residual")]
     if true and all(pupil_nm):
         before_nm, after_nm = pupil_nm
-        over = "over the open pupil"
+        area = "over the open pupil"
     if before_nm is None or after_nm is None or not results["mode_steps"].get("closed"):
         why = results["error_budget"].get("why_not", "this log has no good closed-loop frame")
         return _check("residual", UNKNOWN, why)
-    text = f"{before_nm:.3g} nm before, {after_nm:.3g} nm after {over} in the longest stretch under one law"
+    text = f"{before_nm:.3g} nm before, {after_nm:.3g} nm after correction {area}, in the longest stretch under one law"
     if tilts[before] and tilts[after]:
         text += f"; tip and tilt {tilts[before]['per_axis']:.3g} mas to {tilts[after]['per_axis']:.3g} mas per axis"
     text += f" ({'true' if true else 'measured, both with sensor noise'})"
@@ -169,7 +169,7 @@ def _events(results: Results) -> Results:
 
 
 def _of_end(events: list[Results]) -> bool:
-    """Whether the first of these events only reports that frames ceased, because the camera stopped for good."""
+    """Whether the first of these events only reports the end of the frames, because the camera stopped for good."""
     names = [event["name"] for event in events if event["name"] != "STOPPED" or event["process"] == Role.CAMERA]
     return names[0] == "NO_FRAMES" and "STOPPED" in names and "FRAMES_BACK" not in names
 

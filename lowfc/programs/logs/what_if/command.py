@@ -12,7 +12,7 @@ from lowfc.programs.cli.output import print_result
 
 def what_if(
     logs: Logs,
-    changes: Annotated[
+    assignments: Annotated[
         str | None,
         typer.Option("--set", metavar="KEY=VALUE,...", help="Other gains: gain, leak, limit_nm, tilt_gain, ..."),
     ] = None,
@@ -33,13 +33,13 @@ def what_if(
     from lowfc.adapters.logs.parts import WholeLog, named_log, titled
     from lowfc.adapters.process.progress import reading_bar
     from lowfc.programs.logs.what_if.compare import render
-    from lowfc.programs.logs.what_if.compare import what_if as compared
-    from lowfc.programs.logs.what_if.options import requested
+    from lowfc.programs.logs.what_if.compare import what_if as predict
+    from lowfc.programs.logs.what_if.options import requested_changes
     from lowfc.programs.logs.what_if.run import LoggedRun
 
-    what = requested(changes, config, calibration, controller)
+    changes = requested_changes(assignments, config, calibration, controller)
     log = named_log(logs)
     with reading_bar(Console(stderr=True)) as count:
         history = read_history(WholeLog(log, partial(count, f"reading {titled(log)}")))
-        results = compared(LoggedRun(history), what)
+        results = predict(LoggedRun(history), changes)
     print_result(results, render(results), as_json=as_json)

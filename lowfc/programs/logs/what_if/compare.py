@@ -42,19 +42,19 @@ _TITLES = {
 }
 
 
-def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
+def what_if(run: LoggedRun, changes: WhatIf) -> dict[str, Any]:
     """Results of the logged run and of the what-if run.
 
     The what-if loop is closed throughout, starts from a flat mirror, and corrects the pseudo-open-loop modes of every
     used frame; it holds on a refused or missing frame, as the live loop does. Its modal limits act, actuator limits do
-    not. All results are over the same frames: those without saturated pixels in which both loops have settled and the
-    logged loop is closed (if no such frame is usable, in any loop mode). If the log has truth, the true residual is
-    given too, because the measured one is mostly noise for a faint star. For another reconstructor the frames are read
-    in a second pass.
+    not. All results are over the same frames: frames without saturated pixels, with the logged loop closed, after both
+    loops have settled. If no frame of the closed loop is usable, the logged loop may be in any mode. If the log has
+    truth, the true residual is given, too: the measured one is mostly noise for a faint star. For another reconstructor
+    the frames are read in a second pass.
     """
-    user_step, noll = what.step, run.calibration.noll
-    new_law = law(what, noll, run.law)
-    calibration = _calibration(what, run)
+    user_step, noll = changes.step, run.calibration.noll
+    new_law = law(changes, noll, run.law)
+    calibration = _calibration(changes, run)
 
     was_nm, seen_nm = run.steps.error_nm, run.seen_nm
     if calibration is run.calibration:
@@ -67,7 +67,7 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
 
     usable = run.used & np.isfinite(what_if_nm).all(axis=1)
     lost = np.count_nonzero(run.used & ~usable)
-    rows, settling, over = run.rows_to_compare([run.law, new_law], usable)
+    rows, settling, compared = run.rows_to_compare([run.law, new_law], usable)
     contrast = None
     columns = {"open": rms(pol_nm, rows), "was": rms(was_nm, rows), "what_if": rms(what_if_nm, rows)}
     if run.true_nm is not None:
@@ -79,7 +79,7 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
         "rate_hz": run.history.rate_hz,
         "frames": len(rows),
         "frames_compared": int(rows.sum()),
-        "compared": over,
+        "compared": compared,
         "settling_s": settling / run.history.rate_hz,
         "frames_refused": int(np.count_nonzero(~run.used)),
         "frames_saturated": int(np.count_nonzero(run.used & (run.steps.saturated_pixels > 0))),
@@ -87,7 +87,7 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
         "delay_frames": run.delay_frames,
         "delay_controller_frames": run.controller_delay,
         "delay_measured_frames": run.measured_delay,
-        "controller": what.controller or "integrator",
+        "controller": changes.controller or "integrator",
         "estimator": calibration.estimator,
         "calibration": calibration.id,
         "modes": [
@@ -101,10 +101,10 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
         "added_contrast": contrast,
         "warnings": [
             *_log_warnings(run),
-            *([f"the log lacks {counted(int(lost), 'used frame')}: the what-if holds there"] if lost else []),
+            *([f"the log lacks {counted(int(lost), 'used frame')}: the what-if holds its command"] if lost else []),
             *_range_warnings(run.calibration, columns),
             *_weighting_warnings(run, calibration, None if user_step else new_law),
-            *([] if user_step else _automatic_warnings(what, noll)),
+            *([] if user_step else _automatic_warnings(changes, noll)),
             *([] if user_step else _law_warnings(run, new_law, command_nm[rows])),
         ],
     }
@@ -113,10 +113,10 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
 def _true(
     run: LoggedRun, rows: Mask, moved_nm: Single, command_nm: Single
 ) -> tuple[dict[str, Array], dict[str, Any] | None]:
-    """Rms (modes,) of the true residual, sampled in the frames and continuous, as logged and for the what-if.
+    """Rms (modes,) in nm of the true residual, sampled in the frames and continuous, as logged and for the what-if.
 
-    `moved_nm` (steps, modes) is the what-if's command minus the logged one, as seen by each exposure, `command_nm` the
-    what-if's command. The second value is the contrast added to the dark zone by the continuous residual, if known.
+    `moved_nm` (steps, modes) is the what-if's command minus the logged one, as seen by each exposure; `command_nm` is
+    the what-if's command. The second value is the contrast that the continuous residual adds to the dark zone, or None.
     """
     assert run.true_nm is not None  # noqa: S101  # the caller has checked it
     disturbance_nm, residual_nm = (values.astype(np.float64) for values in run.true_nm)
@@ -167,33 +167,33 @@ def render(results: dict[str, Any]) -> str:
         rows.append(row("tilt per axis, mas", results, "tilt_{}_mas"))
     lines = [
         f"{results['frames_compared']} of {results['frames']} frames compared: {results['compared']}, after "
-        f"{results['settling_s']:.2g} s to settle; {results['frames_refused']} were refused, "
+        f"{results['settling_s']:.2g} s of settling; {results['frames_refused']} were refused, "
         f"{results['frames_saturated']} saturated, {results['frames_missing']} missing",
         f"delay {results['delay_frames']:.2f} frames, {results['estimator']} reconstructor, {results['controller']}",
         "",
         *table(["residual, nm rms", *(_TITLES[name] for name in columns), "gain"], rows),
         "",
-        "measured values include sensor noise; true: at the start of each exposure; continuous: true, also between "
-        "these instants, while the mirror holds; the what-if assumes a linear sensor and no actuator limits",
+        "measured values include sensor noise; true: at the start of each exposure; continuous: true, at all times, "
+        "with the mirror held between its moves; the what-if assumes a linear sensor and no actuator limits",
         *([] if results["added_contrast"] is None else [added_contrast_in_words(results["added_contrast"])]),
         *(f"warning: {warning}" for warning in results["warnings"]),
     ]
     return "\n".join(lines)
 
 
-def _calibration(what: WhatIf, run: LoggedRun) -> Calibration:
+def _calibration(changes: WhatIf, run: LoggedRun) -> Calibration:
     """The calibration of the what-if; by default the log's."""
-    calibration, estimator = run.calibration, what.estimator
-    if what.calibration is not None:
+    calibration, estimator = run.calibration, changes.estimator
+    if changes.calibration is not None:
         from lowfc.adapters.files.calibration_file import load as load_calibration  # the import of astropy is slow
 
-        calibration = load_calibration(what.calibration)
+        calibration = load_calibration(changes.calibration)
         for name in ("noll", "shape", "grid"):
             got, expected = getattr(calibration, name), getattr(run.calibration, name)
             if got != expected:
-                raise CalibrationError(f"{what.calibration}: its {name} is {got}, in the log it is {expected}")
-    elif estimator is None and what.config is not None:
-        estimator = "+".join((what.config.control.estimator, *what.config.control.nuisance))
+                raise CalibrationError(f"{changes.calibration}: its {name} is {got}, in the log it is {expected}")
+    elif estimator is None and changes.config is not None:
+        estimator = "+".join((changes.config.control.estimator, *changes.config.control.nuisance))
     if estimator in (None, calibration.estimator):
         return run.calibration if calibration.id == run.calibration.id else calibration
     if estimator not in ESTIMATORS:
@@ -321,8 +321,8 @@ def _weighting_warnings(run: LoggedRun, calibration: Calibration, law: Integrato
     ]
 
 
-def _automatic_warnings(what: WhatIf, noll: tuple[int, ...]) -> list[str]:
-    kept = logged_gains(what, noll)
+def _automatic_warnings(changes: WhatIf, noll: tuple[int, ...]) -> list[str]:
+    kept = logged_gains(changes, noll)
     if not kept.any():
         return []
     names = ", ".join(mode_name(index) for index in np.array(noll)[kept].tolist())

@@ -34,7 +34,7 @@ class WhatIf:
         config: its [control] section sets gains, leaks, limits and, without `calibration`, the estimator; the other
             attributes take precedence.
         calibration: FITS file of another calibration of the same modes, frames and mirror.
-        controller: name of `step`, which replaces the integrator and its limits.
+        controller: FILE.py:NAME of `step`, the user's function, which replaces the integrator and its limits.
     """
 
     overrides: Mapping[str, float] = field(default_factory=dict)
@@ -45,7 +45,7 @@ class WhatIf:
     step: Controller | None = None
 
 
-def requested(
+def requested_changes(
     text: str | None = None, config: Path | None = None, calibration: Path | None = None, controller: str | None = None
 ) -> WhatIf:
     """Parse the options of the command line.
@@ -57,13 +57,13 @@ def requested(
     for part in filter(None, (part.strip() for part in (text or "").split(","))):
         key, _, value = (word.strip() for word in part.partition("="))
         if key not in KEYS:
-            raise ConfigurationError(f"--set: unknown key {key!r}{nearest(key, KEYS)}; known are {', '.join(KEYS)}")
+            raise ConfigurationError(f"--set: unknown key {key!r}{nearest(key, KEYS)}; the keys are {', '.join(KEYS)}")
         if not value or key in values:
             raise ConfigurationError(f"--set: {key} requires one value, as in {key}=...")
         values[key] = value
     if not (values or config or calibration or controller):
         raise ConfigurationError(
-            f"nothing to change: give --set KEY=VALUE, such as gain=0.3; known are {', '.join(KEYS)}"
+            f"nothing to change: give --set KEY=VALUE, such as gain=0.3; the keys are {', '.join(KEYS)}"
         )
     estimator = values.pop("estimator", None)
     if estimator not in (None, *ESTIMATORS):
@@ -81,30 +81,30 @@ def requested(
     )
 
 
-def law(what: WhatIf, noll: tuple[int, ...], logged: Integrator) -> Integrator:
+def law(changes: WhatIf, noll: tuple[int, ...], logged: Integrator) -> Integrator:
     """The law of the what-if: the logged or the configured one, with the values of `overrides`."""
     base = logged
-    if what.config is not None:
-        base = settings(what.config).integrator(noll)
-        base = replace(base, gain=np.where(logged_gains(what, noll), logged.gain, base.gain))
+    if changes.config is not None:
+        base = settings(changes.config).integrator(noll)
+        base = replace(base, gain=np.where(logged_gains(changes, noll), logged.gain, base.gain))
     tilts = np.isin(noll, TIP_TILT)
     changed = []
     for key in LAW_KEYS:
         values: Single = getattr(base, key).copy()
-        values[:] = what.overrides.get(key, values)
-        values[tilts] = what.overrides.get(f"tilt_{key}", values[tilts])
+        values[:] = changes.overrides.get(key, values)
+        values[tilts] = changes.overrides.get(f"tilt_{key}", values[tilts])
         changed.append(values)
     with raised_as(ConfigurationError, ValueError, "--set"):
         gain, leak, limit_nm = changed
         return Integrator(gain, leak, limit_nm)
 
 
-def logged_gains(what: WhatIf, noll: tuple[int, ...]) -> Mask:
+def logged_gains(changes: WhatIf, noll: tuple[int, ...]) -> Mask:
     """Modes (modes,) that keep the logged gain, because `config` makes it automatic and no override sets it."""
-    if what.config is None or "gain" in what.overrides:
+    if changes.config is None or "gain" in changes.overrides:
         return np.zeros(len(noll), np.bool_)
-    automatic = settings(what.config).automatic(noll)
-    return automatic & ~np.isin(noll, TIP_TILT) if "tilt_gain" in what.overrides else automatic
+    automatic = settings(changes.config).automatic(noll)
+    return automatic & ~np.isin(noll, TIP_TILT) if "tilt_gain" in changes.overrides else automatic
 
 
 def user_controller(where: str) -> Controller:
