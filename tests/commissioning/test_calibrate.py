@@ -23,7 +23,7 @@ from lowfc.control.calibration.response_fit import Initial, Sums, cross_talk
 from lowfc.programs.commissioning.calibrate import pokes, recording
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
 from lowfc.programs.commissioning.calibrate.result import measured_calibration
-from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator, partial_of, resumed, store
+from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator, partial_path, resumed, store
 from tests.support.in_process_loop import BRIGHT, InProcessLoop, configuration
 
 OUT = Path("night.fits")
@@ -169,7 +169,7 @@ def test_a_closed_loop_is_opened_for_pokes_and_closed_afterwards() -> None:
 
 
 def test_unreadable_cycles_give_an_error_of_one_line() -> None:
-    path = partial_of(OUT)
+    path = partial_path(OUT)
     store(path, Sums.none(Initial(np.zeros((2, 4)), "weighted")), {"method": "poke"})
     intact = path.read_bytes()
     other_array = io.BytesIO()
@@ -311,7 +311,7 @@ def test_ctrl_c_restores_the_mirror_and_keeps_the_completed_cycles() -> None:
     loop.run(5)
     assert np.array_equal(loop.surfaces_nm[-1], before_nm)
     assert loop.stops == 1
-    kept = resumed(partial_of(OUT), {"method": "hadamard"})
+    kept = resumed(partial_path(OUT), {"method": "hadamard"})
     assert kept.cycles == 1
     _, data = measure(loop, "hadamard", resume=True)
     assert data.measured.cycles == 4
@@ -352,4 +352,4 @@ def test_a_dead_mirror_ends_the_calibration(monkeypatch: pytest.MonkeyPatch, fra
     with pytest.raises(BusError, match=r"no mirror state came .* is the mirror's process running"):
         calibrator.run()
     assert reports[-1].startswith("a cycle is repeated: the mirror has not reported an applied command for 101 frames")
-    assert resumed(partial_of(OUT), {"method": "hadamard"}).cycles == 1
+    assert resumed(partial_path(OUT), {"method": "hadamard"}).cycles == 1

@@ -332,7 +332,7 @@ def test_no_calibration_is_aligned_to_a_turned_mirror(loop: InProcessLoop, monke
 
     monkeypatch.setattr(loop, "play", turned)
     error = refusal("calibrate", "align", "--out", "aligned.fits", "--frames", "16", kind=CalibrationError)
-    assert "their correlation is 0.0" in error
+    assert "the correlation is 0.0" in error
     assert not Path("aligned.fits").exists()
 
 

@@ -22,11 +22,11 @@ from lowfc.control.calibration.alignment import Geometry, onto
 from lowfc.control.calibration.delay_fit import Delay
 from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.programs.commissioning.calibrate import pokes
-from lowfc.programs.commissioning.calibrate.run import partial_of
+from lowfc.programs.commissioning.calibrate.run import partial_path
 from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.commission import commissioning
 from lowfc.programs.commissioning.commission.commissioning import Commissioning, CommissionOptions, provisional_path
-from lowfc.programs.commissioning.commission.first_calibration import aligned, linear_nm
+from lowfc.programs.commissioning.commission.first_calibration import aligned_calibration, linear_amplitude_nm
 from lowfc.programs.commissioning.commission.first_light import Sensor, calibration_with_reference
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, Agreement, agreement_checks
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop, calibration_of, configuration
@@ -116,7 +116,7 @@ def test_commissioning_closes_a_loop_with_another_frame_size(bench: Bench) -> No
     assert np.linalg.norm(calibration.actuators_to_modes - modelled) < 0.2 * np.linalg.norm(modelled)
     assert calibration.saturation_dn == 2**14 - 1
     assert not provisional_path(bench.out).exists()
-    assert not partial_of(bench.out).exists()
+    assert not partial_path(bench.out).exists()
 
 
 @pytest.mark.parametrize(("scatter", "chosen_nm"), [(0.0, 1.5), (0.2, 3.0)])
@@ -131,7 +131,7 @@ def test_disturbance_of_a_mode_is_not_mistaken_for_nonlinearity(scatter: float, 
 
     player: Any = SimpleNamespace(before=first, cycle=cycle, report=lambda text: None)
     delay: Any = SimpleNamespace(delay_frames=1.0)
-    assert linear_nm(player, CONFIG, delay, 3.0) == chosen_nm
+    assert linear_amplitude_nm(player, CONFIG, delay, 3.0) == chosen_nm
 
 
 def test_the_loop_holds_the_wavefront_of_the_reference_image(bench: Bench) -> None:
@@ -221,7 +221,7 @@ def test_tilt_is_poked_to_find_a_reflection_unless_the_sensor_is_another_one(noi
     before = replace(first, reference=single(image))
     player: Any = SimpleNamespace(before=before, report=lambda text: None, first_poke=first_poke)
     results: dict[str, Any] = {}
-    aligned(player, config, first, Delay(1.0, 0.1, H[:, 0]), results)
+    aligned_calibration(player, config, first, Delay(1.0, 0.1, H[:, 0]), results)
     assert [call.args[0] for call in first_poke.call_args_list] == poked
     assert results.get("parity") == (-1 if poked else None)
 
@@ -241,7 +241,7 @@ def test_a_resumed_commissioning_continues_and_reports_an_operator_who_opens_the
     ask = bench.loop.ask
 
     def interrupted(name: str, **fields: Any) -> Any:
-        if "[7/10] response" in bench.reports and partial_of(bench.out).exists():
+        if "[7/10] response" in bench.reports and partial_path(bench.out).exists():
             raise KeyboardInterrupt
         return ask(name, **fields)
 
@@ -285,7 +285,7 @@ def test_a_commissioning_is_not_resumed_with_other_modes_or_commands(tmp_path: P
 
 def test_a_failed_commissioning_restores_the_previous_calibration(bench: Bench) -> None:
     before = bench.loop.calibration().id
-    partial_of(bench.out).touch()
+    partial_path(bench.out).touch()
     for step, why in ("[6/10] poke", "the previous calibration is in use again"), ("[3/10]", "no calibration was"):
         bench.actions = {step: Mock(side_effect=KeyboardInterrupt)}
         with pytest.raises(KeyboardInterrupt):
@@ -293,7 +293,7 @@ def test_a_failed_commissioning_restores_the_previous_calibration(bench: Bench) 
         assert bench.loop.calibration().id == before
         assert why in bench.reports[-1]
     bench.actions.clear()
-    assert not partial_of(bench.out).exists(), "a new commissioning removes the cycles of a former one"
+    assert not partial_path(bench.out).exists(), "a new commissioning removes the cycles of a former one"
 
 
 def test_a_finished_commissioning_cannot_be_resumed(bench: Bench) -> None:

@@ -1,4 +1,4 @@
-"""The analytic calibration of a configured instrument, with a progress bar while the optical model is built."""
+"""The analytic calibration of a configured instrument; its optical model is built with a progress bar, and cached."""
 
 from collections.abc import Callable
 
@@ -25,7 +25,7 @@ WavefrontFunction = Callable[[Twin, TwinMirror], Array]
 
 
 def analytic(config: Configuration, console: Console, at: WavefrontFunction | None = None) -> Calibration:
-    """Compute I0, H and R, eqs. (6) to (12), and cache the optical model; raises as `factory.analytic_calibration`.
+    """Compute I0, H and R, the paper's eqs. (6) to (12); raises the errors of `factory.analytic_calibration`.
 
     Args:
         config: Configuration of the instrument.

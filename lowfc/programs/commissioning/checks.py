@@ -92,7 +92,7 @@ class Table(Generic[S]):
         Args:
             name: Name of the check.
             expected: Requirement of the contract.
-            advice: Recommended action, used for a warning without its own.
+            advice: Recommended action, used for a warning without an advice of its own.
             cost: Consequence of ignoring this advice.
         """
 
@@ -146,8 +146,8 @@ def print_report(
                     grid.add_row("", Text(label, style="dim", justify="right"), Text(text, style=style))
     console = Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False)
     console.print(grid)
-    words = [
+    totals = [
         f"{numbers[status]} {status}" if status in (Status.OK, Status.WRONG) else counted(numbers[status], status)
         for status in worst_first
     ]
-    console.print(f"\n{', '.join(words)}")
+    console.print(f"\n{', '.join(totals)}")

@@ -56,7 +56,7 @@ def play(live: Live, *, modes: Sequence[int]) -> list[ProbeResponse]:
     for trials in plan:
         for number, (parameters, table, shape) in enumerate(trials):
             responses.append(live.play(KIND, parameters, LoopMode.CLOSED, table, shape))
-            if not removed(responses[-1]):
+            if not shape_removed(responses[-1]):
                 live.skip(sum(len(table) for _, table, _ in trials[number + 1 :]))
                 live.return_to_zero()
                 live.set_mode(LoopMode.CLOSED)
@@ -69,8 +69,8 @@ def _trials(live: Live, noll: int) -> list[tuple[dict[str, Any], Single, Single]
     row, law = live.loop.noll.index(noll), live.loop.law
     if isinstance(law, Integrator) and not law.gain[row]:
         return []
-    # settling_frames() of an integrator ignores the delay, hence twice that; of a linear law it is five time constants
-    # of the slowest pole, of which three are enough: they leave 5 %.
+    # settling_frames() of an integrator ignores the delay, so the hold is twice as long. That of a linear law is five
+    # time constants of the slowest pole; three are enough, because they leave 5 % of the error.
     hold = round(live.loop.settling_frames() * (2 if isinstance(law, Integrator) else 0.6))
     averaged = hold // 4  # levels are compared over the last quarter of their hold time
     shape = live.calibration.modes_to_actuators[:, row][None]
@@ -90,7 +90,7 @@ def _trials(live: Live, noll: int) -> list[tuple[dict[str, Any], Single, Single]
     return trials
 
 
-def removed(trial: ProbeResponse) -> bool:
+def shape_removed(trial: ProbeResponse) -> bool:
     """Whether the loop removed the shape of a trial."""
     if trial.limits_hit:
         return False
@@ -107,11 +107,11 @@ def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> Capt
         raise AcceptanceError("the gains of the tested modes are zero: they have no capture range")
     modes = []
     for noll in dict.fromkeys(trial.parameters["noll"] for trial in trials):
-        # The last trial of each level.
-        of_mode = {trial.parameters["level_nm"]: trial for trial in trials if trial.parameters["noll"] == noll}
-        converged = {level_nm: removed(trial) for level_nm, trial in of_mode.items()}
+        # A repeated level keeps its last trial.
+        trial_of_level = {trial.parameters["level_nm"]: trial for trial in trials if trial.parameters["noll"] == noll}
+        converged = {level_nm: shape_removed(trial) for level_nm, trial in trial_of_level.items()}
         lost = [abs(level_nm) for level_nm, success in converged.items() if not success]
-        good = [size for size in converged if 0 < size < min(lost, default=np.inf) and -size in converged]
+        good = [level for level in converged if 0 < level < min(lost, default=np.inf) and -level in converged]
         required_nm = _required_nm(configuration, noll)
         modes.append(
             CaptureMode(
@@ -120,7 +120,7 @@ def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> Capt
                 required_nm=required_nm,
                 captured_nm=max(good, default=0.0),
                 lost_nm=min(lost, default=None),
-                limits=sorted({name for trial in of_mode.values() for name in trial.limits_hit}),
+                limits=sorted({name for trial in trial_of_level.values() for name in trial.limits_hit}),
                 passed=max(good, default=0.0) >= required_nm * (1 - 1e-6),
             )
         )

@@ -101,7 +101,7 @@ def play(live: Live, *, hold_frames: int, cycles: int, modes: Sequence[int]) -> 
 def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> LinearityResult:
     """Evaluate gain and cross-talk from the probe sequences; AcceptanceError if the loop was disturbed meanwhile."""
     required, modes = configuration.acceptance, []
-    for response in {each.parameters["noll"]: each for each in responses}.values():  # the last one of each mode
+    for response in {each.parameters["noll"]: each for each in responses}.values():  # the last response of each mode
         response.check(LoopMode.OPEN)
         parameters, noll = response.parameters, response.loop.noll
         levels_nm, starts = _levels(response.table[:, 0].astype(float), parameters["averaged"])
@@ -146,11 +146,11 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> L
 
 
 def _levels(stairs: Array, averaged: int) -> tuple[Array, Integers]:
-    """Levels (levels,) of a staircase (frames,), and the first of the last `averaged` frames (levels,) at each."""
+    """Levels (levels,) of a staircase (frames,), and the frame (levels,) at which averaging begins at each level."""
     edges = np.flatnonzero(np.diff(stairs, prepend=np.nan, append=np.nan))
     hold = min(frames for frames in np.diff(edges).tolist() if frames > 1)  # values between levels last one frame
     starts = np.concatenate([np.arange(at, end - hold + 1, hold) for at, end in pairwise(edges)])
-    starts = starts[stairs[starts] != 0]  # the staircase ends at zero
+    starts = starts[stairs[starts] != 0]  # without the zero at the end of the staircase
     return stairs[starts], starts + hold - averaged
 
 

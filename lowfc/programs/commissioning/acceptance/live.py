@@ -26,7 +26,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
 from lowfc.programs.commissioning.calibrate.recording import await_mirror
 
 ATTEMPTS = 3
-"""Plays of a probe sequence that the mirror or the camera interrupts, before the test ends with an error."""
+"""Largest number of plays of a probe sequence that mirror or camera interrupt; then the test ends with an error."""
 _OTHER_BYTES = 1000  # bytes of a request to play, without its table and shapes
 _LAW_FIELDS = ("gain", "leak", "limit_nm", "law", "calibration_id")
 
@@ -110,7 +110,7 @@ class Live:
         self.check_length(frames := len(table), table.shape[1], basis)
         self.set_mode(mode)
         for _ in range(ATTEMPTS):
-            response, interruption = self._played(kind, parameters, mode, table, basis)
+            response, interruption = self._play_once(kind, parameters, mode, table, basis)
             if not interruption:
                 self._done += frames
                 return response
@@ -121,10 +121,10 @@ class Live:
             self.wait(self.loop.settling_frames())
         raise AcceptanceError(f"in {ATTEMPTS} attempts no probe sequence was undisturbed; the last: {interruption}")
 
-    def _played(
+    def _play_once(
         self, kind: Kind, parameters: dict[str, Any], mode: LoopMode, table: Single, basis: Single | None
     ) -> tuple[ProbeResponse, str]:
-        """The response to a table played once, and what interrupted it; empty if nothing did."""
+        """Play a table once; return the response, and what interrupted the play, empty if nothing did."""
         frames, columns = table.shape
         before = self._state()
         steps, watch = self.client.steps(), self.client.mirror_watch()

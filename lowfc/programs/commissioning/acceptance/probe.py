@@ -44,7 +44,7 @@ _ANNOUNCED: dict[Kind, dict[str, Any]] = {
     "capture-range": {"noll": 0, "level_nm": 0.0, "before": [0, 0], "after": [0, 0]},
     "noise-floor": {"loop": ""},
 }
-"""The parameters of each test, with values of their types."""
+"""The parameters of each test; only the types of the values matter."""
 _DISTURBING = ("gain", "leak", "limit", "law", "load", "offset", "channel", "reset", "stop")
 """Requests that make a measurement unusable."""
 
@@ -117,9 +117,10 @@ class ProbeResponse:
 
     Attributes:
         parameters: parameters of the test, from the announcing note.
-        target: `mirror` or `offset`, which the probe was added to; empty without a probe.
+        target: what the probe was added to, `mirror` or `offset`; empty without a probe.
         table: probe amplitudes (frames, columns); (frames, 0) without a probe.
-        error_nm: modal error (frames, modes), NaN where a frame is missing or was refused; pol_nm likewise.
+        error_nm: modal error (frames, modes); NaN where a frame is missing or was refused.
+        pol_nm: pseudo-open-loop modes (frames, modes); NaN as in `error_nm`.
         command_nm: modal command (frames, modes) after each frame; NaN where the frame is missing.
         mode: loop mode (frames,), 0 where a frame is missing.
         reasons: bit `1 << reason` for each reason of a frame (frames,).
@@ -215,7 +216,7 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
 
 
 def _check_undisturbed(history: History, first: int, end: int, *, play: bool) -> None:
-    """DataFileError if a request, or during a probe an event, disturbed the frames from `first` to before `end`."""
+    """Raise DataFileError if a request (with `play` also an event) disturbed the frames `first` to `end` - 1."""
     path, sequence = history.log.path, history.steps.sequence
     for request in history.requests:
         if request.accepted and request.name in _DISTURBING and first < request.frame_sequence < end:
@@ -245,7 +246,7 @@ def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[
 
 
 def _parameters(note: str, kind: Kind) -> dict[str, Any] | None:
-    """The parameters that a note announces; None for another test or without one, as in an operator's own note."""
+    """The parameters that a note announces; None if it announces another test or none, as an operator's own note."""
     try:
         parameters = json.loads(note.removeprefix(ANNOUNCEMENT))
     except (ValueError, RecursionError):

@@ -67,7 +67,7 @@ class RejectionResult(AcceptanceResult):
     law: str = result_field("law")
     delay_frames: float = result_field("delay", "frames", "g")
     rate_hz: float = result_field("rate", "Hz", ".4g")
-    injected: str = result_field("multisine on the")
+    injected: str = result_field("multisine added to")
     lines: int = result_field("lines")
     lowest_hz: float = result_field("lowest", "Hz", ".3g")
     highest_hz: float = result_field("highest", "Hz", ".4g")

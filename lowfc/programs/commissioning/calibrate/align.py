@@ -25,7 +25,7 @@ from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 from lowfc.programs.commissioning.calibrate.tasks import reporter, write
 
 MIN_CORRELATION = 0.5
-"""Smallest correlation of a poke's image with the computed one; below it the sensor is not the configured one."""
+"""Smallest correlation of a poke's image with the computed image; below it the sensor is not the configured one."""
 
 
 class AlignResult(Result):
@@ -68,12 +68,12 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
             amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_nm(config, player.before)[mode]))
             return player.first_poke(mode, first_poke_plan(amplitude_nm)).response
 
-        alignment, calibration, likeness = oriented(config, computed, alignment, before, poke)
-        if likeness < MIN_CORRELATION:
+        alignment, calibration, mean_correlation = oriented(config, computed, alignment, before, poke)
+        if mean_correlation < MIN_CORRELATION:
             raise CalibrationError(
-                f"the images of pokes do not resemble the computed ones: their correlation is {likeness:.2f}, expected "
-                f"{MIN_CORRELATION:g} or more; is the mirror turned or reflected relative to the pupil? Correct that "
-                "in its driver, or measure the response with `lowfc commission`"
+                f"the images of pokes do not resemble the computed ones: the correlation is {mean_correlation:.2f}, "
+                f"expected {MIN_CORRELATION:g} or more; is the mirror turned or reflected relative to the pupil? "
+                "Correct that in its driver, or measure the response with `lowfc commission`"
             )
         write(calibration, out, loop if load else None)
     return AlignResult(

@@ -16,7 +16,7 @@ Method = Literal["analytic", "poke", "hadamard", "in-loop"]
 Out = Annotated[Path, typer.Option("--out", help="Output file (FITS); an existing one is replaced.")]
 Load = Annotated[bool, typer.Option("--load", help="Load the result into the loop, which must be open.")]
 Snr = Annotated[float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")]
-_CYCLES = "Number of cycles; default: as many as --snr requires. The verdict still requires --snr, by default 20 then."
+_CYCLES = "Number of cycles; default: as many as --snr requires. If given, --snr (default 20) decides only the verdict."
 Cycles = Annotated[int | None, typer.Option(min=MIN_CYCLES, help=_CYCLES)]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted calibration.")]
 Frames = Annotated[int, typer.Option(min=16, max=100_000, help="Number of frames to average.")]
@@ -34,7 +34,7 @@ def calibrate(
         float | None,
         typer.Option(
             min=0.01,
-            help="Poke amplitude, nm rms of wavefront; default: 8 poke, 3 hadamard, 2 in-loop, less above --snr 70.",
+            help="Poke amplitude, nm rms of wavefront; default: poke 8, hadamard 3, in-loop 2; less above --snr 70.",
         ),
     ] = None,
     cycles: Cycles = None,
@@ -127,7 +127,7 @@ def dark(
     ] = False,
     file: Annotated[
         Path | None,
-        typer.Option("--file", help="Take the dark frames from a FITS or .npy cube (frames, rows, columns)."),
+        typer.Option("--file", help="Read the dark frames from a FITS or .npy cube (frames, rows, columns)."),
     ] = None,
     load: Load = False,
     as_json: Json = False,

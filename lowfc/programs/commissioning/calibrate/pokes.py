@@ -13,14 +13,14 @@ from lowfc.contract.errors import CalibrationError
 from lowfc.control.calibration import poke_plan
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.response_fit import MIN_CYCLES
-from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS
+from lowfc.programs.commissioning.calibrate.recording import TRAILING_FRAMES
 
 AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
 """Default amplitude of a mode by method, nm rms of wavefront."""
 MIN_SNR = 20.0
 """Signal-to-noise ratio required by default if the number of cycles is given."""
 FULL_AMPLITUDE_SNR = 70.0
-"""Highest signal-to-noise ratio for the default amplitude, since third-order errors grow as the amplitude squared."""
+"""Signal-to-noise ratio above which the default amplitude is reduced: third-order errors grow as its square."""
 MAX_HADAMARD_NM = 3.0
 """Largest amplitude of a mode, nm rms: all modes at once add up to some four times that, within the linear range."""
 SETTLE = 2
@@ -37,7 +37,7 @@ MAX_CYCLES_RATIO = 4
 """Largest ratio of cycles to the number required by photon and read noise; beyond it the operator decides."""
 ALWAYS_ALLOWED_CYCLES = 32
 """Number of cycles always allowed, whatever MAX_CYCLES_RATIO: on a bright star they take little time."""
-CHECK_PART = 0.25
+CHECK_FRACTION = 0.25
 """Number of check cycles relative to the cycles that R is computed from."""
 _MIN_CHECKS = 3
 _SLEW_FRACTION = 0.8
@@ -92,14 +92,14 @@ class Pokes:
         """The plan of cycle `number`."""
         return self._cycle(number, self.amplitude_nm)
 
-    def delay(self, mode: int) -> poke_plan.Plan:
+    def delay_plan(self, mode: int) -> poke_plan.Plan:
         """The plan for measuring the delay: pokes of one mode; in closed loop with the total rms of a dither."""
         closed = self._request.method == "in-loop"
         amplitude = self.amplitude_nm * float(np.sqrt(self._modes)) if closed else AMPLITUDE_NM["poke"]
         return first_poke_plan(min(amplitude, float(self._largest_nm[mode])))
 
     def cycles(self) -> int:
-        """Number of cycles required by photon and read noise."""
+        """Number of cycles: the requested one, or the one that photon and read noise require."""
         request = self._request
         if request.cycles is not None:
             return request.cycles
@@ -114,8 +114,8 @@ class Pokes:
         return needed if needed <= max(MAX_CYCLES_RATIO * self.cycles(), ALWAYS_ALLOWED_CYCLES) else cycles
 
     def frames(self, cycles: int, done: int = 0) -> int:
-        """Frames of the remaining cycles and of their check cycles."""
-        return (cycles + check_cycles(cycles) - done) * (len(self.cycle(0)) + AFTERWARDS)
+        """Frames of the cycles that remain after `done` cycles, and of all check cycles."""
+        return (cycles + check_cycles(cycles) - done) * (len(self.cycle(0)) + TRAILING_FRAMES)
 
     def _cycle(self, number: int, amplitude_nm: float) -> poke_plan.Plan:
         request = self._request
@@ -172,10 +172,10 @@ def default_nm(method: str, snr: float) -> float:
 
 
 def cycles_for(snr: float, cycles: int, error: float) -> int:
-    """Number of cycles to reach a signal-to-noise ratio, given the standard error after a number of cycles."""
+    """Number of cycles to reach a signal-to-noise ratio, given the standard error `error` after `cycles` cycles."""
     return max(ceil(min(cycles * (error * snr / MARGIN) ** 2, 1e9)), cycles + 1)
 
 
 def check_cycles(cycles: int) -> int:
     """Number of check cycles for a reconstructor made from a number of cycles."""
-    return max(_MIN_CHECKS, round(CHECK_PART * cycles))
+    return max(_MIN_CHECKS, round(CHECK_FRACTION * cycles))

@@ -26,7 +26,7 @@ from lowfc.control.loop.safety import Limit, LoopMode
 Report = Callable[[str], None]
 T = TypeVar("T")
 
-AFTERWARDS = 8
+TRAILING_FRAMES = 8
 """Frames recorded after the end of a probe sequence, more than the longest delay that can be measured."""
 MAX_FRAMES_BEHIND = 100
 """Frames by which the mirror's reports may lag behind the controller's steps; beyond it the sequence is repeated."""
@@ -115,7 +115,7 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
         mirror = loop.mirror_watch()
         first = loop.play(basis_nm.astype(np.float32), table.astype(np.float32)).frame_sequence
         last = first + len(table) - 1
-        end = last + 1 + AFTERWARDS
+        end = last + 1 + TRAILING_FRAMES
         images: list[Frame] = []
         recorded: list[Step] = []
         image, step = next(frames), next(steps)
@@ -127,7 +127,7 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
                 image = next(frames)
             else:
                 if first <= step.frame_sequence:
-                    mode = _checked_mode(loop, step, mode, over=step.frame_sequence > last)
+                    mode = _checked_mode(loop, step, mode, ended=step.frame_sequence > last)
                     _check_devices(mirror, step.frame_sequence, first)
                     recorded.append(step)
                     _check_refused(recorded)
@@ -188,16 +188,16 @@ def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
             raise
 
 
-def _checked_mode(loop: Client, step: Step, before: LoopMode | None, *, over: bool) -> LoopMode:
-    """The mode of a step; raise if the probe sequence was ended."""
-    if not over and before is not None and step.mode is not before:
+def _checked_mode(loop: Client, step: Step, before: LoopMode | None, *, ended: bool) -> LoopMode:
+    """The mode of a step; raise if the probe sequence was stopped before it `ended`."""
+    if not ended and before is not None and step.mode is not before:
         loop.check_lease()  # its error names who ended the lease
         raise CalibrationError(
             f"the loop went from {before.name.lower()} to {step.mode.name.lower()} during the pokes, which ended them; "
             "do not operate the loop during a calibration"
         )
     limits = [reason.name for reason in step.reasons if reason in _LIMITS]
-    if limits and not over:
+    if limits and not ended:
         raise CalibrationError(
             f"a limit acted on the pokes ({', '.join(limits)}), which ended them: bring the mirror closer to flat, or "
             "poke less, as with `lowfc calibrate --amplitude`"
@@ -235,8 +235,8 @@ def _check_devices(mirror: MirrorWatch, sequence: int, first: int) -> None:
 
 
 def _recording(images: list[Frame], steps: list[Step], first: int) -> Recording:
-    known = {step.frame_sequence for step in steps}
-    images = [image for image in images if image.sequence in known]
+    stepped = {step.frame_sequence for step in steps}
+    images = [image for image in images if image.sequence in stepped]
     if not images:
         raise CalibrationError("no frame of the probe sequence was received: is the loop's camera running?")
     modes = max(step.command_nm.size for step in steps)

@@ -26,7 +26,7 @@ from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrat
 MAX_NOISE_RATIO = 1.5
 """Largest accepted ratio of the noise of the measured R to that of the computed R, at the same flux. A sensor far from
 its zero point exceeds it."""
-_OTHER_SENSOR = 0.5  # from this error of an element of R H on, a model is that of another sensor or orientation
+_OTHER_SENSOR = 0.5  # error of an element of R H from which on a model is of another sensor or orientation
 DELAY_TOLERANCE_FRAMES = 0.1
 """Largest difference between measured and configured delay without a warning, frames."""
 
@@ -39,7 +39,7 @@ class Verdict(Result):
     check_cycles: int = result_field("check cycles")
     check_cross_talk_rms: float = result_field("check frames: cross-talk, rms", form=".3g")
     check_cross_talk_max: float = result_field("check frames: largest cross-talk, with noise", form=".3g")
-    check_cross_talk_bound: float = result_field("limit of the largest, with noise", form=".3g")
+    check_cross_talk_bound: float = result_field("limit of this cross-talk, with noise", form=".3g")
     check_error: float = result_field("standard error of an element of R H", form=".2g")
     promised_cross_talk_rms: float = result_field("limit of the cross-talk, rms", form=".3g")
     promised_cross_talk_max: float = result_field("limit of the largest cross-talk", form=".3g")
@@ -60,7 +60,7 @@ class CalibrationProperties(Result):
     delay_error_frames: float | None = result_field("standard error of the delay", "frames", ".3f", default=None)
     frame_to_effect_ms: float = result_field("frame to effect", "ms", ".3g")
     noise_gain_nm: list[float] = result_field("noise per frame", "nm", ".3g", column=True)
-    computed_noise_nm: list[float] | None = result_field("computed", "nm", ".3g", column=True, default=None)
+    computed_noise_nm: list[float] | None = result_field("noise of computed R", "nm", ".3g", column=True, default=None)
     bad_pixels: int = result_field("bad pixels")
     flux_dn: float = result_field("light", "DN", ".4g")
     cycles: int | None = result_field("cycles", default=None)
@@ -102,7 +102,7 @@ class Comparison(Result):
 
 
 def finish_calibration(calibrator: Calibrator, data: CalibrationData) -> tuple[Calibration, CalibrationResult]:
-    """Compute R, check it on separate frames, write the file, under another name if it is not recommended."""
+    """Compute R, check it on separate frames, and write the file; under another name if R is not recommended."""
     config, request, computed, measured = calibrator.config, calibrator.request, calibrator.computed, data.measured
     calibration, quality = measured_calibration(config, calibrator.before, measured, request)
     check = calibrator.check(calibration, data)
@@ -135,7 +135,7 @@ def finish_calibration(calibrator: Calibrator, data: CalibrationData) -> tuple[C
 def compute_reconstructor(
     config: Configuration, calibration: Calibration, initial: Array | None, **options: Any
 ) -> Reconstruction:
-    """R from I0, H and flux of a calibration with the camera of a configuration; arguments as for `reconstruct`."""
+    """R for I0, H and flux of a calibration and the configured camera; `initial` and `options` as for `reconstruct`."""
     camera = factory.detector(config)
     flux_e = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain
     arrays = calibration.reference, calibration.response, calibration.good
@@ -288,13 +288,13 @@ def comparison(first: Calibration, second: Calibration) -> Comparison:
 def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array, response: Array) -> Array:
     """Modes (modes, actuators) that R measures per nm of each actuator.
 
-    They agree with the measurement for the mirror's modal shapes, and with the optical model for its other shapes.
+    The result agrees with the measurement for the mirror's modal shapes, and with the optical model for other shapes.
 
     A common factor between measurement and model, such as that of the mirror's stroke or sign, also applies to other
     shapes. A negative factor is accepted only if focus or spherical is among the modes: a mirror of the opposite sign
     reverses all modes, but half a turn of most sensors reverses tip and tilt alone. If the sensor has another size or
-    orientation than the model, the other shapes are those of the calibration in use, or else their projection onto the
-    modal shapes.
+    orientation than the model, the result for other shapes is that of the calibration in use, or else that of their
+    projection onto the modal shapes.
     """
     commands, own = before.modes_to_actuators.astype(np.float64), before.actuators_to_modes.astype(np.float64)
     inverse, product = np.linalg.pinv(commands), matrix @ response  # R H is the identity unless R is regularised

@@ -93,7 +93,7 @@ class Calibrator:
             "amplitude_nm": self.pokes.amplitude_nm,
             "calibration": self.before.id,
         }
-        self._resumed = resumed(partial_of(request.out), self._conditions) if request.resume else None
+        self._resumed = resumed(partial_path(request.out), self._conditions) if request.resume else None
         self.completed = self._resumed.cycles if self._resumed else 0
 
     @contextlib.contextmanager
@@ -158,7 +158,7 @@ class Calibrator:
     def delay(self) -> Delay:
         """Measure the delay from a poke of the quietest mode to its image; warn if the image is unexpected."""
         mode = self._quietest_mode
-        plan = self.pokes.delay(mode)
+        plan = self.pokes.delay_plan(mode)
         self._show("detecting pokes", max(self.pokes.cycles(), self.completed), self.completed)
         delay = self._player.first_poke(mode, plan)
         self._compare_response(delay.response, mode)
@@ -170,8 +170,8 @@ class Calibrator:
         return delay
 
     def _compare_response(self, response: Array, mode: int) -> None:
-        known = self.before.response[:, mode].astype(np.float64)
-        image_correlation = correlation(response, known)
+        expected = self.before.response[:, mode].astype(np.float64)
+        image_correlation = correlation(response, expected)
         if abs(image_correlation) < _MIN_CORRELATION:
             self._report(
                 f"warning: the image of Z{self.before.noll[mode]} differs from that of the calibration in use "
@@ -185,7 +185,7 @@ class Calibrator:
 
     def _cycles(self, delay: Delay) -> Measured:
         pokes, request = self.pokes, self.request
-        path = partial_of(request.out)
+        path = partial_path(request.out)
         if self._resumed is None:
             sums = Sums.none(self._initial(delay))
         else:
@@ -221,10 +221,10 @@ class Calibrator:
         return f"about {self.pokes.frames(needed, done) / self.config.camera.rate_hz:.0f} s to go"
 
     def _initial(self, delay: Delay) -> Initial:
-        """The initial R of the fit: the computed one, unless the one in use measures pokes with less noise."""
+        """The initial R of the fit: the computed R, unless the R in use measures pokes with less noise."""
         before = self.before
-        known = [each for each in (self.computed, before) if comparable(each, before)]
-        candidates = [Initial(each.reconstructor.astype(np.float64) * before.good, each.estimator) for each in known]
+        usable = [each for each in (self.computed, before) if comparable(each, before)]
+        candidates = [Initial(each.reconstructor.astype(np.float64) * before.good, each.estimator) for each in usable]
         full_rank = [each for each in candidates if np.linalg.matrix_rank(each.matrix) == len(before.noll)]
         if not full_rank:
             raise CalibrationError(
@@ -240,7 +240,7 @@ class Calibrator:
         return best_initial(full_rank, delay.response, self._quietest_mode, variance)
 
 
-def partial_of(out: Path) -> Path:
+def partial_path(out: Path) -> Path:
     """File of the completed cycles until the calibration is complete."""
     return out.with_name(out.name + ".part.npz")
 
@@ -254,7 +254,7 @@ def store(path: Path, sums: Sums, conditions: dict[str, Any]) -> None:
 
 
 def resumed(path: Path, conditions: dict[str, Any]) -> Sums:
-    """Read completed cycles; DataFileError if there are none, or the file is damaged or of other conditions."""
+    """Read completed cycles; DataFileError if there are none, if the file is damaged, or if its conditions differ."""
     stored, sums = stored_cycles(path)
     for key, value in conditions.items():
         if stored.get(key) != value:
@@ -266,7 +266,7 @@ def resumed(path: Path, conditions: dict[str, Any]) -> Sums:
 
 
 def stored_cycles(path: Path) -> tuple[dict[str, Any], Sums]:
-    """Read the completed cycles, with their method, amplitude and calibration; DataFileError as in `resumed`."""
+    """Read the completed cycles, with method, amplitude and calibration; DataFileError without them or if damaged."""
     if not path.is_file():
         raise DataFileError(f"nothing to resume: there is no {path}; omit --resume")
     try:

@@ -39,9 +39,9 @@ from lowfc.programs.commissioning.calibrate.result import (
     finish_calibration,
     result_of,
 )
-from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of
+from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_path
 
-_LARGEST_NM = 1e5  # amplitude of a mode in --at
+_LARGEST_NM = 1e5  # largest amplitude of a mode in --at
 
 
 class DarkResult(Result):
@@ -68,7 +68,7 @@ class ReferenceResult(Result):
 
 def calibrate_with_pokes(request: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:
     """Calibrate a running loop with pokes; write the file at the end, and with `load` use it if it is recommended."""
-    require_folder(request.out, partial_of(request.out))
+    require_folder(request.out, partial_path(request.out))
     console = Console(stderr=True)
     report = reporter(console)
     with contextlib.ExitStack() as stack:
@@ -86,11 +86,11 @@ def calibrate_with_pokes(request: CalibrationRequest, run: str | None, *, load: 
                     if load:
                         with calibrator.opened("to load the calibration"):
                             loop.load(calibration)
-                    partial_of(request.out).unlink(missing_ok=True)
+                    partial_path(request.out).unlink(missing_ok=True)
         except BaseException:
-            if calibrator.completed and partial_of(request.out).is_file():
+            if calibrator.completed and partial_path(request.out).is_file():
                 cycles = counted(calibrator.completed, "cycle")
-                report(f"kept in {partial_of(request.out)}: {cycles}; the same command with --resume continues")
+                report(f"kept in {partial_path(request.out)}: {cycles}; the same command with --resume continues")
             raise
     result.not_loaded = load and not result.recommended
     return result
@@ -178,7 +178,7 @@ def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> Re
     with Client(run) as loop, loop.reserved("lowfc calibrate reference"), _in_use(loop) as (before, noise_and_gain):
         warn_of_additions(loop, reporter(Console(stderr=True)))
         cube = next_frames(loop, frames)
-        loop.check_lease()  # without the lease another client may have changed the mirror's shape, so the zero point
+        loop.check_lease()  # without the lease another client may have changed the mirror's shape and the zero point
         check_size(cube.shape[1:], before)
         pixels, allowed = cube.reshape(frames, -1), configuration_of(loop).control.max_saturated_pixels
         if (saturated := max(saturated_pixels(before, frame) for frame in pixels)) > allowed:
@@ -199,7 +199,7 @@ def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> Re
 
 @contextlib.contextmanager
 def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
-    """The calibration in use; the camera's read noise per pixel, e-, and gain, e-/DN."""
+    """Context with the calibration in use, and the camera's read noise per pixel, e-, and gain, e-/DN."""
     camera = factory.detector(configuration_of(loop))
     noise_and_gain = factory.equivalent_read_noise_e(camera), camera.gain_e_per_dn / camera.em_gain
     before = replace(loop.calibration(), camera=loop.camera())

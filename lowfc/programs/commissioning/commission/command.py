@@ -16,7 +16,7 @@ def commission(
     out: Annotated[Path, typer.Option("--out", help="Output file (FITS).")] = Path("calibration.fits"),
     run: AnyRun = None,
     frames: Annotated[
-        int, typer.Option(min=16, max=100_000, help="Frames of the dark and of the reference image.")
+        int, typer.Option(min=16, max=100_000, help="Number of frames for the dark, and for the reference.")
     ] = 400,
     dark: Annotated[Path | None, typer.Option(help="Dark frames: a FITS or .npy cube (frames, rows, columns).")] = None,
     no_dark: Annotated[
@@ -48,7 +48,7 @@ def commission(
     from lowfc.adapters.process.progress import percentage_bar
     from lowfc.client import Client, configuration_of
     from lowfc.programs.commissioning.analytic import analytic
-    from lowfc.programs.commissioning.calibrate.run import partial_of
+    from lowfc.programs.commissioning.calibrate.run import partial_path
     from lowfc.programs.commissioning.calibrate.tasks import reporter
     from lowfc.programs.commissioning.commission.commissioning import Commissioning, CommissionOptions, provisional_path
 
@@ -62,7 +62,7 @@ def commission(
         )
     if out.exists() and not (resume or force):
         raise DataFileError(f"{out} already exists; use another name (--out), or replace it with --force")
-    require_folder(out, provisional_path(out), partial_of(out))
+    require_folder(out, provisional_path(out), partial_path(out))
     console = Console(stderr=True)
     report = reporter(console)
     options = CommissionOptions(out, frames, dark, no_dark, snr, cycles, resume, close)

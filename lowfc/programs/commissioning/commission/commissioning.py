@@ -28,9 +28,9 @@ from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.commissioning.calibrate.pokes import MIN_SNR, CalibrationRequest, Pokes
 from lowfc.programs.commissioning.calibrate.recording import LEASE_CHECK_FRAMES, Player, Report, next_frames
 from lowfc.programs.commissioning.calibrate.result import finish_calibration
-from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of, stored_cycles
+from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_path, stored_cycles
 from lowfc.programs.commissioning.calibrate.tasks import images
-from lowfc.programs.commissioning.commission.first_calibration import aligned, first_delay, linear_nm, poked
+from lowfc.programs.commissioning.commission import first_calibration
 from lowfc.programs.commissioning.commission.first_light import (
     Sensor,
     calibration_with_reference,
@@ -48,7 +48,7 @@ CHECK_GAIN = 0.1
 
 It is stable at any usual delay; with a wrong sign the error grows tenfold in 25 frames.
 """
-MAX_OF_PREDICTED = 1.5
+MAX_ERROR_RATIO = 1.5
 """Largest ratio of measured to predicted error in the closed loop."""
 MIN_RESIDUAL_FRAMES = 1000
 """Smallest number of frames, after settling, for the prediction of the residual and for its measurement."""
@@ -98,7 +98,7 @@ class Commissioning:
         self._advice = ""  # text after an early end, once the calibration is loaded
 
     def run(self) -> tuple[dict[str, Any], str]:
-        """Carry out all steps; return the results, and the text for people."""
+        """Carry out all steps; return the results, and the text to print without --json."""
         options, first_file = self._options, provisional_path(self._options.out)
         if options.resume and not first_file.is_file():
             if options.out.is_file():
@@ -151,19 +151,19 @@ class Commissioning:
         else:
             first, delay = self._provisional()
             calibration_file.save(first, first_file)
-            partial_of(options.out).unlink(missing_ok=True)  # cycles of a former commissioning
+            partial_path(options.out).unlink(missing_ok=True)  # cycles of a former commissioning
         self._provisional_file = first_file
         self._loop.load(first)
         player = Player(self._loop, first, self._report)
         if resumed:
-            delay = first_delay(player, config)
-        has_cycles = resumed and partial_of(options.out).is_file()
+            delay = first_calibration.first_delay(player, config)
+        has_cycles = resumed and partial_path(options.out).is_file()
         if has_cycles:
-            amplitude_nm = float(stored_cycles(partial_of(options.out))[0]["amplitude_nm"])
+            amplitude_nm = float(stored_cycles(partial_path(options.out))[0]["amplitude_nm"])
         else:
             self._announce("poke amplitude")
             default_nm = Pokes(config, first, self._request()).amplitude_nm
-            amplitude_nm = linear_nm(player, config, delay, default_nm)
+            amplitude_nm = first_calibration.linear_amplitude_nm(player, config, delay, default_nm)
         self._announce("response")
         request = self._request(amplitude_nm, resume=has_cycles)
         calibrator = Calibrator(self._loop, request, self._report, self._progress, self._computed)
@@ -178,7 +178,7 @@ class Commissioning:
             )
         self._loop.load(calibration)
         self._advice = f"the calibration is good, saved in {options.out} and loaded: `lowfc ctl close` closes the loop"
-        for path in (first_file, partial_of(options.out)):
+        for path in (first_file, partial_path(options.out)):
             path.unlink(missing_ok=True)
         self._report(result.text())
         return self._results, self._predict_and_close(delay.delay_frames)
@@ -235,11 +235,11 @@ class Commissioning:
         )
         self._announce("delay")
         player = Player(self._loop, before, self._report)
-        delay = first_delay(player, self._config)
+        delay = first_calibration.first_delay(player, self._config)
         self._announce("orientation and sign")
-        first = aligned(player, self._config, self._computed, delay, self._results)
+        first = first_calibration.aligned_calibration(player, self._config, self._computed, delay, self._results)
         if first is None:
-            first = poked(player, self._config, delay)
+            first = first_calibration.poked_calibration(player, self._config, delay)
         return first, delay
 
     def _predict_and_close(self, delay_frames: float) -> str:
@@ -309,7 +309,7 @@ class Commissioning:
             )
             measured = _rms_nm(closed.error_nm, settling)
             self._results["measured_error_nm"] = measured
-            if measured > MAX_OF_PREDICTED * predicted:
+            if measured > MAX_ERROR_RATIO * predicted:
                 raise CalibrationError(
                     f"the measured error in closed loop is {measured:.3g} nm rms, but {predicted:.3g} was predicted: "
                     "are sign and delay right, did the disturbance change? The loop is opened"

@@ -16,14 +16,15 @@ from lowfc.control.calibration.delay_fit import Delay
 from lowfc.control.calibration.response_fit import correlation
 from lowfc.programs.commissioning.calibrate.align import MIN_CORRELATION, computed_scale, in_words, on_sensor, oriented
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, first_poke_plan, largest_nm
-from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError
+from lowfc.programs.commissioning.calibrate.recording import TRAILING_FRAMES, Player, PokesNotSeenError
 from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 
 FIRST_NM = AMPLITUDE_NM["poke"]
 MAX_FIRST_NM = 32.0
 """Largest amplitude of the first pokes, which is doubled until they are detected, nm rms of wavefront."""
 MAX_MISFIT = 0.35
-"""Largest rms difference of image and fitted computed image, as a fraction of the image's rms, for the same sensor."""
+"""If the rms difference of the image and the fitted computed image, relative to the image's rms, is larger, the sensor
+is not the configured one."""
 CYCLES = 12  # cycles of pokes that measure the response without an optical model
 MAX_NONLINEARITY = 0.1
 """Largest relative difference of the gains at full and half amplitude, beyond `_STANDARD_ERRORS` standard errors."""
@@ -51,7 +52,7 @@ def first_delay(player: Player, config: Configuration, mode: int = 0) -> Delay:
     return delay
 
 
-def aligned(
+def aligned_calibration(
     player: Player, config: Configuration, computed: Calibration, first_poke: Delay, results: dict[str, Any]
 ) -> Calibration | None:
     """The computed calibration on the sensor's pixels, with the sign from the poke of the first mode.
@@ -92,7 +93,7 @@ def aligned(
     return identified(calibration)
 
 
-def poked(player: Player, config: Configuration, delay: Delay) -> Calibration:
+def poked_calibration(player: Player, config: Configuration, delay: Delay) -> Calibration:
     """A calibration from pokes of each mode, without an optical model."""
     before, modes = player.before, len(player.before.noll)
     amplitude_nm = min(FIRST_NM, float(largest_nm(config, before).min()))
@@ -107,7 +108,7 @@ def poked(player: Player, config: Configuration, delay: Delay) -> Calibration:
     return identified(replace(calibration, reconstructor=single(matrix)))
 
 
-def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: float) -> float:
+def linear_amplitude_nm(player: Player, config: Configuration, delay: Delay, default_nm: float) -> float:
     """Amplitude at which all modes may be poked at once, nm rms of each.
 
     It is `default_nm`, halved if single pokes at full and half amplitude show that the sensor is not linear.
@@ -122,7 +123,7 @@ def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: f
             plan = _poke_cycle(modes, amplitude_nm, repetition)
             gains[level, repetition] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
     difference = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
-    variance = gains.var(axis=1, ddof=1).mean(axis=0)  # of one gain; two means of two gains differ with this variance
+    variance = gains.var(axis=1, ddof=1).mean(axis=0)  # of one gain, and of the difference of two means of two
     error = np.sqrt(np.maximum(variance, variance.mean()))
     worst = int((difference - _STANDARD_ERRORS * error).argmax())
     chosen_nm = default_nm / 2 if difference[worst] > MAX_NONLINEARITY + _STANDARD_ERRORS * error[worst] else default_nm
@@ -134,7 +135,7 @@ def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: f
 
 
 def _report_time(player: Player, config: Configuration, cycles: int) -> None:
-    frames = len(_poke_cycle(len(player.before.noll), 1.0, 0)) + AFTERWARDS
+    frames = len(_poke_cycle(len(player.before.noll), 1.0, 0)) + TRAILING_FRAMES
     player.report(f"{cycles} cycles of {frames} frames; about {cycles * frames / config.camera.rate_hz:.0f} s to go")
 
 

@@ -20,7 +20,7 @@ from lowfc.programs.commissioning.calibrate.recording import Report
 from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.conformance.settings import agreement_checks
 
-RATE_APART = 0.05
+MAX_RATE_DIFFERENCE = 0.05
 """Largest relative difference between the rate from the frames' times and the rate in the camera's settings."""
 _FULL = 0.9  # brightest pixel allowed, as a fraction of saturation
 _NS = 1e9
@@ -59,7 +59,7 @@ def checked_camera(
     period_ns = float(np.median(np.diff([image.time_ns for image in images])))
     if not (state.period_ns and period_ns > 0):
         faults.append(f"times: the camera's period_ns is {state.period_ns}, but its frames are {period_ns:g} ns apart")
-    elif abs(period_ns / state.period_ns - 1) > RATE_APART:
+    elif abs(period_ns / state.period_ns - 1) > MAX_RATE_DIFFERENCE:
         faults.append(
             f"rate: the camera reports {_NS / state.period_ns:.5g} Hz, its frames arrive at {_NS / period_ns:.5g} Hz"
         )

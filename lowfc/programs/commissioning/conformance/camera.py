@@ -11,15 +11,15 @@ from google.protobuf.message import DecodeError
 
 from lowfc.arrays import Pixels
 from lowfc.contract.messages import CAMERA_STATE, FRAME, RawImage, Role, from_timestamp, wire
-from lowfc.programs.commissioning.conformance.connection import NS, Collected, Connection, Received
+from lowfc.programs.commissioning.conformance.connection import NS, CollectedMessages, Connection, Received
 from lowfc.programs.commissioning.conformance.publisher import LATE_NS
 
 POLL_S = 0.02
-PICTURES = 50
+STORED_IMAGES = 50
 """Number of frames whose pixels are stored."""
 
 
-class Picture(NamedTuple):
+class FrameRecord(NamedTuple):
     """A frame without its pixels; `put_ns` is 0 without a valid envelope, `highest` (DN) None if the size is wrong."""
 
     receive_time_ns: int
@@ -40,7 +40,7 @@ class Picture(NamedTuple):
         return self.image.height, self.image.width
 
 
-class Camera(Collected):
+class Camera(CollectedMessages):
     """Messages of a camera.
 
     Attributes:
@@ -53,7 +53,7 @@ class Camera(Collected):
 
     def __init__(self, connection: Connection) -> None:
         super().__init__(connection, FRAME.key, Role.CAMERA)
-        self.frames: list[Picture] = []
+        self.frames: list[FrameRecord] = []
         self.unreadable = 0
         self.pixels: list[Pixels] = []
         self.states: list[wire.CameraState | None] = []
@@ -79,11 +79,11 @@ class Camera(Collected):
         if image.step == 2 * image.width and len(data) == image.step * image.height > 0:
             pixels = np.frombuffer(data, "<u2").reshape(image.height, image.width)
             highest = int(pixels.max())
-            if len(self.pixels) < PICTURES:
+            if len(self.pixels) < STORED_IMAGES:
                 self.pixels.append(pixels)
         image.ClearField("data")
         put_ns = 0 if envelope is None else envelope.publish_time_ns
-        self.frames.append(Picture(message.receive_time_ns, put_ns, image, len(data), zlib.crc32(data), highest))
+        self.frames.append(FrameRecord(message.receive_time_ns, put_ns, image, len(data), zlib.crc32(data), highest))
 
     @property
     def settings(self) -> wire.CameraState | None:
@@ -97,7 +97,7 @@ class Camera(Collected):
 
     @cached_property
     def brightest_dn(self) -> int:
-        """The brightest pixel of all frames."""
+        """The brightest pixel of all frames, DN."""
         return max((frame.highest or 0 for frame in self.frames), default=0)
 
     @cached_property

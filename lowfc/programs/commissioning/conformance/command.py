@@ -75,7 +75,7 @@ def mirror(
 
     The check takes the place of the controller, which must not be running. Ordinary commands are at most 5 % of the
     smallest limit, with alternating sign. Unless --gentle, the mirror is also raised by up to 10 nm, to see it relax;
-    if no check fails, commands then exceed its stroke, slew and neighbour limits. At the end it returns to its shape.
+    if no check fails, commands then exceed its stroke, slew and neighbour limits. Its shape is restored at the end.
 
     Example: lowfc conformance mirror --run bench --config lowfc.toml
     """
@@ -102,7 +102,7 @@ def mirror(
 
 
 def _run_with(role: str, name: str | None) -> "Run":
-    """The run of that name, or the only one with such a device."""
+    """The run called `name`, or if None the only run that has a process with this role."""
     from lowfc.adapters.bus.run import open_run
     from lowfc.client.runs import live_runs, the_known_run
 

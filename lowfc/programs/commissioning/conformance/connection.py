@@ -111,13 +111,13 @@ class Connection:
         return Received(str(sample.key_expr), sample.payload.to_bytes(), attachment, self.now_ns())
 
 
-class Collected:
+class CollectedMessages:
     """Messages of a device, in the order of arrival.
 
     Attributes:
         connection: connection to the device.
-        key: key of its main topic.
-        process: name under which it publishes its Health.
+        key: key of the device's main topic.
+        process: name under which the device publishes its Health.
         messages: all messages.
         seconds: duration of the check; set at the end.
     """
@@ -159,8 +159,8 @@ class Collected:
             with contextlib.suppress(DecodeError):
                 health = wire.Health.FromString(message.payload)
                 warning = health.last_warning
-                known = warning if warning.startswith(_FAILURES) else "see DRIVER_FAILED in its terminal or its log"
-                return known if health.driver_failures else ""
+                failure = warning if warning.startswith(_FAILURES) else "see DRIVER_FAILED in its terminal or its log"
+                return failure if health.driver_failures else ""
         return ""
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Commands to a mirror under test, small ones first, and the states that it answers with."""
+"""Commands to a mirror under test, small ones first, and the states that answer them."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ from lowfc.arrays import Mask, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import COMMAND, MIRROR_STATE, timestamp, wire
-from lowfc.programs.commissioning.conformance.connection import NS, Collected, Connection, Received
+from lowfc.programs.commissioning.conformance.connection import NS, CollectedMessages, Connection, Received
 
 ANSWER_S = 0.5
 """Timeout for an answer; a slower mirror cannot be used in a loop."""
@@ -73,7 +73,7 @@ class Expected:
         return np.where(self.moving, drawn, 0).astype(np.float32)
 
 
-class Dialogue(Collected):
+class Dialogue(CollectedMessages):
     """Sends commands to a mirror and collects its states.
 
     Attributes:
@@ -105,7 +105,7 @@ class Dialogue(Collected):
         return self.states[-1][1] if self.states else None
 
     @property
-    def where_nm(self) -> Single:
+    def reported_nm(self) -> Single:
         """Reported surface (rows, columns), or the last commanded one if the report cannot be decoded."""
         found = self.surface_nm(self.last)
         return self._commanded_nm if found is None else found
@@ -113,7 +113,7 @@ class Dialogue(Collected):
     def surface_nm(self, state: wire.MirrorState | None) -> Single | None:
         """Actuators (rows, columns) of a state, nm; None without a state.
 
-        None also if it is of another size than configured, not finite, or beyond the full stroke from flat.
+        None also if the grid has another size than configured, or a value is not finite or beyond the full stroke.
         """
         found, most_nm = None if state is None else actuators(state), 2 * self.expected.limits.stroke_nm
         good = found is not None and found.shape == self.expected.grid and bool((np.abs(found) <= most_nm).all())
@@ -194,7 +194,7 @@ class Dialogue(Collected):
 
     def go(self, surface_nm: Single) -> wire.MirrorState | None:
         """Move to a shape in steps of at most half the slew limit; return the last answer, None if one was missing."""
-        start_nm, state = self.where_nm, None
+        start_nm, state = self.reported_nm, None
         count = max(1, int(np.ceil(float(np.abs(surface_nm - start_nm).max()) / self.expected.move_nm)))
         for index in range(1, count + 1):
             state, _, _ = self.ask((start_nm + (surface_nm - start_nm) * np.float32(index / count)).astype(np.float32))

@@ -16,7 +16,7 @@ from lowfc.programs.commissioning.conformance.settings import SETTINGS
 
 _SILENT_PERIODS = 5  # longest wait between frames that is not reported, in frame periods
 _JITTER = 0.1  # largest deviation of 99 % of the waits that is not reported, in frame periods
-_SMOOTHER = 2.0  # ratio of roughness at which bytes count as swapped
+_SMOOTHER = 2.0  # ratio of roughness above which bytes count as swapped
 _READOUT_NS = 50_000_000  # longest plausible time from end of exposure to publication
 _FULL = 0.01  # fraction of saturated pixels above which they are reported
 _STOPPED_NS = 300_000_000  # shorter silences, before the first frame and after the last together, do not count
@@ -64,7 +64,7 @@ def _frame_time(camera: Camera) -> Check:
         return wrong(f"{counted(times.count(0), 'frame')} without a timestamp", "set it in every frame")
     back = sum(later <= earlier for earlier, later in pairwise(times))
     if back:
-        got = f"not later than the previous one, {counted(back, 'time')} of {len(times) - 1}"
+        got = f"{back} of {len(times) - 1} not later than the previous one"
         return wrong(got, "read the time for every exposure, from a clock that never steps")
     age_ns = int(np.median(np.subtract(camera.put_times_ns, times)))
     exposure_ns = 0 if camera.settings is None else camera.settings.exposure_ns
@@ -167,7 +167,7 @@ def _light(camera: Camera) -> Check | None:
 def _byte_order(camera: Camera) -> Check | None:
     if not camera.pixels:
         return None
-    picture = camera.pixels[-1]  # not the median of all, which is meaningless for swapped bytes
+    picture = camera.pixels[-1]  # one image: a median of all is meaningless for swapped bytes
     as_is, swapped = _roughness(picture), _roughness(picture.byteswap())
     if as_is > _SMOOTHER * swapped:
         got = f"the image is {as_is / max(swapped, 1e-9):.0f} times smoother with the bytes swapped: big-endian?"

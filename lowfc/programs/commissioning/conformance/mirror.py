@@ -28,7 +28,7 @@ _SETTLE_S = 0.05  # for drivers that report measured actuator heights, not the t
 
 
 def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool = False) -> list[Check]:
-    """All checks of a mirror; at the end it returns to its shape."""
+    """All checks of a mirror; at the end the mirror returns to its initial shape."""
     found: list[Check] = []
     base_nm = np.zeros(mirror.expected.grid, np.float32)
     begun_ns = mirror.connection.now_ns()
@@ -36,41 +36,41 @@ def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool 
         show("idle")
         found += _idle(mirror)
         last = mirror.last
-        if (where_nm := mirror.surface_nm(last)) is not None:
-            base_nm = where_nm
-        if not _bad(found, "grid", "state"):
+        if (reported_nm := mirror.surface_nm(last)) is not None:
+            base_nm = reported_nm
+        if not _any_wrong(found, "grid", "state"):
             mirror.begin(base_nm, 0 if last is None else last.frame_sequence)
             show("ordinary commands")
             found += _ordinary_commands(mirror, base_nm, seconds)
-        if not _bad(found, "grid", "state", "answers"):
+        if not _any_wrong(found, "grid", "state", "answers"):
             show("commands that must be refused")
-            found += _noted(mirror, _refusals(mirror, base_nm))
+            found += _with_failed_attempts(mirror, _refusals(mirror, base_nm))
             show("the command timeout")
             raised_by_nm = 0.0 if gentle else min(_RAISED_NM, mirror.expected.move_nm)
-            found += _noted(mirror, _timeout(mirror, base_nm, raised_by_nm))
-        if gentle or _bad(found):
+            found += _with_failed_attempts(mirror, _timeout(mirror, base_nm, raised_by_nm))
+        if gentle or _any_wrong(found):
             untried = warning("not tested: another check failed", "correct that first")
             if gentle:
                 untried = warning("not tested: --gentle", "test the limits without --gentle before the loop is closed")
             found.append(untried._replace(name="limits", expected="stroke, slew and neighbour limits of the driver"))
         else:
             show("limits")
-            found += _noted(mirror, _limit_checks(mirror))
+            found += _with_failed_attempts(mirror, _limit_checks(mirror))
     finally:
-        if mirror.states and not _bad(found, "grid", "state"):
+        if mirror.states and not _any_wrong(found, "grid", "state"):
             mirror.go(base_nm)
     mirror.seconds = (mirror.connection.now_ns() - begun_ns) / NS
     return [*found, *PUBLISHER.run(mirror), *PROCESS.run(mirror)]
 
 
-def _noted(mirror: Dialogue, checks: Iterator[Check]) -> Iterator[Check]:
+def _with_failed_attempts(mirror: Dialogue, checks: Iterator[Check]) -> Iterator[Check]:
     """Add to each check the number of its attempts that failed before."""
     for check in checks:
         failed, mirror.failed = mirror.failed, 0
         yield check._replace(got=f"{check.got} ({counted(failed, 'failed attempt')} before)") if failed else check
 
 
-def _bad(found: list[Check], *names: str) -> bool:
+def _any_wrong(found: list[Check], *names: str) -> bool:
     return any(check.status is Status.WRONG and (not names or check.name in names) for check in found)
 
 
@@ -116,7 +116,7 @@ def _grid(mirror: Dialogue, state: wire.MirrorState) -> Check:
 def _ordinary_commands(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator[Check]:
     """Send small shapes of alternating sign, one per period, and check the answers; end if the first has none.
 
-    The wait for one lost command does not shorten them.
+    If an answer was lost, the time of waiting for it is added to `seconds`.
     """
     connection, period_ns = mirror.connection, mirror.expected.period_ns
     answers: list[wire.MirrorState] = []
@@ -181,29 +181,29 @@ def _answers(mirror: Dialogue, durations_ns: list[int], unanswered: int) -> Chec
 
 def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wire.MirrorState) -> Check:
     """Compare the reported surface with the commanded one; the advice names the difference."""
-    expected, where_nm = mirror.expected, mirror.surface_nm(state)
-    if where_nm is None:
+    expected, reported_nm = mirror.expected, mirror.surface_nm(state)
+    if reported_nm is None:
         got = f"{state.rows} x {state.columns}, {len(state.actuators)} bytes"
         return wrong(got, "report the actuators' heights, rows x columns finite float32")
-    off_nm = np.where(expected.moving, np.abs(where_nm - commanded_nm), 0)
+    off_nm = np.where(expected.moving, np.abs(reported_nm - commanded_nm), 0)
     away = np.flatnonzero(off_nm > expected.tolerance_nm)
     if not away.size:
         return ok(f"within {float(off_nm.max()):.2g} nm")
     got = f"{away.size} of {off_nm.size} actuators off, by {float(off_nm.max()):.3g} nm at most"
     if away.size <= off_nm.size // 10:
         return warning(got, f"are they dead? Exclude them in the map mirror.active: {', '.join(map(str, away[:8]))}")
-    moved = (np.abs(where_nm - base_nm) > expected.tolerance_nm) & expected.moving
+    moved = (np.abs(reported_nm - base_nm) > expected.tolerance_nm) & expected.moving
     if moved.any() and not moved.flat[away].any():
         return wrong(got, "they do not move, the others do: exclude those without a channel in the map mirror.active")
-    return wrong(got, _difference(base_nm, commanded_nm, where_nm, moved=bool(moved.any())))
+    return wrong(got, _difference(base_nm, commanded_nm, reported_nm, moved=bool(moved.any())))
 
 
-def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single, *, moved: bool) -> str:
+def _difference(base_nm: Single, commanded_nm: Single, reported_nm: Single, *, moved: bool) -> str:
     """Advice: the error that transforms the commanded shape into the reported one.
 
     `moved`: whether an actuator moved by more than a step of the driver.
     """
-    commanded, got = commanded_nm.astype(np.float64) - base_nm, where_nm.astype(np.float64) - base_nm
+    commanded, got = commanded_nm.astype(np.float64) - base_nm, reported_nm.astype(np.float64) - base_nm
     turns = {
         "with the right orientation": got,
         "with rows and columns exchanged": got.T,
@@ -331,25 +331,27 @@ def _limit_checks(mirror: Dialogue) -> Iterator[Check]:
     limits, flat_nm = mirror.expected.limits, np.zeros(mirror.expected.grid, np.float32)
     uniform = np.ones_like(flat_nm)
     peak, neighbours = _peak(mirror.expected.moving)
-    stroke_nm, slew_nm, apart_nm = limits.stroke_nm, limits.slew_nm, limits.neighbour_nm
+    stroke_nm, slew_nm, neighbour_nm = limits.stroke_nm, limits.slew_nm, limits.neighbour_nm
     too_far_nm = min(_FAR * slew_nm, _NEAR * stroke_nm)
-    fits = _BEYOND * apart_nm / 2 <= _NEAR * stroke_nm and mirror.reachable(_BEYOND * apart_nm)
+    fits = _BEYOND * neighbour_nm / 2 <= _NEAR * stroke_nm and mirror.reachable(_BEYOND * neighbour_nm)
     reached = _reaches_stroke(mirror)
-    for name, words, reason, limit_nm, commanded_nm, shape, possible in (
+    for name, requirement, reason, limit_nm, commanded_nm, shape, possible in (
         ("stroke", "no actuator above", wire.REASON_STROKE, stroke_nm, _BEYOND * stroke_nm, uniform, reached),
         ("slew", "no move above", wire.REASON_SLEW, slew_nm, too_far_nm, uniform, too_far_nm >= _BEYOND * slew_nm),
-        ("neighbours", "no step above", wire.REASON_NEIGHBOUR, apart_nm, _BEYOND * apart_nm, peak, fits),
+        ("neighbours", "no step above", wire.REASON_NEIGHBOUR, neighbour_nm, _BEYOND * neighbour_nm, peak, fits),
     ):
-        expected = f"{words} {limit_nm:g} nm, with {commanded_nm:.4g} nm commanded"
+        expected = f"{requirement} {limit_nm:g} nm, with {commanded_nm:.4g} nm commanded"
         check = warning("not tested: out of reach", "do mirror.stroke_nm (full range) and the limits match the mirror?")
         if possible:
             target_nm = np.float32(commanded_nm) * shape
             state = mirror.ask(target_nm)[0] if name == "slew" else mirror.go(target_nm)
-            where_nm = mirror.surface_nm(state)
-            if state is None or where_nm is None:
+            reported_nm = mirror.surface_nm(state)
+            if state is None or reported_nm is None:
                 check = wrong("no answer", "apply the command as far as the limits allow: a refusal stops the loop")
             else:
-                reached_nm = _highest_nm(mirror, where_nm) if shape is uniform else float(np.ptp(where_nm[neighbours]))
+                reached_nm = (
+                    _highest_nm(mirror, reported_nm) if shape is uniform else float(np.ptp(reported_nm[neighbours]))
+                )
                 check = _within_limit(state, reason, reached_nm, limit_nm + mirror.expected.tolerance_nm)
         yield check._replace(name=name, expected=expected)
         mirror.go(flat_nm)
@@ -371,8 +373,8 @@ def _reaches_stroke(mirror: Dialogue) -> bool:
     mirror.go(np.zeros(mirror.expected.grid, np.float32))
     if not mirror.reachable(stroke_nm):
         return False
-    where_nm = mirror.surface_nm(mirror.go(np.full(mirror.expected.grid, _NEAR * stroke_nm, np.float32)))
-    return where_nm is not None and _highest_nm(mirror, where_nm) >= (_NEAR - 0.05) * stroke_nm
+    reported_nm = mirror.surface_nm(mirror.go(np.full(mirror.expected.grid, _NEAR * stroke_nm, np.float32)))
+    return reported_nm is not None and _highest_nm(mirror, reported_nm) >= (_NEAR - 0.05) * stroke_nm
 
 
 def _peak(moving: Mask) -> tuple[Single, tuple[int, list[int]]]:

@@ -10,7 +10,7 @@ from lowfc.contract.errors import nearest
 from lowfc.contract.messages import EVENT, HEALTH, TOPICS, from_timestamp, wire
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
-from lowfc.programs.commissioning.conformance.connection import NS, Collected
+from lowfc.programs.commissioning.conformance.connection import NS, CollectedMessages
 
 LATE_NS = 20_000_000
 """Clock difference above which every frame of a camera with 100 Hz or more is refused as late by default."""
@@ -19,14 +19,14 @@ _AHEAD_NS = 1_000_000
 _DECADE_S = 10 * 365 * 86_400
 _UNITS = {"microseconds": 1_000, "milliseconds": 1_000_000, "seconds": NS}
 
-PUBLISHER: Table[Collected] = Table()
+PUBLISHER: Table[CollectedMessages] = Table()
 """Checks of the messages of the main topic."""
-PROCESS: Table[Collected] = Table()
+PROCESS: Table[CollectedMessages] = Table()
 """Checks of everything that the device publishes."""
 
 
 @PUBLISHER.check("envelope", "a zenoh attachment of 16 bytes: sequence and publish_time_ns, little-endian uint64")
-def _envelope(device: Collected) -> Check | None:
+def _envelope(device: CollectedMessages) -> Check | None:
     messages = device.published
     bare = [message.attachment for message in messages if message.envelope is None]
     if not bare:
@@ -37,7 +37,7 @@ def _envelope(device: Collected) -> Check | None:
 
 
 @PUBLISHER.check("sequence", "start of the publisher in unix seconds << 32 | count of its messages from 0")
-def _sequence(device: Collected) -> Check | None:
+def _sequence(device: CollectedMessages) -> Check | None:
     sequences = [envelope.sequence for envelope in device.envelopes]
     if not sequences:
         return None
@@ -53,7 +53,7 @@ def _sequence(device: Collected) -> Check | None:
     steps = [later - earlier for earlier, later in pairwise(sequences) if start_of(earlier) == start_of(later)]
     back, gaps = sum(step <= 0 for step in steps), [step - 1 for step in steps if step > 1]
     if back:
-        got = f"not above the previous one, {counted(back, 'time')} of {len(steps)}"
+        got = f"{back} of {len(steps)} not above the previous one"
         return wrong(got, "count every message of this topic, in one thread; such messages are refused")
     if gaps:
         got = f"{sum(gaps)} missing, in {counted(len(gaps), 'gap')} among {len(sequences)} messages"
@@ -67,7 +67,7 @@ def _sequence(device: Collected) -> Check | None:
 
 
 @PUBLISHER.check("publish time", "the host's clock just before publishing, increasing")
-def _put_time(device: Collected) -> Check | None:
+def _put_time(device: CollectedMessages) -> Check | None:
     times = [envelope.publish_time_ns for envelope in device.envelopes]
     if not times:
         return None
@@ -79,7 +79,7 @@ def _put_time(device: Collected) -> Check | None:
         return wrong(got, _clock_advice(times[-1], arrivals[-1], device.connection.offset_ns))
     back = sum(later <= earlier for earlier, later in pairwise(times))
     if back:
-        got = f"not later than the previous one, {counted(back, 'time')} of {len(times) - 1}"
+        got = f"{back} of {len(times) - 1} not later than the previous one"
         return wrong(got, "read the time for every message, from a clock that never steps")
     return ok(f"{lag_ns / 1e3:.0f} us before the arrival, median of {len(times)}")
 
@@ -94,7 +94,7 @@ def _clock_advice(time_ns: int, now_ns: int, offset_ns: int) -> str:
 
 
 @PROCESS.check("health", f"{HEALTH.key} twice a second, with the counts of published messages")
-def _health(device: Collected) -> Check:
+def _health(device: CollectedMessages) -> Check:
     payloads = [message.payload for message in device.on(HEALTH.at(device.process))]
     cost = "without it a recorder cannot count lost messages, and views do not show the process"
     if not payloads:
@@ -121,11 +121,11 @@ def _health(device: Collected) -> Check:
 
 
 @PROCESS.check("topics", "only keys of the table of topics")
-def _topics(device: Collected) -> Check:
+def _topics(device: CollectedMessages) -> Check:
     keys = {message.key for message in device.messages}
     unknown = sorted(key for key in keys if not any(topic.matches(key) for topic in TOPICS))
     if not unknown:
         return ok(f"{len(keys)} keys")
-    known = [topic.key for topic in TOPICS if topic is not EVENT]  # EVENT's short key resembles many others
-    got = ", ".join(f"{key}{nearest(key, known)}" for key in unknown)
+    candidates = [topic.key for topic in TOPICS if topic is not EVENT]  # EVENT's short key resembles many others
+    got = ", ".join(f"{key}{nearest(key, candidates)}" for key in unknown)
     return wrong(got, "publish under the keys of the table; no process subscribes to others")

@@ -144,7 +144,7 @@ class Agreement(NamedTuple):
         key: configuration key that determines it.
         unit: unit in which both are printed.
         tolerance: largest difference, relative to the configured value.
-        needed: whether a difference is wrong for the loop, or only for computed values (a warning).
+        needed: whether a difference disturbs the loop (status wrong), or only computed values (status warning).
         use: results that depend on it.
     """
 
@@ -174,10 +174,10 @@ PERIODS_OF_TIMEOUT = 1.5
 
 def agreement_checks(config: Configuration, state: wire.CameraState) -> Iterator[Check]:
     """Compare a camera's settings with the configuration of its loop."""
-    ours = CameraSettings.configured(config, state.rows, state.columns)
+    expected_settings = CameraSettings.configured(config, state.rows, state.columns)
     for agreement in AGREEMENTS:
         field, unit = agreement.field, agreement.unit
-        configured, reported = float(getattr(ours, field)), float(getattr(state, field))
+        configured, reported = float(getattr(expected_settings, field)), float(getattr(state, field))
         if field == "em_gain":
             reported = max(reported, 1.0)  # a camera without multiplication may report 0
         divisor = _NS_PER_MS if unit == "ms" else 1.0

@@ -33,7 +33,7 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
                 needs = getattr(driver, "needs", lambda _: ())(options)
                 needs = [Need(*(str(part or "") for part in need)) for need in needs]  # found may be a path, or None
         except ConfigurationError as fault:
-            yield wrong(str(fault), "correct its method `needs`, or what that calls")._replace(name=what)
+            yield wrong(str(fault), "correct its method `needs`, or the code it calls")._replace(name=what)
             continue
         for need in needs:
             yield judged(f"{what}: {need.what}", "", bool(need.found), need.found or "not found", need.advice)

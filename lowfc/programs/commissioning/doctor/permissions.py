@@ -86,10 +86,11 @@ def _require_root(option: str) -> None:
         raise ConfigurationError(f"lowfc doctor {option} changes the host and needs root; --setup shows the settings")
 
 
-def _run(*words: str) -> str:
+def _run(name: str, *arguments: str) -> str:
     """Run a command of the host; return its command line. OSError if it does not exist or fails."""
-    program = shutil.which(words[0], path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin") or words[0]
-    run = subprocess.run([program, *words[1:]], capture_output=True, text=True, check=False)  # noqa: S603  # as shown
+    program = shutil.which(name, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin") or name
+    run = subprocess.run([program, *arguments], capture_output=True, text=True, check=False)  # noqa: S603  # as shown
+    command_line = " ".join((name, *arguments))
     if run.returncode:
-        raise OSError(f"{' '.join(words)}: {run.stderr.strip()}")
-    return " ".join(words)
+        raise OSError(f"{command_line}: {run.stderr.strip()}")
+    return command_line

@@ -31,7 +31,7 @@ _BUSY_SHOWN = 3
 
 @CHECKS.check("scheduling class")
 def _scheduling_class(facts: Facts) -> Check:
-    """SCHED_FIFO at `realtime.priority`, requested as by the loop."""
+    """SCHED_FIFO at `realtime.priority`, requested as the loop requests it."""
     priority = fifo_priority(facts.config)
     if not priority:
         reason = "lockstep" if facts.config.lockstep else "realtime.priority = 0"
@@ -88,7 +88,7 @@ def _isolation(facts: Facts) -> Check:
     cost = "other programs and the kernel's own work share the loop's processors; expect a longer tail"
     if not isolated:
         if len(online) <= len(PROCESSES):
-            return note(f"none, and none of the {len(online)} can be spared")
+            return note(f"none is isolated, and none of the {len(online)} can be spared")
         spare = ranges(sorted(online)[-_IN_LOOP:])
         advice = f"boot with isolcpus={spare} nohz_full={spare} and name them in realtime.*_cpus"
         return warning("none", advice, cost)
@@ -232,7 +232,7 @@ def _synchronisation(facts: Facts) -> Check:
 
 @CHECKS.check("boot's clock")
 def _boot_clock(facts: Facts) -> Check:
-    """The clock of all runs since boot, set from CLOCK_REALTIME by the first one, against CLOCK_REALTIME now."""
+    """Difference between CLOCK_REALTIME and the clock of all runs, which the first run after a boot sets from it."""
     file = boot_file()
     if not file.exists():
         return ok("not set yet: the first process of a run sets it")

@@ -48,8 +48,10 @@ class Telemetry:
         source: path of the log, or name of the run.
         noll: Noll index of each mode.
         timing: delay and exposure of the loop, measured if possible.
-        law: the integrator's gains at the end; `driving` is the linear law in force instead, if any.
-        closed: whether the loop was closed in these frames; `frames_closed`: in how many of them.
+        law: the integrator's gains at the end.
+        driving: the linear law in force instead of the integrator at the end; None without one.
+        closed: whether the loop was closed in these frames.
+        frames_closed: number of these frames with the loop closed.
         pol: pseudo-open-loop modes (frames, modes), in pieces without gaps.
         error: modal error (frames, modes). Error and true residual are from the frames after the last change of law or
             gains, or from all frames if those are fewer than `FEWEST`.
@@ -270,19 +272,19 @@ def _telemetry(
     exposure and its rms over all time (steps, modes). The laws are in force since the frame `changed`.
     """
     was_closed, index = steps.mode == LoopMode.CLOSED, np.arange(len(steps.mode))
-    frames_closed = index - np.maximum.accumulate(np.where(was_closed, -1, index))  # since the loop was last not closed
+    frames_since = index - np.maximum.accumulate(np.where(was_closed, -1, index))  # since the loop was last not closed
     settling = settling_frames(laws[0].gain, laws[0].leak)
     if laws[1] is not None:
         settling = SETTLING_FRAMES + FADING_FRAMES + margins.settling_frames(laws[1], timing.delay)
-    settling = min(max(settling, round(_SETTLING_S * rate_hz)), int(frames_closed.max()) - FEWEST)  # `FEWEST` remain
-    closed, rows = True, usable & was_closed & (frames_closed > settling)
+    settling = min(max(settling, round(_SETTLING_S * rate_hz)), int(frames_since.max()) - FEWEST)  # `FEWEST` remain
+    closed, rows = True, usable & was_closed & (frames_since > settling)
     pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if pol.longest < FEWEST:
         if was_closed[usable].any():
             warnings = [
                 *warnings,
                 f"in closed loop at most {counted(pol.longest, 'good frame')} are consecutive, fewer than {FEWEST}: "
-                "those of the open loop are used, too, and the residual achieved is unknown",
+                "open-loop frames are used, too, and the achieved residual is unknown",
             ]
         closed, rows = False, usable
         pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
@@ -295,14 +297,14 @@ def _telemetry(
         warnings = [*warnings, "in some of these frames the integrator drove in place of a law (LAW_OVERRULED)"]
     under_law = rows & (steps.sequence > changed + settling)
     last = np.count_nonzero(under_law)
-    extent = f"over the last {last}, theory is for all"
+    extent = f"that of the last {last}, theory is for all of them"
     if last < FEWEST:
-        under_law, extent = rows, "over all of them, theory is for the last law and gains"
+        under_law, extent = rows, "that of all of them, theory is for the last law and gains"
     if closed and (steps.sequence[rows] <= changed).any():
         warnings = [*warnings, f"law or gains changed in these frames: the achieved residual is {extent}"]
     contrast = known_contrast(config) if config is not None and config.noll == calibration.noll else None
-    known = [None if each is None else each[under_law & np.isfinite(each).all(axis=1)] for each in true_residual]
-    true_nm, rms_nm = (each if each is not None and len(each) else None for each in known)
+    finite = [None if each is None else each[under_law & np.isfinite(each).all(axis=1)] for each in true_residual]
+    true_nm, rms_nm = (each if each is not None and len(each) else None for each in finite)
     return Telemetry(
         source=source,
         noll=calibration.noll,

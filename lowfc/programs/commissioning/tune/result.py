@@ -1,4 +1,4 @@
-"""The result of `lowfc tune`: the present residual and the predicted one of the tuned law."""
+"""The result of `lowfc tune`: the present residual, and the residual predicted for the tuned law."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -55,9 +55,9 @@ class TunedMode(Result):
     noll: int = result_field("mode", form="Z{}")
     name: str = result_field("name")
     gain_now: float | None = result_field("gain now", form=".3g")
-    gain_best: float = result_field("best", form=".2f")
+    gain_best: float = result_field("best gain", form=".2f")
     achieved_nm: float | None = result_field("achieved", "nm", ".3f")
-    predicted_now_nm: float | None = result_field("theory", "nm", ".3f")
+    predicted_now_nm: float | None = result_field("theory now", "nm", ".3f")
     kind: str = result_field("tuned to")
     predicted_nm: float = result_field("predicted", "nm", ".3f")
     integrator_predicted_nm: float = result_field()
@@ -226,7 +226,7 @@ def _present_law(run: Telemetry) -> tuple[LinearLaw, bool]:
 
 
 def _means(power: Array, omega: Array, edges: Array) -> Array:
-    """Mean power between neighbouring edges, from values at omega, all in rad per frame: narrow lines are kept."""
+    """Mean power between neighbouring `edges` from power at `omega` (both rad per frame), so that lines are kept."""
     total = np.append(0, np.cumsum((power[1:] + power[:-1]) / 2 * np.diff(omega)))
     return np.asarray(np.diff(np.interp(edges, omega, total)) / np.diff(edges))
 
