@@ -86,12 +86,12 @@ class Prepared:
 
     @cached_property
     def band_I0(self) -> Array:
-        """`I0` over the band."""
+        """`I0` averaged over the band."""
         return reference(self.sensor, self.band).ravel()
 
     @cached_property
     def band_H(self) -> Array:
-        """`H` over the band."""
+        """`H` averaged over the band."""
         return np.hstack([self.band_tilt_H, response(self.sensor, self.modes[2:], self.band)])
 
     @cached_property
@@ -282,8 +282,8 @@ class Context:
 
     def rng(self, *key: str | int) -> np.random.Generator:
         """A random generator that depends only on the seed and the key, so that trials are independent."""
-        words = [part if isinstance(part, int) else zlib.crc32(part.encode()) for part in key]
-        return np.random.default_rng([self.seed, *words])
+        numbers = [part if isinstance(part, int) else zlib.crc32(part.encode()) for part in key]
+        return np.random.default_rng([self.seed, *numbers])
 
     def map(self, what: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """Apply the function to all items on `jobs` threads, with progress; results in the order of the items."""
@@ -297,7 +297,7 @@ class Context:
 
 
 def assuming(assumption: str) -> Callable[[Callable[[Context], Iterable[Row]]], Callable[[Context], list[Row]]]:
-    """Decorator of a function that yields the rows of a figure: all of them have this assumption."""
+    """Decorator of a function that yields the rows of a figure; gives all of these rows this assumption."""
 
     def decorated(rows_of: Callable[[Context], Iterable[Row]]) -> Callable[[Context], list[Row]]:
         return lambda context: [replace(row, assumption=assumption) for row in rows_of(context)]

@@ -58,14 +58,14 @@ def validate(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Reproduce the paper's tables and figures; each row has paper, measured, limit and assumption.
+    """Reproduce the paper's tables and figures; each row has the paper's value, ours, a limit and the assumption.
 
     Example: lowfc validate table3 table4 --trials 20
     """
-    known = (*TABLES, *ADDITIONAL, "all")
+    names = (*TABLES, *ADDITIONAL, "all")
     for name in tables:
-        if name not in known:
-            raise ConfigurationError(f"there is no table {name!r}{nearest(name, known)}; {', '.join(known)}")
+        if name not in names:
+            raise ConfigurationError(f"there is no table {name!r}{nearest(name, names)}; there are {', '.join(names)}")
     chosen = [name for name in TABLES if name in tables or "all" in tables]
     chosen += [name for name in ADDITIONAL if name in tables]
     only_additional = all(name in ADDITIONAL for name in chosen)

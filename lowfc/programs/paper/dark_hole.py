@@ -24,10 +24,10 @@ SEED = 5
 SETTLE = 100
 """Frames waited for after each step."""
 WINDOW = 300
-"""Further frames waited for after the last step, and frames after the shape is removed."""
+"""Frames waited for after the last step, in addition to `SETTLE`, and after the removal of the shape."""
 STEPS_COMBINED = 5
-"""Number of steps combined into one on the channel that does not shift the zero point: the loop undoes nearly all of
-them, so fewer suffice to measure that fraction."""
+"""Number of steps combined into one on the channel that does not shift the zero point. There the loop undoes nearly the
+whole step, so fewer steps suffice to measure the fraction."""
 SHIFTED, PLAIN = "dark-hole", FLAT
 """A channel that shifts the sensor's zero point, and one that does not."""
 GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
@@ -101,11 +101,11 @@ def dark_hole(
         finally:
             process.send_signal(signal.SIGINT)
             try:
-                out, complaints = process.communicate(timeout=PATIENCE_S)
+                out, errors = process.communicate(timeout=PATIENCE_S)
             finally:
                 process.kill()  # has no effect once the process has ended
     if failure or process.returncode:
-        raise LowfcError(f"{failure}output of the loop: {out}{complaints}")
+        raise LowfcError(f"{failure}output of the loop: {out}{errors}")
     log = folder / json.loads(out)["log"]
     return DarkHoleRun(channel_results(read_history(LogReader(log)), marks, channel_modes_nm), log)
 
@@ -145,10 +145,10 @@ def channel_results(history: History, marks: dict[str, list[int]], channel_modes
     truths, sequences = history.true, history.steps.sequence
     assert truths is not None  # noqa: S101  # a simulated loop logs the truth
     reaction_nm = history.steps.command_nm + truths.disturbance_nm
-    known = np.isfinite(truths.disturbance_nm[:, 0])
+    has_truth = np.isfinite(truths.disturbance_nm[:, 0])
 
     def before(end: int, frames: int) -> Mask:
-        return np.asarray(known & (sequences < end) & (sequences >= end - frames))
+        return np.asarray(has_truth & (sequences < end) & (sequences >= end - frames))
 
     results = {}
     for name, changed_at in marks.items():

@@ -1,4 +1,4 @@
-"""Figures 1 and 7: lambda/30 of focus and of coma, its effect on the contrast, and its estimate."""
+"""Figures 1 and 7: effect on the contrast, and estimate, of an aberration of lambda/30 of focus and of coma."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

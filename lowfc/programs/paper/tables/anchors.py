@@ -37,18 +37,18 @@ LOOP_SENSORS = ("sam", "zwfs_tuned")
 """Sensors for which loops are run."""
 RATE_HZ, MAGNITUDE, EXPOSURE = 1000.0, 2.0, 0.5
 OBSERVED_S, CLOSED_S, MEAN_S = 10.0, 24.0, 2.0
-"""Durations: of the loop from which a law is identified, of the loop that is judged, of a mean as in SCExAO."""
+"""Durations, s: of the loop from which a law is identified, of the loop that is judged, of a mean as in SCExAO."""
 ROMAN_MAS, SCEXAO_MAS = 0.4, {"laboratory": 0.02, "sky": 0.15}
 AVERAGED_S = 100.0
 DRIFT_PM = 20.0
 REACHED, NOT_REACHED = "reached", "not reached"
 
-ABOUT = """An anchor is a published value and lowfc's value by the same definition. *paper* is the published value,
-*limit* is lowfc's with the noise of the quantum limit of the light, unless the assumption says otherwise. Loops are the
-real processes in lockstep, judged by the true wavefront, in continuous time over the second half of a run; the means as
-in SCExAO are of the tilt at the start of each exposure, from 4 s on. A verdict compares lowfc's value (the predicted
-one, if theory gives one) with the published one. The scatter of the tuned CLOWFS and of the Zernike sensor is compared
-with that of the paper's CLOWFS.
+ABOUT = """An anchor is a published value and lowfc's value by the same definition. *paper* is the published value;
+*limit* is lowfc's value with noise at the quantum limit of the light, unless the assumption says otherwise. Loops are
+the real processes in lockstep. They are judged by the true wavefront, in continuous time, over the second half of a
+run; the means as in SCExAO are of the tilt at the start of each exposure, from 4 s on. A verdict compares lowfc's value
+(the predicted value, if theory gives one) with the published value. The scatter of the tuned CLOWFS and of the Zernike
+sensor is compared with the scatter of the paper's CLOWFS.
 """
 LOOP = (
     f"lowfc sim-loop --lockstep: V = {MAGNITUDE:g}, 2 m, {RATE_HZ:g} Hz, exposure of half the period, delay of one "
@@ -60,11 +60,11 @@ ROMAN = (
     "117 Hz, 0.5 % wide, and drift; reaction-wheel-ideal, the lines without width, as on a testbed. "
     f"LQG, identified from {OBSERVED_S:g} s of the closed loop. limit: predicted from the log, with the noise of the "
     "quantum limit; a run may be below it. A mirror that holds its command for a frame leaves 0.72 mas of these lines "
-    "at 1 kHz with any sensor, and 0.36 mas at 2 kHz: 0.4 mas needs a faster loop or lower lines."
+    "at 1 kHz with any sensor, and 0.36 mas at 2 kHz: 0.4 mas needs a faster loop or weaker lines."
 )
 SCEXAO = (
     f"SCExAO LLOWFS (Singh et al.): standard deviation of means over {MEAN_S:g} s of the tilt per axis, "
-    "at 8.2 m and 1.6 um. lowfc: 2 m, 550 nm, where 0.15 mas is 0.0026 lambda/D against their 0.0037. "
+    "at 8.2 m and 1.6 um. lowfc: 2 m, 550 nm, where 0.15 mas is 0.0026 lambda/D; for SCExAO it is 0.0037. "
     "Laboratory: preset bench, integrator; sky: reaction-wheel, LQG."
 )
 HICAT = (
@@ -94,7 +94,7 @@ def anchors(context: Context) -> list[Row]:
 
 
 def _with_verdict(row: Row, allowed: float | None = None) -> list[Row]:
-    """A row, and its verdict if a value is allowed or published, on `predicted` if known, otherwise on `measured`."""
+    """A row, and its verdict if there is an allowed or published value; judges `predicted`, or else `measured`."""
     limit = row.paper if allowed is None else allowed
     ours = row.measured if row.predicted is None else row.predicted
     if limit is None:
@@ -222,7 +222,7 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
 
 
 def added_contrast(name: str, magnitude: float, quantum: bool = False) -> float:
-    """Contrast that drift and noise add behind integrators of the best gains."""
+    """Contrast that the residual of drift and noise adds, with integrators of the best gains."""
     noise = (tolerance.quantum_noise_nm2 if quantum else tolerance.frame_noise_nm2)(name, magnitude)
     step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
     residual_nm2 = [
@@ -259,7 +259,7 @@ def plot(context: Context, path: Path) -> None:
 
 
 def _sensor_toml(name: str) -> str:
-    """[sensor] of a configuration file that is used in another folder."""
+    """Section [sensor] of a configuration file that is used in another folder: a layout file has its whole path."""
     keys = section_of(name).model_dump(exclude_unset=True)
     if keys.get("sam", "").partition(":")[0].endswith(".json"):
         keys["sam"] = str(Path.cwd() / user_path(keys["sam"]))

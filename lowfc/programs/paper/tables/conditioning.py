@@ -20,7 +20,7 @@ from lowfc.optics.detector.photometry import electrons
 from lowfc.programs.paper.cases import Context, Prepared, Row, prepared, sparse_apertures
 from lowfc.programs.paper.tables.pointing import NM_PER_MAS
 
-OTHERS = ("clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned")
+OTHER_SENSORS = ("clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned")
 """Sensors in addition to the packaged sparse apertures."""
 BARS = ((0.05, 20.0), (0.1, 20.0), (0.2, 20.0), (0.1, 0.0), (0.1, 45.0), (0.1, 90.0))
 """Width of each bar in pupil diameters, and its angle in degrees."""
@@ -56,7 +56,7 @@ def conditioning(context: Context) -> list[Row]:
     """Condition number, throughput and Cramer-Rao bounds of each mask in the relay pupil."""
     masks = [("open", prepared("open"))]
     masks += [("bar", _bar(width, angle)) for width, angle in BARS]
-    masks += [("sensor", prepared(name)) for name in context.names(*sparse_apertures(), *OTHERS)]
+    masks += [("sensor", prepared(name)) for name in context.names(*sparse_apertures(), *OTHER_SENSORS)]
     holes = [_with_holes(diameter) for diameter in HOLES]
     masks += [("holes", each) for each in holes if isinstance(each, Prepared)]
     rows = [row for of_mask in context.map("conditioning", lambda mask: [*_rows(*mask)], masks) for row in of_mask]
@@ -69,7 +69,7 @@ def _bar(width: float, angle_deg: float) -> Prepared:
 
 
 def _with_holes(diameter: float) -> Prepared | Row:
-    """The default layout with holes of another diameter, or a row that states that they would not fit."""
+    """The default layout with holes of another diameter, or a row that states that these do not fit into the pupil."""
     layout = load_layout(SensorSection().sam)
     name = f"default layout with holes of {100 * diameter:g} %"
     shrunk = sams.Layout(name, layout.purpose, tuple((x, y, diameter) for x, y, _ in layout.holes))

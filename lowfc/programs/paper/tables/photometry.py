@@ -37,13 +37,13 @@ from lowfc.programs.paper.tables.pointing import (
 )
 
 PAPER_PEAK = {"sam": 0.0022, "clowfs": 0.0110}
-"""Brightest pixel over the light on the sensor."""
+"""Light on the brightest pixel divided by the light on the sensor."""
 PAPER_SIGNAL = {"sam": 0.025, "clowfs": 0.011}
-"""Peak to valley of the signal of 1 mas over the brightest pixel."""
+"""Peak to valley of the signal of 1 mas divided by the brightest pixel."""
 PAPER_SIGNAL_RATIO = 13.0
-"""Signal of 1 mas in electrons, clowfs over sam."""
+"""Signal of 1 mas in electrons: ratio clowfs / sam."""
 PAPER_SCATTER_RATIO = 5.0
-"""Standard deviation of the tilt estimates, sam over clowfs."""
+"""Standard deviation of the tilt estimates: ratio sam / clowfs."""
 PAPER_TILT_PEAK = 5.42e-2
 """Table 2's peak differential intensity of lambda/30 of tilt in x."""
 PAPER_R2 = 0.97

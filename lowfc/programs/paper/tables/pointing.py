@@ -16,7 +16,7 @@ from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
 from lowfc.programs.paper.cases import Context, Prepared, Row, prepared, sparse_apertures
 
-OTHERS = ("clowfs", "clowfs:1", "clowfs_tuned", "zwfs", "zwfs_tuned")
+OTHER_SENSORS = ("clowfs", "clowfs:1", "clowfs_tuned", "zwfs", "zwfs_tuned")
 """Sensors in addition to the packaged sparse apertures."""
 FITTED = {1: (2, 14, 20), 10: (2, 14)}
 """Numbers of fitted modes, tip and tilt first, by the tilt in mas."""
@@ -103,7 +103,7 @@ def predicted_mas(linear: Fit, mean_e: Array) -> Array:
 def table4(context: Context) -> list[Row]:
     """Rows of Table 4: electrons, then scatter and mean error of the tilt by sensor, flux, tilt, modes and kind."""
     rows: list[Row] = []
-    for name in context.names(*sparse_apertures(), *OTHERS):
+    for name in context.names(*sparse_apertures(), *OTHER_SENSORS):
         sensor = prepared(name)
         images = {mas: sensor.image(np.array([mas * NM_PER_MAS]), sensor.band) for mas in FITTED}
         for exposure in exposures(sensor):

@@ -14,7 +14,9 @@ from lowfc.design.paper import MODES, PEAK_E, TABLE3_INPUT_WAVES, TABLE3_READ_NO
 from lowfc.optics.chain.zernike import NOLLS_20
 from lowfc.programs.paper.cases import DEFAULT_SAM, Context, Prepared, Row, prepared, sparse_apertures
 
-OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned", "bar", "lyot", "aplc")
+OTHER_SENSORS = (
+    *("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned", "bar", "lyot", "aplc"),
+)
 """Sensors in addition to the packaged sparse apertures."""
 ITERATIONS = (0, 1, 2)
 WITH_NUISANCES = "weighted, flux and shear fitted along"
@@ -149,7 +151,7 @@ def table3(context: Context) -> list[Row]:
     """Rows of Table 3: input, then rms and P-V residual for each sensor, number of modes, input and estimator."""
     rows: list[Row] = []
     pupils: set[tuple[bytes, int, str]] = set()
-    for name in context.names(*sparse_apertures(), *OTHERS):
+    for name in context.names(*sparse_apertures(), *OTHER_SENSORS):
         sensor = prepared(name)
         in_paper = name in ("sam", "clowfs")
         for modes in MODES:

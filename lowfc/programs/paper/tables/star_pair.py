@@ -19,8 +19,8 @@ STARS = {"reference": (2.0, 20_000.0), "target": (5.0, 5_800.0)}
 """Magnitude V and temperature in K."""
 DRIFT_PM = 20.0
 """Drift of each of 14 modes, pm per root second."""
-ROLL_NM, ROLLED = 1.0, 1e-11
-"""Step of every mode by a roll of the telescope, and the contrast to which it must decay."""
+ROLL_NM, ROLL_CONTRAST = 1.0, 1e-11
+"""Step of every mode by a roll of the telescope, nm rms, and the contrast to which it must decay."""
 _SMALL_NM = 0.3  # amplitude of the modes from which the second-order maps are computed
 _PLANCK_NM_K = 1.438777e7
 _LONGEST_FRAMES = 1 << 20
@@ -54,7 +54,7 @@ def _maps() -> tuple[Array, Array, Mask]:
 
 
 def zero_point_nm(name: str) -> Array:
-    """Modes (14,) at which a loop with the reference star's I0 and R holds the target star, due to its colour."""
+    """Modes (14,), nm, at which a loop with the reference star's I0 and R holds the target star, due to its colour."""
     sensor = prepared(name)
     reference_star, target = (coloured(kelvin) for _, kelvin in STARS.values())
     I0, H = reference(sensor.sensor, reference_star).ravel(), response(sensor.sensor, sensor.modes[:14], reference_star)
@@ -95,10 +95,10 @@ def pair_rows(name: str) -> Iterator[Row]:
     form = tolerance.contrasts_of(name).form
 
     def decayed(frames: int) -> bool:
-        return float(ROLL_NM**2 * form @ (1.0 - gains["target"]) ** (2.0 * frames)) <= ROLLED
+        return float(ROLL_NM**2 * form @ (1.0 - gains["target"]) ** (2.0 * frames)) <= ROLL_CONTRAST
 
     yield new_row(
-        f"time for a roll's step of {ROLL_NM:g} nm in every mode to decay to {ROLLED:g}, target",
+        f"time for a roll's step of {ROLL_NM:g} nm in every mode to decay to {ROLL_CONTRAST:g}, target",
         unit="s",
         measured=bisect_left(range(_LONGEST_FRAMES), True, key=decayed) / tolerance.RATE_HZ,
     )

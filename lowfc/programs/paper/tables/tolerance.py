@@ -38,13 +38,14 @@ _FRAMES_PER_TRIAL = 20  # times 1 / gain, the loop's time constant: 100 trials d
 _SHOWN_NOLLS, _SHOWN_ENDS = (2, 4, 8, 11), tuple(f"V = {magnitude}, {SHOWN_CONTRAST:g}" for magnitude in (2, 5))
 _LARGEST = 6e-9  # contrast up to which the fourth order is fitted
 
-ABOUT = """Drift rate of one mode, and rms of a vibration line in it, that add a contrast of 1e-9, 1e-10 or 1e-11:
-theory of `lowfc/design/tolerance.py`, from the contrast's quadratic form (and its fourth order, which matters for tilt)
-and the noise of a frame. `--json` has every mode, star and contrast; this page has four modes, two stars and 1e-10.
-Then come twelve points by simulation, and a pair of stars as a coronagraph observes them: a reference of V = 2
-and a target of V = 5 with another colour and roll angle, one exposure subtracted from the other. Behind a symmetric
-pupil and a real mask, a change of colour changes the image by an even function of position: the zero point of an
-aperture mask stays; those of the Zernike sensor and of CLOWFS move, and I0 has to be measured again on the target.
+ABOUT = """The table gives the drift rate of one mode, and the rms of a vibration line in it, that add a contrast of
+1e-9, 1e-10 or 1e-11. Both follow from the contrast's quadratic form, its fourth order (which matters for tilt) and the
+noise of a frame, by the theory of `lowfc/design/tolerance.py`. `--json` has every mode, star and contrast; this page
+has four modes, two stars and 1e-10. Twelve points are checked by simulation. The last rows are of two stars that a
+coronagraph observes: a reference of V = 2 and a target of V = 5 with another colour and roll angle; one exposure is
+subtracted from the other. Behind a symmetric pupil and a real mask, colour changes the image by an even function of
+position. Then the zero point of an aperture mask stays, but the zero points of the Zernike sensor and of CLOWFS move,
+so that I0 has to be measured again on the target.
 """
 LOOP = (
     f"{RATE_HZ:g} Hz, exposure of half the period, delay of one frame, 1 e- read noise, weighted fit of all 14 modes, "
