@@ -142,7 +142,7 @@ FAULTS: list[tuple[str, str, Callable[[Evidence, Outcome], object]]] = [
     ("account", "flushed", unflushed),
     ("account", "no message is counted", lambda _, outcome: setattr(outcome, "failure", "disk")),
     ("processes", "did not end", ended("mirror-dm", -signal.SIGKILL, PATIENCE_S, True)),
-    ("processes", "camera ended with 1, by itself", ended("camera", 1, 0.0, False)),
+    ("processes", "camera ended with status 1, by itself", ended("camera", 1, 0.0, False)),
     ("processes", "by itself", ended("camera", 0, 0.0, False)),
     ("processes", "is still running", lambda _, outcome: outcome.alive.append("python (1, Z)")),
     ("processes", "traceback in one", lambda _, outcome: (outcome.folder / "one.stderr").write_text("Traceback (most")),

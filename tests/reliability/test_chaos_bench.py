@@ -24,7 +24,7 @@ from lowfc.contract.configuration import load
 from lowfc.contract.messages import TIMING, Role, wire
 from lowfc.programs.reliability.chaos import bench, console, disk, processes
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench, ProcessEnd
-from lowfc.programs.reliability.chaos.case import WHILE_FRAMES
+from lowfc.programs.reliability.chaos.case import HOLD_FRAMES
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.console import TerminalConsole
 from lowfc.testing.clock import FakeClock
@@ -131,7 +131,7 @@ def test_a_camera_with_another_clock_is_replaced_by_one_with_the_hosts() -> None
     assert mock_bench.method_calls == [
         call.kill(Role.CAMERA),
         call.restart(Role.CAMERA, ["unshare", "--time", "--monotonic", "-3600", "sim-camera"]),
-        call.await_steps(WHILE_FRAMES),
+        call.await_steps(HOLD_FRAMES),
         call.kill(Role.CAMERA),
         call.restart(Role.CAMERA, ["sim-camera"]),
     ]

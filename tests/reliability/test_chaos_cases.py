@@ -36,8 +36,8 @@ def in_simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
         return toy_bench
 
     monkeypatch.setattr(bench, "ChaosBench", new_bench)
-    monkeypatch.setattr(case, "WHILE_FRAMES", 100)
-    monkeypatch.setattr(control, "WHILE_FRAMES", 100)
+    monkeypatch.setattr(case, "HOLD_FRAMES", 100)
+    monkeypatch.setattr(control, "HOLD_FRAMES", 100)
     monkeypatch.setattr(junk, "FLOOD_S", 0.3)
     monkeypatch.setattr(junk, "FORGED_MESSAGES", 60)
     monkeypatch.setattr(control, "FLOOD_VALUES", 600)

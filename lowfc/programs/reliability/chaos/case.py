@@ -15,7 +15,7 @@ Act = Callable[[ChaosBench], None]
 
 LOST = ("MESSAGES_LOST", "MIRROR_LOST")
 """Events of the level ERROR that many faults may cause."""
-WHILE_FRAMES = 250  # number of frames for which a case keeps a state, such as safe mode
+HOLD_FRAMES = 250  # number of frames for which a case keeps a state, such as safe mode
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,13 @@ class Case:
     bad: Callable[[int], bool] | None = None
     statuses: Mapping[str, int] = field(default_factory=dict)
     noisy: bool = False
-    lacks: Callable[[], str] = str  # which returns the empty string
+    lacks: Callable[[], str] = str  # str() is the empty string
 
     def run(self, bench: ChaosBench) -> None:
         """Inject the fault, and wait until the loop has recovered."""
         self.act(bench)
         if self.safe:
-            bench.await_steps(WHILE_FRAMES)
+            bench.await_steps(HOLD_FRAMES)
         else:
             bench.await_settled()
 
@@ -63,7 +63,7 @@ REGISTERED: dict[str, Case] = {}
 
 
 def case(name: str, description: str, **attributes: Any) -> Callable[[Act], Act]:
-    """Register a function as the `act` of a case; `attributes` are the other ones of `Case`."""
+    """Register a function as the `act` of a case; `attributes` are the other attributes of `Case`."""
 
     def register(act: Act) -> Act:
         REGISTERED[name] = Case(name, description, act, **attributes)

@@ -22,7 +22,7 @@ from lowfc.control.laws.stability import limiting_gain
 from lowfc.control.loop.guard import MIN_BLOCK_FRAMES, WORSE_BLOCKS
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
-from lowfc.programs.reliability.chaos.case import LOST, WHILE_FRAMES, case, no_mounts, no_other_clock, read_only
+from lowfc.programs.reliability.chaos.case import HOLD_FRAMES, LOST, case, no_mounts, no_other_clock, read_only
 from lowfc.programs.reliability.chaos.processes import kill_and_restart
 
 STABLE_FRACTION = 0.9
@@ -36,7 +36,7 @@ def _highest_gain(bench: ChaosBench) -> None:
         client.gain(1.01 * limiting)
         raise CaseFailedError(f"a gain of {1.01 * limiting:.3g} was accepted, although {limiting:.3g} is unstable")
     client.gain(STABLE_FRACTION * limiting)
-    bench.await_steps(WHILE_FRAMES)
+    bench.await_steps(HOLD_FRAMES)
     client.gain(FIXED_GAINS["control.gain"])
     client.gain(FIXED_GAINS["control.tilt_gain"], modes=[2, 3])
 
@@ -73,9 +73,9 @@ def _reversed_calibration(bench: ChaosBench) -> None:
     client, good = bench.client(), _calibration(bench)
     client.open_loop()
     _load_and_close(bench, identified(replace(good, reconstructor=-good.reconstructor)))
-    bench.await_steps(WHILE_FRAMES)
+    bench.await_steps(HOLD_FRAMES)
     client.safe()
-    bench.await_steps(WHILE_FRAMES)
+    bench.await_steps(HOLD_FRAMES)
     client.clear()
     _load_and_close(bench, good)
 
@@ -100,7 +100,7 @@ def _foreign_calibration(bench: ChaosBench) -> None:
     )
     client.open_loop()
     client.load(identified(foreign))
-    bench.await_steps(WHILE_FRAMES)
+    bench.await_steps(HOLD_FRAMES)
     _load_and_close(bench, good)
 
 
@@ -128,7 +128,7 @@ def _damaged_calibration(bench: ChaosBench) -> None:
 @case("safed-restart", "safe mode, then the controller is killed and restarted", expected=("SAFED",), safe=True)
 def _restart_in_safe_mode(bench: ChaosBench) -> None:
     bench.client().safe()
-    bench.await_steps(WHILE_FRAMES)
+    bench.await_steps(HOLD_FRAMES)
     kill_and_restart(bench, Role.CONTROLLER)
 
 
@@ -138,7 +138,8 @@ FLIPS, FLOOD_VALUES, FLOOD_HZ = 40, 4000, 2000
 
 @case(
     "interlock",
-    "an interlock's value changes at random times, then comes 2,000 times a second; the last one acts until it expires",
+    "an interlock's value changes at random times, then is sent 2,000 times a second; the last value acts until it "
+    "expires",
     config={"interlocks": [INTERLOCK]},
     expected=("INTERLOCK_ACTS", "INTERLOCK_CLEARED"),
 )
@@ -178,7 +179,7 @@ def _safe_without_latch(no_latch: Callable[[Path], contextlib.AbstractContextMan
     client = bench.client()
     with no_latch(bench.run.path):
         client.safe()
-        bench.await_steps(WHILE_FRAMES)
+        bench.await_steps(HOLD_FRAMES)
         bench.kill(Role.CONTROLLER)
     bench.restart(Role.CONTROLLER)
 
@@ -202,7 +203,7 @@ def _other_clock(bench: ChaosBench, shift_s: int) -> None:
         bench.kill(Role.CAMERA)
         bench.restart(Role.CAMERA, command)
         if command is not normal:
-            bench.await_steps(WHILE_FRAMES)
+            bench.await_steps(HOLD_FRAMES)
 
 
 for _kind, _shift_s, _expected in (("ahead", 3600, ("CAMERA_RESTARTED",)), ("behind", -3600, ())):

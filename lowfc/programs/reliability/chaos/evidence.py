@@ -27,8 +27,8 @@ class Entry(NamedTuple):
     """A decoded message of the loop's processes.
 
     Attributes:
-        sequence: its sequence, with the start time of its publisher.
-        log_time_ns: time at which it was recorded.
+        sequence: sequence of the message, with the start time of its publisher.
+        log_time_ns: time at which the message was recorded.
         message: decoded message.
         actuators_nm: actuators of a command or mirror state, nm of surface; otherwise empty.
     """
@@ -56,7 +56,7 @@ class Evidence:
     Attributes:
         entries: messages of each topic of `DECODED`, in the order of the logs.
         received: counts of the messages in each finished log, by number of the log, key and start of the publisher;
-            each log was written by another recorder, which counts the losses of its own time.
+            each log was written by another recorder, which counts the losses while it runs.
         sent: messages that each publisher reported at its end as sent, by the same keys as `received`.
         lost: messages that the recorders report as lost, by key.
         unreadable: errors of logs and messages that cannot be read.
@@ -98,8 +98,8 @@ def read(folder: Path) -> Evidence:
             evidence.unreadable.append(str(fault))
         evidence.log_ends.append((last_ns, reader.finished))
         for name, value in reader.metadata.get("recording", {}).items():
-            word, _, key = name.partition(" ")
-            if word == "lost":
+            quantity, _, key = name.partition(" ")
+            if quantity == "lost":
                 evidence.lost[key] += int(value)
     return evidence
 

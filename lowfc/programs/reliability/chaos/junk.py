@@ -26,7 +26,7 @@ REQUESTS = 25
 _POLL_S = 0.01
 _NAMES = ("status", "open", "close", "gain", "leak", "limit", "offset", "channel", "play", "load", "law", "nonsense")
 _MAY_SUCCEED = ("status", "open", "close", "offset", "play", "law", "channel")
-"""Requests that random bytes may encode by chance; these are sent under a name that does not exist."""
+"""Requests that random bytes may encode by chance: in their place, a name that does not exist is used."""
 
 
 class Intruder(AbstractContextManager["Intruder"]):

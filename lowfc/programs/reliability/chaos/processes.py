@@ -94,7 +94,7 @@ def _stalled_viewer(bench: ChaosBench) -> None:
 
 
 class CommandTimes:
-    """Frame-to-command latencies of a running bench; those of each measured phase are stored in its `outcome`."""
+    """Frame-to-command latencies of a running bench; percentiles of each phase are stored in the bench's `outcome`."""
 
     def __init__(self, bench: ChaosBench) -> None:
         assert bench.bus is not None  # noqa: S101  # the bench has begun

@@ -232,7 +232,8 @@ def _processes(case: Case, outcome: Outcome) -> Finding:
         if ended.after_s >= PATIENCE_S and ended.status == -signal.SIGKILL:
             wrong.append(f"{ended.name} did not end within {PATIENCE_S:g} s")
         elif ended.status not in allowed:
-            wrong.append(f"{ended.name} ended with {ended.status}" + ("" if ended.requested else ", by itself"))
+            by_itself = "" if ended.requested else ", by itself"
+            wrong.append(f"{ended.name} ended with status {ended.status}{by_itself}")
         elif not ended.requested and ended.status == 0:
             wrong.append(f"{ended.name} ended by itself")
     outputs = [] if case.noisy else sorted(outcome.folder.glob("*.stderr"))

@@ -10,7 +10,7 @@ from lowfc.control.loop.wording import counted
 from lowfc.programs.cli.result import table
 
 BLOCKS = 12
-"""Number of means to which a slope is fitted: neighbouring samples are correlated, means of many samples hardly."""
+"""Number of means to which a slope is fitted: neighbouring samples are correlated, but means of many hardly are."""
 WARM_UP = 0.25
 """Fraction of the time at the start that is left out, while caches and queues fill."""
 SIGNIFICANT = 3.0

@@ -33,7 +33,7 @@ _MUST_BE_ZERO = {
 
 
 class LogChecker:
-    """Checks each finished log for gaps, then removes it, because those of a night would fill the disk."""
+    """Checks each finished log for gaps, then removes it, because the logs of a night would fill the disk."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
