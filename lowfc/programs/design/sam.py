@@ -32,7 +32,7 @@ from lowfc.programs.design.sam_request import Search
 STATE_PERIOD_S = 10.0
 """Shortest time between two writes of the state file."""
 _PUPIL_SAMPLES = 256
-"""One sample per cell of the package's shaped pupil. Predictions agree with those at 512 samples to 4e-4,
+"""One sample per cell of the package's shaped pupil. Predictions agree with those at 512 samples to 4e-4, predictions
 of contrast to 2 %."""
 _NOTHING = "no chain had finished its first steps: nothing was found, nothing is written"
 

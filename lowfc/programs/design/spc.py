@@ -45,7 +45,7 @@ class ShapedPupil(Result):
     """Properties of the designed mask.
 
     `below_optimum_at_limit_fraction`: the best mask with `limit` times the required contrast is more open by at most
-    this fraction of the circle; the best one with the required contrast may be still more open.
+    this fraction of the circle. The best mask with the required contrast may be more open still.
     """
 
     open_area_fraction: float = result_field("open area", "of the circle", ".2%")
