@@ -253,8 +253,8 @@ def test_automatic_gains_of_a_configuration_file_are_the_logged_ones(
     path = tmp_path / "automatic.toml"
     path.write_text('[control]\ntilt_gain="auto"\ngain="auto"\nleak=0.02\n')
     for given, gains, kept in (
-        (None, [0.4, 0.4, 0.2], "those of tilt x, tilt y, focus are the logged ones"),
-        ("tilt_gain=0.3", [0.3, 0.3, 0.2], "those of focus are the logged ones"),
+        (None, [0.4, 0.4, 0.2], "tilt x, tilt y, focus keep the logged gains"),
+        ("tilt_gain=0.3", [0.3, 0.3, 0.2], "focus keep the logged gains"),
         ("gain=0.3", [0.3, 0.3, 0.3], ""),
     ):
         found = results_of(runs["default"], requested_changes(given, path))

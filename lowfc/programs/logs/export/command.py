@@ -144,8 +144,8 @@ def render(results: dict[str, Any]) -> str:
     lines = [f"recorded           {results['selection']}"] if results["selection"] else []
     lines += [f"{', '.join(results['files'])}: {results['steps']} steps of {results['modes']} modes{frames}"]
     if results["steps_left_out"]:
-        what = "with another number of modes than the calibration or with impossible values"
-        lines.append(f"left out           {counted(results['steps_left_out'], 'message')} {what}")
+        mismatch = "with another number of modes than the calibration or with impossible values"
+        lines.append(f"left out           {counted(results['steps_left_out'], 'message')} {mismatch}")
     lines += faults(results["damaged"], results["no_end"])
     lines += [f"configuration      {remark}" for remark in results["remarks"]]
     return "\n".join(lines)

@@ -64,7 +64,7 @@ class Account(Result):
     finished: bool = Field(True, exclude=True)
     """Whether the recorder ended every log."""
     span_ns: tuple[int, int] = Field((0, 0), exclude=True)
-    """Log times of the first frame and the last; (0, 0) without one."""
+    """Log times of the first frame and the last frame; (0, 0) without a frame."""
 
     @computed_field  # type: ignore[prop-decorator]
     @property

@@ -154,7 +154,7 @@ class ControllerReplay:
             self._account.frames += isinstance(body, wire.ControlStep)
 
     def proceed(self, now_ns: int, *, ended: bool = False) -> None:
-        """Replay every input that is complete or overdue; all remaining ones once the log has `ended`."""
+        """Replay every input that is complete or overdue; all remaining inputs once the log has `ended`."""
         while (self._entries or self._states) and not self.done:
             if self._state is None and not self._adopt():
                 if not self.done:
@@ -201,7 +201,7 @@ class ControllerReplay:
             self.retry_pending = True
 
     def _adopt(self) -> bool:
-        """Continue from the earliest complete state whose calibration is known; False without one, or at the end."""
+        """Continue from the earliest complete state whose calibration is known; False without a state or at the end."""
         if not self.retry_pending:
             return False
         self.retry_pending = False

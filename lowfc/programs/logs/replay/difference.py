@@ -42,7 +42,7 @@ class Difference:
 
 
 def difference(input_number: int, frame_sequence: int, logged: Message, replayed: Message | None) -> Difference:
-    """Compare a message of the log with the replayed one, which is None if the replay sent nothing."""
+    """Compare a message of the log with the replayed message; `replayed` is None if the replay sent nothing."""
     found = Difference(logged.DESCRIPTOR.name, input_number, frame_sequence)
     if replayed is None:
         found.fields.append("the replay sends no such message")

@@ -22,7 +22,7 @@ class Frames:
         self._steps: deque[tuple[int, int]] = deque(maxlen=_STEPS_KEPT)
 
     def add(self, sequence: int, payload: bytes) -> None:
-        """Add a frame; drop the oldest ones beyond the limit."""
+        """Add a frame; drop the oldest frames beyond the limit of memory."""
         self._payloads.setdefault(sequence, []).append(payload)
         self._order.append(sequence)
         self._bytes += len(payload)

@@ -1,4 +1,4 @@
-"""Replay of log files, long ones in segments on several processors."""
+"""Replay of log files; long logs are replayed in segments on several processors."""
 
 import contextlib
 import gc

@@ -23,7 +23,7 @@ from lowfc.programs.logs.report.source import LawInForce, Results, Run
 MAX_STEPS = 200_000
 """Only the last steps of a longer stretch are used, to bound the memory."""
 BANDS_HZ = (1.0, 10.0, 100.0, 1000.0)
-"""Edges between the frequency bands; only those between the resolution and the highest frequency are used."""
+"""Edges between the frequency bands; edges below the resolution or above the highest frequency are not used."""
 
 _TIP, _TILT = 2, 3
 
@@ -73,11 +73,11 @@ def longest_stretch(run: Run) -> Stretch | None:
     history, steps = run.history, run.history.steps
     law_of_step = np.searchsorted([law.first for law in run.laws], np.arange(steps.sequence.size), side="right") - 1
     # Before the first law, the index is -1, which selects the element False at the end.
-    known = np.array([*(law.known for law in run.laws), False])[law_of_step]
+    law_known = np.array([*(law.known for law in run.laws), False])[law_of_step]
     linear = np.array([*(law.linear is not None for law in run.laws), False])[law_of_step]
     # Until the next state names the overruled groups, only the steps show that there are any.
     overruled = linear & (steps.reasons >> Limit.LAW_OVERRULED & 1 == 1)
-    closed = (steps.mode == LoopMode.CLOSED) & known & ~overruled & history.under_calibration
+    closed = (steps.mode == LoopMode.CLOSED) & law_known & ~overruled & history.under_calibration
     edges = np.flatnonzero(np.diff(np.where(closed, law_of_step, -1), prepend=-1, append=-1))
     spans = [(first, last) for first, last in pairwise(edges.tolist()) if closed[first]]
     if not spans:

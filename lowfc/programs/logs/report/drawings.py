@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 INK, FAINT, OPEN, CLOSED = (COLOURS[name] for name in ("ink", "faint", "open", "closed"))
 _MODES = {"open": OPEN, "closed": CLOSED, "safe": COLOURS["safe"], "idle": FAINT}
 _BESIDE_TRUTH: dict[str, Any] = {"linestyle": ":", "linewidth": 0.9, "alpha": 0.7}
-"""Style of measured curves if the log also has the true ones."""
+"""Style of measured curves if the log also has the true values."""
 _LIMIT_DRAWN_FROM = 0.25
 """The stroke limit is drawn if more than this fraction of it is used."""
 _MAX_MARKS = 300

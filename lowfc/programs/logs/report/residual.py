@@ -84,9 +84,9 @@ def binned_rms(run: Run) -> dict[str, Array]:
     for name, column in columns.items():
         if column.size:
             squares = np.sum(column.astype(float) ** 2, axis=1)
-            known = np.isfinite(squares)
-            counts = np.add.reduceat(known, starts, dtype=float)
-            sums = np.add.reduceat(np.where(known, squares, 0.0), starts)
+            finite = np.isfinite(squares)
+            counts = np.add.reduceat(finite, starts, dtype=float)
+            sums = np.add.reduceat(np.where(finite, squares, 0.0), starts)
             found[name] = np.sqrt(np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0))
     return found
 
@@ -124,10 +124,10 @@ def _contrast(true: Truths, rows: Integers, config: Configuration | None) -> Res
 
 
 def _rms(values: Single, rows: Integers) -> Array | None:
-    """Rms (modes,) of the rows without NaN; None without any."""
+    """Rms (modes,) over those of `rows` that have no NaN; None if all have NaN."""
     found = values[rows] if values.size else values
-    known = found[np.isfinite(found).all(axis=1)].astype(float)
-    return np.sqrt(np.mean(known**2, axis=0)) if len(known) else None
+    finite = found[np.isfinite(found).all(axis=1)].astype(float)
+    return np.sqrt(np.mean(finite**2, axis=0)) if len(finite) else None
 
 
 def _at(values: Array | None, index: int) -> float | None:

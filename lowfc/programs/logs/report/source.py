@@ -32,9 +32,9 @@ class LawInForce:
     Attributes:
         first: row of the first step under the law; comparisons of laws ignore `first` and `linear`.
         law_id: identity of the linear law, "unknown" if the state has none; empty without a linear law.
-        law_name: name of the linear law; "integrator" without one.
+        law_name: name of the linear law; "integrator" without a linear law.
         overruled: groups of modes that the integrator drives instead of the law.
-        linear: the linear law; None without one, or if it is not in the log, is overruled or has other modes.
+        linear: the linear law; None if there is none, or if it is not in the log, is overruled or has other modes.
     """
 
     first: int = field(compare=False)
@@ -107,9 +107,9 @@ def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None
 
 
 def row_after(history: History, frame_sequence: int, time: Timestamp) -> int:
-    """Row of the first step after those of a frame.
+    """Row of the first step after the steps of a frame.
 
-    If the frame has no step: row of the first later frame since the same start of the camera or, without one, of the
+    If the frame has no step: row of the first later frame since the same start of the camera; if there is none, of the
     first step after `time`, which is on the controller's clock; the camera's clock may differ.
     """
     sequence = history.steps.sequence

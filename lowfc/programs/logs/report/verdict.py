@@ -50,8 +50,8 @@ def _record(results: Results) -> Results:
     if log["messages_lost"]:
         faults.append(f"{counted(log['messages_lost'], 'message')} lost")
     if log["steps_left_out"]:
-        what = "with another number of modes than the calibration or with impossible values"
-        faults.append(f"{counted(log['steps_left_out'], 'message')} {what}, left out")
+        mismatch = "with another number of modes than the calibration or with impossible values"
+        faults.append(f"{counted(log['steps_left_out'], 'message')} {mismatch}, left out")
     if faults:
         return _check("log", BAD if log["stopped"] else LOOK, "; ".join(faults))
     if log["messages_lost"] is None:
@@ -76,7 +76,7 @@ def _why_no_loop(messages: Mapping[str, int]) -> str:
         return "this log has no control steps"
     if CALIBRATION.key not in messages:
         return f"this log has no calibration, without which its {counted(count, 'control step')} cannot be read"
-    return f"this log has {counted(count, 'control step')}, none of which fits its calibration"
+    return f"this log has {counted(count, 'control step')}, but none fits its calibration"
 
 
 def _residual(results: Results) -> Results:
@@ -164,8 +164,8 @@ def _events(results: Results) -> Results:
     if not (worst := grave or warned):
         return _check("events", GOOD, "no warning, no error")
     names = _with_counts(Counter(sorted(event["name"] for event in worst)))
-    what = "error" if grave else "warning"
-    return _check("events", BAD if grave else LOOK, f"{counted(len(worst), what)}: {names}")
+    kind = "error" if grave else "warning"
+    return _check("events", BAD if grave else LOOK, f"{counted(len(worst), kind)}: {names}")
 
 
 def _of_end(events: list[Results]) -> bool:

@@ -121,14 +121,14 @@ def _true(
     assert run.true_nm is not None  # noqa: S101  # the caller has checked it
     disturbance_nm, residual_nm = (values.astype(np.float64) for values in run.true_nm)
     found, covariances = dict[str, Array](), dict[str, Array | None]()
-    known = rows & np.isfinite(residual_nm).all(axis=1)
+    with_truth = rows & np.isfinite(residual_nm).all(axis=1)
     fraction = run.simulated_delay % 1
     for name, after_nm, law_nm in (
         ("was", residual_nm, run.steps.command_nm),
         ("what_if", residual_nm + moved_nm, command_nm),
     ):
-        if known.any():
-            found[f"true_{name}"] = rms(after_nm, known)
+        if with_truth.any():
+            found[f"true_{name}"] = rms(after_nm, with_truth)
         squares = np.full(after_nm.shape, np.nan)
         for piece in np.split(np.arange(len(rows)), np.flatnonzero(run.missing)):
             mirror_nm, next_nm = (after_nm - disturbance_nm)[piece], None
@@ -326,7 +326,7 @@ def _automatic_warnings(changes: WhatIf, noll: tuple[int, ...]) -> list[str]:
     if not kept.any():
         return []
     names = ", ".join(mode_name(index) for index in np.array(noll)[kept].tolist())
-    return [f"automatic gains of --config are not computed: those of {names} are the logged ones; give --set gain=..."]
+    return [f"automatic gains of --config are not computed: {names} keep the logged gains; give --set gain=..."]
 
 
 def _law_warnings(run: LoggedRun, law: Integrator, command_nm: Single) -> list[str]:
