@@ -128,7 +128,7 @@ def oriented(
     `poke` measures the response to a mode, given its index; other arguments as for `on_sensor`.
 
     Returns:
-        The alignment, its calibration, and the mean correlation of the measured responses with the computed ones.
+        The alignment, its calibration, and the mean correlation of measured with computed responses.
     """
     orientations = alignment.orientations
     modes = range(min(len(orientations) // 2, len(computed.noll)))

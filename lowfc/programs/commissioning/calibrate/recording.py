@@ -40,7 +40,7 @@ FAULT_S = 5.0
 """Longest wait before a probe sequence for the end of the mirror's fault."""
 DITHER_SLOWEST = 1 / 16
 """Lowest frequency of a dither that is used, cycles per frame; most of the disturbance is below it."""
-_LIMITS = frozenset(Limit) - {Limit.LAW_OVERRULED}  # those that end a probe sequence
+_LIMITS = frozenset(Limit) - {Limit.LAW_OVERRULED}  # limits that end a probe sequence
 
 
 class PlayInterruptedError(CalibrationError):

@@ -290,7 +290,7 @@ def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Arra
 
     The result agrees with the measurement for the mirror's modal shapes, and with the optical model for other shapes.
 
-    A common factor between measurement and model, such as that of the mirror's stroke or sign, also applies to other
+    A common factor between measurement and model, from the mirror's stroke or sign for example, also applies to other
     shapes. A negative factor is accepted only if focus or spherical is among the modes: a mirror of the opposite sign
     reverses all modes, but half a turn of most sensors reverses tip and tilt alone. If the sensor has another size or
     orientation than the model, the result for other shapes is that of the calibration in use, or else that of their

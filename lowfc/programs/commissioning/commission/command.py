@@ -67,8 +67,8 @@ def commission(
     report = reporter(console)
     options = CommissionOptions(out, frames, dark, no_dark, snr, cycles, resume, close)
 
-    def confirm(what: str) -> None:
-        typer.confirm(what, default=True, abort=True, err=True)
+    def confirm(question: str) -> None:
+        typer.confirm(question, default=True, abort=True, err=True)
 
     with Client(run) as loop, loop.reserved("lowfc commission") as lease, percentage_bar(console) as bar:
         config = configuration_of(loop)

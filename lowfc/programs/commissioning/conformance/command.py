@@ -97,7 +97,7 @@ def mirror(
         )
     with _connection(joined, Role.CONTROLLER) as connection, passing_bar(Console(stderr=True)) as bar:
         task, dialogue = bar.add_task("the mirror", total=None), Dialogue(connection, Expected(settings))
-        checks = mirror_checks(dialogue, duration, lambda what: bar.update(task, description=what), gentle=gentle)
+        checks = mirror_checks(dialogue, duration, lambda stage: bar.update(task, description=stage), gentle=gentle)
     _report_and_exit(f"mirror-{settings.mirror.name}", joined.run_id, checks, as_json)
 
 

@@ -29,7 +29,7 @@ class Received(NamedTuple):
     Attributes:
         key: key under which it was published.
         payload: its bytes.
-        attachment: bytes of the envelope; None without one.
+        attachment: bytes of the envelope; None without an envelope.
         receive_time_ns: time of arrival on the host's clock.
     """
 

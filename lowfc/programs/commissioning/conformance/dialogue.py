@@ -1,4 +1,4 @@
-"""Commands to a mirror under test, small ones first, and the states that answer them."""
+"""Commands to a mirror under test, small shapes first, and the states that answer the commands."""
 
 from collections.abc import Callable
 
@@ -101,7 +101,7 @@ class Dialogue(CollectedMessages):
 
     @property
     def last(self) -> wire.MirrorState | None:
-        """The newest state; None without one."""
+        """The newest state; None if there is none."""
         return self.states[-1][1] if self.states else None
 
     @property
@@ -178,7 +178,7 @@ class Dialogue(CollectedMessages):
         """Send a command, again if it is not answered, and wait for the state that answers it.
 
         Returns:
-            The state, None without an answer; the command's time; and the time until the answer, ns, 0 without one.
+            The state, None without an answer; the command's time; the time until the answer, ns, 0 without an answer.
         """
         self._commanded_nm, before, times_ns, sent_ns = surface_nm, len(self.states), dict[int, int](), 0
         for attempt in range(ATTEMPTS):

@@ -1,4 +1,4 @@
-"""Checks of a mirror driver: sends commands, small ones first, and compares its states with the contract."""
+"""Checks of a mirror driver: send commands, small shapes first, and compare the mirror's states with the contract."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -238,19 +238,19 @@ def _difference(base_nm: Single, commanded_nm: Single, reported_nm: Single, *, m
 
 
 def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
-    """Send invalid commands, which the mirror must refuse, and valid ones in between, which it must apply."""
+    """Send invalid commands, which the mirror must refuse, and valid commands in between, which it must apply."""
     rows, columns = mirror.expected.grid
     other_nm = base_nm + np.float32(0.5) * mirror.expected.pattern_nm[::-1]
     nan_nm, infinite_nm, lost = other_nm.copy(), other_nm.copy(), 0
     nan_nm[rows // 2, columns // 2], infinite_nm[rows // 2, columns // 2] = np.nan, np.inf
-    for name, what, target_nm, cut in (
+    for name, defect, target_nm, cut in (
         ("NaN refused", "one actuator NaN", nan_nm, 0),
         ("infinity refused", "one actuator infinite", infinite_nm, 0),
         ("wrong grid refused", "one row too many", np.zeros((rows + 1, columns), np.float32), 0),
         ("short command refused", "four bytes missing", other_nm, 4),
         ("old command refused", "the frame_sequence before the last", other_nm, 0),
     ):
-        expected = f"a command with {what} changes nothing, and the next valid one is applied"
+        expected = f"a command with {defect} changes nothing, and the next valid one is applied"
         state, _, _ = mirror.ask(base_nm)
         lost += mirror.failed > 0
         before_nm = mirror.surface_nm(state)
@@ -280,7 +280,7 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
 
 
 def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator[Check]:
-    """Raise the mirror, let the command expire while invalid ones arrive, then let one of long validity expire."""
+    """Raise the mirror, let the command expire while invalid commands arrive; then let a long valid command expire."""
     raised_nm, nan_nm = base_nm + np.float32(raised_by_nm), np.full(mirror.expected.grid, np.nan, np.float32)
     for attempt in range(ATTEMPTS):
         mirror.go(base_nm)
@@ -316,7 +316,7 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
     yield judged("longest command", expected, bounded, "EXPIRED", advice, late, warning)
     times_ns = sent_ns, *(message.receive_time_ns for message, _ in mirror.since(sent_ns)), mirror.connection.now_ns()
     longest_s = max(later - earlier for earlier, later in pairwise(times_ns)) / 1e9
-    expected, got = "ten states a second also without commands", f"longest time without one {longest_s:.2g} s"
+    expected, got = "ten states a second also without commands", f"longest time without a state {longest_s:.2g} s"
     advice, severity = "publish the state ten times a second, also when idle", wrong if longest_s > 1.0 else warning
     yield judged("silence", expected, longest_s <= 0.25, got, advice, severity=severity)
 
@@ -378,9 +378,9 @@ def _reaches_stroke(mirror: Dialogue) -> bool:
 
 
 def _peak(moving: Mask) -> tuple[Single, tuple[int, list[int]]]:
-    """A shape with one actuator at 0.5 and all others at -0.5; row and columns of that one and its two neighbours.
+    """A shape with one actuator at 0.5 and all others at -0.5; row and columns of this actuator and its two neighbours.
 
-    The actuator is the nearest to the centre of those that move with both neighbours; of all if there are none.
+    Of the actuators that move with both neighbours, it is the nearest to the centre; of all if none moves so.
     """
     good = np.zeros_like(moving)
     good[:, 1:-1] = moving[:, 1:-1] & moving[:, :-2] & moving[:, 2:]

@@ -76,7 +76,7 @@ def _kept(camera: Camera) -> Check | None:
         return None
     changed = [field for field in _FIELDS if len({str(getattr(state, field)) for state in states}) > 1]
     if changed:
-        return warning(f"{', '.join(changed)} changed", "unless intended: publish the set values, not measured ones")
+        return warning(f"{', '.join(changed)} changed", "unless intended: publish the set values, not measured values")
     return ok(f"{len(states)} identical")
 
 

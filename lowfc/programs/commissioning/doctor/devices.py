@@ -13,30 +13,30 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
     """Check each requirement of the camera and mirror drivers of this name, without opening them."""
     kinds = _kinds(name)
     for kind in kinds:
-        what = f"{kind} {name}"
+        label = f"{kind} {name}"
         try:
             driver = plugins.load(kind, name)
         except ConfigurationError as fault:
-            yield wrong(str(fault), "install it, or correct its name")._replace(name=what)
+            yield wrong(str(fault), "install it, or correct its name")._replace(name=label)
             continue
         try:
             options = plugins.options(driver, plugins.table(config, kind, name))
         except ConfigurationError as fault:
             section = f"drivers.{plugins.section(name)}" + (f".{kind}" if len(kinds) > 1 else "")
             advice = f"set it in [{section}] of a configuration, and give that file with --config FILE"
-            yield wrong(str(fault), advice)._replace(name=what)
+            yield wrong(str(fault), advice)._replace(name=label)
             continue
         found = getattr(driver, "__qualname__", type(driver).__qualname__)  # a factory such as `partial` has none
-        yield ok(f"{driver.__module__}:{found}")._replace(name=what)
+        yield ok(f"{driver.__module__}:{found}")._replace(name=label)
         try:
             with opening("its requirements cannot be checked"):
                 needs = getattr(driver, "needs", lambda _: ())(options)
                 needs = [Need(*(str(part or "") for part in need)) for need in needs]  # found may be a path, or None
         except ConfigurationError as fault:
-            yield wrong(str(fault), "correct its method `needs`, or the code it calls")._replace(name=what)
+            yield wrong(str(fault), "correct its method `needs`, or the code it calls")._replace(name=label)
             continue
         for need in needs:
-            yield judged(f"{what}: {need.what}", "", bool(need.found), need.found or "not found", need.advice)
+            yield judged(f"{label}: {need.what}", "", bool(need.found), need.found or "not found", need.advice)
 
 
 def _kinds(name: str) -> list[plugins.Kind]:

@@ -29,8 +29,8 @@ def _locked_memory(facts: Facts) -> Check:
     if not facts.config.realtime.lock_memory:
         return note("not requested by the configuration: realtime.lock_memory = false")
     if refused := facts.completed_trial.refused.get("lock_memory"):
-        what, cost = refused
-        return warning(f"refused: {what}", _MEMLOCK_ADVICE, cost)
+        reason, cost = refused
+        return warning(f"refused: {reason}", _MEMLOCK_ADVICE, cost)
     return ok("granted")
 
 
@@ -58,8 +58,8 @@ def _swap(facts: Facts) -> Check:
 def _huge_pages(facts: Facts) -> Check:
     """Moving memory to huge pages, as the loop does, and the kernel's setting `transparent_hugepage/enabled`."""
     if refused := facts.completed_trial.refused.get("huge_pages"):
-        what, cost = refused
-        return warning(f"refused: {what}", "a kernel of version 6.1 or newer, with transparent huge pages", cost)
+        reason, cost = refused
+        return warning(f"refused: {reason}", "a kernel of version 6.1 or newer, with transparent huge pages", cost)
     text = facts.host.text("sys/kernel/mm/transparent_hugepage/enabled")
     when = text[text.index("[") + 1 : text.index("]")]
     return ok(when) if when != "always" else warning(when)

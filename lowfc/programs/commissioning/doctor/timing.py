@@ -24,7 +24,7 @@ _SLOW_SOURCES = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
 _SLOW_READING_NS = 1000
 _READINGS = 200  # of the clock, timed together
 _PART_OF_PERIOD = 0.1  # acceptable p99 of the wake-up, in frame periods
-_STOLEN = 1e-3  # share of stolen time above which it is called much
+_STOLEN = 1e-3  # fraction of stolen time above which the report says that it is much
 _BUSY = 0.1  # smallest share of a processor that is reported
 _BUSY_SHOWN = 3
 
@@ -37,9 +37,9 @@ def _scheduling_class(facts: Facts) -> Check:
         reason = "lockstep" if facts.config.lockstep else "realtime.priority = 0"
         return note(f"the configuration requests normal scheduling: {reason}")
     if refused := facts.completed_trial.refused.get("priority"):
-        what, cost = refused
+        reason, cost = refused
         advice = f"`lowfc doctor --setup` (rtprio {priority} in limits.d), or the service's LimitRTPRIO={priority}"
-        return warning(f"refused: {what}", advice, cost)
+        return warning(f"refused: {reason}", advice, cost)
     return ok(f"SCHED_FIFO priority {priority} is granted")
 
 
@@ -146,9 +146,9 @@ def _idle_states(facts: Facts) -> Check:
     detail = f"driver {driver}, deepest state {deepest} with {exit_us} us to wake"
     if facts.config.realtime.disable_cpu_idle:
         if refused := facts.completed_trial.refused.get("disable_cpu_idle"):
-            what, cost = refused
+            reason, cost = refused
             return warning(
-                f"{detail}; not granted: {what}",
+                f"{detail}; not granted: {reason}",
                 "`lowfc doctor --setup`: a udev rule, and this user in its group",
                 cost,
             )
@@ -165,20 +165,20 @@ def _idle_states(facts: Facts) -> Check:
 @CHECKS.check("kernel")
 def _kernel(facts: Facts) -> Check:
     """Preemption model of the kernel."""
-    words = facts.host.text("proc/version").split()
-    release = words[2]
+    version = facts.host.text("proc/version").split()
+    release = version[2]
     advice = "boot with preempt=full, or a kernel with PREEMPT_RT"
     cost = "a frame may have to wait for the end of another program's system call"
-    if "PREEMPT_RT" in words:
+    if "PREEMPT_RT" in version:
         return ok(f"{release}, PREEMPT_RT")
-    if "PREEMPT_DYNAMIC" in words:
+    if "PREEMPT_DYNAMIC" in version:
         model = re.search(r"\((\w+)\)", facts.host.text_or_nothing("sys/kernel/debug/sched/preempt"))
         model = model or re.search(r"(?:^| )preempt=(\w+)", facts.host.text("proc/cmdline"))
         if model is None:
             return note(f"{release}, PREEMPT_DYNAMIC; which model is in force is hidden", advice, cost)
         detail = f"{release}, PREEMPT_DYNAMIC, {model[1]}"
         return ok(detail) if model[1] == "full" else warning(detail, advice, cost)
-    if "PREEMPT" in words:
+    if "PREEMPT" in version:
         return ok(f"{release}, PREEMPT")
     return warning(f"{release}, no preemption of the kernel", advice, cost)
 

@@ -49,7 +49,7 @@ class Telemetry:
         noll: Noll index of each mode.
         timing: delay and exposure of the loop, measured if possible.
         law: the integrator's gains at the end.
-        driving: the linear law in force instead of the integrator at the end; None without one.
+        driving: the linear law in force at the end; None if the integrator is in force.
         closed: whether the loop was closed in these frames.
         frames_closed: number of these frames with the loop closed.
         pol: pseudo-open-loop modes (frames, modes), in pieces without gaps.
@@ -208,7 +208,7 @@ def _from_first_used(run_id: str, steps: Steps) -> Steps:
 
 
 def _without_probes(steps: Steps, seen: SeenCommands, assumed: float, played: Mask) -> tuple[Steps, Mask]:
-    """The steps with pseudo-open-loop modes for the measured delay, and the usable ones (steps,).
+    """The steps with pseudo-open-loop modes for the measured delay, and whether each step is usable (steps,).
 
     Steps with a probe sequence (`played`) get mode 0, as if the loop were not closed, so that the time to settle after
     the sequence is excluded, too.
@@ -266,7 +266,7 @@ def _telemetry(
     calibration: Calibration,
     warnings: Sequence[str],
 ) -> Telemetry:
-    """The usable steps after the loop has settled in closed loop, or all usable ones if those are too few.
+    """The usable steps after the closed loop has settled, or all usable steps if the former are too few.
 
     `laws` are the integrator and the linear law in force, if any. `true_residual` has the residual at the start of each
     exposure and its rms over all time (steps, modes). The laws are in force since the frame `changed`.
