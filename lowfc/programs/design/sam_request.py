@@ -27,7 +27,7 @@ class Search:
         edge: Least distance from a hole to the pupil's edge, in pupil diameters.
         symmetry: none, or the axis of a mirror symmetry: x or y.
         seed: Seed of all random numbers.
-        chains: Independent searches, of which the best is used; along a front, one for each weight.
+        chains: Number of independent searches: the best is used; along a front, each has another weight.
         steps: Steps of each chain.
         name: Name of the layout.
     """
@@ -55,9 +55,9 @@ class Search:
             raise ValueError(f"--focal-mask must be {', '.join(FOCAL_MASKS)} or both, got {self.focal_mask!r}")
         if not self.name or not all(letter.isalnum() or letter in "_-" for letter in self.name):
             raise ValueError(f"--name must be of letters, digits, _ and -, got {self.name!r}")
-        for what, value in {"chains": self.chains, "steps": self.steps}.items():
+        for option, value in {"chains": self.chains, "steps": self.steps}.items():
             if value < 1:
-                raise ValueError(f"{what} must be at least 1, got {value}")
+                raise ValueError(f"{option} must be at least 1, got {value}")
         if self.seed < 0:
             raise ValueError(f"the seed must not be negative, got {self.seed}")
         _ = self.goal, self.bounds  # validated here

@@ -285,14 +285,14 @@ class Context:
         numbers = [part if isinstance(part, int) else zlib.crc32(part.encode()) for part in key]
         return np.random.default_rng([self.seed, *numbers])
 
-    def map(self, what: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    def map(self, description: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """Apply the function to all items on `jobs` threads, with progress; results in the order of the items."""
         todo: Sequence[Item] = list(items)
         results: list[Result] = []
         with ThreadPool(self.jobs) as pool:  # its threads are daemons: Ctrl-C does not wait for them
             for result in pool.imap(function, todo):
                 results.append(result)
-                self.progress(what, len(results), len(todo))
+                self.progress(description, len(results), len(todo))
         return results
 
 

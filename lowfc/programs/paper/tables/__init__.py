@@ -1,1 +1,1 @@
-"""The paper's tables, and the additional ones of `lowfc validate`."""
+"""The paper's tables, and the additional tables of `lowfc validate`."""

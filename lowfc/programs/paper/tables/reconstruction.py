@@ -52,7 +52,7 @@ class Input:
 
 
 def inputs(sensor: Prepared, modes: int, literal: bool) -> Iterator[Input]:
-    """Interpretations of Sect. 3.1: the one that matches the input of Table 3, and if `literal` those of the text."""
+    """Interpretations of Sect. 3.1: matched to the input of Table 3, and if `literal` also with the text's bounds."""
     low, high = trials.LITERAL_WAVES
     bounds = trials.bounds_waves(NOLLS_20[:modes], low, high)
     literal_rms = trials.input_rms(sensor.gram[:modes, :modes], bounds)

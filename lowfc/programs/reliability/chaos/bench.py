@@ -99,7 +99,7 @@ class Outcome:
 
 
 class ChaosBench:
-    """A simulated loop with injected faults; `children` and `health` are those of the present process of each role."""
+    """A simulated loop with injected faults; `children` and `health` have the present process of each role."""
 
     def __init__(self, config: Configuration, folder: Path, rng: random.Random, fault: dict[str, Any] | None) -> None:
         """Open a run whose logs go to `folder`; `fault`, if any, is injected into the camera's frames."""
@@ -152,12 +152,12 @@ class ChaosBench:
         timeout_s = WAIT_S + frames / self.config.camera.rate_hz
         self.wait(lambda: self._closed_frames >= frames, f"{frames} good frames with the loop closed", timeout_s)
 
-    def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = WAIT_S) -> None:
+    def wait(self, condition: Callable[[], bool], awaited: str, timeout_s: float = WAIT_S) -> None:
         """Wait for a condition; CaseFailedError after the timeout."""
         deadline_s = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() >= deadline_s:
-                raise CaseFailedError(f"waited {timeout_s:g} s in vain for {what}")
+                raise CaseFailedError(f"waited {timeout_s:g} s in vain for {awaited}")
             time.sleep(_POLL_S)
 
     def pause(self, shortest_s: float, longest_s: float) -> None:

@@ -105,7 +105,7 @@ def read(folder: Path) -> Evidence:
 
 
 def _add(evidence: Evidence, message: Sample, number: int | None) -> None:
-    """Add a message; `number` is that of its log, None if the log is unfinished."""
+    """Add a message; `number` is the number of its log, None if the log is unfinished."""
     evidence.messages += 1
     start_s, count = start_of(message.sequence), count_of(message.sequence)
     if start_s <= FORGED_S:

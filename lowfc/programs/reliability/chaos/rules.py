@@ -76,13 +76,13 @@ def _limits(outcome: Outcome, evidence: Evidence) -> Finding:
     return _finding("limits", wrong if states else [*wrong, count], count)
 
 
-def _violations(what: str, limits: Limits, shapes: list[Entry], moving: Mask) -> Iterator[str]:
+def _violations(source: str, limits: Limits, shapes: list[Entry], moving: Mask) -> Iterator[str]:
     """Limits that shapes violate at the `moving` actuators; n missing messages allow n + 1 slew steps."""
     if not shapes:
         return
     surface = np.array([shape.actuators_nm for shape in shapes], np.float64)
     if not np.isfinite(surface[:, moving]).all():
-        yield f"{what} that is not finite"
+        yield f"{source} that is not finite"
         return
     surface[:, ~moving] = np.nan
     messages_apart = np.diff([shape.sequence for shape in shapes])
@@ -95,7 +95,7 @@ def _violations(what: str, limits: Limits, shapes: list[Entry], moving: Mask) ->
         ("slew", slews[same_publisher].max(initial=0), limits.slew_nm),
     ):
         if value > bound:
-            yield f"{what}: {name} {value:.2f} nm, above the limit of {bound:g} nm"
+            yield f"{source}: {name} {value:.2f} nm, above the limit of {bound:g} nm"
 
 
 def restart_steps_nm(evidence: Evidence) -> list[float]:

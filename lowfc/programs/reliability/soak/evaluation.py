@@ -43,7 +43,7 @@ def slope(times_s: Sequence[float], values: Sequence[float]) -> tuple[float, flo
 
 
 def _grew(counts: Sequence[int]) -> bool:
-    """Whether the median of the last quarter of the samples exceeds that of the second quarter."""
+    """Whether the median of the last quarter of the samples exceeds the median of the second quarter."""
     quarter = len(counts) // 4
     return bool(np.median(counts[-quarter:]) > np.median(counts[quarter : 2 * quarter]))
 
@@ -62,9 +62,9 @@ def process_statistics(samples: Sequence[Usage]) -> dict[str, Any]:
         grows, too_short = [name for name, grew in checks.items() if grew], []
     measured = {"memory": [round(mb, 2) for mb in memory_mb], "handles": handles, "threads": threads}
     usage: dict[str, Any] = {}
-    for what, values in measured.items():
-        unit = "_mb" if what == "memory" else ""
-        usage |= {f"{what}_first{unit}": values[0], f"{what}_most{unit}": max(values), f"{what}_last{unit}": values[-1]}
+    for name, values in measured.items():
+        unit = "_mb" if name == "memory" else ""
+        usage |= {f"{name}_first{unit}": values[0], f"{name}_most{unit}": max(values), f"{name}_last{unit}": values[-1]}
     return {**usage, **_per_hour("memory_mb", memory_slope), "grows": grows, "too_short": too_short}
 
 
