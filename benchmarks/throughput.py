@@ -2,8 +2,8 @@
 
 A rate is sustained if at most one frame in a thousand is without a command, the recorder loses no message, and the
 frame rate is within 1 % of the requested one, in two of up to three runs. The highest such rate of a geometric grid is
-found by bisection. The loops are those of `lowfc latency`, which skips the first half second, except in the counts of
-lost messages and late commands.
+found by bisection. `lowfc latency` runs the loops. Its results leave out the first half second, but the counts of lost
+messages and late commands include it.
 
 Example:
     python -m benchmarks throughput
@@ -30,7 +30,8 @@ LOOPS = {
 """Options of `lowfc latency` for each loop."""
 MAX_WITHOUT_COMMAND = 0.001
 RATE_TOLERANCE = 0.01
-COMPARED_HZ = 1000.0
+COMMON_HZ = 1000.0
+"""Rate at which the processor times of all loops are compared."""
 
 _ROLES = ("camera", "controller", "mirror", "recorder")
 
@@ -114,7 +115,7 @@ def highest_rate(loop_options: Sequence[str], rates: Sequence[float], seconds: f
     """Find the highest rate of one loop.
 
     highest_hz: None if not even the lowest is sustained; run: a sustained run at that rate; above: a run one step
-    faster that was not sustained (None at the end of the grid); compared: a run at `COMPARED_HZ`.
+    faster that was not sustained (None at the end of the grid); compared: a run at `COMMON_HZ`.
     """
     command = shlex.join(["lowfc", "latency", *loop_options])
     runs: list[Result] = []
@@ -131,13 +132,13 @@ def highest_rate(loop_options: Sequence[str], rates: Sequence[float], seconds: f
         return next((run for run in at_rate if sustained is not bool(complaints(run))), None)
 
     index = search(sustains, len(rates))
-    report(f"{command}: {COMPARED_HZ:g} Hz")
+    report(f"{command}: {COMMON_HZ:g} Hz")
     return {
         "command": command,
         "highest_hz": rates[index] if index >= 0 else None,
         "run": run_at(index, sustained=True),
         "above": run_at(index + 1, sustained=False),
-        "compared": run_once(loop_options, COMPARED_HZ, seconds),
+        "compared": run_once(loop_options, COMMON_HZ, seconds),
         "runs": runs,
     }
 

@@ -37,7 +37,7 @@ def _short(text: str | None) -> str | None:
 
 
 def setup(app: Sphinx) -> None:
-    """Put the built parts into the pages, and shorten the types of arrays."""
+    """Put the generated parts of the reference into the pages, and shorten the types of arrays."""
 
     def read(_app: Sphinx, _name: str, source: list[str]) -> None:
         source[0] = with_built(source[0])

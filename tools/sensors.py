@@ -80,12 +80,12 @@ def alone(name: str) -> Results:
         results["quantum_share"] = float(np.median(np.diag(limit) / np.diag(bound)))
         slopes = normalise_flux(light, shear_response(optics), np.ones(light.size))[1]
         mistaken_nm = SHEAR * np.linalg.norm(plain.reconstructor @ slopes, axis=0)
-        results["shear_taken_for_nm"] = float(np.sqrt(np.mean(mistaken_nm**2)))
+        results["error_from_shear_nm"] = float(np.sqrt(np.mean(mistaken_nm**2)))
     return results
 
 
 def tilt_noise_mas(config: Configuration, calibration: Calibration) -> float:
-    """Noise of one frame's tip and tilt, rms of both axes, fitted with all modes."""
+    """Noise of one frame's tip and tilt, per axis (rms of the two axes), fitted with all modes."""
     noise_nm = factory.frame_noise_nm(config, calibration)[:2]
     return float(np.sqrt(np.mean(noise_nm**2)) / tilt_nm_per_mas(config.star.diameter_m))
 
@@ -108,7 +108,7 @@ def render(results: Results) -> str:
     ]
     rows = []
     for name, sensor in results["sensors"].items():
-        keys = ("noise_mas", "noise_in_band_mas", "noise_with_shear_mas", "shear_taken_for_nm")
+        keys = ("noise_mas", "noise_in_band_mas", "noise_with_shear_mas", "error_from_shear_nm")
         cells = [name, f"{100 * sensor['light']:.2f}", f"{100 * sensor['peak']:.2f}"]
         cells.append(f"{sensor['cond14']:.0f}" if sensor["cond14"] < 1e6 else f"{sensor['cond14']:.0e}")
         cells.append(f"{100 * sensor['quantum_share']:.1f}" if "quantum_share" in sensor else "-")
@@ -125,10 +125,11 @@ def render(results: Results) -> str:
         "detector; peak is the brightest pixel's share of that; cond14 is the condition number of H for Z2 "
         "to Z15. Quantum is the ratio "
         "of the quantum limit to the Cramer-Rao bound in variance: the median of the modes, without read noise. "
-        "Noise is of tip and tilt, rms of both axes, in one frame of "
+        "Noise is of tip and tilt, per axis (rms of the two axes), in one frame of "
         f"{star.exposure_ns / 1e6:g} ms of a star of V = {star.star.magnitude:g}, all {len(star.noll)} modes fitted, "
         "all photons at the central wavelength; then with "
-        "the same photons over the band of 20 %, in four wavelengths; then with the shear of the beam as an additional "
+        "the same photons over a band 20 % of the central wavelength wide, in four wavelengths; then with "
+        "the shear of the beam as an additional "
         f'fitted parameter. "Error from shear" is the wavefront error, nm rms over the circle, from a shear of '
         f"{100 * SHEAR:g} % of the diameter that is not fitted. The twin's time is for one frame on one thread. "
         "The last columns are open loop -> closed loop for two disturbances: true wavefront over the open pupil, and "

@@ -59,8 +59,8 @@ DEFINITIONS = {
     "pyrtcao's WavefrontSensor.expose",
     "t1": "just after the controller has sent the frame's command: after the stream's semaphores are posted, "
     "after the zenoh put, or after pyrtcao's write_stream; for lowfc after the direct link's send, before zenoh's",
-    "to the mirror": "from t0 until the actuators are in the mirror's process; for lowfc until just before it "
-    "publishes its state",
+    "to the mirror": "from t0 until the mirror's process has received the actuator values; for lowfc until just before "
+    "it publishes its state",
     "clock": "CLOCK_MONOTONIC, one host",
     "pacing": "the source sleeps until absolute times; a late frame is sent at once, and its t0 is the actual time of "
     "sending; no frame is skipped",
@@ -70,7 +70,8 @@ DEFINITIONS = {
     "pinning": "source and mirror on the first processor, all else on the second; with three or more processors "
     "lowfc's mirror on the third",
     "memory": "lowfc's processes lock theirs (`realtime.lock_memory`), the others do not",
-    "threads": "BLAS and numba 1; garbage collection off everywhere; chain.c by cc -O3 -march=native -ffast-math",
+    "threads": "BLAS and numba 1; garbage collection off everywhere",
+    "compiler": "the C implementation (chain.c) is built with cc -O3 -march=native -ffast-math",
 }
 
 
@@ -96,7 +97,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, report: Report) -> Result:
-    """Run all implementations in turns: statistics of each turn (None if it failed), and reasons for missing ones."""
+    """Run all implementations in turns: statistics of each turn (None if it failed), and why one is missing."""
     chosen = [one for one in IMPLEMENTATIONS if any(word in one.name for word in options.only or [""])]
     if not chosen:
         raise ConfigurationError(f"--only: none of {'; '.join(one.name for one in IMPLEMENTATIONS)}")
@@ -158,8 +159,8 @@ def one_run(implementation: Implementation, options: argparse.Namespace, priorit
 def run_statistics(folder: Path, warm_up: int) -> dict[str, Any]:
     """Statistics of a run without its first `warm_up` frames; percentiles in us, None without any command.
 
-    command_error: largest difference of the last actuators from those of numpy, relative to the largest actuator; None
-    if a command is missing.
+    command_error: largest difference between the actuator values of the last command and those of numpy, relative
+    to the largest of these; None if a command is missing.
     """
     due, published, commanded, received = (np.fromfile(folder / name, np.int64)[1:] for name in TIME_STAMPS)
     command_error = _command_error(folder, commanded.size) if commanded.all() and received[-1] else None

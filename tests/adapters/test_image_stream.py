@@ -58,7 +58,7 @@ def test_images_of_every_type_are_read_and_written(path: Path, number: int) -> N
     assert received.pixels.dtype == NUMPY_TYPES[number]
     assert np.array_equal(received.pixels, image(1, number))
     stream, other = Stream(path), PlainStream(path, COLUMNS, ROWS, number)
-    other.take(7)
+    other.reserve_semaphore(7)
     before_ns = time.clock_gettime_ns(time.CLOCK_TAI)
     stream.put(image(2, number))
     assert other.wait(7, 1)
@@ -76,7 +76,7 @@ def test_a_created_stream_is_readable_by_others(path: Path) -> None:
     other = PlainStream(path, COLUMNS, ROWS, FLOAT32)
     assert (path.stat().st_mode & 0o777, other.get("<Q", 232)) == (0o666, path.stat().st_ino)
     assert [other.get("<I", 116), other.get("<I", 120), other.get("<Q", 128), other.get("B", 136)] == [9, 6, 54, 9]
-    other.take(3)
+    other.reserve_semaphore(3)
     stream.put(image(1, FLOAT32), 1_700_000_000_000_000_000)
     assert other.wait(3, 1)
     assert np.array_equal(other.pixels[0], image(1, FLOAT32))
@@ -210,9 +210,9 @@ def test_a_recreated_stream_is_reopened(path: Path) -> None:
     with pytest.raises(StreamError, match="layout version"):
         reader.next(0.02)
     writer = new_stream(path, version=b"")
-    writer.map[writer.semaphores + 8] ^= 1
+    writer.map[writer.semaphores + 8] ^= 1  # not yet initialised, although the version is set
     writer.map[:4] = b"2.00"
-    assert reader.next(0) is None, "the stream may still be incomplete"
+    assert reader.next(0) is None, "an unusable stream is read once more before it is an error"
     new_stream(path).write(image(4))
     newest(reader)
 
@@ -229,8 +229,8 @@ def test_a_truncated_file_is_no_longer_accessed(path: Path) -> None:
 
 def test_each_reader_has_its_own_semaphore(path: Path) -> None:
     writer = new_stream(path)
-    writer.take(0, os.getppid())
-    writer.take(1, dead_pid())
+    writer.reserve_semaphore(0, os.getppid())
+    writer.reserve_semaphore(1, dead_pid())
     reader = StreamReader(path)
     assert writer.get("<i", writer.readers + 4) == os.getpid()  # the dead process's semaphore
     writer.write(image(1))
@@ -239,12 +239,12 @@ def test_each_reader_has_its_own_semaphore(path: Path) -> None:
     reader.close()
     assert writer.get("<i", writer.readers + 4) == 0
     for index in range(10):
-        writer.take(index, os.getppid())
+        writer.reserve_semaphore(index, os.getppid())
     with pytest.raises(StreamError, match=f"processes .*{os.getppid()}.* hold them"):
         StreamReader(path)
 
 
-def test_semaphores_are_posted_up_to_ten_and_a_full_one_blocks_nothing(path: Path) -> None:
+def test_semaphores_are_posted_up_to_a_value_of_ten_and_a_full_one_blocks_nothing(path: Path) -> None:
     writer = new_stream(path)
     reader = StreamReader(path)
     stream = Stream(path)
@@ -290,8 +290,8 @@ def test_damaged_headers_cause_no_access_outside_the_stream(path: Path) -> None:
     rng = np.random.default_rng(7)
     writer = new_stream(path, planes=2, axes=3, kind=0x20001, keywords={"tint": 1e-3})
     good = bytes(writer.map)
-    # Readers and writers may change eleven semaphores and four blocks of counters, but nothing after them.
-    after_counters = slice(writer.semaphores + 11 * 32 + 4 * 40, None)
+    # Readers and writers may change eleven semaphores and four blocks of one int32 for each, but nothing after them.
+    after_shared = slice(writer.semaphores + 11 * 32 + 4 * 40, None)
     opened = 0
     for _ in range(1500):
         writer.map[:] = good
@@ -314,5 +314,5 @@ def test_damaged_headers_cause_no_access_outside_the_stream(path: Path) -> None:
         stream.put(np.zeros(stream.layout.shape[1:], stream.layout.dtype))
         assert isinstance(stream.newest.acquired_ns, int)
         assert bytes(writer.map[:184]) == header
-        assert bytes(writer.map[after_counters]) == good[after_counters]
+        assert bytes(writer.map[after_shared]) == good[after_shared]
     assert 75 < opened < 1425

@@ -1,4 +1,4 @@
-"""A run's directory: links, secret, starts, the safe-mode latch, and atomic replacement of files."""
+"""A run's directory: links, secret, start times of processes, the safe-mode latch, and atomic replacement of files."""
 
 import errno
 import os
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("own_runtime")
 FULL_DISK = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
 
 
-def test_a_run_has_free_ports_below_those_of_outgoing_connections_a_secret_and_private_files(
+def test_a_run_has_a_secret_private_files_and_free_ports_below_the_outgoing_range(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     lowest_outgoing = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
@@ -148,7 +148,7 @@ def test_an_invalid_runtime_directory_is_an_error(own_runtime: Path, monkeypatch
         shared.rmdir()
 
 
-def test_a_start_is_claimed_once() -> None:
+def test_each_start_time_of_a_role_is_claimed_once() -> None:
     links = open_run("night").links
     assert [links.claim_start("camera", start_s) for start_s in (100, 100, 50, 200)] == [100, 101, 102, 200]
     assert links.claim_start("controller", 100) == 100
@@ -252,7 +252,7 @@ def test_a_latch_is_kept_in_one_place_while_the_other_is_missing_and_later_in_bo
     assert len(reported) == 1, "reported once despite retries, and a failing handler does not end the thread"
 
 
-def test_an_unreadable_latch_is_safe_and_an_unwritable_one_is_detected(tmp_path: Path) -> None:
+def test_an_unreadable_latch_counts_as_safe_mode_and_an_unwritable_one_is_detected(tmp_path: Path) -> None:
     reported: list[str] = []
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
@@ -304,7 +304,7 @@ def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatc
     assert calls == [False]
 
 
-def test_only_errors_of_the_writing_are_reported_as_errors_of_the_file(tmp_path: Path) -> None:
+def test_errors_of_its_block_are_reported_as_file_errors_by_being_written_but_not_by_draft(tmp_path: Path) -> None:
     with (
         pytest.raises(DataFileError, match="file cannot be written: Connection refused"),
         being_written(tmp_path / "file"),

@@ -230,7 +230,7 @@ class Sum(threading.Thread):
         self.total = channel(folder, "dm00disp", make=True)
         self.others = channel(folder, "dm00disp00", make=True)
         self.own, self.running = channel(folder), True
-        self.own.take(4)  # the semaphore that `run` waits for
+        self.own.reserve_semaphore(4)  # the semaphore that `run` waits for
         self.start()
 
     def run(self) -> None:

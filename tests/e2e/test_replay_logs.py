@@ -98,7 +98,7 @@ def test_operators_a_restart_dropped_frames_and_rotation(night: Night, tmp_path:
     night.start("controller")
     night.loop.gain(0.3)
     until(lambda: len(list((tmp_path / "logs").glob("*.mcap"))) >= 2)
-    for name in ("camera", "controller", "mirror-dm", "recorder"):  # from the source of the data to its end
+    for name in ("camera", "controller", "mirror-dm", "recorder"):  # in the order of the data flow, the recorder last
         night.end(name)
     logs = sorted((tmp_path / "logs").iterdir())
     results = json_of("replay", *logs)

@@ -133,6 +133,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
         "STAR SATURATED BAD",
         "Every frame is refused, detector saturated",
     ),
+    # The percentage is the flux: the three full pixels add 83 %.
     "nearly saturated": (setting(saturated_pixels=3), "STAR 183 % WARNING", "3 pixels at full well"),
     "star gone": (setting(reasons=(Rejection.DARK,), flux=0.01), "STAR GONE BAD", "the star is gone"),
     "dim": (setting(flux=0.4), "STAR 40 % WARNING", "The star is dim"),

@@ -53,9 +53,9 @@ TYPES = {
     for number, name in enumerate(("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8"), start=1)
 }
 NUMBERS = {dtype: number for number, dtype in TYPES.items()}
-MATRIX = 2
+MATH_DATA = 2
 """Kind of a stream without a time axis, as created by the C library."""
-_TIME_AXIS, _TIME_MASK = 0x20001, 0xF000F
+_TIME_AXIS, _TIME_MASK = 0x20001, 0xF000F  # CIRCULAR_BUFFER | ZAXIS_TEMPORAL
 
 
 class Layout(NamedTuple):
@@ -94,7 +94,9 @@ class Layout(NamedTuple):
         time_axis = int(header["kind"]) & _TIME_MASK == _TIME_AXIS
         columns, rows, planes = size[0], size[1], size[2] if axes == 3 else 1
         if planes > 1 and not time_axis:
-            raise ValueError(f"is a cube of {planes} planes without a time axis, expected a circular buffer of images")
+            raise ValueError(
+                f"is a cube of {planes} planes without a time axis, expected images written to the planes in turn"
+            )
         if header["location"] != -1:
             raise ValueError(f"is in the memory of graphics card {header['location']}, expected shared memory")
         if header["shared"] != 1:

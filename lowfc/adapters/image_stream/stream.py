@@ -16,7 +16,7 @@ from lowfc.adapters.image_stream.layout import (
     HEADER,
     HEADER_BYTES,
     KEYWORD,
-    MATRIX,
+    MATH_DATA,
     NEWEST,
     NEWEST_START,
     NUMBERS,
@@ -133,7 +133,7 @@ class Stream:
         header = np.zeros(1, HEADER)
         fields: dict[str, Any] = {"version": VERSION.encode(), "name": path.name.removesuffix(".im.shm").encode()}
         fields |= {"axes": 2, "size": (columns, rows, 0), "elements": rows * columns, "type": NUMBERS[pixel]}
-        fields |= {"kind": MATRIX, "creator": os.getpid(), "shared": 1, "location": -1, "semaphores": SEMAPHORES}
+        fields |= {"kind": MATH_DATA, "creator": os.getpid(), "shared": 1, "location": -1, "semaphores": SEMAPHORES}
         fields |= {"traces": TRACES, "data_bytes": rows * columns * pixel.itemsize}
         fields |= {"created": _now_tai(), "accessed": _now_tai()}
         try:

@@ -1,7 +1,7 @@
 """History of a run for reports, exports and what-ifs: columns of its frequent messages, and its rare messages.
 
-A history omits control inputs, bench values, offloads, images, surfaces and commands' shapes; `History.reader` reads
-these.
+A history omits control inputs, values that other programs publish (`lowfc/bench`), offloads, images, surfaces and
+commands' shapes; `History.reader` reads these.
 """
 
 import contextlib
@@ -113,17 +113,18 @@ class History:
         command_sequence, command_publish_ns: message sequence and publish time of every mirror command in the log.
         stepped_sequence: frame sequence of every step in the log, also of those that `steps` leaves out.
         steps, truths: steps and truths with the number of modes of the last calibration.
-        stages_ns: (timed steps,) durations of each of `STAGES`, for the frames of `timed_sequence`.
+        stages_ns: (timed steps,) durations of each of `columns.STAGES`, for the frames of `timed_sequence`.
         excluded_messages: number of steps with another number of modes than the last calibration, and of messages with
             impossible values.
-        requests: operators' requests, with the answers.
+        requests: requests of operators and of the controller itself, with the answers.
         events: (publish time in ns, message) of each event.
         health: last Health of each process, by name.
         commands_late: commands that the camera counted as late between its first and last Health in the log, also
             across restarts; None with fewer than two Healths.
         counts: number of messages, by topic key.
         published: calibrations, laws and played tables, by identity.
-        span_ns: log times of the first message of a topic that is not queryable, and of the last message; (0, 0): none.
+        span_ns: log times of the first message, without the states and calibrations stored at the start of the log, and
+            of the last message; (0, 0): none.
     """
 
     log: LogReader
@@ -162,8 +163,8 @@ class History:
         """Frame rate, Hz; see `frame_rate_hz`."""
         return frame_rate_hz(self.camera, self.steps)
 
-    def camera_lag_ns(self, process: str) -> int:
-        """Correction to add to a frame's time for another process's clock, ns; publish times are on the recorder's."""
+    def camera_clock_offset_ns(self, process: str) -> int:
+        """Offset that converts a frame's time to the clock of `process`, ns; publish times are the recorder's."""
         camera, other = (self.health.get(name, wire.Health()) for name in (Role.CAMERA, process))
         return camera.router_offset_ns - other.router_offset_ns
 
@@ -171,7 +172,7 @@ class History:
         """Timing of the loop from the mirror's reports; that of `Timing.of` without usable reports, as in lockstep."""
         if (exposure := exposure_fraction(self.camera)) is None:
             exposure = (self.configuration or Configuration()).camera.exposure_fraction
-        applied = self.mirror.sequence, self.mirror.publish_time_ns - self.camera_lag_ns(Role.RECORDER)
+        applied = self.mirror.sequence, self.mirror.publish_time_ns - self.camera_clock_offset_ns(Role.RECORDER)
         return measured_timing(Timing.of(delay_frames, exposure), self.steps, *applied, self.rate_hz)
 
     @property

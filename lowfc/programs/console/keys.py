@@ -49,7 +49,7 @@ class OrderedKeys(App[str]):
             self.set_timer(_TIMEOUT_S, partial(self._next_key, self._turn))
 
     def _follow(self, node: DOMNode, turn: int) -> None:
-        """Queue a call behind the key in each widget from `node` up to the application, and then `_settle`."""
+        """Follow the key from `node` up through its parents: queue a call behind it in each; then call `_settle`."""
         if node is self or not node.call_later(self._follow, node.parent or self, turn):
             self.call_later(self._settle, turn)
 

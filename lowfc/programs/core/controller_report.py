@@ -118,7 +118,7 @@ class LastSecond:
 
 
 def fill_harm_and_contrast(health: wire.Health, watch: GainWatch, state: State) -> None:
-    """Add the harm that closing would do, and the measured added contrast, to a Health."""
+    """Add to a Health why closing would increase the residual (empty if not), and the measured added contrast."""
     health.closing_harm = watch.closing_harm
     measured = watch.added_contrast()
     if measured is None or state.loop is None or not measured[0]:

@@ -81,7 +81,8 @@ class FoxgloveBridge:
         """Subscribe on the bus of a run; the bus of an earlier run of the same name is already closed."""
         self._bus, self._names = bus, Names()
         self.last_states.clear()
-        # The service subscribes to Health after these: peers take that for the last of the viewer's subscriptions.
+        # The service subscribes to Health last: once the viewer reports Health of a peer, that peer assumes that all
+        # subscriptions of the viewer are in place.
         for topic in SHOWN:
             bus.subscribe(topic, partial(self._publish, topic))
         self.service = Service(Role.VIEWER, self._run_id, self._clock, bus)

@@ -51,7 +51,7 @@ class Comb:
             path = file_of(self.folder, f"{TOTAL}{index:02d}")
             if path.name not in self.channels and path.exists():
                 self.channels[path.name] = PlainStream(path, *self.shape, FLOAT32)
-                self.channels[path.name].take(0)
+                self.channels[path.name].reserve_semaphore(0)
 
     def run(self) -> None:
         """Wait for the loop's channel; update the sum whenever a channel was written."""

@@ -138,7 +138,7 @@ class PlainStream:
         self.begin(image, plane)
         self.end(acquired_ns)
 
-    def take(self, index: int, pid: int | None = None) -> None:
+    def reserve_semaphore(self, index: int, pid: int | None = None) -> None:
         """Register a process, by default this one, as the reader of a semaphore."""
         self.pack("<i", self.readers + 4 * index, os.getpid() if pid is None else pid)
 

@@ -225,7 +225,7 @@ def _check_undisturbed(history: History, first: int, end: int, *, play: bool) ->
     if not (play and times_ns.size):
         return
     for _, event in history.events:
-        event_ns = from_timestamp(event.timestamp) - history.camera_lag_ns(event.name)
+        event_ns = from_timestamp(event.timestamp) - history.camera_clock_offset_ns(event.name)
         if event.message.startswith(INTERRUPTIONS) and times_ns[0] <= event_ns <= times_ns[-1]:
             raise DataFileError(f"{path}: {event.message}, during the measurement")
 

@@ -118,7 +118,9 @@ def row_after(history: History, frame_sequence: int, time: Timestamp) -> int:
         later = (sequence > frame_sequence) & (sequence >> COUNT_BITS == frame_sequence >> COUNT_BITS)
         if later.any():
             return int(np.argmax(later))
-        rows = np.flatnonzero(history.steps.time_ns + history.camera_lag_ns(Role.CONTROLLER) <= from_timestamp(time))
+        rows = np.flatnonzero(
+            history.steps.time_ns + history.camera_clock_offset_ns(Role.CONTROLLER) <= from_timestamp(time)
+        )
     return int(rows[-1]) + 1 if rows.size else 0
 
 

@@ -227,7 +227,7 @@ class LoggedRun:
             return delay_from_truth(moved_nm, steps.command_nm, self.missing), "the true wavefront"
         if history.camera is None:
             return None, ""
-        starts_ns = steps.time_ns + history.camera_lag_ns(Role.RECORDER) - int(history.camera.exposure_ns)
+        starts_ns = steps.time_ns + history.camera_clock_offset_ns(Role.RECORDER) - int(history.camera.exposure_ns)
         mirror = history.mirror
         delay = delay_from_times(steps.sequence, starts_ns, mirror.sequence, mirror.publish_time_ns)
         return delay, "the times of frames and mirror"
