@@ -41,7 +41,7 @@ def measure() -> Results:
 
 
 def case(config: Configuration) -> Results:
-    """Mean residual of each mode over windows, rms over the windows, and the bounds by light and camera."""
+    """Mean residual of each mode over windows, rms over the windows; photon-noise bound, and noise through R."""
     calibration = calibrated(config)
     bench = Bench(config, calibration)
     frames = round(WINDOW_S * RATE_HZ)
@@ -90,7 +90,7 @@ def render(results: Results) -> str:
     for name in cases:
         head += [f"exposure {name} of the period: residual, pm rms", "photon-noise bound, pm"]
         head += ["photon and read noise through R, pm", f"below {TARGET_PM:g} pm"]
-    head.append(f"mirror's part, exposure {next(iter(cases))} of the period, pm rms")
+    head.append(f"mirror error (applied minus commanded), exposure {next(iter(cases))} of the period, pm rms")
     rows = []
     for mode, one in first["modes"].items():
         cells = [mode, f"{one['drift_nm']:.2f}"]
@@ -107,8 +107,9 @@ def render(results: Results) -> str:
     )
     return (
         f"{markdown(head, rows)}\n{passed}. Disturbance `thermal`, `sam27d10_bal14`, "
-        f"V = {KEYS['star.magnitude']:g}, {KEYS['camera.read_noise_e']:g} e- of read noise, {RATE_HZ:g} Hz; sensor "
-        "images through the live loop's own `advance` and the simulated mirror, as in lockstep; integrator with gains "
+        f"V = {KEYS['star.magnitude']:g}, {KEYS['camera.read_noise_e']:g} e- of read noise, {RATE_HZ:g} Hz; the "
+        "live loop's `advance` processes the sensor images and drives the simulated mirror, as in lockstep; integrator "
+        "with gains "
         f"of {first['tilt_gain']:g} (tilt) and {first['gain']:g}. Means of the true residual over windows of "
         f"{WINDOW_S:g} s, rms about zero over {WINDOWS} windows after {SETTLE_S:g} s; the column drift is the "
         "same statistic of the disturbance."

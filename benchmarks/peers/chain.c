@@ -120,7 +120,7 @@ static void send_frames(double rate_hz, long count, int64_t *published)
         clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, NULL);
         published[number] = now_ns();
         output.md->write = 1;
-        memcpy(output.array.UI16, frames + number % DIFFERENT * PIXELS, PIXELS * sizeof *frames);
+        memcpy(output.array.UI16, frames + number % DISTINCT_FRAMES * PIXELS, PIXELS * sizeof *frames);
         output.md->cnt1 = number;
         ImageStreamIO_UpdateIm(&output);
     }

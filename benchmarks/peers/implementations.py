@@ -31,7 +31,8 @@ class ComparisonError(Exception):
 class Implementation:
     """An implementation of the loop: description, log, protection of the mirror, use across machines.
 
-    Roles are in the order of their start; a run ends when the source ends. lowfc has a kernel and no roles.
+    `roles` are its processes, in the order of their start; a run ends when the source of frames ends. lowfc starts its
+    own processes and has a `kernel` instead.
     """
 
     name: str
@@ -52,10 +53,10 @@ def _pyrtcao(name: str, description: str, safety: str, *roles: str) -> Implement
 def _lowfc(kernel: str) -> Implementation:
     return Implementation(
         f"lowfc, {kernel}",
-        "its own controller and simulated mirror, with prepared frames: the loop of `lowfc latency`, with this size",
+        "its own controller and simulated mirror, with prepared frames of this comparison's size, as in `lowfc latency`",
         log="every frame, command, mirror state and step is published for a recorder; bit-exact replay",
-        safety="late, dark, saturated, identical and missing frames refused or bridged; limits of mode, stroke, slew "
-        "and neighbours, the last three in the mirror too; command timeout",
+        safety="late, dark, saturated and identical frames refused, missing ones bridged; limits of modal command, "
+        "stroke, slew and difference of neighbours, the last three in the mirror too; command timeout",
         multi_host="yes, mutual TLS",
         kernel=kernel,
     )
@@ -103,7 +104,7 @@ def program(implementation: Implementation, options: argparse.Namespace, folder:
     if implementation.program != CHAIN:
         python = options.pyrtcao if implementation.program == PYRTCAO else sys.executable
         return [python, "-m", f"{__package__}.{implementation.program}"]
-    constants = {name: getattr(shared, name) for name in _CONSTANTS} | {"DIFFERENT": FRAMES}
+    constants = {name: getattr(shared, name) for name in _CONSTANTS} | {"DISTINCT_FRAMES": FRAMES}
     command = ["cc", "-O3", "-march=native", "-ffast-math", *(f"-D{name}={value}" for name, value in constants.items())]
     sources = [Path(__file__).with_name(CHAIN), options.isio / "ImageStreamIO.c"]
     command += [f"-I{options.isio}", *map(str, sources), "-o", str(folder / "chain"), "-lpthread", "-lrt", "-lm"]

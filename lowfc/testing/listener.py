@@ -12,7 +12,7 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 class Listener:
     """Keeps all messages of some topics and all events: `samples` has them by topic, with their envelopes.
 
-    `hub` connects the processes of the test; `bus` is the listener's own connection, as that of an operator's program.
+    `hub` connects the processes of the test; `bus` is the listener's own connection, with an operator's role.
     """
 
     def __init__(self, clock: Clock, *topics: Topic) -> None:

@@ -56,7 +56,7 @@ def test_fast_image_and_quadratic_form_agree_with_the_exact_image(coronagraph, m
 
 @pytest.mark.parametrize(("coronagraph", "ratio"), [("lyot", -39_000), ("aplc", 190)], indirect=["coronagraph"])
 def test_lyot_coronagraphs_are_far_more_sensitive_to_tilt_than_a_shaped_pupil(coronagraph, ratio):
-    """For tilt the APLC adds 190 times as much contrast; the classical mask removes light (form below 0)."""
+    """Tilt adds 190 times as much contrast with the APLC; with the classical mask it lowers that of the dark zone."""
     shaped = coronagraph_from(SensorSection())
     lyot_form, shaped_form = (contrast_form(one, (2,), WAVELENGTH_NM).item() for one in (coronagraph, shaped))
     assert shaped_form > 0

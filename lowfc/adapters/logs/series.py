@@ -139,7 +139,7 @@ class LogSeries:
             self._await_finished()
 
     def remove(self) -> None:
-        """Remove the files, which must all be finished and, as the caller ensures, hold no other process's messages."""
+        """Remove the files; the caller ensures that all are finished and contain only the recorder's own messages."""
         while self.files:
             with raised_as(DataFileError, OSError, f"{self.files[-1]} is empty and cannot be removed"):
                 self.files[-1].unlink(missing_ok=True)

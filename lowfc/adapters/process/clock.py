@@ -26,19 +26,19 @@ class HostClock:
 
     Attributes:
         lockstep: whether the time is simulated and set explicitly.
-        start_s: Unix time (simulated in lockstep) of the process's start, s; the upper half of its sequences.
+        start_s: Unix time (simulated in lockstep) of the process's start, s; the upper 32 bits of its sequences.
         offset_ns: offset to add to CLOCK_MONOTONIC to get the time since the epoch.
     """
 
     lockstep = False
 
     def __init__(self, base: Path | None = None) -> None:
-        """Join this boot's clock, kept in the folder `base` (by default the user's runtime directory)."""
+        """Use this boot's clock offset, stored in the folder `base` (by default the user's runtime directory)."""
         self.offset_ns = boot_offset_ns(runtime_base() if base is None else base)
         self.start_s = self.now_ns() // _NS
 
     def host_ns(self) -> int:
-        """Time of the host, for envelopes and durations; `now_ns`, the run's time, is another one only in lockstep."""
+        """Time of the host, for envelopes and durations; `now_ns`, the run's time, differs only in lockstep."""
         return time.monotonic_ns() + self.offset_ns
 
     now_ns = host_ns

@@ -1,7 +1,8 @@
 """The best law for a log: integrator gains after Gendron and Lena, PI with notches, LQG, each with its margins.
 
-All start from pseudo-open-loop modes, pol = disturbance + white noise, and minimise the residual wavefront over all
-time. This residual exceeds the one that the sensor sees: exposures average, and the star moves while the mirror holds.
+All start from pseudo-open-loop modes, pol = disturbance + white noise, and minimise the true residual: the residual
+wavefront in continuous time, during and between exposures. It exceeds the residual that the sensor sees: exposures
+average, and the star moves while the mirror holds.
 """
 
 from collections.abc import Sequence
@@ -26,8 +27,8 @@ _WIDER = (10.0,)  # factors tried for lines that move
 _SETTLING_FRAMES = 5000
 _OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # log2 of factors on the noise, tried until the margins suffice
 _NEAR_ENOUGH = 0.25
-"""Octaves between a filter with sufficient margins and one without at which the search between them ends: their
-residuals agree within half a percent."""
+"""Width of the bracket, in octaves of noise, at which the search for sufficient margins ends. The residuals of the
+filters at its two ends agree within half a percent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +55,9 @@ class Gains:
     """Integrator gains (modes,) and their residuals, nm rms.
 
     Attributes:
-        gain: gain with the least residual over all time.
-        predicted_nm: residual over all time.
-        sensed_nm: residual of the means over the exposures.
+        gain: gain with the least true residual.
+        predicted_nm: true residual.
+        sensed_nm: residual averaged over each exposure, as the sensor sees it, without noise.
         noise_nm: noise of one frame.
     """
 
@@ -67,7 +68,7 @@ class Gains:
 
 
 def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> Gains:
-    """The gain of each mode with the least residual wavefront of an integrator (after Gendron and Lena 1994).
+    """The gain of each mode with the least true residual of an integrator (after Gendron and Lena 1994).
 
     Args:
         run: (frames, modes) of pseudo-open-loop modes, in pieces.
@@ -76,14 +77,14 @@ def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> 
         leak: (modes,) of the integrators.
 
     Raises:
-        ValueError: there are too few frames in a row.
+        ValueError: there are too few consecutive frames.
     """
     from scipy.optimize import minimize_scalar
 
     # Coarse segments would lose a slow mode's drift.
     fine, coarse = spectrum(run, rate_hz, run.longest), spectrum(run, rate_hz)
     if fine is None or coarse is None or run.longest < FEWEST:
-        raise ValueError(f"a law is tuned from at least {FEWEST} frames in a row, the longest run has {run.longest}")
+        raise ValueError(f"a law needs at least {FEWEST} consecutive frames, the longest piece has {run.longest}")
     noise_nm2 = floor_nm2_hz(coarse) * rate_hz / 2
     omega = 2 * np.pi * fine.frequency_hz[1:] / rate_hz  # an integrator without leak has no value at 0 Hz
     measured = fine.power_nm2_hz[1:] * rate_hz / 2
@@ -117,7 +118,7 @@ def identify_modes(run: TimeSeries, rate_hz: float) -> list[Model]:
     """A model of each mode of pseudo-open-loop modes (frames, modes).
 
     Raises:
-        ValueError: there are too few frames in a row.
+        ValueError: there are too few consecutive frames.
     """
     models = []
     for mode in range(run.values[0].shape[1] if run.values else 0):
@@ -161,7 +162,7 @@ def tune_lqg(
     residual_nm2 = np.nan_to_num([residual(blocks) for blocks in robust], nan=np.inf)
     best = residual_nm2.argmin(axis=0)
     modes = range(len(noll))
-    wins = residual_nm2.min(axis=0) < residual(integrators)  # false, too, for a mode that has no filter in `robust`
+    wins = residual_nm2.min(axis=0) < residual(integrators)  # false without any filter within the margins
     chosen = [tried[best[mode]][mode] for mode in modes]
     law = law_of([robust[best[mode]][mode] if wins[mode] else integrators[mode] for mode in modes])
     return _tuned(law, timing, ["lqg" if better else "integrator" for better in wins], chosen)
@@ -210,7 +211,7 @@ def _tuned(law: LinearLaw, timing: Timing, kinds: Sequence[str], models: Sequenc
 
 
 def predicted_nm(law: LinearLaw, models: Sequence[Model], timing: Timing) -> Array:
-    """Rms (modes,) over all time of the true residual of modes with these models."""
+    """Rms (modes,) of the true residual that these models predict."""
     variance_nm2 = np.zeros(len(models))
     for mode, model in enumerate(models):
         omega = fine_frequencies(model)
@@ -221,8 +222,8 @@ def predicted_nm(law: LinearLaw, models: Sequence[Model], timing: Timing) -> Arr
     return np.sqrt(variance_nm2)
 
 
-def predicted_nm2(law: LinearLaw, models: Sequence[Model], noise_nm2: Array, timing: Timing) -> Array:
-    """Covariance (modes, modes) over all time of the true residual, for modes coupled by noise alone.
+def predicted_covariance_nm2(law: LinearLaw, models: Sequence[Model], noise_nm2: Array, timing: Timing) -> Array:
+    """Covariance (modes, modes) of the true residual that these models predict, for modes coupled by noise alone.
 
     The covariance (modes, modes) of one frame's noise is scaled to the models' noise.
     """
@@ -240,7 +241,7 @@ def frame_noise_nm2(models: Sequence[Model], noise_nm2: Array) -> Array:
 
 
 def simulated_residual_nm2(law: LinearLaw, run: TimeSeries, noise_nm2: Array, timing: Timing) -> Array:
-    """Mean square (modes,) of the mean residual over the period in which each command is in force.
+    """Mean square (modes,) of the residual, averaged over the time in which each command is in force.
 
     Changes within that period, which no law can remove, are not included. Each piece of the run, (frames, modes)
     of pseudo-open-loop modes with noise (modes,), starts with a law at rest and a flat mirror; its first 5000 frames,
@@ -270,7 +271,8 @@ def _scaled(model: Model, factor: float, finest_hz: float) -> Model:
 def within_margins(model: Model, timing: Timing) -> Block | None:
     """Filter of a model, with its noise overestimated until the margins suffice; None if they cannot be reached.
 
-    A filter with less weight on its measurements predicts more smoothly; for a model with a known line little is lost.
+    A filter with less weight on its measurements predicts more smoothly; the residual of a mode with a modelled line
+    hardly increases.
     """
 
     def filtered(octaves: float) -> Block | None:

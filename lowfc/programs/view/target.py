@@ -95,7 +95,7 @@ class Target:
         return stream
 
     def show_all(self, stream: rr.RecordingStream, span_ns: tuple[int, int] | None) -> None:
-        """Make the plots show all of a drawn log; a picture omits panels that show only its last instant."""
+        """Make the plots show all of a log that was sent; a picture omits panels of the log's last instant only."""
         stream.send_blueprint(layout(self.tab, None, span_ns=span_ns, still=self.picture is not None))
 
     def print_address(self, viewer: RerunViewer | None) -> None:

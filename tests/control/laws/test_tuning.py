@@ -109,7 +109,7 @@ def test_white_noise_gets_a_law_with_a_small_residual() -> None:
 
 def test_too_few_frames_are_refused() -> None:
     pol = one_piece(np.zeros((500, 2)))
-    with pytest.raises(ValueError, match="at least 2048 frames in a row, the longest run has 500"):
+    with pytest.raises(ValueError, match="at least 2048 consecutive frames, the longest piece has 500"):
         best_gains(pol, RATE_HZ, Timing.sampled(1.0), NO_LEAK)
     with pytest.raises(ValueError, match="at least 2048 frames in a row"):
         identify_modes(pol, RATE_HZ)

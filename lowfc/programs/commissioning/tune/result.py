@@ -18,8 +18,8 @@ from lowfc.control.laws.tuning import (
     fine_frequencies,
     frame_noise_nm2,
     identify_modes,
+    predicted_covariance_nm2,
     predicted_nm,
-    predicted_nm2,
     tune_integrator,
     tune_lqg,
     tune_pi_notch,
@@ -241,14 +241,16 @@ def _added_contrast(
     if closed_nm is not None:
         instants_nm2 = run.true_nm2
         if instants_nm2 is None:  # predicted: the measured error contains noise that may exceed the residual
-            instants_nm2 = predicted_nm2(now, best.models, run.noise_nm2, run.timing)
+            instants_nm2 = predicted_covariance_nm2(now, best.models, run.noise_nm2, run.timing)
         closed = with_variances(instants_nm2, closed_nm)
     return added_contrast(
         run.contrast,
         {
             "open": opened.T @ opened / len(opened) - frame_noise_nm2(best.models, run.noise_nm2),
             "closed": closed,
-            "predicted": with_variances(predicted_nm2(best.law, best.models, run.noise_nm2, run.timing), best_nm),
+            "predicted": with_variances(
+                predicted_covariance_nm2(best.law, best.models, run.noise_nm2, run.timing), best_nm
+            ),
         },
     )
 

@@ -46,7 +46,9 @@ def export(
     ] = None,
     topics: Annotated[
         list[str] | None,
-        typer.Option(help="With --decimate: keep only this optional topic (key or pattern); repeat for several."),
+        typer.Option(
+            help="With --decimate: of the optional topics keep only this one (key or pattern); repeat for several."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -55,7 +57,7 @@ def export(
         ),
     ] = None,
     frames: Annotated[
-        bool, typer.Option("--frames", help="Export the frames, too; with npz as OUT.frames.npy.")
+        bool, typer.Option("--frames", help="Export the frames, too; with npz in a second file, NAME.frames.npy.")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     as_json: Json = False,

@@ -1,4 +1,4 @@
-"""The bright exposure of a single wavefront in the figures (Sect. 3.1), and its estimators."""
+"""Captions and estimator labels of the figures that estimate one wavefront from one bright exposure (Sect. 3.1)."""
 
 from lowfc.design.estimators import KINDS
 from lowfc.design.paper import PEAK_E, TABLE3_READ_NOISE_E
