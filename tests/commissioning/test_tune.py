@@ -173,9 +173,11 @@ def test_a_loop_that_was_closed_for_too_few_frames_is_not_simply_called_open(tmp
     """Its achieved residual is not given, so there is no warning that the residual contains the offset."""
     night = SyntheticLog().request("open").frames(100).request("close").frames(100)
     night.request("offset", (0.0, 0.0, 20.0)).frames(1900)
-    lines = lowfc("tune", night.write(tmp_path / "night.mcap")).stdout.splitlines()
-    assert "2100 frames at 1000 Hz, loop closed in 2000 of them, delay" in lines[0]
-    (warning,) = [line for line in lines if line.startswith("warning: ")]
+    run = telemetry_from_log(LogReader(night.write(tmp_path / "night.mcap")))
+    result = result_of(run, *tuned(run, "integrator"), "integrator")
+    assert not result.closed
+    assert "2100 frames at 1000 Hz, loop closed in 2000 of them, delay" in result.text()
+    (warning,) = result.warnings
     assert "in closed loop at most 2000 good frames are consecutive, fewer than 2048" in warning
 
 

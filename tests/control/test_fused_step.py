@@ -172,7 +172,7 @@ class Bench:
         assert (outputs.command is None) is (expected.command is None)
         numbers = list(zip(_numbers(outputs), _numbers(expected), strict=True))
         largest_nm = max(np.abs(reference).max(initial=0) for _, reference in numbers)
-        allowed_nm = max(LIMITED_NM if step.reasons else SAME_NM, ROUNDINGS * np.spacing(largest_nm))
+        allowed_nm = max(LIMITED_NM if Limit.NEIGHBOUR in step.reasons else SAME_NM, ROUNDINGS * np.spacing(largest_nm))
         for index, (fused, reference) in enumerate(numbers):
             assert np.isfinite(fused).all()
             difference_nm = float(np.abs(fused - reference).max(initial=0))
