@@ -111,8 +111,8 @@ def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSe
 def spectrum(run: TimeSeries, rate_hz: float, frames: int = 0) -> Spectrum | None:
     """Welch's estimate over all pieces of at least a segment; None if there are none.
 
-    Each segment's mean is subtracted, and Hann's window applied; its default length, a power of two, follows from the
-    longest piece. The import of `scipy.signal` takes half a second.
+    Each segment's mean is subtracted, and Hann's window applied. A segment has `frames` frames, or if 0, a power of two
+    that follows from the longest piece. As `scipy.signal.welch`, whose import takes half a second.
     """
     if run.longest < SHORTEST:
         return None

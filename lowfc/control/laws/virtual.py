@@ -44,7 +44,7 @@ class VirtualIntegrators(NamedTuple):
         command_nm = self.kept * self.history_nm[0] - self.gain * error_nm
         np.maximum(command_nm, -self.limit_nm, out=command_nm)
         np.minimum(command_nm, self.limit_nm, out=command_nm)
-        return VirtualIntegrators(*self[:4], (command_nm, *self.history_nm[:-1])), error_nm
+        return self._replace(history_nm=(command_nm, *self.history_nm[:-1])), error_nm
 
     def held(self, frames: int = 1) -> "VirtualIntegrators":
         """A copy some frames later, without measurements: commands are held, as in the loop."""
