@@ -1,8 +1,8 @@
-"""Shared by all implementations' processes: scheduling, time stamps, start, frames and matrices.
+"""Shared by the processes of all compared loops: scheduling, time stamps, start, frames and matrices.
 
 A process is started with the arguments ROLE FOLDER RATE_HZ FRAMES PROCESSOR PRIORITY; priority 0 is normal scheduling.
-The files of the folder are in shared memory, so a process may be killed after the last frame. This module needs
-numpy only.
+The files of the folder are mapped into memory: they keep what a process wrote when it is killed after the last frame.
+This module needs numpy only.
 """
 
 import ctypes

@@ -61,7 +61,9 @@ def envelope(sequence: int, time_ns: int) -> bytes | None:
 
 
 class Device:
-    """A simulated device that is also its own connection. It is correct except for `changes`: functions or values.
+    """A simulated device with the interface of its connection, correct except for `changes`.
+
+    A change is a value, or a function of the correct value.
 
     Time advances in milliseconds, and only in `wait`.
     """
@@ -261,15 +263,18 @@ CAMERA_FAULTS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "no envelope": ({"attach": lambda *_: None}, {"envelope": WRONG, "settings on request": WRONG}),
     "a short envelope": ({"attach": lambda s, t: b"12345678"}, {"envelope": WRONG, "settings on request": WRONG}),
     "a big-endian envelope": ({"attach": struct.Struct(">QQ").pack}, {"sequence": WRONG, "publish time": WRONG}),
-    "a count without start": ({"attach": lambda s, t: envelope(s & 0xFFFF, t)}, {"sequence": WRONG}),
-    "milliseconds for the start": ({"attach": lambda s, t: envelope(s * 1000 % 2**64, t)}, {"sequence": WRONG}),
+    "a sequence without the start": ({"attach": lambda s, t: envelope(s & 0xFFFF, t)}, {"sequence": WRONG}),
+    "a start in milliseconds": ({"attach": lambda s, t: envelope(s * 1000 % 2**64, t)}, {"sequence": WRONG}),
     "a constant count": ({"count": lambda count, _: 7}, {"sequence": WRONG}),
     "a count of all topics": ({"count": lambda count, _: 3 * count}, {"sequence": WRONG}),
     "a gap": ({"count": lambda count, _: count + 4 * (count > 100)}, {"sequence": WARNING}),
     "a publish time in us": ({"attach": publish_at(lambda t: t // 1000)}, {"publish time": WRONG}),
     "a monotonic clock": ({"attach": publish_at(lambda t: t - OFFSET_NS)}, {"publish time": WRONG}),
     "another clock": ({"attach": publish_at(lambda t: t - 35 * MS)}, {"publish time": WRONG}),
-    "a clock that steps": ({"attach": publish_at(lambda t: t - t % (25 * MS))}, {"publish time": WRONG}),
+    "a clock with a resolution of 25 ms": (
+        {"attach": publish_at(lambda t: t - t % (25 * MS))},
+        {"publish time": WRONG},
+    ),
     "no frame time": ({"frame": lambda frame, _: frame.ClearField("timestamp") or frame}, {"frame time": WRONG}),
     "a frame time ahead": ({"frame": shifted(20 * MS)}, {"frame time": WRONG}),
     "a frame time an hour ago": ({"frame": shifted(-3600 * 1000 * MS)}, {"frame time": WRONG}),
@@ -286,7 +291,7 @@ CAMERA_FAULTS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
         {"frames": WRONG, "topics": WRONG},
     ),
     "frames that stop": ({"frame": lambda frame, i: frame if i < 100 else None}, {"steadiness": WRONG}),
-    "a frame in ten late": ({"frame": lambda frame, i: frame if i % 10 else None}, {"steadiness": WARNING}),
+    "every tenth frame missing": ({"frame": lambda frame, i: frame if i % 10 else None}, {"steadiness": WARNING}),
     "a stuck image": ({"pixels": lambda dn, i: np.full(SHAPE, 500, np.uint16)}, {"live image": WRONG}),
     "zeros": ({"pixels": lambda dn, i: 0 * dn}, {"live image": WRONG, "light": WRONG}),
     "darkness": ({"pixels": lambda dn, i: dn // 3000 + 100 + i % 2}, {"light": WARNING}),
@@ -385,15 +390,21 @@ MIRROR_FAULTS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
         {"state": shaped(lambda shape: np.where(np.abs(shape) > 1, np.float32(3e38), shape))},
         {"applied": WRONG} | UNTRIED,
     ),
-    "its own time": ({"state": lambda state: shifted(3 * MS)(state, 0)}, {"time": WARNING}),
+    "its own timestamp instead of the command's": (
+        {"state": lambda state: shifted(3 * MS)(state, 0)},
+        {"time": WARNING},
+    ),
     "no modal command": ({"state": lambda state: state.ClearField("command_nm") or state}, {"modal command": WARNING}),
     "NaN replaced by zero": (
         {"command": careless("finite")},
         {"NaN refused": WRONG, "infinity refused": WRONG, "dead-man": WRONG} | UNTRIED,
     ),
-    "any grid": ({"command": careless("grid")}, {"wrong grid refused": WRONG} | UNTRIED),
-    "any length": ({"command": careless("bytes")}, {"short command refused": WRONG} | UNTRIED),
-    "any order": ({"command": careless("order")}, {"old command refused": WRONG, "clear": WARNING} | UNTRIED),
+    "accepts any grid": ({"command": careless("grid")}, {"wrong grid refused": WRONG} | UNTRIED),
+    "accepts any length": ({"command": careless("bytes")}, {"short command refused": WRONG} | UNTRIED),
+    "accepts old commands": (
+        {"command": careless("order")},
+        {"old command refused": WRONG, "clear": WARNING} | UNTRIED,
+    ),
     "no dead-man": ({"tick": lambda tick: lambda status, now_ns: status}, NEVER_EXPIRED),
     "a refused command extends the timeout": ({"renews": True}, {"dead-man": WRONG} | UNTRIED),
     "expired at once": (
@@ -427,7 +438,9 @@ def test_a_correct_mirror_passes_and_returns_to_its_shape() -> None:
     mirror.status, _ = mirror.mirror.apply_command(mirror.status, command, mirror.now_ns())
     assert mirror_faults(mirror) == {}
     np.testing.assert_allclose(mirror.status.surface_nm, start, atol=0.03)
-    assert 5 < mirror.status.frame_sequence < 5000, "below a camera's sequences: later commands are accepted"
+    assert 5 < mirror.status.frame_sequence < 5000, (
+        "below a camera's sequences, so that the loop's commands are accepted afterwards"
+    )
 
 
 @pytest.mark.parametrize("fault", MIRROR_FAULTS)
@@ -439,7 +452,7 @@ def test_a_fault_of_a_mirror_is_found(fault: str) -> None:
 def test_an_answer_that_is_read_late_because_this_host_stalls_is_no_fault() -> None:
     class Stalled(Mirror):
         def wait(self, seconds: float) -> None:
-            # Longer than an answer may take, after two of the commands.
+            # After two of the commands, wait longer than an answer may take.
             super().wait(0.6037 if self._received in (31, 33) else seconds)
 
     assert mirror_faults(Stalled()) == {}
@@ -510,7 +523,7 @@ def test_the_check_of_health_names_the_drivers_failure_and_the_expected_process(
     assert [text in check.got + check.advice for check in checks if check.name == "health"] == [True]
 
 
-def test_an_unknown_position_names_the_failure_of_the_driver() -> None:
+def test_a_mirror_state_without_actuators_is_explained_by_the_drivers_failure() -> None:
     why = "DRIVER_FAILED the driver failed and will be tried again: ValueError: it returned () actuators"
     failed = Mirror(state=setting(actuators=b""), health=setting(driver_failures=1, last_warning=why))
     checks = mirror_checks(Dialogue(failed, Expected(CONFIG)), 0.2, lambda _: None)

@@ -48,7 +48,7 @@ def test_a_long_table_prints_selected_rows_and_agrees_with_simulation():
     for row in checked:
         assert row["measured"] == pytest.approx(row["predicted"], rel=0.1)
     for row in table["rows"]:
-        if row["limit"] is not None:  # the largest tolerance of any sensor of this light
+        if row["limit"] is not None:  # the tolerance of a sensor at the quantum limit of this light
             assert row["measured"] <= 1.0001 * row["limit"]
 
 
@@ -65,7 +65,7 @@ def test_every_published_value_has_a_verdict_and_no_noise_is_below_the_quantum_l
 
 
 def agree(rows: list[Row], name: str) -> int:
-    """Assert that the rows that a committed table also has agree with it to 0.1 %; returns their number."""
+    """Assert that each row that is also in the committed table agrees with it to 0.1 %; return their number."""
     references = {(row["name"], row["estimator"], row["quantity"]): row for row in committed(name)["rows"]}
     common = [row for row in map(plain, rows) if (row["name"], row["estimator"], row["quantity"]) in references]
     for row in common:
@@ -110,7 +110,7 @@ def test_curves_against_magnitude_approach_but_do_not_cross_the_quantum_limit(ta
         assert (np.diff(sensor.y) < 0).all() == limit_is_above
 
 
-def test_anchors_from_table_4_are_the_tilts_of_two_modes_with_the_published_values(monkeypatch):
+def test_anchors_from_table_4_are_the_tilt_scatter_of_the_two_mode_fit_beside_the_published_value(monkeypatch):
     rows = [row for row in committed("anchors")["rows"] if "std of x tilt" in row["quantity"]]
     tilts = [Row(**row | {"paper": 0.36}) for row in rows if row["unit"]]
     others = [Row("sam", tilts[0].quantity, "mas", 0.1, modes=14, estimator="weighted"), Row("sam", "other", "", 1)]
@@ -166,10 +166,12 @@ def test_loops_are_judged_by_the_published_pointing(monkeypatch):
         row = rows[f"tilt, {preset}"]
         assert (row.measured, row.paper) == (0.3, anchors.ROMAN_MAS)
         assert rows[f"verdict, tilt, {preset}"].measured == anchors.REACHED
-        assert 0 < row.limit * tilt_nm_per_mas(2.0) < 2.0, "limit in nm; the law's model has the line of 14 nm rms"
+        assert 0 < row.limit * tilt_nm_per_mas(2.0) < 2.0, (
+            "nm; the line has 14 nm rms, and the model of the law predicts it"
+        )
     for where, verdict in (("sky", anchors.REACHED), ("laboratory", anchors.NOT_REACHED)):
         row = rows[f"std of means over 2 s, {where}"]
-        # Ten means of +-0.05 mas, in 24 s without the first four.
+        # Ten means of +-0.05 mas, in 24 s without the first 4 s.
         assert row.measured == pytest.approx(0.05 * np.sqrt(10 / 9))
         assert rows[f"verdict, {row.quantity}"].measured == verdict
     driven = [
@@ -186,7 +188,7 @@ def test_configuration_of_a_loop_selects_the_sensor_of_the_command_line(name, tm
     assert loaded == keys | {"sam": str(Path(name).resolve()) if ".json" in name else keys["sam"]}
 
 
-def test_only_requested_sensors_are_anchored_and_simulated(monkeypatch):
+def test_only_requested_sensors_are_compared_with_anchors_and_simulated(monkeypatch):
     def table4(context):
         quantity = "std of x tilt, 1 mas, own photometry"
         return [Row(name, quantity, "mas", 0.1, modes=2, estimator="weighted") for name in context.sensors]

@@ -1,6 +1,6 @@
 """Emulated hosts on one machine: network namespaces with their own addresses, joined by a bridge.
 
-A namespace exists as long as a process in it. Each is held by a `cat` that ends when its pipe is closed, and all other
+A namespace exists while a process runs in it. Each is held by a `cat` that ends when its pipe is closed, and all other
 processes end with the test process, so that nothing is left behind.
 """
 
@@ -37,12 +37,12 @@ class Host:
         self.folder = folder / name
         hold = ["unshare", "--net", "sh", "-c", "echo && exec cat"]
         self.holder = subprocess.Popen(hold, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
-        # Before this line arrives, the namespace may not exist yet, and commands would run in our own.
+        # Until the holder has printed a line, the namespace may not exist, and commands would run in our own.
         assert self.holder.stdout.readline(), "no namespace was created"
         self.children: dict[str, Child] = {}
         home = self.folder / "runtime" / "lowfc"
         home.mkdir(mode=0o700, parents=True)
-        HostClock(home)  # fixes the offset of this boot, which is then shifted for this host
+        HostClock(home)  # stores the clock offset of this boot; it is shifted for this host
         for file in home.glob("clock-*"):
             file.write_text(str(int(file.read_text()) + clock_shift_ns))
 

@@ -37,7 +37,9 @@ _CHANGED = "its parts are intact, but some are missing or out of order, or bytes
 _BEGIN = MAGIC + bytes([Opcode.HEADER])
 _OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _FIRST_BLOCK_BYTES = 1 << 12
-_TRIES = 4  # the search for chunks reads up to this many times the file's size: no file may occupy it for long
+_TRIES = (
+    4  # candidates for chunks are read up to this many times the file's size: no file may occupy the search for long
+)
 
 
 @dataclass(slots=True)
@@ -66,7 +68,7 @@ class LogFile:
         path: path of the file.
         size: size of the file when opened, bytes.
         finished: whether it ends as a finished log.
-        complete: whether the file is finished and was read up to a valid summary; known at the end of `parts`.
+        complete: whether the file is finished and was read up to a valid summary; set at the end of `parts`.
         unsupported_compression: name of the compression of an unsupported chunk; empty if there is none.
     """
 
@@ -155,7 +157,7 @@ class LogFile:
                 part = self._part(opcode, body, at)
             except UnsoundError as fault:
                 resumed = self._resume(at, end)
-                # Stop at an appended log: its channels have other ids.
+                # Stop at an appended log: it uses the same ids for other channels.
                 if begins and (second := self._appended(max(1, at - len(MAGIC)), resumed)):
                     if at < second.position:
                         yield Damage(at, second.position - at, str(fault))
@@ -172,7 +174,7 @@ class LogFile:
                 at = end
 
     def _appended(self, at: int, end: int) -> Damage | None:
-        """Another log that begins between two positions, up to the end of the file; None without one."""
+        """Another log that begins between `at` and `end`, as damage to the end of the file; None without one."""
         for begin in range(at, end, _BLOCK_BYTES):
             block = self._read(begin, min(_BLOCK_BYTES, end - begin) + len(MAGIC))
             if (offset := block.find(_BEGIN)) >= 0:
@@ -213,7 +215,10 @@ class LogFile:
         return channels
 
     def _resume(self, at: int, end: int) -> int:
-        """Position to continue after a damaged record: its end if a record begins there, else the next intact chunk."""
+        """Position to continue after a damaged record.
+
+        It is the record's end if a record begins there, else the next intact chunk, else the end of the data.
+        """
         if end == self.size:
             return end
         if end < self.size:

@@ -26,8 +26,8 @@ def fifo_priority(config: Configuration) -> int:
 def prepare(config: Configuration, role: str, cpus: list[int]) -> Granted:
     """Set this process up for the loop, before its first zenoh session, whose threads inherit the scheduling.
 
-    All processes have the same priority: if mirror and controller share a processor, the controller yields after its
-    put, so that a command is applied before the controller publishes its step.
+    Camera, controller and mirror have the same priority: if mirror and controller share a processor, the controller
+    yields after its put, so that a command is applied before the controller publishes its step.
     """
     if role != Role.CAMERA:  # a simulated camera computes while messages arrive
         receive_in_one_thread()
@@ -41,7 +41,7 @@ def prepare(config: Configuration, role: str, cpus: list[int]) -> Granted:
 
 
 def prepare_ready(config: Configuration) -> Granted:
-    """Request the measures for a process that is ready."""
+    """Request huge pages, once the process is ready."""
     return use_huge_pages() if config.realtime.lock_memory else NOTHING
 
 
@@ -55,7 +55,7 @@ def join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Serv
 
 
 def join_beside(config: Configuration, service: Service, role: str) -> Service:
-    """Join the run of `service` again, in another role of this process; a direct link to `service` is a function call.
+    """Join the run again, in another role of this process; a direct link between both roles is a function call.
 
     The service manager is notified by `service` only.
     """

@@ -35,7 +35,13 @@ def protocol() -> Any:
 
 
 class EpicsGateway:
-    """Server of the variables; monitors of other PVs keep the valid values in `bench`, and set `changed` on updates."""
+    """Serves variables of the loop as PVs, and monitors PVs of other servers.
+
+    Attributes:
+        variables: the served variables.
+        bench: valid values of the monitored PVs, by name.
+        changed: set by each update of a monitored PV.
+    """
 
     def __init__(self, config: Gateway, variables: Sequence[Variable], carry_out: CarryOut) -> None:
         """Serve; BusError if it cannot listen."""

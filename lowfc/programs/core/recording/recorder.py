@@ -35,7 +35,7 @@ QUEUE_MESSAGES = 20_000
 QUEUE_BYTES = 256_000_000
 """Largest total size of payloads waiting for the disk."""
 MAX_CHANNELS = 4096
-"""Number of publisher starts after which the next file is begun: each is a channel of the file and costs memory."""
+"""Number of channels after which the next file is begun: each start of a publisher adds one, which costs memory."""
 
 _ITERATION_S = 0.02
 _FLUSH_NS = 250_000_000
@@ -138,7 +138,7 @@ class Recorder:
                 return
 
     def _begin(self, *, anew: bool = True) -> None:
-        """Begin a recording, or without `anew` its next file, with calibration and states that messages refer to."""
+        """Begin a recording, or its next file if not `anew`; each begins with calibration and states then in force."""
         if anew:
             self._messages_before, self._lost_before = self._series.messages, self._account.lost()
         self._series.begin(self._peers.newest.values(), new_recording=anew)

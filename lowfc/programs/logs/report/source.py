@@ -34,7 +34,8 @@ class LawInForce:
         law_id: identity of the linear law, "unknown" if the state has none; empty without a linear law.
         law_name: name of the linear law; "integrator" without a linear law.
         overruled: groups of modes that the integrator drives instead of the law.
-        linear: the linear law; None if there is none, or if it is not in the log, is overruled or has other modes.
+        linear: the linear law; None if there is none, if it is not in the log or has other modes, or if the
+            integrator drives any group of modes.
     """
 
     first: int = field(compare=False)
@@ -54,7 +55,7 @@ class LawInForce:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A log that was read.
+    """The history of a run, and its laws.
 
     Attributes:
         history: contents of the log.
@@ -68,7 +69,7 @@ class Run:
         """Convert host times to frame time, seconds since the first step.
 
         Times between the frames are interpolated. In lockstep frame time is simulated; otherwise it differs from host
-        time by an offset. If the log has no frame of a step: host time since the log's beginning.
+        time by an offset. If the log has no frame that belongs to a step, the result is host time since its beginning.
         """
         history, host = self.history, np.asarray(host_ns, dtype=np.int64)
         rows = rows_of(history.frame_sequence, history.steps.sequence)
@@ -109,8 +110,8 @@ def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None
 def row_after(history: History, frame_sequence: int, time: Timestamp) -> int:
     """Row of the first step after the steps of a frame.
 
-    If the frame has no step: row of the first later frame since the same start of the camera; if there is none, of the
-    first step after `time`, which is on the controller's clock; the camera's clock may differ.
+    If the frame has no step, the row is that of the first later frame from the same start of the camera. Without such
+    a frame it is that of the first step after `time`, which is on the controller's clock, unlike the times of steps.
     """
     sequence = history.steps.sequence
     rows = np.flatnonzero(sequence == frame_sequence)

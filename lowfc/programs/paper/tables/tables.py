@@ -24,7 +24,7 @@ PAPER_TABLE2 = dict(
         strict=True,
     )
 )
-"""Peak differential intensity of lambda/30 rms, by Noll index."""
+"""The paper's peak differential intensity for lambda/30 rms of a mode, by its Noll index."""
 TABLE2_SENSORS = ("sam", "sam27d07_bal14", "sam27d10_bal14", "bowtie", "clowfs", "zwfs")
 
 

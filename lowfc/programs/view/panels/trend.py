@@ -1,6 +1,7 @@
 """Trend panel: the residual wavefront since the start of the view, or over a whole log of any length.
 
-It is redrawn as lines each time, because the viewer drops the oldest data of curves when its memory is full.
+It is redrawn whole as line strips, because the viewer drops the oldest samples of a time series when its memory is
+full.
 """
 
 from datetime import UTC, datetime
@@ -19,14 +20,14 @@ from lowfc.programs.view.verdicts.span_means import SpanMeans
 TREND = "residual/trend"
 WIDTH = 200.0
 
-_FIRST_SPAN_S, _GROWTH = 60.0, 1.4
-"""First span of the time axis, and the factor by which it grows when it is full."""
+_FIRST_AXIS_S, _GROWTH = 60.0, 1.4
+"""First length of the time axis, and the factor by which it grows when it is full."""
 _TICKS_S = (10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 86_400, 172_800, 604_800, 2_592_000)
 _MAX_TICKS, _MAX_TICKS_WITH_SECONDS = 6, 3
 
 
 class Trend(Panel):
-    """Rms of each span, drawn every two seconds and at the end of a log."""
+    """Rms over each averaging interval, drawn every two seconds and at the end of a log."""
 
     def __init__(self) -> None:
         self._means = SpanMeans()
@@ -47,7 +48,7 @@ class Trend(Panel):
         logarithms[valid] = np.log10(rms_nm[valid])
         span_s = max(float(after_s[valid][-1]), 1.0)
         if snapshot.ended is None:
-            span_s = _FIRST_SPAN_S * _GROWTH ** max(0, ceil(log(span_s / _FIRST_SPAN_S, _GROWTH)))
+            span_s = _FIRST_AXIS_S * _GROWTH ** max(0, ceil(log(span_s / _FIRST_AXIS_S, _GROWTH)))
         y_ticks = _nm_ticks(float(rms_nm[valid].min()), float(rms_nm[valid].max()))
         y = (y_ticks[0][0], y_ticks[-1][0])
         if len(y_ticks) > _MAX_TICKS:
