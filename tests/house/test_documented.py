@@ -1,11 +1,17 @@
 """Required documentation: public names of five packages, shapes and units of array arguments, advice on events."""
 
 import ast
+import io
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import docutils.nodes
 import pytest
+from docutils.frontend import get_default_settings
+from docutils.parsers.rst import Parser
+from docutils.utils import new_document
+from sphinx.ext.napoleon import Config, GoogleDocstring
 
 from lowfc.contract.events import EVENTS
 from lowfc.contract.wire import lowfc_pb2
@@ -48,6 +54,17 @@ def test_every_public_name_has_a_docstring(package: str) -> None:
     documented = definitions(package)
     assert len(documented) > 20
     assert [name for name, _, text, _ in documented if not text] == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_docstrings_are_valid_markup(package: str) -> None:
+    settings = get_default_settings(Parser)
+    settings.warning_stream = io.StringIO()
+    for name, _, text, _ in definitions(package):
+        document = new_document(name, settings)
+        Parser().parse(str(GoogleDocstring(text, Config(napoleon_use_ivar=True))), document)
+        assert [each.astext() for each in document.findall(docutils.nodes.substitution_reference)] == [], name
+    assert settings.warning_stream.getvalue() == ""
 
 
 @pytest.mark.parametrize("package", PACKAGES)

@@ -44,7 +44,7 @@ class Gains:
         return others
 
     def within(self, gain_error: float, crosstalk: float) -> list[bool | None]:
-        """Whether |gain - 1| and cross-talk are within these limits at each amplitude; None if too noisy to tell."""
+        """Whether `|gain - 1|` and cross-talk are within these limits at each amplitude; None if too noisy to tell."""
         own = np.arange(self.gain.shape[1]) == self.mode
         limit = np.where(own, gain_error, crosstalk)
         beyond = np.abs(self.gain - own) > limit + SIGMAS * self.error
