@@ -1,10 +1,10 @@
 """Why each event occurs and what to do: the second half of its entry in the troubleshooting page."""
 
-_NOTHING = "nothing; for information only."
+_NOTHING = "nothing."
 
 ADVICE: dict[str, tuple[str, str]] = {
     "STARTED": ("a process has started.", _NOTHING),
-    "STOPPED": ("a process has ended, for the named reason.", "start it again if nobody meant to stop it."),
+    "STOPPED": ("a process has ended, for the named reason.", "start it again, unless it was stopped on purpose."),
     "CLOCK_OFF": (
         "the wall clock was set after the first run since boot; the times of all runs do not include that change.",
         "let a time server set the clock before the first run; `lowfc doctor` shows how to correct it later.",
@@ -34,7 +34,7 @@ ADVICE: dict[str, tuple[str, str]] = {
         "relaxes to flat.",
         "remove the cause, then `lowfc ctl clear`; the loop is open afterwards, and `lowfc ctl close` closes it.",
     ),
-    "FRAMES_REFUSED": ("frames arrive and are not used; the command is held.", "see the table of reasons."),
+    "FRAMES_REFUSED": ("frames arrive and are not used; the command is held.", "see the [reasons](#reasons)."),
     "FRAMES_ACCEPTED": ("frames are used again.", _NOTHING),
     "NO_FRAMES": (
         "no frame for `control.frame_timeout_ms`: the camera has stopped, waits for a trigger, or its link is down.",
@@ -68,7 +68,8 @@ ADVICE: dict[str, tuple[str, str]] = {
         "change those channels, then `lowfc ctl channel flat FILE`.",
     ),
     "LAW_NOT_IN_FORCE": (
-        "the law of `control.law` was refused: no calibration of its modes is loaded, or the camera does not fit it.",
+        "the law of `control.law` was refused: no calibration of its modes is loaded, or the camera does not fit the "
+        "calibration.",
         "load a calibration of these modes for the camera's settings, or restore the camera's settings; then "
         "`lowfc ctl law FILE`.",
     ),
@@ -76,7 +77,10 @@ ADVICE: dict[str, tuple[str, str]] = {
         "the guard found that the law's residual exceeds the integrator's, or that the loop amplifies.",
         "tune a law again from a recent log; `lowfc ctl law FILE`, or `open` and then `close`, reactivates it.",
     ),
-    "LAW_BACK": ("the law, simulated on the same frames, had a far smaller residual for some time.", _NOTHING),
+    "LAW_BACK": (
+        "the law, simulated on the same frames, had a far smaller residual than the integrator for some time.",
+        _NOTHING,
+    ),
     "NOTE": ("an operator wrote a note.", _NOTHING),
     "CLOSING_HARMS": (
         "at these gains, closing would increase the residual of some modes: by their noise, or by amplification.",
@@ -126,7 +130,7 @@ ADVICE: dict[str, tuple[str, str]] = {
     ),
     "LIMIT_HIT": (
         "a limit of the controller or the mirror clipped a command.",
-        "see the table of reasons; a limit that acts briefly after closing is normal.",
+        "see the [reasons](#reasons); a limit that acts briefly after closing is normal.",
     ),
     "LIMIT_CLEARED": ("the limit no longer acts.", _NOTHING),
     "COMMAND_EXPIRED": (
@@ -138,18 +142,18 @@ ADVICE: dict[str, tuple[str, str]] = {
     "COMMAND_REFUSED": (
         "a command was not finite, of another grid, out of order, ahead of the clock, or on an unusable channel, or "
         "the driver had failed.",
-        "see the table of reasons; if commands are out of order, find out which process commands this mirror "
+        "see the [reasons](#reasons); if commands are out of order, find out which process commands this mirror "
         "(`lowfc hosts`): only one controller may.",
     ),
     "START_AHEAD": (
         "the clock of the sender's host is ahead by more than `control.max_start_ahead_h`.",
-        "set the clocks of both hosts and start the sender again; if its frames are then OUT_OF_ORDER, see the table "
-        "of reasons.",
+        "set the clocks of both hosts and start the sender again; if its frames are then OUT_OF_ORDER, see the "
+        "[reasons](#reasons).",
     ),
     "LATCH_FAILED": (
         "a file that keeps safe mode across restarts cannot be read or written.",
         "make the directory named in the event writable; the loop mode does not change. A controller "
-        "that cannot read a file at its start is in safe mode; one that can write none of its files starts open.",
+        "that cannot read such a file at its start is in safe mode; one that can write none of them starts open.",
     ),
     "COMMANDS_LATE": (
         "in the simulated camera, more than a quarter of the last 500 commands were applied after the next exposure "
@@ -179,7 +183,7 @@ ADVICE: dict[str, tuple[str, str]] = {
     ),
     "RECORDING_FAILED": (
         "the disk is nearly full, a write failed, or the folder is gone. A log is readable up to its last flush.",
-        "free some space, then `lowfc ctl record start`; the loop continues without a log.",
+        "free some space or restore the folder, then `lowfc ctl record start`; the loop continues without a log.",
     ),
     "DISK_SLOW": ("one write took long; messages waited in memory.", "use a faster or less busy disk."),
     "ON_EVENT_FAILED": (
@@ -192,7 +196,7 @@ ADVICE: dict[str, tuple[str, str]] = {
         "reload the page in a browser; a window returns by itself.",
     ),
     "BAD_MESSAGE": (
-        "a message could not be decoded or has an impossible time: another version, or a faulty program.",
+        "a message could not be decoded or has an impossible time: its publisher is of another version, or faulty.",
         "find the publisher of the topic; `lowfc conformance` checks a camera or a mirror.",
     ),
 }
@@ -207,7 +211,7 @@ REASONS: dict[str, tuple[str, str]] = {
     ),
     "REPEATED": ("the newest frame arrived again", "nothing, unless frequent"),
     "LATE": (
-        "its age is above `control.max_frame_age_ms`, or above both 5 ms and three periods; or it was superseded",
+        "the frame is older than `control.max_frame_age_ms`, or than both 5 ms and three periods; or it was superseded",
         "`lowfc doctor`; check the clocks of the hosts",
     ),
     "SATURATED": ("more than `control.max_saturated_pixels` pixels are at full well", "shorter exposure, lower gain"),
@@ -215,8 +219,8 @@ REASONS: dict[str, tuple[str, str]] = {
         "the flux is less than `control.min_flux_fraction` of the calibration's flux",
         "centre the star on the mask; for a fainter star `lowfc calibrate reference`, or a lower fraction",
     ),
-    "NO_FRAME": ("no frame in time", "as for NO_FRAMES"),
-    "STUCK": ("the same image repeatedly", "restart the camera"),
+    "NO_FRAME": ("no frame came in time", "as for NO_FRAMES"),
+    "STUCK": ("the camera repeats the same image", "restart the camera"),
     "AHEAD": ("the sender's start time is too far ahead of this host's clock", "as for START_AHEAD"),
     "CAMERA_UNKNOWN": (
         "the camera restarted and its settings have not arrived",
@@ -224,11 +228,11 @@ REASONS: dict[str, tuple[str, str]] = {
     ),
     "NO_MIRROR": ("the mirror does not follow", "as for MIRROR_LOST"),
     "HELD": ("an interlock or a permit holds the loop", "wait, or remove the cause of the interlock"),
-    "MODAL_LIMIT": ("a modal command reached its limit", "`lowfc ctl limit`; offload; centre the star"),
+    "MODAL_LIMIT": ("a modal command reached its limit", "centre the star; offload; raise it with `lowfc ctl limit`"),
     "STROKE": ("an actuator reached its stroke", "a better flat map, or smaller channels"),
     "SLEW": (
         "an actuator reached its slew limit in one command",
-        "nothing if the loop has just closed or been reset; else lower gains",
+        "nothing, if the loop has just closed or been reset; else lower gains",
     ),
     "NEIGHBOUR": ("neighbours would differ too much in height", "smaller channels; look for a stuck actuator"),
     "NOT_FINITE": ("a value was not finite; the previous command is kept", "check calibration and law"),
