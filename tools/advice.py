@@ -228,7 +228,10 @@ REASONS: dict[str, tuple[str, str]] = {
     ),
     "NO_MIRROR": ("the mirror does not follow", "as for MIRROR_LOST"),
     "HELD": ("an interlock or a permit holds the loop", "wait, or remove the cause of the interlock"),
-    "MODAL_LIMIT": ("a modal command reached its limit", "centre the star; offload; raise it with `lowfc ctl limit`"),
+    "MODAL_LIMIT": (
+        "a modal command reached its limit",
+        "centre the star; offload; raise the limit with `lowfc ctl limit`",
+    ),
     "STROKE": ("an actuator reached its stroke", "a better flat map, or smaller channels"),
     "SLEW": (
         "an actuator reached its slew limit in one command",
