@@ -63,7 +63,10 @@ _GUARD = (
     ("takeovers after which only an operator reactivates the law", guard.MAX_TAKEOVERS),
 )
 _ACCEPTANCE = (
-    ("rejection: minimum ratio of tolerance to standard error for a line to be evaluated", transfer_function.SIGMAS),
+    (
+        "rejection: minimum ratio of tolerance to standard error at which a line (frequency) is evaluated",
+        transfer_function.SIGMAS,
+    ),
     ("rejection: minimum fraction of a mode's lines that are evaluated", acceptance_rejection.MIN_JUDGED),
     ("linearity: amplitudes, times `linear_nm`", *acceptance_linearity.AMPLITUDES),
     ("linearity: standard errors above the limit at which a value fails", linearity.SIGMAS),

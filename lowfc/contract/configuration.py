@@ -133,13 +133,13 @@ class Acceptance(Section):
     highest_of_rate: float = Field(0.3, gt=0, le=0.5)
     """Highest frequency at which rejection and noise transfer are measured, as a fraction of the frame rate."""
     linear_nm: Amplitude = 12.0
-    """Wavefront rms of a mode up to which the sensor must be linear; 12 nm is 5 mas of tilt at 2 m."""
+    """Wavefront rms of a mode up to which the sensor must be linear; 12 nm is 5 mas of tilt for a 2 m pupil."""
     gain_error: Positive = 0.05
     """Largest deviation from 1 of the ratio of measured to true amplitude of a mode, up to linear_nm."""
     crosstalk: Positive = 0.05
     """Largest fraction of a mode that is measured as another mode, up to linear_nm."""
     capture_tilt_nm: Amplitude = 34.0
-    """Wavefront rms of tip or tilt from which the loop must close; 34 nm is 14 mas at 2 m."""
+    """Wavefront rms of tip or tilt from which the loop must close; 34 nm is 14 mas for a 2 m pupil."""
     capture_nm: Amplitude = 20.0
     """Wavefront rms of any other mode from which the loop must close."""
     noise_ratio: float = Field(1.2, gt=1, le=MAX_VALUE)
