@@ -9,6 +9,7 @@ from lowfc.control.laws.kalman import lqg
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.vibration import Line, Model
+from lowfc.control.loop.wording import counted
 from sim_camera.disturbance import LINES_HZ, LINES_MAS
 from tools.shared import markdown
 
@@ -40,8 +41,9 @@ def table() -> str:
         for name, by_timing in laws.items()
     ]
     rows.append(("lower bound for a command held for a period", *(f"{floor_mas():.3f}" for _ in _CASES)))
-    head = f"law; residual of a disturbance of {np.linalg.norm(LINES_MAS):.3g} mas, mas rms per axis, continuous time"
-    return markdown((head, *(f"delay {t.delay:g}, exposure {t.exposure:g}" for t in _CASES)), rows)
+    head = f"law; continuous-time residual, mas rms per axis, of a disturbance of {np.linalg.norm(LINES_MAS):.3g} mas"
+    cases = (f"delay {counted(t.delay, 'frame')}, exposure {t.exposure:g} of the period" for t in _CASES)
+    return markdown((head, *cases), rows)
 
 
 def kalman(timing: Timing, start: float, length: float) -> LinearLaw:

@@ -33,8 +33,8 @@ def render(results: Results) -> str:
     """A row for each size of the steps."""
     head = (
         *("each step, nm rms of surface", "sum of the steps, nm rms of surface"),
-        *("as seen by the sensor, nm of wavefront", "undone, %", "undone without the shift, %"),
-        "true residual before -> after, nm",
+        *("sum as seen by the sensor, nm of wavefront", "undone, %", "undone without the shift, %"),
+        "true residual before -> after, nm rms",
     )
     rows = [
         (
@@ -52,5 +52,5 @@ def render(results: Results) -> str:
         "as seen by the sensor, that the loop removes. It is the slope of (command + disturbance) against the "
         "channel's modes, sign reversed; least squares over all steps and modes, with its standard error. A negative "
         "value means that the loop adds to the steps. The true residual is the rms of all modes about their mean, over "
-        "the circle, before the first step and after the last."
+        "the full circle, before the first step and after the last."
     )

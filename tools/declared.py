@@ -47,20 +47,23 @@ _TUNING = (
     ("tilt of an open loop above which it is flagged, mas rms per axis", OPTICAL_GAIN_MAS),
     ("minimum gain margin of an integrator", MIN_GAIN_MARGIN),
     ("minimum phase margin of an integrator, deg", MIN_PHASE_MARGIN_DEG),
-    ("integrator gain of a mode whose drift is below the noise", LOWEST_GAIN),
+    ("lowest integrator gain that `lowfc tune` chooses", LOWEST_GAIN),
     *_TAKEOVER,
 )
 _GUARD = (
     ("duration of a block, s, unless the minimum number of frames takes longer", guard.BLOCK_S),
     ("minimum number of frames of a block", guard.MIN_BLOCK_FRAMES),
-    ("consecutive worse blocks before the integrator takes over", guard.WORSE_BLOCKS),
-    ("law is worse: mean squared error / that of the integrator, above", guard.WORSE_RATIO),
-    ("loop amplifies: mean squared error / long-term mean square, above", guard.AMPLIFIED),
+    ("consecutive blocks with a worse law or an amplifying loop before the integrator takes over", guard.WORSE_BLOCKS),
+    ("law is worse if mean squared error / that of the integrator is above", guard.WORSE_RATIO),
+    (
+        "loop amplifies if mean squared error / long-term mean square of the pseudo-open-loop modes is above",
+        guard.AMPLIFIED,
+    ),
     ("time constant of the long-term mean square, s", guard.LONG_TERM_S),
     ("duration of a cross-fade, s", guard.CROSS_FADE_S),
-    ("law is far better: mean squared error / that of the integrator, below", guard.BETTER_RATIO),
+    ("law is far better if mean squared error / that of the integrator is below", guard.BETTER_RATIO),
     ("time for which the law must be far better, at first, s", guard.BETTER_S),
-    ("takeovers after which only an operator reactivates the law", guard.MAX_TAKEOVERS),
+    ("takeovers by the integrator after which only an operator reactivates the law", guard.MAX_TAKEOVERS),
 )
 _ACCEPTANCE = (
     (

@@ -159,11 +159,11 @@ def render(results: Results) -> str:
         {
             "disturbance, frequency shift of its lines": "`{preset}`, {percent:.0f} %",
             "guarded law, mas rms per axis": "**{guarded_mas:.2f}**",
-            "law without guard": "{alone_mas:.2f}",
-            "integrator": "{integrator_mas:.2f}",
-            "ratio guarded law / integrator, worst seed": "{worst_ratio:.3f}",
+            "law without guard, mas": "{alone_mas:.2f}",
+            "integrator, mas": "{integrator_mas:.2f}",
+            "guarded law / integrator, worst seed": "{worst_ratio:.3f}",
             "runs with the law overruled": "{overruled} of {seeds}",
-            "latest overruling after the shift": "{after}",
+            "latest overruling, after the shift": "{after}",
         },
         [row | {"after": "" if row["latest_s"] is None else f"{row['latest_s']:.2f} s"} for row in results["moved"]],
     )

@@ -161,35 +161,46 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
 
 
 def render(results: Results) -> str:
-    """A row for each case and law, and a note for each case."""
+    """A table with a row for each case and law, and one for LQG with a row for each case."""
     head = (
         *("sensor", "law", "residual tilt, mas rms per axis", "predicted from the log, mas"),
         *("in theory, mas: disturbance part, noise part", "gain margin", "phase margin, deg"),
     )
-    rows, notes = [], []
-    for name, one in results["cases"].items():
-        for kind, law in one["laws"].items():
-            theory = f"{law['disturbance_mas']:.3f}, {law['noise_mas']:.3f}"
-            margins = f"{law['gain_margin']:.1f}", f"{law['phase_margin_deg']:.0f}"
-            rows.append((name, kind, f"**{law['got_mas']:.3f}**", f"{law['predicted_mas']:.3f}", theory, *margins))
-        got_mas = one["laws"]["lqg"]["got_mas"]
-        theory_mas = float(np.hypot(one["laws"]["lqg"]["disturbance_mas"], one["laws"]["lqg"]["noise_mas"]))
-        shorter = ", ".join(
-            f"{mas:.3f} mas from {int(frames) / RATE_HZ:g} s" for frames, mas in one["theory_by_frames_mas"].items()
+    rows = [
+        (
+            *(name, kind, f"**{law['got_mas']:.3f}**", f"{law['predicted_mas']:.3f}"),
+            f"{law['disturbance_mas']:.3f}, {law['noise_mas']:.3f}",
+            *(f"{law['gain_margin']:.1f}", f"{law['phase_margin_deg']:.0f}"),
         )
-        notes.append(
-            f"- {name}: the noise of a frame is {one['noise_mas']:.2f} mas; the residual during identification was "
-            f"{one['identified_under_mas']:.2f} mas. LQG reached {got_mas / theory_mas:.2f} times its "
-            f"theoretical residual ({theory_mas:.3f} mas), and {got_mas / one['optimum_mas']:.2f} times that of an LQG "
-            "law with the exact lines of the wheel and a random walk behind a low-pass as drift "
-            f"({one['optimum_mas']:.3f} mas). Theory for LQG identified from shorter data: {shorter}. "
-            f"With the lines 2 % higher the residual of this LQG law was {one['moved']['before_mas']:.2f} mas, and "
-            f"{one['moved']['after_mas']:.3f} mas after identification from the run with the higher lines.\n"
-        )
+        for name, one in results["cases"].items()
+        for kind, law in one["laws"].items()
+    ]
+    first, *_ = results["cases"].values()
+    shorter = [f"theory, identified from {int(frames) / RATE_HZ:g} s" for frames in first["theory_by_frames_mas"]]
+    lqg_head = (
+        *("sensor; LQG, tilt in mas rms per axis", "noise of a frame", "residual during identification"),
+        *("theory", "residual / theory", "exact lines", "residual / exact lines", *shorter),
+        *("lines 2 % higher", "lines 2 % higher, identified again"),
+    )
     return (
-        f"{markdown(head, rows)}\n{''.join(notes)}\nReaction wheel with damped lines, 14 mas rms per axis, V = 0 "
-        f"unless stated, {RATE_HZ:g} Hz; the residual is the true tilt in continuous time (8 samples in each frame); "
-        "blurred sensor images through the live loop's own `advance`; laws identified from "
-        f"{IDENTIFY / RATE_HZ:g} s of the closed loop, measured over {MEASURE / RATE_HZ:g} s, "
-        f"{SETTLE / RATE_HZ:g} s after they were loaded."
+        f"{markdown(head, rows)}\n{markdown(lqg_head, map(_lqg_row, results['cases'].items()))}\nReaction wheel with "
+        f"damped lines, 14 mas rms per axis, V = 0 unless stated, {RATE_HZ:g} Hz; the residual is the true tilt in "
+        "continuous time (8 samples in each frame); blurred sensor images through the live loop's own `advance`; laws "
+        f"identified from {IDENTIFY / RATE_HZ:g} s of the closed loop, measured over {MEASURE / RATE_HZ:g} s, "
+        f"{SETTLE / RATE_HZ:g} s after they were loaded. Exact lines: the residual of an LQG law with the exact "
+        "lines of the wheel, and a random walk behind a low-pass as drift. Lines 2 % higher: the residual of the LQG law "
+        "when the lines have moved, and after identification from that run."
+    )
+
+
+def _lqg_row(case: tuple[str, Results]) -> tuple[str, ...]:
+    name, one = case
+    lqg = one["laws"]["lqg"]
+    theory_mas = float(np.hypot(lqg["disturbance_mas"], lqg["noise_mas"]))
+    return (
+        *(name, f"{one['noise_mas']:.2f}", f"{one['identified_under_mas']:.2f}"),
+        *(f"{theory_mas:.3f}", f"{lqg['got_mas'] / theory_mas:.2f}"),
+        *(f"{one['optimum_mas']:.3f}", f"{lqg['got_mas'] / one['optimum_mas']:.2f}"),
+        *(f"{mas:.3f}" for mas in one["theory_by_frames_mas"].values()),
+        *(f"{one['moved']['before_mas']:.2f}", f"{one['moved']['after_mas']:.3f}"),
     )

@@ -171,11 +171,11 @@ def render(results: Results) -> str:
         for row in harmful
     )
     heads = {"sensor": "`{sensor}`", "V": "{magnitude}"} | {
-        f"`{name}`": f"{{{name}}}" for name in PRESETS if name != "quiet"
+        f"`{name}`, nm rms": f"{{{name}}}" for name in PRESETS if name != "quiet"
     }
     return (
         f"{formatted_table(heads, table)}\n"
-        f"True wavefront, open loop -> closed loop with automatic gains, nm rms over the second half of "
+        f"True wavefront, open loop -> closed loop with automatic gains, over the second half of "
         f"{results['seconds']:g} s at {results['rate_hz']:g} Hz, mean of {results['seeds']} seeds. "
         f"{len(rows)} cases (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them with every image "
         f"simulated); {saturated} more were excluded because the star saturates the detector. Added contrast excludes "

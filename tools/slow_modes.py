@@ -89,7 +89,7 @@ def render(results: Results) -> str:
     head = ["mode", "drift, nm rms"]
     for name in cases:
         head += [f"exposure {name} of the period: residual, pm rms", "photon-noise bound, pm"]
-        head += ["photon and read noise through R, pm", f"below {TARGET_PM:g} pm"]
+        head += ["photon and read noise through R, pm", f"residual below {TARGET_PM:g} pm"]
     head.append(f"mirror error (applied minus commanded), exposure {next(iter(cases))} of the period, pm rms")
     rows = []
     for mode, one in first["modes"].items():
