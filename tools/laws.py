@@ -188,8 +188,8 @@ def render(results: Results) -> str:
         "continuous time (8 samples in each frame); blurred sensor images through the live loop's own `advance`; laws "
         f"identified from {IDENTIFY / RATE_HZ:g} s of the closed loop, measured over {MEASURE / RATE_HZ:g} s, "
         f"{SETTLE / RATE_HZ:g} s after they were loaded. Exact lines: the residual of an LQG law with the exact "
-        "lines of the wheel, and a random walk behind a low-pass as drift. Lines 2 % higher: the residual of the LQG law "
-        "when the lines have moved, and after identification from that run."
+        "lines of the wheel, and a random walk behind a low-pass as drift. Lines 2 % higher: the residual of the LQG "
+        "law when the lines have moved, and after identification from that run."
     )
 
 
