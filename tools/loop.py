@@ -137,19 +137,19 @@ def _json_and_peak_bytes(folder: str, arguments: str) -> tuple[Results, int]:
 
 
 LOG_COLUMNS = {
-    "recorded at 1 kHz": "{seconds} s",
-    "log": "{log_mb:.0f} MB",
+    "duration of the log at 1 kHz": "{seconds} s",
+    "size": "{log_mb:.0f} MB",
     "messages": "{messages_recorded}",
     "lost": "{messages_lost}",
     "steps replayed": "{frames} of {frames_processed}",
-    "unchecked": "{unchecked}",
+    "steps unchecked": "{unchecked}",
     "largest difference": "{largest_difference_nm:g} nm",
     "replay speed, one process": "{speed_one:.1f} x",
-    "all processors": "{speed_all:.1f} x",
-    "memory, one process": "{replay_mb:.0f} MB",
+    "replay speed, all processors": "{speed_all:.1f} x",
+    "memory of replay, one process": "{replay_mb:.0f} MB",
 }
 RECORDER_COLUMNS = {
-    "recorder at": "{offered_hz:.0f} Hz",
+    "frame rate": "{offered_hz:.0f} Hz",
     "processor time": "{cpu_percent:.0f} %",
     "processor time / time to copy the payloads": "{ratio:.0f} x",
     "messages": "{messages_published}",
