@@ -102,9 +102,9 @@ def in_the_loop(name: str, preset: str) -> dict[str, float]:
 def render(results: Results) -> str:
     """A row for each sensor."""
     head = [
-        *("`--sensor`", "light, %", "peak, %", "cond14", "quantum, %", "tilt noise, mas"),
-        *("noise in the band, mas", "noise, shear fitted, mas", "error from shear, nm", "twin, us"),
-        *(column for preset in PRESETS for column in (f"`{preset}`: nm rms", "mas per axis")),
+        *("`--sensor`", "light, %", "peak, %", "condition number", "quantum limit / bound, %", "tilt noise, mas"),
+        *("tilt noise in the band, mas", "tilt noise, shear fitted, mas", "error from shear, nm", "twin time, us"),
+        *(f"`{preset}`: {column}" for preset in PRESETS for column in ("wavefront, nm rms", "tilt, mas rms per axis")),
     ]
     rows = []
     for name, sensor in results["sensors"].items():
@@ -122,15 +122,14 @@ def render(results: Results) -> str:
     star = configured("sam")
     return (
         f"{markdown(head, rows)}\nLight is the fraction of the light entering the open circle that falls on the "
-        "detector; peak is the brightest pixel's share of that; cond14 is the condition number of H for Z2 "
-        "to Z15. Quantum is the ratio "
-        "of the quantum limit to the Cramer-Rao bound in variance: the median of the modes, without read noise. "
-        "Noise is of tip and tilt, per axis (rms of the two axes), in one frame of "
-        f"{star.exposure_ns / 1e6:g} ms of a star of V = {star.star.magnitude:g}, all {len(star.noll)} modes fitted, "
-        "all photons at the central wavelength; then with "
+        "detector; peak is the brightest pixel's share of that light. The condition number is that of H for Z2 to Z15. "
+        "Quantum limit / Cramer-Rao bound is a ratio of variances: the median of the modes, without read noise. "
+        "Tilt noise is the rms of the two axes in one frame of "
+        f"{star.exposure_ns / 1e6:g} ms of a star of V = {star.star.magnitude:g}, with all {len(star.noll)} modes "
+        "fitted and all photons at the central wavelength; then with "
         "the same photons over a band 20 % of the central wavelength wide, in four wavelengths; then with "
         "the shear of the beam as an additional "
-        f'fitted parameter. "Error from shear" is the wavefront error, nm rms over the circle, from a shear of '
+        f"fitted parameter. Error from shear is the wavefront error, nm rms over the circle, from a shear of "
         f"{100 * SHEAR:g} % of the diameter that is not fitted. The twin's time is for one frame on one thread. "
         "The last columns are open loop -> closed loop for two disturbances: true wavefront over the open pupil, and "
         "true tilt, "
