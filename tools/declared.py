@@ -101,7 +101,7 @@ def exported_names(package: str) -> str:
     else:
         documented = [(name, import_module(name).__doc__) for name in modules(package)]
     rows = ((f"`{name}`", one_line((text or "").split("\n\n")[0])) for name, text in documented)
-    return markdown(("name", ""), rows)
+    return markdown(("name", "description"), rows)
 
 
 def modules(package: str) -> list[str]:
@@ -147,7 +147,7 @@ def topics(role: Role, *own: Topic) -> str:
         answers = "; the last one is returned on query" if topic.queryable else ""
         name = topic.message.DESCRIPTOR.full_name
         rows.append((f"`{topic.key}`", f"`{name}`", when(topic), does, topic.description.rstrip(".") + answers))
-    return markdown(("topic", "message", "when", "you", ""), rows)
+    return markdown(("topic", "message", "when", "your program", "description"), rows)
 
 
 def when(topic: Topic) -> str:
@@ -169,7 +169,7 @@ def fields(message: str) -> str:
         repeated = "repeated " if field.label == type(field).LABEL_REPEATED else ""
         comment = comments.get((_MESSAGES, index, _FIELDS, place)) or _UNCOMMENTED[field.name]
         rows.append((f"`{field.name}`", repeated + kind, field.number, comment))
-    return markdown(("field", "type", "number", ""), rows)
+    return markdown(("field", "type", "number", "description"), rows)
 
 
 def one_line(text: str | None) -> str:

@@ -74,7 +74,7 @@ def _keys(heading: str, about: str, section: type[Section], prefix: str) -> str:
         values = [_bound(str(one)) for one in bounds if hasattr(one, "__dataclass_fields__")]
         values += [f"`{one}`" for one in nested if isinstance(one, str | int)]
         rows.append((f"`{prefix}{key}`", default, ", ".join(values), one_line(descriptions[key])))
-    return f"## {heading}\n\n{about}\n\n{markdown(('key', 'default', 'values', ''), rows)}"
+    return f"## {heading}\n\n{about}\n\n{markdown(('key', 'default', 'values', 'description'), rows)}"
 
 
 def _bound(text: str) -> str:
@@ -96,7 +96,7 @@ def topics() -> str:
         ]
         about = f"{topic.description}{' The last one is returned on query.' if topic.queryable else ''}"
         rows.append((f"`{topic.key}`", message, when(topic), *who, about))
-    return markdown(("topic", "message", "when", "published by", "received by", ""), rows)
+    return markdown(("topic", "message", "when", "published by", "received by", "description"), rows)
 
 
 def messages() -> str:
@@ -131,11 +131,16 @@ def _field_table(result: type[Result]) -> str:
     for name, info in printed.items():
         extra = info.json_schema_extra if isinstance(info.json_schema_extra, dict) else {}
         rows.append(
-            (f"`{info.alias or name}`", f"`{_type(info.annotation)}`", extra.get("unit", ""), info.description or "")
+            (f"`{info.alias or name}`", f"`{_type(info.annotation)}`", extra.get("unit", ""), _cell(info.description))
         )
     for name, computed in result.model_computed_fields.items():
-        rows.append((f"`{name}`", f"`{_type(computed.return_type)}`", "", one_line(computed.description)))
-    return markdown(("key", "type", "unit", ""), rows)
+        rows.append((f"`{name}`", f"`{_type(computed.return_type)}`", "", _cell(one_line(computed.description))))
+    return markdown(("key", "type", "unit", "label"), rows)
+
+
+def _cell(text: str | None) -> str:
+    """A text as the cell of a table, in which | would end the cell."""
+    return (text or "").replace("|", r"\|")
 
 
 def _type(annotation: Any) -> str:
