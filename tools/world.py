@@ -115,7 +115,8 @@ def render(results: Results) -> str:
     rows = results["rows"]
     head = ["imperfection", "keys"]
     for sensor, magnitude in (one["of"] for one in rows[0]["figures"]):
-        head += [f"`{sensor}`, V = {magnitude}: nm rms", "added contrast"]
+        star = f"`{sensor}`, V = {magnitude}"
+        head += [f"{star}: residual, nm rms", f"{star}: added contrast"]
     lines = []
     for row in rows:
         keys = ", ".join(f"`{key} = {_shown(value)}`" for key, value in row["keys"].items())
@@ -123,13 +124,13 @@ def render(results: Results) -> str:
         cells = [(f"{one['residual_nm']:.2f}", f"{one['contrast']:.1e}") for one in row["figures"]]
         lines.append([name, keys, *(cell for pair in cells for cell in pair)])
     return (
-        f"{markdown(head, lines)}\nTrue residual wavefront over the open pupil in continuous time, and mean "
-        "contrast that the modes add to the dark zone (quadratic form), over the second half of "
-        f"{results['seconds']:g} s at {RATE_HZ:g} Hz, disturbance `{PRESET}`, one seed, with the first "
-        f"automatic gains of the loop without imperfections, read {_UNTIL_GAINS_S:g} s after its start; from 4 s on, "
-        "most gains of modes other than tilt are lower. The live loop's own `advance` processes the sensor images and "
-        "commands the simulated mirror. The calibration is analytic and includes no imperfection except dark current, "
-        "or has dark and reference image measured on that detector."
+        f"{markdown(head, lines)}\nResidual: true wavefront over the open pupil, in continuous time. Added contrast: mean "
+        "over the dark zone, from the quadratic form of the modes. Both are of the second half of "
+        f"{results['seconds']:g} s at {RATE_HZ:g} Hz, with the disturbance `{PRESET}` and one seed. Gains: the first "
+        f"automatic ones of the loop without imperfections, read {_UNTIL_GAINS_S:g} s after its start; from 4 s on, most "
+        "gains of modes other than tilt are lower. The live loop's own `advance` processes the sensor images and "
+        "commands the simulated mirror. The calibration is analytic and includes no imperfection except dark current; "
+        "\"dark and I0 measured\" means on the detector of that row."
     )
 
 
