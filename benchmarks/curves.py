@@ -160,16 +160,16 @@ def point(size: Size, repeats: Sequence[Result]) -> Result:
 
 HEADINGS = (
     "step p50, us",
-    "p99",
-    "cpu",
-    "products alone",
+    "step p99, us",
+    "step's processor time, us",
+    "products alone, us",
     "bytes, MB",
     "read rate, GB/s",
     "memory limit, us",
     "step / memory limit",
     "loop p50, us",
-    "p99",
-    "controller's cpu, us",
+    "loop p99, us",
+    "controller's processor time, us",
     "half a bare echo, us",
     "frames without a command",
 )
@@ -217,17 +217,18 @@ def about(result: Result) -> str:
     default = Size(**result["default"])
     loops = (
         f"The loop runs at {result['rate_hz']:g} Hz with its real-time set-up; its latency is from just before "
-        "publishing a frame to just after sending its command. The controller's cpu is of all its threads, with "
-        "telemetry, for each frame."
+        "publishing a frame to just after sending its command. The controller's processor time is of all its "
+        "threads, with telemetry, for each frame."
         if result["rate_hz"]
         else ""
     )
     failed = "".join(f" Failed, {fault}." for fault in result["failed"])
     return (
-        f"Times in us, medians over {result['repeats']} repeats of {result['seconds']:g} s each; in brackets the range "
-        f"of p50. Sizes not on the axis: {default.pixels} pixels, {default.modes} modes, {default.actuators} "
-        "actuators. The step: one thread, back to back, normal scheduling, warm caches. The memory limit: one read of "
-        "as many bytes as a step must touch, by a float32 dot product of one half with the other. "
+        f"Medians over {result['repeats']} repeats of {result['seconds']:g} s each; in brackets the range "
+        f"of p50. Sizes that a table does not vary: {default.pixels} pixels, {default.modes} modes, "
+        f"{default.actuators} actuators. The step: one thread, back to back, normal scheduling, warm caches. The "
+        "memory limit: one read of as many bytes as a step must touch, by a float32 dot product of one half with the "
+        "other. "
         f"{loops}{failed}"
     )
 

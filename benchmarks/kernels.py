@@ -56,9 +56,9 @@ def measure(options: argparse.Namespace, report: Report) -> Result:
 
 def tables(found: Result) -> list[Lines]:
     """A row for each size and ratio."""
-    head = ["pixels, modes, actuators", "ratio", "median (range)"]
+    head = ["pixels", "ratio of times", "median (range)"]
     lines = [
-        [f"{one['pixels']}, {one['modes']}, {one['actuators']}", name, ranged(ratios, "{:.2f}".format)]
+        [str(one["pixels"]), name.replace(" over ", " / "), ranged(ratios, "{:.2f}".format)]
         for one in found["sizes"]
         for name, ratios in one["ratios"].items()
     ]
@@ -66,12 +66,17 @@ def tables(found: Result) -> list[Lines]:
 
 
 def about(found: Result) -> str:
-    """Median times, in us, as a sentence."""
+    """Median times, in us, and the sizes, as sentences."""
+    first = found["sizes"][0]
     each = [
-        ", ".join(f"{name} {median(turn[name] for turn in one['turns']):.1f}" for name in one["turns"][0])
+        f"{one['pixels']} pixels: "
+        + ", ".join(f"{name} {median(turn[name] for turn in one['turns']):.1f}" for name in one["turns"][0])
         for one in found["sizes"]
     ]
-    return f"p50 in us, medians over {len(found['sizes'][0]['turns'])} turns: {'; '.join(each)}."
+    return (
+        f"p50 in us, medians over {len(first['turns'])} turns: {'; '.join(each)}. {first['modes']} modes, "
+        f"{first['actuators']} actuators."
+    )
 
 
 def _timed_calls(size: Size) -> dict[str, Callable[[], object]]:

@@ -100,7 +100,8 @@ def allocated(step: ControlStep, payloads: Payloads) -> dict[str, float]:
 def tables(found: Result) -> list[Lines]:
     """A row for each stage."""
     columns = [(name, at) for name in ("hot_us", "paced_us") for at in ("p50", "p99")]
-    head = ["us", "back to back p50", "p99", f"at {found['rate_hz']:g} Hz p50", "p99"]
+    how = {"hot_us": "back to back", "paced_us": f"at {found['rate_hz']:g} Hz"}
+    head = ["stage, us", *(f"{how[name]}: {at}" for name, at in columns)]
     stages = (*STAGES, REMAINDER, STEP, PRODUCT)
     return [[head, *([stage, *(f"{found[name][stage][at]:.1f}" for name, at in columns)] for stage in stages)]]
 

@@ -108,7 +108,11 @@ def tables(result: Result) -> list[Lines]:
     """Latencies of each loop, and their ratios turn by turn."""
     turns = result["turns"]
     lines = [
-        ["", *(f"{label}, us: {at}" for label in SPANS.values() for at in PERCENTILES.values()), "without a command"]
+        [
+            "loop",
+            *(f"{label}, us: {at}" for label in SPANS.values() for at in PERCENTILES.values()),
+            "frames without a command",
+        ]
     ]
     for name in (DIRECT, CAMERA_PROCESS, IN_CONTROLLER):
         each = [turn[name] for turn in turns]

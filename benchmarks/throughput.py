@@ -143,7 +143,14 @@ def highest_rate(loop_options: Sequence[str], rates: Sequence[float], seconds: f
     }
 
 
-HEADINGS = ("loop", "highest rate, Hz", "frame to command p50, us", "p99", "commands late", "why the next rate fails")
+HEADINGS = (
+    "loop",
+    "highest rate, Hz",
+    "frame to command p50, us",
+    "p99, us",
+    "commands late",
+    "why the next rate fails",
+)
 USE_HEADINGS = ("loop", "rate, Hz", *_ROLES, "by processor")
 
 
@@ -186,7 +193,7 @@ def about(result: Result) -> str:
         f"command, no message lost by the recorder, the rate within {100 * RATE_TOLERANCE:g} % of the requested one; "
         f"{runs} runs on a grid of {len(rates)} rates from {rates[0]:g} to {rates[-1]:g} Hz. Latencies are of one "
         "sustained run at the highest rate. A command is late if it arrives after the start of the next exposure "
-        "(known for the simulated camera). Processor time is a percentage of one processor, all threads of the "
-        "process, over the last four fifths of a run; in brackets the processors that it may run on; last the sum of "
-        "the processes bound to one processor."
+        "(known for the simulated camera). The second table has the processor time of each process, all its threads, "
+        "in per cent of one processor, over the last four fifths of a run; the processors that it may run on are in "
+        "brackets. The last column is the sum of the processes bound to one processor."
     )

@@ -48,9 +48,11 @@ LOOP_COLUMNS = {
     "rate": "{rate_hz:.1f} Hz",
     "tilt disturbance, mas rms per axis": "{tilt_disturbance_mas:.1f}",
     "tilt residual, mas rms per axis": "{tilt_residual_mas:.2f}",
-    "predicted residual, mas": "{tilt_predicted_mas:.2f}",
+    "predicted residual, mas rms per axis": "{tilt_predicted_mas:.2f}",
     **{
-        f"{title}, us": " / ".join(f"{{latency_us[{stage}][{p}]:.0f}}" for p in ("p50", "p99", "p99_9"))
+        f"{title}, us: p50 / p99 / p99.9": " / ".join(
+            f"{{latency_us[{stage}][{p}]:.0f}}" for p in ("p50", "p99", "p99_9")
+        )
         for title, stage in (("frame to command", "frame_to_command"), ("frame to mirror", "frame_to_mirror"))
     },
     "frames skipped or missing": "{dropped} of {frames_published}",
@@ -90,7 +92,7 @@ def render(results: Results) -> str:
     )
     return (
         f"{formatted_table(LOOP_COLUMNS, rows)}\n"
-        "The rate is by the host's clock. Latencies are p50 / p99 / p99.9. Frame to command "
+        "The rate is by the host's clock. Frame to command "
         "ends when the controller's send returns; the mirror may have received the command before. The "
         "prediction is for the disturbance's expected spectrum and the measured delay, without lost frames; a run is "
         "one realisation."

@@ -8,7 +8,7 @@ from lowfc.control.kernel.tables import KERNELS
 from tools.shared import Results, markdown
 
 NUMPY = f"lowfc, {KERNELS[0]}"
-HEAD = ("quantity", "target", "reached", "met", "lower bound", "what takes the time")
+HEAD = ("quantity", "target", "reached", "met", "lower bound", "what takes the time or memory")
 Row = tuple[str, ...]
 """A row of the table, with the columns of `HEAD`."""
 OBJECTS = "decoding and encoding by protobuf, new Python objects for the state, calls of compiled code"
@@ -24,7 +24,7 @@ def _row(quantity: str, limit: float, values: Sequence[float], form: str, bound:
     """Row of a quantity with one value for each turn; `bound` holds for any such program; `excess`: work above it."""
     reached, shown = median(values), form.format
     spread = f" ({shown(min(values))} to {shown(max(values))})" if len(values) > 1 else ""
-    met = "yes" if reached <= limit else "no"
+    met = "yes" if reached <= limit else "no" if shown(reached) != shown(limit) else f"no: {reached:.5g}"
     return quantity, f"at most {shown(limit)}", shown(reached) + spread, met, bound, excess
 
 
@@ -36,7 +36,7 @@ def _steps(results: Results) -> Iterator[Row]:
         unit = "product R x" if other == "product" else "read of the step's bytes"
         excess = OBJECTS if other == "product" else "two copies of the frame's bytes by protobuf; " + OBJECTS
         ratios = size["ratios"][f"fused over {other}"]
-        yield _row(f"fused step, {side} x {side}: time / that of one {unit}", limit, ratios, "{:.2f}", "1", excess)
+        yield _row(f"fused step, {side} x {side}: time / time of one {unit}", limit, ratios, "{:.2f}", "1", excess)
 
 
 def _comparison(results: Results) -> Iterator[Row]:
@@ -50,7 +50,7 @@ def _comparison(results: Results) -> Iterator[Row]:
     for other, targets in (("C chain", {"p50": 40.0, "p99": 80.0}), ("pyrtcao, fused", {"p50": 0.0, "p99": 0.0})):
         for at, limit in targets.items():
             differences = [mine[at] - its[at] for mine, its in pairs(runs, other)]
-            quantity = f"frame to command, fused minus {other}, {at}, us"
+            quantity = f"frame to command, lowfc minus {other.replace(',', '')}, {at}, us"
             excess = ways if other == "C chain" else f"{sockets}; also checks, limits and messages that pyrtcao lacks"
             yield _row(quantity, limit, differences, "{:+.0f}", "0 for the same work in C", excess)
 
@@ -63,7 +63,7 @@ def _stalls(results: Results) -> Iterator[Row]:
         0,
         [float(results["frames_without_command"])],
         "{:.0f}",
-        f"{bare}: wake-ups of the bare loops more than a period late",
+        f"{bare}: wake-ups of bare loops, more than a period late",
         f"the host caused {stalls['of_host']} of the {stalls['stalled']} stalls",
     )
     for name, mb in results["memory_mb"].items():

@@ -124,13 +124,13 @@ def render(results: Results) -> str:
         cells = [(f"{one['residual_nm']:.2f}", f"{one['contrast']:.1e}") for one in row["figures"]]
         lines.append([name, keys, *(cell for pair in cells for cell in pair)])
     return (
-        f"{markdown(head, lines)}\nResidual: true wavefront over the open pupil, in continuous time. Added contrast: mean "
-        "over the dark zone, from the quadratic form of the modes. Both are of the second half of "
+        f"{markdown(head, lines)}\nResidual: true wavefront over the open pupil, in continuous time. Added contrast: "
+        "mean over the dark zone, from the quadratic form of the modes. Both are of the second half of "
         f"{results['seconds']:g} s at {RATE_HZ:g} Hz, with the disturbance `{PRESET}` and one seed. Gains: the first "
-        f"automatic ones of the loop without imperfections, read {_UNTIL_GAINS_S:g} s after its start; from 4 s on, most "
-        "gains of modes other than tilt are lower. The live loop's own `advance` processes the sensor images and "
+        f"automatic ones of the loop without imperfections, read {_UNTIL_GAINS_S:g} s after its start; from 4 s on, "
+        "most gains of modes other than tilt are lower. The live loop's own `advance` processes the sensor images and "
         "commands the simulated mirror. The calibration is analytic and includes no imperfection except dark current; "
-        "\"dark and I0 measured\" means on the detector of that row."
+        '"dark and I0 measured" means on the detector of that row.'
     )
 
 

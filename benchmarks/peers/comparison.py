@@ -59,14 +59,15 @@ DEFINITIONS = {
     "pyrtcao's WavefrontSensor.expose",
     "t1": "just after the controller has sent the frame's command: after the stream's semaphores are posted, "
     "after the zenoh put, or after pyrtcao's write_stream; for lowfc after the direct link's send, before zenoh's",
-    "to the mirror": "from t0 until the mirror's process has received the actuator values; for lowfc until just before "
-    "it publishes its state",
+    "frame to command": "from t0 to t1",
+    "frame to mirror": "from t0 until the mirror's process has received the actuator values; for lowfc until just "
+    "before it publishes its state",
     "clock": "CLOCK_MONOTONIC, one host",
     "pacing": "the source sleeps until absolute times; a late frame is sent at once, and its t0 is the actual time of "
     "sending; no frame is skipped",
-    "cells": "t1 - t0 (p50 to max) or the time to the mirror, us, median (lowest to highest) over the turns; each turn "
-    "runs every implementation once, every other turn in the opposite order",
-    "without a command": "measured frames that led to no command, in all turns",
+    "cells": "median (lowest to highest) over the turns; each turn runs every implementation once, every other turn in "
+    "the opposite order",
+    "frames without a command": "measured frames that led to no command, in all turns",
     "pinning": "source and mirror on the first processor, all else on the second; with three or more processors "
     "lowfc's mirror on the third",
     "memory": "lowfc's processes lock theirs (`realtime.lock_memory`), the others do not",
@@ -261,7 +262,12 @@ def _processes(
 
 
 PERCENTILES = {"p50": "p50", "p99": "p99", "p99_9": "p99.9", "max": "max"}
-HEADINGS = ["implementation", *PERCENTILES.values(), "without a command", "to the mirror p50", "to the mirror p99"]
+HEADINGS = [
+    "implementation",
+    *(f"frame to command {at}, us" for at in PERCENTILES.values()),
+    "frames without a command",
+    *(f"frame to mirror {at}, us" for at in ("p50", "p99")),
+]
 
 
 def tables(result: Result) -> list[Lines]:

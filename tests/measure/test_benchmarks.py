@@ -339,10 +339,10 @@ def test_the_tables_have_ranges_differences_within_a_turn_and_missing_implementa
         by_heading(lines) for lines in comparison.tables(json.loads(json.dumps(result)))
     )
     chain, absent, failed, fused = latencies
-    assert fused["p50"] == "100 (60 to 150)"
-    assert fused["max"] == "660 (600 to 690)"
-    assert chain["without a command"] == "12 of 2000"
-    assert (absent["p50"], failed["p50"]) == ("not installed", "failed")
+    assert fused["frame to command p50, us"] == "100 (60 to 150)"
+    assert fused["frame to command max, us"] == "660 (600 to 690)"
+    assert chain["frames without a command"] == "12 of 2000"
+    assert [line["frame to command p50, us"] for line in (absent, failed)] == ["not installed", "failed"]
     (against,) = differences
     assert list(against.values()) == ["1 of 2", "1 of 2", "-60 (-240 to +120)", "+20 (-6 to +45)", "C chain"]
     assert [line["implementation"] for line in features] == list(runs)
@@ -426,7 +426,8 @@ def test_streams_and_the_direct_link_are_compared_turn_by_turn(monkeypatch: pyte
     assert found_p50[:3] == ["350 (100 to 600)", "350 (200 to 500)", "350 (300 to 400)"]
     assert found_p50[3:] == ["1.42 (0.83 to 2.00)", "1.83 (0.67 to 3.00)"]
     _, between, _, ratio, _ = by_heading(lines)
-    assert (between["without a command"], ratio["frame to command, us: p99"]) == ("2 of 1000", "1.00 (1.00 to 1.00)")
+    assert between["frames without a command"] == "2 of 1000"
+    assert ratio["frame to command, us: p99"] == "1.00 (1.00 to 1.00)"
     assert "includes 350 (200 to 500) us (p50)" in streams.about(found)
     assert "reads the stream itself, 350 (300 to 400) us" in streams.about(found)
 
