@@ -65,7 +65,7 @@ def render_chaos(results: Results) -> str:
     seeds = ", ".join(str(run["seed"]) for run in runs)
     parts = [
         f"{passed} of {passed + failed} passed{skipped_text}, seeds {seeds}.\n",
-        markdown(("case", "injected fault", "passed", "residual, nm rms: before -> after"), _rows(by_name)),
+        markdown(("case", "injected fault", "passed", "residual by seed, nm rms: before -> after"), _rows(by_name)),
     ]
     failures = [
         f"- `{case['name']}`, seed {run['seed']}: {rule}: {one['found']}"
@@ -155,10 +155,10 @@ def _consoles(cases: Sequence[Results]) -> list[str]:
 
 SOAK_COLUMNS = {
     "process": "{name}",
-    "memory, MB: first -> last (most)": "{memory_first_mb:.1f} -> {memory_last_mb:.1f} ({memory_most_mb:.1f})",
-    "MB per hour": "{growth}",
-    "handles": "{handles_first} -> {handles_last} (most {handles_most})",
-    "threads": "{threads_first} -> {threads_last}",
+    "memory, MB: first -> last (largest)": "{memory_first_mb:.1f} -> {memory_last_mb:.1f} ({memory_most_mb:.1f})",
+    "slope of memory, MB per hour": "{growth}",
+    "handles: first -> last (largest)": "{handles_first} -> {handles_last} ({handles_most})",
+    "threads: first -> last": "{threads_first} -> {threads_last}",
 }
 GROWTH = "{memory_mb_per_hour:+.2f} +- {memory_mb_per_hour_error:.2f}"
 
