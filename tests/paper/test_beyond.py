@@ -163,14 +163,14 @@ def test_loops_are_judged_by_the_published_pointing(monkeypatch):
     monkeypatch.setattr(anchors, "_history", loops.history)
     rows = {row.quantity: row for row in anchors._pointing(Context(), SMALLEST)}
     for preset in ("reaction-wheel", "reaction-wheel-ideal"):
-        row = rows[f"tilt, {preset}"]
+        row = rows[f"residual tilt, {preset}"]
         assert (row.measured, row.paper) == (0.3, anchors.ROMAN_MAS)
-        assert rows[f"verdict, tilt, {preset}"].measured == anchors.REACHED
+        assert rows[f"verdict, residual tilt, {preset}"].measured == anchors.REACHED
         assert 0 < row.limit * tilt_nm_per_mas(2.0) < 2.0, (
             "nm; the line has 14 nm rms, and the model of the law predicts it"
         )
     for where, verdict in (("sky", anchors.REACHED), ("laboratory", anchors.NOT_REACHED)):
-        row = rows[f"std of means over 2 s, {where}"]
+        row = rows[f"std of 2 s means of tilt, {where}"]
         # Ten means of +-0.05 mas, in 24 s without the first 4 s.
         assert row.measured == pytest.approx(0.05 * np.sqrt(10 / 9))
         assert rows[f"verdict, {row.quantity}"].measured == verdict

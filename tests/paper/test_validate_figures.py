@@ -149,7 +149,9 @@ def test_the_signal_of_a_milliarcsecond_agrees_with_the_slope_of_the_image(table
     tilt_nm = 1e-3 / 3600 * np.pi / 180 * 2.0 / 4 * 1e9 * 2 * np.broadcast_to(u, (512, 512))  # 2 m; Z2 = 2 u
     np.testing.assert_allclose(ready.opd_nm(np.array([NM_PER_MAS, 0.0])), tilt_nm, atol=1e-3)
     slope = ready.band_tilt_H[:, 0] * NM_PER_MAS / ready.band_I0.max()
-    assert values(rows, "P-V change over peak", name="sam, tilt x")[0] == pytest.approx(np.ptp(slope), rel=0.02)
+    assert values(rows, "P-V change of the image / its peak", name="sam, tilt x")[0] == pytest.approx(
+        np.ptp(slope), rel=0.02
+    )
 
 
 def test_the_signal_to_noise_ratio_of_an_image_agrees_with_the_bound_of_tilt(tables):

@@ -64,7 +64,7 @@ def _aberrated(context: Context, name: str, coma: int) -> _Aberrated:
 
 
 @assuming(
-    "Mean from 4.5 to 5.5 lambda/D within 42.5 degrees of the x axis, over the peak of the star with a flat "
+    "Contrast: mean from 4.5 to 5.5 lambda/D within 42.5 degrees of the x axis, over the peak of the star with a flat "
     "wavefront. paper: its goal, and 'over a factor of 100'; it does not specify the coma. Corrected: mean of at "
     f"most {REALISATIONS} exposures; limit: the flat wavefront. {BRIGHT} {FULL_CHAIN}"
 )

@@ -59,7 +59,7 @@ def plot_fig2(context: Context, path: Path) -> None:
     plots.draw(path, panels, f"Fig. 2. {ready.name}: flat wavefront at {optics.wavelength_nm:.0f} nm.")
 
 
-@assuming("The paper gives the light of its own pupil on the disk only; opening of the wedges 95 degrees.")
+@assuming("The paper gives this light for its own pupil, and for the disk only. The wedges open by 95 degrees.")
 def fig3(context: Context) -> Iterator[Row]:
     """Sizes and reflected light of the focal-plane masks, Fig. 3."""
     for name in context.names("sam", "bowtie"):
@@ -95,7 +95,7 @@ def fig4(context: Context) -> Iterator[Row]:
         for noll in _TABLE_NOLLS:
             yield Row(
                 f"{name}, Z{noll} {mode_name(noll)}",
-                "peak of |I - I0| over peak of I0",
+                "peak of abs(I - I0) / peak of I0",
                 "",
                 float(np.abs(differential(ready, noll)).max()),
                 PAPER_TABLE2[noll] if ready.paper_name == "sam" else None,
@@ -124,7 +124,7 @@ def _tilted_e(ready: Prepared, axis: int) -> tuple[Array, Array]:
 @assuming(
     f"1 mas, {TABLE4_EXPOSURE_S} s, V = {STAR.magnitude}, 20 % band in five wavelengths including both ends, "
     "1 e- read noise, our own photometry and masks, full optical chain. "
-    "The ratio of the image is that of the matched filter."
+    "The image's signal-to-noise ratio is that of the matched filter."
 )
 def fig10(context: Context) -> Iterator[Row]:
     """Signal of 1 mas of tilt in a short exposure, Fig. 10 and Sect. 3.3."""
@@ -134,8 +134,8 @@ def fig10(context: Context) -> Iterator[Row]:
             row_name, (flat_e, change_e) = f"{name}, tilt {'xy'[axis]}", _tilted_e(ready, axis)
             signal_e, paper = float(np.ptp(change_e)), PAPER_SIGNAL.get(ready.paper_name)
             ratio = np.abs(change_e) / np.sqrt(variance_e(flat_e + change_e, TABLE4_READ_NOISE_E))
-            yield Row(row_name, "P-V change over peak", "", signal_e / float(flat_e.max()), paper)
-            yield Row(row_name, "P-V change", "e-", signal_e)
+            yield Row(row_name, "P-V change of the image / its peak", "", signal_e / float(flat_e.max()), paper)
+            yield Row(row_name, "P-V change of the image", "e-", signal_e)
             yield Row(row_name, "largest signal-to-noise ratio of a pixel", "", float(ratio.max()))
             yield Row(row_name, "signal-to-noise ratio of the image", "", float(np.sqrt(np.sum(ratio**2))))
 

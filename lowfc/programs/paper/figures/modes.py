@@ -48,7 +48,7 @@ def _ensemble(context: Context, name: str) -> Ensemble:
 
 
 @assuming(
-    "The wavefronts of Table 3, n = 1 to 4, input matched to its rms; the paper only shows the points, 'tight' "
+    "The wavefronts of Table 3, n = 1 to 4, input matched to its rms. The paper only plots the points, 'tight' "
     f"about y = x. {BRIGHT} Images by the full optical chain."
 )
 def fig5(context: Context) -> Iterator[Row]:

@@ -52,10 +52,10 @@ def _screens(context: Context, name: str, width: int) -> list[_Screen]:
 
 
 @assuming(
-    f"At most {SCREENS} screens of power law -11/3, scaled to {_INPUT_WAVES} waves rms over the open pupil; "
-    "the paper does not say how it generates its one screen, on which its low orders depend: both of ours "
-    "have less tilt than an infinite screen, and that periodic over one diameter has almost none. "
-    f"The column limit is the best fit of 14 modes to the screen itself. {BRIGHT} {FULL_CHAIN}"
+    f"At most {SCREENS} screens of power law -11/3, scaled to {_INPUT_WAVES} waves rms over the open pupil. "
+    "The paper does not say how it generates its one screen; the low orders depend on this. Ours have less tilt than "
+    "an infinite screen, and those periodic over one diameter have almost none. "
+    f"limit: the best fit of 14 modes to the screen itself. {BRIGHT} {FULL_CHAIN}"
 )
 def fig9(context: Context) -> Iterator[Row]:
     """Rms of estimate and residual of Kolmogorov screens, Fig. 9."""

@@ -43,38 +43,40 @@ AVERAGED_S = 100.0
 DRIFT_PM = 20.0
 REACHED, NOT_REACHED = "reached", "not reached"
 
-ABOUT = """An anchor is a published value and lowfc's value by the same definition. *paper* is the published value;
-*limit* is lowfc's value with noise at the quantum limit of the light, unless the assumption says otherwise. Loops are
-the real processes in lockstep. They are judged by the true wavefront, in continuous time, over the second half of a
-run; the means as in SCExAO are of the tilt at the start of each exposure, from 4 s on. A verdict compares lowfc's value
-(the predicted value, if theory gives one) with the published value. The scatter of the tuned CLOWFS and of the Zernike
-sensor is compared with the scatter of the paper's CLOWFS.
+ABOUT = """This page compares lowfc with other low-order wavefront control. An anchor is a published value (*paper*) and
+lowfc's value by the same definition. *limit* is lowfc's value with noise at the quantum limit of the light, unless the
+assumption says otherwise. [Sensors](../explanation/sensors.md) describes each sensor.
+
+Loops are the real processes in lockstep. Their tilt is that of the true wavefront, in continuous time, over the second
+half of a run; means as in SCExAO are of the tilt at the start of each exposure, from 4 s on. The verdict is "reached"
+if the predicted value, or lowfc's value if there is no prediction, is at most the published one. The tilt scatter of
+`clowfs_tuned` and `zwfs_tuned` is compared with that of the paper's CLOWFS.
 """
 LOOP = (
     f"lowfc sim-loop --lockstep: V = {MAGNITUDE:g}, 2 m, {RATE_HZ:g} Hz, exposure of half the period, delay of one "
-    "frame, 14 modes, 1 e- read noise, monochromatic with the photons of 110 nm; true tilt per axis."
+    "frame, 14 modes, 1 e- read noise, monochromatic with the photons of 110 nm; true tilt, rms per axis."
 )
 ROMAN = (
-    "Roman (WFIRST) coronagraph, Milestone 6 (Shi et al., final report, 2015): below 0.4 mas rms per axis for most "
-    "reaction-wheel speeds, from about 14 mas of jitter (AAS 17-115). lowfc: preset reaction-wheel, five lines up to "
-    "117 Hz, 0.5 % wide, and drift; reaction-wheel-ideal, the lines without width, as on a testbed. "
-    f"LQG, identified from {OBSERVED_S:g} s of the closed loop. limit: predicted from the log, with the noise of the "
-    "quantum limit; a run may be below it. A mirror that holds its command for a frame leaves 0.72 mas of these lines "
-    "at 1 kHz with any sensor, and 0.36 mas at 2 kHz: 0.4 mas needs a faster loop or weaker lines."
+    "Roman (WFIRST) coronagraph, Milestone 6 (Shi et al., final report, 2015): about 14 mas of jitter (AAS 17-115) "
+    "reduced to less than 0.4 mas rms per axis at most reaction-wheel speeds. lowfc: preset reaction-wheel has five "
+    "lines, 0.5 % wide, up to 117 Hz, and drift; in reaction-wheel-ideal the lines have no width, as on a testbed. "
+    f"LQG is identified from {OBSERVED_S:g} s of the closed loop. limit: predicted from the log, with the noise of the "
+    "quantum limit; one run may be below it. A mirror that holds its command for a frame leaves 0.72 mas of these "
+    "lines at 1 kHz with any sensor, and 0.36 mas at 2 kHz: 0.4 mas needs a faster loop or weaker lines."
 )
 SCEXAO = (
-    f"SCExAO LLOWFS (Singh et al.): standard deviation of means over {MEAN_S:g} s of the tilt per axis, "
+    f"SCExAO LLOWFS (Singh et al.): standard deviation of the tilt's means over {MEAN_S:g} s, per axis, "
     "at 8.2 m and 1.6 um. lowfc: 2 m, 550 nm, where 0.15 mas is 0.0026 lambda/D; for SCExAO it is 0.0037. "
     "Laboratory: preset bench, integrator; sky: reaction-wheel, LQG."
 )
 HICAT = (
-    f"Part of {STEPS} random steps of 2 nm rms of surface on a dark hole's channel that the loop undoes (V = -2). "
-    "HiCAT digs while its low-order loop runs (A&A 663, A49, 2022; arXiv 2301.03242). The verdict is "
-    "'reached' if the part is below 1 %."
+    f"{STEPS} random steps of 2 nm rms of surface on a dark hole's channel (V = -2): fraction that the loop undoes. "
+    "HiCAT digs its dark hole while its low-order loop runs (A&A 663, A49, 2022; arXiv 2301.03242). The verdict is "
+    "'reached' if the fraction is at most 1 %."
 )
 HUNDRED = (
     f"Standard deviation of a mode's mean over {AVERAGED_S:g} s of frames at {tolerance.RATE_HZ:g} Hz, V = 2, "
-    "wavefront flat, all 14 modes fitted. predicted: from the noise of a frame."
+    "wavefront flat, all 14 modes fitted. predicted: from the noise of one frame."
 )
 AGAINST_V = (
     f"Drift of {DRIFT_PM:g} pm/sqrt(s) in each of 14 modes, integrators with the best gains, {tolerance.RATE_HZ:g} Hz: "
@@ -123,10 +125,10 @@ def _pointing(context: Context, name: str) -> list[Row]:
             run = _sim_loop(preset, folder, "law.toml", CLOSED_S, context.seed + 1000)
             limit = _quantum_pointing_nm(observed, name) / nm_per_mas
             new_lqg_row = partial(new_row, estimator="LQG")
-            rows.append(new_row(f"tilt, {preset}, open loop", measured=run["tilt_disturbance_mas"], assumption=LOOP))
+            rows.append(new_row(f"open-loop tilt, {preset}", measured=run["tilt_disturbance_mas"], assumption=LOOP))
             rows += _with_verdict(
                 new_lqg_row(
-                    f"tilt, {preset}",
+                    f"residual tilt, {preset}",
                     measured=run["tilt_residual_mas"],
                     paper=ROMAN_MAS,
                     limit=limit,
@@ -153,7 +155,7 @@ def _means_row(new_row: Callable[..., Row], history: History, where: str) -> Row
     means = tilt_nm[: blocks * frames].reshape(blocks, frames, 2).mean(axis=1) / tilt_nm_per_mas(2.0)
     spread = float(np.sqrt(means.var(axis=0, ddof=1).mean()))
     return new_row(
-        f"std of means over {MEAN_S:g} s, {where}",
+        f"std of {MEAN_S:g} s means of tilt, {where}",
         measured=spread,
         paper=SCEXAO_MAS[where],
         error=spread / np.sqrt(4.0 * (blocks - 1)),
@@ -173,11 +175,13 @@ def _quantum_pointing_nm(history: History, name: str) -> float:
 
 
 def _hicat(context: Context) -> list[Row]:
-    """Row of the part of a dark hole's steps that the loop undoes."""
+    """Row of the fraction of a dark hole's steps that the loop undoes."""
     context.progress("anchors, a dark hole while the loop runs", 10, 12)
     with tempfile.TemporaryDirectory() as folder:
         undone, error = dark_hole(Path(folder), 2.0, seed=context.seed).channels[SHIFTED].undone()
-    row = Row("sam", "part of a dark hole's steps undone", "%", abs(100 * undone), error=100 * error, assumption=HICAT)
+    row = Row(
+        "sam", "fraction of a dark hole's steps undone", "%", abs(100 * undone), error=100 * error, assumption=HICAT
+    )
     return _with_verdict(row, allowed=1.0)
 
 
@@ -209,7 +213,7 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
     for noll, (measured_pm, predicted_pm, limit_pm) in zip(NOLLS_14, modes_pm.tolist(), strict=True):
         yield Row(
             name,
-            f"Z{noll} {mode_name(noll)} over {AVERAGED_S:g} s",
+            f"std of {AVERAGED_S:g} s mean, Z{noll} {mode_name(noll)}",
             "pm",
             measured_pm,
             error=measured_pm / sqrt(2 * (context.trials - 1)),
@@ -240,7 +244,7 @@ def _against_magnitude(name: str) -> Iterator[Row]:
             added_contrast(name, magnitude),
             limit=added_contrast(name, magnitude, quantum=True),
             modes=len(NOLLS_14),
-            estimator="integrator of the best gain",
+            estimator="integrator with the best gain",
             assumption=AGAINST_V,
         )
 

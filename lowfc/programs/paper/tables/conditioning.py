@@ -34,9 +34,9 @@ FIXED_STAR = (
     "condition number ignores the light."
 )
 NOISE = (
-    f"Cramer-Rao bound, all 14 modes fitted, root of the sum of their variances, no read noise: V = {STAR.magnitude}, "
-    f"{TABLE4_EXPOSURE_S} s, our own masks. Same number of photons at the central wavelength and over the band, the "
-    "latter in four Gauss-Legendre wavelengths."
+    f"Root of the sum of the 14 modes' variances, all fitted, no read noise: V = {STAR.magnitude}, "
+    f"{TABLE4_EXPOSURE_S} s, our own masks. The band has four Gauss-Legendre wavelengths and as many photons as the "
+    "central wavelength."
 )
 QUANTUM = (
     "limit: quantum Fisher information of the light after the shaped pupil, 4 N Cov of the modes' phases: no sensor "
@@ -46,7 +46,7 @@ SHARE = "Median over the modes of the ratio of variances, quantum limit over Cra
 CLAIMS = {
     "open": "Sect. 4: extremely high. limit: a condition number above it counts as singular.",
     "bar": "Sect. 4: below 1000 (the limit here), an order of magnitude above the sparse aperture mask's.",
-    "holes": "Sect. 4: smaller holes lower it, for the 14 modes that the mask was designed for.",
+    "holes": "Sect. 4: smaller holes lower the condition number, for the 14 modes that the mask was designed for.",
     "sensor": "limit: an order of magnitude below the bar's.",
 }
 LIMITS = {"open": 1e12, "bar": 1000.0, "holes": None, "sensor": 100.0}
@@ -125,6 +125,6 @@ def _noise_rows(mask: Prepared, light_e: float) -> Iterator[Row]:
     in_band = bound_nm2(reference(sensor, band).ravel(), response(sensor, modes, band))
     noise, least, broad = (float(np.sqrt(each.sum())) for each in (bound, limit, in_band))
     row = partial(Row, mask.name, modes=14, estimator="Cramer-Rao bound")
-    yield row("noise", "nm", noise, limit=least, assumption=f"{NOISE}\n{QUANTUM}")
+    yield row("noise of all modes", "nm", noise, limit=least, assumption=f"{NOISE}\n{QUANTUM}")
     yield row("share of the quantum limit", "", float(np.median(limit / bound)), limit=1.0, assumption=SHARE)
-    yield row("noise, 20 % band", "nm", broad, assumption=NOISE)
+    yield row("noise of all modes, 20 % band", "nm", broad, assumption=NOISE)

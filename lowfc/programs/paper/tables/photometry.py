@@ -134,8 +134,8 @@ def _inconsistencies(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
         "",
         light * PAPER_SIGNAL["clowfs"] / PAPER_SIGNAL["sam"],
         PAPER_SIGNAL_RATIO,
-        assumption="Without a model: light behind the sparse aperture mask, brightest pixel / image and signal / "
-        "brightest pixel, all of Sect. 3.3, multiplied.",
+        assumption="Without a model: product of three ratios of Sect. 3.3: light without and with the sparse aperture "
+        "mask, brightest pixel / image, and signal / brightest pixel.",
     )
 
 
@@ -191,9 +191,9 @@ def _defocus_contradiction(clowfs: Prepared) -> Iterator[Row]:
         "mm",
         float(agreeing_mm),
         section.defocus_mm,
-        assumption="With the paper's electrons, its 0.080 mas needs about this defocus, where a fit of 14 modes (pinv) "
-        "has ten times the scatter; at 1 mm, clowfs:1 in Table 4, it has 36 times. No defocus agrees with both of the "
-        "paper's CLOWFS tables.",
+        assumption="With the paper's electrons, its scatter of 0.080 mas needs about this defocus. There a fit of 14 "
+        "modes (pinv) has ten times that scatter, and at 1 mm (clowfs:1 in Table 4) 36 times. No defocus agrees with "
+        "both of the paper's CLOWFS tables.",
     )
 
 
@@ -203,7 +203,7 @@ def _r2_contradiction(sam: Prepared) -> Iterator[Row]:
     paper_in, paper_out = TABLE3_INPUT_WAVES[14], TABLE3_WAVES["disk"][14][0]
     yield Row(
         name,
-        "R2 if the error of every mode were as far below its input as that of the wavefront",
+        "R2 if every mode's error were as far below its input as the wavefront's error",
         "",
         1.0 - (paper_out / paper_in) ** 2,
         PAPER_R2,

@@ -23,13 +23,14 @@ FITTED = {1: (2, 14, 20), 10: (2, 14)}
 NM_PER_MAS = tilt_nm_per_mas(STAR.diameter_m)
 
 PAPER_PUPIL, PAPER_FOCAL_MASK, PAPER_RELAY_MASK = 0.147, 0.567, 0.091
-SCALED_PUPIL = f"own photometry, pupil transmission scaled to the paper's {100 * PAPER_PUPIL:g} %"
 """Throughputs, each relative to the light that reaches the element."""
+SCALED_PUPIL = "scaled photometry"
+"""Name of our own photometry with the transmission of the paper's pupil."""
 
 ASSUMPTION = (
-    "Band in five wavelengths with both ends, H averaged over it, 1 e- read noise, whole electrons, total known. The "
-    "paper does not say how many modes it fits: its figures agree only with two (tip and tilt); a loop on 14 "
-    "modes has the noise of the 14-mode row. predicted: noise of the tilted image through the estimator; limit: the "
+    "Band in five wavelengths, both ends included, H averaged over it, 1 e- read noise, whole electrons, total flux "
+    "known. The paper does not say how many modes it fits; its values agree only with two, tip and tilt. A loop on 14 "
+    "modes has the noise of a fit of 14. predicted: noise of the tilted image, through the estimator. limit: the "
     "Cramer-Rao bound at the flat wavefront. At 10 mas the weights are still those of the flat image, which costs a "
     "few per cent."
 )
@@ -75,8 +76,8 @@ def dimmed(sensor: Prepared) -> Exposure:
     return Exposure(
         SCALED_PUPIL,
         own,
-        f"{own * float(sensor.band_I0.sum()):.3g} e- on the sensor: own photometry with the transmission "
-        f"of our pupil, {100 * sensor.budget.pupil:.1f} %, scaled to the paper's.",
+        f"{own * float(sensor.band_I0.sum()):.3g} e- on the sensor: pupil transmission scaled from "
+        f"{100 * sensor.budget.pupil:.1f} to {100 * PAPER_PUPIL:g} %.",
     )
 
 

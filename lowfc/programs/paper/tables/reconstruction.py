@@ -19,11 +19,11 @@ OTHER_SENSORS = (
 )
 """Sensors in addition to the packaged sparse apertures."""
 ITERATIONS = (0, 1, 2)
-WITH_NUISANCES = "weighted, flux and shear fitted along"
+WITH_NUISANCES = "weighted, flux and shear fitted too"
 EVEN = (
     "If pupil and masks are real and the pupil is symmetric, flux and shear change the image by an even function of "
-    "position, and every mode changes it by an odd one: fitting them too costs a sparse aperture mask nothing. CLOWFS "
-    "and the Zernike sensor mistake shear for tilt."
+    "position, and every mode changes it by an odd one. So fitting flux and shear costs a sparse aperture mask "
+    "nothing. CLOWFS and the Zernike sensor mistake shear for tilt."
 )
 
 PAPER_INPUT_PV_WAVES = {14: 0.097, 20: 0.11}
@@ -31,8 +31,9 @@ PAPER_WAVES = TABLE3_WAVES | {"sam": TABLE3_WAVES["disk"]}
 
 NOISE = (
     "40,000 e- in the brightest pixel of the sensor's own flat image (which favours masks with low throughput: compare "
-    "Table 4), 3 e- read noise, whole electrons, total flux known, monochromatic; open area: transmission above 0.5, "
-    "piston removed. RMS and its limit (Cramer-Rao bound): root mean square over wavefronts; P-V: mean."
+    "Table 4), 3 e- read noise, whole electrons, total flux known, monochromatic. Residuals are over the open area "
+    "(transmission above 0.5), without piston. RMS and its limit (Cramer-Rao bound) are root mean squares over the "
+    "wavefronts; P-V is a mean."
 )
 
 
@@ -62,8 +63,7 @@ def inputs(sensor: Prepared, modes: int, literal: bool) -> Iterator[Input]:
         low * scale,
         high * scale,
         f"Coefficients uniform within {low * scale:.4f} (n <= 2) and {high * scale:.4f} waves rms, which gives the "
-        f"input rms of Table 3, {TABLE3_INPUT_WAVES[modes]}; with {low} and {high} of the text it would be "
-        f"{literal_rms:.3f}.",
+        f"input rms of Table 3, {TABLE3_INPUT_WAVES[modes]}; the text's {low} and {high} would give {literal_rms:.3f}.",
     )
     if literal:
         yield Input("literal", low, high, f"Coefficients uniform within {low} and {high} waves rms, as in the text.")

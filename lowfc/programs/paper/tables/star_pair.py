@@ -27,7 +27,8 @@ _LONGEST_FRAMES = 1 << 20
 
 ASSUMPTION = (
     f"Every mode drifts by {DRIFT_PM:g} pm/sqrt(s), best gain of each mode for each star, {tolerance.RATE_HZ:g} "
-    "Hz; black bodies of 20,000 K (V = 2) and 5,800 K (V = 5) over the band of 20 %, in four wavelengths."
+    "Hz; black bodies of 20,000 K (V = 2) and 5,800 K (V = 5) over the band of 20 %, in four wavelengths. A roll steps "
+    f"every mode by {ROLL_NM:g} nm; the loop on the target corrects it."
 )
 MAP = "Rms over the dark zone of the difference of the two long exposures, without photon noise of the science camera."
 
@@ -86,9 +87,9 @@ def pair_rows(name: str) -> Iterator[Row]:
         ("I0 of the reference star", by_noise + by_colour),
         ("I0 measured again", by_noise),
     ):
-        yield new_row(f"mean change after subtraction, {reference_image}", measured=float(change[zone].mean()))
+        yield new_row(f"mean contrast after subtraction, {reference_image}", measured=float(change[zone].mean()))
         yield new_row(
-            f"rms change after subtraction, {reference_image}",
+            f"rms contrast after subtraction, {reference_image}",
             measured=float(np.sqrt(np.mean(change[zone] ** 2))),
             assumption=f"{ASSUMPTION}\n{MAP}",
         )
@@ -98,7 +99,7 @@ def pair_rows(name: str) -> Iterator[Row]:
         return float(ROLL_NM**2 * form @ (1.0 - gains["target"]) ** (2.0 * frames)) <= ROLL_CONTRAST
 
     yield new_row(
-        f"time for a roll's step of {ROLL_NM:g} nm in every mode to decay to {ROLL_CONTRAST:g}, target",
+        f"decay time of a roll's step to a contrast of {ROLL_CONTRAST:g}",
         unit="s",
         measured=bisect_left(range(_LONGEST_FRAMES), True, key=decayed) / tolerance.RATE_HZ,
     )

@@ -65,8 +65,8 @@ def _peaks(context: Context, name: str) -> Iterator[Row]:
     sensor = prepared(name)
     peaks = context.map(f"table2 {name}", lambda noll: float(np.abs(differential(sensor, noll)).max()), NOLLS_14)
     assumption = (
-        "lambda/30 rms with the full exp(i phi). (I - I0) / I0 is taken as the peak of |I - I0| over the peak of I0: "
-        "the ratio of single pixels has no bound, because I0 has dark pixels."
+        "lambda/30 rms with the full exp(i phi). (I - I0) / I0 is taken as the peak of |I - I0| over the peak of I0, "
+        "because I0 has dark pixels, where the ratio of single pixels has no bound."
     )
     for noll, value in zip(NOLLS_14, peaks, strict=True):
         quantity, paper = f"peak differential intensity of Z{noll}, {mode_name(noll)}", PAPER_TABLE2[noll]

@@ -30,29 +30,32 @@ MAGNITUDES = (0.0, 2.0, 5.0, 8.0)
 ALLOWED = (1e-9, 1e-10, 1e-11)
 RATE_HZ, EXPOSURE, READ_NOISE_E = 250.0, 0.5, 1.0
 LINE_HZ, LINE_WIDTH = 10.0, 0.005
-ESTIMATORS: dict[Kind, str] = {"integrator": "integrator of the best gain", "lqg": "LQG"}
+ESTIMATORS: dict[Kind, str] = {"integrator": "integrator with the best gain", "lqg": "LQG"}
 
 CHECKED_SENSORS, CHECKED_MODES, CHECKED_MAGNITUDES = ("clowfs_tuned", "zwfs_tuned"), (4, 8, 11), (2.0, 5.0)
 CHECKED_CONTRAST, SHOWN_CONTRAST = 1e-11, 1e-10
 _FRAMES_PER_TRIAL = 20  # times 1 / gain, the loop's time constant: 100 trials determine a variance to 3 %
-_SHOWN_NOLLS, _SHOWN_ENDS = (2, 4, 8, 11), tuple(f"V = {magnitude}, {SHOWN_CONTRAST:g}" for magnitude in (2, 5))
+_SHOWN_NOLLS = (2, 4, 8, 11)
+_SHOWN_ENDS = tuple(f"V = {magnitude}, contrast {SHOWN_CONTRAST:g}" for magnitude in (2, 5))
 _LARGEST = 6e-9  # contrast up to which the fourth order is fitted
 
-ABOUT = """The table gives the drift rate of one mode, and the rms of a vibration line in it, that add a contrast of
-1e-9, 1e-10 or 1e-11. Both follow from the contrast's quadratic form, its fourth order (which matters for tilt) and the
-noise of a frame, by the theory of `lowfc/design/tolerance.py`. `--json` has every mode, star and contrast; this page
-has four modes, two stars and 1e-10. Twelve points are checked by simulation. The last rows are of two stars that a
-coronagraph observes: a reference of V = 2 and a target of V = 5 with another colour and roll angle; one exposure is
-subtracted from the other. Behind a symmetric pupil and a real mask, colour changes the image by an even function of
-position. Then the zero point of an aperture mask stays, but the zero points of the Zernike sensor and of CLOWFS move,
-so that I0 has to be measured again on the target.
+ABOUT = """This page is for the error budget of a telescope. It gives the drift rate of a mode, or the rms of a
+vibration line in it, at which the loop's residual adds a contrast of 1e-10. Both follow from the contrast's quadratic
+form, its fourth order (which matters for tilt) and the noise of a frame, by the theory of `lowfc/design/tolerance.py`.
+The page has four modes and two stars; `--json` has all modes, four stars and contrasts from 1e-9 to 1e-11. Twelve
+points are checked by simulation, at 1e-11. [Sensors](../explanation/sensors.md) describes each sensor.
+
+The last rows are of two stars that a coronagraph observes: a reference of V = 2, and a target of V = 5 with another
+colour and roll angle. The reference's exposure is subtracted from the target's. Behind a symmetric pupil and a real
+mask, colour changes the image by an even function of position, so the zero point of an aperture mask stays. The zero
+points of the Zernike sensor and of CLOWFS move, and I0 has to be measured again on the target.
 """
 LOOP = (
     f"{RATE_HZ:g} Hz, exposure of half the period, delay of one frame, 1 e- read noise, weighted fit of all 14 modes, "
     "monochromatic; 2 m, 110 nm, 50 % throughput, quantum efficiency 0.8. Each mode alone adds the contrast, averaged "
     "over the dark zone. limit: the same with noise at the quantum limit."
 )
-DRIFT = "A random walk. For drift alone LQG equals the integrator of the best gain, unless margins bound the latter."
+DRIFT = "A random walk. For drift alone LQG equals the integrator with the best gain, unless margins limit this gain."
 LINE = (
     f"Rms of a line at {LINE_HZ:g} Hz, {100 * LINE_WIDTH:g} % wide between half-power points; LQG has the line in its "
     "model."
@@ -157,7 +160,7 @@ def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterat
                 drifts = [tolerated_drift(residual_nm2, nm2, EXPOSURE, kind) for nm2 in noise_and_limit_nm2]
                 drift_pm = 1e3 * np.sqrt([drift.step_nm2 * RATE_HZ for drift in drifts])
                 line_pm = 1e3 * np.sqrt(lines[kind](residual_nm2 / noise_and_limit_nm2) * noise_and_limit_nm2)
-                where = f"Z{noll} {mode_name(noll)}, V = {magnitude:g}, {allowed:g}"
+                where = f"Z{noll} {mode_name(noll)}, V = {magnitude:g}, contrast {allowed:g}"
                 for term, unit, pm, about in (("drift", "pm/sqrt(s)", drift_pm, DRIFT), ("line", "pm", line_pm, LINE)):
                     measured, limit = pm.tolist()
                     tolerated = Row(name, f"{term} of {where}", unit, measured, limit=limit)
