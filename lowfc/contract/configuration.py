@@ -66,10 +66,10 @@ class Control(Section):
     """Loop mode once a calibration is loaded; with automatic gains, closed takes effect once these are measured.
     sim-loop starts closed if the file does not set this key."""
     delay_frames: float = Field(0.0, ge=0, le=10)
-    """Measured delay in frames: a command computed from frame n first acts on the whole exposure of frame n + delay; 0:
-    camera.delay_frames. Doubling the delay about halves the highest stable gain."""
+    """Measured delay in frames, defined as camera.delay_frames; 0: that value. Doubling the delay about halves the
+    highest stable gain."""
     estimator: Literal["weighted", "pinv"] = "weighted"
-    """Noise-weighted or plain pseudo-inverse of H."""
+    """Pseudo-inverse of H. weighted: noise-weighted; pinv: plain."""
     nuisance: list[Literal["background", "shear"]] = Field(default_factory=list)
     """Nuisance parameters fitted together with the modes: uniform background light, shear of the beam."""
     tilt_gain: Gain | Literal["auto"] = "auto"
@@ -77,7 +77,7 @@ class Control(Section):
     gain: Gain | Literal["auto"] = "auto"
     """Integrator gain of the other modes."""
     on_harm: Literal["warn", "open", "integrator"] = "warn"
-    """Action if the residual stays larger than in open loop: warn: event only; open: the loop opens; integrator: the
+    """Action if the residual stays larger than in open loop. warn: event only; open: the loop opens; integrator: the
     integrator takes over from a law, or the loop opens if the integrator is already in force."""
     tilt_leak: float = Field(0.0, ge=0, le=1)
     """Integrator leak of tip and tilt: fraction of the command lost per frame."""
@@ -96,7 +96,7 @@ class Control(Section):
     """Action after a frame timeout: hold the command, or relax the mirror to flat."""
     command_timeout_ms: float = Field(200.0, gt=0, le=1e9)
     """Time without a new command after which the mirror's last command expires; more than 2000 acts as 2000. Without
-    frames the controller repeats its command every 10 ms, so less than 20 lets it expire between slow frames."""
+    frames the controller repeats its command every 10 ms, so below 20 the command expires between slow frames."""
     max_start_ahead_h: float = Field(24.0, ge=0, le=1e9)
     """Hours by which the start time of a camera or controller may be ahead of this host's clock; 0: no limit, for a
     host whose clock is not set."""
@@ -109,7 +109,7 @@ class Control(Section):
     law: str = ""
     """Law file (FITS) written by `lowfc tune`; empty for the integrator."""
     guard: bool = True
-    """The integrator takes over from a law that amplifies the disturbance or leaves a larger residual than it would."""
+    """The integrator replaces a law that amplifies the disturbance or has a larger residual than the integrator."""
 
 
 class Safety(Section):
@@ -179,7 +179,7 @@ class Realtime(Section):
     priority: int = Field(50, ge=0, le=98)
     """SCHED_FIFO priority of camera, controller, mirror and router; 0 for normal scheduling, as always in lockstep."""
     recorder_priority: int = Field(10, ge=0, le=98)
-    """SCHED_FIFO priority of the recorder, below `priority`; in lockstep, or if either is 0, the batch class."""
+    """SCHED_FIFO priority of the recorder, below `priority`; the batch class if either is 0, or in lockstep."""
     lock_memory: bool = True
     """Lock the memory of camera, controller, mirror, router; the first three use huge pages once ready (Linux 6.1)."""
     disable_cpu_idle: bool = True

@@ -212,7 +212,7 @@ class Disturbance(Section):
     wheel_mas: NotNegative = 3.0
     """Amplitude of the wheel's first harmonic at high speed, mas rms per axis; further ones have 0.5 to 0.15 of it."""
     wheel_course: Literal["ramp", "walk", "run-down"] = "ramp"
-    """Change of the wheel's speed: linear, random walk, or slowed by friction."""
+    """Change of the wheel's speed. ramp: linear; walk: random walk; run-down: slowed by friction."""
     wheel_change: Signed = 0.0
     """Rate of change of the wheel's speed: ramp, Hz per second; walk, Hz per root second; run-down, decrease at time 0
     in Hz per second. 0 for constant speed."""
@@ -275,7 +275,7 @@ class Mirror(Section):
     active: str = ""
     """Map of the active actuators (FITS or .npy), 0 or 1: modes and flat map exclude the others; empty for all."""
     nm_per_unit: float = Field(1.0, ge=1e-9, le=1e9)
-    """For a driver with VoltMap or of your own: nm of surface per unit written; isio has an option of this name."""
+    """nm of surface per unit written, for your own driver or one with VoltMap; isio has its own option of this name."""
     shift_pitches: float = Field(0.0, ge=-2, le=2)
     """Simulated mirror: misregistration of its actuators along x and along y, pitches."""
     magnification: float = Field(1.0, ge=0.9, le=1.1)

@@ -91,7 +91,7 @@ expected. The assumptions, numbered below each table, are our choices where the 
 
 [Sensors](../explanation/sensors.md) describes each sensor; `clowfs:1` has a defocus of 1 mm, and `bowtie:sam27d07` the
 default layout. Estimators are `pinv`, the paper's pseudo-inverse, and `weighted`, the noise-weighted one; an iteration
-repeats the estimate on the full model.
+estimates what remains after the full model's image is subtracted.
 
 Inputs of Table 3, by the bounds of their coefficients:
 
