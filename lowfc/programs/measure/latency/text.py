@@ -112,7 +112,7 @@ def _remarks(results: Mapping[str, Any]) -> list[str]:
     for name, (_, suffix) in RATIOS.items():
         if results[name]:
             ratios = ", ".join(_ratios(results, name))
-            lines.append(f"ratio of frame to command to half a bare echo plus one control step{suffix}: {ratios}")
+            lines.append(f"frame to command / (half a bare echo + one control step){suffix}: {ratios}")
     if results.get("kernel_ratio"):
         each = zip(_ratios(results, "kernel_ratio"), results["kernel_ratio_spread"], strict=True)
         ratios = ", ".join(f"{ratio}, numpy {results['numpy_us'][at]:.1f} us" for ratio, at in each)
