@@ -59,18 +59,18 @@ class Stall(Result):
 
     second: float = result_field("at, s", form=".3f")
     frame_to_command_us: float | None = result_field("frame to command, us", form=".0f")
-    longest: str = result_field("longest in")
+    longest: str = result_field("longest span")
     held_up_by: Cause = result_field("cause")
     signs: str = result_field("evidence")
     counted: dict[str, CountChanges] = result_field()
 
 
 class BareLoop(Result):
-    """An idle loop beside a process of the control loop; `stalled`: number of wakings more than a period late."""
+    """An idle loop beside a process of the control loop; `stalled`: number of wake-ups more than a period late."""
 
     beside: str = result_field("bare loop beside the")
-    wakings: int = result_field("wakings")
-    stalled: int = result_field("stalled")
+    wakings: int = result_field("wake-ups")
+    stalled: int = result_field("more than a period late")
     late_us: dict[str, float] | None = result_field()
 
 
