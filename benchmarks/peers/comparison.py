@@ -320,8 +320,12 @@ def _difference(runs: Result, other: str) -> list[str]:
 def about(result: Result) -> str:
     """Definitions and conditions of the tables."""
     rules, runs = result["rules"], result["runs"]
-    descriptions = {one.name: one.description for one in IMPLEMENTATIONS if one.name in runs}
-    lines = [f"{name}: {text}." for name, text in (DEFINITIONS | descriptions).items()]
+    descriptions: dict[str, list[str]] = {}
+    for one in IMPLEMENTATIONS:
+        if one.name in runs:
+            descriptions.setdefault(one.description, []).append(one.name)
+    lines = [f"{name}: {text}." for name, text in DEFINITIONS.items()]
+    lines += [f"{' and '.join(names)}: {text}." for text, names in descriptions.items()]
     lines.append(
         f"{rules['repeats']} turns of {rules['seconds']:g} s at {rules['rate_hz']:g} Hz after {rules['warm_up']} "
         f"frames (lowfc: {WARM_UP_S:g} s); {SIDE} x {SIDE} uint16 pixels, {MODES} modes, {ACTUATORS} actuators."

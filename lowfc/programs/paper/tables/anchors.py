@@ -244,7 +244,7 @@ def _against_magnitude(name: str) -> Iterator[Row]:
             added_contrast(name, magnitude),
             limit=added_contrast(name, magnitude, quantum=True),
             modes=len(NOLLS_14),
-            estimator="integrator with the best gain",
+            estimator="integrator, best gain",
             assumption=AGAINST_V,
         )
 

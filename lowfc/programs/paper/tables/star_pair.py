@@ -84,7 +84,7 @@ def pair_rows(name: str) -> Iterator[Row]:
     by_colour = prepared("sam").star_image(shift, len(flat)) - flat
     yield new_row("zero-point shift by colour", unit="nm", measured=float(np.linalg.norm(shift)))
     for reference_image, change in (
-        ("I0 of the reference star", by_noise + by_colour),
+        ("reference star's I0", by_noise + by_colour),
         ("I0 measured again", by_noise),
     ):
         yield new_row(f"mean contrast after subtraction, {reference_image}", measured=float(change[zone].mean()))

@@ -30,7 +30,7 @@ MAGNITUDES = (0.0, 2.0, 5.0, 8.0)
 ALLOWED = (1e-9, 1e-10, 1e-11)
 RATE_HZ, EXPOSURE, READ_NOISE_E = 250.0, 0.5, 1.0
 LINE_HZ, LINE_WIDTH = 10.0, 0.005
-ESTIMATORS: dict[Kind, str] = {"integrator": "integrator with the best gain", "lqg": "LQG"}
+ESTIMATORS: dict[Kind, str] = {"integrator": "integrator, best gain", "lqg": "LQG"}
 
 CHECKED_SENSORS, CHECKED_MODES, CHECKED_MAGNITUDES = ("clowfs_tuned", "zwfs_tuned"), (4, 8, 11), (2.0, 5.0)
 CHECKED_CONTRAST, SHOWN_CONTRAST = 1e-11, 1e-10
