@@ -59,7 +59,7 @@ def plot_fig2(context: Context, path: Path) -> None:
     plots.draw(path, panels, f"Fig. 2. {ready.name}: flat wavefront at {optics.wavelength_nm:.0f} nm.")
 
 
-@assuming("The paper gives this light for its own pupil, and for the disk only. The wedges open by 95 degrees.")
+@assuming("The paper gives the reflected light for its own pupil and the disk only. The wedges open by 95 degrees.")
 def fig3(context: Context) -> Iterator[Row]:
     """Sizes and reflected light of the focal-plane masks, Fig. 3."""
     for name in context.names("sam", "bowtie"):
