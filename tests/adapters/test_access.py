@@ -86,14 +86,14 @@ def test_access_control_denies_by_default_and_refers_to_defined_names_only() -> 
 def test_the_best_clock_exchange_is_the_recent_one_with_the_shortest_round_trip() -> None:
     offset = ClockOffset()
     assert offset.offset_ns == 0
-    offset.exchanged(1000, 5600, 2000)  # unequal ways: offset 4100 ns instead of the true 4000 ns
+    offset.exchanged(1000, 5600, 2000)  # query and answer take different times: 4100 ns, not the true 4000 ns
     assert offset.best == (4100, 1000)
     offset.exchanged(3000, 7050, 3100)
     assert offset.best == (4000, 100)
     for _ in range(RECENT):
         offset.exchanged(5000, 9300, 5600)
     assert offset.best == (4000, 600)
-    offset.exchanged(7000, 9_000_000, 8000)  # the other host was rebooted
+    offset.exchanged(7000, 9_000_000, 8000)  # the other host's clock was set
     assert offset.best == (9_000_000 - 7500, 1000)
 
 
@@ -168,7 +168,7 @@ def test_the_router_forwards_exactly_what_the_table_of_topics_allows(hosts: Host
     bus["camera"].queryable("lowfc/request/*", lambda query: query.reply(b"forged"))
     until(lambda: bus["operator"].get("lowfc/request/status"))
     for role in ROLES:
-        if role not in ("controller", "camera"):  # a queryable of the key is also queried locally
+        if role not in ("controller", "camera"):  # these answer themselves, without the router
             answers = [sample.payload for sample in bus[role].get("lowfc/request/status")]
             assert answers == ([b"done"] if role == "operator" else [])
         states = {sample.payload.decode() for sample in bus[role].get("lowfc/camera/state")}
@@ -248,7 +248,7 @@ def test_a_lost_router_is_reported_with_the_reason(hosts: Hosts, capfd: pytest.C
     hosts.join("camera")
     until(
         lambda: socket_options(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT).count(routed.LINK_LEASE_MS) == 2
-    )  # both ends
+    )  # at both ends of the link
     router.close()
     await_report(f"camera: no link to the router at tls/127.0.0.1:{hosts.port}: Connection refused\n")
     hosts.join(ROUTER)

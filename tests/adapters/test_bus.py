@@ -39,7 +39,7 @@ Join = Callable[..., ZenohBus]
 def _runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="bus-") as path:  # short enough for socket paths
         monkeypatch.setenv("XDG_RUNTIME_DIR", path)
-        monkeypatch.setenv("ZENOH_RUNTIME", "")  # restored after the test
+        monkeypatch.setenv("ZENOH_RUNTIME", "")  # so that pytest removes what a monitor sets here
         monkeypatch.delenv("ZENOH_RUNTIME")
         yield
 
@@ -88,22 +88,22 @@ def test_closing_a_link_does_not_block_its_process(join: Join) -> None:
 
 
 def test_a_query_returns_the_last_message_with_its_envelope(pair: tuple[Bus, Bus]) -> None:
-    controller, late = pair
+    controller, operator = pair
     calibrations, frames = controller.publisher(CALIBRATION), controller.publisher(FRAME)
-    assert late.get(CALIBRATION.key, timeout_s=0.1) == []
+    assert operator.get(CALIBRATION.key, timeout_s=0.1) == []
     calibrations.put(b"old")
     body = bytes(range(256)) * 12_000  # 3 MB, as a large calibration
     envelope = calibrations.put(body)
     frames.put(b"frame")
-    until(lambda: late.get(CALIBRATION.key))
-    (answer,) = late.get(CALIBRATION.key, timeout_s=PATIENCE_S)
+    until(lambda: operator.get(CALIBRATION.key))
+    (answer,) = operator.get(CALIBRATION.key, timeout_s=PATIENCE_S)
     assert (answer.key, answer.payload) == (CALIBRATION.key, body)
     assert (answer.sequence, answer.publish_time_ns) == (envelope.sequence, envelope.publish_time_ns)
     assert calibrations.last == (body, envelope)
-    assert late.get(FRAME.key, timeout_s=0.1) == []
-    late.publisher(HEALTH, "operator").put(b"operator")
+    assert operator.get(FRAME.key, timeout_s=0.1) == []
+    operator.publisher(HEALTH, "operator").put(b"operator")
     controller.publisher(HEALTH, "controller").put(b"controller")
-    until(lambda: {health.payload for health in late.get(HEALTH.at("*"))} == {b"controller", b"operator"})
+    until(lambda: {health.payload for health in operator.get(HEALTH.at("*"))} == {b"controller", b"operator"})
 
 
 def test_a_query_may_be_answered_later_from_another_thread(pair: tuple[Bus, Bus]) -> None:
@@ -339,7 +339,7 @@ def test_a_stopped_subscriber_does_not_delay_the_others(reader: Reader, join: Jo
     join("controller").subscribe(FRAME, box.put)
     until(lambda: box.take(0.01), each=reader.put)
     reader.process.send_signal(signal.SIGSTOP)
-    for _ in range(1500):  # 19 MB, more than the link buffers; a blocking put would close the link
+    for _ in range(1500):  # 19 MB, more than the link can buffer; a blocking put would close the link
         reader.put()
         assert box.take(PATIENCE_S)
     reader.process.send_signal(signal.SIGCONT)
@@ -351,7 +351,7 @@ def test_a_stopped_subscriber_does_not_delay_the_others(reader: Reader, join: Jo
 
 def test_closing_a_session_leaves_a_slow_reader_only_complete_messages(reader: Reader) -> None:
     reader.process.send_signal(signal.SIGSTOP)
-    for _ in range(1000):  # more than the socket buffers
+    for _ in range(1000):  # more than the socket can buffer
         reader.put()
     threading.Timer(0.2, reader.process.send_signal, [signal.SIGCONT]).start()
     reader.camera.close()
@@ -367,10 +367,10 @@ def test_a_session_ends_although_a_handler_never_returns(join: Join, monkeypatch
     mirror, frames = join("mirror-dm"), join("camera").publisher(FRAME)
     mirror.subscribe(FRAME, handler)
     until(lambda: handler.called, each=lambda: frames.put(b"frame"))
-    freed = threading.Timer(PATIENCE_S, free.set)
-    freed.start()
+    timer = threading.Timer(PATIENCE_S, free.set)
+    timer.start()
     mirror.close()
-    freed.cancel()
+    timer.cancel()
     assert not free.is_set()
     free.set()
 

@@ -97,8 +97,8 @@ def test_a_reader_in_the_same_process_receives_each_message_by_a_call(linked: Li
     assert linked.received == list(range(100)), "each message once, although the bus carried it too"
     assert set(linked.threads) == {threading.current_thread().name}
     del linked.threads[:]
-    again = linked.bus("camera").publisher(FRAME)  # as in a separate process
-    linked.until_direct_only(again)
+    separate = linked.bus("camera").publisher(FRAME)  # as in a separate process
+    linked.until_direct_only(separate)
 
 
 def test_switching_to_the_direct_link_loses_and_repeats_nothing(linked: LinkedRun) -> None:
@@ -109,7 +109,7 @@ def test_switching_to_the_direct_link_loses_and_repeats_nothing(linked: LinkedRu
     until(lambda: controller.peers() and camera.peers())
     linked.publish(frames, 250)
     until(lambda: linked.received[-1:] == [frames.published - 1])
-    first = min(linked.received)  # over the socket, it may arrive after later ones over the bus
+    first = min(linked.received)  # it may arrive over the socket after later ones arrived over the bus
     assert sorted(linked.received) == list(range(first, frames.published))
     assert [number for number in linked.received if number != first] == list(range(first + 1, frames.published))
     assert "direct-link" in linked.threads
@@ -120,7 +120,7 @@ class ReaderOnTwoPaths:
 
     Attributes:
         delivered: sequences of the messages that the reader delivered.
-        unsubscribed: number of times that the reader left the bus.
+        unsubscribed: number of times that the reader unsubscribed from the bus.
     """
 
     def __init__(self, path: Path, *, shared: bool = False) -> None:
@@ -210,7 +210,7 @@ def test_reader_and_writer_reconnect_after_restarts_and_the_bus_serves_without_a
     camera = linked.bus("camera")
     linked.until_direct_only(camera.publisher(FRAME))
     camera.close()
-    monkeypatch.setattr(direct_link.DirectWriter, "send", lambda *_: None)  # as a publisher without this library
+    monkeypatch.setattr(direct_link.DirectWriter, "send", lambda *_: None)  # as another library's publisher
     frames = linked.bus("camera").publisher(FRAME)
     until(lambda: linked.threads[-1:] not in ([], ["direct-link"]), each=lambda: frames.put(b""))
 
@@ -229,7 +229,7 @@ def test_a_stalled_reader_never_blocks_the_writer(tmp_path: Path) -> None:
     listener.bind(str(tmp_path / "stalled.in"))
     listener.listen(1)
     writer = direct_link.DirectWriter(tmp_path / "stalled.in")
-    for _ in range(2000):  # far more than a socket buffers: a blocking send would never return
+    for _ in range(2000):  # far more than a socket can buffer: a blocking send would never return
         writer.send(Envelope(1, 2).encode(), bytes(12800))
     accepted, _ = listener.accept()
     accepted.settimeout(PATIENCE_S)
@@ -316,7 +316,7 @@ def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct
     assert all(sample.payload != b"a copy" for sample in mirror.received)
 
 
-def test_handed_ns_precedes_the_bus_put_with_a_direct_reader_and_follows_it_without(linked: LinkedRun) -> None:
+def test_handed_ns_is_before_the_bus_put_if_there_is_a_direct_reader_and_after_it_if_not(linked: LinkedRun) -> None:
     mirror = CommandedMirror(linked)
     mirror.until_both_paths()
     put_ns: list[int] = []

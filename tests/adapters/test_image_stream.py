@@ -24,15 +24,15 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "camnsv.im.shm"
 
 
-def new_stream(path: Path, number: int = UINT16, **options: object) -> PlainStream:
-    """Create a stream with pixels of the type `number`."""
-    return PlainStream.make(path, COLUMNS, ROWS, number, **options)
+def new_stream(path: Path, pixel_type: int = UINT16, **options: object) -> PlainStream:
+    """Create a stream with pixels of this ImageStreamIO type."""
+    return PlainStream.make(path, COLUMNS, ROWS, pixel_type, **options)
 
 
-def image(seed: int, number: int = UINT16) -> np.ndarray:
-    """A random image with pixels of the type `number`."""
+def image(seed: int, pixel_type: int = UINT16) -> np.ndarray:
+    """A random image with pixels of this ImageStreamIO type."""
     values = np.random.default_rng(seed).integers(0, 100, (ROWS, COLUMNS))
-    return values.astype(NUMPY_TYPES[number])
+    return values.astype(NUMPY_TYPES[pixel_type])
 
 
 def newest(reader: StreamReader) -> StreamImage:
@@ -47,27 +47,27 @@ def dead_pid() -> int:
     return child.pid
 
 
-@pytest.mark.parametrize("number", NUMPY_TYPES)
-def test_images_of_every_type_are_read_and_written(path: Path, number: int) -> None:
-    writer = new_stream(path, number)
+@pytest.mark.parametrize("pixel_type", NUMPY_TYPES)
+def test_images_of_every_type_are_read_and_written(path: Path, pixel_type: int) -> None:
+    writer = new_stream(path, pixel_type)
     reader = StreamReader(path)
-    writer.write(image(1, number), 1_700_000_000_123_456_789)
+    writer.write(image(1, pixel_type), 1_700_000_000_123_456_789)
     received = newest(reader)
     assert received.number == 1
     assert received.acquired_ns == 1_700_000_000_123_456_789
-    assert received.pixels.dtype == NUMPY_TYPES[number]
-    assert np.array_equal(received.pixels, image(1, number))
-    stream, other = Stream(path), PlainStream(path, COLUMNS, ROWS, number)
+    assert received.pixels.dtype == NUMPY_TYPES[pixel_type]
+    assert np.array_equal(received.pixels, image(1, pixel_type))
+    stream, other = Stream(path), PlainStream(path, COLUMNS, ROWS, pixel_type)
     other.reserve_semaphore(7)
     before_ns = time.clock_gettime_ns(time.CLOCK_TAI)
-    stream.put(image(2, number))
+    stream.put(image(2, pixel_type))
     assert other.wait(7, 1)
     assert other.count == 2
-    assert np.array_equal(other.pixels[0], image(2, number))
+    assert np.array_equal(other.pixels[0], image(2, pixel_type))
     assert [other.get("<i", other.writers + 4 * index) for index in range(10)] == [os.getpid()] * 10
     assert 0 <= other.get("<q", 200) * 10**9 + other.get("<q", 208) - before_ns < 10**9
     with pytest.raises(TypeError):
-        stream.put(image(2, number).astype("c8"))
+        stream.put(image(2, pixel_type).astype("c8"))
     assert (other.count, stream.writing) == (2, False)
 
 
@@ -99,7 +99,7 @@ def test_keywords_of_every_kind_are_read(path: Path) -> None:
         ({"version": b"\x1b[2J"}, r"layout version '\\x1b\[2J'"),
         ({"header_bytes": 4496}, "DAO_COMPAT"),
         ({"header_bytes": 400}, "built with other options"),
-        ({"number": 12}, "pixels of type 12"),
+        ({"pixel_type": 12}, "pixels of type 12"),
         ({"location": 0}, "graphics card 0"),
         ({"planes": 3, "axes": 3}, "cube of 3 planes"),
         ({"axes": 1}, "1 axes"),
@@ -281,7 +281,7 @@ def test_the_first_existing_folder_is_used_and_a_name_that_is_no_file_name_is_re
     assert stream_path("dm00disp03") == tmp_path / "dm00disp03.im.shm"
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path / "none"))
     assert stream_path("dm00disp03").parent in (Path("/milk/shm"), Path("/tmp"))  # noqa: S108
-    for name in ("", "../shm", "a" * 80, "ä" * 40):  # the header has 80 bytes, with a NUL
+    for name in ("", "../shm", "a" * 80, "ä" * 40):  # the header has 80 bytes for the name and its NUL
         with pytest.raises(StreamError, match="a stream's name"):
             stream_path(name)
 
@@ -290,7 +290,7 @@ def test_damaged_headers_cause_no_access_outside_the_stream(path: Path) -> None:
     rng = np.random.default_rng(7)
     writer = new_stream(path, planes=2, axes=3, kind=0x20001, keywords={"tint": 1e-3})
     good = bytes(writer.map)
-    # Readers and writers may change eleven semaphores and four blocks of one int32 for each, but nothing after them.
+    # Readers and writers may change eleven semaphores and four arrays of ten int32, but nothing after these.
     after_shared = slice(writer.semaphores + 11 * 32 + 4 * 40, None)
     opened = 0
     for _ in range(1500):

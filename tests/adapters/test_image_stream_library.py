@@ -26,9 +26,9 @@ class Image:
         self.memory = ctypes.create_string_buffer(512)
         self.name = name.encode()
 
-    def create(self, number: int, keywords: int = 0, ring: int = 0) -> "Image":
+    def create(self, pixel_type: int, keywords: int = 0, ring: int = 0) -> "Image":
         sizes = (ctypes.c_uint32 * 2)(COLUMNS, ROWS)
-        assert not LIBRARY.ImageStreamIO_createIm(self.memory, self.name, 2, sizes, number, 1, keywords, ring)
+        assert not LIBRARY.ImageStreamIO_createIm(self.memory, self.name, 2, sizes, pixel_type, 1, keywords, ring)
         return self
 
     def open(self) -> "Image":

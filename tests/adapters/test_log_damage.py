@@ -154,7 +154,7 @@ NO_CHUNKS = {"use_chunking": False}
         NO_CHUNKS,
         NO_CHUNKS | NO_CRCS,
         NO_CHUNKS | {"enable_data_crcs": True},
-        NO_CHUNKS | {"library": "lowfc 0.1.0"},  # with the header of the original
+        NO_CHUNKS | {"library": "lowfc 0.1.0"},  # the header names the original's library
         {"compression": CompressionType.ZSTD, "library": "lowfc 0.1.0"},
     ],
     ids=str,

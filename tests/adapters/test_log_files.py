@@ -223,7 +223,7 @@ def test_a_damaged_attachment_is_left_out_and_damaged_metadata_are_reported(tmp_
     assert (list(reader.attachments), len(reader.damage)) == (["h.fits"], 1)
     path.write_bytes(data)
     flipped(path, data.index(b"night"))  # metadata have no checksum of their own
-    for sparse in (False, True):  # `sparse` skips no chunk here: each has messages of the topics
+    for sparse in (False, True):  # `sparse` skips no chunk here, because all topics are read
         with pytest.raises(DataFileError, match="its parts are intact, but"):
             list(LogReader(path, sparse=sparse))
 

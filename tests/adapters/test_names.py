@@ -53,7 +53,7 @@ NOW_S = SIMULATED_START_NS // 10**9
 DAY_S = 86_400
 
 
-def test_starts_far_ahead_are_refused_with_both_clocks() -> None:
+def test_a_start_far_ahead_of_the_hosts_clock_is_refused_and_reported_with_both_times() -> None:
     reported: list[tuple[str, str]] = []
     clock = FakeClock()
     check = StartCheck(clock, 24.0, lambda start, here: reported.append((start, here)))
@@ -130,7 +130,7 @@ def listener() -> Listener:
     return Listener(FakeClock())
 
 
-def test_forged_names_do_not_fill_a_process_and_give_one_event(listener: Listener) -> None:
+def test_forged_names_do_not_fill_the_memory_of_a_process_and_give_one_event(listener: Listener) -> None:
     camera = listener.service("camera")
     for number in range(FORGED):
         listener.bus.publisher(HEALTH, f"forged-{number}").put(health(number))
@@ -152,7 +152,7 @@ def test_a_process_with_many_starts_is_stored_once(listener: Listener) -> None:
     assert len(camera._known_starts) == 1
 
 
-def test_forged_names_do_not_fill_launcher_and_viewer() -> None:
+def test_forged_names_do_not_fill_the_memory_of_launcher_and_viewer() -> None:
     watch, view = Watch({}, []), Accumulator()
     launcher = MemoryBus(MemoryHub(), "launcher", FakeClock())
     launcher.subscribe(HEALTH, watch.add_health)

@@ -304,7 +304,7 @@ def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatc
     assert calls == [False]
 
 
-def test_errors_of_its_block_are_reported_as_file_errors_by_being_written_but_not_by_draft(tmp_path: Path) -> None:
+def test_being_written_reports_errors_of_its_block_as_file_errors_and_draft_does_not(tmp_path: Path) -> None:
     with (
         pytest.raises(DataFileError, match="file cannot be written: Connection refused"),
         being_written(tmp_path / "file"),

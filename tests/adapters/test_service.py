@@ -77,7 +77,7 @@ def test_the_time_before_the_first_work_is_not_in_the_rate(
 def test_the_rate_of_slow_work_is_measured_over_several_units_of_work(
     listener: Listener, clock: FakeClock, rate_hz: float
 ) -> None:
-    """The rate also holds with an extra Health between two regular ones; after a silence it is 0."""
+    """The rate also holds with an extra Health between two regular ones; when the work ends, it becomes 0."""
     camera = listener.service("camera")
     for number in range(300):
         camera.work = int(number * 0.5 * rate_hz)
@@ -140,7 +140,7 @@ def test_events_are_published_and_warnings_printed(
     printed = capsys.readouterr().err
     assert printed == "controller: REALTIME_REFUSED the host refused SCHED_FIFO: a longer tail\n"
     (_, terminal), stderr = os.openpty(), os.dup(2)
-    termios.tcflow(terminal, termios.TCOOFF)  # as by Ctrl-S
+    termios.tcflow(terminal, termios.TCOOFF)  # stops its output, as Ctrl-S does
     os.dup2(terminal, 2)
     controller.event("CLOCK_OFF", ahead_ms=200)
     os.dup2(stderr, 2)
@@ -191,7 +191,7 @@ def test_a_newcomer_gets_a_health_before_the_next_is_due(listener: Listener) -> 
     camera.beat()
     assert [health.process for health in listener.messages(HEALTH)] == ["camera", "controller", "camera", "controller"]
     assert [camera.has_newcomers(), camera.has_newcomers()] == [True, False]
-    listener.service("controller").beat()  # restarted; in a container, with its former process id
+    listener.service("controller").beat()  # restarted with its former process id, as in a container
     assert camera.has_newcomers()
     before = len(listener.messages(HEALTH))
     for number in (1, 2, 1):  # two viewers, in turns
@@ -259,14 +259,14 @@ if {stuck}:
 """
 
 
-@pytest.mark.parametrize(("number", "stuck", "status"), [("SIGTERM", False, 0), ("SIGINT", True, 128 + signal.SIGINT)])
-def test_a_signal_ends_the_loop_and_a_second_interrupt_the_process(number: str, stuck: bool, status: int) -> None:
+@pytest.mark.parametrize(("name", "stuck", "status"), [("SIGTERM", False, 0), ("SIGINT", True, 128 + signal.SIGINT)])
+def test_a_signal_ends_the_loop_and_a_second_interrupt_ends_the_process(name: str, stuck: bool, status: int) -> None:
     arguments = [sys.executable, "-c", LOOP.format(stuck=stuck)]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "up\n"
         begun_s = time.monotonic()
-        process.send_signal(signal.Signals[number])
-        assert process.stdout.readline() == number + "\n"
+        process.send_signal(signal.Signals[name])
+        assert process.stdout.readline() == name + "\n"
         assert time.monotonic() - begun_s < PATIENCE_S, "the stop ended the wait"
         if stuck:
             process.send_signal(signal.SIGINT)
