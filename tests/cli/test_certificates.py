@@ -23,7 +23,9 @@ make, CA_DAYS = certificates.make_certificates, certificates.CA_DAYS
 
 
 def handshake(server: Path, client: Path, role: str, name: str = "localhost") -> None:
-    """Mutual TLS handshake in memory: router with the certificates in `server`, client `role` with those in `client`.
+    """Mutual TLS handshake in memory, of a client with a router that it reaches as host `name`.
+
+    Folder `server` has the router's certificate, folder `client` that of the client, whose role is `role`.
 
     Raises:
         ssl.SSLError: router or client does not accept the other.
@@ -114,7 +116,7 @@ def test_an_interruption_leaves_no_certificate_that_does_not_fit_its_key(
     for role in roles:
         if all((tmp_path / f"{role}.{kind}").exists() for kind in ("pem", "key")):
             handshake(tmp_path, tmp_path, role if role != ROUTER else "viewer")
-    assert not [name for name in tmp_path.iterdir() if name.name.startswith(".")]
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
     make(tmp_path, roles, [], renew=True)  # the router keeps its address
     handshake(tmp_path, tmp_path, "camera")
     assert stat.S_IMODE((tmp_path / "camera.key").stat().st_mode) == 0o600
@@ -195,7 +197,7 @@ def test_a_certificate_without_a_name_is_refused(tmp_path: Path, monkeypatch: py
         read_certificate(tmp_path / "ca.pem", tmp_path / "camera.pem", tmp_path / "camera.key")
 
 
-def test_another_authority_in_the_file_does_not_end_a_certificate(
+def test_an_authority_that_did_not_sign_a_certificate_does_not_limit_its_validity(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make(tmp_path, ("camera",), [], 100)

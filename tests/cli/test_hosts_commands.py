@@ -130,7 +130,7 @@ def test_the_configuration_of_the_router_is_shown_without_creating_its_run(toml:
     assert runs() == []
 
 
-def test_a_list_of_hosts_without_a_link_to_the_router_creates_no_run(toml: Path) -> None:
+def test_lowfc_hosts_creates_no_run_if_the_router_cannot_be_joined(toml: Path) -> None:
     assert "the router accepts no process without it" in refusal("hosts", "--config", toml, "--run", "bench")
     assert "a run's name is up to 48 of" in refusal("hosts", "--config", toml, "--run", "")
     assert runs() == []

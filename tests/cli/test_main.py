@@ -125,7 +125,7 @@ def test_text_and_json_of_a_result_have_the_same_fields() -> None:
     }
 
 
-def test_a_process_of_a_run_that_does_not_answer_is_not_called_absent() -> None:
+def test_a_process_that_does_not_answer_is_not_called_absent_from_its_run() -> None:
     processes = [{"process": name, "state": "starting", "pid": None} for name in ("controller", "recorder")]
     row = {"run": "bench", "mode": "starting", "holding": None, "rate_hz": None, "uptime_s": None}
     row |= {"processes": processes, "recording": "none", "log": None}

@@ -105,11 +105,11 @@ def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(client, name, 0.05)
 
 
-SIMPLE = ("open", "close", "pause", "safe", "clear", "reset", "stop")
+WITHOUT_FIELDS = ("open", "close", "pause", "safe", "clear", "reset", "stop")
 METHODS = {"open": Client.open_loop, "close": Client.close_loop}
-"""Methods that do not have the name of their request."""
+"""Methods whose name differs from that of their request."""
 CALLS: tuple[tuple[Callable[[Client], object], Request], ...] = (
-    *((METHODS.get(name) or getattr(Client, name), Request(0, name)) for name in ("status", *SIMPLE)),
+    *((METHODS.get(name) or getattr(Client, name), Request(0, name)) for name in ("status", *WITHOUT_FIELDS)),
     (lambda loop: loop.step(7), Request(0, "step", (), (7.0,))),
     (lambda loop: loop.gain(0.5, [2, 3]), Request(0, "gain", (2, 3), (0.5,))),
     (lambda loop: loop.gain(0.5, modes=2), Request(0, "gain", (2,), (0.5,))),
@@ -145,7 +145,7 @@ def test_every_request_is_tested() -> None:
     assert {request.name for _, request in CALLS} == set(REQUESTS)
 
 
-def test_every_request_has_its_requester(controller: FakeController, loop: Client) -> None:
+def test_every_request_names_its_requester(controller: FakeController, loop: Client) -> None:
     loop.safe()
     (request,) = controller.requests
     assert request.requester.endswith(f"(process {os.getpid()})")
@@ -609,7 +609,7 @@ def test_the_declared_requests_match_the_implemented_ones() -> None:
     ]
     fields = set(wire.Request.DESCRIPTOR.fields_by_name)
     assert all({name for name, _ in declared.fields} <= fields for declared in DECLARED)
-    assert all(not by_key[REQUEST_KEY.format(name=name)].fields for name in SIMPLE)
+    assert all(not by_key[REQUEST_KEY.format(name=name)].fields for name in WITHOUT_FIELDS)
 
 
 def test_mode_lists_are_parsed() -> None:
@@ -722,7 +722,8 @@ def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
     summary = bench.stop()
     assert [path.absolute() for path in summary.files] == [stopped, Path(started.text)]
     read = list(LogReader(summary.files[1]))
-    assert [message.key for message in read[:2]] == [CALIBRATION.key, CAMERA_STATE.key], "a log begins with these"
+    # A log begins with the last message of each of these topics.
+    assert [message.key for message in read[:2]] == [CALIBRATION.key, CAMERA_STATE.key]
     assert bodies_of(read, FRAME) == second[:5] + second[6:]
     assert "RECORDING recording" in [Log.FromString(body).message for body in bodies_of(read, EVENT)]
     assert (summary.lost, summary.failure) == ({FRAME.key: 2}, ""), "messages while stopped do not count as lost"
@@ -755,7 +756,7 @@ def test_a_log_that_cannot_be_created_is_refused_and_the_answer_to_the_next_star
     second = operator.record(True)
     assert second.text != stopped.text
     assert second.reply.startswith(f"recording into {second.text}; about 3.6 GB an hour; ")
-    shutil.rmtree(bench.folder)  # a recording that failed can be followed by another
+    shutil.rmtree(bench.folder)  # ends the recording with a failure; another can follow
     until(lambda: bench.camera.last_health["recorder"].recording.failure)
     third = operator.record(True).text
     summary = bench.stop()
