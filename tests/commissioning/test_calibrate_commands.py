@@ -90,7 +90,7 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
 ) -> None:
     loop = noiseless_loop
     check = Calibrator.check
-    delay_measurement_frames = DELAY_FRAMES + 16  # before the first report of the time to go; 16 frames are at its ends
+    delay_measurement_frames = DELAY_FRAMES + 16  # these precede the reports of the time to go; 16 are at the ends
     monkeypatch.setattr(Calibrator, "check", Mock(side_effect=KeyboardInterrupt))
     before = loop.calibration()
     arguments = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]
@@ -188,7 +188,7 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(monkeyp
     assert not result["recommended"]
     assert result["snr_reached"] < 200
     assert "200 required: find what disturbs this mode, or measure about" in result["faults"][0]
-    assert "--resume --snr 200 --cycles " in result["faults"][0]  # --cycles alone would require a ratio of 20
+    assert "--resume --snr 200 --cycles " in result["faults"][0]  # --cycles alone would require a signal-to-noise of 20
     assert result["file"] == "night.rejected.fits"
     assert calibration_file.load(Path("night.rejected.fits")).id != before.id
     assert not Path("night.fits").exists(), "an existing calibration would be overwritten"
@@ -241,17 +241,17 @@ def test_progress_without_a_terminal_is_a_line_every_10_s_with_the_time_to_go_of
 
 
 def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:
-    result = json_of("calibrate", "reference", "--frames", "200", "--out", "there.fits")
+    result = json_of("calibrate", "reference", "--frames", "200", "--out", "present.fits")
     shift = dict(zip(result["noll"], result["reference_shift_nm"], strict=True))
     assert shift[4] == pytest.approx(6.0, abs=0.6)
-    calibration = calibration_file.load(Path("there.fits"))
+    calibration = calibration_file.load(Path("present.fits"))
     assert np.abs(cross_talk(calibration.reconstructor, calibration.response)).max() < 1e-3
     assert np.array_equal(calibration.response, loop.calibration().response)
-    loop.offset(5.0, [4])  # the new reference includes the offset, which would move the loop once more
+    loop.offset(5.0, [4])  # a new reference would contain this offset, so that it would act twice
     done = lowfc("calibrate", "reference", "--frames", "16")
     assert "the new reference image contains the offset" in " ".join(done.stderr.split())
     loop.ask("lease", values=60.0, text="somebody", lease_id=2)
-    arguments = ("calibrate", "reference", "--frames", "200", "--out", "there.fits")
+    arguments = ("calibrate", "reference", "--frames", "200", "--out", "present.fits")
     assert "reserved for somebody" in refusal(*arguments, kind=RequestRefusedError)
 
 
@@ -341,7 +341,7 @@ def test_no_calibration_is_aligned_to_a_turned_mirror(loop: InProcessLoop, monke
 def test_pokes_resolve_a_reflection_or_rotation_that_does_not_change_the_image(
     geometry: Geometry, pupil: dict[str, Any]
 ) -> None:
-    """Without a mask, the image of a circular pupil is circular, that of the other pupil symmetric about both axes."""
+    """Without a mask, the image of a circular pupil is circular; that of the prolate pupil has two axes of symmetry."""
     config = load(None, SMALL_MIRROR | {"sensor.kind": "clowfs", "sensor.modes": 3} | pupil)
     first = calibration_of(config.to_toml())
     image = first.reference.astype(float).reshape(80, 80)
@@ -398,8 +398,8 @@ def test_a_truncation_keeps_the_fit_of_a_background() -> None:
 
 def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop) -> None:
     compute(loop.config, "flat.fits")
-    compute(loop.config, "there.fits", "--at", "3=-10,4=15")
-    result = json_of("calibrate", "--compare", "flat.fits", "there.fits")
+    compute(loop.config, "aberrated.fits", "--at", "3=-10,4=15")
+    result = json_of("calibrate", "--compare", "flat.fits", "aberrated.fits")
     assert result["estimators"] == ["weighted", "weighted+at 3=-10,4=15"]
     assert result["cross_talk"] > 0.02
     shift = dict(zip(result["noll"], result["reference_shift_nm"], strict=True))
@@ -409,7 +409,7 @@ def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop)
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
-        ("--out there.fits dark --star-blocked", "--out is before `dark`: .* after it"),
+        ("--out night.fits dark --star-blocked", "--out is before `dark`: .* after it"),
         ("--json reference", "--json is before `reference`"),
         ("--method poke --config test.toml", "--config requires --method analytic"),
         ("--at 4=15", "--at requires --method analytic"),

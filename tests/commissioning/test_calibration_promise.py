@@ -141,7 +141,7 @@ def test_the_default_calibration_takes_less_than_three_minutes_at_250_hz(tmp_pat
     assert plans.frames(plans.cycles()) / 250 < 180
 
 
-BUS = """
+TOML = """
 seed = 5
 [disturbance]
 preset = "{preset}"
@@ -157,7 +157,7 @@ disable_cpu_idle = false
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(("method", "preset"), [("hadamard", "bench"), ("poke", "thermal"), ("in-loop", "kolmogorov")])
 def test_calibrations_over_the_bus_have_the_requested_accuracy(method: str, preset: str, tmp_path: Path) -> None:
-    (tmp_path / "test.toml").write_text(BUS.format(preset=preset))
+    (tmp_path / "test.toml").write_text(TOML.format(preset=preset))
     loop = start(tmp_path, "sim-loop", "--config", "test.toml", "--lockstep", *(["--open"] * (method != "in-loop")))
     try:
         until(running)

@@ -119,11 +119,13 @@ def machine(root: Path, changes: dict[str, object]) -> Host:
     return host
 
 
-def facts(root: Path, changes: dict[str, object] | None = None, **others: object) -> Facts:
-    config = others.pop(
+def facts(root: Path, changes: dict[str, object] | None = None, **other_facts: object) -> Facts:
+    """Facts about the suitable host with `changes`, and with these other facts in place of the defaults."""
+    config = other_facts.pop(
         "config", load(None, {"recorder.folder": "/logs", "realtime.disable_cpu_idle": False, **PINNED})
     )
-    return Facts(**{"host": machine(root, changes or {}), "config": config, "trial": trial(), "busy": (), **others})
+    defaults = {"host": machine(root, changes or {}), "config": config, "trial": trial(), "busy": ()}
+    return Facts(**{**defaults, **other_facts})
 
 
 def examine(facts: Facts) -> dict[str, Check]:
@@ -207,8 +209,9 @@ def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
 def test_each_property_of_a_host_has_its_status_and_text(
     tmp_path: Path, name: str, status: str, text: str, changes: dict[str, object]
 ) -> None:
-    others = {key: changes[key] for key in ("trial", "config", "busy") if key in changes}
-    check = examine(facts(tmp_path, {key: changes[key] for key in changes.keys() - others.keys()}, **others))[name]
+    other_facts = {key: changes[key] for key in ("trial", "config", "busy") if key in changes}
+    host_changes = {key: value for key, value in changes.items() if key not in other_facts}
+    check = examine(facts(tmp_path, host_changes, **other_facts))[name]
     assert (check.status, text in " ".join([check.got, check.advice, check.cost])) == (status, True), check
     assert status != "warning" or (check.advice and check.cost)
 
@@ -331,7 +334,7 @@ def test_a_trial_ends_after_an_interrupt() -> None:
 
 
 def test_a_failed_trial_names_its_cause(monkeypatch: pytest.MonkeyPatch) -> None:
-    multiprocessing.resource_tracker.ensure_running()  # started now, because the program below cannot start it
+    multiprocessing.resource_tracker.ensure_running()  # started now, because /bin/false cannot start it
     monkeypatch.setattr(multiprocessing.spawn, "get_executable", lambda: b"/bin/false")
     with pytest.raises(OSError, match="the trial's process ended"):
         try_out(Realtime(), set(), 0.01)
@@ -440,6 +443,6 @@ def test_real_time_rights_are_shown_applied_and_removed(tmp_path: Path, monkeypa
         assert (type(failed), str(failed)) == (DataFileError, f"the settings cannot be changed completely: {fault}")
 
 
-def test_the_udev_rule_equals_that_of_the_services() -> None:
+def test_the_udev_rule_of_doctor_setup_equals_the_rule_shipped_for_the_services() -> None:
     shipped = Path(__file__).parents[2] / "deploy/udev/70-lowfc.rules"
     assert permissions.FILES["etc/udev/rules.d/90-lowfc-user.rules"] == shipped.read_text()

@@ -71,9 +71,9 @@ def test_gains_with_which_the_loop_is_unstable_are_refused(key: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["map.npy", "map.fits"])
-@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int16, ">f4"])
-def test_a_map_is_read_from_fits_and_numpy_files(tmp_path: Path, name: str, kind: npt.DTypeLike) -> None:
-    shape = np.round(wavy()).astype(kind)
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int16, ">f4"])
+def test_a_map_is_read_from_fits_and_numpy_files(tmp_path: Path, name: str, dtype: npt.DTypeLike) -> None:
+    shape = np.round(wavy()).astype(dtype)
     read = read_shape(Path(saved(tmp_path, name, shape)))
     assert read.dtype == np.float32
     np.testing.assert_array_equal(read, shape)

@@ -150,8 +150,8 @@ def test_the_residual_achieved_is_that_of_the_last_gains(
     assert warning.startswith(f"law or gains changed in these frames: the achieved residual is {extent}")
 
 
-def test_an_offset_does_not_belong_to_the_disturbance_at_a_measured_delay(tmp_path: Path) -> None:
-    """Without truth, this log's mirror reports each command a frame later than the controller assumes."""
+def test_an_offset_is_not_counted_as_disturbance_when_the_delay_is_measured(tmp_path: Path) -> None:
+    """In a log without the true wavefront, the mirror reports each command a frame later than assumed."""
     night = SyntheticLog(truth=False).request("close").frames(1500).request("offset", (0.0, 0.0, 20.0)).frames(1500)
     run = telemetry_from_log(LogReader(night.write(tmp_path / "night.mcap")))
     assert run.timing.delay == 2
@@ -159,14 +159,14 @@ def test_an_offset_does_not_belong_to_the_disturbance_at_a_measured_delay(tmp_pa
 
 
 def test_an_offset_or_a_channel_in_the_true_residual_is_reported(closed: SyntheticLog, tmp_path: Path) -> None:
-    shaped = "an offset or channels were in force: the achieved residual contains their shapes, theory does not"
+    warning = "an offset or channels were in force: the achieved residual contains their shapes, theory does not"
     night = SyntheticLog().request("close").frames(100).request("offset", (0.0, 0.0, 20.0)).frames(2700)
     result = json_of("tune", night.write(tmp_path / "night.mcap"))
     assert result["modes"][2]["achieved_nm"] > 19
-    assert result["warnings"] == [shaped]
+    assert result["warnings"] == [warning]
     night = closed.copy()
     night.change(CONTROLLER_STATE, -1, lambda state: state.channels.add(name="dark-hole"))
-    assert telemetry_from_log(LogReader(night.write(tmp_path / "dark-hole.mcap"))).warnings == (shaped,)
+    assert telemetry_from_log(LogReader(night.write(tmp_path / "dark-hole.mcap"))).warnings == (warning,)
 
 
 def test_a_loop_that_was_closed_for_too_few_frames_is_not_simply_called_open(tmp_path: Path) -> None:
@@ -225,10 +225,10 @@ PROBE = wire.Play(first_sequence=frame_sequence(3050), frames=100, id="probe")
 
 
 class SteppedLoop(InProcessLoop):
-    """A loop with these steps, whose mirror reports each command `report_periods` after the end of the exposure.
+    """A loop with these steps, whose mirror reports each command `report_periods` frame periods after the exposure.
 
-    With a `later_gain`, only the state requested after 3100 steps has the probe sequence; it and later ones have the
-    gain.
+    With a `later_gain`, the state requested after 3100 steps is the only one with the probe sequence; this state and
+    all later ones have that gain.
     """
 
     lost, offset = 0, None  # number of steps that the client lost, and offset of the clock of the mirror's host
@@ -303,7 +303,7 @@ def test_the_mirrors_reports_give_the_time_of_application() -> None:
 
 
 def closed_loop(disturbance_nm: np.ndarray, delay_frames: int) -> list[Step]:
-    """Steps of a controller that assumes a delay of one frame, with commands of noise."""
+    """Steps at a disturbance (frames, modes): the commands are noise, and the controller assumes a delay of 1 frame."""
     command_nm = np.random.default_rng(7).standard_normal(disturbance_nm.shape).astype(np.float32)
     error_nm = disturbance_nm + np.concatenate([np.zeros((delay_frames, 3), np.float32), command_nm[:-delay_frames]])
     pol_nm = error_nm - np.concatenate([np.zeros((1, 3), np.float32), command_nm[:-1]])

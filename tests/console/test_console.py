@@ -407,7 +407,7 @@ def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatc
     assert console_feed._config == CONFIG
 
 
-def test_states_are_queried_of_a_new_process_and_of_an_incomplete_controller_every_five_seconds(
+def test_states_are_queried_of_a_new_process_and_every_five_seconds_of_a_controller_without_states(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(monitor.Monitor, "_query", query := Mock())
