@@ -106,15 +106,15 @@ def test_the_identity_depends_on_every_field() -> None:
 
 
 def test_actuators_to_modes_are_stored_and_optional(tmp_path: Path) -> None:
-    without, path = calibration(), tmp_path / "night.fits"
+    without_matrix, path = calibration(), tmp_path / "night.fits"
     matrix = np.arange(60, dtype=np.float32).reshape(3, 20)
-    with_matrix = calibration_codec.identified(replace(without, actuators_to_modes=matrix))
+    with_matrix = calibration_codec.identified(replace(without_matrix, actuators_to_modes=matrix))
     save(with_matrix, path)
     assert np.array_equal(load(path).actuators_to_modes, matrix)
-    assert with_matrix.id != without.id
+    assert with_matrix.id != without_matrix.id
     with fits.open(path) as hdus:
         assert "ACT2MODES" in hdus
-    save(without, path)
+    save(without_matrix, path)
     assert load(path).actuators_to_modes.size == 0
     with fits.open(path) as hdus:
         assert "ACT2MODES" not in hdus

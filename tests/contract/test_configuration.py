@@ -183,7 +183,7 @@ def test_an_impossible_address_of_the_router_is_refused(key: str, address: str, 
 
 
 def test_config_show_sets_only_keys_that_were_set(tmp_path: Path) -> None:
-    """Read from a file, the output of `config show` leaves the defaults of a command in force."""
+    """A file with the output of `config show` leaves a command's own defaults in force."""
     defaults_file = write(tmp_path, commented(load(None)))
     assert all(section == {} for section in tomllib.loads(defaults_file.read_text()).values())
     assert load(defaults_file, None, {"control.start_mode": "closed"}).control.start_mode == "closed"
@@ -191,7 +191,7 @@ def test_config_show_sets_only_keys_that_were_set(tmp_path: Path) -> None:
         key.rpartition(".")[2] for key in KEYS
     }
     chosen = {
-        "control": {"start_mode": "open"},  # the default, but set
+        "control": {"start_mode": "open"},  # equal to the default, but set
         "disturbance": {"static_nm": {"4": 1.5}},
         "mirror": {"dead": [1, 2], "stuck_nm": {"3": 25.0, "5": -2.0}},
     }

@@ -91,7 +91,7 @@ def test_readers_of_a_log_escape_their_output(log: Path, command: str) -> None:
     if command == "report":
         page = log.with_suffix(".html").read_text()
         check(page, keep=LINES)
-        assert page.count("clouds\\x1b[2J") >= 6, "events, requests, versions"
+        assert page.count("clouds\\x1b[2J") >= 6, "in events, requests and versions"
 
 
 def test_a_view_escapes_events(log: Path) -> None:

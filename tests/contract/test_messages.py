@@ -28,12 +28,13 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "lowfc_v1.txt"
 
 
 def declared() -> FileDescriptorProto:
-    """The project's file in the committed descriptor, with comments."""
+    """The package lowfc.v1 in the committed descriptor, with comments."""
     descriptors = FileDescriptorSet.FromString((WIRE / "lowfc.desc").read_bytes())
     return next(file for file in descriptors.file if file.package == "lowfc.v1")
 
 
 def comments(file: FileDescriptorProto) -> dict[tuple[int, ...], str]:
+    """Comment of each element, by the element's path in the descriptor."""
     return {
         tuple(location.path): " ".join(location.leading_comments.split()) for location in file.source_code_info.location
     }

@@ -46,7 +46,7 @@ def test_a_state_with_too_few_modes_is_refused(field: str) -> None:
 
 
 @pytest.mark.parametrize("field", ["gain", "leak", "limit_nm", "auto_gain"])
-def test_settings_with_a_pair_of_another_length_are_refused(field: str) -> None:
+def test_settings_with_three_values_in_place_of_a_pair_are_refused(field: str) -> None:
     message = controller_state(State(), settings(auto_gain=(True, False)), 1)
     getattr(message.settings, field).append(1)
     with pytest.raises(ValueError, match="two gains"):

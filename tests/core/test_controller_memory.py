@@ -457,7 +457,7 @@ def test_a_refusal_by_the_mirror_for_an_unknown_reason_is_a_fault(calibration: C
 def test_a_warm_up_changes_no_state_publishes_nothing_and_loses_no_settings(
     calibration: Calibration, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    warmed_up: list[bool] = []
+    unchanged: list[bool] = []  # for each warm-up
     original = Controller._warm_up
 
     monkeypatch.setattr(cache_warmup, "LEAD_NS", 30_000_000)  # a host that runs other tests is sometimes late
@@ -469,7 +469,7 @@ def test_a_warm_up_changes_no_state_publishes_nothing_and_loses_no_settings(
         def watched(self: Controller) -> None:
             before, counts_before = self._state, counts()
             original(self)
-            warmed_up.append(self._state is before and counts() == counts_before)
+            unchanged.append(self._state is before and counts() == counts_before)
 
         monkeypatch.setattr(Controller, "_warm_up", watched)
         for index in range(5):
@@ -480,8 +480,8 @@ def test_a_warm_up_changes_no_state_publishes_nothing_and_loses_no_settings(
         monkeypatch.setattr(rig.controller._warmup, "due", lambda now_ns: True)
         rig.settings.put(CHANGED_CAMERA)
         rig.until("CAMERA_CHANGED", lambda: "CAMERA_CHANGED" in rig.events())
-    assert len(warmed_up) >= 3
-    assert all(warmed_up)
+    assert len(unchanged) >= 3
+    assert all(unchanged)
 
 
 def test_an_exception_in_frame_processing_ends_the_controller(

@@ -210,16 +210,16 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     assert estimate(load(None, {"recorder.folder": ""})).startswith("recording into .: ")
     camera = wire.CameraState(rows=160, columns=120)
     assert " GB an hour at 250 Hz and 160 x 120 pixels; " in estimate(config, camera)
-    added_per_s = bytes_per_s(config, configured_selection(config), camera) - log_bytes_per_s
-    assert added_per_s == pytest.approx((160 * 120 - 80 * 80) * 2 * 0.6 * 250)
+    added_bytes_per_s = bytes_per_s(config, configured_selection(config), camera) - log_bytes_per_s
+    assert added_bytes_per_s == pytest.approx((160 * 120 - 80 * 80) * 2 * 0.6 * 250)  # compressed to 60 %
     assert estimate(config, wire.CameraState()) == estimate(config)
     lockstep = config.model_copy(update={"lockstep": True})
     assert " GB an hour at 250 Hz in simulated time and 80 x 80 pixels" in estimate(lockstep)
     assert " 40 x 40 pixels (size of the simulated camera); " in estimate(load(None, keys | {"sensor.kind": "zwfs"}))
     fields = *wire.ControlStep.DESCRIPTOR.fields, *wire.Truth.DESCRIPTOR.fields
-    modal = sum(field.is_repeated and field.name.endswith("_nm") for field in fields)
-    added_per_s = bytes_per_s(load(None, keys | {"sensor.modes": 35}), EVERYTHING) - log_bytes_per_s
-    assert added_per_s == pytest.approx(modal * (35 - 14) * 4 * 250)
+    modal_fields = sum(field.is_repeated and field.name.endswith("_nm") for field in fields)
+    added_bytes_per_s = bytes_per_s(load(None, keys | {"sensor.modes": 35}), EVERYTHING) - log_bytes_per_s
+    assert added_bytes_per_s == pytest.approx(modal_fields * (35 - 14) * 4 * 250)
     assert bytes_per_s(load(None, keys | {"camera.rate_hz": 500.0}), EVERYTHING) > 1.8 * log_bytes_per_s
     fewer = load(None, keys | {"recorder.every": 10, "recorder.topics": [FRAME.key, "lowfc/mirror/{name}/state"]})
     assert bytes_per_s(fewer, configured_selection(fewer)) < 0.5 * log_bytes_per_s

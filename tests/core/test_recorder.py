@@ -106,7 +106,9 @@ def test_states_published_before_the_recorder_started_are_written_first_and_once
 
 
 @pytest.mark.parametrize("state", [wire.CameraState(rows=6, columns=7), None, b"\xff"])
-def test_the_camera_is_known_before_the_first_log_begins(bench: Bench, state: wire.CameraState | bytes | None) -> None:
+def test_the_state_of_the_camera_is_queried_before_the_first_log_begins(
+    bench: Bench, state: wire.CameraState | bytes | None
+) -> None:
     if state is not None:
         payload = state if isinstance(state, bytes) else state.SerializeToString()
         bench.camera.publisher(CAMERA_STATE).put(payload)
@@ -215,7 +217,7 @@ def test_duplicates_neither_count_as_losses_nor_hide_them() -> None:
     account.revert()
     for published, lost in ((7, 1), (8, 1), (9, 2)):
         reconcile(account, published, "stopped")
-        assert account.lost() == {FRAME.key: lost}, "frame 3 was lost; of nine published messages, one more"
+        assert account.lost() == {FRAME.key: lost}, "frame 3, and one more if nine frames were published"
     assert account.recorded() == {FRAME.key: 7}
 
 

@@ -63,7 +63,7 @@ def check_account(bench: Bench, summary: Summary, frames: Publisher) -> int:
 
 
 def refuse_writes(bench: Bench, descriptor: int) -> None:
-    """Replace the log's file by one that refuses writes."""
+    """Replace the log's file by the one open as `descriptor`, which refuses writes; close `descriptor`."""
     os.dup2(descriptor, bench.recorder._series._log._raw.fileno())
     os.close(descriptor)
 
@@ -157,7 +157,7 @@ def test_messages_lost_while_the_disk_stalls_are_counted(bench: Bench, monkeypat
 
 
 def slow_disk(monkeypatch: pytest.MonkeyPatch, *, refuses: bool) -> tuple[threading.Event, threading.Event]:
-    """Block a log's flush; return an event that reports its start, and one that ends it, in a fault if `refuses`."""
+    """Block a log's flush; return two events: the flush has begun, and it may end (with an error if `refuses`)."""
     reached, release, sync = threading.Event(), threading.Event(), os.fsync
 
     def slow(descriptor: int) -> None:
@@ -318,7 +318,7 @@ def test_the_backlog_is_bounded_by_number_and_size() -> None:
     assert len(backlog) == 1
 
 
-def test_forged_names_and_starts_do_not_fill_the_recorder_or_a_log(
+def test_forged_names_and_starts_do_not_fill_the_recorders_memory_or_a_log(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lowfc.programs.core.recording.recorder.MAX_CHANNELS", 100)

@@ -11,7 +11,7 @@ from lowfc.programs.core.camera_reports import CameraReports
 
 
 def test_settings_at_the_start_of_a_lockstep_run_have_the_time_of_its_start() -> None:
-    """The camera publishes settings at its start and with its first frame; the host decides which the query returns."""
+    """The camera publishes settings at its start and with its first frame; the query may return either."""
     clock, received = SimulatedClock(), list[CameraSettings]()
     state = wire.CameraState(timestamp=timestamp(clock.now_ns() + 10_000_000), rows=6, columns=7)
     answer = Sample(CAMERA_STATE.key, state.SerializeToString(), sequence_of(1, 1), 1, 1)
