@@ -154,5 +154,5 @@ def test_expected_rms_agrees_with_many_draws(circle_modes):
 def test_r_squared_is_one_minus_squared_errors_over_the_scatter_of_the_estimates():
     truth = np.array([[0.0, 1.0], [2.0, 1.0], [4.0, 4.0]])
     estimates = truth + np.array([[0.0, 1.0], [0.0, 0.0], [0.0, -1.0]])
-    # The second mode: errors 1, 0, -1, squares 2; estimates 2, 1, 3 about their mean 2, squares 2.
+    # Sums of squares of the second mode: 2 of the errors 1, 0, -1, and 2 of the estimates 2, 1, 3 about their mean.
     np.testing.assert_allclose(r_squared(estimates, truth), [1.0, 1.0 - 2.0 / 2.0])

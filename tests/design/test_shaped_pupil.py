@@ -37,7 +37,7 @@ def designed(request):
 
 
 def field_of(quarter, samples_per, extent):
-    """Field by the sensor's transform, at half-integer offsets.
+    """Axis, lambda/D, and field relative to its peak, by the sensor's transform, at half-integer offsets.
 
     With 30 samples per lambda/D, no sample is a point at which the design is checked.
     """
@@ -47,7 +47,7 @@ def field_of(quarter, samples_per, extent):
 
 
 def in_zone(request, axis, margin=0.0):
-    """Whether each point of the grid of an axis is in the dark zone, at least a margin from its edge; in lambda/D."""
+    """Whether each point of the grid of an axis is in the dark zone, at least `margin` from its edge, lambda/D."""
     radius, angle = np.hypot(axis[:, None], axis), np.rad2deg(np.arctan2(np.abs(axis)[:, None], np.abs(axis)))
     return (
         (radius >= request.inner + margin)

@@ -368,7 +368,7 @@ def test_options_in_a_section_named_after_the_class_are_refused() -> None:
 
 
 def test_camera_clock_is_converted_to_within_the_shortest_transfer_time() -> None:
-    """Clock slow by 30 ppm, transfers of 0.2 ms plus an exponential delay of mean 0.5 ms, a pause of an hour."""
+    """The clock is slow by 30 ppm; a transfer takes 0.2 ms plus an exponential delay of mean 0.5 ms; one hour's pause."""
     clock, rng = CameraClock(), np.random.default_rng(1)
     errors_ns = []
     minute = np.arange(10**15, 10**15 + 60 * 10**9, 10**7)
@@ -376,7 +376,7 @@ def test_camera_clock_is_converted_to_within_the_shortest_transfer_time() -> Non
         stamp_ns = round((end_ns - 10**15) * (1 - 30e-6)) + 77
         received_ns = end_ns + 200_000 + int(rng.exponential(500_000))
         errors_ns.append(clock.monotonic_ns(stamp_ns, received_ns) - end_ns)
-    for steady_ns in (errors_ns[100:6000], errors_ns[6100:]):
-        assert max(map(abs, steady_ns)) < 300_000
+    for settled_errors_ns in (errors_ns[100:6000], errors_ns[6100:]):
+        assert max(map(abs, settled_errors_ns)) < 300_000
     assert min(errors_ns[6000:]) > -300_000, "the offsets before the pause are not used after it"
     assert clock.monotonic_ns(MS, end_ns + 10**9) == end_ns + 10**9, "the camera's clock restarted"

@@ -224,9 +224,9 @@ def test_frame_numbers_are_unwrapped_and_gaps_count_as_lost_frames() -> None:
     )
 
 
-@pytest.mark.parametrize("kind", [np.uint32, np.uint64])
-def test_whole_numbers_of_the_settings_may_be_numpy_integers(kind: Any) -> None:
-    settings = replace(SETTINGS, period_ns=kind(SETTINGS.period_ns), number_wrap=kind(SETTINGS.number_wrap))
+@pytest.mark.parametrize("dtype", [np.uint32, np.uint64])
+def test_whole_numbers_of_the_settings_may_be_numpy_integers(dtype: Any) -> None:
+    settings = replace(SETTINGS, period_ns=dtype(SETTINGS.period_ns), number_wrap=dtype(SETTINGS.number_wrap))
     bench = CameraBench(*[good(number=number) for number in (65_535, 1, 30_000, 0)], settings=settings)
     assert None not in [bench.loop._next_frame() for _ in range(4)], bench.listener.event_texts("DRIVER_FAILED")
     assert camera_state(replace(SETTINGS, bit_depth=np.uint8(12)), 0).saturation_dn == 4095
@@ -257,7 +257,10 @@ def test_a_changed_region_is_published_before_its_first_frame() -> None:
 
 
 class Mirror:
-    """Mirror whose next calls run the functions in `plan`; without any it applies the command."""
+    """Mirror whose next calls run the functions in `plan`; when `plan` is empty, it applies the command.
+
+    `heights_nm` has the largest actuator of each command.
+    """
 
     def __init__(self) -> None:
         self.geometry = geometry(CONFIG)

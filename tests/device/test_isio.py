@@ -65,7 +65,7 @@ def channel(folder: Path, name: str = "dm00disp03", *, make: bool = False) -> Pl
 
 
 @pytest.mark.parametrize(
-    ("number", "options", "pixels", "expected"),
+    ("pixel_type", "options", "pixels", "expected"),
     [
         (UINT16, {}, [0, 1, 65535], [0, 1, 65535]),
         (INT32, {}, [-5, 70_000, 12], [0, 65535, 12]),
@@ -74,9 +74,9 @@ def channel(folder: Path, name: str = "dm00disp03", *, make: bool = False) -> Pl
     ],
 )
 def test_pixels_of_any_type_are_converted_to_dn(
-    folder: Path, number: int, options: dict[str, float], pixels: list[float], expected: list[int]
+    folder: Path, pixel_type: int, options: dict[str, float], pixels: list[float], expected: list[int]
 ) -> None:
-    writer = PlainStream.make(file_of(folder, "camnsv"), 3, 1, number)
+    writer = PlainStream.make(file_of(folder, "camnsv"), 3, 1, pixel_type)
     driver, _ = camera(**options)
     writer.write(np.array([pixels]))
     exposure = driver.expose()
@@ -249,7 +249,7 @@ def test_the_reached_position_comes_from_the_sum_of_channels(folder: Path, monke
     driver, _ = mirror()
     others_nm = shape_nm(3) + 100
     summing.others.write(others_nm / 1000)
-    assert driver.apply(shape_nm(1)) is None  # as written, except for piston
+    assert driver.apply(shape_nm(1)) is None  # reached as written, except for piston
     assert np.allclose(driver.beside(), others_nm - others_nm.mean(), atol=1e-3)
     too_far = shape_nm(2)
     too_far[5, 7] = 600
@@ -312,9 +312,9 @@ def test_a_sum_that_is_absent_although_expected_counts_as_not_following(
 
 
 def test_a_channel_whose_writer_died_while_writing_stays_in_the_sum(folder: Path) -> None:
-    dark_hole, turbulence, begun = (channel(folder, f"dm00disp0{index}", make=True) for index in range(3))
+    dark_hole, turbulence, interrupted = (channel(folder, f"dm00disp0{index}", make=True) for index in range(3))
     dark_hole.write(shape_nm(1) / 1000)
-    begun.begin(shape_nm(2) / 1000)
+    interrupted.begin(shape_nm(2) / 1000)
     others = OtherChannels(other_channel_names("dm00disp03"), GRID)
     assert np.allclose(1000 * others.sum(), shape_nm(1) + shape_nm(2), atol=1e-3)
     dark_hole.begin(shape_nm(3) / 1000)

@@ -85,8 +85,9 @@ def test_an_existing_stream_is_adopted_unless_another_process_writes_it(folder: 
 def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The bridge polls ten times. Cases:
 
-    normal: the controller restarts at the fourth poll; busy: it also refuses at the first five; controller-late: it
-    only starts at the fourth; run-restarted: instead the run is restarted, and the bridge joins the new one.
+    normal: the controller restarts at the fourth poll. busy: as normal, and the controller does not answer the first
+    five. controller-late: the controller starts only at the fourth poll. run-restarted: the run restarts, and not only
+    the controller; the bridge joins the new run.
     """
     hub, clock, received = MemoryHub(), FakeClock(AT_NS), list[wire.Request]()
     controller = MemoryBus(hub, "controller", clock)

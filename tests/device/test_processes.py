@@ -146,7 +146,7 @@ class Bench:
         until(holds, 60)
 
     def is_commanded(self, command_nm: list[float]) -> bool:
-        """Whether the last command is this one, up to noise."""
+        """Whether the last command is this one within 3 nm of noise in each mode."""
         return bool(np.allclose(self.steps[-1].command_nm, command_nm, rtol=0, atol=3))
 
     def calls_nm(self) -> list[float]:
