@@ -37,7 +37,7 @@ Join = Callable[..., ZenohBus]
 
 @pytest.fixture(autouse=True)
 def _runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    with tempfile.TemporaryDirectory(prefix="bus-") as path:  # short enough for socket paths
+    with tempfile.TemporaryDirectory(prefix="bus-") as path:  # a path short enough for Unix sockets
         monkeypatch.setenv("XDG_RUNTIME_DIR", path)
         monkeypatch.setenv("ZENOH_RUNTIME", "")  # so that pytest removes what a monitor sets here
         monkeypatch.delenv("ZENOH_RUNTIME")
@@ -84,7 +84,7 @@ def test_a_put_reaches_every_subscriber_of_its_key(pair: tuple[Bus, Bus]) -> Non
 def test_closing_a_link_does_not_block_its_process(join: Join) -> None:
     buses = [join(role) for role in ("controller", "camera")]
     until(lambda: all(bus.peers() for bus in buses))
-    until(lambda: not any(socket_options(socket.SOL_SOCKET, socket.SO_LINGER)))
+    until(lambda: not any(socket_options(socket.SOL_SOCKET, socket.SO_LINGER)))  # with it, closing waits up to 10 s
 
 
 def test_a_query_returns_the_last_message_with_its_envelope(pair: tuple[Bus, Bus]) -> None:
@@ -125,7 +125,7 @@ def test_a_query_may_be_answered_later_from_another_thread(pair: tuple[Bus, Bus]
     assert [(answer.key, answer.payload) for answer in answers] == [("lowfc/request/gain", b"done")]
 
 
-def test_a_failing_handler_affects_no_other_and_is_printed_once(
+def test_the_error_of_a_handler_is_printed_once_and_affects_no_other_handler(
     pair: tuple[Bus, Bus], capfd: pytest.CaptureFixture[str]
 ) -> None:
     controller, operator = pair
@@ -272,14 +272,15 @@ def test_a_monitor_receives_every_truth_and_frames_at_display_rate(join: Join) -
         return truths.put(b"truth")
 
     until(lambda: drained[FRAME] and drained[TRUTH] and recorded.received, each=lambda: (put(), drain()))
-    first = {topic: len(samples) for topic, samples in drained.items()}
-    before = recorded.received
+    drained_before = {topic: len(samples) for topic, samples in drained.items()}
+    recorded_before = recorded.received
     for _ in range(250):
         last = put()
         time.sleep(0.002)
-    until(lambda: drained[TRUTH][-1].sequence == last.sequence and recorded.received >= before + 250, each=drain)
-    assert len(drained[TRUTH]) - first[TRUTH] >= 250
-    assert 5 < len(drained[FRAME]) - first[FRAME] < 125
+    all_recorded = recorded_before + 250
+    until(lambda: drained[TRUTH][-1].sequence == last.sequence and recorded.received >= all_recorded, each=drain)
+    assert len(drained[TRUTH]) - drained_before[TRUTH] >= 250
+    assert 5 < len(drained[FRAME]) - drained_before[FRAME] < 125
 
 
 # A recorder that drains its ring on request, and prints how many messages it received so far, how many of these are
@@ -311,10 +312,10 @@ class Reader:
         )
         self.camera = camera
         self.frames = camera.publisher(FRAME)
-        self.number = itertools.count()
+        self.numbers = itertools.count()
 
     def put(self) -> int:
-        number = next(self.number)
+        number = next(self.numbers)
         self.frames.put(b"%08d" % number * 1600)
         return number
 

@@ -210,7 +210,8 @@ def test_reader_and_writer_reconnect_after_restarts_and_the_bus_serves_without_a
     camera = linked.bus("camera")
     linked.until_direct_only(camera.publisher(FRAME))
     camera.close()
-    monkeypatch.setattr(direct_link.DirectWriter, "send", lambda *_: None)  # as another library's publisher
+    # A publisher of another library does not send over the direct link.
+    monkeypatch.setattr(direct_link.DirectWriter, "send", lambda *_: None)
     frames = linked.bus("camera").publisher(FRAME)
     until(lambda: linked.threads[-1:] not in ([], ["direct-link"]), each=lambda: frames.put(b""))
 
@@ -279,7 +280,7 @@ class CommandedMirror:
         self.received.append(sample)
         self.threads.append(threading.current_thread().name)
 
-    def until_both_paths(self) -> None:
+    def until_both_paths_deliver(self) -> None:
         def both() -> bool:
             return "direct-link" in self.threads and any(sample.payload == b"operator" for sample in self.received)
 
@@ -290,18 +291,22 @@ class CommandedMirror:
         self.operator.put(b"operator")
 
 
-def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct_link(linked: LinkedRun) -> None:
+def test_a_mirror_receives_each_command_once_and_those_of_the_controller_over_the_direct_link(
+    linked: LinkedRun,
+) -> None:
     mirror = CommandedMirror(linked)
-    mirror.until_both_paths()
-    begun = len(mirror.received)
+    mirror.until_both_paths_deliver()
+    received_before = len(mirror.received)
     for _ in range(100):
         mirror.put()
         time.sleep(0.001)
     last = mirror.controller.published - 1, mirror.operator.published - 1
     newest = set(zip((b"controller", b"operator"), last, strict=True))
-    until(lambda: newest <= {(sample.payload, count_of(sample.sequence)) for sample in mirror.received[begun:]})
-    time.sleep(0.1)  # time for a copy over the bus
-    by_publisher = list(zip(mirror.received, mirror.threads, strict=True))[begun:]
+    until(
+        lambda: newest <= {(sample.payload, count_of(sample.sequence)) for sample in mirror.received[received_before:]}
+    )
+    time.sleep(0.1)  # by then, a copy over the bus would have arrived
+    by_publisher = list(zip(mirror.received, mirror.threads, strict=True))[received_before:]
     for payload, last_count in zip((b"controller", b"operator"), last, strict=True):
         counts = [count_of(sample.sequence) for sample, _ in by_publisher if sample.payload == payload]
         assert counts[-100:] == list(range(last_count - 99, last_count + 1))
@@ -318,7 +323,7 @@ def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct
 
 def test_handed_ns_is_before_the_bus_put_if_there_is_a_direct_reader_and_after_it_if_not(linked: LinkedRun) -> None:
     mirror = CommandedMirror(linked)
-    mirror.until_both_paths()
+    mirror.until_both_paths_deliver()
     put_ns: list[int] = []
     timed = SimpleNamespace(put=lambda payload, attachment: put_ns.append(linked.clock.host_ns()))
     for publisher, has_reader in ((mirror.controller, True), (mirror.operator, False)):
@@ -328,7 +333,7 @@ def test_handed_ns_is_before_the_bus_put_if_there_is_a_direct_reader_and_after_i
         assert (publisher.handed_ns <= put_ns[-1]) is has_reader
 
 
-def test_after_a_stall_with_the_bus_ahead_nothing_is_delivered_twice(tmp_path: Path) -> None:
+def test_no_message_is_delivered_twice_after_a_stall_in_which_the_bus_was_ahead(tmp_path: Path) -> None:
     """A socket buffers at most a few thousand commands, fewer than the reader remembers."""
     reader, commands = ReaderOnTwoPaths(tmp_path / "mirror-dm.in", shared=True), 5000
     for count in range(commands):

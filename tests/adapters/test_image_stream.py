@@ -1,4 +1,4 @@
-"""ImageStreamIO streams, against an independent reader and writer made from the layout definition."""
+"""ImageStreamIO streams, tested with an independent reader and writer made from the layout definition."""
 
 import contextlib
 import os
@@ -106,7 +106,9 @@ def test_keywords_of_every_kind_are_read(path: Path) -> None:
         ({"axes": 4}, "4 axes"),
     ],
 )
-def test_other_layouts_are_refused_with_the_difference(path: Path, options: dict[str, object], difference: str) -> None:
+def test_a_stream_of_another_layout_is_refused_with_the_difference(
+    path: Path, options: dict[str, object], difference: str
+) -> None:
     new_stream(path, **options)
     with pytest.raises(StreamError, match=difference) as fault:
         Stream(path)
@@ -232,7 +234,7 @@ def test_each_reader_has_its_own_semaphore(path: Path) -> None:
     writer.reserve_semaphore(0, os.getppid())
     writer.reserve_semaphore(1, dead_pid())
     reader = StreamReader(path)
-    assert writer.get("<i", writer.readers + 4) == os.getpid()  # the dead process's semaphore
+    assert writer.get("<i", writer.readers + 4) == os.getpid()  # it has taken the dead process's semaphore
     writer.write(image(1))
     newest(reader)
     assert writer.value(0) == 1  # the parent's semaphore is not consumed

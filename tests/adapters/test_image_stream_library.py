@@ -1,4 +1,4 @@
-"""ImageStreamIO streams against the C library, if the loader finds libImageStreamIO.so."""
+"""ImageStreamIO streams, tested with the C library, if the loader finds libImageStreamIO.so."""
 
 import ctypes
 import multiprocessing
@@ -77,7 +77,7 @@ def test_images_of_the_c_library_are_read(path: Path) -> None:
     assert reader.next(0.02) is None
 
 
-def test_the_c_library_respects_our_semaphore(path: Path) -> None:
+def test_the_c_library_does_not_take_the_semaphore_of_a_lowfc_reader(path: Path) -> None:
     library = Image(path.name.removesuffix(".im.shm")).create(3)
     reader = StreamReader(path)
     context = multiprocessing.get_context("fork")
@@ -99,7 +99,7 @@ def _receive(name: str, images: int, started: Any, queue: Any) -> None:
 
 
 @pytest.mark.parametrize("made_by", ["library", "lowfc"])
-def test_our_images_wake_readers_of_the_c_library(path: Path, made_by: str) -> None:
+def test_images_of_lowfc_wake_readers_of_the_c_library(path: Path, made_by: str) -> None:
     name = path.name.removesuffix(".im.shm")
     if made_by == "library":
         Image(name).create(9, ring=3)

@@ -43,7 +43,7 @@ SENT = small_samples()
 
 
 def read_of(reader: LogReader) -> tuple[list[Sample], str]:
-    """Messages that a reader delivers, and its error."""
+    """Messages that a reader delivers, and the text of its error or an empty text."""
     read: list[Sample] = []
     try:
         read.extend(reader)
@@ -240,21 +240,21 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
         assert list(file.index()) == []
 
 
-@pytest.mark.parametrize("bytes_cut", [(0, 0), (0, 500), (40_000, 0), (40_000, 500), (60_000, 100_000)])
+@pytest.mark.parametrize("bytes_cut_from_each", [(0, 0), (0, 500), (40_000, 0), (40_000, 500), (60_000, 100_000)])
 def test_of_two_logs_in_one_file_the_first_is_read_and_the_second_reported(
-    tmp_path: Path, source: Path, bytes_cut: tuple[int, int]
+    tmp_path: Path, source: Path, bytes_cut_from_each: tuple[int, int]
 ) -> None:
     """The second is not read with the channels of the first, even if the first was truncated when its recorder died."""
-    first = (whole := source.read_bytes())[: len(whole) - bytes_cut[0]]
+    first = (whole := source.read_bytes())[: len(whole) - bytes_cut_from_each[0]]
     second = rewritten(source, tmp_path / "second.mcap", {}).read_bytes()
-    second = second[: len(second) - bytes_cut[1]]
+    second = second[: len(second) - bytes_cut_from_each[1]]
     source.write_bytes(first)
     expected = list(LogReader(source))
     source.write_bytes(first + second)
     reader = LogReader(source, skip_damaged=True)
     assert list(reader) == expected
     damage = reader.damage[-1]
-    assert len(reader.damage) == 1 + bool(bytes_cut[0])
+    assert len(reader.damage) == 1 + bool(bytes_cut_from_each[0])
     assert (damage.position, damage.length) == (len(first), len(second))
     command = f"`tail -c +{len(first) + 1} {source.name} > second.mcap`"
     assert damage.why == f"it is another log, appended to this one; {command} copies it"

@@ -264,7 +264,7 @@ INVALID_LENGTHS = [
 def test_contradictory_or_unchecked_records_are_damage(
     tmp_path: Path, records: list[McapRecord], error: str, delivered: list[int]
 ) -> None:
-    """A differing second declaration, an invalid start, a message without checksum, impossible lengths."""
+    """Such a record is a differing second declaration, or has an invalid start, no checksum or an impossible length."""
     path = crafted(tmp_path / "a", *records)
     with pytest.raises(DataFileError, match=error):
         list(LogReader(path))

@@ -136,7 +136,7 @@ def test_a_single_old_message_counts_as_superseded() -> None:
     timed.now_ns += 10**9
     timed.arrive(1, timed.now_ns - OLD_NS)
     timed.now_ns += 10**9
-    timed.arrive(2, timed.now_ns - PERIOD_NS)  # late by a period, without a sign of a newer one
+    timed.arrive(2, timed.now_ns - PERIOD_NS)  # late by a period, but nothing shows that there is a newer one
     assert timed.handled == [0, 2]
 
 

@@ -28,7 +28,9 @@ def test_an_envelope_is_16_little_endian_bytes() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"x" * 15, b"x" * 17])
 @pytest.mark.parametrize("read", [Envelope.decode, Envelope.decode_checked])
-def test_other_lengths_are_refused_as_envelopes(data: bytes, read: Callable[[bytes], object]) -> None:
+def test_data_of_another_length_than_16_bytes_is_refused_as_an_envelope(
+    data: bytes, read: Callable[[bytes], object]
+) -> None:
     with pytest.raises(BusError, match=f"16 bytes.*got {len(data)}"):
         read(data)
 

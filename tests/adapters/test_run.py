@@ -111,7 +111,9 @@ def test_a_run_that_cannot_be_made_is_an_error_and_leaves_nothing(
         HostClock()
 
 
-def test_foreign_public_and_linked_directories_are_refused(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_directories_of_other_users_public_directories_and_links_are_refused(
+    own_runtime: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     base = own_runtime / "lowfc"
     base.mkdir(mode=0o755)
     with pytest.raises(DataFileError, match="mode 700"):
@@ -138,7 +140,7 @@ def test_an_invalid_runtime_directory_is_an_error(own_runtime: Path, monkeypatch
     with pytest.raises(DataFileError, match="XDG_RUNTIME_DIR"):
         runtime_base()
     monkeypatch.delenv("XDG_RUNTIME_DIR")
-    # An unused user id: the created directory belongs to another user.
+    # This user id is unused, so that the created directory belongs to another user.
     monkeypatch.setattr(os, "geteuid", lambda: 4_000_000_000)
     shared = Path("/tmp/lowfc-4000000000")  # noqa: S108  # the path under test
     try:

@@ -66,7 +66,7 @@ def test_the_time_before_the_first_work_is_not_in_the_rate(
     camera = listener.service("camera")
     for number in range(40):
         clock.advance(HEALTH_PERIOD_NS if number else 10_250_000_000)  # a long start-up
-        camera.work = max(0, 1 + int((number - 8.25) * 0.5 * rate_hz)) if number > 8 else 0
+        camera.work = max(0, 1 + int((number - 8.25) * 0.5 * rate_hz)) if number > 8 else 0  # from 8.25 periods on
         camera.beat()
     rates = [health.rate_hz for health in listener.messages(HEALTH) if health.rate_hz]
     assert rates
@@ -267,7 +267,7 @@ def test_a_signal_ends_the_loop_and_a_second_interrupt_ends_the_process(name: st
         begun_s = time.monotonic()
         process.send_signal(signal.Signals[name])
         assert process.stdout.readline() == name + "\n"
-        assert time.monotonic() - begun_s < PATIENCE_S, "the stop ended the wait"
+        assert time.monotonic() - begun_s < PATIENCE_S, "the signal ended the wait"
         if stuck:
             process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE_S) == status
