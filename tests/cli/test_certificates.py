@@ -87,7 +87,7 @@ MISSING_FILES = ((), ("camera.key",), ("camera.pem",), ("camera.key", "camera.pe
 
 
 @pytest.mark.parametrize(
-    ("file", "missing"),
+    ("interrupted_at", "missing"),
     [
         (file, missing)
         for file in ("camera.key", "camera.pem", "viewer.pem")
@@ -95,8 +95,8 @@ MISSING_FILES = ((), ("camera.key",), ("camera.pem",), ("camera.key", "camera.pe
         if file[-3:] == "pem" or file in missing
     ],
 )
-def test_an_interruption_leaves_no_certificate_that_does_not_fit_its_key(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, missing: tuple[str, ...]
+def test_after_an_interruption_each_certificate_fits_its_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interrupted_at: str, missing: tuple[str, ...]
 ) -> None:
     roles = (ROUTER, "camera", "viewer")
     make(tmp_path, roles, ["localhost"])
@@ -105,7 +105,7 @@ def test_an_interruption_leaves_no_certificate_that_does_not_fit_its_key(
     replace = Path.replace
 
     def interrupted(draft: Path, target: Path) -> Path:
-        if target.name == file:
+        if target.name == interrupted_at:
             raise KeyboardInterrupt
         return replace(draft, target)
 

@@ -53,7 +53,7 @@ def test_a_missing_run_is_created_only_with_make() -> None:
 
 @pytest.mark.usefixtures("toml")
 def test_a_run_is_made_with_the_mirror_of_the_role() -> None:
-    for role in ("mirror-tt", "camera"):  # the run exists already for the second
+    for role in ("mirror-tt", "camera"):  # at the second role the run exists already
         done = lowfc("config", "zenoh", "--role", role, "--make")
         assert done.exit_code == 0, done.exception
     assert set(open_run("default", ()).links.ports) == {"camera", "controller", "mirror-tt", "recorder"}

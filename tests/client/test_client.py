@@ -219,7 +219,7 @@ def test_arrays_arrive_unchanged(controller: FakeController, loop: Client) -> No
     assert load.calibration.id == LOADED.id
 
 
-def test_a_refusal_raises_with_the_controllers_reply(controller: FakeController, loop: Client) -> None:
+def test_a_refused_request_raises_an_error_with_the_controllers_reply(controller: FakeController, loop: Client) -> None:
     controller.reply = Reply(False, "the loop is in safe mode", 3)
     with pytest.raises(RequestRefusedError, match=r"^close refused: the loop is in safe mode \(run default\)$"):
         loop.close_loop()
@@ -283,7 +283,7 @@ def test_a_controller_without_a_calibration_accepts_a_channel_of_the_mirrors_gri
         loop.calibration()
 
 
-def test_the_configuration_of_a_loop_is_read_and_another_versions_is_refused(
+def test_the_configuration_of_a_loop_is_read_and_that_of_another_version_is_refused(
     controller: FakeController, loop: Client
 ) -> None:
     for toml, rate_hz in ((Configuration().to_toml(), 250.0), ("[camera]\nrate_hz = 500.0\n", 500.0)):
@@ -350,7 +350,7 @@ def test_the_message_about_an_absent_process_says_whether_it_is_starting_stopped
     listen("dusk", "launcher", "controller")
     assert "was started with --no-record" in absence("dusk", Role.RECORDER)
     listen("bench", "camera")
-    for run in ("bench", "noon"):  # not started by sim-loop
+    for run in ("bench", "noon"):  # these were not started by sim-loop
         assert absence(run, Role.CONTROLLER).startswith(f"run '{run}' has no controller: start one")
     with Client("bench") as loop:
         (open_run("bench").path / "links.json").touch()
@@ -363,7 +363,7 @@ def test_the_message_about_an_absent_process_says_whether_it_is_starting_stopped
 def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., None]) -> None:
     for name in ("night", "night-2", "noon"):
         listen(name, "controller")
-    assert [the_run(word) for word in ("night", "night-", "noo")] == ["night", "night-2", "noon"]
+    assert [the_run(beginning) for beginning in ("night", "night-", "noo")] == ["night", "night-2", "noon"]
     with pytest.raises(BusError, match=r"'n' is the beginning of several runs' names: night, night-2, noon$"):
         the_run("n")
     with pytest.raises(BusError, match=r"there is no run 'day': there are night, night-2, noon$"):
@@ -386,8 +386,8 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
     name = f"night-{os.getpid()}"
     arguments = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", name]
     shell = ["/bin/sh", "-c", 'echo; read end; "$@"', *arguments[3:]]
-    program = "import subprocess, sys; subprocess.run(sys.argv[3:])"
-    parent = [sys.executable, "-c", program, "lowfc", "sim-loop", *arguments]
+    start_child = "import subprocess, sys; subprocess.run(sys.argv[3:])"
+    parent = [sys.executable, "-c", start_child, "lowfc", "sim-loop", *arguments]
     for runtime_dir, command in (
         ("/run/elsewhere", arguments),
         ("", arguments),
@@ -503,7 +503,7 @@ def test_lost_frames_are_counted_but_not_restarts_or_duplicates() -> None:
     assert frames.lost == 1, "only frame 9 is missing"
 
 
-def test_a_silent_stream_raises_also_at_its_start() -> None:
+def test_a_silent_stream_raises_an_error_even_at_its_start() -> None:
     frames = stream(frame_sample(1))
     next(frames)
     with pytest.raises(BusError, match=r"no frame came within 0.02 s: `lowfc ctl status` shows why"):
