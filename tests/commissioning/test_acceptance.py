@@ -34,7 +34,7 @@ from tests.support.report_log import TOY_CALIBRATION, SyntheticLog
 MULTISINE = {"duration_s": 3.0, "rms_nm": 3.0, "lines_per_mode": 8, "modes": (), "seed": 1}
 THREE_MODES = {
     "disturbance.preset": "quiet",
-    "camera.instants": 1,  # sufficient without a disturbance
+    "camera.instants": 1,  # one suffices without a disturbance
     "sensor.modes": 3,
     "star.magnitude": -1.0,
     "control.gain": 0.3,
@@ -77,7 +77,7 @@ def test_the_rejection_of_the_simulated_bench_matches_theory(multisine: tuple[In
     assert result.lines == 3 * MULTISINE["lines_per_mode"]
     assert result.lines_judged > 0.7 * result.lines
     assert result.lowest_hz >= 2.0
-    assert result.highest_hz == pytest.approx(75, rel=0.05)  # 0.3 of 250 Hz
+    assert result.highest_hz == pytest.approx(75, rel=0.05)  # 0.3 times the rate of 250 Hz
     wrong_delay = replace(response, loop=replace(response.loop, delay_frames=response.loop.delay_frames + 1))
     failed = rejection.judge([wrong_delay], loop.config)
     assert not failed.passed

@@ -106,7 +106,7 @@ def test_a_measured_calibration_reads_the_true_modes(
         assert np.allclose(scaled.actuators_to_modes, calibration.actuators_to_modes, atol=1e-3)
     assert calibration.id != before.id
     assert calibration.estimator == f"weighted+{method}"
-    # The fit may start from the provisional R of a commissioning; the calibration is then not provisional itself.
+    # The fit may start from the provisional R of a commissioning; its result is not provisional.
     from_first = data.measured._replace(initial=data.measured.initial._replace(estimator=f"weighted+{method}+first"))
     assert not measured_calibration(config, before, from_first, CalibrationRequest(method, OUT, 50.0))[0].provisional
 
@@ -181,7 +181,7 @@ def test_unreadable_cycles_give_an_error_of_one_line() -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_errors_name_why_a_calibration_is_impossible(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_say_why_a_calibration_is_impossible(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording, "ATTEMPTS", 2)
     dead_mirror = InProcessLoop(configured(**FEW), world=configured(**FEW, mirror__dead=list(range(12 * 12))))
     with pytest.raises(CalibrationError, match="pokes are not seen"):
@@ -242,7 +242,7 @@ def restart_camera(loop: InProcessLoop) -> None:
     loop.first += 5 << 32
 
 
-def test_a_sequence_during_a_device_restart_is_stopped_at_once_and_repeated() -> None:
+def test_a_probe_sequence_during_a_device_restart_is_stopped_at_once_and_repeated() -> None:
     faults = {
         1: (kill_mirror, InProcessLoop.start_mirror),
         3: (expire, ignore),
@@ -276,7 +276,7 @@ def lose_mirror(loop: InProcessLoop) -> None:
     loop.report_mirror("does not answer")
 
 
-def test_a_sequence_waits_until_the_controller_notices_that_a_restarted_mirror_follows(
+def test_a_probe_sequence_waits_until_the_controller_notices_that_a_restarted_mirror_follows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The mirror's first state arrives before the controller reads its first Health; until then `play` is refused."""

@@ -1,4 +1,4 @@
-"""`lowfc calibrate` and its subcommands: files, results, errors, other wavefronts; on a loop in one process."""
+"""`lowfc calibrate` and its subcommands on a loop in one process: files, results, errors, calibrations off flat."""
 
 import json
 import re
@@ -90,7 +90,7 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
 ) -> None:
     loop = noiseless_loop
     check = Calibrator.check
-    delay_measurement_frames = DELAY_FRAMES + 16  # these precede the reports of the time to go; 16 are at the ends
+    delay_measurement_frames = DELAY_FRAMES + 16  # before the time to go is reported; 16 at the ends of the sequence
     monkeypatch.setattr(Calibrator, "check", Mock(side_effect=KeyboardInterrupt))
     before = loop.calibration()
     arguments = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]
@@ -260,7 +260,7 @@ def test_a_saturated_image_is_no_reference(loop: InProcessLoop) -> None:
     assert "good pixels at full well" in refusal("calibrate", "reference", "--frames", "16", kind=CalibrationError)
 
 
-def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
+def test_a_dark_reveals_bad_pixels_and_is_refused_if_it_contains_light(
     loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     error = refusal("calibrate", "dark", "--star-blocked", "--frames", "50", kind=CalibrationError)
@@ -425,7 +425,7 @@ def test_an_option_without_effect_is_refused(arguments: str, why: str) -> None:
     assert {path.name for path in Path().iterdir()} == before
 
 
-def test_too_few_cycles_for_their_scatter_are_refused() -> None:
+def test_too_few_cycles_to_measure_their_scatter_are_refused() -> None:
     assert "--cycles" in lowfc("calibrate", "--cycles", "3").stderr
 
 
@@ -470,7 +470,7 @@ def test_the_response_is_the_derivative_of_the_image(config: Configuration) -> N
     assert np.abs(response(optics, modes, 0 * state_nm) - flat).max() < 1e-12 * np.abs(flat).max()
 
 
-def test_the_option_at_takes_a_mirror_shape_for_the_wavefront_that_it_makes(config: Configuration) -> None:
+def test_the_option_at_accepts_a_mirror_shape_in_place_of_a_wavefront(config: Configuration) -> None:
     flat, at_zero_point = analytic(config, SILENT), analytic(config, SILENT, zero_point(config, ZERO_POINT)[1])
     command_nm = np.zeros(len(flat.noll))
     command_nm[[flat.noll.index(4), flat.noll.index(7)]] = 20.0, -20.0
@@ -499,7 +499,7 @@ def test_the_option_at_takes_a_mirror_shape_for_the_wavefront_that_it_makes(conf
     ],
 )
 def test_a_computed_calibration_warns_of_its_configuration(keys: dict[str, Any], warned: str) -> None:
-    """It warns of noise above the modal limit, a mirror that does not span the pupil, and frames with another flux."""
+    """It warns of noise above a modal limit, a mirror that does not span the pupil, and flux changed by rounding."""
     analytic(load(None, keys), Console(file=(printed := StringIO())))
     assert warned in printed.getvalue()
     assert ("warning" in printed.getvalue()) is bool(warned)

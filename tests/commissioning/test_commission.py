@@ -111,7 +111,7 @@ def test_commissioning_closes_a_loop_with_another_frame_size(bench: Bench) -> No
     assert list(state.automatic) == [True, True, False]
     calibration = calibration_file.load(bench.out)
     assert calibration.shape == (64, 64)
-    # They agree for every mirror shape, not only for the shapes of the modes.
+    # Measured and computed matrix agree for every mirror shape, not only for the shapes of the modes.
     modelled = calibration_of(DISTURBED.to_toml()).actuators_to_modes
     assert np.linalg.norm(calibration.actuators_to_modes - modelled) < 0.2 * np.linalg.norm(modelled)
     assert calibration.saturation_dn == 2**14 - 1
@@ -138,7 +138,7 @@ def test_the_loop_holds_the_wavefront_of_the_reference_image(bench: Bench) -> No
     bench.loop.run(200)
     true = bench.loop.residual_nm(-200)
     measured = bench.loop.residual_nm(bench.exposed["[7/10] response"], bench.exposed["[8/10] verdict"])
-    assert np.abs(measured.mean(axis=0)).max() > 5, "far from flat"
+    assert np.abs(measured.mean(axis=0)).max() > 5, "the reference is far from flat"
     assert true.mean(axis=0) == pytest.approx(measured.mean(axis=0), abs=1.0)  # the tilts scatter by 3 nm
     true_error_nm = np.sqrt(true.var(axis=0).sum())
     assert true_error_nm < bench.results["measured_error_nm"], "the measured error includes noise"
@@ -209,7 +209,7 @@ def test_a_given_number_of_cycles_changes_only_the_default_signal_to_noise_ratio
     assert (request.snr, request.cycles) == (required, cycles)
 
 
-@pytest.mark.parametrize(("noise", "poked"), [(0.0, [1]), (0.3, [])], ids=["the configured sensor", "another"])
+@pytest.mark.parametrize(("noise", "poked"), [(0.0, [1]), (0.3, [])], ids=["the configured sensor", "another sensor"])
 def test_tilt_is_poked_to_find_a_reflection_unless_the_sensor_is_another_one(noise: float, poked: list[int]) -> None:
     config = configured(sensor__kind="clowfs", sensor__modes=3)
     first, geometry = calibration_of(config.to_toml()), Geometry(1.0, 40.2, 39.5, 12.0, -1)
@@ -314,7 +314,7 @@ def test_the_operator_is_asked_to_block_and_unblock_the_star(tmp_path: Path) -> 
     assert bench.questions == ["block the star; is it dark?", "unblock the star; is it visible?"]
 
 
-def test_a_hot_pixel_at_full_well_is_not_the_star() -> None:
+def test_a_hot_pixel_at_full_well_is_not_mistaken_for_the_star() -> None:
     camera, frames = camera_settings(configured_camera(CONFIG)), np.full((16, 80, 80), 200)
     frames[:, 0, 0] = camera.saturation_dn
     sensor = Sensor(camera, np.full(6400, 100.0), (np.arange(6400) > 0).astype(float), measured=False)

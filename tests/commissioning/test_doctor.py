@@ -237,15 +237,15 @@ def test_the_check_of_the_disk_uses_the_recorders_volume(tmp_path: Path, monkeyp
     facts_with_disk = facts(tmp_path, config=load(None, {**keys, "mirror.rows": 10, "mirror.columns": 10}))
     assert facts_with_disk.bytes_per_s == 1000 * (80 * 80 * 2 + 2 * 100 * 4)
     log_gb_per_h = bytes_per_s(facts_with_disk.config, EVERYTHING) * 3600 / 1e9
-    bytes_in_an_hour = 500_000_000 + round(log_gb_per_h * 1e9) + 1
-    for free, status in ((bytes_in_an_hour, "ok"), (bytes_in_an_hour - 10**6, "warning"), (10**6, "warning")):
+    bytes_for_an_hour = 500_000_000 + round(log_gb_per_h * 1e9) + 1
+    for free, status in ((bytes_for_an_hour, "ok"), (bytes_for_an_hour - 10**6, "warning"), (10**6, "warning")):
         usage.free = free
         check = examine(facts_with_disk)["disk"]
         assert check.status == status
         assert check.got.startswith(f"{Path.home()}/not/yet: ")
         assert (f"enough for 1.0 h at 1000 Hz, {log_gb_per_h:.1f} GB an hour" in check.got) == (free > 10**9)
     monkeypatch.setattr(host_module.os, "access", lambda path, mode: False)
-    usage.free = bytes_in_an_hour
+    usage.free = bytes_for_an_hour
     assert "not writable" in examine(facts_with_disk)["disk"].got
 
 

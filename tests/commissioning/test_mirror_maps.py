@@ -113,7 +113,7 @@ def test_the_flat_map_is_zero_where_no_actuator_is_active(tmp_path: Path) -> Non
     assert active_actuators(load(None)) is None
 
 
-def test_each_unusable_file_is_a_line_of_the_error(tmp_path: Path) -> None:
+def test_the_error_has_one_line_for_each_unusable_file(tmp_path: Path) -> None:
     config = load(None)
     small, tall = saved(tmp_path, "small.npy", np.ones((5, 6))), saved(tmp_path, "tall.npy", wavy(900.0))
     assert complaint({"mirror.flat": small}).endswith("5 x 6 values, the mirror has 34 x 34 actuators")
@@ -138,7 +138,7 @@ def test_each_unusable_file_is_a_line_of_the_error(tmp_path: Path) -> None:
     assert all(text in line for text, line in zip(("none.json", "mirror.flat", "control.law"), several, strict=True))
 
 
-def test_inactive_actuators_get_no_command_and_modes_and_actuators_stay_inverse(
+def test_inactive_actuators_get_no_command_and_each_mode_is_still_read_back_exactly(
     tmp_path: Path, calibration: Calibration
 ) -> None:
     """Five inactive actuators in the pupil: the product ACT2MODES MODES2ACT remains the identity."""

@@ -113,7 +113,7 @@ def test_the_command_writes_the_law_and_draws_it_with_the_labels_of_the_page_and
     page = " ".join((Path(__file__).parents[2] / "docs/howto/tuning.md").read_text().split())
     curves = {line.get_label().split(" (")[0]: line.get_ydata() for line in drawn[0].axes[0].lines}
     assert [label for label in curves if f"the {label}" not in page] == []
-    assert drawn[0].axes[0].get_ylabel() < drawn[0].axes[1].get_ylabel()
+    assert drawn[0].axes[0].get_ylabel() < drawn[0].axes[1].get_ylabel(), "modes in the order of their indexes"
     tip = result_of(telemetry, best, gains, "lqg").modes[0]
     spacing_hz = drawn[0].axes[0].lines[0].get_xdata()[0]
     for law, rms_nm in (("present", tip.predicted_now_nm), ("tuned", tip.predicted_nm)):
@@ -169,7 +169,7 @@ def test_an_offset_or_a_channel_in_the_true_residual_is_reported(closed: Synthet
     assert telemetry_from_log(LogReader(night.write(tmp_path / "dark-hole.mcap"))).warnings == (warning,)
 
 
-def test_a_loop_that_was_closed_for_too_few_frames_is_not_simply_called_open(tmp_path: Path) -> None:
+def test_a_loop_closed_for_too_few_frames_is_reported_as_partly_closed(tmp_path: Path) -> None:
     """Its achieved residual is not given, so there is no warning that the residual contains the offset."""
     night = SyntheticLog().request("open").frames(100).request("close").frames(100)
     night.request("offset", (0.0, 0.0, 20.0)).frames(1900)
@@ -210,7 +210,7 @@ def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path)
     assert [line["frequency_hz"] for line in result["modes"][0]["lines"]] == pytest.approx([7.0], abs=0.05)
 
 
-def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
+def test_an_open_loop_with_much_tilt_gives_a_warning(tmp_path: Path) -> None:
     run = telemetry_from_log(LogReader(SyntheticLog().request("open").frames(2150).write(tmp_path / "open.mcap")))
     best = tuned(run, "integrator")
     result = result_of(run, *best, "integrator")
@@ -293,8 +293,8 @@ def test_tuning_uses_the_steps_of_a_running_loop() -> None:
     assert f"closed {added['closed']:+.1e}, predicted {added['predicted']:+.1e}; tilt contributes most (" in text
 
 
-def test_the_mirrors_reports_give_the_time_of_application() -> None:
-    """The mirror's clock is 2 frame periods behind the router's clock, the camera's is 9 behind."""
+def test_the_mirrors_reports_give_the_time_at_which_commands_are_applied() -> None:
+    """The mirror's clock is 2 frame periods behind the router's clock, and the camera's clock is 9 behind it."""
     loop = SteppedLoop(noisy_steps(), 7.2)
     loop.offset = SimpleNamespace(offset_ns=2 * PERIOD_NS)
     loop.processes = lambda: {"camera": wire.Health(router_offset_ns=9 * PERIOD_NS)}

@@ -231,7 +231,7 @@ def test_a_form_stays_open_at_the_answer_to_an_earlier_request_of_its_button(
     screen.until(lambda: not screen.form_is_open())
 
 
-def test_auto_is_for_gains_only(screen: Screen, run: LiveRun) -> None:
+def test_auto_is_accepted_for_gains_only(screen: Screen, run: LiveRun) -> None:
     before = len(run.requests)
     for key, values in (("l", ("auto", "")), ("t", ("auto",))):
         screen.press(key)
@@ -407,7 +407,7 @@ def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatc
     assert console_feed._config == CONFIG
 
 
-def test_states_are_queried_of_a_new_process_and_every_five_seconds_of_a_controller_without_states(
+def test_states_are_queried_from_a_new_process_and_every_five_seconds_from_a_controller_without_states(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(monitor.Monitor, "_query", query := Mock())

@@ -250,7 +250,7 @@ def test_an_integer_is_accepted_for_a_float() -> None:
     assert isinstance(config.camera.rate_hz, float)
 
 
-def test_a_missing_or_invalid_file_is_named(tmp_path: Path) -> None:
+def test_the_error_of_a_missing_or_invalid_file_names_it(tmp_path: Path) -> None:
     assert error_of(tmp_path / "none.toml") == f"{tmp_path / 'none.toml'}: there is no such configuration file"
     assert "not a readable TOML file" in error_of(write(tmp_path, "seed = = 3"))
     (tmp_path / "latin.toml").write_bytes(b"seed = 3 # caf\xe9")

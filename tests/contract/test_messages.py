@@ -120,7 +120,7 @@ def test_only_frames_steps_commands_and_mirror_states_are_in_the_loop() -> None:
 
 
 def raised_events() -> Iterator[tuple[str, str, set[str]]]:
-    """Place, name and keys of the details of each event that is raised by its literal name."""
+    """Place, name and detail keys of each event whose name is a literal where it is raised."""
     for package in ("lowfc", "sim_camera", "sim_dm"):
         for path in sorted((ROOT / package).rglob("*.py")):
             text = path.read_text(encoding="utf-8")

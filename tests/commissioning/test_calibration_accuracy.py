@@ -32,7 +32,7 @@ WHEEL = "reaction-wheel"
 """Preset with 34 nm of tilt, at which pokes of some nm cannot reach a signal-to-noise ratio of 30."""
 SEEDS = 20
 BLOCK = 5
-"""Seeds in one test."""
+"""Number of seeds in one test."""
 
 
 class Outcome(NamedTuple):
@@ -105,11 +105,11 @@ def test_a_calibration_with_few_cycles_has_the_requested_accuracy(
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize("first", range(1, SEEDS + 1, BLOCK))
+@pytest.mark.parametrize("first_seed", range(1, SEEDS + 1, BLOCK))
 @pytest.mark.parametrize("preset", REACHABLE)
 @pytest.mark.parametrize("method", ["hadamard", "poke", "in-loop"])
-def test_calibrations_have_the_requested_accuracy(method: str, preset: str, first: int, tmp_path: Path) -> None:
-    for seed in range(first, first + BLOCK):
+def test_calibrations_have_the_requested_accuracy(method: str, preset: str, first_seed: int, tmp_path: Path) -> None:
+    for seed in range(first_seed, first_seed + BLOCK):
         assert_accurate(outcome(method, preset, seed, 30.0, tmp_path), 30.0)
 
 
