@@ -137,7 +137,7 @@ def test_the_noise_of_tip_falls_to_a_quarter_if_only_tip_and_tilt_are_corrected(
     assert noise_nm == pytest.approx([42, 10], rel=0.02)
 
 
-def test_modes_not_corrected_reduce_the_noise_of_the_others(faint: Bench) -> None:
+def test_leaving_modes_uncorrected_reduces_the_noise_of_the_other_modes(faint: Bench) -> None:
     active_loop = faint.state.loop
     uncorrected = active_loop.weighting.prior_nm2 > 0
     assert 0 < uncorrected.sum() < uncorrected.size
@@ -241,15 +241,15 @@ def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:
     loop = bench(-1.0)
     form = np.diag(factory.contrast_of(loop.config).form)
 
-    def true(name: str, frames: int) -> float:
+    def true_contrast(name: str, frames: int) -> float:
         return float(form @ mean_squares_nm2(loop, name, frames))
 
     assert loop.watch.added_contrast() is None
     loop.run(333, record=False)
     loop.run(667)
     uncorrected, by_mode = loop.watch.added_contrast()
-    assert uncorrected == pytest.approx(true("disturbance_nm", 667), rel=0.3)
-    assert 0.5 < by_mode.sum() / true("residual_nm", 500) < 2
+    assert uncorrected == pytest.approx(true_contrast("disturbance_nm", 667), rel=0.3)
+    assert 0.5 < by_mode.sum() / true_contrast("residual_nm", 500) < 2
     loop.ask("open")
     loop.run(1)
     _, opened_by_mode = loop.watch.added_contrast()

@@ -226,5 +226,5 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     assert "1 in 10 frames" in estimate(fewer)
 
 
-def test_record_with_the_word_start_is_refused_and_names_the_request() -> None:
+def test_lowfc_record_start_is_refused_with_the_name_of_the_request() -> None:
     assert "`lowfc ctl record start`" in refusal("record", "start", kind=ConfigurationError)

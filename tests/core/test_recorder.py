@@ -93,14 +93,14 @@ def test_states_published_before_the_recorder_started_are_written_first_and_once
     put(frames, 10)
     summary = bench.stop()
     messages = logged(summary)
-    firsts = [message for message in messages if message.key in (CALIBRATION.key, *(s.key for s in states))]
-    assert [(m.key, count_of(m.sequence)) for m in firsts] == [
+    states_in_log = [message for message in messages if message.key in (CALIBRATION.key, *(s.key for s in states))]
+    assert [(message.key, count_of(message.sequence)) for message in states_in_log] == [
         (CAMERA_STATE.key, 2),
         (CONTROLLER_STATE.key, 2),
         (CALIBRATION.key, 1),
         (CAMERA_STATE.key, 3),
     ]
-    assert messages[:3] == firsts[:3]
+    assert messages[:3] == states_in_log[:3]
     assert len(bodies_of(messages, FRAME)) == 10
     assert summary.lost == {}
 

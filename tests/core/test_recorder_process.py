@@ -114,7 +114,7 @@ def test_the_log_has_every_message_after_any_signal(bench: Bench, signals: tuple
 @pytest.mark.parametrize("bench", [("--longest-s", 1, "--json")], indirect=True)
 def test_record_rotates_logs_and_reports_messages_and_losses(bench: Bench) -> None:
     until(lambda: len(list(bench.folder.iterdir())) > 1, each=bench.put)
-    bench.frames.published += 3  # three counts are skipped: lost messages
+    bench.frames.published += 3  # three counts are skipped, as if messages were lost
     bench.put()
     out, errors = bench.stop(signal.SIGTERM)
     published = bench.frames.published - 3

@@ -125,7 +125,7 @@ class Rig(ThreadedRun):
         return truths
 
     def inject(self, modes_nm: npt.ArrayLike) -> None:
-        """Add modes to the wavefront, by a second mirror in the same place."""
+        """Add modes to the wavefront, as a second mirror in the same place would."""
         shape = self.calibration.modes_to_actuators @ np.asarray(modes_nm, np.float32)
         self.offset_nm = shape.reshape(GRID)
 
@@ -274,7 +274,7 @@ def test_safe_mode_flattens_the_mirror_and_is_latched(rig: Rig) -> None:
     assert {"SAFED", "MODE_CHANGED"} <= set(rig.events())
 
 
-def test_a_camera_that_changes_opens_the_loop(rig: Rig) -> None:
+def test_a_change_of_the_cameras_settings_opens_the_loop(rig: Rig) -> None:
     rig.expose(1)
     rig.ask("close")
     rig.settings.put(CHANGED_CAMERA)
@@ -284,7 +284,10 @@ def test_a_camera_that_changes_opens_the_loop(rig: Rig) -> None:
 
 
 def test_frames_with_wrong_times_do_not_stop_the_controller(calibration: Calibration, scene: Scene) -> None:
-    """A frame of 1970 is late, a future one is used, durations are clipped; without frames the command is repeated."""
+    """A frame of 1970 counts as late, and a frame of the future is used.
+
+    Durations are clipped, and without frames the command is repeated.
+    """
     with running(configured(lockstep=False), calibration, scene) as rig:
         pixels = scene.expose(0, rig.offset_nm)
         rig.put(pixels, publish_time_ns=1)
@@ -440,7 +443,7 @@ def test_an_automatic_gain_request_dated_by_the_cameras_clock_ends_no_reservatio
 ) -> None:
     _, _, controller = lone_controller(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     assert controller._carry_out_internal(Request(0, "lease", (), (5.0,), "somebody", lease_id=1)).accepted
-    reply = controller._carry_out_internal(Request(2**62, "gain", (), (0.1,), "auto"))  # the frame's time
+    reply = controller._carry_out_internal(Request(2**62, "gain", (), (0.1,), "auto"))  # dated by a frame
     assert (reply.accepted, "the loop is reserved for somebody" in reply.text) == (False, True)
 
 
