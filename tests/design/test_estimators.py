@@ -77,7 +77,7 @@ def test_fitted_nuisance_parameters_do_not_bias_the_modes(fits, optics, kind):
     assert with_nuisance.R.shape == (3, 60)
 
 
-def test_iterations_with_the_full_model_remove_the_second_order(fits, optics):
+def test_iterations_with_the_full_model_remove_the_second_order_error(fits, optics):
     I0, H = optics
 
     def model(modes_nm):
@@ -92,7 +92,7 @@ def test_iterations_with_the_full_model_remove_the_second_order(fits, optics):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_scatter_with_noise_agrees_with_the_prediction(fits, kind):
+def test_scatter_of_estimates_from_noisy_images_agrees_with_the_prediction(fits, kind):
     rng, linear, count = np.random.default_rng(5), fits[kind], 20_000
     images_e = noisy_e(rng, np.tile(linear.reference_e, (count, 1)), READ_NOISE_E)
     predicted = np.sqrt(np.diag(covariance(linear.R, variance_e(linear.reference_e, READ_NOISE_E) + 1 / 12)))
@@ -105,7 +105,7 @@ def test_an_unknown_kind_is_refused(optics):
         fit(*optics, SCALE_E, READ_NOISE_E, "best")
 
 
-def test_noise_is_photon_noise_read_noise_and_rounding():
+def test_noise_is_the_sum_of_photon_noise_read_noise_and_rounding():
     mean_e = np.repeat([0.0, 7.0, 400.0], 40_000)
     image_e = noisy_e(np.random.default_rng(3), mean_e, READ_NOISE_E)
     assert (image_e == np.rint(image_e)).all()
@@ -132,7 +132,7 @@ def circle_modes():
     return zernikes(NOLLS_14, u, u[:, None])[:, inside]
 
 
-def test_residual_rms_and_pv_over_the_circle(circle_modes):
+def test_residual_rms_and_pv_over_the_circle_agree_with_closed_forms(circle_modes):
     residuals = np.zeros((2, 14))
     residuals[0, 0], residuals[1, :3] = 0.5, (3.0, 0.0, 4.0)
     products = gram(circle_modes)

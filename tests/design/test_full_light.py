@@ -88,7 +88,7 @@ def test_prediction_of_a_candidate_agrees_with_the_full_chain(name, focal_light,
     expected = np.sum(contrast_form(Coronagraph(sensor.pupil), NOLLS_14, 550.0) * bound)
     assert contrast_noise(candidate.forms, central, "weighted") == pytest.approx(expected, rel=0.01)
     assert merit(candidate, Goal("contrast", "weighted")) == contrast_noise(candidate.forms, central, "weighted")
-    measured = {"zwfs_tuned": 9.0e-4, "clowfs_tuned": 1.4e-3}[name]  # second order alone, plain pseudo-inverse
+    measured = {"zwfs_tuned": 9.0e-4, "clowfs_tuned": 1.4e-3}[name]  # by the second order, with the pseudo-inverse
     assert candidate.nonlinearity_waves(14) == pytest.approx(measured, rel=0.2)
     assert predictions(candidate)["table3_waves"]["pinv"]["14"] > candidate.nonlinearity_waves(14)
 

@@ -81,7 +81,7 @@ def test_result_does_not_depend_on_the_executor(uninterrupted, tmp_path):
 
 
 @pytest.mark.parametrize("blocks", [1, 3])
-def test_interrupted_search_writes_its_best_and_resumes(blocks, uninterrupted, tmp_path):
+def test_interrupted_search_writes_its_best_layout_and_resumes(blocks, uninterrupted, tmp_path):
     result, out = run(search_with(), tmp_path, Interrupted(blocks))
     assert result["interrupted"]
     assert result["steps"] < 2 * SMALL["steps"]

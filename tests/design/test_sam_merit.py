@@ -143,7 +143,7 @@ def test_merits_agree_with_their_definitions(optics, fields):
     assert merit(SamCandidate(optics, np.zeros_like(fields)), Goal("table4")) == np.inf
 
 
-def test_the_weighted_estimator_is_never_worse(optics, fields):
+def test_the_weighted_estimator_is_never_noisier_than_the_pseudo_inverse(optics, fields):
     disk_signal = SamCandidate(optics, fields).central("disk")
     for count in (2, 14, 20):
         plain, weighted = (covariance_nm2(disk_signal, 1e6, 3.0, count, name) for name in ("pinv", "weighted"))
@@ -180,7 +180,7 @@ def bounds(draw):
 
 
 def moved(orbits, at, orbit):
-    """The orbits after a move: the one at index `at` is removed, and `orbit` is added; None: neither."""
+    """The orbits after a move, which removes that at index `at` unless None, and adds `orbit` unless None."""
     remaining = [each for index, each in enumerate(orbits) if index != at]
     return remaining if orbit is None else [*remaining, orbit]
 

@@ -37,7 +37,7 @@ def designed(request):
 
 
 def field_of(quarter, samples_per, extent):
-    """Axis, lambda/D, and field relative to its peak, by the sensor's transform, at half-integer offsets.
+    """Axis, lambda/D, at half-integer offsets, and the field on it by the sensor's transform, relative to the peak.
 
     With 30 samples per lambda/D, no sample is a point at which the design is checked.
     """
@@ -62,7 +62,7 @@ def test_field_agrees_with_the_sensor_transform():
     np.testing.assert_allclose(relative_field(quarter, axis), field, atol=1e-12)
 
 
-def test_properties_of_the_open_circle():
+def test_properties_of_the_open_circle_agree_with_closed_forms():
     found = properties(circle(512)[256:, 256:], Request())
     assert found.open_area_fraction == pytest.approx(1.0, abs=1e-3)
     assert found.energy_fraction == found.open_area_fraction
@@ -84,6 +84,7 @@ def test_first_program_has_the_same_optimum_as_another_formulation_and_solver():
     y = np.concatenate([axis[row], [r * np.sin(a) for r, a in polar]])
     u, samples = pupil_axis(32), np.arange(-7.5, 8.0) / SAMPLES
     v, h = (position[circle(32) > 0] for position in np.meshgrid(u, u, indexing="ij"))
+    # Transform of one square cell of the pupil, from its samples.
     square = np.cos(2 * np.pi * np.outer(x, samples)).mean(1) * np.cos(2 * np.pi * np.outer(y, samples)).mean(1)
     fields = [np.cos(2 * np.pi * (np.outer(x, h) + np.outer(side * y, v))) * square[:, None] for side in (-1, 1)]
     field, level = np.vstack(fields), np.sqrt(request.contrast)
@@ -127,7 +128,7 @@ def test_design_is_reproducible():
     np.testing.assert_array_equal(first.quarter, again.quarter)
 
 
-def test_octant_symmetry_is_as_open_as_quarter_symmetry():
+def test_a_mask_with_octant_symmetry_is_as_open_as_one_with_quarter_symmetry():
     request = replace(SMALL, half_angle_deg=90.0, limit=0.98)
     octant = designed(replace(request, symmetry="octant"))
     np.testing.assert_array_equal(octant.quarter, octant.quarter.T)

@@ -20,25 +20,26 @@ from lowfc.programs.paper.cases import Context, Prepared
 from lowfc.programs.paper.tables import tolerance
 from lowfc.programs.paper.tables.star_pair import zero_point_nm
 
-EXPOSURE = 0.5
+EXPOSURE_FRACTION = 0.5
 
 
 @pytest.mark.parametrize("gain", [0.05, 0.4, 1.0])
 def test_residual_of_a_drift_agrees_with_the_continuous_theory(gain):
     law, omega = integrator([gain], [0.0], (2,), 1.0, 250.0), np.geomspace(1e-6, 300 * np.pi, 200_000)
-    transmitted = residual_power(law, omega, Timing.of(1.0, EXPOSURE))[:, 0]
+    transmitted = residual_power(law, omega, Timing.of(1.0, EXPOSURE_FRACTION))[:, 0]
     expected = 0.3 * np.trapezoid(transmitted / omega**2, omega) / np.pi + 2.0 * noise_gain(law)[0]
-    assert drift_residual_nm2(0.3, 2.0, EXPOSURE, gain) == pytest.approx(expected, rel=1e-3)
+    assert drift_residual_nm2(0.3, 2.0, EXPOSURE_FRACTION, gain) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("noise_nm2", [1e-3, 0.3, 30.0])
 def test_tolerated_drift_leaves_the_allowed_residual_at_the_best_gain(noise_nm2):
     for kind in ("integrator", "lqg"):
-        tolerated = tolerated_drift(0.5, noise_nm2, EXPOSURE, kind)
-        assert drift_residual_nm2(tolerated.step_nm2, noise_nm2, EXPOSURE, tolerated.gain) == pytest.approx(0.5)
-    best = best_gain(tolerated.step_nm2, noise_nm2, EXPOSURE)
+        tolerated = tolerated_drift(0.5, noise_nm2, EXPOSURE_FRACTION, kind)
+        residual_nm2 = drift_residual_nm2(tolerated.step_nm2, noise_nm2, EXPOSURE_FRACTION, tolerated.gain)
+        assert residual_nm2 == pytest.approx(0.5)
+    best = best_gain(tolerated.step_nm2, noise_nm2, EXPOSURE_FRACTION)
     assert tolerated.gain == pytest.approx(best)
-    assert min(drift_residual_nm2(tolerated.step_nm2, noise_nm2, EXPOSURE, best * f) for f in (0.9, 1.1)) > 0.5
+    assert min(drift_residual_nm2(tolerated.step_nm2, noise_nm2, EXPOSURE_FRACTION, best * f) for f in (0.9, 1.1)) > 0.5
 
 
 def test_margins_bound_the_gain_of_an_integrator_if_frames_are_exposed_all_the_time():
@@ -48,15 +49,15 @@ def test_margins_bound_the_gain_of_an_integrator_if_frames_are_exposed_all_the_t
     assert drift_residual_nm2(bounded.step_nm2, 1e-3, 1.0, bounded.gain) == pytest.approx(0.5)
 
 
-def test_residual_of_a_slow_loop_is_the_root_of_drift_times_noise():
+def test_residual_variance_of_a_slow_loop_is_the_root_of_drift_times_noise():
     """At low gain, a drift D per frame and a noise n leave a residual variance of sqrt(D n) (Kalman and Bucy)."""
-    tolerated = tolerated_drift(1.0, 1e4, EXPOSURE)
+    tolerated = tolerated_drift(1.0, 1e4, EXPOSURE_FRACTION)
     assert tolerated.step_nm2 * 1e4 == pytest.approx(1.0, rel=1e-3)
 
 
 def test_lqg_with_the_line_tolerates_more_than_an_integrator():
     allowed, line = np.geomspace(1e-10, 1e4, 15), Line(10.0, 0.05, 1.0)
-    plain, lqg = (tolerated_lines(kind, line, 250.0, EXPOSURE)(allowed) for kind in ("integrator", "lqg"))
+    plain, lqg = (tolerated_lines(kind, line, 250.0, EXPOSURE_FRACTION)(allowed) for kind in ("integrator", "lqg"))
     assert (lqg >= plain * 0.999).all()
     assert (plain >= allowed * 0.999).all()  # a line of the allowed variance needs no loop
     assert lqg[10] > 10 * plain[10]

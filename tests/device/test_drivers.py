@@ -368,7 +368,10 @@ def test_options_in_a_section_named_after_the_class_are_refused() -> None:
 
 
 def test_camera_clock_is_converted_to_within_the_shortest_transfer_time() -> None:
-    """The clock is slow by 30 ppm; a transfer takes 0.2 ms plus an exponential delay of mean 0.5 ms; one hour's pause."""
+    """The camera's clock is slow by 30 ppm, and the camera pauses for an hour.
+
+    A transfer takes 0.2 ms plus an exponential delay of mean 0.5 ms.
+    """
     clock, rng = CameraClock(), np.random.default_rng(1)
     errors_ns = []
     minute = np.arange(10**15, 10**15 + 60 * 10**9, 10**7)

@@ -34,8 +34,8 @@ def stream(folder: Path, name: str, columns: int, rows: int = 1, *, make: bool =
     return create_or_open(file_of(folder, name), columns, rows, FLOAT32)
 
 
-class Run:
-    """Bus of a run, with a publisher of steps and the bridge's streams."""
+class RunWithStreams:
+    """The bus of a run, with a publisher of steps and the bridge's streams."""
 
     def __init__(self) -> None:
         self.hub, self.clock = MemoryHub(), FakeClock(AT_NS)
@@ -50,7 +50,7 @@ class Run:
 
 
 def test_each_step_is_an_image_of_one_row(folder: Path) -> None:
-    run = Run()
+    run = RunWithStreams()
     run.step(error_nm=[3, -4], command_nm=[1, 2], flux_dn=500)
     error, command = (stream(folder, f"night_{name}", 2) for name in ("error", "command"))
     residual, flux = (stream(folder, f"night_{name}", 1) for name in ("residual", "flux"))
@@ -69,24 +69,24 @@ def test_each_step_is_an_image_of_one_row(folder: Path) -> None:
 def test_an_existing_stream_is_adopted_unless_another_process_writes_it(folder: Path) -> None:
     command = stream(folder, "night_command", 2, make=True)
     stream(folder, "night_flux", 7, make=True)
-    run = Run()
+    run = RunWithStreams()
     run.step(command_nm=[1, 2], flux_dn=500)
     assert command.pixels.ravel().tolist() == [1, 2]
     assert stream(folder, "night_flux", 1).pixels.ravel().tolist() == [500]
     stream(folder, "night_residual", 34, 34, make=True)
     with pytest.raises(StreamError, match="'night_residual' is of another program"):
-        Run().step(error_nm=[3, -4])
+        RunWithStreams().step(error_nm=[3, -4])
     command.pack("<i", command.writers, os.getppid())
     with pytest.raises(StreamError, match=f"process {os.getppid()} writes stream 'night_command'"):
-        Run().step(command_nm=[1, 2])
+        RunWithStreams().step(command_nm=[1, 2])
 
 
 @pytest.mark.parametrize("case", ["normal", "busy", "controller-late", "run-restarted"])
 def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The bridge polls ten times. Cases:
 
-    normal: the controller restarts at the fourth poll. busy: as normal, and the controller does not answer the first
-    five. controller-late: the controller starts only at the fourth poll. run-restarted: the run restarts, and not only
+    normal: the controller restarts at the fourth poll. busy: as normal, and the controller is busy at the first five
+    polls. controller-late: the controller starts only at the fourth poll. run-restarted: the run restarts, and not only
     the controller; the bridge joins the new run.
     """
     hub, clock, received = MemoryHub(), FakeClock(AT_NS), list[wire.Request]()

@@ -184,7 +184,9 @@ def test_a_camera_hang_of_five_seconds_is_reported_and_the_loop_holds_and_resume
 
 @pytest.mark.slow
 @pytest.mark.exclusive
-def test_a_mirror_hang_of_five_seconds_blocks_commands_and_the_mirror_goes_flat_before_the_next(bench: Bench) -> None:
+def test_a_mirror_hang_of_five_seconds_blocks_commands_and_the_mirror_goes_flat_before_the_next_command(
+    bench: Bench,
+) -> None:
     with in_background(bench.folder, MIRROR):
         bench.wait_until_settled()
         bench.inject("mirror", "hang")
