@@ -45,7 +45,7 @@ noiseless = partial(configured, camera__noise=False)
 
 
 def responses_of(loop: InProcessLoop, test: Any, **options: Any) -> list[ProbeResponse]:
-    """Run a test on a loop, check that the loop mode is restored, and return the responses to its probe sequences."""
+    """Run an acceptance test; check that the loop's mode is restored; return the responses to its probe sequences."""
     loop.run(5)
     live = Live(loop, lambda *_: None, print)
     mode_before = loop.status().state.mode

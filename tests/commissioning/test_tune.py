@@ -151,7 +151,7 @@ def test_the_residual_achieved_is_that_of_the_last_gains(
 
 
 def test_an_offset_is_not_counted_as_disturbance_when_the_delay_is_measured(tmp_path: Path) -> None:
-    """In a log without the true wavefront, the mirror reports each command a frame later than assumed."""
+    """Without the true wavefront, the delay is measured from the mirror's reports: a frame more than assumed."""
     night = SyntheticLog(truth=False).request("close").frames(1500).request("offset", (0.0, 0.0, 20.0)).frames(1500)
     run = telemetry_from_log(LogReader(night.write(tmp_path / "night.mcap")))
     assert run.timing.delay == 2

@@ -118,7 +118,7 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
     assert first_line(mode=wire.LOOP_MODE_CLOSED, **not_closed) == f"closed at the end{expected}"
     short = first_line(mode=wire.LOOP_MODE_CLOSED, not_closed_ns=SECOND // 25)
     assert short == "closed; not closed for 0.04 s in total"
-    assert screen(Watch({}, [Log(message="without a level")]), Configuration(), None, 1.0)
+    assert screen(Watch({}, [Log(message="without a level")]), Configuration(), None, 1.0), "shown without an error"
     assert first_line() == "no controller reported", "no time is shown before the controller reports a mode"
     state, _ = feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1), replace(CAMERA, bias_dn=DARK_DN + 300))
     message = controller_state(state, SETTINGS, (START + 12) * SECOND)
@@ -236,17 +236,17 @@ def test_statistics_of_the_last_second_exclude_older_and_refused_frames() -> Non
 def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame() -> None:
     watch = Watch({"controller": wire.Health(mode=wire.LOOP_MODE_CLOSED), "camera": wire.Health(process="camera")}, [])
     assert status_line(watch, 5.0) == "    5 s  no frame yet"
-    whole = wire.WavefrontFigures(residual_rms_nm=27.0, disturbance_rms_nm=31.0)
+    whole_run = wire.WavefrontFigures(residual_rms_nm=27.0, disturbance_rms_nm=31.0)
     recent = wire.WavefrontFigures(residual_rms_nm=2.2, disturbance_rms_nm=30.0)
-    watch.health["camera"] = wire.Health(process="camera", rate_hz=250, wavefront=whole, recent_wavefront=recent)
+    watch.health["camera"] = wire.Health(process="camera", rate_hz=250, wavefront=whole_run, recent_wavefront=recent)
     watch.health["camera"].mean_rate_hz = 250
     assert "closed     250 Hz  residual 2.20 of 30.00 nm rms" in status_line(watch, 10.0)
     received = wire.TopicCount(topic=FRAME.key, received=900)
-    begun = wire.Health(mode=wire.LOOP_MODE_CLOSED, topics=[received], not_closed_ns=2 * SECOND)
-    early = Watch(watch.health | {"controller": begun}, [])
+    controller = wire.Health(mode=wire.LOOP_MODE_CLOSED, topics=[received], not_closed_ns=2 * SECOND)
+    early = Watch(watch.health | {"controller": controller}, [])
     assert "closed for 1.6 s     250 Hz" in status_line(early, 5.0), "the residual includes open-loop frames"
     assert "closed for 2.0 s  225 Hz in simulated time" in status_line(early, 5.0, 225.0)
-    begun.topics[0].received, begun.not_closed_ns = 250 * 3601, 3600 * SECOND
+    controller.topics[0].received, controller.not_closed_ns = 250 * 3601, 3600 * SECOND
     early.health["camera"].rate_hz = 250.4  # the rate of the last half second
     assert "closed for 1.0 s     250 Hz" in status_line(early, 5.0)
     with Console(width=120, file=io.StringIO(), record=True) as console:

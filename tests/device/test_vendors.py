@@ -37,7 +37,7 @@ OPTIONS = {"rows": 60, "columns": 80, "region_row": 16, "region_column": 32, "ra
 
 
 def run(driver: Any, frames: int) -> tuple[Listener, list[int]]:
-    """Run a driver's loop for a number of frames; return the listener and the frame counts."""
+    """Run a driver's loop for a number of frames; return the listener and the count in each frame's sequence."""
     listener = Listener(HostClock(), FRAME, CAMERA_STATE)
     CameraLoop(driver, listener.service("camera"), frames).run()
     counts = [sample.sequence & 0xFFFFFFFF for sample in listener.samples[FRAME]]
@@ -81,7 +81,7 @@ def test_settings_default_to_the_configuration() -> None:
 class Buffers:
     """Stand-in for a stream of aravis: buffers of 2 x 3 pixels with the given frame numbers; 0 for a failed buffer.
 
-    At first, all but the last `later` are in the queue. By default none is: each arrives when the driver waits for it.
+    At first, all but the last `later` are in the queue. By default it is empty: each arrives when the driver waits.
     """
 
     def __init__(self, *numbers: int, later: int = 99) -> None:
@@ -189,7 +189,7 @@ def test_a_basler_camera_is_configured_and_failed_buffers_count_as_lost_frames(e
 
     driver.expose = fail_later
     listener, counts = run(driver, 60)
-    assert counts[-1] - 59 >= 7, "the seven that fail after number 20 are counted"
+    assert counts[-1] - 59 >= 7, "the seven buffers that fail after frame 20 count as lost"
     assert "FRAMES_LOST" in listener.events()
     pixels = np.frombuffer(listener.messages(FRAME)[0].data, "<u2")
     assert pixels.size == 60 * 80
@@ -317,7 +317,7 @@ def test_a_closed_loop_counts_every_failed_buffer(emulated: None, tmp_path: Path
     refusals = (wire.REASON_LATE, wire.REASON_SATURATED, wire.REASON_DARK, wire.REASON_STUCK)
     refused = sum(entry.count for entry in status.counts if entry.reason in refusals)
     failed = int((tmp_path / "failed").read_text())
-    assert sent.missing == received.missing >= failed - 1  # the last may fail after the last frame
+    assert sent.missing == received.missing >= failed - 1  # the last failure may come after the last frame
     assert failed > sent.published // 25
     assert sent.published - sent.missing == received.received
     assert received.received - received.skipped == status.frames_used + refused
