@@ -1,4 +1,4 @@
-"""`lowfc calibrate` and its subcommands on a loop in one process: files, results, errors, calibrations off flat."""
+"""`lowfc calibrate` and its subcommands on a loop in one process: files, results, errors, other wavefronts."""
 
 import json
 import re

@@ -52,14 +52,14 @@ class Bench:
         self.loop.run(5)
         self.results: dict[str, Any] = {}
         self.reports: list[str] = []
-        self.exposed: dict[str, int] = {}
+        self.frames_before: dict[str, int] = {}
         self.questions: list[str] = []
         self.actions: dict[str, Callable[[], None]] = {}
 
     def report(self, text: str) -> None:
         """Store a report and the number of frames exposed before it; run each action whose key begins the report."""
         self.reports.append(text)
-        self.exposed.setdefault(text, len(self.loop.surfaces_nm))
+        self.frames_before.setdefault(text, len(self.loop.surfaces_nm))
         for start, action in self.actions.items():
             if text.startswith(start):
                 action()
@@ -102,7 +102,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     return bench
 
 
-def test_commissioning_closes_a_loop_with_another_frame_size(bench: Bench) -> None:
+def test_commissioning_closes_a_loop_whose_frames_have_another_size_than_the_model(bench: Bench) -> None:
     assert bench.results["recommended"]
     assert bench.results["measured_error_nm"] == pytest.approx(bench.results["predicted_error_nm"], rel=0.15)
     state = bench.loop.status().state
@@ -137,7 +137,7 @@ def test_disturbance_of_a_mode_is_not_mistaken_for_nonlinearity(scatter: float, 
 def test_the_loop_holds_the_wavefront_of_the_reference_image(bench: Bench) -> None:
     bench.loop.run(200)
     true = bench.loop.residual_nm(-200)
-    measured = bench.loop.residual_nm(bench.exposed["[7/10] response"], bench.exposed["[8/10] verdict"])
+    measured = bench.loop.residual_nm(bench.frames_before["[7/10] response"], bench.frames_before["[8/10] verdict"])
     assert np.abs(measured.mean(axis=0)).max() > 5, "the reference is far from flat"
     assert true.mean(axis=0) == pytest.approx(measured.mean(axis=0), abs=1.0)  # the tilts scatter by 3 nm
     true_error_nm = np.sqrt(true.var(axis=0).sum())

@@ -284,7 +284,7 @@ def test_a_change_of_the_cameras_settings_opens_the_loop(rig: Rig) -> None:
 
 
 def test_frames_with_wrong_times_do_not_stop_the_controller(calibration: Calibration, scene: Scene) -> None:
-    """A frame of 1970 counts as late, and a frame of the future is used.
+    """A frame of 1970 counts as late, and a frame from the future is used.
 
     Durations are clipped, and without frames the command is repeated.
     """

@@ -211,7 +211,7 @@ def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None
     results = summary(watch, False) | {"costliest_modes": {"modes": "coma", "share": 0.7}}
     for beyond in (False, True):
         shown = summary_text(results | {"beyond_quadratic": beyond})
-        assert ("; coma contributes most (70 %)" in shown) is not beyond, "shares are of the quadratic form"
+        assert ("; coma contributes most (70 %)" in shown) is not beyond, "the share is of the quadratic form only"
     for frames in (50, 0):  # without frames the controller's estimate is an old one
         controller = wire.Health(recent_wavefront=recent, last_second=wire.LoopFigures(frames=frames))
         assert (expected in status.text(status.json_object(message, {"controller": controller}))) == bool(frames)

@@ -180,7 +180,7 @@ def bounds(draw):
 
 
 def moved(orbits, at, orbit):
-    """The orbits after a move, which removes that at index `at` unless None, and adds `orbit` unless None."""
+    """The orbits after a move that removes the one at index `at` and adds `orbit`; either may be None."""
     remaining = [each for index, each in enumerate(orbits) if index != at]
     return remaining if orbit is None else [*remaining, orbit]
 

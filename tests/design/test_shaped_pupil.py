@@ -37,7 +37,7 @@ def designed(request):
 
 
 def field_of(quarter, samples_per, extent):
-    """Axis, lambda/D, at half-integer offsets, and the field on it by the sensor's transform, relative to the peak.
+    """Axis (lambda/D, half-integer offsets), and the field on it by the sensor's transform, relative to its peak.
 
     With 30 samples per lambda/D, no sample is a point at which the design is checked.
     """
