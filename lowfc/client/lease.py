@@ -12,7 +12,7 @@ from lowfc.contract.errors import BusError, CalibrationError, LowfcError, Reques
 from lowfc.control.loop.lease import LEASE_OVER, MAX_S, REMAINING_TIME_SEPARATOR
 
 if TYPE_CHECKING:
-    from lowfc.adapters.process.progress import Counted
+    from lowfc.adapters.process.progress import ProgressCallback
 
 DURATION_S = 10.0
 """Time in force without renewal: after the holder's death, other clients are refused for this long."""
@@ -31,8 +31,8 @@ class Lease:
     def __init__(self, ask: Callable[..., object], purpose: str, duration_s: float | None, *, lockstep: bool) -> None:
         """Reserve the loop for a purpose such as "lowfc calibrate", with its expected duration, or None if unknown.
 
-        `ask` sends the requests. In lockstep the loop's time, in which a reservation ends, may run a hundred times
-        faster than the host's clock: so each renewal lasts as long as the controller allows.
+        `ask` sends the requests. In lockstep a reservation ends by the loop's time, which may run a hundred times
+        faster than the host's clock, so each renewal lasts as long as the controller allows.
 
         Raises:
             RequestRefusedError: another client has reserved the loop, or the loop is in safe mode.
@@ -54,7 +54,7 @@ class Lease:
         """Set the expected remaining duration."""
         self._end_s = time.monotonic() + duration_s
 
-    def expecting(self, progress: "Counted", rate_hz: float) -> "Counted":
+    def expecting(self, progress: "ProgressCallback", rate_hz: float) -> "ProgressCallback":
         """Wrap a progress callback that counts frames, so that other clients can read the remaining time."""
 
         def count(what: str, done: int, total: int) -> None:

@@ -87,14 +87,14 @@ def test_access_control_denies_by_default_and_refers_to_defined_names_only() -> 
 def test_the_best_clock_exchange_is_the_recent_one_with_the_shortest_round_trip() -> None:
     offset = ClockOffset()
     assert offset.offset_ns == 0
-    offset.exchanged(1000, 5600, 2000)  # query in 600 ns, answer in 400 ns: offset 4100, not the true 4000 ns
+    offset.add_exchange(1000, 5600, 2000)  # query in 600 ns, answer in 400 ns: offset 4100, not the true 4000 ns
     assert offset.best == (4100, 1000)
-    offset.exchanged(3000, 7050, 3100)
+    offset.add_exchange(3000, 7050, 3100)
     assert offset.best == (4000, 100)
     for _ in range(RECENT):
-        offset.exchanged(5000, 9300, 5600)
+        offset.add_exchange(5000, 9300, 5600)
     assert offset.best == (4000, 600)
-    offset.exchanged(7000, 9_000_000, 8000)  # the other host's clock was set
+    offset.add_exchange(7000, 9_000_000, 8000)  # the other host's clock was set
     assert offset.best == (9_000_000 - 7500, 1000)
 
 

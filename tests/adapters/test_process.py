@@ -14,7 +14,7 @@ from unittest.mock import Mock
 import pytest
 import zenoh
 
-from lowfc.adapters.bus.zenoh_fault import plain
+from lowfc.adapters.bus.zenoh_fault import cause_of
 from lowfc.adapters.process import join
 from lowfc.adapters.process.child import Child
 from lowfc.adapters.process.clock import SIMULATED_START_NS, HostClock, SimulatedClock, boot_offset_ns
@@ -300,10 +300,10 @@ def test_zenohs_errors_are_shown_without_source_locations() -> None:
         "Can not create a new TCP listener bound to tcp/127.0.0.1:4: [127.0.0.1:4: Address already in use "
         "(os error 98) at /root/.cargo/git/zenoh/io/tcp.rs:61.] at /root/.cargo/git/zenoh/unicast.rs:338."
     )
-    assert plain(zenoh.ZError(text)) == "127.0.0.1:4: Address already in use (os error 98)"
-    assert plain(zenoh.ZError(text.replace("127.0.0.1", "[::1]"))) == "[::1]:4: Address already in use (os error 98)"
-    assert plain(zenoh.ZError("invalid configuration at zenoh/src/api/session.rs:12.\nmore")) == "invalid configuration"
+    assert cause_of(zenoh.ZError(text)) == "127.0.0.1:4: Address already in use (os error 98)"
+    assert cause_of(zenoh.ZError(text.replace("127.0.0.1", "[::1]"))) == "[::1]:4: Address already in use (os error 98)"
+    assert cause_of(zenoh.ZError("invalid configuration at zenoh/src/api/session.rs:12.\nmore")) == "invalid configuration"
     timeout = "Unable to connect to any of [Single(tcp/127.0.0.1:99)]. Timeout!"
-    assert plain(zenoh.ZError(f"{timeout} at /root/zenoh/orchestrator.rs:388.")) == timeout
+    assert cause_of(zenoh.ZError(f"{timeout} at /root/zenoh/orchestrator.rs:388.")) == timeout
     for unchanged in ("no peer among [tcp/127.0.0.1:99]", "an invalid key: [a/**b] cannot be used"):
-        assert plain(zenoh.ZError(unchanged)) == unchanged
+        assert cause_of(zenoh.ZError(unchanged)) == unchanged

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from lowfc.adapters.logs.history import History
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.recovery import in_words
+from lowfc.adapters.logs.recovery import damage_in_words
 from lowfc.arrays import Array
 from lowfc.contract.codecs.calibration_codec import identified, wire_camera
 from lowfc.contract.codecs.codec import decode_frame
@@ -240,7 +240,7 @@ def test_damage_is_reported_with_its_place_and_reason(tmp_path: Path) -> None:
     results = export_log(log, Format.NPZ, tmp_path / "out.npz", console=QUIET)
     reader = LogReader(log, skip_damaged=True)
     assert sum(1 for _ in reader)
-    assert results["damaged"] == [in_words(reader.damage[0])]
+    assert results["damaged"] == [damage_in_words(reader.damage[0])]
     assert f"left out: at byte {reader.damage[0].position}, " in render(results)
 
 

@@ -161,7 +161,7 @@ def test_added_contrast_of_shaped_pupil_and_lyot_coronagraph() -> None:
         config = configuration({}, **keys)
         return added_contrast(factory.contrast_of(config), {"was": 0 * spherical, "what if": spherical, "other": None})
 
-    assert factory.known_contrast(load(None, {"sensor.pupil": "elsewhere.npz"})) is None
+    assert factory.contrast_or_none(load(None, {"sensor.pupil": "elsewhere.npz"})) is None
     contrast = found()
     assert contrast is not None
     expected = 0.01 * contrast_form(Coronagraph(factory.sensor(Configuration(), print).pupil), (11,), 550.0).item()

@@ -1,7 +1,7 @@
 """Access control at the router: the table of topics defines what is permitted, all other messages are denied.
 
-The common name of a process's certificate is its role: "camera", "mirror-dm". Directions are the router's: ingress is
-from a process to the router, egress from the router to a process.
+The common name of a process's certificate is its role: "camera", "mirror-dm". Directions are seen from the router:
+ingress is from a process to the router, egress from the router to a process.
 """
 
 from collections.abc import Iterable
@@ -21,7 +21,7 @@ _LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # never part of a run on sever
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """Rights of a role, the common name of a certificate, as lists of keys.
+    """Rights of a role, as lists of keys.
 
     `subscribed` are the role's keys to which other processes may subscribe, `queried` those that they may query. A role
     publishes Health under its own name only; a mirror publishes, answers and receives commands under its name only. All
@@ -109,5 +109,5 @@ def _rules(rights: Grant) -> list[dict[str, Any]]:
 
 
 def _own(topic: Topic, role: str, name: str) -> str:
-    """Key of a topic with the name that a role may use: its own, its mirror's, or any name."""
+    """Key of a topic with the name that a role may use: the role itself (Health), its mirror's name, or any name."""
     return topic.at(role if topic is HEALTH else name or ALL)

@@ -23,9 +23,9 @@ from lowfc.adapters.files.whole_file import write_whole
 from lowfc.contract.errors import ConfigurationError, DataFileError
 
 CA_DAYS, DAYS = 3650, 825
-"""Validity of the authority, and by default of a role's certificate, days."""
+"""Validity of the authority's certificate, and default validity of a role's certificate, days."""
 
-_BACKDATED = datetime.timedelta(hours=1)  # hosts' clocks differ
+_BACKDATED = datetime.timedelta(hours=1)  # a certificate is valid from an hour ago, because hosts' clocks differ
 
 
 def make_certificates(

@@ -125,8 +125,8 @@ class DirectReader:
             handler: called with each message, one at a time, on a thread of the bus, of this reader or of a writer.
             subscribe: subscribes a handler to the same topic on the bus; the function it returns unsubscribes.
             now_ns: the host's clock.
-            failed: called with the exception if a message of the direct link has an invalid envelope, or if `handler`
-                raises for such a message; the bus handles exceptions for its own messages.
+            failed: called with the exception if a message from the direct link has an invalid envelope or makes
+                `handler` raise; the bus handles the exceptions of its own messages.
             shared: whether the topic has several publishers.
         """
         self._handler = handler
@@ -156,7 +156,7 @@ class DirectReader:
             with self._lock:
                 if self._first < 0:
                     self._first = sample.sequence
-                # While unsubscribed, a newer message is no copy; it is not remembered: a repetition is forwarded.
+                # Without the bus, a newer message is no copy. It is not remembered, so a repetition is forwarded.
                 surely_new = self._unsubscribe is None and sample.sequence > self._newest
                 if surely_new or not self._is_copy(sample):
                     self._forward(sample)

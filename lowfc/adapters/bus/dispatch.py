@@ -11,15 +11,16 @@ MAX_IN_A_ROW = 16
 QUEUED_WITHIN_NS = 50_000
 """A message counts as queued if it is received within this time after the dispatch of the previous message ended."""
 OLD_NS = 5_000_000
-"""Age from which any message counts as superseded, or three periods if that is longer."""
+"""Age, ns, from which any message counts as superseded; three periods of the messages if that is longer."""
 
 
 class Dispatch(Arrivals):
     """Passes messages to a handler in their order of arrival and identifies superseded ones.
 
     Messages queue while the process stands still. A queued message is superseded if it is at least a period old when
-    received; any other message, from an age of 5 ms or three periods, whichever is longer. After `MAX_IN_A_ROW`
-    messages back to back, those that still wait are skipped, so that a slow handler does not fall ever further behind.
+    received. Any other message is superseded at an age of 5 ms or three periods, whichever is longer. After
+    `MAX_IN_A_ROW` messages back to back, the messages that still wait are skipped, so that a slow handler does not fall
+    ever further behind.
     """
 
     def __init__(
@@ -35,7 +36,7 @@ class Dispatch(Arrivals):
         Args:
             key: key of the messages.
             handler: called with each message.
-            now_ns: clock of their `receive_time_ns`.
+            now_ns: clock of the messages' `receive_time_ns`.
             period_ns: period of the messages; None (lockstep): no message is ever superseded.
             superseded: called with superseded messages instead of `handler`; None skips them.
         """
@@ -52,7 +53,7 @@ class Dispatch(Arrivals):
 
     @property
     def skipped(self) -> int:
-        """Number of skipped messages: superseded ones without a handler, or queued behind too many others."""
+        """Number of skipped messages: superseded without a handler for these, or queued behind too many others."""
         return self._skipped
 
     def put(self, sample: Sample) -> None:

@@ -8,7 +8,7 @@ MAX_NAMES = 64
 """Largest number of names on one topic, in addition to those of `Role`."""
 MAX_NAME_LENGTH = 128
 MAX_HEALTH_BYTES = 256_000
-"""Enough for a recorder's Health with `MAX_HEALTH_LOGS` logs whose paths have up to 240 bytes."""
+"""Largest Health: enough for a recorder's with `MAX_HEALTH_LOGS` logs whose paths have up to 240 bytes."""
 MAX_HEALTH_LOGS = 1000
 """Largest number of logs in a recorder's Health, which then lists the newest."""
 
@@ -22,7 +22,7 @@ class Names:
     def admit(self, topic: Topic, key: str) -> str:
         """Name of the mirror or process in a key of this topic; empty for a topic without one.
 
-        BadMessageError if it is too long, or new when `MAX_NAMES` are known.
+        BadMessageError if the name is too long, or is new although `MAX_NAMES` names are known already.
         """
         name = name_in(topic, key)
         known = self._known.setdefault(topic.key, set())

@@ -62,7 +62,7 @@ def _program(arguments: Sequence[str]) -> str:
 
 
 def _directory_clause(process: psutil.Process, owner: int) -> tuple[str, bool]:
-    """Clause on a process's runtime directory, and whether it is a young process of this user with this directory.
+    """Clause on a process's runtime directory; whether it is a young process of this user with our runtime directory.
 
     The clause is empty for such a process, and for a process of another user whose environment cannot be read.
     """

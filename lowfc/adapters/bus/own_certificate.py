@@ -16,7 +16,7 @@ _ROUNDS = 4  # of the handshake; three are needed
 class OwnCertificate(NamedTuple):
     """A certificate's common name (its role), and the end of its validity or the authority's, whichever is first.
 
-    `ends_with_authority`: whether the authority's is first, so that a renewal of the certificate does not help.
+    `ends_with_authority`: whether the authority's validity ends first, so that renewing the certificate does not help.
     """
 
     name: str
@@ -25,10 +25,11 @@ class OwnCertificate(NamedTuple):
 
 
 def read_certificate(authority: Path, certificate: Path, key: Path, *, server: bool = False) -> OwnCertificate:
-    """Read a certificate and check that `authority` signed it for `key`, and for a server if `server` (router).
+    """Read a certificate and check that `authority` signed it for `key`; `server`: that it is a server's (router).
 
-    DataFileError if a file cannot be read, the key is encrypted, the three do not match, one is not valid now, or the
-    certificate has no common name. Whether a router's certificate has the router's host name is not checked.
+    DataFileError if a file cannot be read, the key is encrypted, the three do not match, the certificate or the
+    authority is not valid now, or the certificate has no common name. It is not checked that a router's certificate has
+    the router's host name.
     """
     import ssl  # slow to import, and only loops on several hosts need it
 

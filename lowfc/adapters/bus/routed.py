@@ -14,7 +14,7 @@ import zenoh
 
 from lowfc.adapters.bus.access import ROUTER, access_control
 from lowfc.adapters.bus.own_certificate import WARN_DAYS, read_certificate
-from lowfc.adapters.bus.zenoh_fault import plain
+from lowfc.adapters.bus.zenoh_fault import cause_of
 from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.network import Network
@@ -38,7 +38,7 @@ _ABSENT = {
 
 
 def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict[str, Any]:
-    """Session configuration of a role across hosts, in place of its links on one host.
+    """Zenoh's session configuration of a role in a run on several hosts; it replaces the links on one host.
 
     `sending` is zenoh's `transport/link/tx`, as on one host.
     """
@@ -57,7 +57,7 @@ def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict
 
 
 def router_session(network: Network, mirrors: Iterable[str], sending: dict[str, Any]) -> dict[str, Any]:
-    """Session configuration of the router: TLS only, and access control from the table of topics.
+    """Zenoh's session configuration of the router: TLS only, and access control from the table of topics.
 
     `mirrors` are roles such as "mirror-dm"; `sending` is zenoh's `transport/link/tx`, as on one host.
     """
@@ -87,7 +87,7 @@ def open_by_router(config: zenoh.Config, network: Network, role: str) -> zenoh.S
             if failures > 1:
                 raise BusError(
                     f"the router at {network.router} accepts {role}'s certificate, but zenoh opens no session: "
-                    f"{plain(fault)}"
+                    f"{cause_of(fault)}"
                 ) from fault
             if trouble != reported and trouble:
                 sys.stderr.write(f"{role}: waiting for the router at {network.router}: {trouble}\n")

@@ -1,7 +1,7 @@
 """A run: one loop's runtime directory, ports and secret, so that two loops on one host never mix.
 
-The first process creates the directory complete under another name and renames it; all others read it. It belongs to
-the user (mode 0700), under $XDG_RUNTIME_DIR, or under /tmp if that is not set.
+The first process fills the directory under another name, then renames it; all others read it. It belongs to the user
+(mode 0700), and is under $XDG_RUNTIME_DIR, or under /tmp if that variable is not set.
 """
 
 import contextlib
@@ -84,7 +84,7 @@ class Links:
         return path if len(os.fsencode(path)) <= _MAX_SOCKET_PATH_BYTES else None
 
     def live(self) -> set[str]:
-        """Roles whose processes listen now; a killed run leaves its directory behind.
+        """Roles whose processes listen now; the directory is no evidence, as a killed run leaves it behind.
 
         With a router, only the router listens: while it does, all roles are returned, as any may be running.
         """

@@ -24,15 +24,15 @@ class StartCheck:
         self._refused = refused
         self._reported_start_s = self._reported_at_s = 0
         self._enabled = max_ahead_h > 0 and not clock.lockstep
-        self._allowed = 0
+        self._first_refused = 0
 
     def ahead(self, sequence: int) -> bool:
         """Whether the start in this sequence is too far ahead."""
-        if sequence < self._allowed or not self._enabled:  # time only increases: an allowed sequence stays allowed
+        if sequence < self._first_refused or not self._enabled:  # time only increases, and this bound with it
             return False
         now_s = self._clock.host_ns() // _NS
-        self._allowed = sequence_of(now_s + self._ahead_s + 1, 0)
-        if sequence < self._allowed:
+        self._first_refused = sequence_of(now_s + self._ahead_s + 1, 0)
+        if sequence < self._first_refused:
             return False
         start_s = start_of(sequence)
         if start_s != self._reported_start_s and now_s != self._reported_at_s:  # a faulty sender must not fill the log

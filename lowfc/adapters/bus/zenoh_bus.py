@@ -1,6 +1,7 @@
 """The bus between processes: zenoh peers over loopback TCP, each connected to all roles of its run that listen.
 
-Monitors connect by Unix socket and get `latest_only` topics at a lower rate. Across hosts, all connect to a router.
+Monitors connect by Unix socket and get `latest_only` topics at a lower rate. Across hosts, every process connects to a
+router.
 `zenoh_session` and `routed` explain each setting.
 """
 
@@ -19,7 +20,7 @@ from lowfc.adapters.bus.bus import ALL, Faults, Query, Sample
 from lowfc.adapters.bus.direct_link import DirectCall, DirectReader, DirectWriter
 from lowfc.adapters.bus.routed import RouterWatch, open_by_router, require_certificate
 from lowfc.adapters.bus.run import Links, mirror_role
-from lowfc.adapters.bus.zenoh_fault import plain, usable
+from lowfc.adapters.bus.zenoh_fault import cause_of, raising_bus_error
 from lowfc.adapters.bus.zenoh_session import (
     keep_thread_state,
     prevent_slow_closing,
@@ -27,7 +28,7 @@ from lowfc.adapters.bus.zenoh_session import (
     session_config,
 )
 from lowfc.adapters.process.clock import Clock
-from lowfc.adapters.process.clock_offset import ClockAsker, ClockOffset
+from lowfc.adapters.process.clock_offset import ClockOffset, ClockQuerier
 from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import HEALTH, Role, Topic
@@ -47,8 +48,8 @@ def declare_publisher(session: zenoh.Session, topic: Topic, key: str, *, lockste
         encoding=f"application/protobuf;{topic.message.DESCRIPTOR.full_name}",
         congestion_control=zenoh.CongestionControl.BLOCK if lockstep else zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.REAL_TIME if topic.in_loop else zenoh.Priority.DATA,
-        # With express every message is its own batch: a burst of 16 fills the queue and the rest is lost. Without it
-        # the latency is the same, as messages are batched only under back-pressure.
+        # If True, every message is its own batch: a burst of 16 fills the queue and the rest is lost. If False, the
+        # latency is the same, as messages are batched only under back-pressure.
         express=False,
     )
 
@@ -118,7 +119,7 @@ class ZenohRing:
         """See `Ring.drain`."""
         samples: list[Sample] = []
         now_ns = self._bus.clock.host_ns()
-        with usable(self._expression):
+        with raising_bus_error(self._expression):
             while (sample := self._subscriber.try_recv()) is not None:
                 try:
                     samples.append(self._bus.read(sample, now_ns, self._key))
@@ -190,7 +191,7 @@ class ZenohBus:
                 address = own_port if role != ROUTER else links.network.listen or links.network.router
                 advice = "is one running already? Stop that process, or start another run"
                 what = f"{role} of run {links.run_id!r} cannot listen on {address}; {advice}"
-            raise BusError(f"{what} ({plain(fault)})") from None
+            raise BusError(f"{what} ({cause_of(fault)})") from None
         prevent_slow_closing(self._session)
         if role == ROUTER:
             self.queryable(CLOCK_KEY, lambda query: query.reply(b""))
@@ -205,7 +206,7 @@ class ZenohBus:
         self.offset = ClockOffset()
         self.read = partial(_sample_across_hosts, self.offset)
         self._router = RouterWatch(self._links.network, self.role)
-        self._closers.append(ClockAsker(self.offset, self._query_time, self.clock.host_ns).close)
+        self._closers.append(ClockQuerier(self.offset, self._query_time, self.clock.host_ns).close)
 
     def _query_time(self) -> list[tuple[int, int]]:
         self._router.update(linked=bool(self._session.info.routers_zid()))
@@ -215,7 +216,7 @@ class ZenohBus:
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
         """See `Bus.publisher`."""
         key = topic.at(name)
-        with usable(key):
+        with raising_bus_error(key):
             publisher = ZenohPublisher(self, self._session, topic, key, self._direct_writer(topic, name, key))
         self._closers.append(publisher.close)
         self._publishers.append(publisher)
@@ -251,12 +252,12 @@ class ZenohBus:
             except Exception as fault:  # zenoh would only print it; count it here
                 faults.add(f"{self.role}: handler of", key, fault)
 
-        with usable(key):
+        with raising_bus_error(key):
             return self._session.declare_subscriber(key, Callback(received, indirect=False)).undeclare
 
     def ring(self, topic: Topic, capacity: int) -> "ZenohRing":
         """See `Bus.ring`; zenoh's threads keep the messages without waking Python."""
-        with usable(topic.at(ALL)):
+        with raising_bus_error(topic.at(ALL)):
             return ZenohRing(self, self._session.declare_subscriber(topic.at(ALL), RingChannel(capacity)))
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
@@ -271,7 +272,7 @@ class ZenohBus:
                 query.drop()  # type: ignore[no-untyped-call]
                 self.faults.add(f"{self.role}: queryable of", key, fault)
 
-        with usable(key_expression):
+        with raising_bus_error(key_expression):
             self._session.declare_queryable(key_expression, Callback(queried, indirect=False))
 
     def get(
@@ -289,7 +290,7 @@ class ZenohBus:
             except Exception as fault:
                 self.faults.add(f"{self.role}: answer to", key, fault)
 
-        with usable(key):  # the key may be invalid
+        with raising_bus_error(key):  # the key may be invalid
             self._session.get(
                 key,
                 Callback(answered, done.set, indirect=False),

@@ -12,7 +12,7 @@ _LONGEST = 200  # characters
 _PLACE = re.compile(r"\s*\bat /?\S+\.rs:\d+\.?")
 
 
-def plain(fault: zenoh.ZError) -> str:
+def cause_of(fault: zenoh.ZError) -> str:
     """Cause of an error, without zenoh's source locations and component names."""
     text = _PLACE.sub("", str(fault).partition("\n")[0]).strip(" .")
     if text.endswith("]") and ": [" in text:  # ": [cause]" at the end; an IPv6 address may end in "]", too
@@ -21,9 +21,9 @@ def plain(fault: zenoh.ZError) -> str:
 
 
 @contextmanager
-def usable(key: str) -> Iterator[None]:
+def raising_bus_error(key: str) -> Iterator[None]:
     """Convert an error of zenoh in the block, such as for an invalid key or a closed session, to BusError."""
     try:
         yield
     except zenoh.ZError as fault:
-        raise BusError(f"{key} cannot be used: {plain(fault)}") from None
+        raise BusError(f"{key} cannot be used: {cause_of(fault)}") from None

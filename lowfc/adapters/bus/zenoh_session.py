@@ -103,9 +103,9 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
             "exit_on_failure": False,
             "retry": {
                 "period_init_ms": 50,
-                # A new process connects to all others that listen. Each attempt to reach an absent one (such as the
-                # recorder) delays a frame, so they are rare. A role without a port cannot be reached: it must attempt
-                # often itself.
+                # A new process connects to all others that listen. Each attempt to reach an absent process (such as
+                # the recorder) delays a frame, so attempts are rare. A role without a port cannot be reached: it must
+                # attempt often itself.
                 "period_max_ms": 4000 if role in links.ports else 200,
                 "period_increase_factor": 2,
             },
@@ -118,10 +118,10 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
                 "usrpwd": {"user": links.user, "password": links.secret, "dictionary_file": str(links.secret_file)}
             },
             "link": {"tx": sending, "rx": {"buffer_size": _SPARE_BUFFERS * batch_bytes if monitor else batch_bytes}},
-            # No gain at these sizes, and a receiver descheduled for 100 ms loses messages silently.
+            # No gain at the sizes of our messages, and a receiver descheduled for 100 ms loses messages silently.
             "shared_memory": {"enabled": False},
         },
-        # Monitors, which connect by Unix socket, get these topics at display rate: sending costs the loop time.
+        # Monitors, which connect by Unix socket, get these topics at display rate: sending takes the loop's time.
         "downsampling": [
             {"id": "monitor", "flows": ["egress"], "messages": ["put"], "link_protocols": [_SOCKET], "rules": throttled}
         ],
@@ -140,7 +140,7 @@ def _socket(links: Links, role: str) -> str | None:
 def receive_in_one_thread() -> None:
     """Make zenoh receive and decode messages in one thread; call it before the first session.
 
-    It saves waking a second thread in a process that blocks on input; in a process that computes meanwhile it would
-    delay messages. Child processes inherit the setting.
+    A process that blocks on input then need not wake a second thread. In a process that computes meanwhile, one thread
+    would delay messages. Child processes inherit the setting.
     """
     os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")

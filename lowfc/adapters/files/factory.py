@@ -70,8 +70,8 @@ def contrast_of(config: Configuration) -> ModalContrast:
     return ModalContrast(*optics, load_or_compute_form(*optics))
 
 
-def known_contrast(config: Configuration | None) -> ModalContrast | None:
-    """Result of `contrast_of` for a log or running loop; None without configuration, or with a warning if it fails."""
+def contrast_or_none(config: Configuration | None) -> ModalContrast | None:
+    """Result of `contrast_of` for a log or running loop; None without `config`; a warning and None if it fails."""
     try:
         return None if config is None else contrast_of(config)
     except LowfcError as error:
@@ -169,13 +169,13 @@ def analytic_calibration(
     """Calibration from the sensor's digital twin: I0 and H (the paper's eqs. 6 to 12), R, and the mirror's modes.
 
     The modes are fitted with the influence functions, then mixed slightly so that the sensor measures each modal
-    command as itself: through the shaped pupil, the mirror's print-through looks like low-order modes, up to 0.3 % of a
-    command. Inactive actuators are in no mode, and the sensor's response to them is set to 0.
+    command exactly: through the shaped pupil, the mirror's print-through looks like low-order modes of up to 0.3 % of
+    the command. No mode moves an inactive actuator, and the sensor's response to these actuators is set to 0.
 
     Args:
         config: Configuration of the instrument.
-        optics: Digital twin of its sensor.
-        on_nodes: Its mirror on the twin's nodes.
+        optics: Digital twin of the instrument's sensor.
+        on_nodes: Wavefront of the nominal mirror at the twin's nodes.
         opd_nm: Wavefront at the twin's used nodes at which I0 and H are computed; flat when None.
 
     Raises:
@@ -247,7 +247,7 @@ def actuators_to_modes(
         reference: (pixels,) I0 of the twin.
         good: (pixels,) 1 for a used pixel, else 0.
         optics: Digital twin of the sensor.
-        on_nodes: The mirror on the twin's nodes.
+        on_nodes: Wavefront of the mirror at the twin's nodes.
         opd_nm: Wavefront at the twin's used nodes at which R was computed; flat when None.
     """
     sensed = projected_response(optics, unnormalised(reconstructor, reference, good), opd_nm)
@@ -307,8 +307,8 @@ def _dark_dn(camera: Detector) -> float:
 def equivalent_read_noise_e(camera: Detector) -> float:
     """Read noise equivalent to all noise except photon noise, electrons before multiplication, for the weights of R.
 
-    With EM gain a pixel's variance is 2 (I0 + read_noise^2 / (2 gain^2)), as the register doubles the variance of the
-    photons. Clock-induced charge and dark current add noise as light does.
+    With EM gain a pixel's variance is 2 (I0 + read_noise^2 / (2 gain^2)), as the multiplication register doubles the
+    variance of the photons. Clock-induced charge and dark current add noise as light does.
     """
     read_noise_e = camera.read_noise_e
     if camera.em_gain > 1:

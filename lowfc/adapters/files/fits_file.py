@@ -81,7 +81,7 @@ def opened(path: Path, content: bytes | None = None) -> Iterator[fits.HDUList]:
         if magic in (b"PK", b"\x1f\x9d"):  # astropy's errors for these are not in DAMAGED
             raise ValueError("it is an archive, such as .npz or .Z, and not a FITS file")
         stream.seek(0)
-        if magic == b"\x1f\x8b":  # astropy does not read as far as the checksum
+        if magic == b"\x1f\x8b":  # gzip: astropy does not read as far as the checksum at its end
             with gzip.GzipFile(fileobj=stream) as unpacked:
                 while unpacked.read(1 << 20):
                     pass

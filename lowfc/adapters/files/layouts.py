@@ -32,7 +32,7 @@ def load_layout(name: str) -> sams.Layout:
 
     Raises:
         ConfigurationError: No layout has that name, or the file holds several and none is named.
-        DataFileError: The file is missing, damaged, or its holes overlap or leave the pupil.
+        DataFileError: The file is missing or damaged, or the layout's holes overlap or leave the pupil.
     """
     in_file = re.fullmatch(r"(.*\.json)(?::(.*))?", name)
     file: Traversable = input_file.user_path(in_file[1]) if in_file else SHIPPED
@@ -41,11 +41,11 @@ def load_layout(name: str) -> sams.Layout:
     if not chosen and len(layouts) == 1:
         chosen = next(iter(layouts))
     if chosen not in layouts:
-        known = ", ".join(sorted(layouts))
+        names = ", ".join(sorted(layouts))
         if not chosen:
-            raise ConfigurationError(f"{file} holds several layouts; choose one with {file}:NAME; it has {known}")
+            raise ConfigurationError(f"{file} holds several layouts; choose one with {file}:NAME; it has {names}")
         raise ConfigurationError(
-            f"no sparse-aperture layout is called {chosen!r}{nearest(chosen, layouts)}: there are {known}"
+            f"no sparse-aperture layout is called {chosen!r}{nearest(chosen, layouts)}: there are {names}"
         )
     return parse_layout(file, chosen, layouts[chosen])
 

@@ -201,7 +201,9 @@ def _pupil(section: SensorSection) -> Array:
     if section.pupil.endswith(".npz"):
         return load_pupil(file=input_file.user_path(section.pupil))
     hint = nearest(section.pupil, ("shaped", "circle", "prolate"))
-    raise ConfigurationError(f"sensor.pupil = {section.pupil!r}: no such pupil{hint}: shaped, circle, prolate, *.npz")
+    raise ConfigurationError(
+        f"sensor.pupil = {section.pupil!r}: no such pupil{hint}; there are shaped, circle, prolate and *.npz"
+    )
 
 
 def _focal_mask(section: SensorSection) -> NDArray[np.inexact]:

@@ -16,8 +16,8 @@ _NAME_LENGTH = 50  # at most so many characters of the final name go into the te
 
 @contextlib.contextmanager
 def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> Iterator[Path]:
-    """As `draft`, for a block that only writes the file: its OSErrors are DataFileErrors as well."""
-    with _reported(path), draft(path, source, mode) as part:
+    """As `draft`, but for a block that only writes the file: its OSErrors become DataFileErrors, too."""
+    with _os_errors_as_data_file_errors(path), draft(path, source, mode) as part:
         yield part
 
 
@@ -31,7 +31,7 @@ def draft(path: Path, source: Path | None = None, mode: int = 0o666) -> Iterator
     Raises:
         DataFileError: the file cannot be written, or is a log. Errors of the block are raised unchanged.
     """
-    with _reported(path):
+    with _os_errors_as_data_file_errors(path):
         _require_replaceable(path, source)
         permitted = source.stat().st_mode & mode if source is not None and source.exists() else mode
         part = path.with_name(f".{path.name[:_NAME_LENGTH]}.{secrets.token_hex(4)}")
@@ -40,8 +40,8 @@ def draft(path: Path, source: Path | None = None, mode: int = 0o666) -> Iterator
         os.close(descriptor)
     try:
         yield part
-        with _reported(path):
-            part.chmod(mode)  # the writer may have replaced it
+        with _os_errors_as_data_file_errors(path):
+            part.chmod(mode)  # the writer may have replaced the temporary file
             with part.open("rb") as written:
                 os.fsync(written.fileno())  # otherwise the file may be empty after a power failure
             part.replace(path)
@@ -50,7 +50,7 @@ def draft(path: Path, source: Path | None = None, mode: int = 0o666) -> Iterator
 
 
 @contextlib.contextmanager
-def _reported(path: Path) -> Iterator[None]:
+def _os_errors_as_data_file_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:

@@ -35,11 +35,12 @@ class OtherChannels:
     """Sum of a mirror's channels except one, in the unit of the streams.
 
     Unusable channels are left out: those with another grid or layout, or a value that is not finite. While a channel is
-    being written, or if its writer died meanwhile, its last complete shape counts; before any, the shape as it is.
+    being written, or if its writer died meanwhile, its last complete shape counts; if there was none yet, the
+    incomplete one.
     """
 
     def __init__(self, names: Iterable[str], grid: tuple[int, int]) -> None:
-        """Read these channels of (rows, columns) actuators, including those that appear later."""
+        """Read the channels `names`, each with `grid` (rows, columns) actuators, also those that appear later."""
         self._paths = [stream_path(name) for name in names]
         self._grid = grid
         self._streams: dict[Path, Stream] = {}

@@ -12,7 +12,7 @@ import numpy as np
 VERSION = "2.00"
 HEADER_BYTES = 384
 DAO_HEADER_BYTES = 4496
-"""Header size of a library built with DAO_COMPAT, under the same version."""
+"""Header size of a library built with DAO_COMPAT, which states the same version."""
 SEMAPHORE_BYTES = 32
 _TIME = ("<i8", 2)  # seconds, nanoseconds
 

@@ -29,7 +29,7 @@ class StreamImage(NamedTuple):
 class StreamReader:
     """Waits for images on its own semaphore, and reopens a recreated stream.
 
-    `stream` is the mapped stream, None while there is none; `generation` counts the streams, from 1.
+    `stream` is the mapped stream, None while there is none; `generation` counts the streams mapped so far.
     """
 
     def __init__(self, path: Path) -> None:

@@ -35,7 +35,7 @@ class Semaphores:
             _LIBC.sem_init(address, 1, 0)
 
     def usable(self) -> bool:
-        """Whether this C library created the semaphores; it aborts a process that uses those of another library."""
+        """Whether this C library created the semaphores; it aborts a process that uses another library's."""
         fresh = ctypes.create_string_buffer(SEMAPHORE_BYTES)
         _LIBC.sem_init(fresh, 1, 0)
         memory = self._memory.raw

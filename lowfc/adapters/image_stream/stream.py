@@ -78,8 +78,8 @@ class Stream:
         layout: positions of its parts, as declared in its header when opened.
         data: (planes, rows, columns) view of the pixels.
         semaphores: semaphores, one for each reader.
-        readers: (semaphores,) view of the process ids that wait for them; 0 or less for none.
-        writers: (semaphores,) view of the ids of the processes that last posted them.
+        readers: (semaphores,) view of the id of the process that waits for each semaphore; 0 or less for none.
+        writers: (semaphores,) view of the id of the process that last posted each semaphore.
         identity: identity of the file, which differs for another file of the same name.
     """
 

@@ -88,11 +88,11 @@ def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
     name = body[_FIXED.size : _FIXED.size + name_length]
     if name not in _COMPRESSIONS:
         raise CompressionError(name[:_MAX_NAME_LENGTH].decode(errors="backslashreplace"))
-    decompressed, largest_ratio = _COMPRESSIONS[name]
+    decompress, largest_ratio = _COMPRESSIONS[name]
     if not 0 < size <= min(MAX_BYTES, largest_ratio * compressed):
         raise UnsoundError("a chunk declares an impossible size")
     try:
-        content = decompressed(memoryview(body)[begin:], size)
+        content = decompress(memoryview(body)[begin:], size)
     except (RuntimeError, EOFError, zstandard.ZstdError) as fault:
         raise UnsoundError("a chunk cannot be decompressed") from fault
     computed = zlib.crc32(content)

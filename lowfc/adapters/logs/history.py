@@ -107,7 +107,7 @@ class History:
             message is lost; each names the log.
         calibration: the last recorded one; without any in the log, the attached calibration that `controller` names.
         controllers: states of the controllers, in order.
-        camera: camera state whose settings held in most steps under `calibration` (most closed-loop steps, if any).
+        camera: camera state with the settings of most steps under `calibration`; of most closed-loop steps if any.
         under_camera: (steps,) whether the camera had the settings of `camera` in each step.
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
         command_sequence, command_publish_ns: message sequence and publish time of every mirror command in the log.
@@ -123,8 +123,8 @@ class History:
             across restarts; None with fewer than two Healths.
         counts: number of messages, by topic key.
         published: calibrations, laws and played tables, by identity.
-        span_ns: log times of the first message, without the states and calibrations stored at the start of the log, and
-            of the last message; (0, 0): none.
+        span_ns: log times of the first and the last message; the states and calibrations stored at the start of the log
+            do not count as first. (0, 0) without any other message.
     """
 
     log: LogReader
@@ -164,7 +164,7 @@ class History:
         return frame_rate_hz(self.camera, self.steps)
 
     def camera_clock_offset_ns(self, process: str) -> int:
-        """Offset that converts a frame's time to the clock of `process`, ns; publish times are the recorder's."""
+        """Offset to add to a frame's time for the clock of `process`, ns; a log's publish times are the recorder's."""
         camera, other = (self.health.get(name, wire.Health()) for name in (Role.CAMERA, process))
         return camera.router_offset_ns - other.router_offset_ns
 
@@ -392,7 +392,7 @@ class _HistoryBuilder:
 
 
 def measured_timing(timing: Timing, steps: Steps, applied: Sequences, applied_ns: Integers, rate_hz: float) -> Timing:
-    """Timing from the frame sequences of applied commands and `applied_ns`, the time of each on the camera's clock."""
+    """Timing if the commands of the frames `applied` were applied at `applied_ns`, ns of the camera's clock."""
     rows = rows_of(applied, steps.sequence)
     if not (rows >= 0).any():
         return timing

@@ -15,7 +15,7 @@ from lowfc.contract.sequence_gaps import Gaps
 
 MAX_STARTS = 8
 """Number of a publisher's newest starts with separate counts; earlier ones are summed."""
-_EARLIER = -1
+_EARLIER = -1  # in place of a start: the sum of the earlier ones
 _UNNAMED = "?"
 
 
@@ -25,10 +25,10 @@ class _Tally:
 
     Attributes:
         gaps: gaps in the received sequences.
-        published: number published, by the publisher's own count, 0 until it reports that it has stopped; a message
+        published: number published, by the publisher's own count; 0 until it reports that it has stopped. A message
             sent twice counts twice.
         recorded: number recorded.
-        duplicates: number of those recorded that were duplicates.
+        duplicates: number of recorded messages that were duplicates.
         never_sent: frames that a camera lost and never sent, according to its Health, less `lost_before`.
         lost_before: frames that the camera had lost by its first Health, assumed to precede the first message; None
             until then.
@@ -53,7 +53,7 @@ class _Tally:
 
     @property
     def confirmed(self) -> int:
-        """Number surely lost; if the camera lost frames before sending, at most `lost` at the last `newly_lost`.
+        """Number surely lost: `lost`, but no more than at the last `newly_lost` if the camera lost frames itself.
 
         The newest gap may consist of further frames that the camera never sent; its next Health reports them.
         """
@@ -144,7 +144,7 @@ class LossAccount:
         return +self._sum(lambda tally: tally.lost)
 
     def newly_lost(self) -> dict[str, int]:
-        """Number of messages lost since the last call, by key; a lost message that arrives late offsets a later one."""
+        """Number of messages lost since the last call, by key; one that arrives late after all offsets a later loss."""
         lost = +self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():
             tally.reported = max(tally.reported, tally.confirmed)

@@ -136,7 +136,7 @@ def named_logs(names: Sequence[Path], out: Path | None = None, *, as_json: bool 
     """
     logs: dict[tuple[str, ...], dict[int, Path]] = {}
     for path in _files(names):
-        alone = [path] == list(names)  # named by itself: its place in a recording does not matter
+        alone = [path] == list(names)  # the only file named: its place in a recording does not matter
         key, number = ((), 1) if alone else _recording_and_number(path)
         parts = logs.setdefault(key or (str(path.absolute()),), {})
         if number in parts:
@@ -225,7 +225,7 @@ def _newest(folder: Path) -> list[Path]:
     for path, match in files.items():
         time, repeat, suffix, part = match.groups()
         order[path] = time, int(repeat or 1), not (suffix or part), suffix == "-recovered", bool(part)
-    # Of several files with the same time and number, prefer a finished recording, then a recovered, then an unfinished.
+    # Of several files with the same time and number, prefer a finished log, then a recovered one, then an unfinished.
     best = {order[path][:2]: path for path in sorted(files, key=order.__getitem__)}
     newest = best.pop(max(best))
     recording, number = _recording_and_number(newest)

@@ -60,7 +60,7 @@ class LogReader:
             topics: topics whose messages are delivered; None: all.
             skip_damaged: whether to leave out damaged stretches instead of raising an error.
             from_ns: log time; chunks known to end before it are skipped.
-            always: topics for which `from_ns` skips nothing: a chunk with a message of them is read with all messages.
+            always: topics exempt from `from_ns`: a chunk with a message of any of them is read, with all its messages.
             sparse: whether to skip chunks without messages of `topics`, by their indexes: for topics with few messages
                 in a long log. The checksums of skipped chunks, and then of the data section, are not checked.
         """
@@ -85,7 +85,7 @@ class LogReader:
         self._delivered: dict[int, tuple[str, int] | None] = {}  # by channel id: key and first sequence; None: excluded
         self._chunks: set[int] = set()  # identities of the intact chunks
         self._last_ns: int | None = None
-        self._dated_damage = 0  # number of `damage` with `before_ns`
+        self._dated_damage = 0  # number of entries of `damage` whose `before_ns` is set
         self._has_chunks = False
 
     @property

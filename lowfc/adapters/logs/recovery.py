@@ -51,7 +51,7 @@ class Recovery:
             name = self.log.name.removesuffix(UNFINISHED)
             advice = "there is nothing to recover" if name == self.log.name else f"rename it to {name}"
             return f"{self.log} is intact; {advice}"
-        lines = [f"left out {in_words(damage)}" for damage in self.damage]
+        lines = [f"left out {damage_in_words(damage)}" for damage in self.damage]
         if self.unreadable:
             lines.append(f"left out {counted(self.unreadable, 'message')}: the declaration was in a damaged chunk")
         if not self.finished:
@@ -107,11 +107,11 @@ def origin(reader: LogReader, messages: int) -> dict[str, str]:
         "messages": str(messages),
         "unreadable": str(reader.unreadable),
         "left_out": str(len(reader.damage)),
-        **{f"left_out {number}": in_words(damage) for number, damage in enumerate(reader.damage, 1)},
+        **{f"left_out {number}": damage_in_words(damage) for number, damage in enumerate(reader.damage, 1)},
     }
 
 
-def in_words(damage: Damage) -> str:
+def damage_in_words(damage: Damage) -> str:
     """Position, reason and lost time of a damaged stretch, as text."""
     place = f"at byte {damage.position}, {damage.length} bytes: {damage.why}"
     if not damage.length or damage.after_ns is None or damage.before_ns is None:
@@ -133,7 +133,7 @@ def missing_end_text(paths: Sequence[Path], *, finished: bool) -> str:
 def missing_parts(reader: LogReader) -> dict[str, Any]:
     """Missing parts of a log that was read to its end, for JSON: `no_end` is empty for a finished log."""
     no_end = missing_end_text(reader.paths, finished=reader.finished)
-    return {"finished": reader.finished, "no_end": no_end, "damaged": [in_words(damage) for damage in reader.damage]}
+    return {"finished": reader.finished, "no_end": no_end, "damaged": list(map(damage_in_words, reader.damage))}
 
 
 def faults(damaged: Sequence[str], no_end: str) -> list[str]:

@@ -100,7 +100,7 @@ class LogSeries:
         return self._finishing is not None and not self._finishing[1].done()
 
     def begin(self, first: Iterable[Sample], *, new_recording: bool = True) -> None:
-        """Begin a file of a new or of the present recording with the messages `first`, on which later ones depend."""
+        """Begin a file of a new or the present recording with the messages `first`, which later messages depend on."""
         now_ns = self._clock.host_ns()
         with raised_as(DataFileError, OSError, f"{self._folder} cannot be accessed"):
             path = log_path(self._folder, now_ns)
@@ -186,7 +186,7 @@ def _finish(log: LogWriter, totals: Mapping[str, str]) -> int:
 
 def shortage(folder: Path, min_free_bytes: int) -> str:
     """Sentence on too little space on the disk of `folder`, else empty; DataFileError if the folder is inaccessible."""
-    if not (parent := existing(folder)).is_dir():
+    if not (parent := nearest_existing(folder)).is_dir():
         raise DataFileError(
             f"no log can be recorded in {folder}: {parent} is no folder; name another (recorder.folder)"
         )
@@ -200,7 +200,7 @@ def shortage(folder: Path, min_free_bytes: int) -> str:
     )
 
 
-def existing(folder: Path) -> Path:
+def nearest_existing(folder: Path) -> Path:
     """The folder, or its nearest existing parent; DataFileError if it cannot be accessed."""
     absolute = folder.absolute()
     with raised_as(DataFileError, OSError, f"{folder} cannot be accessed"):

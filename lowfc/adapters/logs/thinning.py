@@ -35,7 +35,7 @@ def thin(
         return topic is None or combined.keeps(topic, message.sequence, message.payload)
 
     def include_record(record: Metadata | Attachment) -> bool:
-        """Whether to copy a record: the first of each name, or all of a kind of which readers use the last."""
+        """Whether to copy a record: the first of its name, or any "recording" or "recovery": readers use their last."""
         excluded = record.name in excluded_names and record.name not in ("recording", RECOVERY)
         excluded_names.add(record.name)
         return not excluded

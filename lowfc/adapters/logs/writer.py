@@ -40,7 +40,7 @@ UNFINISHED = ".part"
 FILE_MODE = 0o640
 """Default permissions of a log, further reduced by the umask: notes and frames are not public."""
 
-CHUNK_BYTES = 240 * 1024  # the message that exceeds this closes the chunk: below 256 KiB for frames up to 15 KiB
+CHUNK_BYTES = 240 * 1024  # the message that exceeds this ends the chunk, which stays below 256 KiB with 15-KiB frames
 PART = "part"
 """Name of the metadata with the recording that a file belongs to, and the file's number in it."""
 

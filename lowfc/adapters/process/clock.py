@@ -1,7 +1,7 @@
 """Time: nanoseconds since the epoch, without steps, the same for all processes of a user on a host.
 
-The host's clock is CLOCK_MONOTONIC plus an offset that the first process after a boot fixes and stores in the user's
-runtime directory, in a file named after the boot. In lockstep the time of messages is simulated; envelopes keep the
+The host's clock is CLOCK_MONOTONIC plus an offset that the first process after a boot stores in the user's runtime
+directory, in a file named after the boot. In lockstep the time of messages is simulated; envelopes keep the
 host's time, so that latencies can be measured.
 """
 
@@ -15,7 +15,7 @@ SIMULATED_START_NS = 1_767_225_600_000_000_000
 """2026-01-01T00:00:00Z, the start of every lockstep run."""
 
 WALL_TOLERANCE_NS = 100_000_000
-"""Difference from the wall clock above which an event reports it: the wall clock was set after the offset was fixed."""
+"""Difference from the wall clock, above which an event reports that the wall clock was set after the offset was."""
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _NS = 1_000_000_000
@@ -85,9 +85,9 @@ def boot_file(base: Path | None = None) -> Path:
 
 
 def boot_offset_ns(base: Path) -> int:
-    """Offset to add to CLOCK_MONOTONIC to get the time since the epoch, ns; the first call since the boot fixes it.
+    """Offset to add to CLOCK_MONOTONIC to get the time since the epoch, ns; the first call since the boot stores it.
 
-    DataFileError if its file in `base` is damaged, or cannot be read or made.
+    DataFileError if the offset's file in `base` is damaged, or cannot be read or made.
     """
     path = boot_file(base)
     with raised_as(DataFileError, OSError, f"{path} cannot be read or made"):

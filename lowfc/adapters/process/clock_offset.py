@@ -24,7 +24,7 @@ class Exchange(NamedTuple):
 
 
 class ClockOffset:
-    """Offset of the other clock; `best` is the best recent exchange, None before the first."""
+    """Offset of the other clock; `best` is the best recent exchange, None before the first exchange."""
 
     def __init__(self) -> None:
         self.best: Exchange | None = None
@@ -36,7 +36,7 @@ class ClockOffset:
         best = self.best
         return 0 if best is None else best.offset_ns
 
-    def exchanged(self, queried_ns: int, other_ns: int, received_ns: int) -> None:
+    def add_exchange(self, queried_ns: int, other_ns: int, received_ns: int) -> None:
         """Add one exchange: this host's time at query and receipt, and the other host's time at its answer."""
         new = Exchange(other_ns - (queried_ns + received_ns) // 2, received_ns - queried_ns)
         apart_ns = abs(new.offset_ns - self.offset_ns) - 1_000_000  # 1 ms, ten times the drift
@@ -46,22 +46,22 @@ class ClockOffset:
         self.best = min(self._recent, key=lambda exchange: exchange.round_trip_ns)
 
 
-class ClockAsker:
+class ClockQuerier:
     """Queries another host's time: several times at the start, then periodically on its own thread."""
 
     def __init__(
-        self, offset: ClockOffset, ask: Callable[[], Sequence[tuple[int, int]]], host_ns: Callable[[], int]
+        self, offset: ClockOffset, query: Callable[[], Sequence[tuple[int, int]]], host_ns: Callable[[], int]
     ) -> None:
         """Measure the offset, if the other host answers.
 
         Args:
             offset: receives the exchanges.
-            ask: queries the other host; returns for each answer the other host's time minus the known offset, and this
-                host's time at receipt.
+            query: queries the other host; returns for each answer the other host's time minus the present estimate in
+                `offset`, and this host's time at receipt.
             host_ns: this host's clock.
         """
         self._offset = offset
-        self._ask = ask
+        self._query = query
         self._host_ns = host_ns
         self._ended = threading.Event()
         for _ in range(FIRST_EXCHANGES):
@@ -81,7 +81,7 @@ class ClockAsker:
 
     def _exchange(self) -> bool:
         queried_ns = self._host_ns()
-        answers = self._ask()
+        answers = self._query()
         for corrected_ns, received_ns in answers:
-            self._offset.exchanged(queried_ns, corrected_ns + self._offset.offset_ns, received_ns)
+            self._offset.add_exchange(queried_ns, corrected_ns + self._offset.offset_ns, received_ns)
         return bool(answers)

@@ -17,7 +17,7 @@ from lowfc.control.kernel.tables import FUSED, NUMPY, Kernel
 FASTMATH = frozenset({"reassoc", "contract"})
 """Permitted parts of fast-math: NaN and infinity are preserved, and the same binary gives the same bytes."""
 SHARED_BYTES = 8 << 20
-"""Size of R above which threads share a frame; below, waking them takes longer than they save."""
+"""Size of R from which threads share a frame; below, waking the threads takes longer than they save."""
 
 
 def available() -> bool:
@@ -67,7 +67,7 @@ class Pool:
         for number, go_and_done in enumerate(self._locks):
             for lock in go_and_done:
                 lock.acquire()
-            threading.Thread(target=self._help, args=(number, *go_and_done), name="fused step", daemon=True).start()
+            threading.Thread(target=self._share, args=(number, *go_and_done), name="fused step", daemon=True).start()
 
     def measure(
         self,
@@ -98,7 +98,8 @@ class Pool:
             done.acquire()
         return self._measure(pixels[:0], *scanned[1:], *rest)  # no pixels: it uses the sums computed above
 
-    def _help(self, number: int, go: threading.Lock, done: threading.Lock) -> None:
+    def _share(self, number: int, go: threading.Lock, done: threading.Lock) -> None:
+        """Process this thread's share of each frame."""
         while go.acquire():
             pixels, good, dark, tiles, _, sums_nm, totals = self._work
             first, last = self._shares[number]

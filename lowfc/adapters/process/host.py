@@ -41,7 +41,7 @@ class Host:
         return (self.root / path).read_text(errors="replace").strip()
 
     def text_or_nothing(self, path: str) -> str:
-        """Content as by `text`; empty if the file cannot be read."""
+        """Content of a file as in `text`; empty if the file cannot be read."""
         try:
             return self.text(path)
         except OSError:
@@ -49,7 +49,7 @@ class Host:
 
     def cpus(self, which: str) -> set[int]:
         """Processors in a list of the kernel: `online`, `isolated` (isolcpus), `nohz_full`."""
-        read = self.text_or_nothing if which == "nohz_full" else self.text  # not every kernel has it
+        read = self.text_or_nothing if which == "nohz_full" else self.text  # not every kernel has nohz_full
         numbers: set[int] = set()
         for part in filter(None, read(f"{CPUS}/{which}").replace("(null)", "").split(",")):
             first, _, last = part.partition("-")
@@ -125,7 +125,7 @@ class Counts(NamedTuple):
     """The kernel's counters of delays of a process, since boot or since the process's start.
 
     Attributes:
-        stolen_ns: time that the hypervisor gave to other guests, of one processor or of all, in steps of 10 ms.
+        stolen_ns: time of one processor, or of all, that the hypervisor gave to other guests, in steps of 10 ms.
         throttled: number of periods in which the control group's quota was used up.
         waited_ns: time for which the thread was runnable without a processor.
         preempted: number of involuntary context switches of the thread.
@@ -234,5 +234,5 @@ def program_name() -> str:
 
 
 def by_this_process(what: str) -> str:
-    """Text of an action with its user and process, here this one: `lowfc ctl by ann (process 12)`."""
+    """Text that names this process and its user as the author of an action: `lowfc ctl by ann (process 12)`."""
     return f"{what} by {psutil.Process().username()} (process {os.getpid()})"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, ProgressColumn, TaskID, TextColumn, TimeRemainingColumn
 
-Counted = Callable[[str, int, int], None]
+ProgressCallback = Callable[[str, int, int], None]
 """Progress callback: description of the work, amount done, total amount."""
 _EVERY_S = 10.0
 
@@ -18,7 +18,7 @@ def passing_bar(console: Console, *columns: ProgressColumn) -> Progress:
 
 
 @contextlib.contextmanager
-def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted]:
+def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[ProgressCallback]:
     """One bar for several tasks in turn, with `columns` beside its description; it appears with the first progress.
 
     Without a terminal, lines are printed: see `progress_lines`.
@@ -37,18 +37,18 @@ def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted
         yield count
 
 
-def percentage_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
-    """Bar as by `counting_bar`, in per cent of the total amount."""
+def percentage_bar(console: Console) -> contextlib.AbstractContextManager[ProgressCallback]:
+    """Make a bar like `counting_bar`, in per cent of the total amount."""
     return counting_bar(console, TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn())
 
 
-def reading_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
-    """Bar as by `counting_bar`, for the bytes read from a file."""
+def reading_bar(console: Console) -> contextlib.AbstractContextManager[ProgressCallback]:
+    """Make a bar like `counting_bar`, for the bytes read from a file."""
     return counting_bar(console, DownloadColumn(), TimeRemainingColumn())
 
 
-def progress_lines(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Counted:
-    """Progress without a terminal: a line every 10 s with the estimated remaining time; `clock` is in seconds."""
+def progress_lines(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> ProgressCallback:
+    """Make a callback for use without a terminal: a line every 10 s with the remaining time; `clock` is in seconds."""
     first = last = -1
     begun = written = 0.0
 
@@ -57,7 +57,7 @@ def progress_lines(write: Callable[[str], None], clock: Callable[[], float] = ti
         now = clock()
         if last < 0:
             written = now
-        if last < 0 or done < last:  # the first task, or another one
+        if last < 0 or done < last:  # a new task
             first = done
         last = done
         if done == first:  # exclude the time before the first progress from the rate

@@ -24,7 +24,7 @@ _HUGE_PAGE_BYTES = "/sys/kernel/mm/transparent_hugepage/hpage_pmd_size"
 _COMPILER = "llvmlite"  # library whose pages are not locked: large, and not used after the first frame
 
 _Measure = tuple[str, Callable[[], object], str]
-"""Name of a measure, the function that requests it, and the cost of its refusal."""
+"""Name of a real-time measure, the function that requests it, and the cost of its refusal."""
 
 _open_devices: list[int] = []
 
@@ -83,10 +83,10 @@ def use_huge_pages() -> Granted:
 
 
 def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int]]:
-    """Configuration keys that distribute the loop's processes over these processors; none for a single one.
+    """Configuration keys that distribute the loop's processes over these processors; no key for a single processor.
 
     The controller gets its own processor if possible: other processes would evict its code and data from the caches,
-    and the recorder, which receives each frame at the same time, would run first. With two processors, a simulated
+    and the recorder, which receives each frame at the same time, would run before it. With two processors, a simulated
     camera needs one, and the recorder may use both: on a processor whose real-time share is used up, it would stop for
     50 ms.
 
@@ -206,7 +206,7 @@ def _lock_memory() -> None:
 
 
 def _collapse_memory() -> None:
-    """Move each part of the heap and of anonymous mappings that fills a huge page to one, unless the part is empty."""
+    """Move to a huge page each part of the heap and of anonymous mappings that fills one, unless the part is empty."""
     try:
         size = int(Path(_HUGE_PAGE_BYTES).read_text())
     except FileNotFoundError as fault:

@@ -231,7 +231,7 @@ class Service:
             self._send_health(now_ns)
 
     def finish(self) -> None:
-        """Publish a final Health, with all counts, as the last message; raise a failed handler's fault instead."""
+        """Publish a final Health, with all counts, as the last message; if a handler failed, raise its exception."""
         if self._fault is not None:
             raise self._fault
         self._report_unreadable()

@@ -38,8 +38,8 @@ class Trial(NamedTuple):
 def try_out(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
     """Request the measures of a process of the loop, and time 1000 wake-ups per second in each scheduling class.
 
-    The trial runs on `cpus`, or on the caller's if none of them can be used. OSError if its process cannot start, or
-    fails.
+    The trial runs on `cpus`, or on the caller's processors if none of `cpus` can be used. OSError if the trial's
+    process cannot start, or fails.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         try:

@@ -165,7 +165,7 @@ class RerunViewer:
         self._stderr.close()
 
     def screenshot(self, path: Path | None = None, timeout_s: float = 20.0) -> bytes:
-        """PNG of the whole viewer once loaded and two consecutive images are equal, or `timeout_s` after it has loaded.
+        """PNG of the whole viewer once two consecutive images after loading are equal, or `timeout_s` after loading.
 
         Raises:
             ViewerError: the viewer does not answer, or has not loaded everything within the timeout.

@@ -39,7 +39,7 @@ class ViewerPage:
                     self.end_headers()
                     shutil.copyfileobj(answer, self.wfile, _CHUNK_BYTES)
                 except (OSError, http.client.HTTPException):
-                    self.close_connection = True  # the viewer is gone, or the browser
+                    self.close_connection = True  # the viewer or the browser is gone
                 finally:
                     source.close()
 

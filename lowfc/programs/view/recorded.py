@@ -13,7 +13,7 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.history import LAST_NS, REORDERING_NS, attached_configuration
 from lowfc.adapters.logs.parts import missing_between
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.recovery import in_words, missing_end_text
+from lowfc.adapters.logs.recovery import damage_in_words, missing_end_text
 from lowfc.adapters.logs.writer import PART
 from lowfc.adapters.process.clock import SIMULATED_START_NS
 from lowfc.contract.configuration import Configuration
@@ -118,7 +118,7 @@ class _Drawing:
         """End a log: note its damage, a missing end and its count of lost messages."""
         log = reader.path
         self._damaged += len(reader.damage)
-        self._drawn.remarks += [f"{log.name}: left out {in_words(damage)}" for damage in reader.damage]
+        self._drawn.remarks += [f"{log.name}: left out {damage_in_words(damage)}" for damage in reader.damage]
         if missing := missing_end_text([log], finished=reader.finished):
             self._no_end = missing
             self._drawn.remarks.append(f"{log.name}: {missing}")

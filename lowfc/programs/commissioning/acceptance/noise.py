@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters.files.factory import frame_noise_nm2, known_contrast
+from lowfc.adapters.files.factory import contrast_or_none, frame_noise_nm2
 from lowfc.arrays import Array
 from lowfc.contract.configuration import Configuration
 from lowfc.control.laws import margins
@@ -102,7 +102,7 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> N
         noise_ratio=noise_ratio,
         law=loop.name,
         frames={name: len(response.error_nm) for name, response in by_loop.items()},
-        added_contrast=added_contrast(known_contrast(configuration), residual_nm2),
+        added_contrast=added_contrast(contrast_or_none(configuration), residual_nm2),
         modes=modes,
     )
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from lowfc.adapters.files import factory, fits_file
 from lowfc.adapters.files.whole_file import write_whole
-from lowfc.adapters.process.progress import Counted
+from lowfc.adapters.process.progress import ProgressCallback
 from lowfc.arrays import Array
 from lowfc.client import Client, configuration_of
 from lowfc.contract.errors import CalibrationError, DataFileError, LowfcError
@@ -63,7 +63,12 @@ class Calibrator:
     """
 
     def __init__(
-        self, loop: Client, request: CalibrationRequest, report: Report, progress: Counted, computed: Calibration
+        self,
+        loop: Client,
+        request: CalibrationRequest,
+        report: Report,
+        progress: ProgressCallback,
+        computed: Calibration,
     ) -> None:
         """Get the controller's calibration, and read the completed cycles with --resume.
 

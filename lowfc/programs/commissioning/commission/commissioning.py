@@ -10,7 +10,7 @@ import numpy as np
 
 from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.columns import Steps, steps_as_columns
-from lowfc.adapters.process.progress import Counted
+from lowfc.adapters.process.progress import ProgressCallback
 from lowfc.arrays import Single
 from lowfc.client import Client
 from lowfc.contract.codecs.law_codec import driving, integrator_of
@@ -87,7 +87,7 @@ class Commissioning:
         computed: Calibration,
         options: CommissionOptions,
         report: Report,
-        progress: Counted,
+        progress: ProgressCallback,
         confirm: Callable[[str], None],
     ) -> None:
         """Commission the loop that `loop` is connected to; `computed` is the calibration of the optical model."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lowfc.adapters.files.factory import frame_noise_nm2, known_contrast
+from lowfc.adapters.files.factory import contrast_or_none, frame_noise_nm2
 from lowfc.adapters.logs.columns import Steps, count_reasons, steps_as_columns
 from lowfc.adapters.logs.history import measured_timing, read_history
 from lowfc.adapters.logs.reader import LogReader
@@ -302,7 +302,7 @@ def _telemetry(
         under_law, extent = rows, "that of all of them, theory is for the last law and gains"
     if closed and (steps.sequence[rows] <= changed).any():
         warnings = [*warnings, f"law or gains changed in these frames: the achieved residual is {extent}"]
-    contrast = known_contrast(config) if config is not None and config.noll == calibration.noll else None
+    contrast = contrast_or_none(config) if config is not None and config.noll == calibration.noll else None
     finite = [None if each is None else each[under_law & np.isfinite(each).all(axis=1)] for each in true_residual]
     true_nm, rms_nm = (each if each is not None and len(each) else None for each in finite)
     return Telemetry(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lowfc.adapters.files.sensors import PUPIL_IMAGE_PIXELS
 from lowfc.adapters.logs.selection import Selection, selection
-from lowfc.adapters.logs.series import existing, shortage
+from lowfc.adapters.logs.series import nearest_existing, shortage
 from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
@@ -67,7 +67,7 @@ def check_folder(config: Configuration) -> None:
     """Raise DataFileError if the recorder's folder can hold no log: no access, no permission or too little space."""
     folder = user_path(config.recorder.folder)
     fault = shortage(folder, round(config.recorder.min_free_mb * 1e6))
-    if not fault and not os.access(existing(folder), os.W_OK):
+    if not fault and not os.access(nearest_existing(folder), os.W_OK):
         fault = f"no log can be recorded in {folder}: it is not writable; name another (recorder.folder)"
     if fault:
         raise DataFileError(fault)
@@ -75,7 +75,7 @@ def check_folder(config: Configuration) -> None:
 
 def growth_in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: float, conditions: str = "") -> str:
     """Growth per hour, `conditions` (" at 250 Hz"), and time until the disk of `folder` has `min_free_bytes` left."""
-    free_bytes = shutil.disk_usage(existing(folder)).free
+    free_bytes = shutil.disk_usage(nearest_existing(folder)).free
     lasts_h = max(0.0, free_bytes - min_free_bytes) / growth_bytes_per_s / 3600
     growth = f"about {_size(growth_bytes_per_s * 3600)} an hour{conditions}"
     return f"{growth}; {_size(free_bytes)} free, enough for {lasts_h:.1f} h"

@@ -4,7 +4,7 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
-from lowfc.adapters.files.factory import known_contrast
+from lowfc.adapters.files.factory import contrast_or_none
 from lowfc.adapters.logs.columns import TruthRows, Truths
 from lowfc.arrays import Array, Integers, Single
 from lowfc.contract.configuration import Configuration
@@ -120,7 +120,7 @@ def _contrast(true: Truths, rows: Integers, config: Configuration | None) -> Res
             return None
         known_nm = sampled_nm[rows][np.isfinite(sampled_nm[rows]).all(axis=1)].astype(float)
         covariances[name] = with_variances(known_nm.T @ known_nm / len(known_nm), modes_nm)
-    return added_contrast(known_contrast(config), covariances)
+    return added_contrast(contrast_or_none(config), covariances)
 
 
 def _rms(values: Single, rows: Integers) -> Array | None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters.files.factory import detector, equivalent_read_noise_e, known_contrast
+from lowfc.adapters.files.factory import contrast_or_none, detector, equivalent_read_noise_e
 from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.recovery import missing_end_text
 from lowfc.arrays import Array, Mask, Single
@@ -141,7 +141,7 @@ def _true(
             found[f"continuous_{name}"] = np.sqrt(squares[with_squares].mean(axis=0))
             sampled_nm2 = after_nm[with_squares].T @ after_nm[with_squares] / np.count_nonzero(with_squares)
             covariances[name.replace("_", " ")] = with_variances(sampled_nm2, found[f"continuous_{name}"])
-    contrast = added_contrast(known_contrast(run.history.configuration), covariances)
+    contrast = added_contrast(contrast_or_none(run.history.configuration), covariances)
     return {name: found[name] for name in _TITLES if name in found}, contrast
 
 

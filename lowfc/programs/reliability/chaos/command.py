@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.adapters.logs.series import existing
+from lowfc.adapters.logs.series import nearest_existing
 from lowfc.adapters.process.terminal import INTERRUPTED, Json
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError, nearest
 from lowfc.programs.cli.output import print_result
@@ -78,7 +78,7 @@ def chaos(
 
 def _require_writable(folder: Path) -> None:
     """Check before the first case that logs can be kept in a folder, which may not exist yet."""
-    nearest_folder = existing(folder)
+    nearest_folder = nearest_existing(folder)
     if not nearest_folder.is_dir() or not os.access(nearest_folder, os.W_OK):
         raise DataFileError(
             f"no logs can be kept in {folder}: {nearest_folder} is no writable folder; name another with --keep"
