@@ -83,15 +83,15 @@ class Client:
 
     Only the process that answers a request has to be running.
 
-    Every request is carried out between two frames or refused; the answer has the first frame for which it is in force.
-    A refused request raises RequestRefusedError, an unanswered one BusError.
+    Every request is carried out between two frames or refused; the answer has the first frame for which the request is
+    in force. A refused request raises RequestRefusedError, an unanswered one BusError.
     """
 
     def __init__(self, run: str | None = None, *, bus: Bus | None = None) -> None:
         """Join a run.
 
-        None selects the only run on this host. With a `bus`, `run` is only a name in messages, and `disconnect` does
-        not close the bus.
+        `run` None selects the only run on this host. With a `bus`, `run` is only a name in messages, and `disconnect`
+        does not close the bus.
 
         Raises:
             BusError: there is no such run, none at all, or more than one to choose from; or its router refuses this
@@ -305,7 +305,7 @@ class Client:
         return reports
 
     def laws(self) -> dict[str, LinearLaw]:
-        """The control law published last, by its identity, whether or not it drives the mirror; empty before any."""
+        """The control law published last, by its identity, whether or not it drives the mirror; empty without any."""
         published = Published()
         for sample in self._bus.get(LAW.key, timeout_s=ANSWER_S):
             published.store(LAW, sample.payload)

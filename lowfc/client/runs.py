@@ -19,7 +19,7 @@ def the_run(name: str | None) -> str:
     """Find a run by its name or a unique prefix, or the only run if `name` is None; it may be without a controller.
 
     Raises:
-        BusError: there is no such run, or it or its router is stopped; there is none at all, or more than one.
+        BusError: no run has that name; the run or its router is stopped; or, for None, there is no run or several.
         DataFileError: the run's directory is damaged.
     """
     runs = live_runs(name)

@@ -49,7 +49,7 @@ class Rate(StrEnum):
     EVENT = "on event"
 
 
-@dataclass(frozen=True, slots=True, eq=False)  # hashed by identity, as it is a key of every message
+@dataclass(frozen=True, slots=True, eq=False)  # hashed by identity, as it is looked up for every message
 class Topic:
     """A topic of the table.
 
@@ -140,7 +140,7 @@ CONTROLLER_STATE = Topic(
     wire.ControllerState,
     1.0,
     _CONTROLLER,
-    "The controller's state, at this rate while frames arrive, and after most other changes. It contains all that the "
+    "The controller's state: at this rate while frames arrive, and after most other inputs. It contains all that the "
     "next command depends on, but only the identities of calibration, law and probe sequence.",
     queryable=True,
 )

@@ -167,7 +167,7 @@ class Camera(Section):
     clock_induced_charge_e: NotNegative = 0.0
     """Spurious electrons per pixel and frame before multiplication."""
     dark_current_e_s: NotNegative = 0.0
-    """Dark current of every pixel, electrons per second; included in an analytic calibration, as by a dark frame."""
+    """Dark current of every pixel, electrons per second; an analytic calibration includes it, as a dark frame does."""
     hot_pixels: float = Field(0.0, ge=0, le=0.5)
     """Simulated camera: fraction of hot pixels, which an analytic calibration does not include."""
     hot_pixel_e_s: float = Field(20_000.0, gt=0, le=MAX_VALUE)
@@ -210,7 +210,7 @@ class Disturbance(Section):
     wheel_hz: NotNegative = 0.0
     """Initial speed of a reaction wheel, turns per second (0: none). It excites tip and tilt at its harmonics."""
     wheel_mas: NotNegative = 3.0
-    """Amplitude of the wheel's first harmonic at high speed, mas rms per axis; further ones have 0.5 to 0.15 of it."""
+    """Amplitude of the wheel's first harmonic at high speed, mas rms per axis; the others have 0.5 to 0.15 of it."""
     wheel_course: Literal["ramp", "walk", "run-down"] = "ramp"
     """Change of the wheel's speed. ramp: linear; walk: random walk; run-down: slowed by friction."""
     wheel_change: Signed = 0.0

@@ -73,7 +73,7 @@ def wire_camera(camera: CameraSettings) -> wire.CameraState:
 
 
 def camera_settings(message: wire.CameraState, start_s: int = 0) -> CameraSettings:
-    """Camera settings of a message; `start_s` is the start of the camera, unix seconds, 0 for that in the message."""
+    """Camera settings of a message; `start_s` is the camera's start, unix seconds, 0 for the start in the message."""
     return CameraSettings(
         from_timestamp(message.timestamp),
         (message.rows, message.columns),

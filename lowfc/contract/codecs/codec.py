@@ -257,12 +257,12 @@ def request(
     if message.play_id:
         if message.play_id not in plays:
             raise ValueError(f"the table {message.play_id[:12]} of a probe sequence is missing")
-        known_table = plays[message.play_id]
-        table, shapes_nm = known_table.rows, known_table.basis.reshape(-1)
+        stored_table = plays[message.play_id]
+        table, shapes_nm = stored_table.rows, stored_table.basis.reshape(-1)
     calibration = None
     if message.HasField("calibration"):
-        known = calibrations.get(message.calibration.id)
-        calibration = decode_calibration(message.calibration) if known is None else known
+        stored = calibrations.get(message.calibration.id)
+        calibration = decode_calibration(message.calibration) if stored is None else stored
     return Request(
         time_ns,
         name,

@@ -30,15 +30,15 @@ def wire_law(law: LinearLaw, time_ns: int = 0) -> wire.LinearLaw:
     return message
 
 
-def law_of(message: wire.LinearLaw, known: Mapping[str, LinearLaw] = MappingProxyType({})) -> LinearLaw:
-    """The law of a message; without matrices, the `known` law of its identity.
+def law_of(message: wire.LinearLaw, laws: Mapping[str, LinearLaw] = MappingProxyType({})) -> LinearLaw:
+    """The law of a message; if the message has no matrices, the law with its identity in `laws`.
 
-    ValueError if it is incomplete or not known.
+    ValueError if the law is incomplete or not in `laws`.
     """
     if message.id and not message.transition:
-        if message.id not in known:
+        if message.id not in laws:
             raise ValueError(f"the law {message.id[:12]} is missing")
-        return known[message.id]
+        return laws[message.id]
     shapes = matrix_shapes(message.states, len(message.noll))
     matrices: dict[str, Any] = {name: floats(getattr(message, name), *shape) for name, shape in shapes.items()}
     return LinearLaw(noll=tuple(message.noll), **fields_of(message, _PLAIN), **matrices)

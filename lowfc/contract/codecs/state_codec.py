@@ -40,7 +40,7 @@ _LEASE = ("id", "holder", "last_sequence", "ended", "holds")
 
 
 def controller_state(state: State, settings: Settings, time_ns: int) -> wire.ControllerState:
-    """Message of everything the next command depends on; of calibration, law and table only the identities."""
+    """Message of all that the next command depends on; it has only the identities of calibration, law and table."""
     conditions, loop, estimate, lease = state.conditions, state.loop, state.estimate, state.conditions.lease
     message = wire.ControllerState(
         timestamp=timestamp(time_ns),
