@@ -6,7 +6,7 @@ from lowfc.arrays import Single
 from lowfc.optics.chain.added_contrast import ModalContrast
 
 IMAGES = 200
-"""Full images averaged for each mean; fewer in a short run."""
+"""Number of full images averaged for each mean; smaller in a short run."""
 
 
 class Contrast:

@@ -199,7 +199,7 @@ def highest_hz(disturbance: Disturbance) -> float:
 def variances_nm2(disturbance: Disturbance, per_line: int = 401) -> tuple[Array, Array]:
     """Frequencies (n,) in Hz of waves, damped lines and wheels, and the variance at each (n, modes), nm^2.
 
-    A damped line is represented by quantiles of its power, a wheel by its harmonics at time 0.
+    A damped line is represented by `per_line` quantiles of its power, a wheel by its harmonics at time 0.
     """
     frequency_hz, variance_nm2 = [disturbance.frequency_hz], [np.abs(disturbance.amplitude_nm) ** 2 / 2]
     quantiles = (np.arange(per_line) + 0.5) / per_line
@@ -345,7 +345,7 @@ def _thermal_nm(noll: tuple[int, ...]) -> Array:
 
 
 def _drift(rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]) -> tuple[Array, Complex]:
-    """Sine waves, even in log(frequency), with power per hertz falling as 1/f^2; `rms_nm` (modes,) is of their sum."""
+    """Sine waves, even in log(frequency), with power per hertz falling as 1/f^2; rms `rms_nm` (modes,) of their sum."""
     frequencies = np.geomspace(*band_hz, _WAVES_PER_BAND) * rng.uniform(0.95, 1.05, _WAVES_PER_BAND)
     weights = frequencies**-0.5
     weights *= np.sqrt(2 / np.sum(weights**2))

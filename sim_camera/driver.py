@@ -79,7 +79,7 @@ def disturbance_of(config: Configuration) -> Disturbance:
 
 
 def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scene:
-    """The scene of a configuration, its twin from the cache; `disturbance` replaces the configured one if given."""
+    """Make the scene of a configuration, with a twin from the cache; `disturbance` replaces the configured one."""
     sensor = factory.sensor(config, lambda _: None)  # `lowfc sim-loop` prints the warnings of the optics
     optics, detector, camera = factory.twin(config, None, lambda _: None), factory.detector(config), config.camera
     disturbance = disturbance_of(config) if disturbance is None else disturbance
@@ -108,7 +108,7 @@ def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scen
 
 
 def _centred_region(name: str, size: int, available: int) -> tuple[int, int]:
-    """First row (or column) of the centred readout region, and their number; the whole sensor for size 0."""
+    """First row (or column) of the centred readout region, and its number of rows (columns); all for size 0."""
     if size > available:
         raise ConfigurationError(f"options of the simulated camera: {name} is {size}, the sensor has {available}")
     return ((available - size) // 2, size) if size else (0, available)
@@ -346,7 +346,8 @@ class SimulatedCamera:
     def _moment(self, publish_time_ns: int) -> float:
         """Time at which the mirror reached a shape, in periods.
 
-        In lockstep and with a fractional delay, whose shape moves during an exposure: the start of the next exposure.
+        In lockstep, or with a fractional delay, for which the shape moves during an exposure, this is the start of the
+        next exposure.
         """
         index, start_ns = self._exposed.frame, self._exposed.start_ns
         if self._service.clock.lockstep or index < 0 or self._config.camera.delay_frames % 1:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 Frame = npt.NDArray[np.uint16]
 
-MAX_FRAMES_LATE = 50
+MAX_FRAMES_LATE = 50  # largest lateness of a frame, in frames
 LOST_SHARE = 0.1  # fraction of the frames that is lost
 HOT_SHARE = 0.1  # fraction of the pixels that is hot
 COSMIC_SHARE = 0.2  # fraction of the frames with a cosmic-ray track
@@ -96,7 +96,7 @@ class Fault:
         return frame
 
     def payload(self, index: int, message: bytes, image_end: int) -> bytes:
-        """The bytes published in place of a frame's message, whose image ends at `image_end`."""
+        """The bytes published in place of a frame's message, whose image ends at byte `image_end`."""
         rng = self.random(index)
         match self.kind_at(index):
             case Kind.TRUNCATED:
@@ -106,7 +106,7 @@ class Fault:
         return message
 
 
-@lru_cache(maxsize=2 * MAX_FRAMES_LATE)  # each exposure asks for all frames that may still be due
+@lru_cache(maxsize=2 * MAX_FRAMES_LATE)  # called at each exposure for all frames that may still be due
 def _exposures(fault: Fault, frame: int) -> tuple[int, ...]:
     """Indices of the exposures at whose end a frame is published."""
     match fault.kind_at(frame):

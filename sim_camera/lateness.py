@@ -13,7 +13,7 @@ class Lateness:
 
     Attributes:
         total: late commands since the start.
-        habitual: set when more than a quarter of the window was late, until an eighth or less is.
+        habitual: becomes true when more than a quarter of the window is late, false when an eighth or less is.
     """
 
     def __init__(self) -> None:

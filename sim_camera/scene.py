@@ -1,7 +1,7 @@
 """The simulated optics: compute frame and true wavefront from the mirror's shape and the disturbance.
 
-Time is continuous: the star moves while the mirror holds. An image is the mean over its exposure. The true wavefront
-is given at the start of the exposure, and as the root mean square over the period.
+Time is continuous: the star moves while the mirror holds its shape. An image is the mean over its exposure. The true
+wavefront is given at the start of the exposure, and as the root mean square over the period.
 """
 
 from collections import deque
@@ -25,8 +25,8 @@ GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 MAX_TRUTHS = 10
 """Largest number of frames for which the truth is computed together."""
 _MAX_NODES = 256
-"""Largest number of nodes, which bounds the time to compute them and a frame; reached by the presets below 1 Hz, and
-by fast wheels at higher frame rates."""
+"""Largest number of nodes, which bounds the time to compute them and a frame. The presets reach it at frame rates below
+1 Hz, fast wheels also at higher frame rates."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,8 +232,8 @@ class Scene:
     def _mean_squares_nm2(self, disturbance_nm: Single, shapes_nm: list[Single], weights: Single) -> Array:
         """Mean squares (2, frames, times) over the open pupil, piston removed: without the mirror, and with it.
 
-        They are quadratic forms of the integrated products of modes, screen and shapes. In double precision, as the
-        mirror cancels most of the disturbance.
+        They are quadratic forms of the integrated products of modes, screen and shapes, computed in double precision,
+        as the mirror cancels most of the disturbance.
 
         Args:
             disturbance_nm: (frames, times, modes) modes without the screen's.

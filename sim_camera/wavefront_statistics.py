@@ -11,7 +11,7 @@ from lowfc.optics.chain.added_contrast import by_group, costliest
 from sim_camera.scene import Truth, Wavefront
 
 MAX_BLOCKS = 1024
-"""Blocks stored, at first of one frame each. When all are full, pairs are merged: memory does not grow with the run.
+"""Number of stored blocks, at first of one frame each. When all are full, pairs are merged, so that memory is bounded.
 
 The second half of the run begins at the border of a block.
 """

@@ -7,7 +7,7 @@ import numpy as np
 from lowfc.arrays import Array, Complex
 
 ORDERS = (1.0, 2.0, 2.9, 4.4, 5.4)
-"""Frequencies of the harmonics, as multiples of the wheel's speed; bearing harmonics are not integers."""
+"""Frequencies of the harmonics, as multiples of the wheel's speed; those of the bearings are not integers."""
 HEIGHTS = (1.0, 0.5, 0.3, 0.2, 0.15)
 """Amplitudes of the harmonics, relative to the first."""
 SOFT_HZ = 5.0

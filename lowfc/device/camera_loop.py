@@ -19,7 +19,7 @@ PATIENCE_S = 1.0
 REST_NS = 100_000_000
 """Longest sleep between two heartbeats of the process (`beat`) while a failed driver is not called."""
 AHEAD_NS = 5_000_000
-"""Largest time by which the end of an exposure may be ahead of its clock."""
+"""Largest time by which the stated end of an exposure may be ahead of the present time of its clock."""
 MAX_LOST_FRAMES, MAX_RATE_RATIO = 100, 4
 """Largest plausible step of frame numbers: MAX_LOST_FRAMES + MAX_RATE_RATIO x periods since the last frame. A
 larger step is a restart."""
@@ -171,7 +171,7 @@ class CameraLoop:
             self._lost += lost
 
     def _report_lost(self) -> None:
-        """Report lost frames, one event per half second."""
+        """Report lost frames in an event, at most one per half second."""
         now_ns = self._service.clock.host_ns()
         if self._lost and now_ns >= self._lost_due_ns:
             self._service.event("FRAMES_LOST", count=self._lost)
@@ -183,7 +183,8 @@ class CameraLoop:
         if not isinstance(settings, CameraSettings):
             raise TypeError(f"settings() returned {type(settings).__name__}, expected CameraSettings")
         time_ns = self._service.clock.now_ns() if settings.time_ns is None else settings.time_ns
-        step_ns = min(int(settings.period_ns), SETTINGS_NS, time_ns - self._settings_asked_ns)  # until the next call
+        # Estimated time until the next call.
+        step_ns = min(int(settings.period_ns), SETTINGS_NS, time_ns - self._settings_asked_ns)
         self._settings_asked_ns = time_ns
         if settings != self._settings or time_ns + step_ns // 2 >= self._settings_due_ns:
             self._states.put(camera_state(settings, time_ns).SerializeToString())

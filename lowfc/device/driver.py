@@ -190,7 +190,7 @@ class CameraExtras:
         """Called when a frame has been published, with its envelope."""
 
     def step(self) -> None:
-        """Called after each frame in lockstep: wait until the mirror has applied its command."""
+        """Called after each frame in lockstep: wait until the mirror has applied the frame's command."""
 
     def through(self, publisher: Publisher) -> Puts:
         """Replace the publisher of frames, for example in fault tests."""
@@ -266,7 +266,7 @@ class MirrorExtras:
         """Read back the shape (rows, columns), nm of surface; called at the start and after a fault.
 
         Without this method, or if it returns None, the mirror is driven to flat at the start; after a fault its last
-        commanded shape is taken as its position.
+        commanded shape is assumed as its position.
         """
         return None
 
@@ -277,8 +277,9 @@ class MirrorExtras:
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
         """Called instead of `apply`, for simulated mirrors; also called repeatedly without a new command.
 
-        Return the positions reached. `actuators_nm` is the shape to approach, (rows, columns) nm of surface;
-        `elapsed_ns` the run's time since the previous command or, without a new one, the last call; infinite at first.
+        Return the positions reached. `actuators_nm` is the shape to approach, (rows, columns) nm of surface.
+        `elapsed_ns` is the run's time since the previous command or, without a new one, since the last call; infinite
+        at first.
         """
         raise NotImplementedError
 

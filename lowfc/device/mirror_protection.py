@@ -41,7 +41,7 @@ class MirrorProtection:
     flatten: bool
 
     @cached_property
-    def tighter(self) -> Limits:
+    def tightened_limits(self) -> Limits:
         """Limits tightened by one driver step, so that rounding cannot exceed the real limits."""
         limits, step = self.limits, self.step_nm
         return Limits(limits.stroke_nm - step, limits.slew_nm - step, limits.neighbour_nm - step)
@@ -150,12 +150,12 @@ def apply_command(
 def _limited(protection: MirrorProtection, previous_nm: Single, target_nm: Single, others_nm: Single | None) -> Limited:
     """Limit the command so that its sum with other programs' shape exceeds the stroke no more than that shape alone."""
     if others_nm is None or not others_nm.any() or not finite(target_nm):
-        return limit(protection.tighter, previous_nm, target_nm)
-    stroke_nm = np.float32(protection.tighter.kept_stroke_nm)
-    room_nm = np.clip(target_nm, np.minimum(-stroke_nm - others_nm, 0), np.maximum(stroke_nm - others_nm, 0))
-    limited = limit(protection.tighter, previous_nm, room_nm)
-    clipped = Limit.STROKE not in limited.reasons and not np.array_equal(room_nm, target_nm)
-    return limited._replace(reasons=(Limit.STROKE, *limited.reasons)) if clipped else limited
+        return limit(protection.tightened_limits, previous_nm, target_nm)
+    stroke_nm = np.float32(protection.tightened_limits.kept_stroke_nm)
+    clipped_nm = np.clip(target_nm, np.minimum(-stroke_nm - others_nm, 0), np.maximum(stroke_nm - others_nm, 0))
+    limited = limit(protection.tightened_limits, previous_nm, clipped_nm)
+    add_reason = Limit.STROKE not in limited.reasons and not np.array_equal(clipped_nm, target_nm)
+    return limited._replace(reasons=(Limit.STROKE, *limited.reasons)) if add_reason else limited
 
 
 def tick(protection: MirrorProtection, status: Status, now_ns: int, move: Move) -> Status:
@@ -163,7 +163,7 @@ def tick(protection: MirrorProtection, status: Status, now_ns: int, move: Move) 
     if status.following and expired(now_ns - status.received_ns, status.valid_for_ns):
         status = status._replace(following=False, channels={})
     if not status.following and protection.flatten and status.driven_nm.any():
-        flat = limit(protection.tighter, status.driven_nm, np.zeros(protection.grid, np.float32)).actuators_nm
+        flat = limit(protection.tightened_limits, status.driven_nm, np.zeros(protection.grid, np.float32)).actuators_nm
         status = status._replace(driven_nm=flat, limits_hit=(), command_nm=_NONE, channels={})
     has_time = status.time_ns and status.time_ns - now_ns < AHEAD_NS
     time_ns = max(now_ns, status.time_ns) if has_time else now_ns

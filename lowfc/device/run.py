@@ -137,7 +137,7 @@ def run_mirror(driver: Mirror, config: Configuration, run: str) -> None:
     Raises:
         BusError: the run has this mirror already.
         DataFileError: as in `run_camera`.
-        ConfigurationError: the driver's grid or limits do not fit [mirror], or it cannot be started.
+        ConfigurationError: the driver's grid or limits do not fit [mirror], or the driver cannot be started.
         LowfcError: the driver reported a fault that a user has to correct.
     """
     with closed_on_fault(driver.close):

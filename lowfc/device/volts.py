@@ -30,7 +30,7 @@ class VoltOptions(DriverOptions):
 
 
 class VoltMap:
-    """Converts a surface to channel values and back, linearly; `channels` includes channels without an actuator."""
+    """Converts a surface to channel values and back, linearly; `channels` is the number of channels, wired or not."""
 
     def __init__(self, options: VoltOptions, config: Configuration, channels: int | None = None) -> None:
         """Read the maps; `channels` is the number of channels of the electronics, if known.

@@ -138,7 +138,7 @@ class DriverWatch:
             self._report(fault)
 
     def fill(self, fill: Callable[[wire.Health], None], health: wire.Health) -> None:
-        """Add the number of failures and the driver's fields to a Health; once the driver is closed, the last ones."""
+        """Add the number of failures and the driver's fields to a Health; once it is closed, its last fields."""
         health.driver_failures = self.failures
         if not self._closed.is_set():
             self._fields.Clear()
@@ -163,7 +163,7 @@ class DriverWatch:
             self._service.event("DRIVER_FAILED", why=self.why)
 
     def check(self) -> None:
-        """Report a call that lasts too many checks. Checks are counted because the host may have stopped for a time."""
+        """Report a call that lasts too many checks: they are counted, not timed, as the host may have stood still."""
         with self._ending:
             if not self._in_call or self._calls != self._checked_call:
                 self._checked_call, self._checks = self._calls, 0

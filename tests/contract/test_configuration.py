@@ -40,7 +40,7 @@ def test_the_limits_of_the_mirror_are_by_default_wider_than_those_of_the_control
     assert config == Configuration()
     protection = protection_of(SimulatedMirror(DriverOptions(), config), config)
     for name in ("stroke_nm", "slew_nm", "neighbour_nm"):
-        assert getattr(protection.tighter, name) > getattr(config.safety, name), name
+        assert getattr(protection.tightened_limits, name) > getattr(config.safety, name), name
 
 
 def test_every_key_has_a_description() -> None:

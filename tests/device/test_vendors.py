@@ -135,7 +135,7 @@ def test_a_disconnected_camera_is_opened_again(kind: Any) -> None:
     driver._pylon, driver.start = SimpleNamespace(TimeoutHandling_Return=1), lambda: opened.append("started")
     driver._open, driver._serial, driver._name, driver._stream = open_at_the_third_attempt, "7", "7", Buffers()
     if kind is AravisCamera:
-        driver._lose(None)  # the library's signal
+        driver._mark_lost(None)  # the library's signal
     for _ in range(2):
         with pytest.raises(OSError, match="no such device"):
             driver.expose()

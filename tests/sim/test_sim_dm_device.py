@@ -316,7 +316,7 @@ def test_apply_command_does_not_modify_its_arguments() -> None:
 
 def test_driver_step_too_coarse_for_the_slew_limit_is_refused() -> None:
     with pytest.raises(ValueError, match="slew_nm"):
-        _ = MirrorProtection(GRID, Limits(750.0, 5.0, 500.0), 1500 / 2**8, flatten=True).tighter
+        _ = MirrorProtection(GRID, Limits(750.0, 5.0, 500.0), 1500 / 2**8, flatten=True).tightened_limits
 
 
 def test_the_configuration_gives_the_mirrors_limits_and_faulty_actuators() -> None:

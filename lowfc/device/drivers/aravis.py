@@ -92,7 +92,7 @@ class AravisCamera:
     def _open(self, name: str) -> None:
         self._camera = camera = self._aravis.Camera.new(name or None)
         self._name, self._lost = name or camera.get_device_id(), False  # before `connect`: the signal may come at once
-        camera.get_device().connect("control-lost", self._lose)
+        camera.get_device().connect("control-lost", self._mark_lost)
         self._configure(self._options)
         self._stream = camera.create_stream(None, None)
         if camera.is_gv_device():  # a resent packet would arrive too late
@@ -100,7 +100,7 @@ class AravisCamera:
         for _ in range(_BUFFERS):
             self._stream.push_buffer(self._aravis.Buffer.new_allocate(camera.get_payload()))
 
-    def _lose(self, device: Any) -> None:
+    def _mark_lost(self, device: Any) -> None:
         self._lost = True
 
     def _configure(self, options: GenicamOptions) -> None:
