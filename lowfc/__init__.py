@@ -2,10 +2,10 @@
 
 Names for your own programs, each imported on first use:
 
-- `Client`, `running`: connection to a running loop; names of the user's runs on this host
-- `Configuration`, `load_configuration`: configuration; load it from a file
-- `Calibration`, `load_calibration`: calibration; load it from a file
-- `LogReader`, `read_history`: read a log; read all of its steps as columns
+- `Client`: connection to a running loop; `running`: names of the user's runs on this host
+- `Configuration`: all settings; `load_configuration`: read them from a file
+- `Calibration`: matrices of a calibration; `load_calibration`: read them from a file
+- `LogReader`: reader of a log's messages; `read_history`: read all steps of a log as columns
 """
 
 from importlib import import_module

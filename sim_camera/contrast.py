@@ -34,7 +34,7 @@ class Contrast:
     def measure(self) -> dict[str, float]:
         """Means at up to `IMAGES` instants of the run's second half, by field of `WavefrontFigures`.
 
-        The contrast added with a flat mirror and by the residual, and the coronagraph's own, are from full images;
+        The contrasts added with a flat mirror and by the residual, and the coronagraph's own, are from full images;
         `quadratic_added_contrast` is from the quadratic form. Empty before the first frame.
         """
         half = self._kept[len(self._kept) // 2 :]

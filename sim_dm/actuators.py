@@ -1,4 +1,4 @@
-"""Response of actuators to a command: gain errors, hysteresis and creep, which have memory."""
+"""Response of actuators to a command: gain errors, and the memory effects hysteresis and creep."""
 
 import numpy as np
 
@@ -34,13 +34,13 @@ class Actuators:
 
     def reach(self, driven_nm: Single, elapsed_ns: float) -> Single:
         """Positions reached (rows, columns) after this command has been applied for `elapsed_ns`."""
-        wanted_nm: Array = driven_nm * self._gain
+        position_nm: Array = driven_nm * self._gain
         if self._hysteresis:
             width_nm = np.array(PLAY_NM)[:, None, None]
-            self._plays_nm = np.clip(self._plays_nm, wanted_nm - width_nm, wanted_nm + width_nm)
-            wanted_nm = wanted_nm + self._hysteresis * (self._plays_nm.mean(axis=0) - wanted_nm)
+            self._plays_nm = np.clip(self._plays_nm, position_nm - width_nm, position_nm + width_nm)
+            position_nm = position_nm + self._hysteresis * (self._plays_nm.mean(axis=0) - position_nm)
         if self._creep:
             remaining = np.exp(-max(elapsed_ns, 0) / (1e9 * np.array(CREEP_S)))[:, None, None]
-            self._crept_nm = wanted_nm + remaining * (self._crept_nm - wanted_nm)
-            wanted_nm = wanted_nm + self._creep * self._crept_nm.sum(axis=0)
-        return wanted_nm.astype(np.float32)
+            self._crept_nm = position_nm + remaining * (self._crept_nm - position_nm)
+            position_nm = position_nm + self._creep * self._crept_nm.sum(axis=0)
+        return position_nm.astype(np.float32)

@@ -68,7 +68,7 @@ LARGE_BYTES = 100_000
 """Size of a request above which the longer timeout applies."""
 
 
-def _plain(name: str) -> Callable[["Client"], Answer]:
+def _request_method(name: str) -> Callable[["Client"], Answer]:
     """Make the method of a request without fields, with its declared description as docstring."""
 
     def ask(client: "Client") -> Answer:
@@ -124,14 +124,14 @@ class Client:
             self._own_bus.close()
             self._bench.clear()  # a new publisher on the closed bus raises BusError, an old one would raise zenoh's
 
-    status = _plain("status")
-    open_loop = _plain("open")
-    close_loop = _plain("close")
-    pause = _plain("pause")
-    safe = _plain("safe")
-    clear = _plain("clear")
-    reset = _plain("reset")
-    stop = _plain("stop")
+    status = _request_method("status")
+    open_loop = _request_method("open")
+    close_loop = _request_method("close")
+    pause = _request_method("pause")
+    safe = _request_method("safe")
+    clear = _request_method("clear")
+    reset = _request_method("reset")
+    stop = _request_method("stop")
 
     def gain(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
         """Set integrator gains: one value, or one for each of `modes` (a Noll index or several, all when empty)."""

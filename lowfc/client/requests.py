@@ -44,8 +44,8 @@ DECLARED: tuple[Declaration, ...] = (
     _declared("close", "Close the loop: the control law drives the mirror.", "close"),
     _declared(
         "pause",
-        "Open a closed loop; closing it resumes from the held command. It is reported as paused, unless the holder of "
-        "a reservation sent the request.",
+        "Open a closed loop; closing it resumes from the held command. The loop is reported as paused, unless the "
+        "holder of a reservation sent the request.",
         "pause",
     ),
     _declared(

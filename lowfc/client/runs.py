@@ -16,7 +16,7 @@ def running() -> list[str]:
 
 
 def the_run(name: str | None) -> str:
-    """Find a run by its name or a unique prefix, or the only run if `name` is None; it may be without a controller.
+    """Find a run by its name or a unique prefix, or the only run if `name` is None; the run may have no controller.
 
     Raises:
         BusError: no run has that name; the run or its router is stopped; or, for None, there is no run or several.

@@ -36,7 +36,7 @@ class Section(BaseModel):
 
 
 def _docstrings(section: type[Section]) -> Iterator[tuple[str, str]]:
-    """Keys of a class, with the docstrings below them; none for a class without source, as if made at run time."""
+    """Keys of a class, with the docstrings below them; none for a class that has no source (made at run time)."""
     try:
         source = inspect.getsource(section)
     except (OSError, TypeError):

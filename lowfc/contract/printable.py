@@ -22,5 +22,5 @@ def printable(text: str, keep: str = "") -> str:
 
 
 def encodable(text: str) -> str:
-    """Text whose bytes that are not UTF-8 (of a file name) have become escapes: messages and logs are UTF-8."""
+    """Text in which bytes that are not UTF-8, as in a file name, have become escapes: messages and logs are UTF-8."""
     return text.encode(errors="backslashreplace").decode()

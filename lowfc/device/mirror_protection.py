@@ -111,7 +111,7 @@ def apply_command(
     move: Move,
     others_nm: Single | None = None,
 ) -> tuple[Status, Reason | None]:
-    """Apply a command received at `now_ns`; return the new status and None, or the former one and why it was refused.
+    """Apply a command received at `now_ns`; return the new status and None, or the former status and the refusal.
 
     `others_nm` (rows, columns) is the shape of other programs on the mirror; it uses part of the stroke.
     """

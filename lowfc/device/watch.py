@@ -138,7 +138,7 @@ class DriverWatch:
             self._report(fault)
 
     def fill(self, fill: Callable[[wire.Health], None], health: wire.Health) -> None:
-        """Add the number of failures and the driver's fields to a Health; once it is closed, its last fields."""
+        """Add the number of failures and the driver's fields to a Health; after `close`, the driver's last fields."""
         health.driver_failures = self.failures
         if not self._closed.is_set():
             self._fields.Clear()

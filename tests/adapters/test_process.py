@@ -302,7 +302,8 @@ def test_zenohs_errors_are_shown_without_source_locations() -> None:
     )
     assert cause_of(zenoh.ZError(text)) == "127.0.0.1:4: Address already in use (os error 98)"
     assert cause_of(zenoh.ZError(text.replace("127.0.0.1", "[::1]"))) == "[::1]:4: Address already in use (os error 98)"
-    assert cause_of(zenoh.ZError("invalid configuration at zenoh/src/api/session.rs:12.\nmore")) == "invalid configuration"
+    two_lines = zenoh.ZError("invalid configuration at zenoh/src/api/session.rs:12.\nmore")
+    assert cause_of(two_lines) == "invalid configuration"
     timeout = "Unable to connect to any of [Single(tcp/127.0.0.1:99)]. Timeout!"
     assert cause_of(zenoh.ZError(f"{timeout} at /root/zenoh/orchestrator.rs:388.")) == timeout
     for unchanged in ("no peer among [tcp/127.0.0.1:99]", "an invalid key: [a/**b] cannot be used"):

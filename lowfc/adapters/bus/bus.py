@@ -32,7 +32,7 @@ class Sample(NamedTuple):
         payload: protobuf bytes.
         sequence: sequence as in `Envelope`.
         publish_time_ns: time at which the publisher sent it, host clock.
-        receive_time_ns: time at which a receive thread got it, or its ring was drained; host clock.
+        receive_time_ns: time at which a receive thread got it, or at which its ring was drained; host clock.
     """
 
     key: str
@@ -73,7 +73,7 @@ class Publisher(Protocol):
     handed_ns: int
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
-        """Send `payload`, by default with the present time and the next sequence; this may wait for slow readers.
+        """Send `payload`, by default with the present time and the next sequence; the call may wait for slow readers.
 
         A caller that sets sequences (a replay sets those of the log) must set them in every call.
         """
@@ -152,7 +152,7 @@ class Faults:
         self._lock = threading.Lock()
 
     def add(self, place: str, key: str, fault: Exception) -> None:
-        """Count a fault at `place` and `key`, such as "camera: handler of" "lowfc/frame", or an unreadable message."""
+        """Count an unreadable message, or another fault at a place such as "camera: handler of" and a topic's key."""
         if isinstance(fault, UNREADABLE):
             self.add_unreadable(key, fault)
             return

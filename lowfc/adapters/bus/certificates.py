@@ -82,6 +82,7 @@ def make_certificates(
 
 
 def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]:
+    """Key and certificate of the authority, made if neither exists."""
     certificate_file, key_file = folder / CA, folder / CA_KEY
     missing = [file.name for file in (certificate_file, key_file) if not file.exists()]
     if len(missing) == 2:

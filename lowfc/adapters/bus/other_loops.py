@@ -36,7 +36,7 @@ def no_loop_message() -> str:
 def other_loops() -> Iterator[tuple[str, bool]]:
     """Yield a sentence and a flag for each simulated loop and each separate controller on this host, of any user.
 
-    The flag is set for a young process of this user with this runtime directory: as no run was found there, the loop is
+    The flag is set for a young process of this user with our runtime directory: as no run was found there, the loop is
     starting or ending.
     """
     for process in psutil.process_iter():

@@ -1,8 +1,7 @@
 """The bus between processes: zenoh peers over loopback TCP, each connected to all roles of its run that listen.
 
-Monitors connect by Unix socket and get `latest_only` topics at a lower rate. Across hosts, every process connects to a
-router.
-`zenoh_session` and `routed` explain each setting.
+Monitors connect by Unix socket and get `latest_only` topics at a lower rate. In a run on several hosts, every process
+connects to the router instead. `zenoh_session` and `routed` explain each setting.
 """
 
 import contextlib
@@ -79,7 +78,7 @@ class ZenohPublisher:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
-        """Send `payload`; a slow reader delays this by at most 1 ms, then loses the message; in lockstep put waits."""
+        """Send `payload`; wait at most 1 ms for a slow reader, which then loses the message; in lockstep, wait on."""
         envelope = Envelope(
             sequence_of(self._bus.start_s, self.published) if sequence is None else sequence,
             self._host_ns() if publish_time_ns is None else publish_time_ns,
@@ -113,7 +112,7 @@ class ZenohRing:
     def __init__(self, bus: "ZenohBus", subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]") -> None:
         self._bus, self._subscriber = bus, subscriber
         self._expression = str(subscriber.key_expr)
-        self._key = _known_key(self._expression)
+        self._key = _single_key(self._expression)
 
     def drain(self) -> list[Sample]:
         """See `Ring.drain`."""
@@ -242,13 +241,13 @@ class ZenohBus:
 
     def _subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str) -> Callable[[], None]:
         key, host_ns, faults, read = topic.at(name), self.clock.host_ns, self.faults, self.read
-        known_key = _known_key(key)
+        single_key = _single_key(key)
 
         def received(sample: zenoh.Sample) -> None:
             now_ns = host_ns()
             keep_thread_state()
             try:
-                handler(read(sample, now_ns, known_key))
+                handler(read(sample, now_ns, single_key))
             except Exception as fault:  # zenoh would only print it; count it here
                 faults.add(f"{self.role}: handler of", key, fault)
 
@@ -374,7 +373,7 @@ def _reader(topic: Topic, name: str) -> str | None:
     return mirror_role(name) if topic.direct_subscriber is Role.MIRROR else topic.direct_subscriber
 
 
-def _known_key(expression: str) -> str | None:
+def _single_key(expression: str) -> str | None:
     """Key of an expression without wildcard, otherwise None."""
     return None if ALL in expression else expression
 

@@ -30,7 +30,7 @@ _DATA = resources.files("lowfc") / "data"
 _MAX_BYTES = 1 << 30
 PUPIL_IMAGE_PIXELS = 40  # across the image of a Zernike sensor
 _MAX_PROLATE_RADIUS = 7.0  # lambda / D; beyond, double precision mixes the prolate function with the next orders
-_WITH_LYOT_STOP = ("circle", "prolate")
+_PUPILS_WITH_LYOT_STOP = ("circle", "prolate")
 _LYOT_OUTER = 12.0
 """Outer radius of the annular dark zone with a Lyot stop, lambda / D; the inner radius is the mask's edge."""
 _log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
         file: An npz file whose array `quarter` is the quadrant x >= 0, y >= 0.
 
     Raises:
-        DataFileError: The file is missing, damaged, or holds no such quadrant or one that transmits beyond the circle.
+        DataFileError: The file is missing or damaged, holds no quadrant, or one that transmits beyond the circle.
         ConfigurationError: `samples` is not such a multiple.
     """
     with _opened(file) as arrays:
@@ -150,7 +150,7 @@ def coronagraph_from(section: SensorSection) -> Coronagraph:
         DataFileError: The pupil's file is missing or damaged.
     """
     pupil = _pupil(section)
-    if section.pupil not in _WITH_LYOT_STOP:
+    if section.pupil not in _PUPILS_WITH_LYOT_STOP:
         return Coronagraph(
             pupil, DARK_ZONE if section.pupil == "shaped" else load_dark_zone(input_file.user_path(section.pupil))
         )

@@ -44,7 +44,7 @@ class StreamAbsentError(StreamError):
 
 
 def stream_path(name: str) -> Path:
-    """File of a stream in the first existing of $MILK_SHM_DIR, /milk/shm and /tmp; StreamError for an invalid name."""
+    """File of a stream, in the first existing folder: $MILK_SHM_DIR, /milk/shm or /tmp; StreamError for a bad name."""
     if not name.isprintable() or "/" in name or not 0 < len(name.encode()) <= _MAX_NAME_BYTES:
         limit = f"1 to {_MAX_NAME_BYTES} bytes without '/', all printable"
         raise StreamError(f"a stream's name has {limit}; got {name!r}")

@@ -67,7 +67,7 @@ class Truths:
         time_ns: time of the frame, ns since the epoch.
         disturbance_nm: (frames, modes) disturbance at the start of the exposure.
         residual_nm: (frames, modes) residual at the start of the exposure.
-        sensed_nm: (frames, modes) mean of the residual over the exposure, as sensed.
+        sensed_nm: (frames, modes) mean of the residual over the exposure, as the sensor sees it.
         modes_disturbance_rms_nm: (frames, modes) rms of the disturbance over the period.
         modes_residual_rms_nm: (frames, modes) rms of the residual over the period.
         disturbance_rms_nm: rms of the disturbance over the open pupil and the period.

@@ -188,7 +188,7 @@ class History:
 
     @cached_property
     def true(self) -> Truths | None:
-        """Truths joined to the steps, NaN for steps without one; None without any truth."""
+        """Truths joined to the steps, NaN for steps without truth; None if no step has truth."""
         rows = rows_of(self.steps.sequence, self.truths.sequence)
         if not (rows >= 0).any():
             return None

@@ -144,7 +144,7 @@ class LossAccount:
         return +self._sum(lambda tally: tally.lost)
 
     def newly_lost(self) -> dict[str, int]:
-        """Number of messages lost since the last call, by key; one that arrives late after all offsets a later loss."""
+        """Messages lost since the last call, by key; a counted one that arrives after all offsets a later loss."""
         lost = +self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():
             tally.reported = max(tally.reported, tally.confirmed)

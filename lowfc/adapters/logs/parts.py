@@ -122,8 +122,8 @@ class WholeLog(LogReader):
 def named_logs(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Parts]:
     """Logs named on a command line, each with all of its named files.
 
-    `last` is the newest log in the default folder, with all files of its recording, FOLDER/last the newest log in
-    another folder; an existing file of that name has precedence.
+    `last` is the newest log in the default folder, with all files of its recording; FOLDER/last is the newest log in
+    another folder. An existing file named `last` has precedence.
 
     Args:
         names: names on the command line.

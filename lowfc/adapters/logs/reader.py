@@ -36,7 +36,7 @@ class LogReader:
         channels: channels declared so far, by key and start of the publisher.
         damage: damaged stretches that were left out.
         unreadable: number of messages left out because their declaration was damaged.
-        finished: whether the log ends as a finished one; False during recording, or if its recorder died.
+        finished: whether the log has the end of a finished log; False during recording, or if its recorder died.
         complete: whether the end was reached with a valid summary; False while reading.
         progress: function called with the progress of reading, see `__init__`.
     """

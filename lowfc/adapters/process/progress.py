@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, ProgressColumn, TaskID, TextColumn, TimeRemainingColumn
 
 ProgressCallback = Callable[[str, int, int], None]
-"""Progress callback: description of the work, amount done, total amount."""
+"""Function called with the description of the work, the amount done and the total amount."""
 _EVERY_S = 10.0
 
 
