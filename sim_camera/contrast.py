@@ -15,15 +15,15 @@ class Contrast:
     def __init__(self, modal: ModalContrast) -> None:
         """Start without instants."""
         self._modal, self._form = modal, modal.form.astype(np.float32)
-        self._kept: list[tuple[Single, Single]] = []
+        self._instants: list[tuple[Single, Single]] = []
         self._stride, self._frames = 1, 0
 
     def add(self, disturbance_nm: Single, residual_nm: Single) -> None:
         """Add the modes (modes,) at one instant of the next frame."""
         if self._frames % self._stride == 0:
-            self._kept.append((disturbance_nm, residual_nm))
-            if len(self._kept) == 4 * IMAGES:
-                self._kept, self._stride = self._kept[::2], 2 * self._stride
+            self._instants.append((disturbance_nm, residual_nm))
+            if len(self._instants) == 4 * IMAGES:
+                self._instants, self._stride = self._instants[::2], 2 * self._stride
         self._frames += 1
 
     def quadratic(self, modes_nm: Single) -> Single:
@@ -37,7 +37,7 @@ class Contrast:
         The contrasts added with a flat mirror and by the residual, and the coronagraph's own, are from full images;
         `quadratic_added_contrast` is from the quadratic form. Empty before the first frame.
         """
-        half = self._kept[len(self._kept) // 2 :]
+        half = self._instants[len(self._instants) // 2 :]
         instants = [half[int(place)] for place in np.linspace(0, len(half) - 1, min(IMAGES, len(half)))]
         if not instants:
             return {}

@@ -190,7 +190,7 @@ class Scene:
             sensed_nm = image_nm - modes[:, 0] + both_nm[1, :, 0]
             modes_rms_nm = np.sqrt(np.square(both_nm[:, :, 1:]).mean(axis=2))
             pupil_rms_nm = np.sqrt(mean_squares_nm2[:, :, 1:].mean(axis=2)).T.tolist()
-        found = []
+        truths = []
         for row, (index, *_) in enumerate(frames):
             sampled = Wavefront(*both_nm[:, row, 0], *start_rms_nm[row])
             continuous, sensed, at_nm = None, sampled.residual_nm, both_nm[:, row]
@@ -198,15 +198,15 @@ class Scene:
                 continuous = Wavefront(*modes_rms_nm[:, row], *pupil_rms_nm[row])
                 sensed, at_nm = sensed_nm[row], at_nm[:, 1:]
             speeds = speeds_hz(self._disturbance, index / self._rate_hz)
-            found.append(Truth(sampled, continuous, sensed, at_nm, speeds, self._shear(index)))
-        return found
+            truths.append(Truth(sampled, continuous, sensed, at_nm, speeds, self._shear(index)))
+        return truths
 
     def _weighted_shapes(
         self, frames: Sequence[tuple[int, Single, MirrorMotion | None]]
     ) -> tuple[list[Single], Single]:
         """The shapes (rows, columns) of the mirror in these frames, and weights (frames, times, shapes) of each."""
-        count, still = len(self.instants), np.ones((len(self.instants), 1), np.float32)
-        in_frames = [(actuators_nm, *(motion or ([actuators_nm], still))) for _, actuators_nm, motion in frames]
+        count, still_weights = len(self.instants), np.ones((len(self.instants), 1), np.float32)
+        in_frames = [(actuators_nm, *(motion or ([actuators_nm], still_weights))) for _, actuators_nm, motion in frames]
         shapes = {id(shape): shape for start, moved, _ in in_frames for shape in (start, *moved)}
         columns = {identity: column for column, identity in enumerate(shapes)}
         weights = np.zeros((len(frames), 1 + count, len(shapes)), np.float32)

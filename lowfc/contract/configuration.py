@@ -376,14 +376,14 @@ def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str
     return infos
 
 
-def _nearest(key: str, known: Sequence[str]) -> str:
+def _nearest(key: str, valid_keys: Sequence[str]) -> str:
     """Suffix of an error about an unknown key: the most similar known key of any section, or a remark on its quotes."""
-    if key in known:
+    if key in valid_keys:
         return "; write it without quotes, which make it one name"
-    by_name = {dotted.rpartition(".")[2]: dotted for dotted in reversed(known)}
+    by_name = {dotted.rpartition(".")[2]: dotted for dotted in reversed(valid_keys)}
     elsewhere = difflib.get_close_matches(key.rpartition(".")[2], by_name, 1, 0.75)
-    similar = difflib.get_close_matches(key, known, 1, 0.8)
-    close = similar or [by_name[name] for name in elsewhere] or difflib.get_close_matches(key, known, 1)
+    similar = difflib.get_close_matches(key, valid_keys, 1, 0.8)
+    close = similar or [by_name[name] for name in elsewhere] or difflib.get_close_matches(key, valid_keys, 1)
     return f"; the nearest known one is {close[0]!r}" if close else ""
 
 
@@ -393,8 +393,8 @@ def explain(detail: Any) -> str:
     if detail["type"] == "missing":
         return printable(f"{key[:_MAX_KEY_LENGTH]} is missing")
     if detail["type"] == "extra_forbidden":
-        known = [*keys(), *Configuration.model_fields, *keys(InterlockSection, "interlocks.")]
+        valid_keys = [*keys(), *Configuration.model_fields, *keys(InterlockSection, "interlocks.")]
         plain = ".".join(part for part in detail["loc"] if isinstance(part, str))
-        return f"unknown key {brief(key)}{_nearest(plain[:_MAX_KEY_LENGTH], known)}"
+        return f"unknown key {brief(key)}{_nearest(plain[:_MAX_KEY_LENGTH], valid_keys)}"
     message = reworded(detail["msg"])
     return printable(f"{key[:_MAX_KEY_LENGTH]} = {brief(detail['input'])}: {message[:300]}" if key else message)

@@ -43,12 +43,12 @@ def load(kind: Kind, name: str) -> Any:
             # also with `python -P`, whose search path has no current folder
             sys.path.insert(0, str(Path(module).resolve().parent if module.endswith(".py") else Path.cwd()))
             point = EntryPoint(name, f"{section(name)}:{attribute}", f"lowfc.{kind}s")
-        elif name in (known := installed(kind)):
-            point = known[name]
+        elif name in (drivers := installed(kind)):
+            point = drivers[name]
         else:
             raise ConfigurationError(
-                f"no driver of a {kind} is called {name!r}{nearest(name, known)}; there are "
-                f"{', '.join(sorted(known))}, or write module:Class or file.py:Class"
+                f"no driver of a {kind} is called {name!r}{nearest(name, drivers)}; there are "
+                f"{', '.join(sorted(drivers))}, or write module:Class or file.py:Class"
             )
         driver = point.load()
     missing = [method for method in METHODS[kind] if isinstance(driver, type) and not hasattr(driver, method)]
@@ -110,10 +110,10 @@ def table(config: Configuration, kind: Kind, name: str) -> dict[str, Any]:
     for other in {name, name.rpartition(":")[2]} - {expected}:
         if other in config.drivers:
             raise ConfigurationError(f"the options of {name} are in [drivers.{expected}], got [drivers.{other}]")
-    own = config.drivers.get(expected) or _nested(config.drivers, expected)
-    if own and set(own) <= set(KINDS) and all(isinstance(part, dict) for part in own.values()):
-        return dict(own.get(kind, {}))
-    return own
+    entries = config.drivers.get(expected) or _nested(config.drivers, expected)
+    if entries and set(entries) <= set(KINDS) and all(isinstance(part, dict) for part in entries.values()):
+        return dict(entries.get(kind, {}))
+    return entries
 
 
 def _nested(tables: dict[str, Any], name: str) -> dict[str, Any]:

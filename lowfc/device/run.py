@@ -33,9 +33,9 @@ def driver_command(kind: Kind, name: str | None = None) -> type[TyperCommand]:
 
         def format_options(self, ctx: Any, formatter: Any) -> None:
             super().format_options(ctx, formatter)
-            own = {option for parameter in self.params for option in parameter.opts}  # not passed on to the driver
+            accepted = {option for parameter in self.params for option in parameter.opts}  # not passed on to the driver
             rows = options_help(load(kind, self.driver)) if self.driver else []
-            rows = [row for row in rows if row[0].split()[0] not in own]
+            rows = [row for row in rows if row[0].split()[0] not in accepted]
             if rows:
                 with formatter.section(f"Options of the driver {self.driver}"):
                     formatter.write_dl(rows)

@@ -33,8 +33,8 @@ def described(fault: Exception | SystemExit) -> str:
         and not path.is_relative_to(_PROGRAMS)
         and "importlib" not in frame.filename
     ]
-    of_driver = [frame for frame in frames if frame.filename == frames[0].filename]
-    where = f" ({Path(of_driver[-1].filename).name}, line {of_driver[-1].lineno})" if of_driver else ""
+    driver_frames = [frame for frame in frames if frame.filename == frames[0].filename]
+    where = f" ({Path(driver_frames[-1].filename).name}, line {driver_frames[-1].lineno})" if driver_frames else ""
     try:
         text = str(fault)
     except Exception:  # as in a driver that returns a number from `__str__`

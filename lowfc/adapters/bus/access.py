@@ -76,10 +76,10 @@ def access_control(mirrors: Iterable[str]) -> dict[str, Any]:
     rules: list[dict[str, Any]] = []
     subjects, policies = [], []
     for role in roles(mirrors):
-        own = _rules(grant(role))
-        rules += own
+        role_rules = _rules(grant(role))
+        rules += role_rules
         subjects.append({"id": role, "cert_common_names": [role]})
-        policies.append({"subjects": [role], "rules": [rule["id"] for rule in own]})
+        policies.append({"subjects": [role], "rules": [rule["id"] for rule in role_rules]})
     return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies}
 
 

@@ -17,7 +17,7 @@ class Names:
     """The names received on each topic."""
 
     def __init__(self) -> None:
-        self._known: dict[str, set[str]] = {}
+        self._by_topic: dict[str, set[str]] = {}
 
     def admit(self, topic: Topic, key: str) -> str:
         """Name of the mirror or process in a key of this topic; empty for a topic without one.
@@ -25,15 +25,15 @@ class Names:
         BadMessageError if the name is too long, or is new although `MAX_NAMES` names are known already.
         """
         name = name_in(topic, key)
-        known = self._known.setdefault(topic.key, set())
-        if name in known:
+        names = self._by_topic.setdefault(topic.key, set())
+        if name in names:
             return name
         if len(name) > MAX_NAME_LENGTH:
             raise BadMessageError(f"a name has up to {MAX_NAME_LENGTH} characters, got {len(name)}: {name[:40]!r}...")
         if name not in _ROLES:
-            if len(known) >= MAX_NAMES:
+            if len(names) >= MAX_NAMES:
                 raise BadMessageError(f"{MAX_NAMES} names are known on this topic, and there is no room for {name!r}")
-            known.add(name)
+            names.add(name)
         return name
 
     def health(self, key: str, payload: bytes) -> tuple[str, wire.Health]:

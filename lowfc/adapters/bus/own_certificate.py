@@ -50,14 +50,14 @@ def read_certificate(authority: Path, certificate: Path, key: Path, *, server: b
             with contextlib.suppress(ssl.SSLWantReadError):
                 side.do_handshake()
         verifying = sides[1] if server else sides[0]
-        own: Any = verifying.getpeercert() or {}
-        name = dict(pair for part in own["subject"] for pair in part).get("commonName")
+        fields: Any = verifying.getpeercert() or {}
+        name = dict(pair for part in fields["subject"] for pair in part).get("commonName")
         if not name:
             raise ValueError("it has no common name, which must be the role")
         authorities: Any = verifier.get_ca_certs()
-        issuers = [each for each in authorities if each["subject"] == own["issuer"]] or authorities
-        last_s = ssl.cert_time_to_seconds(own["notAfter"])
-        authority_last_s = max(ssl.cert_time_to_seconds(each["notAfter"]) for each in issuers)
+        issuers = [issuer for issuer in authorities if issuer["subject"] == fields["issuer"]] or authorities
+        last_s = ssl.cert_time_to_seconds(fields["notAfter"])
+        authority_last_s = max(ssl.cert_time_to_seconds(issuer["notAfter"]) for issuer in issuers)
     except (OSError, KeyError, ValueError) as fault:  # ssl.SSLError is an OSError
         why = getattr(fault, "verify_message", "") or getattr(fault, "reason", "") or getattr(fault, "strerror", "")
         raise DataFileError(

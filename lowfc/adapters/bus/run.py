@@ -314,17 +314,17 @@ def _read(path: Path) -> Links:
 def free_ports(count: int, taken: AbstractSet[int] = frozenset()) -> list[int]:
     """Return free loopback TCP ports below the host's ephemeral range and not in `taken`; BusError if too few are free.
 
-    An outgoing connection could take an ephemeral port before the role listens on it. A connection that is retried to
+    An outgoing connection could take an ephemeral port before the role listens on it. A repeated attempt to connect to
     an ephemeral port without a listener could get this port on its own side, and connect to itself. If the ephemeral
     range begins at 15000 or below, the kernel chooses ports within it.
     """
     candidates = sorted({*range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))} - taken)
     chooser = random.SystemRandom()
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as sockets:
         ports: list[int] = []
         for _ in range(1000):
             port = chooser.choice(candidates) if candidates else 0
-            probe = held.enter_context(socket.socket())
+            probe = sockets.enter_context(socket.socket())
             try:
                 probe.bind(("127.0.0.1", port))
             except OSError:

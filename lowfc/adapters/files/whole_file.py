@@ -11,7 +11,7 @@ from pathlib import Path
 
 from lowfc.contract.errors import ConfigurationError, DataFileError, raised_as
 
-_NAME_LENGTH = 50  # at most so many characters of the final name go into the temporary one: file systems limit it
+_NAME_LENGTH = 50  # most characters that the temporary name takes from the final one: file systems limit its length
 
 
 @contextlib.contextmanager

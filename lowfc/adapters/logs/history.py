@@ -179,10 +179,10 @@ class History:
     def under_calibration(self) -> Mask:
         """Whether each step (steps,) came after the last change of calibration in the log, and is `under_camera`."""
         steps, states = self.steps, self.controllers
-        own = ("", self.calibration.id if self.calibration is not None else "")
-        if not (others := [number for number, state in enumerate(states) if state.calibration_id not in own]):
+        current_ids = ("", self.calibration.id if self.calibration is not None else "")
+        if not (foreign := [number for number, state in enumerate(states) if state.calibration_id not in current_ids]):
             return np.ones(steps.sequence.shape, np.bool_) & self.under_camera
-        last, *later = (state.frame_sequence for state in states[others[-1] :])  # a change publishes a state
+        last, *later = (state.frame_sequence for state in states[foreign[-1] :])  # a change publishes a state
         change = max(last, next(filter(None, later), 0))  # a state published at a start or by `clear` has no frame
         return (steps.sequence > change) & self.under_camera
 
@@ -372,10 +372,10 @@ class _HistoryBuilder:
             settings = np.array([settings for settings, _ in self._cameras])
             # Index of the first state with the same settings; a camera may return to earlier settings.
             first = np.array([np.isclose(settings, row, rtol=0.01, atol=0).all(axis=1).argmax() for row in settings])
-            numbers = first[np.maximum(np.searchsorted(begun_ns, steps.time_ns) - 1, 0)]
-            usual = np.bincount(numbers[considered]).argmax() if considered.any() else first[-1]
-            history.camera = self._cameras[np.flatnonzero(first == usual)[-1]][1]
-            history.under_camera = numbers == usual
+            in_force = first[np.maximum(np.searchsorted(begun_ns, steps.time_ns) - 1, 0)]
+            most_frequent = np.bincount(in_force[considered]).argmax() if considered.any() else first[-1]
+            history.camera = self._cameras[np.flatnonzero(first == most_frequent)[-1]][1]
+            history.under_camera = in_force == most_frequent
 
     def _last_calibration(self) -> Calibration | None:
         history = self._history

@@ -87,8 +87,8 @@ class WholeLog(LogReader):
             self.parts.append(self)
             yield from super().__iter__()
             return
-        with contextlib.ExitStack() as held:
-            files = [held.enter_context(LogFile(path)) for path in self.paths]
+        with contextlib.ExitStack() as opened:
+            files = [opened.enter_context(LogFile(path)) for path in self.paths]
         self.size, self.finished = sum(file.size for file in files), all(file.finished for file in files)
         earlier: list[Metadata | Attachment] = []
         repeated = Repeated()

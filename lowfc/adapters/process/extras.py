@@ -16,8 +16,8 @@ def install_advice(extra: str) -> str:
         required = metadata.requires("lowfc") or []
     except metadata.PackageNotFoundError:  # a checkout on the path that is not installed
         return f"{pip} -e '.[{extra}]' in the checkout of lowfc"
-    of_extra = [line for line in required if re.search(rf"extra == ['\"]{extra}['\"]", line)]
-    names = [line.partition(";")[0].strip() for line in of_extra]
+    requirements = [line for line in required if re.search(rf"extra == ['\"]{extra}['\"]", line)]
+    names = [line.partition(";")[0].strip() for line in requirements]
     return " ".join([pip, *(f"'{name}'" for name in names)])
 
 

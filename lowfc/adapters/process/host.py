@@ -47,11 +47,11 @@ class Host:
         except OSError:
             return ""
 
-    def cpus(self, which: str) -> set[int]:
+    def cpus(self, list_name: str) -> set[int]:
         """Processors in a list of the kernel: `online`, `isolated` (isolcpus), `nohz_full`."""
-        read = self.text_or_nothing if which == "nohz_full" else self.text  # not every kernel has nohz_full
+        read = self.text_or_nothing if list_name == "nohz_full" else self.text  # not every kernel has nohz_full
         numbers: set[int] = set()
-        for part in filter(None, read(f"{CPUS}/{which}").replace("(null)", "").split(",")):
+        for part in filter(None, read(f"{CPUS}/{list_name}").replace("(null)", "").split(",")):
             first, _, last = part.partition("-")
             numbers |= set(range(int(first), int(last or first) + 1))
         return numbers

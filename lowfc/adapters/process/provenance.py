@@ -68,10 +68,10 @@ def _cpuinfo(*names: str) -> str:
 def _blas() -> str:
     """BLAS library used by numpy; scipy's own, if loaded, is not used in the loop."""
     loaded = [library for library in threadpool_info() if library["user_api"] == "blas"]
-    of_numpy = [library for library in loaded if Path(library["filepath"]).is_relative_to(_NUMPY / "numpy.libs")]
+    numpy_blas = [library for library in loaded if Path(library["filepath"]).is_relative_to(_NUMPY / "numpy.libs")]
     names = {
         " ".join(str(library[key]) for key in ("internal_api", "version", "architecture") if library.get(key))
-        for library in of_numpy or loaded
+        for library in numpy_blas or loaded
     }
     return ", ".join(sorted(names))
 
@@ -82,7 +82,7 @@ def _commit() -> str:
     if git is None or not (checkout / ".git").exists():
         return ""
     try:
-        done = subprocess.run(  # noqa: S603  # a fixed command
+        result = subprocess.run(  # noqa: S603  # a fixed command
             [git, "-C", str(checkout), "describe", "--always", "--dirty", "--tags"],
             capture_output=True,
             text=True,
@@ -91,4 +91,4 @@ def _commit() -> str:
         )
     except (OSError, subprocess.TimeoutExpired):  # a slow disk must not keep the recorder from starting
         return ""
-    return done.stdout.strip()
+    return result.stdout.strip()

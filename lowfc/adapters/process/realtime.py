@@ -95,15 +95,15 @@ def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int
         simulated: whether the camera computes its frames.
     """
     cpus = sorted(cpus)
-    camera, *others = cpus
-    if not others:
+    camera, *remaining = cpus
+    if not remaining:
         return {}
-    controller, *others = others
-    only_two = simulated and not others
+    controller, *remaining = remaining
+    only_two = simulated and not remaining
     return {
         "realtime.camera_cpus": [camera],
         "realtime.controller_cpus": [controller],
-        "realtime.mirror_cpus": [controller if only_two else (others or cpus)[0]],
+        "realtime.mirror_cpus": [controller if only_two else (remaining or cpus)[0]],
         "realtime.recorder_cpus": [] if only_two else [cpu for cpu in cpus if cpu != controller],
     }
 

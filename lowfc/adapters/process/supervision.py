@@ -28,8 +28,8 @@ class Supervisor:
         self._due_ns = 0
         self._sent: set[str] = set()
         timeout_us = environment.get("WATCHDOG_USEC", "")
-        own = environment.get("WATCHDOG_PID", "") in ("", str(os.getpid()))  # otherwise a parent's watchdog
-        if self._address and timeout_us.isdecimal() and int(timeout_us) > 0 and own:
+        is_ours = environment.get("WATCHDOG_PID", "") in ("", str(os.getpid()))  # otherwise a parent's watchdog
+        if self._address and timeout_us.isdecimal() and int(timeout_us) > 0 and is_ours:
             self.period_ns = int(timeout_us) * 1000 // 2
 
     def ready(self) -> None:

@@ -22,8 +22,8 @@ class ViewerPage:
 
         The page may connect to this server and to the stream only.
         """
-        own = "'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:"
-        policy = f"default-src {own}; connect-src {own} http://{host}:{stream_port}"
+        own_sources = "'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:"
+        policy = f"default-src {own_sources}; connect-src {own_sources} http://{host}:{stream_port}"
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:

@@ -52,7 +52,7 @@ class IsioMirror:
         self._grid = self.geometry.rows, self.geometry.columns
         self._channel = open_channel(options.stream, self._grid)
         self._count = self._channel.count
-        self._others = OtherChannels(other_channel_names(options.stream), self._grid)
+        self._other_channels = OtherChannels(other_channel_names(options.stream), self._grid)
         self._total_name = sum_name(options.stream) if options.total is None else options.total
         self._beside: tuple[Single | None, Single] = None, np.zeros(self._grid, np.float32)
         self._total: Stream | None = None
@@ -75,7 +75,7 @@ class IsioMirror:
 
     def beside(self) -> Single:
         """Sum of the other channels without its piston, which the process that sums them may subtract."""
-        shape = self._others.sum()
+        shape = self._other_channels.sum()
         if shape is not self._beside[0]:
             self._beside = shape, (shape - shape.mean()) * np.float32(self._options.nm_per_unit)
         return self._beside[1]
@@ -161,6 +161,6 @@ class IsioMirror:
         shape = complete_shape(total)
         if shape is None:
             return None
-        deviation_nm = (shape - self._others.sum()) * np.float32(self._options.nm_per_unit) - actuators_nm
+        deviation_nm = (shape - self._other_channels.sum()) * np.float32(self._options.nm_per_unit) - actuators_nm
         deviation_nm -= np.median(deviation_nm)
         return actuators_nm + deviation_nm if np.abs(deviation_nm).max() > SAME_NM else None
