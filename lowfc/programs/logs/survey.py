@@ -43,10 +43,10 @@ _MIN_FOR_RATE = 10
 class Digest:
     """SHA-256 over the payloads of the topics that are `deterministic`, key by key.
 
-    A key's digest is over the SHA-256 of each of its payloads in order, the log's over the sorted lines "KEY DIGEST".
-    A state requested by the recorder may precede an older one in the log, so states are sorted by sequence; of the
-    states before the first frame only the newest counts, because their number depends on the order in which the
-    processes start.
+    The digest of a key is over the SHA-256 of its payloads in order; the digest of the log is over the sorted lines
+    "KEY DIGEST". A state requested by the recorder may precede an older one in the log, so states are sorted by
+    sequence. Of the states before the first frame only the newest counts, because their number depends on the order in
+    which the processes start.
     """
 
     def __init__(self) -> None:
@@ -108,7 +108,7 @@ class _TopicRow:
             "messages": self.messages,
             "rate_hz": round((self.messages - 1) / length_s, 3) if has_rate and length_s > 0 else None,
             "bytes": self.size,
-            "restarts": len(self.starts) - len({author for author, _ in self.starts}),
+            "restarts": len(self.starts) - len({publisher for publisher, _ in self.starts}),
             "missing": missing,
             "schema": self.schema,
         }
@@ -120,7 +120,7 @@ class _Account:
     def __init__(self, selection: Selection = EVERYTHING) -> None:
         self._selection = selection
         self._losses = LossAccount(selection)
-        self._lines: dict[str, _TopicRow] = {}
+        self._rows: dict[str, _TopicRow] = {}
         self._events: Counter[str] = Counter()
         self._modes: list[str] = []
         self._begin_ns: int | None = None
@@ -129,17 +129,17 @@ class _Account:
     def enter(self, topic: Topic | None, message: Sample, schema: str) -> None:
         """Count a message."""
         now_ns = message.receive_time_ns
-        line = self._lines.setdefault(message.key, _TopicRow(schema, now_ns, now_ns))
-        line.messages += 1
-        line.size += len(message.payload)
-        line.first_ns, line.last_ns = min(line.first_ns, now_ns), max(line.last_ns, now_ns)
+        row = self._rows.setdefault(message.key, _TopicRow(schema, now_ns, now_ns))
+        row.messages += 1
+        row.size += len(message.payload)
+        row.first_ns, row.last_ns = min(row.first_ns, now_ns), max(row.last_ns, now_ns)
         if topic is None:
             return
         self._end_ns = max(self._end_ns, now_ns)
         if not topic.queryable and (self._begin_ns is None or now_ns < self._begin_ns):
             self._begin_ns = now_ns  # states and calibration, queried at the log's start, may be hours old
         self._losses.enter(topic, message, recorded=True)
-        author = ""
+        publisher = ""  # the process, for a topic that several publish
         with contextlib.suppress(BadMessageError, DecodeError):  # a log holds unreadable messages, too
             if topic is HEALTH:
                 self._losses.reconcile(message, wire.Health.FromString(message.payload))
@@ -149,26 +149,26 @@ class _Account:
                     self._modes.append(mode)
             elif topic is EVENT:
                 event = Log.FromString(message.payload)
-                author = event.name  # several processes publish events
+                publisher = event.name
                 if event.level >= Level.WARNING:
                     self._events[event.message.partition(" ")[0]] += 1
-        line.starts.add((author, start_of(message.sequence)))
+        row.starts.add((publisher, start_of(message.sequence)))
 
     def json_object(self) -> dict[str, Any]:
         """The account as a dictionary."""
         missing = self._losses.lost()
         begin = None if self._begin_ns is None else datetime.fromtimestamp(self._begin_ns / 1e9, UTC)
         topics = {}
-        for key, line in sorted(self._lines.items()):
-            counted = (topic := known_topic(key)) is None or self._selection.records_all(topic)
-            topics[key] = line.json_object(topic, missing.get(key, 0) if counted else None)
+        for key, row in sorted(self._rows.items()):
+            is_counted = (topic := known_topic(key)) is None or self._selection.records_all(topic)
+            topics[key] = row.json_object(topic, missing.get(key, 0) if is_counted else None)
         return {
             "start": None if begin is None else begin.isoformat(timespec="milliseconds"),
             "duration_s": None if self._begin_ns is None else round((self._end_ns - self._begin_ns) / 1e9, 3),
-            "messages": sum(line.messages for line in self._lines.values()),
+            "messages": sum(row.messages for row in self._rows.values()),
             "messages_missing": sum(missing.values()),
             "topics": topics,
-            "missing_topics": {key: count for key, count in missing.items() if key not in self._lines},
+            "missing_topics": {key: count for key, count in missing.items() if key not in self._rows},
             "loop_modes": self._modes,
             "events": dict(self._events.most_common()),
         }
@@ -181,7 +181,7 @@ def survey(
     reader, account, digests = WholeLog(log, progress), _Account(), Digest()
     for number, message in enumerate(reader):
         if not number:
-            account = _Account(reader.selection)  # known from the first message on
+            account = _Account(reader.selection)  # the selection is known from the first message on
         topic = known_topic(message.key)
         account.enter(topic, message, reader.schema_of(message))
         if digest and topic is not None:

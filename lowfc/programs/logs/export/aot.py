@@ -10,17 +10,17 @@ AOT describes a telescope with a Shack-Hartmann or pyramid sensor. A log is mapp
       measurements        not in the file; they are (frame - dark) / flux - reference over the good pixels
       ref_measurements    I0, fraction of the flux
     Detector            the camera: dark, bad pixels, exposure, and the frames if requested
-    DeformableMirror    the mirror; actuator positions in m across the pupil, row by row; stroke in each direction, m
+    DeformableMirror    the mirror; actuator positions in m across the pupil, row by row; stroke to each side of flat, m
     ControlLoop         one row for each step, in the log's order
       time                end of the exposure, and frame count
       modal_coefficients  measured modal error, nm rms of wavefront; NaN if the frame was refused
-      commands            surface at each actuator as sent, m; NaN if the log has no command for this frame
+      commands            commanded surface at each actuator, m; NaN if the log has no command for this frame
       modes               Zernike polynomials of the calibration's modes, over the unit circle
       measurements_to_modes, modes_to_measurements, modes_to_commands: R (as at the end of the log, weighted by
                           automatic gains), H and MODES2ACT
       time_filter_num, _den: the integrator g / (z - (1 - leak)) of each mode, at the end of the log
-      delay               from mid-exposure to the middle of the command's period: delay_frames + (1 - exposure /
-                          period) / 2
+      delay               from mid-exposure to the middle of the command's period, in frames: delay_frames +
+                          (1 - exposure / period) / 2
       closed              whether the loop was closed for more than half of the steps
 
 AOT has no fields for flux, reasons, durations and truth; the other formats contain them.
@@ -55,13 +55,13 @@ from lowfc.programs.logs.export.cubes import copy_frames_to_fits, fits_cube
 
 _COMMANDS = "COMMANDS"
 _FRAMES = "FRAMES"
-_MODES_PIXELS = 64
+_MODES_PIXELS = 64  # on each side of a mode's image
 _NM = 1e-9
 
 
 def write_aot(files: list[Path], history: History, *, with_frames: bool) -> None:
-    """Write a run as AOT; `aotpy` checks the file before commands and frames replace its empty images."""
-    step_columns(history)  # raises DataFileError without steps
+    """Write a run as AOT; `aotpy` checks the file before commands and frames replace the empty images in it."""
+    step_columns(history)  # raises DataFileError if the log has no steps
     path = files[0]
     if history.calibration is None:
         raise DataFileError(f"{history.log.path} has no calibration, which AOT requires")
@@ -69,12 +69,12 @@ def write_aot(files: list[Path], history: History, *, with_frames: bool) -> None
     units = AOTFITSWriter(system).get_hdulist()
     units.writeto(path, overwrite=True)
     AOTFITSReader(path, exception_level=AOTFITSErrorLevel.WARNING)
-    cubes = {unit.name: unit for unit in units if unit.name in (_COMMANDS, _FRAMES)}
-    fits.HDUList([unit for unit in units if unit.name not in cubes]).writeto(path, overwrite=True)
-    if _COMMANDS in cubes:
-        _copy_commands(path, cubes[_COMMANDS], history, history.calibration)
-    if _FRAMES in cubes:
-        copy_frames_to_fits(path, cubes[_FRAMES], history)
+    empty_images = {unit.name: unit for unit in units if unit.name in (_COMMANDS, _FRAMES)}
+    fits.HDUList([unit for unit in units if unit.name not in empty_images]).writeto(path, overwrite=True)
+    if _COMMANDS in empty_images:
+        _copy_commands(path, empty_images[_COMMANDS], history, history.calibration)
+    if _FRAMES in empty_images:
+        copy_frames_to_fits(path, empty_images[_FRAMES], history)
 
 
 class _System:
@@ -198,7 +198,7 @@ class _System:
             "CLOSED": (closed, "fraction of the steps with the loop closed"),
             "GAINSETS": (
                 sum(one.accepted and one.name in ("gain", "leak") for one in history.requests),
-                "changes of gain or leak",
+                "number of accepted requests gain and leak",
             ),
         }
         if history.camera is not None:
@@ -220,7 +220,7 @@ class _System:
 def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibration: Calibration) -> None:
     sequence = history.steps.sequence
     shape = (len(sequence), calibration.grid[0] * calibration.grid[1])
-    row_of = {int(one): row for row, one in reversed(list(enumerate(sequence)))}  # the first step of each frame
+    row_of = {int(one): row for row, one in reversed(list(enumerate(sequence)))}  # row of the first step of each frame
     rows = fits_cube(path, image, shape)
     rows[:] = np.nan
     for message in history.reader(COMMAND):
@@ -229,7 +229,7 @@ def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibrati
         except DecodeError:
             continue
         surface_nm = actuators(command)
-        if surface_nm is not None and surface_nm.size == shape[1]:  # another size: another mirror
+        if surface_nm is not None and surface_nm.size == shape[1]:  # another size is another mirror's
             row = row_of.pop(command.frame_sequence, None)  # later commands of this frame only repeat the first
             if row is not None:
                 rows[row] = surface_nm.ravel() * np.float32(_NM)

@@ -105,7 +105,7 @@ def calibration_columns(calibration: Calibration) -> list[Column]:
 
 
 def _truth(history: History) -> list[Column]:
-    true, modes, pupil = history.true, "each mode, wavefront rms", "over the open pupil, without piston"
+    true, modes, pupil = history.true, "each mode, wavefront rms", "wavefront rms over the open pupil, without piston"
     if true is None:
         return []
     when = "rms over the frame period" if true.continuous else "at the start of the exposure"
@@ -130,9 +130,9 @@ def _durations(history: History) -> list[Column]:
     if not history.timed_sequence.size:
         return []
     rows = rows_of(history.steps.sequence, history.timed_sequence)
+    durations_us = {stage: joined(history.stages_ns[stage] / 1e3, rows) for stage in STAGES}
     return [
-        Column(f"{stage}_us", joined(history.stages_ns[stage] / 1e3, rows), "us", "duration of this stage")
-        for stage in STAGES
+        Column(f"{stage}_us", us, "us", f"duration of {stage.replace('_', ' ')}") for stage, us in durations_us.items()
     ]
 
 

@@ -47,7 +47,7 @@ def export(
     topics: Annotated[
         list[str] | None,
         typer.Option(
-            help="With --decimate: of the optional topics keep only this one (key or pattern); repeat for several."
+            help="With --decimate: keep only this one of the optional topics (key or pattern); repeat for several."
         ),
     ] = None,
     out: Annotated[

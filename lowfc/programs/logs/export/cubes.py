@@ -28,7 +28,7 @@ _FITS_ZERO = 0x8000
 
 
 def fits_cube(path: Path, image: "fits.ImageHDU", shape: tuple[int, ...]) -> npt.NDArray[Any]:
-    """Memory-mapped array ">f4" in a new extension at the end of a FITS file.
+    """Memory-mapped array of type ">f4" in a new extension at the end of a FITS file.
 
     The header is that of `image`, which must have the same number of axes; its data is not used. OSError if the disk
     has no room for the array: a write to a memory map on a full disk would kill the process.
@@ -42,7 +42,7 @@ def fits_cube(path: Path, image: "fits.ImageHDU", shape: tuple[int, ...]) -> npt
 
 
 def copy_frames_to_fits(path: Path, image: "fits.ImageHDU", history: History) -> Columns:
-    """Copy the frames of a run into a new extension with the header of `image`; DataFileError if a frame is unfit.
+    """Copy the frames of a run into a new extension with the header of `image`; DataFileError as in `_frames`.
 
     Returns:
         `sequence` and `time_ns` of each frame in the order of recording.
@@ -60,7 +60,7 @@ def copy_frames_to_fits(path: Path, image: "fits.ImageHDU", history: History) ->
 
 
 def copy_frames_to_npy(path: Path, history: History) -> None:
-    """Copy the frames of a run into a .npy file for `numpy.load(..., mmap_mode="r")`; DataFileError if one is unfit."""
+    """Copy the frames of a run into a .npy file for `numpy.load(..., mmap_mode="r")`; DataFileError as in `_frames`."""
     with path.open("wb") as stream:
         for _, pixels in _frames(history):
             if not stream.tell():

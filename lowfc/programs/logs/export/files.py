@@ -38,7 +38,7 @@ def write_csv(files: list[Path], history: History) -> None:
 
 
 def write_npz(files: list[Path], history: History) -> None:
-    """Write the arrays of the steps and the calibration, without pickling; the names end in the unit if there is one.
+    """Write the arrays of the steps and the calibration, without pickling; the name of an array ends in its unit.
 
     Frames (frames, rows, columns) in DN go to the second of `files`, if given: a .npy in the order of `frame_sequence`,
     which `numpy.load` maps with `mmap_mode="r"`.

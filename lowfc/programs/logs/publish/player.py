@@ -1,4 +1,4 @@
-"""Republish a log on the bus at the recorded rate or a multiple, for a viewer, a controller under test or another tool.
+"""Republish a log on the bus, at the recorded rate or faster, for a viewer, a controller under test or another tool.
 
 Payloads and sequences are those of the log, so that frame, step, command and mirror state can be joined. Publication
 times are new, so that no message counts as late. Deadlines are absolute: timing errors do not accumulate.
@@ -150,11 +150,11 @@ class Player:
             return
         is_state = publisher.topic.queryable and publisher.topic is not HEALTH
         if is_state and not self._begun_ns and message.key not in self._initial_keys:
-            # A log begins with the calibration and states then in force. They may be old, so they are not timed.
+            # A log begins with the calibration and the states in force then. They may be old: they are sent at once.
             self._initial_keys.add(message.key)
             publisher.put(message.payload, None, message.sequence)
         elif not is_state and message.receive_time_ns < self._last_log_ns - REORDERING_NS:
-            raise DataFileError("a log begins before the previous one ends; name each once, in order of recording")
+            raise DataFileError("a log begins before the previous one ends; name each log once, in order of recording")
         else:
             self._send(publisher, message)
 
@@ -241,7 +241,7 @@ def _wait_for_receivers(service: Service, live: Collection[str], wait_for: Colle
     while missing and service.running:
         missing = service.wait_for(missing, _WAIT_FOR_S)
     begun_s = time.monotonic()
-    service.wait_for(live, _WAIT_FOR_S)  # at most this long: a user's program may send no Health
+    service.wait_for(live, _WAIT_FOR_S)  # no longer: a user's program may send no Health
     while service.running and time.monotonic() - begun_s < _SETTLE_S:
         time.sleep(0.02)
     return service.running

@@ -17,7 +17,7 @@ class Account(Result):
     """Result of a replay, and the state of the logs.
 
     Attributes:
-        frames: number of steps checked; `commands`, `states` and `requests` are the numbers of these that were checked.
+        frames: number of steps checked; `commands`, `states` and `requests` count the checked messages of these kinds.
         unchecked_because: number of steps that could not be checked, by reason.
         inputs_missing: number of controller inputs missing from the log, found by the input number of a later state.
         commands_missing: number of commands that the replay sends but the log does not have.

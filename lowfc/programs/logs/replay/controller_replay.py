@@ -69,8 +69,8 @@ class Context:
 
     Attributes:
         tolerance_nm: largest difference to ignore.
-        kernel: name of the kernel; empty for the log's own.
-        former: fields to compare in a file of another version, None in one of this version; set for each file.
+        kernel: name of the kernel to replay with; empty for the log's own.
+        former: fields to compare in a file of another version; None for a file of this version; set for each file.
     """
 
     tolerance_nm: float = 0.0
@@ -83,7 +83,7 @@ class Context:
 
 
 class ControllerReplay:
-    """Replay of a controller from one of its starts on: `advance` folded over its inputs in their order.
+    """Replay of a controller from one of its starts on: applies `advance` to its inputs, one after the other.
 
     Attributes:
         done: whether the state at the start of the next segment has been reached.
@@ -118,7 +118,7 @@ class ControllerReplay:
         if isinstance(body, wire.ControllerState):
             self._add_state(body, message.receive_time_ns)
         else:
-            number: int = body.input_number  # type: ignore[attr-defined]  # all messages but states have it
+            number: int = body.input_number  # type: ignore[attr-defined]  # all kinds but states have it
             if not number:  # an unreadable request, or a command of another program
                 if kind is wire.ControlStep:
                     raise DataFileError(
@@ -201,7 +201,7 @@ class ControllerReplay:
             self.retry_pending = True
 
     def _adopt(self) -> bool:
-        """Continue from the earliest complete state whose calibration is known; False without a state or at the end."""
+        """Continue from the earliest complete state whose calibration is known; False without one, or at the end."""
         if not self.retry_pending:
             return False
         self.retry_pending = False
@@ -315,7 +315,7 @@ class ControllerReplay:
                 logged.state.CopyFrom(self._reencoded(logged.state))
             logged, replayed = self._context.former.compared(logged), self._context.former.compared(replayed)
         if replayed == logged and (self._context.former is not None or isinstance(logged, wire.ControllerState)):
-            return None  # steps, commands and requests of this version must be equal byte by byte
+            return None  # other messages of this version must be equal byte by byte, too
         return difference(state.input_number, state.frame_sequence, logged, replayed)
 
     def _reencoded(self, logged: wire.ControllerState) -> wire.ControllerState:
@@ -347,8 +347,9 @@ class ControllerReplay:
             account.requests += 1
             assert isinstance(input_, Request)  # noqa: S101
             assert outputs.reply is not None  # noqa: S101  # every request has one
-            shown = controller_state(state, self._settings, input_.time_ns) if entry.logged.HasField("state") else None
-            answer = codec.encode_request(input_, outputs.reply, state.input_number, shown)
+            in_answer = entry.logged.HasField("state")
+            answered = controller_state(state, self._settings, input_.time_ns) if in_answer else None
+            answer = codec.encode_request(input_, outputs.reply, state.input_number, answered)
             self._compare(entry.logged, entry.logged_bytes, answer)
         logged = self._states.pop(state.input_number, None)
         if logged is not None:

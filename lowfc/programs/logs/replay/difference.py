@@ -51,7 +51,7 @@ def difference(input_number: int, frame_sequence: int, logged: Message, replayed
         _compare(found, "", logged, replayed)
         if not found.fields:
             found.fields.append(
-                "the bytes differ, but no value: the sign of a zero, an empty part, or a field of another version"
+                "the bytes differ, but no value does: the sign of a zero, an empty part, or a field of another version"
             )
     return found
 

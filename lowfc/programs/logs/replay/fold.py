@@ -34,7 +34,7 @@ class Replay:
         self._last_ns = 0
 
     def begin_file(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
-        """Begin a file; forget controllers and frames of another recording, because lockstep runs share sequences."""
+        """Begin a file; if it is of another recording, forget controllers and frames: lockstep runs share sequences."""
         recording = metadata.get("lowfc", {}).get("run", ""), metadata.get(PART, {}).get("of", "")
         if recording != self._recording:
             self.finish()

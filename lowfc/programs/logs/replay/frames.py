@@ -8,7 +8,7 @@ from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.loop.inputs import Frame
 
-FRAMES_BYTES = 64 << 20  # limit of memory
+FRAMES_BYTES = 64 << 20  # limit of the memory for frames
 _STEPS_KEPT = 10_000  # number of steps whose frame is remembered
 
 

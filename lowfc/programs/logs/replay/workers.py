@@ -26,9 +26,9 @@ from lowfc.programs.logs.replay.fold import TOPICS, Replay
 from lowfc.programs.logs.replay.former import FormerVersion
 
 _WORTH_BYTES = 50_000_000
-"""Size of log that justifies another process; for less, starting the process takes longer than it saves."""
+"""Size of log that justifies another process; for a smaller log, starting the process takes longer than it saves."""
 _SEGMENTS_PER_JOB = 4  # for steady progress, and short idle times at the end
-_PROGRESS_EVERY = 5000
+_PROGRESS_EVERY = 5000  # messages
 
 Progress = Callable[[int], None]
 
@@ -39,12 +39,12 @@ def replay_files(
     """Replay consecutive logs in at most `jobs` processes (0: one per processor).
 
     `progress` is called with the bytes replayed so far. ConfigurationError if a log is named twice or begins before the
-    previous one ends, DataFileError if one cannot be replayed.
+    previous one ends, DataFileError if a log cannot be replayed.
     """
     chunk_ends_ns = [_chunk_ends_ns(path) for path in paths]
-    ends_ns = sorted(end_ns for ends in chunk_ends_ns for end_ns in ends)  # a chunk of states alone may be older
+    ends_ns = sorted(end_ns for ends in chunk_ends_ns for end_ns in ends)  # a chunk of states alone may end earlier
     if len({path.resolve() for path in paths}) < len(paths):
-        raise ConfigurationError("a log is named twice; name each once, in the order they were recorded")
+        raise ConfigurationError("a log is named twice; name each log once, in the order of recording")
     if len(paths) > 1:
         _refuse_disorder(paths, chunk_ends_ns)
     size = sum(path.stat().st_size for path in paths)
@@ -87,7 +87,7 @@ def _refuse_disorder(paths: Sequence[Path], chunk_ends_ns: Sequence[Sequence[int
         if begin_ns is not None and begin_ns < end_ns - PATIENCE_NS:
             raise ConfigurationError(
                 f"{path} begins {(end_ns - begin_ns) / 1e9:.1f} s before {previous} ends; "
-                "name the logs in the order they were recorded, and replay logs of the same time separately"
+                "name the logs in the order of recording, and replay logs of the same time separately"
             )
         end_ns, previous = max([end_ns, begin_ns or 0, *ends_ns]), path
 

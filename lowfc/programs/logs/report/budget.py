@@ -13,7 +13,7 @@ from lowfc.programs.logs.report.source import Results, Run
 Masks = dict[str, Mask]
 
 Entry = tuple[Term | None, str]
-"""A term and its source; or None and what would be required."""
+"""A term and its source; or None, and what the term would require."""
 
 _THROUGH = "times the loop's noise transfer"
 _NO_CAMERA = "a calibration, light, and the camera's gain"
@@ -39,9 +39,9 @@ def budget_results(
     total = Term(np.sum([np.maximum(term.variance_nm2, 0) for term in found], axis=0)) if found else None
     missing = [name for name, (term, _) in terms.items() if term is None]
     true = None
-    if stretch.residual_ms_nm2 is not None and stretch.frames.values and not shaped:
+    if stretch.residual_ms_nm2 is not None and stretch.series.values and not shaped:
         true = Term(stretch.residual_ms_nm2)
-    measured = Term(np.mean(stretch.signal(ERROR).joined() ** 2, axis=0)) if stretch.frames.values else None
+    measured = Term(np.mean(stretch.signal(ERROR).joined() ** 2, axis=0)) if stretch.series.values else None
     return {
         "terms": rows,
         "sum": _columns(total, masks),
@@ -60,7 +60,7 @@ def budget_results(
 
 
 def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None, *, shaped: bool) -> dict[str, Entry]:
-    """Each term and its source, or None and what would be required."""
+    """Each term and its source, or None and what the term would require."""
     law, timing = stretch.law, stretch.timing
     entries: dict[str, Entry] = {}
     if noise is None:

@@ -21,7 +21,7 @@ from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.logs.report.source import LawInForce, Results, Run
 
 MAX_STEPS = 200_000
-"""Only the last steps of a longer stretch are used, to bound the memory."""
+"""Largest number of steps used, to bound the memory; of a longer stretch, the last ones are used."""
 BANDS_HZ = (1.0, 10.0, 100.0, 1000.0)
 """Edges between the frequency bands; edges below the resolution or above the highest frequency are not used."""
 
@@ -39,8 +39,8 @@ class Stretch:
         in_force: the law as the controller's states report it.
         law: the same law (also the integrator) as a linear law with the rate and delay of the stretch.
         timing: timing of the loop; continuous if truth is continuous and the exposure known, otherwise sampled.
-        frames: columns of error, pseudo-open-loop and, if the log has truth, disturbance, residual and the residual's
-            mean over the exposure.
+        series: (frames, columns) error, pseudo-open-loop and, if the log has truth, disturbance, residual and the
+            residual's mean over the exposure, each with a column for every mode.
         residual_ms_nm2: (modes,) mean square of the true residual, over all times if the truth is continuous, otherwise
             over the frames; None without truth.
     """
@@ -51,7 +51,7 @@ class Stretch:
     in_force: LawInForce
     law: LinearLaw
     timing: Timing
-    frames: TimeSeries
+    series: TimeSeries
     residual_ms_nm2: Array | None
 
     @property
@@ -62,7 +62,7 @@ class Stretch:
     def signal(self, number: int) -> TimeSeries:
         """One of `ERROR`, `POL`, `DISTURBANCE`, `RESIDUAL` and `SENSED`, (frames, modes)."""
         modes = len(self.law.noll)
-        return self.frames.columns(slice(number * modes, (number + 1) * modes))
+        return self.series.columns(slice(number * modes, (number + 1) * modes))
 
 
 ERROR, POL, DISTURBANCE, RESIDUAL, SENSED = range(5)
@@ -75,7 +75,7 @@ def longest_stretch(run: Run) -> Stretch | None:
     # Before the first law, the index is -1, which selects the element False at the end.
     law_known = np.array([*(law.known for law in run.laws), False])[law_of_step]
     linear = np.array([*(law.linear is not None for law in run.laws), False])[law_of_step]
-    # Until the next state names the overruled groups, only the steps show that there are any.
+    # Until the next state names the overruled groups of modes, only the steps show that a group is overruled.
     overruled = linear & (steps.reasons >> Limit.LAW_OVERRULED & 1 == 1)
     closed = (steps.mode == LoopMode.CLOSED) & law_known & ~overruled & history.under_calibration
     edges = np.flatnonzero(np.diff(np.where(closed, law_of_step, -1), prepend=-1, append=-1))
@@ -99,14 +99,14 @@ def longest_stretch(run: Run) -> Stretch | None:
         residual_ms_nm2 = np.nanmean(true.modes_residual_rms_nm[rows].astype(float) ** 2, axis=0)
         if true.continuous and exposure_fraction(history.camera) is not None:
             timing = history.timing(in_force.delay_frames)
-    frames = time_series(steps.sequence[rows], np.hstack(signals))
+    series = time_series(steps.sequence[rows], np.hstack(signals))
     noll = tuple(range(2, 2 + gain.size))  # only the number of modes is used
     rate_hz = history.rate_hz or 1.0  # with a single step the rate is unknown, and unused
     if in_force.linear is None:
         law = integrator(gain, leak, noll, in_force.delay_frames, rate_hz)
     else:
         law = replace(in_force.linear, delay_frames=in_force.delay_frames, rate_hz=rate_hz)
-    return Stretch(rows, settling, earlier, in_force, law, timing, frames, residual_ms_nm2)
+    return Stretch(rows, settling, earlier, in_force, law, timing, series, residual_ms_nm2)
 
 
 def why_no_stretch(run: Run) -> str:
@@ -132,9 +132,9 @@ def stretch_results(run: Run, stretch: Stretch | None) -> Results | None:
         "from_s": float(times_s[0]),
         "to_s": float(times_s[-1]),
         "true": stretch.true,
-        "frames": stretch.frames.frames,
-        "pieces": len(stretch.frames.values),
-        "frames_bridged": stretch.frames.interpolated,
+        "frames": stretch.series.frames,
+        "pieces": len(stretch.series.values),
+        "frames_bridged": stretch.series.interpolated,
         "steps_settling": stretch.settling,
         "steps_earlier": stretch.earlier,
         "steps_limited": int(limited.sum()),
@@ -164,31 +164,31 @@ def spectra_of(stretch: Stretch | None) -> Spectra | None:
     return [one for one in found if one is not None] or None  # all signals are equally long
 
 
-def spectra_results(run: Run, stretch: Stretch | None, found: Spectra | None) -> Results:
+def spectra_results(run: Run, stretch: Stretch | None, spectra: Spectra | None) -> Results:
     """Spectra of tip, tilt and the sum of the others: in bins, by band, and compared with theory."""
     if stretch is None:
         return {"why_not": why_no_stretch(run)}
-    if found is None:
-        longest = stretch.frames.longest
+    if spectra is None:
+        longest = stretch.series.longest
         return {"why_not": f"the longest gap-free stretch has {longest} frames, but a spectrum requires {SHORTEST}"}
     calibration = run.history.calibration
     groups = groups_of(calibration.noll if calibration is not None else ())
     noise = noise_of(run.history, stretch.rows)
     noise_nm2_hz = None if noise is None else 2 * noise.total_nm**2 / stretch.law.rate_hz
     return {
-        "segments": found[ERROR].segments,
-        "resolution_hz": found[ERROR].spacing_hz,
-        "groups": [_group(name, mask, stretch.law, found, noise_nm2_hz) for name, mask in groups.items()],
+        "segments": spectra[ERROR].segments,
+        "resolution_hz": spectra[ERROR].spacing_hz,
+        "groups": [_group(name, mask, stretch.law, spectra, noise_nm2_hz) for name, mask in groups.items()],
     }
 
 
-def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz: Array | None) -> Results:
+def _group(name: str, modes: Mask, law: LinearLaw, spectra: Spectra, noise_nm2_hz: Array | None) -> Results:
     """Spectra of one group; modes are summed in power."""
 
     def total(one: Spectrum) -> Array:
         return np.asarray(one.power_nm2_hz[:, modes].sum(axis=1))
 
-    error, pol, *true = found
+    error, pol, *true = spectra
     frequency_hz = pol.frequency_hz
     power_rejection = rejection(law, frequency_hz)[:, modes] ** 2
     columns = {

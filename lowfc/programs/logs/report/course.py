@@ -52,7 +52,7 @@ def events(run: Run) -> list[Results]:
 
 
 def requests(run: Run) -> list[Results]:
-    """Requests, also the controller's own, and their answers; without those that change nothing and are periodic."""
+    """Requests, including the controller's own, and their answers, but no periodic ones that change nothing."""
     if not run.history.steps.sequence.size:
         return []
     return [

@@ -25,7 +25,7 @@ _BESIDE_TRUTH: dict[str, Any] = {"linestyle": ":", "linewidth": 0.9, "alpha": 0.
 """Style of measured curves if the log also has the true values."""
 _LIMIT_DRAWN_FROM = 0.25
 """The stroke limit is drawn if more than this fraction of it is used."""
-_MAX_MARKS = 300
+_MAX_MARKS = 300  # of one kind in a drawing
 _SECONDS = "seconds since the first step"
 
 
@@ -185,8 +185,8 @@ def _spectra(figure: "Figure", report: Report) -> bool:
     return True
 
 
-def _ratio(one: Array, other: Array) -> Array:
-    return np.divide(one, other, out=np.full_like(one, np.nan), where=other > 0)
+def _ratio(numerator: Array, denominator: Array) -> Array:
+    return np.divide(numerator, denominator, out=np.full_like(numerator, np.nan), where=denominator > 0)
 
 
 def _budget(figure: "Figure", report: Report) -> bool:
@@ -200,16 +200,18 @@ def _budget(figure: "Figure", report: Report) -> bool:
     groups = [name for name in budget["sum"]["rms_nm"] if name != "all modes"]
     panels = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
     for axes, group in zip(panels, groups, strict=True):
-        for place, (name, values, limits) in enumerate(rows):
+        for place, (name, values, upper_limits) in enumerate(rows):
             if values[group] is None:
                 continue
             colour = {"sum of the terms": INK, "true residual": CLOSED}.get(name, COLOURS["other"])
-            limited = group in limits
+            is_upper_limit = group in upper_limits
             style: dict[str, Any] = {"facecolor": colour}
-            if limited:
+            if is_upper_limit:
                 style = {"facecolor": "none", "edgecolor": colour, "linestyle": "--"}
             axes.barh(place, values[group], 0.6, **style)
-            axes.text(values[group], place, f" {'< ' if limited else ''}{values[group]:.2g}", va="center", fontsize=8)
+            axes.text(
+                values[group], place, f" {'< ' if is_upper_limit else ''}{values[group]:.2g}", va="center", fontsize=8
+            )
         axes.set(title=group, xlabel="nm rms")
         axes.grid(visible=False, axis="y")
         axes.margins(x=0.2)
@@ -301,6 +303,7 @@ def _stroke(figure: "Figure", report: Report) -> bool:
 
 
 def _envelope(axes: "Axes", time_s: Array, values: npt.NDArray[np.floating], starts: Any, colour: str) -> None:
+    """Draw the range of the values in each bin, and the middle of the range as a line."""
     least, most = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
     axes.fill_between(time_s, least, most, color=colour, alpha=0.25, linewidth=0)
     axes.plot(time_s, (least + most) / 2, color=colour, linewidth=1.0)

@@ -57,7 +57,7 @@ def fixed(value: float | str, decimals: int = 3) -> str:
 
 
 def per_mode(values: Sequence[float]) -> str:
-    """The value of each mode with four significant digits, or a single one if they are equal."""
+    """The value of each mode with four significant digits, or a single value if all are equal."""
     shown = [f"{value:.4g}" for value in values]
     return f"{shown[0]} for all" if len(set(shown)) == 1 else ", ".join(shown)
 

@@ -118,8 +118,8 @@ def _contrast(true: Truths, rows: Integers, config: Configuration | None) -> Res
     ):
         if (modes_nm := _rms(rms_nm, rows)) is None:
             return None
-        known_nm = sampled_nm[rows][np.isfinite(sampled_nm[rows]).all(axis=1)].astype(float)
-        covariances[name] = with_variances(known_nm.T @ known_nm / len(known_nm), modes_nm)
+        finite_nm = sampled_nm[rows][np.isfinite(sampled_nm[rows]).all(axis=1)].astype(float)
+        covariances[name] = with_variances(finite_nm.T @ finite_nm / len(finite_nm), modes_nm)
     return added_contrast(contrast_or_none(config), covariances)
 
 
@@ -135,7 +135,7 @@ def _at(values: Array | None, index: int) -> float | None:
 
 
 def _tilt_mas(values: Array | None, noll: tuple[int, ...], configuration: Configuration | None) -> Results | None:
-    """Tip, tilt and rms per axis, sqrt((x^2 + y^2) / 2), mas; None without configuration or one of the two modes."""
+    """Tip, tilt and rms per axis, sqrt((x^2 + y^2) / 2), mas; None without configuration, or without both modes."""
     if values is None or configuration is None or not {2, 3} <= set(noll):
         return None
     x, y = values[[noll.index(2), noll.index(3)]] / tilt_nm_per_mas(configuration.star.diameter_m)

@@ -160,7 +160,7 @@ def _mirror(results: Results) -> Results:
 def _events(results: Results) -> Results:
     events = results["events"]
     grave = [event for event in events if event["level"] in ("error", "fatal")]
-    warned = [event for k, event in enumerate(events) if event["level"] == "warning" and not _of_end(events[k:])]
+    warned = [event for k, event in enumerate(events) if event["level"] == "warning" and not _is_only_end(events[k:])]
     if not (worst := grave or warned):
         return _check("events", GOOD, "no warning, no error")
     names = _with_counts(Counter(sorted(event["name"] for event in worst)))
@@ -168,7 +168,7 @@ def _events(results: Results) -> Results:
     return _check("events", BAD if grave else LOOK, f"{counted(len(worst), kind)}: {names}")
 
 
-def _of_end(events: list[Results]) -> bool:
+def _is_only_end(events: list[Results]) -> bool:
     """Whether the first of these events only reports the end of the frames, because the camera stopped for good."""
     names = [event["name"] for event in events if event["name"] != "STOPPED" or event["process"] == Role.CAMERA]
     return names[0] == "NO_FRAMES" and "STOPPED" in names and "FRAMES_BACK" not in names

@@ -1,4 +1,4 @@
-"""`lowfc what-if`: the residual of a log with other gains, another reconstructor or another controller."""
+"""Results of a what-if: the residual of a log with other gains, another reconstructor or another controller."""
 
 from dataclasses import replace
 from typing import Any
@@ -46,11 +46,11 @@ def what_if(run: LoggedRun, changes: WhatIf) -> dict[str, Any]:
     """Results of the logged run and of the what-if run.
 
     The what-if loop is closed throughout, starts from a flat mirror, and corrects the pseudo-open-loop modes of every
-    used frame; it holds on a refused or missing frame, as the live loop does. Its modal limits act, actuator limits do
-    not. All results are over the same frames: frames without saturated pixels, with the logged loop closed, after both
-    loops have settled. If no frame of the closed loop is usable, the logged loop may be in any mode. If the log has
-    truth, the true residual is given, too: the measured one is mostly noise for a faint star. For another reconstructor
-    the frames are read in a second pass.
+    used frame; at a refused or missing frame it holds its command, as the live loop does. Its modal limits act,
+    actuator limits do not. All results are over the same frames: frames without saturated pixels, with the logged loop
+    closed, after both loops have settled. If no frame of the closed loop is usable, the logged loop may be in any mode.
+    If the log has truth, the true residual is given, too: the measured one is mostly noise for a faint star. For
+    another reconstructor the frames are read in a second pass.
     """
     user_step, noll = changes.step, run.calibration.noll
     new_law = law(changes, noll, run.law)

@@ -46,16 +46,16 @@ class WhatIf:
 
 
 def requested_changes(
-    text: str | None = None, config: Path | None = None, calibration: Path | None = None, controller: str | None = None
+    sets: str | None = None, config: Path | None = None, calibration: Path | None = None, controller: str | None = None
 ) -> WhatIf:
-    """Parse the options of the command line.
+    """Parse the options of the command line; `sets` is the text of --set.
 
     A controller is FILE.py:NAME of a function `step(state, error_nm) -> (state, command_nm)`; the state is None at
     first, both arrays are (modes,) nm of wavefront rms.
     """
     values: dict[str, str] = {}
-    for part in filter(None, (part.strip() for part in (text or "").split(","))):
-        key, _, value = (word.strip() for word in part.partition("="))
+    for part in filter(None, (part.strip() for part in (sets or "").split(","))):
+        key, _, value = (piece.strip() for piece in part.partition("="))
         if key not in KEYS:
             raise ConfigurationError(f"--set: unknown key {key!r}{nearest(key, KEYS)}; the keys are {', '.join(KEYS)}")
         if not value or key in values:

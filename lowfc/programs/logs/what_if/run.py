@@ -238,8 +238,8 @@ def _played(sequence: Sequences, requests: Sequence[wire.Request], plays: Mappin
     for request in requests:
         if request.name == "play" and request.accepted:
             first = request.frame_sequence
-            known = plays.get(request.play_id)
-            table = floats(request.table, -1, request.columns or 1) if known is None else known.rows
+            stored = plays.get(request.play_id)
+            table = floats(request.table, -1, request.columns or 1) if stored is None else stored.rows
             rows |= during_probe(sequence, first, len(table))
     return rows
 
@@ -254,13 +254,13 @@ def _target_nm(states: Sequence[wire.ControllerState], sequence: Sequences, mode
 
     A state is logged at every change. That after `clear` has frame sequence 0, because `clear` resets the sequence.
     """
-    known = [(state.frame_sequence, state.offset_nm or [0.0] * modes) for state in states]
-    known = [(frame, offset_nm) for frame, offset_nm in known if len(offset_nm) == modes]
-    if not known:
+    offsets = [(state.frame_sequence, state.offset_nm or [0.0] * modes) for state in states]
+    offsets = [(frame, offset_nm) for frame, offset_nm in offsets if len(offset_nm) == modes]
+    if not offsets:
         return np.zeros((len(sequence), modes), np.float32)
-    frames = np.maximum.accumulate(np.array([frame for frame, _ in known], np.uint64))
+    frames = np.maximum.accumulate(np.array([frame for frame, _ in offsets], np.uint64))
     rows = np.searchsorted(frames, sequence) - 1
-    return np.array([offset_nm for _, offset_nm in known], np.float32)[np.maximum(rows, 0)]
+    return np.array([offset_nm for _, offset_nm in offsets], np.float32)[np.maximum(rows, 0)]
 
 
 def _law_and_delay(history: History, calibration: Calibration) -> tuple[Integrator, float]:
@@ -272,10 +272,10 @@ def _law_and_delay(history: History, calibration: Calibration) -> tuple[Integrat
             f"{history.log.path}: its gains and delay are unknown: it has no configuration, and no controller state "
             "for its modes"
         )
-    known = settings(history.configuration)
-    if any(known.auto_gain):
+    configured = settings(history.configuration)
+    if any(configured.auto_gain):
         raise DataFileError(
             f"{history.log.path}: its gains are unknown: they are automatic in its configuration, and it has no "
             "controller state"
         )
-    return known.integrator(calibration.noll), known.delay_frames
+    return configured.integrator(calibration.noll), configured.delay_frames
