@@ -51,7 +51,7 @@ def time_alone(
         payload = payloads.at(len(step_ns), due_ns)
         if period_ns is not None:
             late_ns = max(0, clock.host_ns() - due_ns)
-            due_ns += period_ns * (1 + late_ns // period_ns)  # in the future, so that it sleeps
+            due_ns += period_ns * (1 + late_ns // period_ns)  # the next due time that is still in the future
             clock.sleep_until_ns(due_ns)
         begun_ns = clock.host_ns()
         step(payload)

@@ -1,4 +1,4 @@
-"""A loop's messages without the loop: one process sends what camera, controller and mirror send, at any rate."""
+"""The messages of a loop without the loop: one process sends those of camera, controller and mirror, at any rate."""
 
 import time
 from typing import Any
@@ -37,7 +37,7 @@ _WAIT_S = 0.05
 
 
 class Traffic:
-    """Sends the messages of three roles of a run, frame after frame."""
+    """Sends the messages of camera, controller and mirror, frame after frame."""
 
     def __init__(self, run: Run, rate_hz: float) -> None:
         """Join `run` as camera, controller and mirror of a loop of `rate_hz`."""
@@ -79,7 +79,7 @@ class Traffic:
         return True
 
     def run(self, seconds: float) -> None:
-        """Send a loop's messages at its rate for `seconds`; overdue ones are sent at once, so that none is left out."""
+        """Send messages at the loop's rate for `seconds`; overdue messages are sent at once: none is left out."""
         due_ns = begun_ns = self._clock.host_ns()
         while due_ns - begun_ns < seconds * 1e9:
             self._clock.sleep_until_ns(due_ns)

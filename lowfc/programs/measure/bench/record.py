@@ -21,7 +21,7 @@ RATES_HZ = (1000.0, 2000.0, 5000.0)
 _READY_S = 30.0  # longest wait until the recorder is ready
 _STOP_S = 60.0  # longest wait until the recorder has stopped
 _POLL_S = 0.5
-_WARM_UP_S = 0.5
+_WARM_UP_S = 0.5  # time with traffic before the measurement
 _COPY_S = 0.5  # duration of the copying that is timed
 _COPY_BYTES = 256 * 1024  # buffer of the copied file
 _RECORDER_KEYS = ("messages_recorded", "messages_lost", "longest_wait_ms", "longest_unflushed_ms", "longest_write_ms")
@@ -98,7 +98,7 @@ def render(results: dict[str, Any]) -> str:
         for rate in results["rates"]
     ]
     lines.append(
-        f"processor: all threads of the recorder, share of one processor, and as a multiple of copying a frame's "
+        "Processor: share of one processor that the recorder uses; x copying: the same over that of copying a frame's "
         f"{results['payload_bytes_per_frame']:.0f} bytes to the same disk ({results['copy_us_per_frame']:.1f} us). "
         "Longest wait: from a message's arrival until it is written; unflushed: until it survives a kill -9; write: "
         "one write to the disk."

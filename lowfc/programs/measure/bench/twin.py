@@ -37,8 +37,8 @@ def bench_twin(seconds: float = 1.0) -> dict[str, Any]:
     """Measure three twins; the results of the first, the default of the live loop, are also at the top level.
 
     Each time is the median for one frame, from the wavefront to the binned image; the models are timed one by one.
-    `relative_l2` is the worst of 20 random wavefronts of radial degrees 1 to 5 within the bounds of Subedi et al. 2015,
-    Sect. 3.1.
+    `relative_l2` is the largest relative error of the image over 20 random wavefronts of radial degrees 1 to 5, within
+    the bounds of Subedi et al. 2015, Sect. 3.1.
     """
     optics = sensor_named(SENSOR)
     wavelength_nm = optics.wavelength_nm
@@ -91,7 +91,7 @@ def render(result: dict[str, Any]) -> str:
         for case in result["cases"]
     ]
     lines.append(
-        f"one thread, medians; sensor {result['sensor']}; relative L2 is the worst of "
+        f"one thread, median times; sensor {result['sensor']}; relative L2: largest relative error of the image over "
         f"{result['wavefronts']} random wavefronts"
     )
     return "\n".join(lines)

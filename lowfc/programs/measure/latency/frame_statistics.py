@@ -36,7 +36,7 @@ SPANS = {
     "due_to_mirror": "  due to mirror",
 }
 """Labels of the spans, by their names in latency_us."""
-ALONE = {
+REFERENCES = {
     "echo_us": "half a bare echo",
     "step_us": "control step alone",
     "hot_step_us": "  back to back",
@@ -44,9 +44,9 @@ ALONE = {
 }
 """Labels of the host's reference times, by their names in the results."""
 RATIOS = {"ratio": ("step_us", ""), "ratio_hot": ("hot_step_us", ", timed back to back")}
-"""Ratios of the latency from frame to command to half a bare echo plus one control step.
+"""Ratios of the latency from frame to command over half a bare echo plus one control step.
 
-For each name of a ratio: the name of the step's duration in `ALONE`, and the end of the ratio's label.
+For each name of a ratio: the name of the step's duration in `REFERENCES`, and the end of the ratio's label.
 """
 RATIOS_AT = ("p50", "p99")
 COUNTS = {
@@ -67,7 +67,7 @@ COUNTS = {
 
 _BINS_PER_OCTAVE = 8
 _LOWEST_US, _OCTAVES = 1.0, 20
-_TIME_PARTS = 200  # most parts of a repeat whose latency is given against time
+_TIME_PARTS = 200  # largest number of parts of a repeat in which latency is given against time
 _PAUSE = 1000
 """Multiple of the median period above which the camera paused, as when it waits for its trigger."""
 _BURST = 0.5
@@ -80,7 +80,7 @@ class FrameOutcomes:
 
     Attributes:
         put_ns: time just before the frame was published.
-        commanded: whether its command was timed by the controller or applied by the mirror.
+        commanded: whether the frame's command was timed by the controller or applied by the mirror.
         spans_us: times by the names of `SPANS`, NaN if unknown; those from the due time only with a schedule.
     """
 

@@ -180,7 +180,7 @@ def _children(options: LatencyOptions, run: Run) -> list[Child]:
         view = program(str(Role.VIEWER), arguments, run.path / f"{Role.VIEWER}.stderr")
         children.insert(len(children) - options.record, view)  # the recorder ends last
     if not options.simulated:
-        waits = [word for child in children[1:] for word in ("--wait-for", child.name)]
+        waits = [argument for child in children[1:] for argument in ("--wait-for", child.name)]
         arguments = ["-m", "lowfc.programs.measure.frame_source", *_options(run), "--seconds", str(seconds), *waits]
         children[0] = program(str(Role.CAMERA), arguments, run.path / f"{Role.CAMERA}.stderr")
     elif options.view:  # the simulated camera already waits for the others
@@ -232,7 +232,7 @@ def _run_children(
     started: Callable[[], None] = lambda: None,
 ) -> None:
     """Start the processes, call `started`, then call `meanwhile` repeatedly until the awaited ones have ended."""
-    # Deferred: while a process forks, Python may swallow an exception of a signal handler.
+    # Signals are deferred: while a process forks, Python may swallow an exception of a signal handler.
     with deferred_signals() as interrupted:
         for child in children:
             child.start()

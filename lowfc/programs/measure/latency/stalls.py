@@ -15,7 +15,7 @@ from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.measure.latency.frame_statistics import SPANS, STAGES, WARM_UP_S, FrameOutcomes, percentiles
 
 Cause = Literal["host", "loop", "unknown"]
-"""Cause of a stall: the loop if one of its processes waited for a processor or pages, and the host is not the cause."""
+"""Cause of a stall: "loop" if a process of the loop waited for a processor or pages, and the host is not the cause."""
 
 _MIN_PERIODS = 0.25
 """Shortest delay that explains a stall, in frame periods."""
@@ -144,7 +144,7 @@ def combine(repeats: Sequence[Stalls]) -> Stalls:
 
 
 def _ends_ns(frames: FrameOutcomes, period_ns: int) -> Array:
-    """Time of each frame's command, ns; without a command, of the next one, at most a period after the last frame."""
+    """Time, ns, of each frame's command or, without one, of the next command; at most a period after the last frame."""
     sent_ns = frames.put_ns + frames.spans_us["frame_to_command"] * 1e3
     next_ns = np.fmin.accumulate(sent_ns[::-1])[::-1]  # without the NaN of frames that have no command
     return np.where(np.isfinite(sent_ns), sent_ns, np.fmin(next_ns, frames.put_ns.max(initial=0) + period_ns))

@@ -7,7 +7,7 @@ import numpy as np
 
 from lowfc.control.kernel.tables import KERNELS
 from lowfc.programs.measure.latency import stalls
-from lowfc.programs.measure.latency.frame_statistics import ALONE, COUNTS, RATIOS, RATIOS_AT, edges_us
+from lowfc.programs.measure.latency.frame_statistics import COUNTS, RATIOS, RATIOS_AT, REFERENCES, edges_us
 
 RATIO_ROW = "over_echo_and_step"
 COMPARED = ("p50", "p99", "p99_9")
@@ -32,7 +32,7 @@ def combine(repeats: Repeats) -> dict[str, Any]:
         "latency_us": {span: median_of(values) for span, values in by_span.items()},
         "spread_us": {span: spread_of(values) for span, values in by_span.items()},
     }
-    references = {name: [repeat[name] for repeat in repeats if repeat.get(name)] for name in ALONE}
+    references = {name: [repeat[name] for repeat in repeats if repeat.get(name)] for name in REFERENCES}
     for name in RATIOS:
         references[name] = [
             {at: ratio(repeat, at, name) for at in RATIOS_AT} for repeat in repeats if repeat.get("echo_us")
@@ -49,7 +49,7 @@ def combine(repeats: Repeats) -> dict[str, Any]:
     results["rate_hz"] = float(np.median([repeat["rate_hz"] for repeat in repeats]))
     results["histogram"] = _histogram(repeats, spans)
     results["over_time"] = [repeat["over_time"] for repeat in repeats]
-    results["repeats"] = [{name: repeat.get(name) for name in ("latency_us", *ALONE)} for repeat in repeats]
+    results["repeats"] = [{name: repeat.get(name) for name in ("latency_us", *REFERENCES)} for repeat in repeats]
     if memory := [repeat["memory_mb"] for repeat in repeats if "memory_mb" in repeat]:
         results["memory_mb"] = {name: max(processes[name] for processes in memory) for name in memory[0]}
     if traced := [repeat["stalls"] for repeat in repeats if "stalls" in repeat]:
@@ -76,19 +76,19 @@ def kernel_summary(repeats: Repeats) -> dict[str, Any]:
 
 
 def median_of(repeats: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Median over the repeats of each percentile; for max, the largest."""
+    """Median of each percentile over the repeats; of max, the largest."""
     by_percentile = {at: [repeat[at] for repeat in repeats] for at in repeats[0]}
     return {at: float(max(values) if at == "max" else np.median(values)) for at, values in by_percentile.items()}
 
 
 def spread_of(repeats: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
-    """Lowest and highest over the repeats of each percentile."""
+    """Lowest and highest value of each percentile over the repeats."""
     by_percentile = {at: [repeat[at] for repeat in repeats] for at in repeats[0]}
     return {at: [float(min(values)), float(max(values))] for at, values in by_percentile.items()}
 
 
 def ratio(repeat: Mapping[str, Any], at: str, name: str = "ratio") -> float:
-    """Latency from frame to command, over the sum of half a bare echo's round trip and one control step alone."""
+    """Latency from frame to command, divided by the sum of half a bare echo's round trip and one control step alone."""
     reference_us: float = repeat["echo_us"][at] / 2 + repeat[RATIOS[name][0]][at]
     return float(repeat["latency_us"]["frame_to_command"][at] / reference_us)
 

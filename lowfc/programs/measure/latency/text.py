@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lowfc.adapters.logs.recovery import faults
-from lowfc.programs.measure.latency.frame_statistics import ALONE, COUNTS, LOOP_SPANS, PERCENTILES, RATIOS, SPANS
+from lowfc.programs.measure.latency.frame_statistics import COUNTS, LOOP_SPANS, PERCENTILES, RATIOS, REFERENCES, SPANS
 from lowfc.programs.measure.latency.stalls import Stalls
 from lowfc.programs.measure.latency.summary import RATIO_ROW
 
@@ -23,13 +23,13 @@ def table(results: Mapping[str, Any]) -> str:
     """The result as text."""
     title = f"{'us':<22}" + "".join(f"{name.replace('_', '.'):>9}" for name in PERCENTILES)
     edges = results["histogram"]["edges_us"]
-    lines = [f"{title}   log counts, {edges[0]:.0f} to {edges[-1]:.0f} us"]
+    lines = [f"{title}   log of counts, {edges[0]:.0f} to {edges[-1]:.0f} us"]
     for span, values in results["latency_us"].items():
         if span == "due_to_frame":
             lines.append("from the time the frame was due instead of the time it was published:")
         bars = sparkline(results["histogram"]["counts"][span])
         lines.append(f"{_row(SPANS[span], values)}   {bars}")
-    for name, label in ALONE.items():
+    for name, label in REFERENCES.items():
         values = results[name]
         if name == "echo_us" and values:
             values = {at: value / 2 for at, value in values["round_trip"].items()}
@@ -54,15 +54,15 @@ def compared(comparison: Mapping[str, Any]) -> str:
         )
     lines += [f"{COUNTS[name]}: a {a}, b {b}" for name, (a, b) in comparison["counts"].items() if a or b]
     lines.append(
-        "in us, but `over echo and step` is a ratio; spread: the larger of both ranges over the repeats, unknown for a "
-        "single repeat."
+        "in us, but `over echo and step` is a ratio; spread: the larger of the ranges of a and b over the "
+        "repeats; -: a single repeat."
     )
     return "\n".join(lines)
 
 
 def sparkline(counts: Sequence[int]) -> str:
     """Counts as blocks of logarithmic height; many bins are combined into at most `_LINE`."""
-    bins = math.ceil(len(counts) / _LINE)  # combined in one block
+    bins = math.ceil(len(counts) / _LINE)  # bins combined in one block
     sums = [sum(counts[start : start + bins]) for start in range(0, len(counts), bins)]
     highest = math.log1p(max(sums, default=0)) or 1.0
     return "".join(_BLOCKS[math.ceil(math.log1p(count) / highest * (len(_BLOCKS) - 1))] for count in sums).rstrip()
@@ -112,13 +112,11 @@ def _remarks(results: Mapping[str, Any]) -> list[str]:
     for name, (_, suffix) in RATIOS.items():
         if results[name]:
             ratios = ", ".join(_ratios(results, name))
-            lines.append(f"frame to command / (half a bare echo + one control step){suffix}: {ratios}")
+            lines.append(f"frame to command / (half a bare echo + one control step{suffix}): {ratios}")
     if results.get("kernel_ratio"):
         each = zip(_ratios(results, "kernel_ratio"), results["kernel_ratio_spread"], strict=True)
         ratios = ", ".join(f"{ratio}, numpy {results['numpy_us'][at]:.1f} us" for ratio, at in each)
-        lines.append(
-            f"all results are of the fused step; ratio of its frame to command to numpy's, measured in turns: {ratios}"
-        )
+        lines.append(f"all results are of the fused step; frame to command, fused / numpy, measured in turns: {ratios}")
     counts = {name: results.get(name) for name in COUNTS}
     shown = [name for name, count in counts.items() if count or (name in _ALWAYS and count is not None)]
     lines.append(", ".join(f"{counts[name]} {COUNTS[name]}" for name in shown))
@@ -146,8 +144,8 @@ def _title(results: Mapping[str, Any]) -> str:
     """The settings of the measurement in one line."""
     settings, count = results["settings"], len(results["repeats"])
     if settings.get("log"):
-        left_out = f", {settings['selection']}" if settings["selection"] else ""
-        return f"{Path(settings['log']).name}, {results['rate_hz']:.1f} Hz{left_out}"
+        recorded = f", {settings['selection']}" if settings["selection"] else ""
+        return f"{Path(settings['log']).name}, {results['rate_hz']:.1f} Hz{recorded}"
     also = "".join(f", with --{name}" for name in ("record", "view", "trace") if settings.get(name))
     duration = f"{settings['duration_s']:g} s"
     times = f"{count} repeats of {duration}: medians, largest max" if count > 1 else duration
