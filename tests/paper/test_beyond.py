@@ -81,7 +81,7 @@ def test_tolerances_of_a_sensor_have_the_committed_values(monkeypatch):
     for module, name in ((tolerance, "_checked"), (star_pair, "pair_rows")):  # other tests cover these
         monkeypatch.setattr(module, name, lambda argument: [])
     rows = tolerance.tolerance(Context(sensors=(SMALLEST,)))
-    assert len(rows) == len(tolerance.MAGNITUDES) * 14 * len(tolerance.ALLOWED) * 2 * len(KINDS)
+    assert len(rows) == len(tolerance.MAGNITUDES) * 14 * len(tolerance.ALLOWED_CONTRASTS) * 2 * len(KINDS)
     shown = [row for row in rows if tolerance.is_printed(plain(row))]
     assert agree(shown, "tolerance") == len(shown) == 4 * 2 * 2
 

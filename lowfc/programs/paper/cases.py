@@ -1,4 +1,4 @@
-"""Tables and figures as cases, the context in which they run, and the prepared sensors."""
+"""Cases (tables and figures), the settings with which they are computed, and the prepared sensors."""
 
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -36,10 +36,10 @@ Result = TypeVar("Result")
 class Prepared:
     """A sensor at the paper's sampling, with the quantities that the tables use, computed on first use."""
 
-    def __init__(self, name: str, section: SensorSection, sensor: Sensor | None = None) -> None:
-        """Build the sensor of a section, or use `sensor` behind the section's coronagraph."""
+    def __init__(self, name: str, section: SensorSection, optics: Sensor | None = None) -> None:
+        """Build the optics of a section's sensor, or use `optics` behind the section's coronagraph."""
         self.name, self.section = name, section
-        self.sensor = sensor_from(section) if sensor is None else sensor
+        self.optics = sensor_from(section) if optics is None else optics
 
     @property
     def paper_name(self) -> str:
@@ -52,12 +52,12 @@ class Prepared:
     @cached_property
     def modes(self) -> Array:
         """The 20 modes (20, n, n) at the pupil's samples."""
-        return modes_at(len(self.sensor.pupil))
+        return modes_at(len(self.optics.pupil))
 
     @cached_property
     def open(self) -> Mask:
         """The open part (n, n) of the pupil, where wavefronts are compared."""
-        return np.asarray(self.sensor.pupil > 0.5)
+        return np.asarray(self.optics.pupil > 0.5)
 
     @cached_property
     def open_modes(self) -> Array:
@@ -72,42 +72,42 @@ class Prepared:
     @cached_property
     def I0(self) -> Array:
         """Image (pixels,) of a flat wavefront at the central wavelength, fractions of the open circle's light."""
-        return reference(self.sensor).ravel()
+        return reference(self.optics).ravel()
 
     @cached_property
     def H(self) -> Array:
         """Derivative (pixels, 20) of the image per nm of each mode."""
-        return response(self.sensor, self.modes)
+        return response(self.optics, self.modes)
 
     @cached_property
     def band(self) -> Band:
         """The band of Sect. 3.3: 20 % in five wavelengths, both ends included."""
-        return uniform(self.sensor.wavelength_nm)
+        return uniform(self.optics.wavelength_nm)
 
     @cached_property
     def band_I0(self) -> Array:
         """`I0` averaged over the band."""
-        return reference(self.sensor, self.band).ravel()
+        return reference(self.optics, self.band).ravel()
 
     @cached_property
     def band_H(self) -> Array:
         """`H` averaged over the band."""
-        return np.hstack([self.band_tilt_H, response(self.sensor, self.modes[2:], self.band)])
+        return np.hstack([self.band_tilt_H, response(self.optics, self.modes[2:], self.band)])
 
     @cached_property
     def band_tilt_H(self) -> Array:
-        """The columns (pixels, 2) of `band_H` for tip and tilt, in a tenth of the time."""
-        return response(self.sensor, self.modes[:2], self.band)
+        """The columns (pixels, 2) of `band_H` for tip and tilt, computed in a tenth of the time."""
+        return response(self.optics, self.modes[:2], self.band)
 
     @cached_property
     def nuisance(self) -> Array:
         """Changes of the image (pixels, 3) by nuisance parameters: flux (relative), pupil shear x and y (diameters)."""
-        return np.column_stack([self.I0, shear_response(self.sensor)])
+        return np.column_stack([self.I0, shear_response(self.optics)])
 
     @cached_property
     def budget(self) -> LightBudget:
         """Throughput of each element."""
-        return light_budget(self.sensor)
+        return light_budget(self.optics)
 
     @cached_property
     def coronagraph(self) -> Coronagraph:
@@ -117,7 +117,7 @@ class Prepared:
     @cached_property
     def twin(self) -> Twin:
         """The twin used by the iterations with the full model, accurate to about 1e-5 of the image."""
-        return load_or_build(self.sensor, ACCURATE)
+        return load_or_build(self.optics, ACCURATE)
 
     def opd_nm(self, modes_nm: Array) -> Array:
         """Wavefront (n, n) of the first modes (up to 20,) in nm."""
@@ -125,11 +125,11 @@ class Prepared:
 
     def image(self, modes_nm: Array, band: Band | None = None) -> Array:
         """Image (pixels,) of the first modes (up to 20,) in nm by the full optical chain, the truth of the trials."""
-        return image(self.sensor, self.opd_nm(modes_nm), band).ravel()
+        return image(self.optics, self.opd_nm(modes_nm), band).ravel()
 
     def star_image(self, modes_nm: Array, columns: int, samples_per: int = SAMPLES_PER) -> Array:
         """Contrast (columns, columns) around the star with a wavefront of the first modes (up to 20,) in nm."""
-        opd_nm, wavelength_nm = self.opd_nm(modes_nm), self.sensor.wavelength_nm
+        opd_nm, wavelength_nm = self.opd_nm(modes_nm), self.optics.wavelength_nm
         return contrast(self.coronagraph, opd_nm, wavelength_nm, columns, samples_per=samples_per)
 
     def fit(
@@ -192,12 +192,12 @@ def sparse_apertures() -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def prepared(name: str) -> Prepared:
-    """A sensor by its name, see `section_of`, cached in the process."""
+    """The sensor of a name as in `section_of`, cached in the process."""
     return Prepared(name, section_of(name))
 
 
 def section_of(name: str) -> SensorSection:
-    """[sensor] for one of `SENSORS`, a layout, clowfs:MM with its defocus, or bowtie:LAYOUT."""
+    """Section [sensor] for one of `SENSORS`, for a layout, for clowfs:MM with its defocus, or for bowtie:LAYOUT."""
     kind, _, detail = name.partition(":")
     if kind == "clowfs" and detail:
         try:
@@ -266,7 +266,7 @@ class Context:
         trials: Number of wavefronts and noise realisations.
         seed: Seed of all random numbers.
         jobs: Number of threads; the results do not depend on it.
-        sensors: Sensors that replace the table's own, if it has a choice.
+        sensors: Sensors that replace the table's own, unless those are fixed; None for the table's own.
         progress: Called with a description, the number of steps done, and the total.
     """
 
@@ -297,7 +297,7 @@ class Context:
 
 
 def assuming(assumption: str) -> Callable[[Callable[[Context], Iterable[Row]]], Callable[[Context], list[Row]]]:
-    """Decorator of a function that yields the rows of a figure; gives all of these rows this assumption."""
+    """Decorator of a function that yields the rows of a figure: all of them get this assumption."""
 
     def decorated(rows_of: Callable[[Context], Iterable[Row]]) -> Callable[[Context], list[Row]]:
         return lambda context: [replace(row, assumption=assumption) for row in rows_of(context)]

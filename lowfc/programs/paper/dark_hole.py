@@ -20,7 +20,7 @@ from lowfc.contract.errors import LowfcError
 from lowfc.control.loop.command_channels import FLAT
 
 STEPS = 20
-SEED = 5
+SEED = 5  # of the steps
 SETTLE = 100
 """Frames waited for after each step."""
 WINDOW = 300

@@ -24,15 +24,16 @@ from lowfc.programs.paper.figures.exposure import (
 )
 from lowfc.programs.paper.tables.reconstruction import bound_nm2, exposed_e, fits, iterated_nm, mean_and_error
 
-COMAS = (7, 8)
+COMAS = (7, 8)  # Noll indices
 REALISATIONS = 20
 _CORRECTED = (PINV, WEIGHTED_1, WEIGHTED_2)
 _RING = Wedge(4.5, 5.5)
-_VIEW, _VIEW_SAMPLES_PER, _FINE_SAMPLES_PER = 20, 6, 10
-_CURVE_EDGES = np.arange(0.25, 20.5, 0.5)
+_VIEW = 20  # half width of a picture, lambda/D
+_VIEW_SAMPLES_PER, _FINE_SAMPLES_PER = 6, 10  # per lambda/D
+_CURVE_EDGES = np.arange(0.25, 20.5, 0.5)  # radii between the rings of a contrast curve, lambda/D
 _LIMIT_DRAWS = 400
-_PAPER_GOAL = 1e-9
-_PAPER_WORSE = 100.0
+_PAPER_GOAL = 1e-9  # contrast
+_PAPER_WORSE = 100.0  # contrast with the aberration over contrast of the flat wavefront
 _PAPER_PV_WAVES = 6e-3
 
 
@@ -40,7 +41,7 @@ _PAPER_PV_WAVES = 6e-3
 class _Aberrated:
     """One aberration (modes,), and its residuals (realisations, modes) for each estimator."""
 
-    ready: Prepared
+    sensor: Prepared
     truth_nm: Array
     residuals_nm: dict[str, Array]
 
@@ -48,18 +49,18 @@ class _Aberrated:
 @lru_cache(maxsize=8)
 def _aberrated(context: Context, name: str, coma: int) -> _Aberrated:
     """lambda/30 of focus and of the coma with this Noll index, seen by a sensor."""
-    ready = prepared(name)
+    sensor = prepared(name)
     truth_nm = np.zeros(MODES)
-    truth_nm[[NOLLS_14.index(4), NOLLS_14.index(coma)]] = ready.sensor.wavelength_nm / 30.0
-    image, linear = ready.image(truth_nm), fits(ready, MODES)
-    ready.model(truth_nm)  # builds the twin before the threads use it
+    truth_nm[[NOLLS_14.index(4), NOLLS_14.index(coma)]] = sensor.optics.wavelength_nm / 30.0
+    image, linear = sensor.image(truth_nm), fits(sensor, MODES)
+    sensor.model(truth_nm)  # builds the twin before the threads use it
 
     def estimate(i: int) -> dict[str, Array]:
-        return iterated_nm(ready, linear, exposed_e(ready, image, context.rng("focus and coma", name, coma, i)))
+        return iterated_nm(sensor, linear, exposed_e(sensor, image, context.rng("focus and coma", name, coma, i)))
 
     results = context.map(f"{name}, coma Z{coma}", estimate, range(min(context.trials, REALISATIONS)))
     return _Aberrated(
-        ready, truth_nm, {key: truth_nm - np.stack([each[key] for each in results]) for key in ESTIMATORS}
+        sensor, truth_nm, {key: truth_nm - np.stack([each[key] for each in results]) for key in ESTIMATORS}
     )
 
 
@@ -74,25 +75,25 @@ def fig1(context: Context) -> Iterator[Row]:
         yield from _between_samples(prepared(name))
         for coma in COMAS:
             case = _aberrated(context, name, coma)
-            ready, row_name = case.ready, f"{name}, coma Z{coma}"
-            flat, aberrated = _contrast(ready, 0.0 * case.truth_nm), _contrast(ready, case.truth_nm)
+            sensor, row_name = case.sensor, f"{name}, coma Z{coma}"
+            flat, aberrated = _contrast(sensor, 0.0 * case.truth_nm), _contrast(sensor, case.truth_nm)
             yield Row(row_name, "contrast, flat wavefront", "", flat, _PAPER_GOAL)
             yield Row(row_name, "contrast, aberrated", "", aberrated)
             yield Row(row_name, "contrast, aberrated / flat wavefront", "", aberrated / flat, _PAPER_WORSE)
             for key in _CORRECTED:
-                corrected = context.map(f"{row_name}, {key}", partial(_contrast, ready), case.residuals_nm[key])
+                corrected = context.map(f"{row_name}, {key}", partial(_contrast, sensor), case.residuals_nm[key])
                 mean, error = mean_and_error(np.array(corrected))
                 fitted = partial(Row, row_name, modes=MODES, estimator=key)
                 yield fitted("contrast, corrected", "", mean, error=error, limit=flat)
                 yield fitted("contrast, corrected / flat wavefront", "", mean / flat, error=error / flat, limit=1.0)
 
 
-def _between_samples(ready: Prepared) -> list[Row]:
+def _between_samples(sensor: Prepared) -> list[Row]:
     """Contrast halfway between the points of the fine grid of the pupil's design, with a flat wavefront."""
     columns = 2 * _VIEW * _FINE_SAMPLES_PER
-    image = ready.star_image(np.zeros(MODES), columns, _FINE_SAMPLES_PER)
-    zone = image[wedge_samples(ready.coronagraph.dark_zone, columns, columns, _FINE_SAMPLES_PER)]
-    row_name = f"{ready.name}, dark zone, {_FINE_SAMPLES_PER} samples per lambda/D"
+    image = sensor.star_image(np.zeros(MODES), columns, _FINE_SAMPLES_PER)
+    zone = image[wedge_samples(sensor.coronagraph.dark_zone, columns, columns, _FINE_SAMPLES_PER)]
+    row_name = f"{sensor.name}, dark zone, {_FINE_SAMPLES_PER} samples per lambda/D"
     return [
         Row(row_name, "largest contrast, flat wavefront", "", float(zone.max()), _PAPER_GOAL),
         Row(row_name, f"samples above 1e-9, of {zone.size}", "", float((zone > _PAPER_GOAL).sum())),
@@ -107,12 +108,12 @@ def plot_fig1(context: Context, path: Path) -> None:
         case = _aberrated(context, name, coma)
         flat_nm = 0.0 * case.truth_nm
         for title, modes_nm in (("flat wavefront", flat_nm), (f"$\\lambda$/30 of Z4 and of Z{coma}", case.truth_nm)):
-            image = case.ready.star_image(modes_nm, 2 * _VIEW * _VIEW_SAMPLES_PER, _VIEW_SAMPLES_PER)
+            image = case.sensor.star_image(modes_nm, 2 * _VIEW * _VIEW_SAMPLES_PER, _VIEW_SAMPLES_PER)
             panels.append(plots.picture(image, title, plots.SKY, _VIEW, (1e-11, 1.0), "contrast", "log"))
         middles = (_CURVE_EDGES[1:] + _CURVE_EDGES[:-1]) / 2.0
         wavefronts = {"flat": flat_nm, "aberrated": case.truth_nm}
         wavefronts |= {key: case.residuals_nm[key][0] for key in _CORRECTED}
-        lines = [plots.Line(key, middles, _curve(case.ready, modes_nm)) for key, modes_nm in wavefronts.items()]
+        lines = [plots.Line(key, middles, _curve(case.sensor, modes_nm)) for key, modes_nm in wavefronts.items()]
         panels.append(
             plots.curves(lines, f"Z{coma}, corrected by {name}", f"radius, {plots.SKY_UNIT}", "contrast", "log")
         )
@@ -133,12 +134,12 @@ def plot_fig1(context: Context, path: Path) -> None:
 def fig7(context: Context) -> Iterator[Row]:
     """Peak-to-valley residual of the estimate, Fig. 7(c)."""
     for name in context.names("sam"):
-        ready = prepared(name)
-        basis, wavelength_nm = ready.open_modes[:MODES], ready.sensor.wavelength_nm
-        root = np.linalg.cholesky(bound_nm2(ready, MODES))
+        sensor = prepared(name)
+        basis, wavelength_nm = sensor.open_modes[:MODES], sensor.optics.wavelength_nm
+        root = np.linalg.cholesky(bound_nm2(sensor, MODES))
         drawn_nm = context.rng("focus and coma", "limit").standard_normal((_LIMIT_DRAWS, MODES)) @ root.T
         limit = float(residual_pv(basis, drawn_nm).mean()) / wavelength_nm
-        paper = _PAPER_PV_WAVES if ready.paper_name == "sam" else None
+        paper = _PAPER_PV_WAVES if sensor.paper_name == "sam" else None
         for coma in COMAS:
             for key, residuals_nm in _aberrated(context, name, coma).residuals_nm.items():
                 mean, error = mean_and_error(residual_pv(basis, residuals_nm) / wavelength_nm)
@@ -158,21 +159,21 @@ def plot_fig7(context: Context, path: Path) -> None:
             (f"estimate, {WEIGHTED_1}", case.truth_nm - residuals[WEIGHTED_1], 0.1),
             *((f"residual, {key}", modes_nm, 0.006) for key, modes_nm in residuals.items()),
         ):
-            waves = case.ready.opd_nm(modes_nm) / case.ready.sensor.wavelength_nm
-            inside = waves[case.ready.open]
-            shown = np.where(case.ready.open, waves - inside.mean(), np.nan)
+            waves = case.sensor.opd_nm(modes_nm) / case.sensor.optics.wavelength_nm
+            inside = waves[case.sensor.open]
+            shown = np.where(case.sensor.open, waves - inside.mean(), np.nan)
             title = f"{title}\nP-V {np.ptp(inside):.2g} waves"
             panels.append(plots.picture(shown, title, plots.PUPIL, 0.5, (-bound, bound), "waves", "signed"))
     plots.draw(path, panels, f"Fig. 7. One estimate of {name}. {BRIGHT}", columns=4)
 
 
-def _contrast(ready: Prepared, modes_nm: Array) -> float:
+def _contrast(sensor: Prepared, modes_nm: Array) -> float:
     """Mean contrast from 4.5 to 5.5 lambda/D with a wavefront (modes,)."""
-    return mean_contrast(ready.coronagraph, ready.opd_nm(modes_nm), ready.sensor.wavelength_nm, _RING)
+    return mean_contrast(sensor.coronagraph, sensor.opd_nm(modes_nm), sensor.optics.wavelength_nm, _RING)
 
 
-def _curve(ready: Prepared, modes_nm: Array) -> Array:
-    return contrast_curve(ready.coronagraph, ready.opd_nm(modes_nm), ready.sensor.wavelength_nm, _CURVE_EDGES)
+def _curve(sensor: Prepared, modes_nm: Array) -> Array:
+    return contrast_curve(sensor.coronagraph, sensor.opd_nm(modes_nm), sensor.optics.wavelength_nm, _CURVE_EDGES)
 
 
 CASES = {

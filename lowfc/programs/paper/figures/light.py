@@ -21,7 +21,8 @@ from lowfc.programs.paper.tables.tables import PAPER_TABLE2
 
 _TABLE_NOLLS = (4, 5, 6, 7, 8)
 _PLOT_NOLLS = (4, 5, 7)
-_VIEW, _VIEW_SAMPLES_PER = 10, 8
+_VIEW, _VIEW_SAMPLES_PER = 10, 8  # half width of a picture, lambda/D; samples per lambda/D
+# Least intensity that a picture shows, relative to its peak, by plane.
 _FAINTEST = {"focal": 1e-8, "relay": 1e-4, "sensor": 1e-5}
 
 
@@ -31,18 +32,18 @@ _FAINTEST = {"focal": 1e-8, "relay": 1e-4, "sensor": 1e-5}
 def fig2(context: Context) -> Iterator[Row]:
     """Fraction of the light that passes each plane, Fig. 2 and Sect. 3.3."""
     for name in context.names("sam"):
-        ready = prepared(name)
-        budget, relay = ready.budget, PAPER_RELAY_MASK if ready.paper_name == "sam" else None
+        sensor = prepared(name)
+        budget, relay = sensor.budget, PAPER_RELAY_MASK if sensor.paper_name == "sam" else None
         yield Row(name, "shaped pupil / open circle", "", budget.pupil, PAPER_PUPIL)
         yield Row(name, "reflected by the focal-plane mask / light on it", "", budget.focal_mask, PAPER_FOCAL_MASK)
         yield Row(name, "sensor / reflected by the focal-plane mask", "", budget.sensor, relay)
-        yield Row(name, "brightest pixel / light on the sensor", "", budget.peak, PAPER_PEAK.get(ready.paper_name))
+        yield Row(name, "brightest pixel / light on the sensor", "", budget.peak, PAPER_PEAK.get(sensor.paper_name))
 
 
 def plot_fig2(context: Context, path: Path) -> None:
     """Draw Fig. 2: intensities in the focal plane, after the aperture mask and on the sensor."""
-    ready = prepared(context.names("sam")[0])
-    optics = ready.sensor
+    sensor = prepared(context.names("sam")[0])
+    optics = sensor.optics
     pupil = optics.pupil.astype(np.complex128)
     sky = np.abs(to_image(pupil, 2 * _VIEW * _VIEW_SAMPLES_PER, _VIEW_SAMPLES_PER, 1.0)) ** 2
     panels: list[plots.Panel] = [
@@ -54,33 +55,34 @@ def plot_fig2(context: Context, path: Path) -> None:
         transmitted = relay / relay.max() * optics.relay.transmission**2
         bounds = (_FAINTEST["relay"], 1.0)
         panels.append(plots.picture(transmitted, "after the aperture mask", plots.PUPIL, 0.5, bounds, "of peak", "log"))
-    image, bounds = ready.I0 / ready.I0.max(), (_FAINTEST["sensor"], 1.0)
-    panels.append(_on_sensor(ready, image, "sensor, $I_0$", bounds, "of peak", "log"))
-    plots.draw(path, panels, f"Fig. 2. {ready.name}: flat wavefront at {optics.wavelength_nm:.0f} nm.")
+    image, bounds = sensor.I0 / sensor.I0.max(), (_FAINTEST["sensor"], 1.0)
+    panels.append(_on_sensor(sensor, image, "sensor, $I_0$", bounds, "of peak", "log"))
+    plots.draw(path, panels, f"Fig. 2. {sensor.name}: flat wavefront at {optics.wavelength_nm:.0f} nm.")
 
 
 @assuming("The paper gives the reflected light for its own pupil and the disk only. The wedges open by 95 degrees.")
 def fig3(context: Context) -> Iterator[Row]:
     """Sizes and reflected light of the focal-plane masks, Fig. 3."""
     for name in context.names("sam", "bowtie"):
-        ready = prepared(name)
-        mask, reflected = np.abs(ready.sensor.focal_mask) ** 2, PAPER_FOCAL_MASK if ready.paper_name == "sam" else None
-        radius = len(mask) / (2.0 * ready.sensor.samples_per)
-        yield Row(name, "outer radius", "lambda/D", radius, {"sam": 4.0, "bowtie": 10.0}.get(ready.paper_name))
-        yield Row(name, "reflecting area", "(lambda/D)^2", float(mask.sum()) / ready.sensor.samples_per**2)
-        yield Row(name, "reflected / light on it", "", ready.budget.focal_mask, reflected)
+        sensor = prepared(name)
+        mask, paper_name = np.abs(sensor.optics.focal_mask) ** 2, sensor.paper_name
+        reflected = PAPER_FOCAL_MASK if paper_name == "sam" else None
+        radius = len(mask) / (2.0 * sensor.optics.samples_per)
+        yield Row(name, "outer radius", "lambda/D", radius, {"sam": 4.0, "bowtie": 10.0}.get(paper_name))
+        yield Row(name, "reflecting area", "(lambda/D)^2", float(mask.sum()) / sensor.optics.samples_per**2)
+        yield Row(name, "reflected / light on it", "", sensor.budget.focal_mask, reflected)
 
 
 def plot_fig3(context: Context, path: Path) -> None:
     """Draw Fig. 3: the disk and the bowtie."""
     chosen = [prepared(name) for name in context.names("sam", "bowtie")]
-    widest = max(len(ready.sensor.focal_mask) for ready in chosen)
+    widest = max(len(sensor.optics.focal_mask) for sensor in chosen)
     panels: list[plots.Panel] = []
-    for ready in chosen:
-        mask = np.abs(ready.sensor.focal_mask) ** 2
+    for sensor in chosen:
+        mask = np.abs(sensor.optics.focal_mask) ** 2
         padded = np.pad(mask, (widest - len(mask)) // 2)
-        half_width = widest / (2.0 * ready.sensor.samples_per)
-        panels.append(plots.picture(padded, ready.name, plots.SKY, half_width, (0.0, 1.0), "reflectivity"))
+        half_width = widest / (2.0 * sensor.optics.samples_per)
+        panels.append(plots.picture(padded, sensor.name, plots.SKY, half_width, (0.0, 1.0), "reflectivity"))
     plots.draw(path, panels, "Fig. 3. Focal-plane masks: bright parts reflect to the sensor.")
 
 
@@ -91,34 +93,34 @@ def plot_fig3(context: Context, path: Path) -> None:
 def fig4(context: Context) -> Iterator[Row]:
     """Largest change of the image by lambda/30, Fig. 4 and Table 2."""
     for name in context.names("sam"):
-        ready = prepared(name)
+        sensor = prepared(name)
         for noll in _TABLE_NOLLS:
             yield Row(
                 f"{name}, Z{noll} {mode_name(noll)}",
                 "peak of abs(I - I0) / peak of I0",
                 "",
-                float(np.abs(differential(ready, noll)).max()),
-                PAPER_TABLE2[noll] if ready.paper_name == "sam" else None,
+                float(np.abs(differential(sensor, noll)).max()),
+                PAPER_TABLE2[noll] if sensor.paper_name == "sam" else None,
             )
 
 
 def plot_fig4(context: Context, path: Path) -> None:
     """Draw Fig. 4: differential images of focus, astigmatism and coma."""
-    ready = prepared(context.names("sam")[0])
+    sensor = prepared(context.names("sam")[0])
     panels: list[plots.Panel] = []
     for noll in _PLOT_NOLLS:
-        change = differential(ready, noll)
+        change = differential(sensor, noll)
         bound = float(np.abs(change).max())
         panels.append(
-            _on_sensor(ready, change, f"Z{noll}, {mode_name(noll)}", (-bound, bound), "$(I - I_0)$ / peak", "signed")
+            _on_sensor(sensor, change, f"Z{noll}, {mode_name(noll)}", (-bound, bound), "$(I - I_0)$ / peak", "signed")
         )
-    plots.draw(path, panels, rf"Fig. 4. {ready.name}: differential images of $\lambda$/30 rms, without noise.")
+    plots.draw(path, panels, rf"Fig. 4. {sensor.name}: differential images of $\lambda$/30 rms, without noise.")
 
 
-def _tilted_e(ready: Prepared, axis: int) -> tuple[Array, Array]:
+def _tilted_e(sensor: Prepared, axis: int) -> tuple[Array, Array]:
     """Electrons (pixels,) of a flat wavefront in Table 4's exposure, and their change by 1 mas of tilt."""
     light_e = electrons(STAR, TABLE4_EXPOSURE_S)
-    return light_e * ready.band_I0, light_e * tilt_signal(ready, axis)
+    return light_e * sensor.band_I0, light_e * tilt_signal(sensor, axis)
 
 
 @assuming(
@@ -129,10 +131,10 @@ def _tilted_e(ready: Prepared, axis: int) -> tuple[Array, Array]:
 def fig10(context: Context) -> Iterator[Row]:
     """Signal of 1 mas of tilt in a short exposure, Fig. 10 and Sect. 3.3."""
     for name in context.names("sam", "clowfs"):
-        ready = prepared(name)
+        sensor = prepared(name)
         for axis in (0, 1):
-            row_name, (flat_e, change_e) = f"{name}, tilt {'xy'[axis]}", _tilted_e(ready, axis)
-            signal_e, paper = float(np.ptp(change_e)), PAPER_SIGNAL.get(ready.paper_name)
+            row_name, (flat_e, change_e) = f"{name}, tilt {'xy'[axis]}", _tilted_e(sensor, axis)
+            signal_e, paper = float(np.ptp(change_e)), PAPER_SIGNAL.get(sensor.paper_name)
             ratio = np.abs(change_e) / np.sqrt(variance_e(flat_e + change_e, TABLE4_READ_NOISE_E))
             yield Row(row_name, "P-V change of the image / its peak", "", signal_e / float(flat_e.max()), paper)
             yield Row(row_name, "P-V change of the image", "e-", signal_e)
@@ -144,12 +146,12 @@ def plot_fig10(context: Context, path: Path) -> None:
     """Draw Fig. 10: noisy differential images of 1 mas."""
     panels: list[plots.Panel] = []
     for name in context.names("sam", "clowfs"):
-        ready = prepared(name)
-        flat_e, change_e = _tilted_e(ready, 0)
+        sensor = prepared(name)
+        flat_e, change_e = _tilted_e(sensor, 0)
         image_e = noisy_e(context.rng("fig10", name), flat_e + change_e, TABLE4_READ_NOISE_E)
         for values, title in ((image_e - flat_e, name), (change_e, f"{name}, without noise")):
             bound = float(np.percentile(np.abs(values), 99.8))
-            panels.append(_on_sensor(ready, values, title, (-bound, bound), "e-", "signed"))
+            panels.append(_on_sensor(sensor, values, title, (-bound, bound), "e-", "signed"))
     plots.draw(
         path,
         panels,
@@ -160,9 +162,9 @@ def plot_fig10(context: Context, path: Path) -> None:
 
 
 def _on_sensor(
-    ready: Prepared, image: Array, title: str, bounds: tuple[float, float], unit: str, scale: plots.Scale
+    sensor: Prepared, image: Array, title: str, bounds: tuple[float, float], unit: str, scale: plots.Scale
 ) -> plots.Panel:
-    optics = ready.sensor
+    optics = sensor.optics
     axes = plots.PUPIL if isinstance(optics.relay, PupilImage) else plots.SKY
     half_width = optics.samples * optics.pitch / 2.0
     shape = (optics.pixels, optics.pixels)

@@ -30,16 +30,17 @@ DEGREES = np.array([noll_to_orders(noll)[0] for noll in NOLLS_14])
 AMPLITUDES = np.array([0.005 * step for step in range(1, 31)])
 """Amplitudes of the pure modes of Fig. 8(a), waves rms."""
 _MODE_TICKS = [str(noll) for noll in NOLLS_14]
+# Least and mean coefficient of determination of the modes.
 _PAPER_R2 = {"sam": (0.95, 0.97), "clowfs": (0.79, 0.90)}
 _PAPER_DEVIATIONS = {"sam": ("linear", 0.1), "clowfs": ("linear", 0.1), "zwfs": ("linear to 0.03 waves", None)}
 """The paper's deviations from linearity at lambda/20 and at lambda/10; None if it has none."""
 _PAPER_ERROR_WAVES = 0.01
-_DEVIATION = 0.1
+_DEVIATION = 0.1  # relative deviation from linearity at the end of the linear range
 
 
-def _matched(ready: Prepared) -> Input:
+def _matched(sensor: Prepared) -> Input:
     """The interpretation of Sect. 3.1 that matches the input of Table 3."""
-    return next(inputs(ready, MODES, literal=False))
+    return next(inputs(sensor, MODES, literal=False))
 
 
 @lru_cache(maxsize=8)
@@ -54,9 +55,9 @@ def _ensemble(context: Context, name: str) -> Ensemble:
 def fig5(context: Context) -> Iterator[Row]:
     """Linear fit to estimated against true coefficients of each radial degree, Fig. 5."""
     for name in context.names("sam"):
-        ready, estimated = prepared(name), _ensemble(context, name)
+        sensor, estimated = prepared(name), _ensemble(context, name)
         for degree in range(1, 5):
-            truth, estimates = (values[:, degree == DEGREES].ravel() for values in _waves(ready, estimated))
+            truth, estimates = (values[:, degree == DEGREES].ravel() for values in _waves(sensor, estimated))
             (slope, intercept), covariance = np.polyfit(truth, estimates, 1, cov=True)
             fitted = partial(Row, f"{name}, n = {degree}", modes=MODES, estimator=PINV)
             errors = np.sqrt(np.diag(covariance))
@@ -68,8 +69,8 @@ def fig5(context: Context) -> Iterator[Row]:
 def plot_fig5(context: Context, path: Path) -> None:
     """Draw Fig. 5: estimated against true coefficients, a panel for each radial degree."""
     name = context.names("sam")[0]
-    ready = prepared(name)
-    truth, estimates = _waves(ready, _ensemble(context, name))
+    sensor = prepared(name)
+    truth, estimates = _waves(sensor, _ensemble(context, name))
     panels = []
     for degree in range(1, 5):
         lines = [
@@ -81,9 +82,9 @@ def plot_fig5(context: Context, path: Path) -> None:
     plots.draw(path, panels, f"Fig. 5. {name}, {PINV}, {len(truth)} wavefronts of Table 3. {BRIGHT}", columns=2)
 
 
-def _waves(ready: Prepared, estimated: Ensemble) -> tuple[Array, Array]:
+def _waves(sensor: Prepared, estimated: Ensemble) -> tuple[Array, Array]:
     """True coefficients and their `PINV` estimates (trials, modes) in waves."""
-    wavelength_nm = ready.sensor.wavelength_nm
+    wavelength_nm = sensor.optics.wavelength_nm
     return estimated.truth_nm / wavelength_nm, estimated.estimates_nm[PINV] / wavelength_nm
 
 
@@ -94,10 +95,10 @@ def _waves(ready: Prepared, estimated: Ensemble) -> tuple[Array, Array]:
 def fig6(context: Context) -> Iterator[Row]:
     """Coefficient of determination of each mode, Fig. 6 and eq. (15)."""
     for name, values in _r_squared(context).items():
-        ready = prepared(name)
-        limits = _r_squared_limit(ready)
+        sensor = prepared(name)
+        limits = _r_squared_limit(sensor)
         fitted = partial(Row, unit="", modes=MODES, estimator=PINV)
-        paper = _PAPER_R2.get(ready.paper_name, (None, None))
+        paper = _PAPER_R2.get(sensor.paper_name, (None, None))
         yield fitted(name, "least R^2", measured=float(values.min()), paper=paper[0], limit=float(limits.min()))
         yield fitted(name, "mean R^2", measured=float(values.mean()), paper=paper[1], limit=float(limits.mean()))
         for noll, value, limit in zip(NOLLS_14, values, limits, strict=True):
@@ -127,27 +128,27 @@ def _r_squared(context: Context) -> dict[str, Array]:
     return {name: r_squared(each.estimates_nm[PINV], each.truth_nm) for name, each in ensembles.items()}
 
 
-def _r_squared_limit(ready: Prepared) -> Array:
+def _r_squared_limit(sensor: Prepared) -> Array:
     """Coefficient of determination (modes,) of estimates whose errors are at the Cramer-Rao bound."""
-    wavefronts = _matched(ready)
-    bounds_nm = bounds_waves(NOLLS_14, wavefronts.low, wavefronts.high) * ready.sensor.wavelength_nm
-    return expected_r_squared(np.diag(bound_nm2(ready, MODES)), bounds_nm)
+    wavefronts = _matched(sensor)
+    bounds_nm = bounds_waves(NOLLS_14, wavefronts.low, wavefronts.high) * sensor.optics.wavelength_nm
+    return expected_r_squared(np.diag(bound_nm2(sensor, MODES)), bounds_nm)
 
 
 @lru_cache(maxsize=8)
 def _pure_modes(context: Context, name: str) -> Array:
     """Estimates (iterations, modes, amplitudes) in waves of each pure mode from its image, without noise."""
-    ready = prepared(name)
-    wavelength_nm, linear = ready.sensor.wavelength_nm, fits(ready, MODES)["pinv"]
-    ready.model(np.zeros(MODES))  # builds the twin before the threads use it
+    sensor = prepared(name)
+    wavelength_nm, linear = sensor.optics.wavelength_nm, fits(sensor, MODES)["pinv"]
+    sensor.model(np.zeros(MODES))  # builds the twin before the threads use it
 
     def estimate(k: int) -> Array:
         estimates = np.empty((len(ITERATIONS), AMPLITUDES.size))
         for j, amplitude in enumerate(AMPLITUDES):
             truth_nm = np.zeros(MODES)
             truth_nm[k] = amplitude * wavelength_nm
-            image_e = linear.scale_e * ready.model(truth_nm)
-            steps_nm = iterated(linear, image_e, ready.model, ITERATIONS[-1])
+            image_e = linear.scale_e * sensor.model(truth_nm)
+            steps_nm = iterated(linear, image_e, sensor.model, ITERATIONS[-1])
             estimates[:, j] = [steps_nm[iterations][k] / wavelength_nm for iterations in ITERATIONS]
         return estimates
 
@@ -172,12 +173,12 @@ def linear_range(deviation: Array) -> float:
 @lru_cache(maxsize=8)
 def _one_wavefront(context: Context, name: str, literal: bool) -> tuple[Array, dict[str, Array]]:
     """One random wavefront (modes,) in waves, and its estimates."""
-    ready = prepared(name)
-    wavelength_nm, matched = ready.sensor.wavelength_nm, _matched(ready)
+    sensor = prepared(name)
+    wavelength_nm, matched = sensor.optics.wavelength_nm, _matched(sensor)
     low, high = LITERAL_WAVES if literal else (matched.low, matched.high)
     truth = random_wavefronts(context.rng("fig8"), 1, NOLLS_14, low, high)[0]
-    image_e = exposed_e(ready, ready.image(truth * wavelength_nm), context.rng("fig8", name))
-    estimates = iterated_nm(ready, fits(ready, MODES), image_e)
+    image_e = exposed_e(sensor, sensor.image(truth * wavelength_nm), context.rng("fig8", name))
+    estimates = iterated_nm(sensor, fits(sensor, MODES), image_e)
     return truth, {key: modes_nm / wavelength_nm for key, modes_nm in estimates.items()}
 
 

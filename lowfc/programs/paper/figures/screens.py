@@ -27,25 +27,25 @@ _Screen = tuple[Array, dict[str, Array]]
 """A screen (n, n) in nm, and its estimates (modes,) in nm by each estimator and by the best fit."""
 
 
-def _screen_nm(context: Context, ready: Prepared, width: int, i: int) -> Array:
+def _screen_nm(context: Context, sensor: Prepared, width: int, i: int) -> Array:
     """Screen (n, n) with the paper's rms over the open pupil, piston removed."""
-    screen = kolmogorov(context.rng("kolmogorov", width, i), len(ready.sensor.pupil), width)
-    inside = screen[ready.open]
-    return np.asarray((screen - inside.mean()) * (_INPUT_WAVES * ready.sensor.wavelength_nm / inside.std()))
+    screen = kolmogorov(context.rng("kolmogorov", width, i), len(sensor.optics.pupil), width)
+    inside = screen[sensor.open]
+    return np.asarray((screen - inside.mean()) * (_INPUT_WAVES * sensor.optics.wavelength_nm / inside.std()))
 
 
 @lru_cache(maxsize=4)
 def _screens(context: Context, name: str, width: int) -> list[_Screen]:
-    ready = prepared(name)
-    linear = fits(ready, MODES)
-    centred = ready.open_modes[:MODES] - ready.open_modes[:MODES].mean(axis=1, keepdims=True)
-    ready.model(np.zeros(MODES))  # builds the twin before the threads use it
+    sensor = prepared(name)
+    linear = fits(sensor, MODES)
+    centred = sensor.open_modes[:MODES] - sensor.open_modes[:MODES].mean(axis=1, keepdims=True)
+    sensor.model(np.zeros(MODES))  # builds the twin before the threads use it
 
     def estimate(i: int) -> _Screen:
-        opd_nm = _screen_nm(context, ready, width, i)
-        image_e = exposed_e(ready, image(ready.sensor, opd_nm).ravel(), context.rng("screen", name, width, i))
-        modes_nm = iterated_nm(ready, linear, image_e)
-        modes_nm[_BEST] = np.linalg.lstsq(centred.T, opd_nm[ready.open])[0]
+        opd_nm = _screen_nm(context, sensor, width, i)
+        image_e = exposed_e(sensor, image(sensor.optics, opd_nm).ravel(), context.rng("screen", name, width, i))
+        modes_nm = iterated_nm(sensor, linear, image_e)
+        modes_nm[_BEST] = np.linalg.lstsq(centred.T, opd_nm[sensor.open])[0]
         return opd_nm, modes_nm
 
     return context.map(f"{name}, screens {WIDTHS[width]}", estimate, range(min(context.trials, SCREENS)))
@@ -60,15 +60,15 @@ def _screens(context: Context, name: str, width: int) -> list[_Screen]:
 def fig9(context: Context) -> Iterator[Row]:
     """Rms of estimate and residual of Kolmogorov screens, Fig. 9."""
     for name in context.names("sam"):
-        ready = prepared(name)
+        sensor = prepared(name)
         for width, extent in WIDTHS.items():
             screens = _screens(context, name, width)
             values = {
-                key: np.array([_rms_waves(ready, each, key) for each in screens]) for key in (*_ESTIMATORS, _BEST)
+                key: np.array([_rms_waves(sensor, each, key) for each in screens]) for key in (*_ESTIMATORS, _BEST)
             }
             for k, quantity in enumerate(("reconstructed", "residual")):
                 limit = float(values[_BEST][:, k].mean()) if quantity == "residual" else None
-                paper = _PAPER_WAVES[quantity] if ready.paper_name == "sam" else None
+                paper = _PAPER_WAVES[quantity] if sensor.paper_name == "sam" else None
                 for key in (*_ESTIMATORS, _BEST):
                     mean, error = mean_and_error(values[key][:, k])
                     fitted = partial(Row, f"{name}, {extent}", modes=MODES, estimator=key)
@@ -81,19 +81,19 @@ def fig9(context: Context) -> Iterator[Row]:
 def plot_fig9(context: Context, path: Path) -> None:
     """Draw Fig. 9: the first screen, its estimate and the residual, in radians."""
     name, width = context.names("sam")[0], next(iter(WIDTHS))
-    ready = prepared(name)
+    sensor = prepared(name)
     screen_nm, modes_nm = _screens(context, name, width)[0]
-    residual_nm = {key: screen_nm - ready.opd_nm(modes_nm[key]) for key in (PINV, _BEST)}
+    residual_nm = {key: screen_nm - sensor.opd_nm(modes_nm[key]) for key in (PINV, _BEST)}
     panels: list[plots.Panel] = []
     for title, opd_nm, bound in (
         ("(a) input", screen_nm, 1.0),
-        (f"(b) estimate, {PINV}", ready.opd_nm(modes_nm[PINV]), 1.0),
+        (f"(b) estimate, {PINV}", sensor.opd_nm(modes_nm[PINV]), 1.0),
         ("(c) residual", residual_nm[PINV], 0.4),
         (f"residual, {_BEST}", residual_nm[_BEST], 0.4),
     ):
-        inside = opd_nm[ready.open]
-        radians = (opd_nm - inside.mean()) * (2.0 * np.pi / ready.sensor.wavelength_nm)
-        title = f"{title}\nrms {inside.std() / ready.sensor.wavelength_nm:.3f} waves"
+        inside = opd_nm[sensor.open]
+        radians = (opd_nm - inside.mean()) * (2.0 * np.pi / sensor.optics.wavelength_nm)
+        title = f"{title}\nrms {inside.std() / sensor.optics.wavelength_nm:.3f} waves"
         shown = np.where(circle(len(radians)) > 0, radians, np.nan)
         panels.append(plots.picture(shown, title, plots.PUPIL, 0.5, (-bound, bound), "radians", "signed"))
     plots.draw(
@@ -105,12 +105,12 @@ def plot_fig9(context: Context, path: Path) -> None:
     )
 
 
-def _rms_waves(ready: Prepared, screen: _Screen, key: str) -> tuple[float, float]:
+def _rms_waves(sensor: Prepared, screen: _Screen, key: str) -> tuple[float, float]:
     """Rms of the estimate and of the residual, waves, over the open pupil."""
     opd_nm, modes_nm = screen
-    fitted = modes_nm[key] @ ready.open_modes[:MODES]
-    residual = opd_nm[ready.open] - fitted
-    return float(fitted.std()) / ready.sensor.wavelength_nm, float(residual.std()) / ready.sensor.wavelength_nm
+    fitted = modes_nm[key] @ sensor.open_modes[:MODES]
+    residual = opd_nm[sensor.open] - fitted
+    return float(fitted.std()) / sensor.optics.wavelength_nm, float(residual.std()) / sensor.optics.wavelength_nm
 
 
 CASES = {"fig9": Case("Fig. 9: estimate of Kolmogorov screens", fig9, plot_fig9)}

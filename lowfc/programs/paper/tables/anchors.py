@@ -35,9 +35,9 @@ from lowfc.programs.paper.tables import pointing, tolerance
 
 LOOP_SENSORS = ("sam", "zwfs_tuned")
 """Sensors for which loops are run."""
-RATE_HZ, MAGNITUDE, EXPOSURE = 1000.0, 2.0, 0.5
+RATE_HZ, MAGNITUDE, EXPOSURE = 1000.0, 2.0, 0.5  # exposure: as a fraction of the period
 OBSERVED_S, CLOSED_S, MEAN_S = 10.0, 24.0, 2.0
-"""Durations, s: of the loop from which a law is identified, of the loop that is judged, of a mean as in SCExAO."""
+"""Durations: of the loop from which a law is identified, of the loop that is judged, of a mean as in SCExAO."""
 ROMAN_MAS, SCEXAO_MAS = 0.4, {"laboratory": 0.02, "sky": 0.15}
 AVERAGED_S = 100.0
 DRIFT_PM = 20.0
@@ -114,14 +114,14 @@ def _pointing(context: Context, name: str) -> list[Row]:
     new_row = partial(Row, name, unit="mas", modes=len(NOLLS_14))
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
-        sensor = _sensor_toml(name)
-        (folder / "gains.toml").write_text(f"{GAINS}{sensor}")
+        sensor_toml = _sensor_toml(name)
+        (folder / "gains.toml").write_text(f"{GAINS}{sensor_toml}")
         for preset in ("reaction-wheel", "reaction-wheel-ideal"):
             context.progress(f"anchors {name}, {preset}", len(rows), 12)
             observed = _history(folder / _sim_loop(preset, folder, "gains.toml", OBSERVED_S, context.seed)["log"])
             law = folder / f"{preset}.fits"
             _lowfc(folder, "tune", str(observed.log.path), "--controller", "lqg", "--out", str(law))
-            (folder / "law.toml").write_text(f'{GAINS}law = "{law}"\n{sensor}')
+            (folder / "law.toml").write_text(f'{GAINS}law = "{law}"\n{sensor_toml}')
             run = _sim_loop(preset, folder, "law.toml", CLOSED_S, context.seed + 1000)
             limit = _quantum_pointing_nm(observed, name) / nm_per_mas
             new_lqg_row = partial(new_row, estimator="LQG")
@@ -228,9 +228,10 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
 def added_contrast(name: str, magnitude: float, quantum: bool = False) -> float:
     """Contrast that the residual of drift and noise adds, with integrators of the best gains."""
     noise = (tolerance.quantum_noise_nm2 if quantum else tolerance.frame_noise_nm2)(name, magnitude)
-    step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
+    step_nm2 = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ  # variance of the drift in a period
     residual_nm2 = [
-        drift_residual_nm2(step, n, tolerance.EXPOSURE, best_gain(step, n, tolerance.EXPOSURE)) for n in noise.tolist()
+        drift_residual_nm2(step_nm2, n, tolerance.EXPOSURE, best_gain(step_nm2, n, tolerance.EXPOSURE))
+        for n in noise.tolist()
     ]
     return float(sum(tolerance.contrasts_of(name).added(mode, each) for mode, each in enumerate(residual_nm2)))
 

@@ -59,7 +59,7 @@ def conditioning(context: Context) -> list[Row]:
     masks += [("sensor", prepared(name)) for name in context.names(*sparse_apertures(), *OTHER_SENSORS)]
     holes = [_with_holes(diameter) for diameter in HOLES]
     masks += [("holes", each) for each in holes if isinstance(each, Prepared)]
-    rows = [row for of_mask in context.map("conditioning", lambda mask: [*_rows(*mask)], masks) for row in of_mask]
+    rows = [row for mask_rows in context.map("conditioning", lambda mask: [*_rows(*mask)], masks) for row in mask_rows]
     return rows + [each for each in holes if isinstance(each, Row)]
 
 
@@ -69,7 +69,7 @@ def _bar(width: float, angle_deg: float) -> Prepared:
 
 
 def _with_holes(diameter: float) -> Prepared | Row:
-    """The default layout with holes of another diameter, or a row that states that these do not fit into the pupil."""
+    """The default layout with holes of another diameter, or a row that says that they do not fit into the pupil."""
     layout = load_layout(SensorSection().sam)
     name = f"default layout with holes of {100 * diameter:g} %"
     shrunk = sams.Layout(name, layout.purpose, tuple((x, y, diameter) for x, y, _ in layout.holes))
@@ -79,9 +79,9 @@ def _with_holes(diameter: float) -> Prepared | Row:
         return Row(
             name, "condition number", "", None, modes=14, assumption="These holes would reach outside the pupil."
         )
-    sensor = prepared("sam").sensor
-    relay = ApertureMask(sams.transmission(shrunk, len(sensor.pupil)))
-    return Prepared(name, SensorSection(), replace(sensor, relay=relay))
+    optics = prepared("sam").optics
+    relay = ApertureMask(sams.transmission(shrunk, len(optics.pupil)))
+    return Prepared(name, SensorSection(), replace(optics, relay=relay))
 
 
 def _rows(kind: str, mask: Prepared) -> Iterator[Row]:
@@ -111,8 +111,8 @@ def _rows(kind: str, mask: Prepared) -> Iterator[Row]:
 
 def _noise_rows(mask: Prepared, light_e: float) -> Iterator[Row]:
     """Rows of the noise of 14 modes, and of its quantum limit; none if the mask cannot distinguish the modes."""
-    sensor, modes = mask.sensor, mask.modes[:14]
-    band = gauss_legendre(sensor.wavelength_nm, count=4)
+    optics, modes = mask.optics, mask.modes[:14]
+    band = gauss_legendre(optics.wavelength_nm, count=4)
 
     def bound_nm2(I0: Array, H: Array) -> Array:
         return np.diag(cramer_rao(H * light_e, variance_e(I0 * light_e, 0.0)))
@@ -121,10 +121,10 @@ def _noise_rows(mask: Prepared, light_e: float) -> Iterator[Row]:
         bound = bound_nm2(mask.I0, mask.H[:, :14])
     except ValueError:
         return
-    limit = np.diag(np.linalg.inv(quantum_information(sensor.pupil, modes, sensor.wavelength_nm, light_e)))
-    in_band = bound_nm2(reference(sensor, band).ravel(), response(sensor, modes, band))
-    noise, least, broad = (float(np.sqrt(each.sum())) for each in (bound, limit, in_band))
+    limit = np.diag(np.linalg.inv(quantum_information(optics.pupil, modes, optics.wavelength_nm, light_e)))
+    in_band = bound_nm2(reference(optics, band).ravel(), response(optics, modes, band))
+    noise, limit_nm, noise_in_band = (float(np.sqrt(each.sum())) for each in (bound, limit, in_band))
     row = partial(Row, mask.name, modes=14, estimator="Cramer-Rao bound")
-    yield row("noise of all modes", "nm", noise, limit=least, assumption=f"{NOISE}\n{QUANTUM}")
+    yield row("noise of all modes", "nm", noise, limit=limit_nm, assumption=f"{NOISE}\n{QUANTUM}")
     yield row("share of the quantum limit", "", float(np.median(limit / bound)), limit=1.0, assumption=SHARE)
-    yield row("noise of all modes, 20 % band", "nm", broad, assumption=NOISE)
+    yield row("noise of all modes, 20 % band", "nm", noise_in_band, assumption=NOISE)

@@ -60,9 +60,9 @@ def photometry(context: Context) -> list[Row]:
 
 
 def _throughputs(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
-    budget, pupil = sam.budget, "Shaped pupil by linear programming; the paper's ripple pupil is not published."
-    yield Row("shaped pupil", "throughput", "", budget.pupil, PAPER_PUPIL, assumption=pupil)
-    yield Row("focal-plane mask", "throughput", "", budget.focal_mask, PAPER_FOCAL_MASK, assumption=pupil)
+    budget, pupils = sam.budget, "Shaped pupil by linear programming; the paper's ripple pupil is not published."
+    yield Row("shaped pupil", "throughput", "", budget.pupil, PAPER_PUPIL, assumption=pupils)
+    yield Row("focal-plane mask", "throughput", "", budget.focal_mask, PAPER_FOCAL_MASK, assumption=pupils)
     yield Row("sparse aperture mask", "throughput", "", budget.relay_mask, PAPER_RELAY_MASK)
     yield Row(
         "sam", "fraction of the light on the relay mask that reaches the sensor", "", budget.sensor, PAPER_RELAY_MASK
@@ -91,7 +91,7 @@ def tilt_signal(sensor: Prepared, axis: int) -> Array:
 def differential(sensor: Prepared, noll: int) -> Array:
     """(I - I0) / max(I0), (pixels,), for lambda/30 rms of one of the 14 modes, with the full exp(i phi)."""
     modes_nm = np.zeros(len(NOLLS_14))
-    modes_nm[NOLLS_14.index(noll)] = sensor.sensor.wavelength_nm / 30.0
+    modes_nm[NOLLS_14.index(noll)] = sensor.optics.wavelength_nm / 30.0
     return np.asarray((sensor.image(modes_nm) - sensor.I0) / sensor.I0.max())
 
 
@@ -141,7 +141,7 @@ def _inconsistencies(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
 
 def _tilt_contradiction(sam: Prepared) -> Iterator[Row]:
     """Table 2's tilt contradicts the 2.5 % of Sect. 3.3: a P-V is at most twice the largest |dI|."""
-    name, tilt_nm = "inconsistency 1: Table 2 against 2.5 % for 1 mas", sam.sensor.wavelength_nm / 30.0
+    name, tilt_nm = "inconsistency 1: Table 2 against 2.5 % for 1 mas", sam.optics.wavelength_nm / 30.0
     yield Row(
         name,
         "largest P-V of 1 mas that Table 2's tilt allows",
@@ -170,8 +170,8 @@ def _defocus_contradiction(clowfs: Prepared) -> Iterator[Row]:
     section = SensorSection(kind="clowfs")
 
     def peak(defocus_mm: float) -> float:
-        relay = Defocus(fresnel_distance(defocus_mm, section.focal_ratio, clowfs.sensor.wavelength_nm))
-        I0 = reference(replace(clowfs.sensor, relay=relay))
+        relay = Defocus(fresnel_distance(defocus_mm, section.focal_ratio, clowfs.optics.wavelength_nm))
+        I0 = reference(replace(clowfs.optics, relay=relay))
         return float(I0.max() / I0.sum())
 
     paper_peak, own = PAPER_PEAK["clowfs"], f"{section.defocus_mm:g} mm"
@@ -182,7 +182,7 @@ def _defocus_contradiction(clowfs: Prepared) -> Iterator[Row]:
         "",
         peak(section.defocus_mm),
         paper_peak,
-        assumption=f"{own} are {defocus_waves(section, clowfs.sensor.wavelength_nm):.2f} waves of defocus.",
+        assumption=f"{own} are {defocus_waves(section, clowfs.optics.wavelength_nm):.2f} waves of defocus.",
     )
     agreeing_mm = brentq(lambda mm: peak(mm) - paper_peak, 1.0, section.defocus_mm, xtol=1e-3)
     yield Row(
@@ -209,7 +209,7 @@ def _r2_contradiction(sam: Prepared) -> Iterator[Row]:
         PAPER_R2,
         assumption="Without a model: eq. (15) with the ratio of Table 3.",
     )
-    gram, wavelength_nm = sam.gram[:14, :14], sam.sensor.wavelength_nm
+    gram, wavelength_nm = sam.gram[:14, :14], sam.optics.wavelength_nm
     wavefronts = next(reconstruction.inputs(sam, 14, literal=False))
     linear = reconstruction.fits(sam, 14)["pinv"]
     spread = covariance(linear.R, variance_e(linear.reference_e, TABLE3_READ_NOISE_E)) / wavelength_nm**2

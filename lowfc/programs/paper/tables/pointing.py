@@ -23,7 +23,7 @@ FITTED = {1: (2, 14, 20), 10: (2, 14)}
 NM_PER_MAS = tilt_nm_per_mas(STAR.diameter_m)
 
 PAPER_PUPIL, PAPER_FOCAL_MASK, PAPER_RELAY_MASK = 0.147, 0.567, 0.091
-"""Throughputs, each relative to the light that reaches the element."""
+"""The paper's throughputs, each relative to the light that reaches the element."""
 SCALED_PUPIL = "scaled photometry"
 """Name of our own photometry with the transmission of the paper's pupil."""
 
@@ -49,7 +49,7 @@ class Exposure:
 
 def paper_count_e(sensor: Prepared) -> float:
     """Electrons on the sensor with the paper's throughputs."""
-    relay = PAPER_RELAY_MASK if isinstance(sensor.sensor.relay, ApertureMask) else 1.0
+    relay = PAPER_RELAY_MASK if isinstance(sensor.optics.relay, ApertureMask) else 1.0
     return electrons(STAR, TABLE4_EXPOSURE_S) * PAPER_PUPIL * PAPER_FOCAL_MASK * relay
 
 
@@ -164,11 +164,11 @@ def _rows(
     )
 
 
-def _dimmed_rows(sensor: Prepared, exposure: Exposure, tilted: Array) -> Iterator[Row]:
-    """Predictions with the throughput of the paper's pupil."""
+def _dimmed_rows(sensor: Prepared, exposure: Exposure, tilted_image: Array) -> Iterator[Row]:
+    """Predictions with the throughput of the paper's pupil, from the image (pixels,) with a tilt of 1 mas."""
     linear = fits(sensor, exposure, 1)
     quantity, paper = f"predicted std of x tilt, 1 mas, {exposure.name}", TABLE4_MAS.get(_paper_name(sensor), {}).get(1)
     for kind in KINDS:
-        std, limit = predicted_mas(linear[2, kind], tilted * exposure.scale_e), bound_mas(linear[2, kind])
+        std, limit = predicted_mas(linear[2, kind], tilted_image * exposure.scale_e), bound_mas(linear[2, kind])
         fitted = partial(Row, sensor.name, modes=2, estimator=kind, assumption=exposure.assumption)
         yield fitted(quantity, "mas", float(std[0]), paper, limit=float(limit[0]))

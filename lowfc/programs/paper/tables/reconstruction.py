@@ -125,7 +125,7 @@ def iterated_nm(sensor: Prepared, linear: dict[str, Fit], image_e: Array) -> dic
 def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisances: bool = False) -> Ensemble:
     """Draw the wavefronts, image them with the full chain and noise, and estimate them with every estimator."""
     sensor = prepared(name)
-    linear, wavelength_nm = fits(sensor, modes, nuisances), sensor.sensor.wavelength_nm
+    linear, wavelength_nm = fits(sensor, modes, nuisances), sensor.optics.wavelength_nm
     rng = context.rng("table3", modes, wavefronts.name)
     nolls = NOLLS_20[:modes]
     truth_nm = wavelength_nm * trials.random_wavefronts(rng, context.trials, nolls, wavefronts.low, wavefronts.high)
@@ -183,7 +183,7 @@ def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, estimated: E
         assumption = "\n".join((wavefronts.assumption, NOISE, *((EVEN,) if estimator == WITH_NUISANCES else ())))
         fitted = partial(Row, sensor.name, unit="waves", modes=modes, estimator=estimator, assumption=assumption)
         for statistic, value, limit, (mean, error) in (
-            ("RMS", paper[0], estimated.bound_nm / sensor.sensor.wavelength_nm, _rms(sensor, residuals_nm)),
+            ("RMS", paper[0], estimated.bound_nm / sensor.optics.wavelength_nm, _rms(sensor, residuals_nm)),
             ("P-V", paper[1], None, _pv(sensor, residuals_nm)),
         ):
             quantity = f"{statistic} residual, {wavefronts.name} input"
@@ -193,7 +193,7 @@ def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, estimated: E
 def _rms(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:
     """Rms over wavefronts and over the open pupil, and its standard error to first order, waves."""
     modes = coefficients_nm.shape[1]
-    values = trials.residual_rms(sensor.gram[:modes, :modes], coefficients_nm) / sensor.sensor.wavelength_nm
+    values = trials.residual_rms(sensor.gram[:modes, :modes], coefficients_nm) / sensor.optics.wavelength_nm
     mean, error = mean_and_error(values)
     rms = float(np.sqrt(np.mean(values**2)))
     return rms, error * mean / rms
@@ -202,4 +202,4 @@ def _rms(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:
 def _pv(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:
     """Mean peak to valley over the open pupil of wavefronts, and its standard error, waves."""
     values = trials.residual_pv(sensor.open_modes[: coefficients_nm.shape[1]], coefficients_nm)
-    return mean_and_error(values / sensor.sensor.wavelength_nm)
+    return mean_and_error(values / sensor.optics.wavelength_nm)

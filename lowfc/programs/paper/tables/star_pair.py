@@ -35,7 +35,7 @@ MAP = "Rms over the dark zone of the difference of the two long exposures, witho
 
 def coloured(temperature_K: float) -> Band:
     """The band weighted by a black body's photons."""
-    band = gauss_legendre(prepared("sam").sensor.wavelength_nm, count=4)
+    band = gauss_legendre(prepared("sam").optics.wavelength_nm, count=4)
     nm = np.array(band.wavelengths_nm)
     photons = np.array(band.weights) * nm**-4.0 / np.expm1(_PLANCK_NM_K / (nm * temperature_K))
     return Band(band.wavelengths_nm, tuple((photons / photons.sum()).tolist()))
@@ -45,11 +45,11 @@ def coloured(temperature_K: float) -> Band:
 def _maps() -> tuple[Array, Array, Mask]:
     """Second-order maps (modes, samples, samples) of contrast per nm^2, the map of a flat wavefront, the dark zone."""
     samples = 2 * int(np.ceil(DARK_ZONE.outer)) * SAMPLES_PER
-    ready = prepared("sam")
-    flat = ready.star_image(np.zeros(len(NOLLS_14)), samples)
+    sensor = prepared("sam")
+    flat = sensor.star_image(np.zeros(len(NOLLS_14)), samples)
     pure_modes_nm = _SMALL_NM * np.eye(len(NOLLS_14))
     maps = np.array(
-        [(ready.star_image(nm, samples) + ready.star_image(-nm, samples)) / 2 - flat for nm in pure_modes_nm]
+        [(sensor.star_image(nm, samples) + sensor.star_image(-nm, samples)) / 2 - flat for nm in pure_modes_nm]
     )
     return maps / _SMALL_NM**2, flat, wedge_samples(DARK_ZONE, samples, samples)
 
@@ -58,22 +58,22 @@ def zero_point_nm(name: str) -> Array:
     """Modes (14,), nm, at which a loop with the reference star's I0 and R holds the target star, due to its colour."""
     sensor = prepared(name)
     reference_star, target = (coloured(kelvin) for _, kelvin in STARS.values())
-    I0, H = reference(sensor.sensor, reference_star).ravel(), response(sensor.sensor, sensor.modes[:14], reference_star)
+    I0, H = reference(sensor.optics, reference_star).ravel(), response(sensor.optics, sensor.modes[:14], reference_star)
     normalised_I0, R = sensor.loop_fit(I0, H, tolerance.light_e(STARS["reference"][0]), tolerance.READ_NOISE_E)
-    target_I0 = reference(sensor.sensor, target).ravel()
+    target_I0 = reference(sensor.optics, target).ravel()
     return np.asarray(-R @ (target_I0 / target_I0.sum() - normalised_I0))
 
 
 def pair_rows(name: str) -> Iterator[Row]:
     """Rows of one sensor behind the shaped pupil."""
     maps, flat, zone = _maps()
-    step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
+    step_nm2 = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ  # variance of the drift in a period
     new_row = partial(Row, name, unit="", assumption=ASSUMPTION)
     gains, residual_nm2 = dict[str, Array](), dict[str, Array]()
     for star, (magnitude, _) in STARS.items():
         noise = tolerance.frame_noise_nm2(name, magnitude).tolist()
-        best = [best_gain(step, n, tolerance.EXPOSURE) for n in noise]
-        residual = [drift_residual_nm2(step, n, tolerance.EXPOSURE, g) for n, g in zip(noise, best, strict=True)]
+        best = [best_gain(step_nm2, n, tolerance.EXPOSURE) for n in noise]
+        residual = [drift_residual_nm2(step_nm2, n, tolerance.EXPOSURE, g) for n, g in zip(noise, best, strict=True)]
         gains[star], residual_nm2[star] = np.array(best), np.array(residual)
         yield new_row(
             f"added contrast, {star}, V = {magnitude:g}",

@@ -30,7 +30,7 @@ TABLE2_SENSORS = ("sam", "sam27d07_bal14", "sam27d10_bal14", "bowtie", "clowfs",
 
 def table1(context: Context) -> list[Row]:
     """Rows of Table 1, and of parameters in the text of Sects. 2 and 3."""
-    sensor, section, clowfs = prepared("sam").sensor, SensorSection(), SensorSection(kind="clowfs")
+    sensor, section, clowfs = prepared("sam").optics, SensorSection(), SensorSection(kind="clowfs")
     layout = load_layout(section.sam)
     diameters = sorted({hole[2] for hole in layout.holes})
     scaled = "The model uses focal lengths and diameters only by their ratio."

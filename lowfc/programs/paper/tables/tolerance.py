@@ -27,9 +27,9 @@ from lowfc.programs.paper.plots import curves, draw
 
 SENSORS_COMPARED = ("sam", "sam18_sized", "bar", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned", "aplc")
 MAGNITUDES = (0.0, 2.0, 5.0, 8.0)
-ALLOWED = (1e-9, 1e-10, 1e-11)
-RATE_HZ, EXPOSURE, READ_NOISE_E = 250.0, 0.5, 1.0
-LINE_HZ, LINE_WIDTH = 10.0, 0.005
+ALLOWED_CONTRASTS = (1e-9, 1e-10, 1e-11)
+RATE_HZ, EXPOSURE, READ_NOISE_E = 250.0, 0.5, 1.0  # exposure: as a fraction of the period
+LINE_HZ, LINE_WIDTH = 10.0, 0.005  # width: as a fraction of the frequency
 ESTIMATORS: dict[Kind, str] = {"integrator": "integrator, best gain", "lqg": "LQG"}
 
 CHECKED_SENSORS, CHECKED_MODES, CHECKED_MAGNITUDES = ("clowfs_tuned", "zwfs_tuned"), (4, 8, 11), (2.0, 5.0)
@@ -86,7 +86,7 @@ class Contrasts:
 def contrasts(pupil: str, focal_radius: float) -> Contrasts:
     """Contrast that each mode adds behind a coronagraph; the fourth order is from full images."""
     section = SensorSection(pupil=pupil, focal_radius=focal_radius)
-    modal = ModalContrast(coronagraph_from(section), NOLLS_14, prepared("sam").sensor.wavelength_nm)
+    modal = ModalContrast(coronagraph_from(section), NOLLS_14, prepared("sam").optics.wavelength_nm)
     flat, form = modal.by_image(np.zeros(len(NOLLS_14))), np.diag(modal.form)
     if not (form > 0).all():
         raise ConfigurationError(
@@ -133,7 +133,7 @@ def quantum_noise_nm2(name: str, magnitude: float) -> Array:
 def _quantum_noise_of_one_electron_nm2(name: str) -> Array:
     """Variance (14,) at the quantum limit for as much light as yields one electron from the open circle."""
     sensor = prepared(name)
-    information = quantum_information(sensor.sensor.pupil, sensor.modes[: len(NOLLS_14)], sensor.sensor.wavelength_nm)
+    information = quantum_information(sensor.optics.pupil, sensor.modes[: len(NOLLS_14)], sensor.optics.wavelength_nm)
     return np.asarray(np.diag(np.linalg.inv(information)))
 
 
@@ -155,7 +155,7 @@ def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterat
     for magnitude in MAGNITUDES:
         noises_nm2 = np.column_stack([frame_noise_nm2(name, magnitude), quantum_noise_nm2(name, magnitude)])
         for mode, (noll, noise_and_limit_nm2) in enumerate(zip(NOLLS_14, noises_nm2, strict=True)):
-            for allowed, kind in product(ALLOWED, KINDS):
+            for allowed, kind in product(ALLOWED_CONTRASTS, KINDS):
                 residual_nm2 = modal.variance_nm2(mode, allowed)
                 drifts = [tolerated_drift(residual_nm2, nm2, EXPOSURE, kind) for nm2 in noise_and_limit_nm2]
                 drift_pm = 1e3 * np.sqrt([drift.step_nm2 * RATE_HZ for drift in drifts])
