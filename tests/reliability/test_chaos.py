@@ -22,7 +22,7 @@ from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, TRUTH, Log, Topic, wire
 from lowfc.contract.sequence_gaps import Gaps
 from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Outcome, ProcessEnd
-from lowfc.programs.reliability.chaos.case import Case, lacking
+from lowfc.programs.reliability.chaos.case import Case, unmet
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.command import _run, configured
 from lowfc.programs.reliability.chaos.evidence import FORGED_S, Entry, Evidence, read
@@ -135,8 +135,8 @@ FAULTS: list[tuple[str, str, Callable[[Evidence, Outcome], object]]] = [
     ("recovery", "open", lambda _, outcome: setattr(outcome, "mode", wire.LOOP_MODE_OPEN)),
     ("recovery", "in vain", lambda _, outcome: outcome.notes.append("waited in vain")),
     ("events", "1 unexpected SAFED", lambda e, _: e.entries[EVENT].append(event(Level.ERROR, "SAFED why"))),
-    ("account", f"2 of {STEP.key} missing, 0 counted", lambda e, _: e.received.__setitem__(STEPS, received(7, 8))),
-    ("account", f"5 of {STEP.key} missing", lambda e, _: e.sent.__setitem__(STEPS, FRAMES + 5)),
+    ("account", f"{STEP.key}: 2 missing, 0 counted", lambda e, _: e.received.__setitem__(STEPS, received(7, 8))),
+    ("account", f"{STEP.key}: 5 missing", lambda e, _: e.sent.__setitem__(STEPS, FRAMES + 5)),
     ("account", "damaged", lambda e, _: e.unreadable.append("damaged")),
     ("account", "no log", lambda e, _: setattr(e, "messages", 0)),
     ("account", "flushed", unflushed),
@@ -172,7 +172,7 @@ def test_losses_that_are_counted_and_refused_frames_that_hold_the_command_break_
         shapes[500] = shapes[500]._replace(actuators_nm=shapes[499].actuators_nm)
 
     def broken_with(bad: Callable[[int], bool]) -> dict[str, str]:
-        return broken_rules(replace(CASE, bad=bad), outcome, evidence)
+        return broken_rules(replace(CASE, is_bad=bad), outcome, evidence)
 
     assert broken_with(lambda number: number == 500) == {}
     assert "bad frame 501 was used" in broken_with(lambda number: number == 501)["bad frames"]
@@ -187,7 +187,7 @@ def test_a_missing_expected_event_breaks_the_rule(outcome: Outcome, evidence: Ev
 
 
 def test_a_safe_case_requires_the_safe_mode_and_a_flat_mirror(outcome: Outcome, evidence: Evidence) -> None:
-    case = replace(CASE, safe=True)
+    case = replace(CASE, ends_safe=True)
     assert "closed" in broken_rules(case, outcome, evidence)["recovery"]
     outcome.mode = wire.LOOP_MODE_SAFE
     assert "nm of flat" in broken_rules(case, outcome, evidence)["recovery"]
@@ -251,11 +251,11 @@ def test_every_case_has_a_valid_configuration_and_known_events(tmp_path: Path) -
     for case in {str(case.config): case for case in CASES.values()}.values():  # each configuration once
         assert configured(case, tmp_path).control.start_mode == "closed"
     assert {case.fault for case in CASES.values() if case.fault} == set(Kind)
-    bad = next(case for case in CASES.values() if case.bad is not None).bad
+    bad = next(case for case in CASES.values() if case.is_bad is not None).is_bad
     edges = (FIRST - 1, FIRST, FIRST + FAULTY_FRAMES - 1, FIRST + FAULTY_FRAMES)
     assert [bad(number) for number in edges] == [False, True, True, False]
     assert FORGED_S < START_S
-    bad = CASES["frames-stuck"].bad  # the first frames may be used, up to max_identical_frames
+    bad = CASES["frames-stuck"].is_bad  # the first frames may be used, up to max_identical_frames
     edges = (FIRST, FIRST + 2, FIRST + 3, FIRST + FAULTY_FRAMES)
     assert [bad(number) for number in edges] == [False, False, True, False]
 
@@ -289,7 +289,7 @@ def without_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lowfc.programs.reliability.chaos.rules.judge", judge_notes)
     acts = {"good": Mock(), "odd": faulty, "stopped": Mock(side_effect=KeyboardInterrupt), "last": Mock()}
     cases = {name: replace(CASE, name=name, act=act) for name, act in acts.items()}
-    cases["lacking"] = replace(CASE, name="lacking", act=faulty, lacks=lambda: "requires a mount (not here)")
+    cases["lacking"] = replace(CASE, name="lacking", act=faulty, why_skipped=lambda: "requires a mount (not here)")
     monkeypatch.setattr("lowfc.programs.reliability.chaos.cases.CASES", cases)
 
 
@@ -340,16 +340,16 @@ def test_an_interrupted_command_prints_the_results_so_far() -> None:
 
 
 def test_the_reason_why_a_command_fails_is_given() -> None:
-    assert lacking("requires it", "true") == ""
-    assert lacking("requires it", "ls", "/not/there").startswith("requires it (ls: ")
-    assert lacking("requires it", "false") == "requires it (false ended with 1)"
-    assert lacking("requires it", "/not/there") == "requires it (/not/there: No such file or directory)"
+    assert unmet("requires it", "true") == ""
+    assert unmet("requires it", "ls", "/not/there").startswith("requires it (ls: ")
+    assert unmet("requires it", "false") == "requires it (false ended with 1)"
+    assert unmet("requires it", "/not/there") == "requires it (/not/there: No such file or directory)"
 
 
 def test_a_shifted_clock_is_tried_with_the_shift_of_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
     """The kernel refuses a monotonic clock below zero: an hour behind needs a host that has been up for an hour."""
-    monkeypatch.setattr("lowfc.programs.reliability.chaos.case.lacking", lambda *words: " ".join(words[-2:]))
-    assert [CASES[f"clock-{kind}"].lacks() for kind in ("ahead", "behind")] == ["3600 true", "-3600 true"]
+    monkeypatch.setattr("lowfc.programs.reliability.chaos.case.unmet", lambda *words: " ".join(words[-2:]))
+    assert [CASES[f"clock-{kind}"].why_skipped() for kind in ("ahead", "behind")] == ["3600 true", "-3600 true"]
 
 
 @pytest.mark.usefixtures("without_loop")

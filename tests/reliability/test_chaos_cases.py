@@ -55,7 +55,7 @@ def test_a_console_is_measured_in_every_phase(tmp_path: Path, monkeypatch: pytes
     process = Mock()
     shown = nullcontext(SimpleNamespace(process=process, start_s=0.5, cpu_s=lambda: 2.0))
     monkeypatch.setattr(console, "TerminalConsole", lambda run: shown)
-    monkeypatch.setattr(console, "SPAN_S", 0.3)
+    monkeypatch.setattr(console, "PHASE_S", 0.3)
     monkeypatch.setattr(processes, "_SETTLE_S", 0.1)
     row = run_case(replace(CASES["console"], config=TOY_KEYS), 2, tmp_path)
     assert row["passed"], row["findings"]

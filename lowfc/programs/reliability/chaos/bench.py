@@ -30,7 +30,7 @@ from lowfc.programs.launch.processes import program
 from lowfc.programs.launch.sim_loop import children_of, prepare
 
 _POLL_S = 0.02
-_QUIET_FRAMES = 250  # before a fault: one second at the default rate
+_QUIET_FRAMES = 250  # closed-loop frames before a fault: one second at the default rate
 _LAST_HEALTH_S = 0.2
 SETTLED_FRAMES = 500
 """Closed-loop frames to wait for after a fault: two seconds at the default rate; the last second is judged."""
@@ -53,7 +53,7 @@ class ProcessEnd:
     Attributes:
         name: name of the process.
         status: exit status; negative for a signal.
-        after_s: time from the request to its end.
+        after_s: time from the request to end until the end.
         requested: whether the case ended it, or waited for its end.
     """
 
@@ -70,8 +70,8 @@ class Outcome:
     Attributes:
         folder: folder with the logs and the standard error of the processes.
         config: configuration of the loop.
-        settled_ns: time at which the loop had settled, host clock; 0 if it did not.
-        end_ns: time at which the processes were stopped.
+        settled_ns: time at which the loop had settled, host clock; 0 if it did not settle.
+        end_ns: time at which the stop of the processes began, host clock.
         ended: processes that ended.
         alive: processes that still exist after the end of the case.
         killed_ns: times at which a recorder was killed, host clock.

@@ -30,11 +30,11 @@ class Case:
         config: configuration keys that the case sets.
         expected: beginnings of the events that must be in the log.
         allowed: names of events of the level ERROR that may be in the log.
-        safe: whether the loop must end in safe mode with a flat mirror, instead of closed with the former residual.
-        bad: whether the frame with a given number must be refused; None if all may be used.
+        ends_safe: whether the loop must end in safe mode with a flat mirror, not closed with the former residual.
+        is_bad: whether the frame with a given number must be refused; None if all frames may be used.
         statuses: exit status other than 0 with which a process may end, by process.
-        noisy: whether tracebacks are expected, from messages that cannot be decoded.
-        lacks: function that returns why this host cannot run the case; empty if it can.
+        prints_tracebacks: whether the processes may print tracebacks, from messages that cannot be decoded.
+        why_skipped: function that returns why this host cannot run the case; empty if it can.
     """
 
     name: str
@@ -44,16 +44,16 @@ class Case:
     config: Mapping[str, Any] = field(default_factory=dict)
     expected: tuple[str, ...] = ()
     allowed: tuple[str, ...] = ()
-    safe: bool = False
-    bad: Callable[[int], bool] | None = None
+    ends_safe: bool = False
+    is_bad: Callable[[int], bool] | None = None
     statuses: Mapping[str, int] = field(default_factory=dict)
-    noisy: bool = False
-    lacks: Callable[[], str] = str  # str() is the empty string
+    prints_tracebacks: bool = False
+    why_skipped: Callable[[], str] = str  # str() is the empty string
 
     def run(self, bench: ChaosBench) -> None:
         """Inject the fault, and wait until the loop has recovered."""
         self.act(bench)
-        if self.safe:
+        if self.ends_safe:
             bench.await_steps(HOLD_FRAMES)
         else:
             bench.await_settled()
@@ -72,18 +72,18 @@ def case(name: str, description: str, **attributes: Any) -> Callable[[Act], Act]
     return register
 
 
-def no_other_clock(shift_s: int) -> str:
+def no_clock_shift(shift_s: int) -> str:
     """Why a process cannot have a clock shifted by this time on this host; empty if it can."""
-    return lacking(f"requires a clock shifted by {shift_s} s", "unshare", "--time", "--monotonic", str(shift_s), "true")
+    return unmet(f"requires a clock shifted by {shift_s} s", "unshare", "--time", "--monotonic", str(shift_s), "true")
 
 
 def no_mounts() -> str:
     """Why this process cannot mount on this host; empty if it can."""
     mount = ("mount", "-t", "tmpfs", "-o", "ro,size=1m", "tmpfs", tempfile.gettempdir())
-    return lacking("requires the right to mount", "unshare", "--mount", *mount)
+    return unmet("requires the right to mount", "unshare", "--mount", *mount)
 
 
-def lacking(requirement: str, *command: str) -> str:
+def unmet(requirement: str, *command: str) -> str:
     """Try a harmless command; return the requirement and why the command failed, or empty if it succeeded."""
     try:
         process = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603  # ours

@@ -88,7 +88,7 @@ def _require_writable(folder: Path) -> None:
 def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
     """Run one case in its own folder, and judge it; without `keep`, only the log of a failed case is kept."""
     row: dict[str, Any] = {"name": case.name, "sentence": case.description, "seconds": 0.0}
-    row |= {"passed": False, "skipped": case.lacks() or None, "log": None, "findings": {}, "figures": {}}
+    row |= {"passed": False, "skipped": case.why_skipped() or None, "log": None, "findings": {}, "figures": {}}
     if row["skipped"]:
         return row | {"detail": row["skipped"]}
     begun_s, folder = time.monotonic(), Path(tempfile.mkdtemp(prefix=f"lowfc-chaos-{case.name}-"))

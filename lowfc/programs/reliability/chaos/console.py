@@ -22,12 +22,12 @@ from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, case
 from lowfc.programs.reliability.chaos.processes import CommandTimes
 
-SPAN_S = 5.0
+PHASE_S = 5.0
 """Duration of each phase."""
 START_S = 60.0
 FLOOD_HZ = 2000
 _STEP_S = 0.02
-_SIZE = 30, 100
+_SIZE = 30, 100  # rows and columns of the terminal
 _LOOP_MODE = rb"\b(OPEN|CLOSED)\b"
 """Text on the screen once the console shows the loop."""
 
@@ -40,25 +40,25 @@ _LOOP_MODE = rb"\b(OPEN|CLOSED)\b"
 )
 def _console(bench: ChaosBench) -> None:
     times = CommandTimes(bench)
-    times.measure("without", SPAN_S)
+    times.measure("without", PHASE_S)
     with TerminalConsole(bench.run.run_id) as console:
         cpu_before_s, began_s = console.cpu_s(), time.monotonic()
-        times.measure("open", SPAN_S)
+        times.measure("open", PHASE_S)
         share = (console.cpu_s() - cpu_before_s) / (time.monotonic() - began_s)
         bench.outcome.measurements["console"] = {"start_s": round(console.start_s, 2), "share": round(share, 3)}
         with _flood(bench):
-            times.measure("flooded", SPAN_S)
+            times.measure("flooded", PHASE_S)
             console.process.send_signal(signal.SIGSTOP)
-            times.measure("flooded and frozen", SPAN_S)
-        times.measure("frozen", SPAN_S)
+            times.measure("flooded and frozen", PHASE_S)
+        times.measure("frozen", PHASE_S)
         console.process.kill()
-        times.measure("killed", SPAN_S)
+        times.measure("killed", PHASE_S)
     with _flood(bench):
-        times.measure("flood without", SPAN_S)
+        times.measure("flood without", PHASE_S)
 
 
 class TerminalConsole(contextlib.AbstractContextManager["TerminalConsole"]):
-    """`lowfc console` as a process with its own terminal; it showed the loop `start_s` after its start."""
+    """`lowfc console` as a process with its own terminal; `start_s`: time from its start until it showed the loop."""
 
     def __init__(self, run: str, folder: Path | None = None) -> None:
         """Start the console in a folder, and wait until it shows the loop; CaseFailedError after `START_S`."""

@@ -22,7 +22,7 @@ from lowfc.control.laws.stability import limiting_gain
 from lowfc.control.loop.guard import MIN_BLOCK_FRAMES, WORSE_BLOCKS
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
-from lowfc.programs.reliability.chaos.case import HOLD_FRAMES, LOST, case, no_mounts, no_other_clock, read_only
+from lowfc.programs.reliability.chaos.case import HOLD_FRAMES, LOST, case, no_clock_shift, no_mounts, read_only
 from lowfc.programs.reliability.chaos.processes import kill_and_restart
 
 STABLE_FRACTION = 0.9
@@ -125,7 +125,7 @@ def _damaged_calibration(bench: ChaosBench) -> None:
     bench.restart(Role.CONTROLLER, good)
 
 
-@case("safed-restart", "safe mode, then the controller is killed and restarted", expected=("SAFED",), safe=True)
+@case("safed-restart", "safe mode, then the controller is killed and restarted", expected=("SAFED",), ends_safe=True)
 def _restart_in_safe_mode(bench: ChaosBench) -> None:
     bench.client().safe()
     bench.await_steps(HOLD_FRAMES)
@@ -184,7 +184,7 @@ def _safe_without_latch(no_latch: Callable[[Path], contextlib.AbstractContextMan
     bench.restart(Role.CONTROLLER)
 
 
-no_latch_case = partial(case, expected=("SAFED", "LATCH_FAILED"), safe=True)
+no_latch_case = partial(case, expected=("SAFED", "LATCH_FAILED"), ends_safe=True)
 no_latch_case(
     "safe-without-directory",
     "safe mode while the run's directory is missing; then the controller is killed and restarted",
@@ -192,7 +192,7 @@ no_latch_case(
 no_latch_case(
     "safe-read-only",
     "safe mode while the run's directory is read-only; then the controller is killed and restarted",
-    lacks=no_mounts,
+    why_skipped=no_mounts,
 )(partial(_safe_without_latch, read_only))
 
 
@@ -212,5 +212,5 @@ for _kind, _shift_s, _expected in (("ahead", 3600, ("CAMERA_RESTARTED",)), ("beh
         f"a camera whose clock is an hour {_kind} replaces the camera for a while",
         expected=_expected,
         allowed=LOST,
-        lacks=partial(no_other_clock, _shift_s),
+        why_skipped=partial(no_clock_shift, _shift_s),
     )(partial(_other_clock, shift_s=_shift_s))

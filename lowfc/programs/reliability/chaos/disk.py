@@ -16,7 +16,7 @@ SLOW_S = 3.0
 """Duration of a slow write."""
 
 
-# The recorder with a file whose writes sleep and are timed, as on a slow disk.
+# Program of a recorder on a slow disk: some writes to its file sleep, and all writes are timed.
 _SLOW = """
 import sys, time
 from lowfc.adapters.logs import writer
@@ -51,7 +51,7 @@ def _full(bench: ChaosBench) -> None:
     "disk-read-only",
     "a recorder on a read-only disk refuses to start, another one records",
     statuses={Role.RECORDER: 2},
-    lacks=no_mounts,
+    why_skipped=no_mounts,
 )
 def _read_only(bench: ChaosBench) -> None:
     locked = bench.folder / "locked"

@@ -40,7 +40,7 @@ class Entry(NamedTuple):
 
     @property
     def start_s(self) -> int:
-        """Start time of its publisher."""
+        """Start time of the message's publisher, Unix seconds."""
         return start_of(self.sequence)
 
     @property
@@ -55,8 +55,8 @@ class Evidence:
 
     Attributes:
         entries: messages of each topic of `DECODED`, in the order of the logs.
-        received: counts of the messages in each finished log, by number of the log, key and start of the publisher;
-            each log was written by another recorder, which counts the losses while it runs.
+        received: counts of the messages in each finished log, by number of the log, key and start of the publisher.
+            Each log was written by another recorder, which counts losses only while it runs.
         sent: messages that each publisher reported at its end as sent, by the same keys as `received`.
         lost: messages that the recorders report as lost, by key.
         unreadable: errors of logs and messages that cannot be read.

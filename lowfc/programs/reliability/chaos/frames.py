@@ -43,7 +43,7 @@ for _kind, _description, _reason, _used, _lost in _KINDS:
         fault=_kind,
         expected=(_event,) if _event else (),
         allowed=LOST if _lost else (),
-        bad=range(FIRST + _used, FIRST + FAULTY_FRAMES).__contains__ if _used < FAULTY_FRAMES else None,
+        is_bad=range(FIRST + _used, FIRST + FAULTY_FRAMES).__contains__ if _used < FAULTY_FRAMES else None,
     )(_wait_for_last)
 case(
     "stuck-actuators",

@@ -58,7 +58,7 @@ class Intruder(AbstractContextManager["Intruder"]):
         return len(self._bus.get(REQUEST_KEY.format(name=name), payload, timeout_s))
 
 
-@case("junk", "random bytes on every topic, 2,000 a second", allowed=LOST, noisy=True)
+@case("junk", "random bytes on every topic, 2,000 a second", allowed=LOST, prints_tracebacks=True)
 def _flood(bench: ChaosBench) -> None:
     with Intruder(bench) as intruder:
         begun_s = time.monotonic()

@@ -16,7 +16,7 @@ process_case = partial(case, allowed=LOST)
 
 STALL_S = 10.0
 CALM_S = STALL_S / 2
-"""Time measured before a stall, and after it: together as many frames as during it."""
+"""Duration of the measurement before a stall, and of the one after it; together they last as long as the stall."""
 RANDOM_FAULTS = 6
 _SETTLE_S = 0.3
 _STATIC = {"disturbance.static_nm": {"4": 40.0}}

@@ -19,7 +19,7 @@ from lowfc.programs.reliability.chaos.evidence import Entry, Evidence
 MAX_RATIO = 2.0
 """Largest ratio of the residual after recovery to that before the fault."""
 FLOOR_NM = 1.0
-"""Noise of the residual, added to the limit."""
+"""Allowance for the noise of the residual, added to the limit from `MAX_RATIO`."""
 FLUSHED_S = 1.0
 """Messages recorded longer than this before a kill must be in the log, which is flushed four times a second."""
 SPAN_NS = 1_000_000_000
@@ -58,7 +58,7 @@ def judge(case: Case, outcome: Outcome, evidence: Evidence) -> list[Finding]:
 
 
 def _limits(outcome: Outcome, evidence: Evidence) -> Finding:
-    """Commands are within the controller's limits, mirror states within the mirror's."""
+    """Commands are within the limits of the controller, mirror states within those of the mirror."""
     config = outcome.config
     commands, states = evidence.entries[COMMAND], evidence.entries[MIRROR_STATE]
     moving = np.ones((config.mirror.rows, config.mirror.columns), bool)
@@ -77,7 +77,7 @@ def _limits(outcome: Outcome, evidence: Evidence) -> Finding:
 
 
 def _violations(source: str, limits: Limits, shapes: list[Entry], moving: Mask) -> Iterator[str]:
-    """Limits that shapes violate at the `moving` actuators; n missing messages allow n + 1 slew steps."""
+    """Limits that shapes violate at the `moving` actuators; across n missing messages n + 1 slew steps are allowed."""
     if not shapes:
         return
     surface = np.array([shape.actuators_nm for shape in shapes], np.float64)
@@ -151,8 +151,8 @@ def _bad_frames(case: Case, evidence: Evidence) -> Finding:
             if step.message.frame_sequence <= last:
                 wrong.append(f"frame {step.frame} was used after a newer one, or twice")
             newest[step.start_s] = max(step.message.frame_sequence, last)
-    if case.bad is not None:
-        bad = [step for step in steps if case.bad(step.frame)]
+    if case.is_bad is not None:
+        bad = [step for step in steps if case.is_bad(step.frame)]
         wrong += [f"bad frame {step.frame} was used" for step in bad if step.message.error_nm]
         wrong += [] if bad else ["no bad frame was received"]
     return _finding("bad frames", wrong, f"{len(refused)} refused, {len(steps)} steps")
@@ -167,7 +167,7 @@ def _recovery(case: Case, outcome: Outcome, evidence: Evidence) -> Finding:
     mode = mode_name(outcome.mode)
     if outcome.notes:
         return Finding("recovery", False, "; ".join(outcome.notes))
-    if not case.safe:
+    if not case.ends_safe:
         held = outcome.mode == wire.LOOP_MODE_CLOSED and after <= MAX_RATIO * before + FLOOR_NM
         return Finding("recovery", held, f"residual {before:.2f} -> {after:.2f} nm, {mode}")
     states = evidence.entries[MIRROR_STATE]
@@ -205,7 +205,7 @@ def _account(outcome: Outcome, evidence: Evidence) -> Finding:
         if key != FRAME.key:  # a faulty camera sends more or fewer frames than it numbers
             missing[key] += max(0, evidence.sent.get(publication, 0) - received.next)
     wrong += [
-        f"{count} of {key} missing, {counted.get(key, 0)} counted as lost"
+        f"{key}: {count} missing, {counted.get(key, 0)} counted as lost"
         for key, count in missing.items()
         if count > counted.get(key, 0)
     ]
@@ -236,7 +236,7 @@ def _processes(case: Case, outcome: Outcome) -> Finding:
             wrong.append(f"{ended.name} ended with status {ended.status}{by_itself}")
         elif not ended.requested and ended.status == 0:
             wrong.append(f"{ended.name} ended by itself")
-    outputs = [] if case.noisy else sorted(outcome.folder.glob("*.stderr"))
+    outputs = [] if case.prints_tracebacks else sorted(outcome.folder.glob("*.stderr"))
     wrong += [f"a traceback in {path.name}" for path in outputs if "Traceback" in path.read_text(errors="replace")]
     if not {ended.name for ended in outcome.ended} & set(map(str, Role)):
         wrong.append("no process ended")

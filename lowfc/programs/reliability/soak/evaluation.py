@@ -30,7 +30,7 @@ class Usage(NamedTuple):
 
 
 def slope(times_s: Sequence[float], values: Sequence[float]) -> tuple[float, float] | None:
-    """Change per hour and its standard error, fitted to means of blocks after the warm-up; None if too short."""
+    """Change per hour and its standard error, from means of blocks after the warm-up; None if the time is too short."""
     hours, samples = np.asarray(times_s, np.float64) / 3600, np.asarray(values, np.float64)
     later = hours >= hours[0] + WARM_UP * (hours[-1] - hours[0]) if hours.size else hours
     if np.count_nonzero(later) < 2 * BLOCKS:

@@ -24,7 +24,7 @@ from lowfc.programs.reliability.chaos.processes import CommandTimes
 from lowfc.programs.reliability.soak.evaluation import Usage, latency_statistics, process_statistics, too_short
 
 SAMPLE_S = 1.0
-_PATIENCE_S = 10.0
+_PATIENCE_S = 10.0  # for a process to exit
 _MUST_BE_ZERO = {
     "messages_lost": "messages lost",
     "gaps": "messages missing in the logs",
@@ -43,7 +43,7 @@ class LogChecker:
 
     @property
     def gaps(self) -> int:
-        """Messages missing in the logs between others of the same publisher, of topics that are recorded completely."""
+        """Messages missing in the logs between others of one publisher, on topics whose messages are all recorded."""
         received = self._received.items()
         return sum(gaps.missing for (key, _), gaps in received if self._selection.records_all(topic_of(key)))
 
