@@ -44,7 +44,7 @@ STUCK_S = 10.0
 MAX_EARLIER_EVENTS = 1000
 """Largest number of events shown from before the start of the view."""
 
-_RECORDER_S = 3.0  # time without its Health after which the recorder counts as absent
+_RECORDER_S = 3.0  # time without the recorder's Health after which the recorder counts as absent
 _FILE_S = 60.0  # longest time for the last data to be written to a file
 _POLL_S = 0.1
 _CHECK_S = 1.0

@@ -15,7 +15,7 @@ _QUERY_AGAIN_NS = 5_000_000_000  # time until a controller that did not answer i
 
 
 def import_late_modules() -> None:
-    """Import the module that only later verdicts use: an import during a verdict would delay all values shown."""
+    """Import the module that only later verdicts use: its import during a verdict would delay all values shown."""
     import_module("lowfc.control.laws.tuning")
 
 
@@ -61,7 +61,7 @@ class Monitor:
         return snapshot
 
     def _complete(self, snapshot: Snapshot) -> bool:
-        """Whether all states queried of the controller have arrived; subclasses may query more."""
+        """Whether all states queried from the controller have arrived; subclasses may query more states."""
         return None not in (snapshot.calibration, snapshot.controller)
 
     def _query(self) -> None:

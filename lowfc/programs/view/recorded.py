@@ -33,7 +33,7 @@ _STRIDE = 500  # messages between progress reports
 class Drawn:
     """Summary of drawn logs: number of snapshots, duration, and `remarks` on damaged, truncated or unreadable parts.
 
-    `span_ns`: times on the timeline of the first and last snapshot with a frame; None without one.
+    `span_ns`: times on the timeline of the first and the last snapshot with a frame; None without a frame.
     """
 
     snapshots: int = 0
@@ -77,10 +77,10 @@ class _Drawing:
         self._due_ns = self._first_ns = self._last_ns = 0
         self._damaged, self._no_end = 0, ""
         self._stroke_nm: float | None = None
-        self._lost: dict[str, int] = {}  # by recording; its last file has the count of all its files
+        self._lost: dict[str, int] = {}  # by recording: the last file has the count of all files
 
     def begin(self, reader: LogReader) -> None:
-        """Begin the next log: its first message is read, and with it what precedes the messages."""
+        """Begin the next log, after its first message was read, and with it the metadata at its start."""
         self._order.begin(reader, self._last_ns)
         if self._renderer is None:
             config = self._config or _configuration_of(reader, self._drawn.remarks)
@@ -158,10 +158,8 @@ class _Order:
     def __init__(self) -> None:
         self.run = self.host = ""
         self._ended_ns = 0
-        self._newest_frame = self._last_frame = (
-            -1,
-            0,
-        )  # largest sequence and its publish time: so far, and before the log
+        # Largest frame sequence and its publish time: up to now, and up to the end of the log before this one.
+        self._newest_frame = self._last_frame = (-1, 0)
 
     def begin(self, reader: LogReader, ended_ns: int) -> None:
         """Begin the next log; the one before it ended at `ended_ns`."""
@@ -177,7 +175,7 @@ class _Order:
     def check(self, message: Sample, topic: Topic, log: Path) -> None:
         """Check a message of the log."""
         if not topic.queryable and message.receive_time_ns < self._ended_ns - REORDERING_NS:
-            raise DataFileError(f"{log} begins before the previous log ends; name each once, in order of recording")
+            raise DataFileError(f"{log} begins before the previous log ends; name each log once, in order of recording")
         if topic is FRAME:
             sequence, sent_ns = message.sequence, message.publish_time_ns
             last_sequence, last_sent_ns = self._last_frame

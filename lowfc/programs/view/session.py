@@ -80,7 +80,7 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
     """
     require_folder(target.written)
     for log in logs:
-        next(iter(LogReader(log, skip_damaged=True)), None)  # an unreadable file is an error before a viewer starts
+        next(iter(LogReader(log, skip_damaged=True)), None)  # reports an unreadable file before a viewer starts
     drawn = Drawn()
     with contextlib.ExitStack() as stack:
         if target.save is not None:

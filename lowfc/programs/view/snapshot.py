@@ -276,7 +276,7 @@ class Accumulator:
         return self._data_ns + max(0, host_ns - self._data_host_ns) if self._data_ns else host_ns
 
     def _read(self, topic: Topic, message: Sample) -> None:
-        """Read a message of a topic of which all are kept; another number of modes discards the rows so far."""
+        """Read a message of a topic whose messages are all kept; another number of modes discards the rows so far."""
         if topic is STEP:
             step = wire.ControlStep.FromString(message.payload)
             time_ns = checked_time_ns(step.timestamp)
@@ -305,7 +305,7 @@ class Accumulator:
             if isinstance(state, wire.ControllerState):
                 checked_time_ns(state.mode_timestamp)
                 if any(len(channel.actuators) % 4 for channel in state.channels):
-                    raise ValueError("a channel whose bytes are not whole numbers of four bytes")
+                    raise ValueError("a channel whose actuators are not a multiple of four bytes")
                 if any(acting.number >= len(state.settings.interlocks) for acting in state.interlocks_acting):
                     raise ValueError("an interlock that is not in its settings")
             self._states[topic] = decode_calibration(state) if isinstance(state, wire.Calibration) else state

@@ -10,7 +10,7 @@ from rerun.components import ImageBufferBatch, ImageFormat
 from lowfc.programs.view.draw.colours import Rgb, diverging
 from lowfc.programs.view.draw.plots import at, labels
 
-_STEPS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
+_STEPS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)  # round numbers in a decade
 _SHRINK_NS = 2_000_000_000
 
 
@@ -23,7 +23,7 @@ class Scale:
         self._needed_ns = 0
 
     def fit(self, values: npt.NDArray[np.floating], time_ns: int) -> bool:
-        """Adapt the limit to values; True if it changed."""
+        """Adapt the limit to the finite ones of the values; True if the limit changed."""
         largest = max(self.least, float(np.abs(values[np.isfinite(values)]).max(initial=0.0)))
         decade = 10.0 ** floor(log10(largest))
         fitted = next(step * decade for step in _STEPS if largest <= step * decade * (1 + 1e-9))

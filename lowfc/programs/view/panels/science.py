@@ -1,4 +1,4 @@
-"""Science camera panel: contrast of the dark zone for the residual wavefront, and with a flat mirror."""
+"""Science camera panel: computed contrast of the dark zone, for the residual wavefront and with a flat mirror."""
 
 from collections import deque
 

@@ -21,7 +21,7 @@ from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
 
 TILES = "status/tiles"
-WIDTH, HEIGHT = 1760, 256
+WIDTH, HEIGHT = 1760, 256  # px
 GROUND: Colour = (13, 16, 17)
 """Rerun's background, so that only the tiles are visible."""
 MIN_PERIOD_NS = 250_000_000
@@ -32,18 +32,18 @@ _GAP, _INSET, _BAND, _CLOCK = 6, 9, 46, 190  # gap of boxes, inset of text, heig
 _TILES_END = 196  # lower edge of the tiles, px
 _FACTS = (3, 4, 4, 4)  # relative widths of the facts below the tiles
 _MIN_FONT = 8
-_SHADES = 16
+_SHADES = 16  # of each level
 _PITCH = 1.16  # distance from line to line, in font sizes
 
 Box = tuple[int, int, int, int]
-"""Left and top inside the box, right and bottom just outside."""
+"""Left, top, right and bottom, px; left and top are inside the box, right and bottom just outside."""
 Text = tuple[Box, str, int]
 """Box, words, and largest font size."""
 Shades = npt.NDArray[np.uint8]
 
 
 class Tiles(Panel):
-    """Draws the verdict on the run, once a second and when its words change; at a log's end, that on the whole log."""
+    """Draws the verdict on the run, once a second and when its words change; at a log's end, on the whole log."""
 
     def __init__(self, nm_per_mas: float) -> None:
         """`nm_per_mas`: wavefront rms of a tilt of 1 mas."""

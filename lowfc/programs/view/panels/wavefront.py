@@ -86,4 +86,5 @@ class Wavefront(Panel):
 
 
 def _rss(values: Values) -> Values:
+    """Root of the sum of squares over the columns (rows,)."""
     return np.asarray(np.sqrt(np.sum(values**2, axis=1)))

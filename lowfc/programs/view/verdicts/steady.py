@@ -16,7 +16,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.view.snapshot import Snapshot
 
 FRAMES = 6144
-"""Frames kept, for spectra of eleven half-overlapping segments of 1024."""
+"""Frames kept, for spectra of eleven half-overlapping segments of 1024 frames."""
 
 
 class LawInForce(NamedTuple):

@@ -29,7 +29,7 @@ FRAMES_SILENT_S = 1.0
 """Time without a frame or a step after which it is reported as missing, but at least `PERIODS` frame periods."""
 COMPARISON_PERIOD_NS = 30_000_000_000
 """Time between two computations of the best gains, which take 0.3 s for 14 modes."""
-_SAMPLES = 1000
+_SAMPLES = 1000  # largest number kept
 _MODES: dict[int, LoopMode] = {mode.value: mode for mode in LoopMode}
 _COUNTERS: dict[str, tuple[Role, Callable[[wire.Health], int]]] = {
     "skipped": (Role.CONTROLLER, lambda health: topic_count(health, FRAME.key).skipped),
@@ -170,7 +170,7 @@ class Watcher:
         return max(0.0, (self._snapshot.host_ns - time_ns) * 1e-9 - self._snapshot.behind_s)
 
     def _update_mode(self, snapshot: Snapshot) -> None:
-        """Keep the newest step's mode; without a new step, that of the controller's state; without one, of Health."""
+        """Keep the loop mode of the newest step; without one, of the controller's state; without a state, of its Health."""
         last = snapshot.health.get(Role.CONTROLLER)
         report = snapshot.controller or (last.health if last is not None else None)
         mode = snapshot.steps.mode[-1] if snapshot.steps.mode.size else report.mode if report is not None else 0
