@@ -31,7 +31,7 @@ from lowfc.programs.logs.report.source import read_run
 from lowfc.programs.view.layout import layout
 from lowfc.programs.view.live_view import earlier_events
 from lowfc.programs.view.panels import mirror, pointing, sensor, tiles, trend, wavefront
-from lowfc.programs.view.recorded import Drawn, draw_logs
+from lowfc.programs.view.recorded import DrawnLogs, draw_logs
 from lowfc.programs.view.session import memory_remarks, show_logs
 from lowfc.programs.view.snapshot import Accumulator
 from lowfc.programs.view.target import Target
@@ -62,7 +62,7 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
     return verdicts
 
 
-def drawn(*logs: Path, config: Configuration | None = None) -> tuple[Drawn, Tape]:
+def drawn(*logs: Path, config: Configuration | None = None) -> tuple[DrawnLogs, Tape]:
     tape = Tape()
     return draw_logs(logs, config or Configuration(), tape), tape
 

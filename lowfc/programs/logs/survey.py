@@ -114,8 +114,8 @@ class _TopicRow:
         }
 
 
-class _Account:
-    """Counts of the messages of a log that was recorded with `selection`."""
+class _MessageCounts:
+    """Counts of a log's messages; `selection`: the messages that the recorder was to write."""
 
     def __init__(self, selection: Selection = EVERYTHING) -> None:
         self._selection = selection
@@ -155,7 +155,7 @@ class _Account:
         row.starts.add((publisher, start_of(message.sequence)))
 
     def json_object(self) -> dict[str, Any]:
-        """The account as a dictionary."""
+        """The counts as a dictionary."""
         missing = self._losses.lost()
         begin = None if self._begin_ns is None else datetime.fromtimestamp(self._begin_ns / 1e9, UTC)
         topics = {}
@@ -178,16 +178,16 @@ def survey(
     log: LogFiles, progress: Callable[[int, int], None] | None = None, *, digest: bool = False
 ) -> dict[str, Any]:
     """Summary of a log, complete or not, from all of its messages; `digest` adds digests of the log and of each key."""
-    reader, account, digests = WholeLog(log, progress), _Account(), Digest()
+    reader, counts, digests = WholeLog(log, progress), _MessageCounts(), Digest()
     for number, message in enumerate(reader):
         if not number:
-            account = _Account(reader.selection)  # the selection is known from the first message on
+            counts = _MessageCounts(reader.selection)  # the selection is known from the first message on
         topic = known_topic(message.key)
-        account.enter(topic, message, reader.schema_of(message))
+        counts.enter(topic, message, reader.schema_of(message))
         if digest and topic is not None:
             digests.enter(topic, message)
     configuration, remarks = attached_configuration(reader)
-    content = account.json_object()
+    content = counts.json_object()
     for key, hexadecimal in digests.by_key().items():
         content["topics"][key]["digest"] = hexadecimal
     return {
@@ -217,12 +217,12 @@ def _state(reader: WholeLog) -> str:
 
 def recovery_in_words(metadata: Mapping[str, Mapping[str, str]]) -> str:
     """Text on the source of a recovered log and on what was left out; empty for any other log."""
-    account = metadata.get(RECOVERY)
-    if account is None:
+    recovery = metadata.get(RECOVERY)
+    if recovery is None:
         return ""
-    unfinished = ", which was incomplete" if account.get("source_finished") == "false" else ""
-    parts, unreadable = account.get("left_out", "?"), account.get("unreadable", "?")
+    unfinished = ", which was incomplete" if recovery.get("source_finished") == "false" else ""
+    parts, unreadable = recovery.get("left_out", "?"), recovery.get("unreadable", "?")
     return (
-        f"recovered from {account.get('source', '?')}{unfinished}; "
+        f"recovered from {recovery.get('source', '?')}{unfinished}; "
         f"left out: damaged parts {parts}, unreadable messages {unreadable}"
     )

@@ -30,7 +30,7 @@ _STRIDE = 500  # messages between progress reports
 
 
 @dataclass(slots=True)
-class Drawn:
+class DrawnLogs:
     """Summary of drawn logs: number of snapshots, duration, and `remarks` on damaged, truncated or unreadable parts.
 
     `span_ns`: times on the timeline of the first and the last snapshot with a frame; None without a frame.
@@ -47,7 +47,7 @@ def draw_logs(
     config: Configuration | None,
     stream: rr.RecordingStream,
     progress: Callable[[int], None] = lambda done: None,
-) -> Drawn:
+) -> DrawnLogs:
     """Draw consecutive logs on a stream.
 
     Raises:
@@ -72,7 +72,7 @@ class _Drawing:
 
     def __init__(self, config: Configuration | None, stream: rr.RecordingStream) -> None:
         self._config, self._stream = config, stream
-        self._drawn, self._order, self._accumulator = Drawn(), _Order(), Accumulator()
+        self._drawn, self._order, self._accumulator = DrawnLogs(), _Order(), Accumulator()
         self._renderer: Renderer | None = None
         self._due_ns = self._first_ns = self._last_ns = 0
         self._damaged, self._no_end = 0, ""
@@ -125,7 +125,7 @@ class _Drawing:
         if re.fullmatch("[0-9]{1,18}", account := reader.metadata.get("recording", {}).get("messages_lost", "")):
             self._lost[reader.metadata.get(PART, {}).get("of", log.name)] = int(account)
 
-    def finish(self, logs: Sequence[Path]) -> Drawn:
+    def finish(self, logs: Sequence[Path]) -> DrawnLogs:
         """Draw the verdict on the logs, and return the summary."""
         if self._renderer is None:
             raise DataFileError(

@@ -20,7 +20,7 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Role
 from lowfc.programs.view.live_view import LiveView, ViewError
-from lowfc.programs.view.recorded import Drawn, draw_logs
+from lowfc.programs.view.recorded import DrawnLogs, draw_logs
 from lowfc.programs.view.target import Target
 
 PICTURE_AFTER_S = 8.0
@@ -81,7 +81,7 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
     require_folder(target.written)
     for log in logs:
         next(iter(LogReader(log, skip_damaged=True)), None)  # reports an unreadable file before a viewer starts
-    drawn = Drawn()
+    drawn = DrawnLogs()
     with contextlib.ExitStack() as stack:
         if target.save is not None:
             target.part = stack.enter_context(draft(target.save, logs[0]))
@@ -125,7 +125,7 @@ def memory_remarks(log_bytes: int, target: Target) -> list[str]:
     ]
 
 
-def _draw(logs: list[Path], config: Configuration | None, stream: rr.RecordingStream, target: Target) -> Drawn:
+def _draw(logs: list[Path], config: Configuration | None, stream: rr.RecordingStream, target: Target) -> DrawnLogs:
     total = sum(log.stat().st_size for log in logs if log.exists())
     with reading_bar(Console(stderr=True)) as count:
         drawn = draw_logs(logs, config, stream, lambda done: count("drawing", done, total))

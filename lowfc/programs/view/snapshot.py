@@ -281,16 +281,16 @@ class Accumulator:
             step = wire.ControlStep.FromString(message.payload)
             time_ns = checked_time_ns(step.timestamp)
             if not self._steps.add(step):
-                self._steps = _added(StepRows(len(step.command_nm)), step)
+                self._steps = _added_or_raise(StepRows(len(step.command_nm)), step)
             if NOT_NEW.isdisjoint(step.reasons):
                 self._set_data_time(time_ns, message.publish_time_ns)
         elif topic is TRUTH:
             truth = wire.Truth.FromString(message.payload)
             checked_time_ns(truth.timestamp)
             if not self._truths.add(truth):
-                self._truths = _added(TruthRows(len(truth.residual_nm)), truth)
+                self._truths = _added_or_raise(TruthRows(len(truth.residual_nm)), truth)
         elif topic is TIMING:
-            _added(self._timings, wire.ControlTiming.FromString(message.payload))
+            _added_or_raise(self._timings, wire.ControlTiming.FromString(message.payload))
         elif topic is HEALTH:
             name, health = self._names.health(message.key, message.payload)
             before, start_s = self._health.get(name), start_of(message.sequence)
@@ -329,7 +329,7 @@ class Accumulator:
         return self._decoded.pop(topic, None) if complete else decoded
 
 
-def _added(rows: Any, message: Message) -> Any:
+def _added_or_raise(rows: Any, message: Message) -> Any:
     if not rows.add(message):
         raise ValueError("a message with another number of columns or modes")
     return rows

@@ -64,8 +64,8 @@ def report_of(run: Run) -> Report:
 def _log(run: Run) -> Results:
     log = run.history.log
     missing = missing_between(log.paths)
-    account = log.metadata.get("recording", {})
-    lost = {name.removeprefix("lost "): _number(text) for name, text in account.items() if name.startswith("lost ")}
+    recording = log.metadata.get("recording", {})
+    lost = {name.removeprefix("lost "): _number(text) for name, text in recording.items() if name.startswith("lost ")}
     return {
         "file": log.path.name,
         "files": [path.name for path in log.paths],
@@ -74,13 +74,13 @@ def _log(run: Run) -> Results:
         "finished": log.finished,
         "complete": log.complete and not log.damage and not missing,
         "missing_files": missing,
-        "stopped": account.get("stopped") or None,
+        "stopped": recording.get("stopped") or None,
         "recovery": recovery_in_words(log.metadata) or None,
         "damage": [{"byte": damage.position, "bytes": damage.length, "why": damage.why} for damage in log.damage],
         "remarks": run.history.remarks,
         "messages": sum(run.history.counts.values()),
         "messages_by_topic": dict(sorted(run.history.counts.items())),
-        "messages_lost": _number(account.get("messages_lost", "")),
+        "messages_lost": _number(recording.get("messages_lost", "")),
         "lost_by_topic": {name: count for name, count in lost.items() if count is not None},
         "messages_unreadable": log.unreadable,
         "steps_left_out": run.history.excluded_messages,

@@ -16,7 +16,7 @@ from lowfc.programs.view.draw.colours import GREEN, GREY, YELLOW
 from lowfc.programs.view.draw.plots import BOX_HEIGHT, Axes, at, labels
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
-from lowfc.programs.view.verdicts.steady import LawInForce, Steady
+from lowfc.programs.view.verdicts.steady import LawInForce, SteadyFrames
 
 TILTS, OTHERS = "spectra/tip_tilt", "spectra/other_modes"
 WIDTH = 150.0
@@ -39,7 +39,7 @@ class Spectra(Panel):
     """
 
     def __init__(self) -> None:
-        self._steady = Steady()
+        self._steady = SteadyFrames()
         self._axes = [Axes(path, WIDTH) for path in (TILTS, OTHERS)]
         self._last: dict[str, tuple[str, Array, list[Array]]] = {}
         self._decades = dict.fromkeys((TILTS, OTHERS), (0, 0))

@@ -35,7 +35,7 @@ class LogVerdict:
 
     def __init__(self) -> None:
         self._means = SpanMeans()
-        self._closed = SpanMeans()
+        self._closed = SpanMeans()  # of the frames with the loop closed
         self._modes = np.zeros((2, 0), np.uint64)  # sequence and loop mode of the last steps
         self._without_step = np.zeros(0, np.uint64), np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
         self._mode_ns: Counter[LoopMode | None] = Counter()

@@ -56,7 +56,7 @@ class RunState:
 
     Attributes:
         snapshot: last snapshot.
-        mode: loop mode; None before the first message about it. `why` is the cause of its last change.
+        mode: loop mode; None before the first message about it. `mode_cause` is the cause of its last change.
         running_s: time since the first message.
         rate_hz: frame rate, from the times of the steps; None with fewer than two steps.
         controller, camera, mirror, recorder: liveness of the processes; with several mirrors that of the worst.
@@ -75,7 +75,7 @@ class RunState:
 
     snapshot: Snapshot
     mode: LoopMode | None
-    why: str
+    mode_cause: str
     running_s: float
     rate_hz: float | None
     controller: Process

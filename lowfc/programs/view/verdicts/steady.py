@@ -28,7 +28,7 @@ class LawInForce(NamedTuple):
     linear: str
 
 
-class Steady:
+class SteadyFrames:
     """Measured error and pseudo-open-loop of the last frames since loop mode or law changed, after settling.
 
     `mode` is 0 before the first step; `law` is None if the controller reports none, or a law for other modes.
@@ -81,7 +81,7 @@ class ResidualComparison(NamedTuple):
 
 
 def compare_with_best_gains(
-    steady: Steady, rate_hz: float, camera: wire.CameraState | None
+    steady: SteadyFrames, rate_hz: float, camera: wire.CameraState | None
 ) -> ResidualComparison | None:
     """Evaluate the last frames; None if the loop is not closed, its law unknown, or too few frames consecutive."""
     law, modes = steady.law, len(steady.law.gain) if steady.law is not None else 0

@@ -93,10 +93,10 @@ def _loop(state: RunState) -> Tile:
         return gone or tile("WAITING", "for the controller")
     if mode is LoopMode.SAFE:
         advice = "Loop in safe mode: the mirror stays flat until `lowfc ctl clear`; do that when it is safe."
-        return tile("SAFE", state.why or "mirror flat, latched", Level.BAD, advice)
+        return tile("SAFE", state.mode_cause or "mirror flat, latched", Level.BAD, advice)
     if mode is LoopMode.IDLE:
         advice = "There is no calibration for these frames: the controller refuses every one. Load or measure one."
-        return tile("IDLE", state.why or "no calibration", Level.WARNING, advice)
+        return tile("IDLE", state.mode_cause or "no calibration", Level.WARNING, advice)
     if mode is LoopMode.OPEN:
         return _open(state)
     if Liveness.STARTING in (controller.life, camera.life) or camera.life is Liveness.NEVER:
@@ -148,12 +148,12 @@ def _open(state: RunState) -> Tile:
     if rms is not None and correction(rms.residual_nm, rms.open_nm) is Correction.HARM:
         shape += ", worse than a flat mirror: `lowfc ctl safe` flattens it"
     level, advice = Level.NEUTRAL, "The loop is open: nothing is corrected, `lowfc ctl close` closes it."
-    if state.why == MEASURED_FIRST:
+    if state.mode_cause == MEASURED_FIRST:
         advice = "The loop is open until its gains are measured, and then closes by itself."
-    if state.why.startswith(CAMERA_MISFIT):
+    if state.mode_cause.startswith(CAMERA_MISFIT):
         level = Level.WARNING
         advice = f"The loop opened by itself, as {CAMERA_MISFIT}: restore it or calibrate, then `lowfc ctl close`."
-    return Tile("LOOP", "OPEN", f"{state.why or 'measuring only'}; {shape}", level, f"{advice} The {shape}.")
+    return Tile("LOOP", "OPEN", f"{state.mode_cause or 'measuring only'}; {shape}", level, f"{advice} The {shape}.")
 
 
 def _mirror(state: RunState) -> Tile:

@@ -18,7 +18,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.launch.watch import topic_count
 from lowfc.programs.view.snapshot import Accumulator, Snapshot, Wavefronts
 from lowfc.programs.view.verdicts.run_state import NOW_S, PERIODS, RECENT_S, Counts, Liveness, Process, Rms, RunState
-from lowfc.programs.view.verdicts.steady import ResidualComparison, Steady, compare_with_best_gains
+from lowfc.programs.view.verdicts.steady import ResidualComparison, SteadyFrames, compare_with_best_gains
 
 LATEST_S = 0.3
 """Length of the interval, up to the last snapshot, over which `latest` is computed; it is short, to show the
@@ -62,14 +62,14 @@ class Watcher:
     def __init__(self) -> None:
         self._snapshot: Snapshot = Accumulator().snapshot(0)
         self._mode: LoopMode | None = None
-        self._why, self._why_ns = "", 0
+        self._cause, self._cause_ns = "", 0
         self._flux: float | None = None
         self._saturated = 0
         self._mirror: wire.MirrorState | None = None
         self._begun_ns = 0
         self._note: Log | None = None
         self._totals: Counts = Counter()
-        self._steady, self._compared_ns = Steady(), 0
+        self._steady, self._compared_ns = SteadyFrames(), 0
         self._comparison: ResidualComparison | None = None
         self._samples: deque[_Sample] = deque(maxlen=_SAMPLES)
         self._last_counts: dict[str, tuple[int, int]] = {}
@@ -90,11 +90,11 @@ class Watcher:
         while self._samples[0].host_ns < snapshot.host_ns - RECENT_S * 1e9 - PERIODS * self._snapshot.period_ns:
             self._samples.popleft()
         if snapshot.steps.mode.size:
-            self._last_active = self._last(NOW_S)
+            self._last_active = self._last_samples(NOW_S)
 
     def state(self) -> RunState:
         """The state at the last snapshot."""
-        snapshot, now = self._snapshot, self._last(NOW_S)
+        snapshot, now = self._snapshot, self._last_samples(NOW_S)
         controller = self._process((Role.CONTROLLER,), STEP, CONTROLLER_STATE)
         stopped = controller.life is Liveness.STOPPED
         wavefront, true = _rms(now)
@@ -106,7 +106,7 @@ class Watcher:
         return RunState(
             snapshot=snapshot,
             mode=self._mode,
-            why=cause or self._why,  # the cause may have changed without an event, or before this view
+            mode_cause=cause or self._cause,  # the cause may have changed without an event, or before this view
             running_s=(snapshot.host_ns - self._begun_ns) * 1e-9 if self._begun_ns else 0.0,
             rate_hz=_rate_hz(now),
             controller=controller,
@@ -115,13 +115,13 @@ class Watcher:
             recorder=self._process((Role.RECORDER,)),
             frame_silent_s=self._silent_s(FRAME),
             step_silent_s=self._silent_s(STEP),
-            recent=sum((one.counts for one in self._last(RECENT_S)), Counts()),
+            recent=sum((one.counts for one in self._last_samples(RECENT_S)), Counts()),
             now=sum((one.counts for one in now), Counts()),
             totals=self._totals,
             flux=self._flux,
             saturated=self._saturated,
             wavefront=wavefront,
-            latest=_rms(self._last(LATEST_S))[0],
+            latest=_rms(self._last_samples(LATEST_S))[0],
             true=true,
             comparison=self._comparison,
             latency_us=tuple(np.percentile(durations_us, [50, 99]).tolist()) if durations_us.size else None,
@@ -129,7 +129,7 @@ class Watcher:
             note=self._note,
         )
 
-    def _last(self, span_s: float) -> list[_Sample]:
+    def _last_samples(self, span_s: float) -> list[_Sample]:
         begin_ns = self._snapshot.host_ns - max(span_s * 1e9, PERIODS * self._snapshot.period_ns)
         return [one for one in self._samples if one.host_ns > begin_ns]
 
@@ -170,7 +170,7 @@ class Watcher:
         return max(0.0, (self._snapshot.host_ns - time_ns) * 1e-9 - self._snapshot.behind_s)
 
     def _update_mode(self, snapshot: Snapshot) -> None:
-        """Keep the loop mode of the newest step; without one, of the controller's state; without a state, of its Health."""
+        """Take the loop mode from the newest step, else from the controller's state, else from its Health."""
         last = snapshot.health.get(Role.CONTROLLER)
         report = snapshot.controller or (last.health if last is not None else None)
         mode = snapshot.steps.mode[-1] if snapshot.steps.mode.size else report.mode if report is not None else 0
@@ -183,8 +183,8 @@ class Watcher:
         """
         for event in events:
             time_ns = from_timestamp(event.timestamp)
-            if event.message.startswith("MODE_CHANGED") and time_ns >= self._why_ns:
-                self._why, self._why_ns = printable(event.message.partition(": ")[2]), time_ns
+            if event.message.startswith("MODE_CHANGED") and time_ns >= self._cause_ns:
+                self._cause, self._cause_ns = printable(event.message.partition(": ")[2]), time_ns
             newest_ns = from_timestamp(self._note.timestamp) if self._note is not None else 0
             if event.message.startswith("NOTE ") and time_ns >= newest_ns:
                 self._note = event
@@ -223,7 +223,7 @@ class Watcher:
 
     def _count_increases(self, snapshot: Snapshot) -> dict[str, int]:
         """Increase of the processes' counts since the last snapshot, or since the first Health of a new process."""
-        grown: dict[str, int] = {}
+        increases: dict[str, int] = {}
         for name, (role, count_in) in _COUNTERS.items():
             last = snapshot.health.get(role)
             if last is None:
@@ -233,9 +233,9 @@ class Watcher:
             if start_s != last.start_s:
                 before = count_in(last.first)
             if count > before:
-                grown[name] = count - before
+                increases[name] = count - before
             self._last_counts[name] = (last.start_s, count)
-        return grown
+        return increases
 
 
 def _rms(samples: list[_Sample]) -> tuple[Rms | None, bool]:
