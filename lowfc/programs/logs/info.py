@@ -69,7 +69,7 @@ def _summary(contents: Mapping[str, Any]) -> dict[str, str]:
 
     metadata, recording = contents["metadata"], contents["metadata"].get("recording", {})
     digest = contents.get("digest", "")
-    if digest and contents["lockstep"] is False:  # None: unknown
+    if digest and contents["lockstep"] is False:  # None if unknown
         digest += " (not a lockstep run: cannot be reproduced)"
     damage = [f"byte {one['position']}, {one['length']} bytes: {one['why']}" for one in contents["damage"]]
     lost = [f"{contents['messages_missing']} missing by their sequence numbers"]

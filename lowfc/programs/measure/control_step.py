@@ -29,7 +29,7 @@ class ControlStep:
         self.state, _ = advance(self._settings, State(), Load(now_ns, calibration, "the run's"))
 
     def __call__(self, payload: bytes) -> bytes:
-        """The command for a frame; it counts as the next frame, whatever its time."""
+        """The command for a frame, which is processed as the next frame, whatever its time."""
         frame = codec.decode_frame(payload, self.state.frame_sequence + 1, 0)
         self.state, outputs = advance(self._settings, self.state, frame)
         assert outputs.command is not None  # noqa: S101  # each of these frames yields a command

@@ -79,7 +79,7 @@ def answer(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds
 
 
 def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) -> Long:
-    """Time the round trip of each frame for `seconds` after the warm-up, -1 if lost; an empty frame ends the echo."""
+    """Round trip of each frame, ns, for `seconds` after the warm-up; -1 if lost. An empty frame ends the echo."""
     clock = HostClock()
     sent_ns: list[int] = []
     round_trip_ns: list[int] = []

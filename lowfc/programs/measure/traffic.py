@@ -108,7 +108,7 @@ class Traffic:
 
 
 def frame_payloads() -> list[list[bytes]]:
-    """Payloads of different frames: frame, command, step, mirror state and truth, nearly as large as a loop's."""
+    """Payloads of different frames: frame, command, step, mirror state and truth, of nearly the sizes in a loop."""
     rng = np.random.default_rng(1)
     return [[message.SerializeToString() for message in _messages(rng)] for _ in range(_VARIETY)]
 

@@ -161,7 +161,7 @@ class Prepared:
             return I0_normalised, reconstructor(I0_normalised, H_normalised, good, flux_e, read_noise_e)
 
     def _fitting(self, modes: int) -> AbstractContextManager[None]:
-        """Convert the ValueError of a fit of modes that the sensor cannot distinguish to ConfigurationError."""
+        """Convert ValueError, raised by a fit if the sensor cannot distinguish the modes, to ConfigurationError."""
         return raised_as(ConfigurationError, ValueError, f"sensor {self.name}, {modes} modes")
 
     @cached_property
@@ -173,7 +173,7 @@ class Prepared:
         return zernikes(NOLLS_20, *node_radii(self.twin))
 
     def model(self, modes_nm: Array) -> Array:
-        """The same as `image` at the central wavelength, by the twin."""
+        """The same as `image` at the central wavelength, computed by the twin."""
         opd_nm = modes_nm @ self._node_modes[: len(modes_nm)]
         return np.asarray(self._evaluator.image(opd_nm.astype(np.float32)), np.float64).ravel()
 
@@ -186,7 +186,7 @@ def modes_at(samples: int) -> Array:
 
 
 def sparse_apertures() -> tuple[str, ...]:
-    """Names of the default sensor, and of the sensors with each other packaged layout."""
+    """Names of the default sensor, and of a sensor with each of the other packaged layouts."""
     return "sam", *(name for name in layout_names() if name != DEFAULT_SAM)
 
 

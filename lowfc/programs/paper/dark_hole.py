@@ -39,7 +39,7 @@ PATIENCE_S = 60.0
 
 @dataclass(frozen=True)
 class ChannelResult:
-    """Result of a channel; arrays (1 + steps, modes), nm rms of wavefront, the first row before the first step.
+    """Result of a channel; arrays (1 + steps, modes), nm rms of wavefront; the first row is before the first step.
 
     Attributes:
         channel_nm: Modes of the channel's shape as the sensor sees them.

@@ -95,7 +95,7 @@ class Target:
         return stream
 
     def show_all(self, stream: rr.RecordingStream, span_ns: tuple[int, int] | None) -> None:
-        """Make the plots show all of a log that was sent; a picture omits the panels that show only the log's end."""
+        """Make the plots show the whole log, after it was sent; a picture omits the panels that show only its end."""
         stream.send_blueprint(layout(self.tab, None, span_ns=span_ns, still=self.picture is not None))
 
     def print_address(self, viewer: RerunViewer | None) -> None:

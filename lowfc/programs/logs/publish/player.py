@@ -1,4 +1,4 @@
-"""Republish a log on the bus, at the recorded rate or faster, for a viewer, a controller under test or another tool.
+"""Republish a log on the bus, at the recorded speed or another, for a viewer, a controller under test or another tool.
 
 Payloads and sequences are those of the log, so that frame, step, command and mirror state can be joined. Publication
 times are new, so that no message counts as late. Deadlines are absolute: timing errors do not accumulate.
@@ -86,7 +86,7 @@ def publish(
 
 
 class Player:
-    """Publishes the messages of logs, each at its time."""
+    """Publishes the messages of logs, each at its due time."""
 
     def __init__(
         self, service: Service, buses: dict[str, ZenohBus], keys: PublishedKeys, speed: float, console: Console

@@ -1,4 +1,4 @@
-"""Logs of other versions: the fields to compare, and the controller's rules that have changed on purpose since."""
+"""Logs of other versions: the fields to compare, and the controller's rules that were changed on purpose since then."""
 
 import contextlib
 from collections.abc import Mapping

@@ -37,7 +37,7 @@ class Stretch:
         settling: number of steps left out for settling.
         earlier: number of steps after settling that are left out because the stretch is longer than `MAX_STEPS`.
         in_force: the law as the controller's states report it.
-        law: the same law (also the integrator) as a linear law with the rate and delay of the stretch.
+        law: the same law, even if it is the integrator, as a linear law with the rate and delay of the stretch.
         timing: timing of the loop; continuous if truth is continuous and the exposure known, otherwise sampled.
         series: (frames, columns) error, pseudo-open-loop and, if the log has truth, disturbance, residual and the
             residual's mean over the exposure, each with a column for every mode.

@@ -31,7 +31,7 @@ def mode_spans(run: Run) -> list[Results]:
 
 
 def mode_steps(history: History) -> dict[str, int]:
-    """Steps in each loop mode."""
+    """Number of steps in each loop mode."""
     return {mode_name(number): count for number, count in sorted(Counter(history.steps.mode.tolist()).items())}
 
 

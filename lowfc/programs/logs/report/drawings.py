@@ -104,7 +104,7 @@ def _intervals(figure: "Figure", report: Report) -> bool:
     for (name, values), colour, style in zip(stages.items(), colours, styles, strict=False):
         ordered = np.sort(values)
         places = np.geomspace(1, ordered.size, min(400, ordered.size)).astype(np.int64)
-        keep = ordered.size - np.unique(places)[::-1]  # denser towards the end, which is included
+        keep = ordered.size - np.unique(places)[::-1]  # denser towards the longest latency, which is kept
         beyond = 1 - keep / ordered.size
         right.plot(np.maximum(ordered[keep], 0.1), beyond, label=name.replace("_", " "), color=colour, linestyle=style)
     if stages:

@@ -49,7 +49,7 @@ def number(value: float | str | None, digits: int = 3) -> str:
 
 
 def fixed(value: float | str, decimals: int = 3) -> str:
-    """A number in a column with this number of decimals; a positive one that rounds to zero becomes "< 0.001"."""
+    """A number in a column with this number of decimals; a positive number that rounds to zero is "< 0.001"."""
     if isinstance(value, str | int):
         return str(value)
     least = 10.0**-decimals

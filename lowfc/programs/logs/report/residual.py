@@ -74,7 +74,7 @@ def residual_results(run: Run, stretch: Stretch | None) -> Results:
 
 
 def binned_rms(run: Run) -> dict[str, Array]:
-    """Rms of all modes in nm before and after correction, in at most 300 bins; `time_s` is the start of each."""
+    """Rms of all modes in nm before and after correction, in at most 300 bins; `time_s` is the start of a bin."""
     steps, true = run.history.steps, run.history.true
     columns = {"pseudo_open_loop": steps.pol_nm, "error": steps.error_nm}
     if true is not None:

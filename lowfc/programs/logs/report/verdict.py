@@ -80,9 +80,9 @@ def _why_no_loop(messages: Mapping[str, int]) -> str:
 
 
 def _residual(results: Results) -> Results:
-    """Wavefront before and after: true over the open pupil if the log has truth, otherwise the measured modes.
+    """Wavefront before and after correction: true over the open pupil if the log has truth, otherwise measured modes.
 
-    The measured modes are also used if the true residual contains shapes of offset or channels; the error has none.
+    The measured modes are also used if the true residual contains shapes of offset or channels, as the error has none.
     """
     totals, tilts = results["residual"]["total_rms_nm"], results["residual"]["tilt_mas"]
     shaped = totals["residual"] is not None and results["residual"]["shaped"]

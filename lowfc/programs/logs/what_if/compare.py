@@ -222,7 +222,7 @@ def _reconstructed(calibration: Calibration, estimator: str, run: LoggedRun) -> 
 
 
 def _in_other_modes(logged: Calibration, other: Calibration, command_nm: Single) -> Single:
-    """Convert commands (steps, modes) of the logged calibration to the other's for the same mirror shape."""
+    """Convert commands (steps, modes) of the logged calibration to those of the other for the same mirror shape."""
     if np.array_equal(other.modes_to_actuators, logged.modes_to_actuators):
         return command_nm
     change = np.linalg.pinv(other.modes_to_actuators.astype(float)) @ logged.modes_to_actuators.astype(float)

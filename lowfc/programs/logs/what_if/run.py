@@ -252,7 +252,7 @@ def during_probe(sequence: Sequences, first: int, frames: int) -> Mask:
 def _target_nm(states: Sequence[wire.ControllerState], sequence: Sequences, modes: int) -> Single:
     """Target (steps, modes) of the loop: the offset of the last state before each step, or else of the first state.
 
-    A state is logged at every change. That after `clear` has frame sequence 0, because `clear` resets the sequence.
+    A state is logged at every change. The state after `clear` has frame sequence 0, because `clear` resets it.
     """
     offsets = [(state.frame_sequence, state.offset_nm or [0.0] * modes) for state in states]
     offsets = [(frame, offset_nm) for frame, offset_nm in offsets if len(offset_nm) == modes]

@@ -81,7 +81,7 @@ class FrameOutcomes:
     Attributes:
         put_ns: time just before the frame was published.
         commanded: whether the frame's command was timed by the controller or applied by the mirror.
-        spans_us: times by the names of `SPANS`, NaN if unknown; those from the due time only with a schedule.
+        spans_us: durations by the names of `SPANS`; NaN if unknown; with a schedule, also those from the due time.
     """
 
     put_ns: Long

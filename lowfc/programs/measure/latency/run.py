@@ -74,7 +74,7 @@ def write_shared_files(config: Configuration, run: Run) -> None:
 def prepared(
     config: Configuration, write_files: Callable[[Configuration, Run], None] = write_shared_files
 ) -> Iterator[Run]:
-    """A run with the files that its processes share; removed at the end."""
+    """A run with the files that its processes share; the run is removed at the end."""
     run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
     try:
         write_files(config, run)

@@ -58,7 +58,7 @@ def combine(repeats: Repeats) -> dict[str, Any]:
 
 
 def kernel_summary(repeats: Repeats) -> dict[str, Any]:
-    """The combined repeats if all have the same kernel; otherwise those of the fused step, compared with numpy's.
+    """The combined repeats if all have the same kernel; otherwise those with the fused step, compared with numpy.
 
     Returns:
         kernel: numpy, fused or both. With both: numpy_us, frame to command with numpy; kernel_ratio (p50 and p99), the

@@ -48,7 +48,7 @@ class _Aberrated:
 
 @lru_cache(maxsize=8)
 def _aberrated(context: Context, name: str, coma: int) -> _Aberrated:
-    """lambda/30 of focus and of the coma with this Noll index, seen by a sensor."""
+    """lambda/30 of focus and of the coma with this Noll index, and the residuals of a sensor's estimates of it."""
     sensor = prepared(name)
     truth_nm = np.zeros(MODES)
     truth_nm[[NOLLS_14.index(4), NOLLS_14.index(coma)]] = sensor.optics.wavelength_nm / 30.0

@@ -55,7 +55,7 @@ def _maps() -> tuple[Array, Array, Mask]:
 
 
 def zero_point_nm(name: str) -> Array:
-    """Modes (14,), nm, at which a loop with the reference star's I0 and R holds the target star, due to its colour."""
+    """Modes (14,), nm, at which a loop with the reference star's I0 and R holds the target, due to its other colour."""
     sensor = prepared(name)
     reference_star, target = (coloured(kelvin) for _, kelvin in STARS.values())
     I0, H = reference(sensor.optics, reference_star).ravel(), response(sensor.optics, sensor.modes[:14], reference_star)

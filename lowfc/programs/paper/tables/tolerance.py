@@ -34,7 +34,7 @@ ESTIMATORS: dict[Kind, str] = {"integrator": "integrator, best gain", "lqg": "LQ
 
 CHECKED_SENSORS, CHECKED_MODES, CHECKED_MAGNITUDES = ("clowfs_tuned", "zwfs_tuned"), (4, 8, 11), (2.0, 5.0)
 CHECKED_CONTRAST, SHOWN_CONTRAST = 1e-11, 1e-10
-_FRAMES_PER_TRIAL = 20  # times 1 / gain, the loop's time constant: 100 trials determine a variance to 3 %
+_FRAMES_PER_TRIAL = 20  # in units of 1 / gain, the loop's time constant; 100 trials give a variance to 3 %
 _SHOWN_NOLLS = (2, 4, 8, 11)
 _SHOWN_ENDS = tuple(f"V = {magnitude}, contrast {SHOWN_CONTRAST:g}" for magnitude in (2, 5))
 _LARGEST = 6e-9  # contrast up to which the fourth order is fitted
@@ -68,7 +68,7 @@ CHECK = (
 
 @dataclass(frozen=True, eq=False)
 class Contrasts:
-    """Contrast that each mode adds alone: form a^2 + quartic a^4 for an amplitude a in nm rms; both are (modes,)."""
+    """Contrast that each mode adds alone: form a^2 + quartic a^4 for an amplitude a in nm rms; arrays (modes,)."""
 
     form: Array
     quartic: Array

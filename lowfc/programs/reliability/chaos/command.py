@@ -145,7 +145,7 @@ def _in_one_line(error: Exception, folder: Path) -> str:
 
 
 def _run(case: "Case", folder: Path, rng: random.Random) -> "Outcome":
-    """Run a case; errors are added to the outcome's notes, and the processes are stopped in any case."""
+    """Run a case; errors are added to the outcome's notes, and the processes are always stopped."""
     from lowfc.programs.reliability.chaos.bench import ChaosBench
     from lowfc.programs.reliability.chaos.frames import FAULTY_FRAMES, FIRST
 

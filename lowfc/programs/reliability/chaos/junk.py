@@ -115,7 +115,7 @@ def _forged_frames(bench: ChaosBench) -> None:
 
 @case("malformed-requests", "requests of random bytes")
 def _malformed_requests(bench: ChaosBench) -> None:
-    """Every request is answered."""
+    """Every request must be answered."""
     with Intruder(bench) as intruder:
         for number in range(200):
             name = _NAMES[number % len(_NAMES)]
@@ -128,7 +128,7 @@ def _malformed_requests(bench: ChaosBench) -> None:
 
 @case("huge-requests", "requests of up to 64 MB", allowed=LOST)
 def _huge_requests(bench: ChaosBench) -> None:
-    """The requests are refused, or lost by the bus; the loop continues."""
+    """The requests may be refused, or lost by the bus; the loop must continue."""
     with Intruder(bench) as intruder:
         for megabytes in (1, 8, 32, 64):
             message = wire.Request(name="channel", text="huge", actuators=bytes(megabytes * 1_000_000))
@@ -137,7 +137,7 @@ def _huge_requests(bench: ChaosBench) -> None:
 
 @case("concurrent-requests", "eight operators at once")
 def _concurrent_requests(bench: ChaosBench) -> None:
-    """Each operator has its own connection, and every request is answered."""
+    """Each operator has its own connection; every request must be answered."""
 
     def operate(number: int) -> str:
         """Make the requests of one operator; return why they failed, or an empty text."""

@@ -23,7 +23,7 @@ class Scale:
         self._needed_ns = 0
 
     def fit(self, values: npt.NDArray[np.floating], time_ns: int) -> bool:
-        """Adapt the limit to the finite ones of the values; True if the limit changed."""
+        """Adapt the limit to the finite values; True if the limit changed."""
         largest = max(self.least, float(np.abs(values[np.isfinite(values)]).max(initial=0.0)))
         decade = 10.0 ** floor(log10(largest))
         fitted = next(step * decade for step in _STEPS if largest <= step * decade * (1 + 1e-9))

@@ -28,7 +28,7 @@ Points = npt.NDArray[np.floating]
 
 
 class Pointing(Panel):
-    """The trail of the last two seconds, and rings whose scale follows its largest deviation."""
+    """The trail of the last two seconds, and rings whose scale follows the trail's largest deviation."""
 
     def __init__(self, nm_per_mas: float) -> None:
         self._nm_per_mas = nm_per_mas

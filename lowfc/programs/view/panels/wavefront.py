@@ -86,5 +86,5 @@ class Wavefront(Panel):
 
 
 def _rss(values: Values) -> Values:
-    """Root of the sum of squares over the columns (rows,)."""
+    """Root sum square (rows,) of values (rows, columns)."""
     return np.asarray(np.sqrt(np.sum(values**2, axis=1)))

@@ -54,7 +54,7 @@ def frames(state: RunState) -> Tile:
     relaxes = controller is not None and controller.settings.on_frame_timeout == "flat"
     harm = "the mirror relaxes to flat" if relaxes else "the loop holds"
     gone = absent("FRAMES", "camera", camera, state.running_s, harm)
-    if gone is not None and camera.life is not Liveness.SILENT:  # reported below, by the time without frames
+    if gone is not None and camera.life is not Liveness.SILENT:  # a silent one is reported below
         return gone
     if camera.life is Liveness.STARTING:
         return tile("STARTING", "the camera")

@@ -83,7 +83,7 @@ class LogVerdict:
         self._without_step = sequence[waiting], time_ns[waiting], rms_nm[waiting]
 
     def _add_modes(self, steps: Steps, period_ns: int) -> None:
-        """Add the time before each step to its loop mode; a gap that a live view would report has no frames."""
+        """Add the time before each step to its loop mode; a gap that a live view would report has no loop mode."""
         time_ns = steps.time_ns
         if not time_ns.size:
             return

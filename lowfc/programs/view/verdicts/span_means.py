@@ -15,7 +15,7 @@ _COLUMNS = 8
 
 
 class SpanMeans:
-    """Means over consecutive spans of `span_ns`, at first one second; they begin at `begin_ns`, None before any row.
+    """Means over consecutive spans of `span_ns`, at first one second; they begin at `begin_ns`, None without rows.
 
     The wavefront is the `true` one of a simulation, otherwise the measured one.
     """
@@ -59,7 +59,7 @@ class SpanMeans:
         return _means(self._sums[:, _LIGHT])[:, 0]
 
     def add(self, time_ns: Long, columns: slice, values: npt.NDArray[np.floating]) -> None:
-        """Add rows (rows, values) at their times to the sums in these columns, and count them in the first of these."""
+        """Add rows (rows, values) at their times to the sums in these columns, and count them in the first one."""
         if self.begin_ns is None and time_ns.size:
             self.begin_ns = int(time_ns.min())
         after_ns = time_ns - (self.begin_ns or 0)

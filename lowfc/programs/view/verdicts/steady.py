@@ -20,7 +20,7 @@ FRAMES = 6144
 
 
 class LawInForce(NamedTuple):
-    """The integrator and, in `linear`, identity and overruled modes of the law that replaces it; empty for none."""
+    """The integrator; `linear`: identity and overruled modes of the law that replaces it, empty without a law."""
 
     gain: tuple[float, ...]
     leak: tuple[float, ...]
@@ -83,7 +83,7 @@ class ResidualComparison(NamedTuple):
 def compare_with_best_gains(
     steady: SteadyFrames, rate_hz: float, camera: wire.CameraState | None
 ) -> ResidualComparison | None:
-    """Evaluate the last frames; None if the loop is not closed, its law unknown, or too few frames consecutive."""
+    """Evaluate the last frames; None if the loop is not closed, its law is unknown, or too few frames are in a row."""
     law, modes = steady.law, len(steady.law.gain) if steady.law is not None else 0
     if law is None or steady.mode != LoopMode.CLOSED or not rate_hz:
         return None
