@@ -71,8 +71,8 @@ def validate(
     only_additional = all(name in ADDITIONAL for name in chosen)
     if docs is not None and (not (only_additional or tuple(chosen) == TABLES) or sensor or plots is not None):
         raise ConfigurationError(
-            f"--docs writes complete pages: use it with all, or with {' or '.join(ADDITIONAL)}; without --sensor and "
-            "--plots"
+            f"--docs writes complete pages: use it with all, or with {' or '.join(ADDITIONAL)}, without --sensor "
+            "and --plots"
         )
 
     from lowfc.programs.paper.cases import Context

@@ -117,14 +117,14 @@ def export_log(
     for file in files:
         if file.exists() and not force:
             raise DataFileError(f"{file} already exists; use another name (--out), or replace it with --force")
-    with contextlib.ExitStack() as held:
-        count = held.enter_context(reading_bar(console))
+    with contextlib.ExitStack() as stack:
+        count = stack.enter_context(reading_bar(console))
         reader.progress = partial(count, "reading")
         history = read_history(reader)
         if frames and not history.frame_sequence.size:
             raise DataFileError(f"{reader.path} has no frames; export without --frames")
         reader.progress = partial(count, "writing")
-        write([held.enter_context(being_written(file, reader.path)) for file in files], history)
+        write([stack.enter_context(being_written(file, reader.path)) for file in files], history)
     return {
         "format": str(to),
         "files": [str(file) for file in files],

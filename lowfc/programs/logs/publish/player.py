@@ -218,15 +218,15 @@ def render(results: dict[str, Any]) -> str:
 @contextlib.contextmanager
 def _join(run: Run, keys: PublishedKeys, granted: Granted) -> Iterator[tuple[Service, dict[str, ZenohBus]]]:
     """Join the run in the roles of the selected topics, or as `replay` if events are the only topic."""
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as stack:
         clock = HostClock()
         buses: dict[str, ZenohBus] = {}
         for role in keys.roles or (Role.REPLAY,):
             buses[role] = ZenohBus(run.links, role, clock)
-            held.callback(buses[role].close)
+            stack.callback(buses[role].close)
         service = Service(Role.REPLAY, run.run_id, clock, next(iter(buses.values())), granted=granted)
         service.catch_signals()
-        held.callback(service.finish)
+        stack.callback(service.finish)
         yield service, buses
 
 

@@ -185,9 +185,9 @@ class LoggedRun:
         rows = usable & (since >= settling) & (steps.saturated_pixels == 0)
         if not rows.any():
             raise DataFileError(
-                f"{self.history.log.path}: no frame is left to compare: of {len(rows)}, {np.count_nonzero(~usable)} "
-                f"were refused, {np.count_nonzero(steps.saturated_pixels)} have saturated pixels and "
-                f"{np.count_nonzero(since < settling)} are within the settling time of {settling} frames"
+                f"{self.history.log.path}: no frame is left to compare: of {len(rows)} frames, "
+                f"{np.count_nonzero(~usable)} were refused, {np.count_nonzero(steps.saturated_pixels)} have saturated "
+                f"pixels and {np.count_nonzero(since < settling)} are within the settling time of {settling} frames"
             )
         return rows, settling, compared
 

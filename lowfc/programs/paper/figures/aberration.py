@@ -38,7 +38,7 @@ _PAPER_PV_WAVES = 6e-3
 
 
 @dataclass(frozen=True, eq=False)
-class _Aberrated:
+class _Aberration:
     """One aberration (modes,), and its residuals (realisations, modes) for each estimator."""
 
     sensor: Prepared
@@ -47,7 +47,7 @@ class _Aberrated:
 
 
 @lru_cache(maxsize=8)
-def _aberrated(context: Context, name: str, coma: int) -> _Aberrated:
+def _aberrated(context: Context, name: str, coma: int) -> _Aberration:
     """lambda/30 of focus and of the coma with this Noll index, and the residuals of a sensor's estimates of it."""
     sensor = prepared(name)
     truth_nm = np.zeros(MODES)
@@ -59,7 +59,7 @@ def _aberrated(context: Context, name: str, coma: int) -> _Aberrated:
         return iterated_nm(sensor, linear, exposed_e(sensor, image, context.rng("focus and coma", name, coma, i)))
 
     results = context.map(f"{name}, coma Z{coma}", estimate, range(min(context.trials, REALISATIONS)))
-    return _Aberrated(
+    return _Aberration(
         sensor, truth_nm, {key: truth_nm - np.stack([each[key] for each in results]) for key in ESTIMATORS}
     )
 
@@ -74,14 +74,14 @@ def fig1(context: Context) -> Iterator[Row]:
     for name in context.names("sam"):
         yield from _between_samples(prepared(name))
         for coma in COMAS:
-            case = _aberrated(context, name, coma)
-            sensor, row_name = case.sensor, f"{name}, coma Z{coma}"
-            flat, aberrated = _contrast(sensor, 0.0 * case.truth_nm), _contrast(sensor, case.truth_nm)
+            aberration = _aberrated(context, name, coma)
+            sensor, row_name = aberration.sensor, f"{name}, coma Z{coma}"
+            flat, aberrated = _contrast(sensor, 0.0 * aberration.truth_nm), _contrast(sensor, aberration.truth_nm)
             yield Row(row_name, "contrast, flat wavefront", "", flat, _PAPER_GOAL)
             yield Row(row_name, "contrast, aberrated", "", aberrated)
             yield Row(row_name, "contrast, aberrated / flat wavefront", "", aberrated / flat, _PAPER_WORSE)
             for key in _CORRECTED:
-                corrected = context.map(f"{row_name}, {key}", partial(_contrast, sensor), case.residuals_nm[key])
+                corrected = context.map(f"{row_name}, {key}", partial(_contrast, sensor), aberration.residuals_nm[key])
                 mean, error = mean_and_error(np.array(corrected))
                 fitted = partial(Row, row_name, modes=MODES, estimator=key)
                 yield fitted("contrast, corrected", "", mean, error=error, limit=flat)
@@ -105,15 +105,15 @@ def plot_fig1(context: Context, path: Path) -> None:
     name = context.names("sam")[0]
     panels: list[plots.Panel] = []
     for coma in COMAS:
-        case = _aberrated(context, name, coma)
-        flat_nm = 0.0 * case.truth_nm
-        for title, modes_nm in (("flat wavefront", flat_nm), (f"$\\lambda$/30 of Z4 and of Z{coma}", case.truth_nm)):
-            image = case.sensor.star_image(modes_nm, 2 * _VIEW * _VIEW_SAMPLES_PER, _VIEW_SAMPLES_PER)
+        aberration = _aberrated(context, name, coma)
+        sensor, truth_nm, flat_nm = aberration.sensor, aberration.truth_nm, 0.0 * aberration.truth_nm
+        for title, modes_nm in (("flat wavefront", flat_nm), (f"$\\lambda$/30 of Z4 and of Z{coma}", truth_nm)):
+            image = sensor.star_image(modes_nm, 2 * _VIEW * _VIEW_SAMPLES_PER, _VIEW_SAMPLES_PER)
             panels.append(plots.picture(image, title, plots.SKY, _VIEW, (1e-11, 1.0), "contrast", "log"))
         middles = (_CURVE_EDGES[1:] + _CURVE_EDGES[:-1]) / 2.0
-        wavefronts = {"flat": flat_nm, "aberrated": case.truth_nm}
-        wavefronts |= {key: case.residuals_nm[key][0] for key in _CORRECTED}
-        lines = [plots.Line(key, middles, _curve(case.sensor, modes_nm)) for key, modes_nm in wavefronts.items()]
+        wavefronts = {"flat": flat_nm, "aberrated": truth_nm}
+        wavefronts |= {key: aberration.residuals_nm[key][0] for key in _CORRECTED}
+        lines = [plots.Line(key, middles, _curve(sensor, modes_nm)) for key, modes_nm in wavefronts.items()]
         panels.append(
             plots.curves(lines, f"Z{coma}, corrected by {name}", f"radius, {plots.SKY_UNIT}", "contrast", "log")
         )
@@ -152,16 +152,16 @@ def plot_fig7(context: Context, path: Path) -> None:
     name = context.names("sam")[0]
     panels: list[plots.Panel] = []
     for coma in COMAS:
-        case = _aberrated(context, name, coma)
-        residuals = {key: case.residuals_nm[key][0] for key in (PINV, WEIGHTED_1)}
+        aberration = _aberrated(context, name, coma)
+        residuals = {key: aberration.residuals_nm[key][0] for key in (PINV, WEIGHTED_1)}
         for title, modes_nm, bound in (
-            (f"input, $\\lambda$/30 of Z4 and of Z{coma}", case.truth_nm, 0.1),
-            (f"estimate, {WEIGHTED_1}", case.truth_nm - residuals[WEIGHTED_1], 0.1),
+            (f"input, $\\lambda$/30 of Z4 and of Z{coma}", aberration.truth_nm, 0.1),
+            (f"estimate, {WEIGHTED_1}", aberration.truth_nm - residuals[WEIGHTED_1], 0.1),
             *((f"residual, {key}", modes_nm, 0.006) for key, modes_nm in residuals.items()),
         ):
-            waves = case.sensor.opd_nm(modes_nm) / case.sensor.optics.wavelength_nm
-            inside = waves[case.sensor.open]
-            shown = np.where(case.sensor.open, waves - inside.mean(), np.nan)
+            waves = aberration.sensor.opd_nm(modes_nm) / aberration.sensor.optics.wavelength_nm
+            inside = waves[aberration.sensor.open]
+            shown = np.where(aberration.sensor.open, waves - inside.mean(), np.nan)
             title = f"{title}\nP-V {np.ptp(inside):.2g} waves"
             panels.append(plots.picture(shown, title, plots.PUPIL, 0.5, (-bound, bound), "waves", "signed"))
     plots.draw(path, panels, f"Fig. 7. One estimate of {name}. {BRIGHT}", columns=4)

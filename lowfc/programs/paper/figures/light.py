@@ -22,8 +22,7 @@ from lowfc.programs.paper.tables.tables import PAPER_TABLE2
 _TABLE_NOLLS = (4, 5, 6, 7, 8)
 _PLOT_NOLLS = (4, 5, 7)
 _VIEW, _VIEW_SAMPLES_PER = 10, 8  # half width of a picture, lambda/D; samples per lambda/D
-# Least intensity that a picture shows, relative to its peak, by plane.
-_FAINTEST = {"focal": 1e-8, "relay": 1e-4, "sensor": 1e-5}
+_FAINTEST = {"focal": 1e-8, "relay": 1e-4, "sensor": 1e-5}  # least intensity shown, relative to the peak, by plane
 
 
 @assuming(

@@ -172,10 +172,10 @@ def _checked(context: Context) -> list[Row]:
     # Simulating other sensors takes days.
     names = [name for name in CHECKED_SENSORS if name in context.names(*CHECKED_SENSORS)]
     twins = {name: prepared(name).twin for name in names}  # built before the threads use them
-    cases = list(product(names, CHECKED_MAGNITUDES, CHECKED_MODES))
+    points = list(product(names, CHECKED_MAGNITUDES, CHECKED_MODES))
 
-    def simulated(case: tuple[str, float, int]) -> Row:
-        name, magnitude, noll = case
+    def simulated(point: tuple[str, float, int]) -> Row:
+        name, magnitude, noll = point
         mode, modal = NOLLS_14.index(noll), contrasts_of(name)
         noise = float(frame_noise_nm2(name, magnitude)[mode])
         drift = tolerated_drift(modal.variance_nm2(mode, CHECKED_CONTRAST), noise, EXPOSURE)
@@ -197,7 +197,7 @@ def _checked(context: Context) -> list[Row]:
             assumption=CHECK,
         )
 
-    return context.map("tolerance by simulation", simulated, cases)
+    return context.map("tolerance by simulation", simulated, points)
 
 
 def is_printed(row: Mapping[str, Any]) -> bool:
