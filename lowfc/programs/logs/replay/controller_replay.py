@@ -25,7 +25,7 @@ from lowfc.programs.logs.replay.former import FormerVersion, changed_rule
 from lowfc.programs.logs.replay.frames import Frames
 
 PATIENCE_NS = 2_000_000_000
-"""Longest log time to wait for a message of another publisher: a log is in the order of arrival."""
+"""Longest log time to wait for a message of another publisher, because a log is in the order of arrival."""
 _STATES_KEPT = 256
 _BEFORE_STATE = "recorded before the first complete state of the controller"
 

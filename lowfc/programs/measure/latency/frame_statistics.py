@@ -69,7 +69,7 @@ _BINS_PER_OCTAVE = 8
 _LOWEST_US, _OCTAVES = 1.0, 20
 _TIME_PARTS = 200  # largest number of parts of a repeat in which latency is given against time
 _PAUSE = 1000
-"""Multiple of the median period above which the camera paused, as when it waits for its trigger."""
+"""Interval between frames, in median periods, above which the camera counts as paused, as if waiting for a trigger."""
 _BURST = 0.5
 """Fraction of the mean period; frames less than this apart came in a burst."""
 

@@ -17,7 +17,7 @@ RECENT_S = 5.0
 PERIODS = 10
 """Minimum length of each time span of the verdict, in frame periods, for slow cameras."""
 GRACE_S = 10.0
-"""Time for processes to start, after which an absent one is reported."""
+"""Time for processes to start, after which an absent process is reported."""
 OTHER_CLOCK_NS = 3_600_000_000_000
 """Difference from host time above which frame times count as simulated, or as those of another clock."""
 

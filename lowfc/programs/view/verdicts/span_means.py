@@ -7,7 +7,7 @@ from lowfc.arrays import Array, Long, Single
 from lowfc.programs.view.snapshot import Snapshot
 
 MAX_SPANS = 600
-"""Largest number of spans: beyond it, pairs are merged, so that a night needs no more memory than ten minutes."""
+"""Largest number of spans; beyond it, two spans become one, so that a night needs no more memory than ten minutes."""
 _FIRST_NS = 1_000_000_000
 _FARTHEST_NS = 7 * 86_400 * 10**9  # a longer jump is an error of the camera's clock
 _TRUE, _MEASURED, _LIGHT = slice(0, 3), slice(3, 6), slice(6, 8)  # columns: a count, then sums
