@@ -28,9 +28,9 @@ class Frames:
         self._bytes += len(payload)
         while self._bytes > FRAMES_BYTES and len(self._order) > 1:
             oldest = self._order.popleft()
-            kept = self._payloads[oldest]
-            self._bytes -= len(kept.pop(0))
-            if not kept:
+            payloads = self._payloads[oldest]
+            self._bytes -= len(payloads.pop(0))
+            if not payloads:
                 del self._payloads[oldest]
 
     def note_step(self, step: wire.ControlStep) -> None:

@@ -116,12 +116,12 @@ def _replay_segment(
             account = run.finish()
     finally:
         gc.enable()
-    about = [(part.path.name, part.metadata) for part in log.parts]
-    account.complete, account.recorded_on = log.complete, about[0][1].get("lowfc", {})
+    named_metadata = [(part.path.name, part.metadata) for part in log.parts]
+    account.complete, account.recorded_on = log.complete, named_metadata[0][1].get("lowfc", {})
     account.finished = log.finished
     account.damaged = [f"byte {one.position}: {one.why}" for one in log.damage]
-    account.runs = sorted({metadata.get("lowfc", {}).get("run", "?") for _, metadata in about})
-    stopped = [(name, metadata.get("recording", {}).get("stopped")) for name, metadata in about]
+    account.runs = sorted({metadata.get("lowfc", {}).get("run", "?") for _, metadata in named_metadata})
+    stopped = [(name, metadata.get("recording", {}).get("stopped")) for name, metadata in named_metadata]
     account.stopped = [f"{name}: {why}" for name, why in stopped if why]
     return account
 

@@ -93,7 +93,7 @@ def _number(text: str) -> int | None:
 
 def _run(run: Run) -> Results:
     history = run.history
-    about = history.log.metadata.get("lowfc", {})
+    recorded = history.log.metadata.get("lowfc", {})
     (first_ns, last_ns), simulated = history.span_ns, TRUTH.key in history.counts
     calibration, configuration, steps = history.calibration, history.configuration, history.steps
     began = datetime.fromtimestamp(first_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
@@ -105,8 +105,8 @@ def _run(run: Run) -> Results:
         "simulated": simulated,
         "imperfections": configuration.imperfections if configuration is not None and simulated else {},
         "lockstep": configuration.lockstep if configuration is not None else None,
-        **{key: about.get(key) for key in _NOT_VERSIONS},
-        "versions": {name: value for name, value in about.items() if name not in _NOT_VERSIONS},
+        **{key: recorded.get(key) for key in _NOT_VERSIONS},
+        "versions": {name: value for name, value in recorded.items() if name not in _NOT_VERSIONS},
         "calibration": None
         if calibration is None
         else {

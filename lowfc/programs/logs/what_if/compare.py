@@ -322,10 +322,10 @@ def _weighting_warnings(run: LoggedRun, calibration: Calibration, law: Integrato
 
 
 def _automatic_warnings(changes: WhatIf, noll: tuple[int, ...]) -> list[str]:
-    kept = logged_gains(changes, noll)
-    if not kept.any():
+    unchanged = logged_gains(changes, noll)
+    if not unchanged.any():
         return []
-    names = ", ".join(mode_name(index) for index in np.array(noll)[kept].tolist())
+    names = ", ".join(mode_name(index) for index in np.array(noll)[unchanged].tolist())
     return [f"automatic gains of --config are not computed: {names} keep the logged gains; give --set gain=..."]
 
 

@@ -107,11 +107,11 @@ def logged_gains(changes: WhatIf, noll: tuple[int, ...]) -> Mask:
     return automatic & ~np.isin(noll, TIP_TILT) if "tilt_gain" in changes.overrides else automatic
 
 
-def user_controller(where: str) -> Controller:
+def user_controller(location: str) -> Controller:
     """The function at FILE.py:NAME; its output goes to standard error, because standard output is for the results."""
-    file, _, name = where.rpartition(":")
+    file, _, name = location.rpartition(":")
     if not file.endswith(".py") or not Path(file).is_file():
-        raise ConfigurationError(f"--controller must be FILE.py:NAME of an existing file, got {where!r}")
+        raise ConfigurationError(f"--controller must be FILE.py:NAME of an existing file, got {location!r}")
     try:
         with contextlib.redirect_stdout(sys.stderr):
             function = run_path(file).get(name)
@@ -129,7 +129,7 @@ def user_controller(where: str) -> Controller:
                 raise ValueError(f"command_nm must be {len(error_nm)} finite numbers, got {command}")
         except (Exception, SystemExit) as error:
             raise ConfigurationError(
-                f"--controller: {where}: {type(error).__name__}: {error}; "
+                f"--controller: {location}: {type(error).__name__}: {error}; "
                 "step(state, error_nm) must return (state, command_nm)"
             ) from None
         return state, command_nm

@@ -96,11 +96,11 @@ def latency(
         write_whole(plot, picture(results))
 
 
-def _refuse_others(context: typer.Context, what: str, *used: str) -> None:
-    """Refuse the options that have no effect with `--compare` or with logs."""
+def _refuse_others(context: typer.Context, chosen: str, *allowed: str) -> None:
+    """Refuse the options that have no effect with `--compare` or with logs, which are `chosen`."""
     for option in options_set(context):
-        if option not in (what, *used):
-            raise ConfigurationError(f"{option} has no effect with {what}: omit it")
+        if option not in (chosen, *allowed):
+            raise ConfigurationError(f"{option} has no effect with {chosen}: omit it")
 
 
 def _configuration(file: Path | None, rate: float | None, camera: Camera, *, plain: bool) -> "Configuration":
@@ -159,8 +159,8 @@ def _from_log(names: list[Path]) -> dict[str, Any]:
 
     log = named_log(names)
     with reading_bar(Console(stderr=True)) as count:
-        results, about = log_statistics(log, partial(count, f"reading {titled(log)}"))
-    return combine([results]) | about
+        results, log_facts = log_statistics(log, partial(count, f"reading {titled(log)}"))
+    return combine([results]) | log_facts
 
 
 def _compare(files: tuple[Path, Path]) -> dict[str, Any]:

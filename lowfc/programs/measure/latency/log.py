@@ -48,9 +48,9 @@ def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tup
                 trip_ns = wire.Health.FromString(message.payload).router_round_trip_ns
                 round_trips_ns[name] = max(round_trips_ns[name], trip_ns)
         host["clock_error_us"] = sum(sorted(round_trips_ns.values())[-2:]) / 2e3
-    about = {
+    log_facts = {
         "settings": {"log": str(log.path), "selection": log.selection.description},
         **missing_parts(log),
         "host": host,
     }
-    return statistics | controller_counts(controller), about
+    return statistics | controller_counts(controller), log_facts

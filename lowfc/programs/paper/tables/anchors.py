@@ -145,7 +145,7 @@ def _pointing(context: Context, name: str) -> list[Row]:
     return rows
 
 
-def _means_row(new_row: Callable[..., Row], history: History, where: str) -> Row:
+def _means_row(new_row: Callable[..., Row], history: History, site: str) -> Row:
     """Row with the standard deviation of means of the true tilt after the first four seconds."""
     truths = history.true
     assert truths is not None  # noqa: S101  # a simulated loop logs the truth
@@ -155,9 +155,9 @@ def _means_row(new_row: Callable[..., Row], history: History, where: str) -> Row
     means = tilt_nm[: blocks * frames].reshape(blocks, frames, 2).mean(axis=1) / tilt_nm_per_mas(2.0)
     spread = float(np.sqrt(means.var(axis=0, ddof=1).mean()))
     return new_row(
-        f"std of {MEAN_S:g} s means of tilt, {where}",
+        f"std of {MEAN_S:g} s means of tilt, {site}",
         measured=spread,
-        paper=SCEXAO_MAS[where],
+        paper=SCEXAO_MAS[site],
         error=spread / np.sqrt(4.0 * (blocks - 1)),
         assumption=f"{LOOP}\n{SCEXAO}",
     )

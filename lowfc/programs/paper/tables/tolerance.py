@@ -160,11 +160,11 @@ def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterat
                 drifts = [tolerated_drift(residual_nm2, nm2, EXPOSURE, kind) for nm2 in noise_and_limit_nm2]
                 drift_pm = 1e3 * np.sqrt([drift.step_nm2 * RATE_HZ for drift in drifts])
                 line_pm = 1e3 * np.sqrt(lines[kind](residual_nm2 / noise_and_limit_nm2) * noise_and_limit_nm2)
-                where = f"Z{noll} {mode_name(noll)}, V = {magnitude:g}, contrast {allowed:g}"
-                for term, unit, pm, about in (("drift", "pm/sqrt(s)", drift_pm, DRIFT), ("line", "pm", line_pm, LINE)):
+                point = f"Z{noll} {mode_name(noll)}, V = {magnitude:g}, contrast {allowed:g}"
+                for term, unit, pm, basis in (("drift", "pm/sqrt(s)", drift_pm, DRIFT), ("line", "pm", line_pm, LINE)):
                     measured, limit = pm.tolist()
-                    tolerated = Row(name, f"{term} of {where}", unit, measured, limit=limit)
-                    yield replace(tolerated, estimator=ESTIMATORS[kind], assumption=f"{LOOP}\n{about}")
+                    tolerated = Row(name, f"{term} of {point}", unit, measured, limit=limit)
+                    yield replace(tolerated, estimator=ESTIMATORS[kind], assumption=f"{LOOP}\n{basis}")
 
 
 def _checked(context: Context) -> list[Row]:

@@ -104,14 +104,14 @@ def read(folder: Path) -> Evidence:
     return evidence
 
 
-def _add(evidence: Evidence, message: Sample, number: int | None) -> None:
-    """Add a message; `number` is the number of its log, None if the log is unfinished."""
+def _add(evidence: Evidence, message: Sample, log_number: int | None) -> None:
+    """Add a message; `log_number` is None if its log is unfinished."""
     evidence.messages += 1
     start_s, count = start_of(message.sequence), count_of(message.sequence)
     if start_s <= FORGED_S:
         return
-    if number is not None and message.key != EVENT.key:  # all processes publish events: the publisher is ambiguous
-        evidence.received.setdefault((number, message.key, start_s), Gaps(count)).add(count)
+    if log_number is not None and message.key != EVENT.key:  # all processes publish events: the publisher is ambiguous
+        evidence.received.setdefault((log_number, message.key, start_s), Gaps(count)).add(count)
     topic = known_topic(message.key)
     if topic is None or topic not in DECODED:
         return
@@ -125,5 +125,5 @@ def _add(evidence: Evidence, message: Sample, number: int | None) -> None:
         evidence.entries[topic].append(Entry(message.sequence, message.receive_time_ns, decoded, shape))
     elif topic is COMMAND or decoded.actuators:  # a mirror that does not know its shape reports no actuators
         evidence.unreadable.append(f"a message on {message.key} has {len(decoded.actuators)} bytes of actuators")
-    if topic is HEALTH and decoded.state == "stopped" and number is not None:
-        evidence.sent |= {(number, each.topic, start_s): each.published for each in decoded.topics if each.published}
+    if topic is HEALTH and decoded.state == "stopped" and log_number is not None:
+        evidence.sent |= {(log_number, one.topic, start_s): one.published for one in decoded.topics if one.published}

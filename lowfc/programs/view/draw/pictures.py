@@ -17,14 +17,14 @@ _SHRINK_NS = 2_000_000_000
 class Scale:
     """Largest magnitude shown, a round number: it grows at once, and shrinks after two seconds of smaller values."""
 
-    def __init__(self, least: float) -> None:
-        self.least = least
+    def __init__(self, min_limit: float) -> None:
+        self._min_limit = min_limit
         self.limit = 0.0
         self._needed_ns = 0
 
     def fit(self, values: npt.NDArray[np.floating], time_ns: int) -> bool:
         """Adapt the limit to the finite values; True if the limit changed."""
-        largest = max(self.least, float(np.abs(values[np.isfinite(values)]).max(initial=0.0)))
+        largest = max(self._min_limit, float(np.abs(values[np.isfinite(values)]).max(initial=0.0)))
         decade = 10.0 ** floor(log10(largest))
         fitted = next(step * decade for step in _STEPS if largest <= step * decade * (1 + 1e-9))
         if fitted >= self.limit:

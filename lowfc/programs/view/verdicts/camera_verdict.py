@@ -60,10 +60,10 @@ def frames(state: RunState) -> Tile:
         return tile("STARTING", "the camera")
     if silent_s is not None:
         alive = camera.life is not Liveness.SILENT and silent_s > HEALTH_OVERDUE_S
-        who = "the camera runs, but sends none" if alive else "camera silent"
+        cause = "the camera runs, but sends none" if alive else "camera silent"
         since = duration(silent_s)
-        advice = f"No frame for {since}, {who}: {harm}. Check the camera's last output and restart it."
-        return tile("NO FRAMES", f"for {since}: {who}", Level.BAD, advice)
+        advice = f"No frame for {since}, {cause}: {harm}. Check the camera's last output and restart it."
+        return tile("NO FRAMES", f"for {since}: {cause}", Level.BAD, advice)
     lost = state.recent["skipped"] + state.recent["missing"]
     period_ns = state.snapshot.period_ns
     nominal_hz = 1e9 / period_ns if period_ns else 0.0

@@ -58,9 +58,9 @@ class SteadyFrames:
         excluded = min(self._settling, len(signals) - first)
         self._settling -= excluded
         self._kept.append((steps.sequence[first + excluded :], signals[first + excluded :]))
-        kept = sum(len(sequence) for sequence, _ in self._kept)
-        while kept - len(self._kept[0][0]) >= FRAMES:
-            kept -= len(self._kept.popleft()[0])
+        frames = sum(len(sequence) for sequence, _ in self._kept)
+        while frames - len(self._kept[0][0]) >= FRAMES:
+            frames -= len(self._kept.popleft()[0])
         return True
 
     def rows(self) -> tuple[Sequences, Single]:
