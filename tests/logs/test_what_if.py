@@ -486,7 +486,7 @@ def test_steps_under_another_calibration_give_a_warning() -> None:
 
 
 def test_too_few_frames_to_compare_are_an_error() -> None:
-    with pytest.raises(DataFileError, match="of 40, 0 were refused, 40 have saturated pixels and 10 are within"):
+    with pytest.raises(DataFileError, match="of 40 frames, 0 were refused, 40 have saturated pixels and 10 are within"):
         rows_compared(LoggedRun(history(saturated_pixels=np.ones(40, np.int64))))
     nothing = np.full((40, 3), np.nan, np.float32)
     for short, why in (
