@@ -74,7 +74,7 @@ def test_an_existing_stream_is_adopted_unless_another_process_writes_it(folder: 
     assert command.pixels.ravel().tolist() == [1, 2]
     assert stream(folder, "night_flux", 1).pixels.ravel().tolist() == [500]
     stream(folder, "night_residual", 34, 34, make=True)
-    with pytest.raises(StreamError, match="'night_residual' is of another program"):
+    with pytest.raises(StreamError, match="'night_residual' belongs to another program"):
         RunWithStreams().step(error_nm=[3, -4])
     command.pack("<i", command.writers, os.getppid())
     with pytest.raises(StreamError, match=f"process {os.getppid()} writes stream 'night_command'"):

@@ -1,4 +1,4 @@
-"""`lowfc bridge isio`: write steps to ImageStreamIO streams, and report the mirror's other channels to the loop."""
+"""`lowfc bridge isio`: write control steps to ImageStreamIO streams, and report other programs' shapes to the loop."""
 
 import contextlib
 import sys
@@ -29,10 +29,10 @@ from lowfc.control.loop.command_channels import EXTERNAL
 RING_STEPS = 2000
 """Length of the ring buffer of steps: two seconds at 1 kHz."""
 _POLL_S = 0.005
-_REQUESTS_S = 0.1
+_REQUEST_PERIOD_S = 0.1
 """Shortest time between two requests for a channel that changes continuously."""
-_REFUSED_S = 2.0
-"""Time from a refusal to the next request: each refused request is in the log."""
+_RETRY_S = 2.0
+"""Time from a refusal to the next request, long, because each refused request is in the log."""
 
 
 def bridge_isio(
@@ -58,7 +58,7 @@ def bridge_isio(
     if beside in names:
         raise ConfigurationError(f"{beside} is the loop's own channel (--beside): leave out --external {beside}")
     for name in names:
-        if sum_name(f"{name}00") == name:
+        if sum_name(f"{name}00") == name:  # such as dm00disp, the sum that contains dm00disp00
             raise ConfigurationError(
                 f"--external {name} is a sum, which may contain the loop's own channel: name single channels"
             )
@@ -119,7 +119,7 @@ class StepStreams:
 
 
 class ExternalChannels:
-    """Shapes of other programs on the mirror, reported to the loop on every change and to a starting controller."""
+    """Sum of other programs' shapes on the mirror, reported to the loop on change, and to a starting controller."""
 
     def __init__(self, client: Client, bus: Bus, names: Sequence[str], nm_per_unit: float) -> None:
         """Watch these channels, with `nm_per_unit` nm of surface per unit; StreamError for an impossible name."""
@@ -130,16 +130,16 @@ class ExternalChannels:
             stream_path(name)
         self._names = names
         self._others: OtherChannels | None = None  # None until a controller has reported the mirror's grid
-        self._known = b""  # shape of the channel at the controller, as last reported or requested
+        self._controller_shape = b""  # of the channel `external`, as last reported or requested
         self._next_request_s = 0.0
         self._report = ""
 
     def report_changes(self) -> None:
-        """Request the channel `external` if it differs from the controller's."""
+        """Request a new shape of the controller's channel `external` if the sum differs from the present one."""
         for sample in self._states.drain():
             with contextlib.suppress(DecodeError):
                 channels = wire.ControllerState.FromString(sample.payload).channels
-                self._known = next((one.actuators for one in channels if one.name == EXTERNAL), b"")
+                self._controller_shape = next((one.actuators for one in channels if one.name == EXTERNAL), b"")
         if (now_s := time.monotonic()) < self._next_request_s:
             return
         try:
@@ -147,27 +147,27 @@ class ExternalChannels:
                 self._others = OtherChannels(self._names, self._client.mirror_grid())
             shape_nm = self._others.sum() * self._nm_per_unit
             requested = shape_nm.tobytes() if shape_nm.any() else b""
-            if requested != self._known:
+            if requested != self._controller_shape:
                 self._client.channel(EXTERNAL, shape_nm if requested else None)
-                self._known, self._next_request_s = requested, now_s + _REQUESTS_S
+                self._controller_shape, self._next_request_s = requested, now_s + _REQUEST_PERIOD_S
             report = "; left out: ".join((", ".join(self._others.names) or "none yet", *self._others.unusable))
         except LowfcError as error:
             report = f"not reported to the loop: {error}"
-            self._next_request_s = now_s + (_REFUSED_S if isinstance(error, RequestRefusedError) else _REQUESTS_S)
+            self._next_request_s = now_s + (_RETRY_S if isinstance(error, RequestRefusedError) else _REQUEST_PERIOD_S)
         if report != self._report:
             self._report = report
             sys.stderr.write(f"other channels: {printable(report)}\n")
 
 
 def _open_or_create(name: str, columns: int) -> Stream:
-    """A stream of one row for this process to write: an existing one, created again if it has another size."""
+    """The stream of one row that this process writes: an existing one, or a new one if it has another size."""
     path = stream_path(name)
     with contextlib.suppress(StreamAbsentError):
         stream = Stream(path)
         if pid := stream.other_writer():
             raise StreamError(f"process {pid} writes stream {name!r}: stop it first, or use another --prefix")
         if not fits(stream, (1, stream.layout.shape[2])):
-            raise StreamError(f"stream {name!r} is of another program ({path}): use another --prefix")
+            raise StreamError(f"stream {name!r} belongs to another program ({path}): use another --prefix")
         if stream.layout.shape[2] == columns:
             return stream
         path.unlink(missing_ok=True)
