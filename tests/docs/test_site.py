@@ -13,7 +13,7 @@ from lowfc.contract.configuration import keys
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import TOPICS
 from lowfc.contract.wire import lowfc_pb2
-from lowfc.programs.cli.main import COMMANDS, PARTS
+from lowfc.programs.cli.main import COMMANDS, GROUP_COMMANDS
 from lowfc.programs.commissioning.tune.result import TuneResult
 from lowfc.programs.logs.replay.account import Account
 from tools.advice import REASONS
@@ -66,7 +66,7 @@ def test_the_site_has_every_page_and_every_declared_name(
     for page in DOCS.rglob("*.md"):
         assert (site / page.relative_to(DOCS).with_suffix(".html")).is_file()
     declared = {
-        "reference/commands": [f"lowfc {row.name}" for row in (*sum(COMMANDS.values(), ()), *PARTS)],
+        "reference/commands": [f"lowfc {row.name}" for row in (*sum(COMMANDS.values(), ()), *GROUP_COMMANDS)],
         "reference/configuration": [*keys()],
         "reference/topics": [topic.key for topic in TOPICS],
         "reference/messages": [*lowfc_pb2.DESCRIPTOR.message_types_by_name],

@@ -15,7 +15,7 @@ import pytest
 from lowfc.adapters.logs.selection import EVERYTHING
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import TOPICS, RawImage, from_timestamp, topic_of, wire
-from lowfc.programs.cli.ctl import SIGNAL
+from lowfc.programs.cli.ctl import SAFE_BY_SIGNAL
 from lowfc.programs.core.recording.volume import bytes_per_s
 from tests.support.loops import FIXED, LOWFC, children, loop, lowfc, output_of, payloads, recorded_bytes, start, until
 from tests.support.other_readers import foxglove
@@ -106,7 +106,7 @@ def test_npm_mcap_core_reads_the_same_messages(live: dict[str, Any], topics: dic
 
 def test_a_signal_makes_the_loop_safe_and_a_process_that_dies_is_named(tmp_path: Path) -> None:
     """The documented pattern of pkill finds the controller, and the log has the signal as a request."""
-    (pattern,) = re.findall(r"pkill -USR1 -f '(.*)'", SIGNAL)
+    (pattern,) = re.findall(r"pkill -USR1 -f '(.*)'", SAFE_BY_SIGNAL)
     process = start(tmp_path, "sim-loop", "--rate", "200", "--duration", "60")
     until(lambda: recorded_bytes(tmp_path) > 4e6)
     controller = children(process.pid)["controller"]

@@ -9,13 +9,13 @@ from lowfc.arrays import Array
 from lowfc.optics.chain.added_contrast import ModalContrast, by_group, costliest
 
 QUADRATIC = "; quadratic form, valid to 3 nm rms of a mode"
-"""Method for the added contrast of a running loop: within 10 % for up to 3 nm rms of a mode (shaped pupil)."""
+"""Method for the added contrast of a running loop: to 3 nm rms of a mode, within 10 % of full images (shaped pupil)."""
 ESTIMATED = ", estimated from the sensor"
 """Source of the added contrast of a running loop whose true wavefront is not known."""
 
 
 def added_contrast(contrast: ModalContrast | None, covariance_nm2: Mapping[str, Array | None]) -> dict[str, Any] | None:
-    """Contrast added by wavefronts with these covariances (modes, modes), by name; None for an unknown one.
+    """Contrast added by wavefronts with these covariances (modes, modes), by name; None for an unknown covariance.
 
     Further keys: `by_group`, the contribution of each group of modes; `beyond_quadratic`, the names for which full
     images disagree with the quadratic form. The result is None without a `contrast`, without a known covariance, or if
@@ -41,20 +41,23 @@ def with_variances(covariance_nm2: Array, rms_nm: Array) -> Array:
 
 
 def costliest_modes(statistics: Mapping[str, Any]) -> tuple[str, float] | None:
-    """Names and share of the modes that contribute most, from the statistics of `launch.watch.wavefront`."""
+    """The modes that add most contrast, and their share of it, from the statistics of `launch.watch.wavefront`."""
     most = statistics["costliest_modes"]
     return None if most is None else (most["modes"], most["share"])
 
 
 def contrast_cases(added: Mapping[str, float]) -> dict[str, float | None]:
-    """Contrast added with a flat mirror and, in any loop mode, with the present mirror shape, by label."""
+    """Added contrast by label: with a flat mirror, and with the present mirror shape, even if the loop is open."""
     return {"flat mirror": added["open"], "residual": added["closed"]}
 
 
 def contrast_in_words(
     added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = (), how: str = ""
 ) -> str:
-    """The added contrast of each case, the modes that contribute most to the last case, and `how` it was computed."""
+    """The added contrast of each case, the modes that add `most` in the last case, and `how` the contrast was computed.
+
+    A caveat names the cases in `beyond`, for which full images differ from the quadratic form.
+    """
     cases = ", ".join(f"{name} {value:+.1e}" for name, value in added.items() if value is not None)
     largest = "" if most is None else f"; {most[0]} contributes most ({100 * most[1]:.0f} %)"
     caveat = f"; full images differ from the quadratic form by more than 10 %: {', '.join(beyond)}" if beyond else ""

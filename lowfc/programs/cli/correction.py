@@ -3,9 +3,9 @@
 from enum import Enum, auto
 
 WORSE = 1.1
-"""Ratio of residual to open wavefront above which a closed loop does harm; an rms over 1 s scatters by under 10 %."""
+"""Ratio of residual to open-loop wavefront above which a loop does harm; an rms over 1 s scatters by under 10 %."""
 GOOD_FACTOR = 2.0
-"""Reduction of the wavefront that counts as good: leaked light scales with its square, so a quarter is left."""
+"""Reduction factor of the wavefront rms that counts as good: leaked light, which scales as its square, falls to 1/4."""
 
 
 class Correction(Enum):

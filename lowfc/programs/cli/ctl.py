@@ -25,8 +25,8 @@ ctl_app.add_typer(record_app, name="record")
 
 ZERO = "--zero"
 INTEGRATOR = "integrator"
-SIGNAL = (
-    "if the controller does not answer, a signal on its host puts it and any other loop there in safe mode: "
+SAFE_BY_SIGNAL = (
+    "if the controller does not answer, run this command on its host; it puts every loop there in safe mode: "
     "pkill -USR1 -f '^[^ ]*python.* (-m |[^ ]*/)lowfc controller'"
 )
 
@@ -73,10 +73,10 @@ def bench_name(word: str) -> str:
     return word
 
 
-_EACH = "One value for all modes, or one for each mode."
-Values = Annotated[list[float], typer.Argument(help=_EACH, parser=number)]
-Gains = Annotated[list[str], typer.Argument(help=f"{_EACH[:-1]}; or {AUTO}.", parser=gain_word)]
-ValuesIfAny = Annotated[list[float] | None, typer.Argument(help=f"{_EACH} nm rms of wavefront.", parser=number)]
+_VALUES_HELP = "One value for all modes, or one for each mode."
+Values = Annotated[list[float], typer.Argument(help=_VALUES_HELP, parser=number)]
+Gains = Annotated[list[str], typer.Argument(help=f"{_VALUES_HELP[:-1]}; or {AUTO}.", parser=gain_word)]
+ValuesIfAny = Annotated[list[float] | None, typer.Argument(help=f"{_VALUES_HELP} nm rms of wavefront.", parser=number)]
 ZeroOffset = Annotated[bool, typer.Option(ZERO, help="Set the offset to zero.")]
 ZeroChannel = Annotated[bool, typer.Option(ZERO, help="Remove the channel.")]
 Frames = Annotated[int, typer.Argument(help="Number of frames with the loop closed.", parser=frame_count)]
@@ -84,10 +84,10 @@ Text = Annotated[str, typer.Argument(help="The note.")]
 Purpose = Annotated[str, typer.Argument(help="What will be moved.")]
 Hold = Annotated[
     float | None,
-    typer.Option(help="Hold the loop for this many seconds, at most 60; `open` ends the hold.", parser=number),
+    typer.Option(help="Seconds to hold the loop's command, at most 60; `open` ends the hold.", parser=number),
 ]
-_NAME = "Name of the value, as in [[interlocks]] of the configuration."
-BenchName = Annotated[str, typer.Argument(help=_NAME, parser=bench_name)]
+_BENCH_NAME_HELP = "Name of the value, as in [[interlocks]] of the configuration."
+BenchName = Annotated[str, typer.Argument(help=_BENCH_NAME_HELP, parser=bench_name)]
 BenchValue = Annotated[str, typer.Argument(help="true, false, a number or a text.")]
 Channel = Annotated[str, typer.Argument(help="Name of the channel; `flat` does not shift the sensor's zero point.")]
 Shape = Annotated[Path | None, typer.Argument(help="FITS or .npy array (rows, columns), nm of surface.")]
@@ -98,22 +98,22 @@ _Command = Callable[..., None]
 
 
 def _plain_command(name: str) -> _Command:
-    def ask(run: AnyRun = None, as_json: Json = False) -> None:
+    def command(run: AnyRun = None, as_json: Json = False) -> None:
         try:
             _request_and_print(run, as_json, lambda loop: loop.ask(name))
         except (BusError, DataFileError) as fault:
             if name != "safe":
                 raise
-            raise type(fault)(f"{fault}\n{SIGNAL}") from None
+            raise type(fault)(f"{fault}\n{SAFE_BY_SIGNAL}") from None
 
-    return ask
+    return command
 
 
 def _values_command(name: str) -> _Command:
-    def ask(values: Values, modes: Modes = None, run: AnyRun = None, as_json: Json = False) -> None:
+    def command(values: Values, modes: Modes = None, run: AnyRun = None, as_json: Json = False) -> None:
         _request_and_print(run, as_json, lambda loop: loop.ask(name, noll_of(modes), values))
 
-    return ask
+    return command
 
 
 def _gain(values: Gains, modes: Modes = None, run: AnyRun = None, as_json: Json = False) -> None:
@@ -193,7 +193,7 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
 
     Example: lowfc ctl bench mask-moving true
     """
-    from lowfc.programs.cli.status import interlocks, json_object
+    from lowfc.programs.cli.status import interlocks_in_words, json_object
 
     parsed = bench_value(value)
     with _client(run) as loop:
@@ -204,7 +204,7 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
     status = json_object(state, run=loop.run_id)
     names = sorted({interlock.name for interlock in state.settings.interlocks})
     unused = "" if name in names else f"; no interlock uses it (interlocks use {', '.join(names)})" if names else ""
-    acting = f"interlocks: {interlocks(status)}" if names else "no interlock is configured"
+    acting = f"interlocks: {interlocks_in_words(status)}" if names else "no interlock is configured"
     result = {"run": loop.run_id, "name": name, "value": parsed, "interlocks": status["interlocks"]}
     print_result(result, f"{name} is {value}{unused}; {acting} (run {loop.run_id})", as_json=as_json)
 
@@ -224,16 +224,16 @@ def _law(file: LawFile, run: AnyRun = None, as_json: Json = False) -> None:
 
 
 def _recording_command(name: str) -> _Command:
-    def ask(run: AnyRun = None, as_json: Json = False) -> None:
+    def command(run: AnyRun = None, as_json: Json = False) -> None:
         with _client(run) as loop:
             answer = loop.record(name == "record/start")
         result = {"run": answer.run, "accepted": answer.accepted, "reply": answer.reply, "log": answer.text}
         print_result(result, f"{answer.reply} (run {answer.run})", as_json=as_json)
 
-    return ask
+    return command
 
 
-_OWN: dict[str, _Command] = {
+_SPECIAL: dict[str, _Command] = {
     "status": _status,
     "configuration": _configuration,
     "close": _close,
@@ -251,12 +251,13 @@ _BY_FIELDS: dict[tuple[str, ...], Callable[[str], _Command]] = {
     (): _plain_command,
     ("modes", "values"): _values_command,
 }
+"""How to make the command of any other request, by the request's fields."""
 
 for _name, _request in BY_NAME.items():
     if _request.example:
         _fields = tuple(field for field, _ in _request.fields)
         _records = _name.startswith("record/")
-        _command = _recording_command(_name) if _records else _OWN.get(_name) or _BY_FIELDS[_fields](_name)
+        _command = _recording_command(_name) if _records else _SPECIAL.get(_name) or _BY_FIELDS[_fields](_name)
         (record_app if _records else ctl_app).command(
             _request.name,
             help=f"{_request.description}\n\nExample: lowfc ctl {_request.example}",

@@ -31,7 +31,7 @@ class HostProcess(Result):
 
     process: str = result_field("process")
     state: str = result_field("state")
-    clock_offset_us: float | None = result_field("router's clock minus its own", "us", "+.0f")
+    clock_offset_us: float | None = result_field("router's clock minus host's", "us", "+.0f")
     clock_error_us: float | None = result_field("clock error at most", "us", ".0f")
 
 
@@ -66,7 +66,7 @@ def certs(
 ) -> None:
     """Make a certificate for each role of a run on several hosts, and the authority that signs them.
 
-    Copy ca.pem to each host, and ROLE.pem and ROLE.key of its roles; keep ca.key secret.
+    Copy ca.pem to each host, with ROLE.pem and ROLE.key of each role that runs there; keep ca.key secret.
 
     Example: lowfc certs certs --router bench.example.org --router 192.168.7.1
     """
@@ -92,7 +92,7 @@ def router(
         bool, typer.Option("--show", help="Only print the router's configuration, for your own zenohd.")
     ] = False,
 ) -> None:
-    """Run the router of a run on several hosts: mutual TLS, and only the messages that each role may send or receive.
+    """Run the router of a run on several hosts, with mutual TLS; it passes only what each role may send or receive.
 
     It listens on network.listen of the configuration, or else on network.router. Your own zenohd works as well, but
     does not compare clocks: each host then stamps envelopes by its own clock.

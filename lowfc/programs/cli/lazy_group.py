@@ -24,9 +24,9 @@ class Row(NamedTuple):
 class Commands(Mapping[str, Any]):
     """Commands by name; each is imported when it is looked up."""
 
-    def __init__(self, rows: Sequence[Row], parts: Sequence[Row]) -> None:
-        """`rows` are the commands and groups; `parts` are the commands of the groups, named "GROUP COMMAND"."""
-        self._rows, self._parts = {row.name: row for row in rows}, parts
+    def __init__(self, rows: Sequence[Row], group_commands: Sequence[Row]) -> None:
+        """`rows` are the commands and groups; `group_commands` are named "GROUP COMMAND"."""
+        self._rows, self._group_commands = {row.name: row for row in rows}, group_commands
 
     def __getitem__(self, name: str) -> Any:
         row = self._rows[name]
@@ -34,9 +34,9 @@ class Commands(Mapping[str, Any]):
             module, _, attribute = row.target.partition(":")
             command = getattr(import_module(f"lowfc.programs.{module}"), attribute)
         else:
-            parts = [part for part in self._parts if part.name.startswith(f"{name} ")]
-            commands = [part._replace(name=part.name.removeprefix(f"{name} ")) for part in parts]
-            command = lazy_app(f"{row.description}\n\nExample: lowfc {parts[0].name}", {"Commands": commands})
+            full_rows = [each for each in self._group_commands if each.name.startswith(f"{name} ")]
+            commands = [each._replace(name=each.name.removeprefix(f"{name} ")) for each in full_rows]
+            command = lazy_app(f"{row.description}\n\nExample: lowfc {full_rows[0].name}", {"Commands": commands})
             command.callback()(lambda: None)
         if not isinstance(command, typer.Typer):
             function, command = command, new_app("")
@@ -52,13 +52,13 @@ class Commands(Mapping[str, Any]):
         return len(self._rows)
 
 
-def lazy_app(help_text: str, panels: Mapping[str, Sequence[Row]], parts: Sequence[Row] = ()) -> typer.Typer:
+def lazy_app(help_text: str, panels: Mapping[str, Sequence[Row]], group_commands: Sequence[Row] = ()) -> typer.Typer:
     """A typer application; the caller adds its callback.
 
     Args:
         help_text: text at the head of `--help`.
         panels: commands by the heading under which `--help` lists them.
-        parts: commands of its groups, named "GROUP COMMAND".
+        group_commands: commands of the groups among them, named "GROUP COMMAND".
     """
     rows = [row for panel in panels.values() for row in panel]
     width = max(len(row.name) for row in rows)
@@ -66,7 +66,7 @@ def lazy_app(help_text: str, panels: Mapping[str, Sequence[Row]], parts: Sequenc
     class Group(AppGroup):
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
-            self.commands = Commands(rows, parts)  # type: ignore[assignment]  # read only
+            self.commands = Commands(rows, group_commands)  # type: ignore[assignment]  # read only
 
         def format_commands(self, ctx: Any, formatter: Any) -> None:
             for heading, panel in panels.items():

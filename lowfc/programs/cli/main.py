@@ -57,8 +57,8 @@ COMMANDS = {
     ),
     "Design": (Row("design", "design.command:design_app", "Design shaped pupils and sparse aperture masks."),),
 }
-"""By purpose, in the order of `lowfc --help`; a row without a module is a group with its commands in `PARTS`."""
-PARTS = (
+"""Commands by purpose, in the order of `lowfc --help`; a row without a target is a group (see `GROUP_COMMANDS`)."""
+GROUP_COMMANDS = (
     Row("bridge isio", "bridge.isio:bridge_isio", "Write steps to ImageStreamIO streams, report other channels."),
     Row("config show", "cli.config:config_show", "Print every key with its value and description, as TOML."),
     Row("config check", "cli.config:config_check", "Check a configuration file and the files it names."),
@@ -69,7 +69,7 @@ PARTS = (
 )
 
 app = lazy_app(
-    "Low-order wavefront control for coronagraphs.\n\nExample: lowfc sim-loop --duration 20", COMMANDS, PARTS
+    "Low-order wavefront control for coronagraphs.\n\nExample: lowfc sim-loop --duration 20", COMMANDS, GROUP_COMMANDS
 )
 
 

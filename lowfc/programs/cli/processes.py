@@ -22,7 +22,8 @@ def controller(
     camera: Annotated[
         str | None,
         typer.Option(
-            metavar="DRIVER", help="Run this camera driver in the controller's process; default: in its own process."
+            metavar="DRIVER",
+            help="Run this camera driver in the controller's process; default: the camera has its own process.",
         ),
     ] = None,
     wait_for: Annotated[
@@ -103,7 +104,7 @@ def record(
             "several. Default: all."
         ),
     ] = None,
-    words: Annotated[list[str] | None, typer.Argument(hidden=True)] = None,
+    arguments: Annotated[list[str] | None, typer.Argument(hidden=True)] = None,
     as_json: Json = False,
 ) -> None:
     """Record the messages of a run in MCAP logs until Ctrl-C or SIGTERM.
@@ -127,9 +128,10 @@ def record(
         "recorder.every": every,
         "recorder.topics": topics or None,
     }
-    if words:
-        hint = f"; `lowfc ctl record {words[0]}` controls a running recorder" if words[0] in ("start", "stop") else ""
-        raise ConfigurationError(f"lowfc record takes options only, got {' '.join(words)!r}{hint}")
+    if arguments:
+        first = arguments[0]
+        hint = f"; `lowfc ctl record {first}` controls a running recorder" if first in ("start", "stop") else ""
+        raise ConfigurationError(f"lowfc record takes options only, got {' '.join(arguments)!r}{hint}")
     run_config = run_path(run) / "config.toml"
     settings = configuration(run_config if config is None and run_config.exists() else config, overrides)
     joined = open_run(run, (settings.mirror.name,), network=settings.network)

@@ -63,7 +63,7 @@ class Result(BaseModel):
 
 
 def parts_table(parts: Sequence[Result]) -> list[str]:
-    """A row for each part, a column for each of its labelled fields; its remarks follow the row."""
+    """Table with a row for each part, a column for each labelled field, and the part's remarks after its row."""
     shown = [(name, info) for name, info in type(parts[0]).model_fields.items() if info.description]
     rows = [[formatted(info, getattr(part, name)) for name, info in shown] for part in parts]
     lines = table([_heading(info) for _, info in shown], rows)

@@ -24,7 +24,7 @@ def runs(as_json: Json = False) -> None:
     for name, roles in live_runs().items():
         try:
             rows.append(_row(name, roles))
-        except LowfcError as fault:  # it has just ended, or this host has no certificate of an operator
+        except LowfcError as fault:  # the run has just ended, or this host has no operator's certificate
             not_joined[name] = str(fault)
     results = {"runs": rows, "not_joined": not_joined, "searched": str(runtime_path())}
     lines = [*_lines(rows), *(f"{name}  cannot be joined: {why}" for name, why in not_joined.items())]

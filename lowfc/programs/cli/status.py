@@ -145,7 +145,7 @@ def text(status: dict[str, Any]) -> str:
         if playing
         else "nothing",
         "reserved": f"for {status['reserved_for']}" if status["reserved_for"] else "no",
-        "interlocks": interlocks(status),
+        "interlocks": interlocks_in_words(status),
         "mirror limits": f"stroke {status['stroke_nm']:g} nm, slew {status['slew_nm']:g} nm a frame, "
         f"neighbours {status['neighbour_nm']:g} nm; {_limits_in_words(status['limits_hit'])}",
         "counted": ", ".join(_count_text(name, count) for name, count in status["counts"].items()) or "nothing refused",
@@ -153,7 +153,7 @@ def text(status: dict[str, Any]) -> str:
         "calibration": (status["calibration_id"][:12] or "none")
         + (", provisional: from the first steps of commissioning" if status["calibration_provisional"] else ""),
     }
-    return "\n".join([_in_short(status), *(f"{name:14} {value}" for name, value in rows.items())])
+    return "\n".join([_summary_line(status), *(f"{name:14} {value}" for name, value in rows.items())])
 
 
 def _contrast_row(status: dict[str, Any]) -> dict[str, str]:
@@ -182,7 +182,7 @@ def channels_in_words(status: dict[str, Any]) -> str:
     return "; ".join(channels) or "no channel"
 
 
-def interlocks(status: dict[str, Any]) -> str:
+def interlocks_in_words(status: dict[str, Any]) -> str:
     """Text of the interlocks that act."""
     if status["interlocks"]:
         return "; ".join(f"{one['why']} ({one['action'].replace('_', ' ')})" for one in status["interlocks"])
@@ -191,7 +191,7 @@ def interlocks(status: dict[str, Any]) -> str:
 
 
 def holds_shape(state: wire.ControllerState | None) -> bool:
-    """Whether the loop holds a shape on purpose, so that the true wavefront is not its residual."""
+    """Whether an offset or a channel other than `flat` is set: the true wavefront contains it besides the residual."""
     return state is not None and (any(state.offset_nm) or any(one.name != FLAT for one in state.channels))
 
 
@@ -204,8 +204,8 @@ def recording_state(recorder: wire.Health) -> str:
     return "stopped" if recorder.recording.stopped else "recording"
 
 
-def _in_short(status: dict[str, Any]) -> str:
-    """Summary line: mode, residual and flux of the last second, lost frames, recording, run, law, last warning.
+def _summary_line(status: dict[str, Any]) -> str:
+    """Mode, residual and flux of the last second, lost frames, recording, run, law, last warning.
 
     The true residual is over the simulated camera's last two seconds; lost frames are counted from the controller's
     start.
@@ -238,7 +238,7 @@ def _in_short(status: dict[str, Any]) -> str:
 
 
 def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Health]) -> dict[str, Any] | None:
-    """The newest warning; if a mirror's driver fails, that mirror's, because it causes warnings of other processes."""
+    """The newest warning; if a mirror's driver failed, that mirror's newest, because the failure causes the others."""
     warnings = [
         (from_timestamp(one.last_warning_timestamp), name) for name, one in processes.items() if one.last_warning
     ]

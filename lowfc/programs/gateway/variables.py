@@ -14,7 +14,7 @@ import numpy as np
 from lowfc.client import Answer, Client
 from lowfc.client.requests import DECLARED, Declaration
 from lowfc.contract.messages import Role, wire
-from lowfc.programs.cli.status import interlocks
+from lowfc.programs.cli.status import interlocks_in_words
 from lowfc.programs.gateway.watch import RunView
 
 
@@ -70,7 +70,7 @@ READINGS = (
     Variable("verdict", Kind.TEXT, "", "State of the loop in a sentence.", lambda view, _: view.verdict.headline),
     Variable("verdict_level", Kind.TEXT, "", "Level of the verdict.", lambda view, _: view.verdict.level.name.lower()),
     Variable("holding", Kind.TEXT, "", "Why a closed loop holds its command.", _status("holding", "")),
-    Variable("interlocks", Kind.TEXT, "", "Interlocks that act.", lambda _, status: interlocks(status)),
+    Variable("interlocks", Kind.TEXT, "", "Interlocks that act.", lambda _, status: interlocks_in_words(status)),
     Variable("reserved_for", Kind.TEXT, "", "Holder of the loop's reservation.", _status("reserved_for", "")),
     Variable("residual", Kind.NUMBER, "nm", "Modal error with noise, rms over 1 s.", _status("residual_rms_nm", nan)),
     Variable("flux", Kind.NUMBER, "", "Flux relative to the calibration.", _status("flux_fraction", nan)),
