@@ -136,7 +136,9 @@ def test_the_result_is_printed_although_the_loop_refuses_the_law(
     assert json.loads(done.stdout)["applied"] is None
 
 
-@pytest.mark.parametrize(("frames", "extent"), [(3000, "that of the last 2500, theory is"), (1000, "that of all of")])
+@pytest.mark.parametrize(
+    ("frames", "extent"), [(3000, "that of the last 2500 frames, theory is"), (1000, "that of all of")]
+)
 def test_the_residual_achieved_is_that_of_the_last_gains(
     closed: SyntheticLog, tmp_path: Path, frames: int, extent: str
 ) -> None:

@@ -92,7 +92,7 @@ class Table(Generic[S]):
         Args:
             name: Name of the check.
             expected: Requirement of the contract.
-            advice: Recommended action, used for a warning without an advice of its own.
+            advice: Recommended action, for each warning in which the function names none.
             cost: Consequence of ignoring this advice.
         """
 
@@ -102,12 +102,12 @@ class Table(Generic[S]):
 
         return register
 
-    def run(self, subject: S, unknown: tuple[type[Exception], ...] = ()) -> Iterator[Check]:
-        """Run every check on `subject`; a check that raises one of the `unknown` exceptions gives a note."""
+    def run(self, subject: S, read_errors: tuple[type[Exception], ...] = ()) -> Iterator[Check]:
+        """Run every check on `subject`; a check that raises one of `read_errors` gives the note "not known"."""
         for template, function in self.functions.values():
             try:
                 result = function(subject)
-            except unknown as fault:
+            except read_errors as fault:
                 result = note(f"not known: {fault}")
             if result is not None and result.status is Status.WARNING and not result.advice:
                 yield template._replace(got=result.got)

@@ -87,8 +87,8 @@ def examine(facts: "Facts") -> list[Check]:
     """The result of every check; a note if a check cannot read its data."""
     from lowfc.programs.commissioning.doctor import resources, timing
 
-    unknown = (OSError, ValueError, LookupError, LowfcError)
-    return [*timing.CHECKS.run(facts, unknown), *resources.CHECKS.run(facts, unknown)]
+    read_errors = (OSError, ValueError, LookupError, LowfcError)
+    return [*timing.CHECKS.run(facts, read_errors), *resources.CHECKS.run(facts, read_errors)]
 
 
 def measured(facts: "Facts") -> dict[str, Any]:

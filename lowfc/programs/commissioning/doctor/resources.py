@@ -19,7 +19,7 @@ CHECKS: Table[Facts] = Table()
 """The docstring of each check describes its subject; docs/howto/doctor.md also describes its warning."""
 
 _STALL_S = 0.1  # stall of a reader that socket buffers should outlast
-_OPEN_FILES = 256  # needed by a process
+_MIN_OPEN_FILES = 256  # limit of open files that a process needs
 _MEMLOCK_ADVICE = "`lowfc doctor --setup` (memlock unlimited in limits.d), or the service's LimitMEMLOCK=infinity"
 
 
@@ -143,7 +143,7 @@ def _open_files(facts: Facts) -> Check:
     """Limit of open files and sockets of a process."""
     limit = facts.host.max_open_files()
     detail = "no limit" if limit is None else f"{limit}"
-    return ok(detail) if limit is None or limit >= _OPEN_FILES else warning(detail)
+    return ok(detail) if limit is None or limit >= _MIN_OPEN_FILES else warning(detail)
 
 
 @CHECKS.check(

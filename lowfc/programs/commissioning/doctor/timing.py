@@ -22,8 +22,8 @@ _IN_LOOP = 3  # number of these processes that are in the control loop
 _SLOW_EXIT_US = 50  # longest acceptable exit from an idle state
 _SLOW_SOURCES = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
 _SLOW_READING_NS = 1000
-_READINGS = 200  # of the clock, timed together
-_PART_OF_PERIOD = 0.1  # acceptable p99 of the wake-up, in frame periods
+_READINGS = 200  # number of readings of the clock that are timed together
+_MAX_WAKE_UP_PERIODS = 0.1  # largest acceptable p99 of the wake-up latency, frame periods
 _STOLEN = 1e-3  # fraction of stolen time above which the report says that it is much
 _BUSY = 0.1  # smallest share of a processor that is reported
 _BUSY_SHOWN = 3
@@ -68,15 +68,15 @@ def _processors(facts: Facts) -> Check:
     named = named_cpus(facts.config)
     if named and (missing := named - facts.completed_trial.cpus):
         return warning(
-            f"{detail}; the configuration names {ranges(missing)}",
+            f"{detail}; the configuration also names {ranges(missing)}",
             "correct realtime.camera_cpus, controller_cpus, mirror_cpus and recorder_cpus",
-            "the kernel moves the loop between processors; expect a longer tail",
+            "the kernel moves the loop between processors; expect a longer tail of the latencies",
         )
     if len(usable | named) < len(PROCESSES):
         return warning(
             f"{detail}, for {len(PROCESSES)} processes: {', '.join(PROCESSES)}",
             f"a host with {len(PROCESSES)} processors or more; if it has them, a wider affinity (taskset, cpuset)",
-            "the processes wait for each other: a longer tail, and a lower maximum rate",
+            "the processes wait for each other: a longer tail of the latencies, and a lower maximum rate",
         )
     return ok(detail)
 
@@ -85,7 +85,7 @@ def _processors(facts: Facts) -> Check:
 def _isolation(facts: Facts) -> Check:
     """Processors kept free of other programs: `isolcpus` and `nohz_full`."""
     isolated, online = facts.host.cpus("isolated"), facts.host.cpus("online")
-    cost = "other programs and the kernel's own work share the loop's processors; expect a longer tail"
+    cost = "other programs and the kernel's own work share the loop's processors; expect a longer tail of the latencies"
     if not isolated:
         if len(online) <= len(PROCESSES):
             return note(f"none is isolated, and none of the {len(online)} can be spared")
@@ -219,8 +219,8 @@ def _clock_source(facts: Facts) -> Check:
 @CHECKS.check(
     "synchronisation",
     advice="run chronyd (with rtcsync), ntpd, systemd-timesyncd or phc2sys before the first run after a boot",
-    cost="a step does not affect the loop, but the times in a log have the error of the clock at the first run after "
-    "the boot, and those of two hosts cannot be compared",
+    cost="a step of this clock does not affect the loop, but times in a log have the error of this clock at the first "
+    "run after the boot, and times of two hosts cannot be compared",
 )
 def _synchronisation(facts: Facts) -> Check:
     """Whether a daemon synchronises CLOCK_REALTIME, and the error that the kernel reports."""
@@ -232,7 +232,7 @@ def _synchronisation(facts: Facts) -> Check:
 
 @CHECKS.check("boot's clock")
 def _boot_clock(facts: Facts) -> Check:
-    """Difference between CLOCK_REALTIME and the clock of all runs, which the first run after a boot sets from it."""
+    """Clock of all runs minus CLOCK_REALTIME; the first run after a boot sets the former to the latter."""
     file = boot_file()
     if not file.exists():
         return ok("not set yet: the first process of a run sets it")
@@ -254,7 +254,7 @@ def _boot_clock(facts: Facts) -> Check:
     cost="every frame waits this long before processing, however fast the loop computes",
 )
 def _wake_up(facts: Facts) -> Check:
-    """Lateness of a timer wake-up, 1000 times in one second, in normal scheduling and, if granted, SCHED_FIFO."""
+    """Latency of timer wake-ups, 1000 in one second, in normal scheduling and, if granted, SCHED_FIFO."""
     wake_up = wake_up_us(facts.completed_trial)
     detail = "; ".join(
         f"{name}: p50 {late_us['p50']:.0f} us, p99 {late_us['p99']:.0f} us, max {late_us['max']:.0f} us"
@@ -262,7 +262,7 @@ def _wake_up(facts: Facts) -> Check:
     )
     best = list(wake_up.values())[-1]
     period_us = facts.config.period_ns / 1e3
-    if best["p99"] <= _PART_OF_PERIOD * period_us and best["max"] <= period_us:
+    if best["p99"] <= _MAX_WAKE_UP_PERIODS * period_us and best["max"] <= period_us:
         return ok(detail)
     return warning(f"{detail}; a frame period is {period_us:.0f} us")
 

@@ -48,15 +48,16 @@ class Telemetry:
         source: path of the log, or name of the run.
         noll: Noll index of each mode.
         timing: delay and exposure of the loop, measured if possible.
-        law: the integrator's gains at the end.
+        law: the integrator's gains, leaks and limits at the end.
         driving: the linear law in force at the end; None if the integrator is in force.
         closed: whether the loop was closed in these frames.
         frames_closed: number of these frames with the loop closed.
         pol: pseudo-open-loop modes (frames, modes), in pieces without gaps.
         error: modal error (frames, modes). Error and true residual are from the frames after the last change of law or
-            gains, or from all frames if those are fewer than `FEWEST`.
-        true_nm2: mean products of the true residual at the start of each exposure (modes, modes); None if unknown.
-        continuous_rms_nm: rms of the true residual over all time (modes,); None if unknown.
+            gains, or from all frames if fewer than `FEWEST` frames follow this change.
+        true_nm2: mean products of the modes' true residuals at the starts of the exposures (modes, modes); None if
+            unknown.
+        continuous_rms_nm: rms of the true residual over all time, also within exposures (modes,); None if unknown.
         nm_per_mas: wavefront rms of a tilt of 1 mas; None if the telescope's diameter is unknown.
         contrast: contrast added by the modes; None without a science image.
         noise_nm2: computed covariance (modes, modes) of one frame's noise; None without a science image.
@@ -160,16 +161,16 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
         applied_ns += watch.offset.offset_ns - camera.router_offset_ns
     period_s = float(np.median(np.diff(steps.time_ns))) * 1e-9 if len(steps.time_ns) > 1 else 0.0
     rate_hz = 1 / period_s if period_s > 0 else config.camera.rate_hz
-    assumed = float(states[0].delay_frames)
-    measured = delay_from_times(steps.sequence, steps.time_ns - config.exposure_ns, applied, applied_ns)
-    if config.lockstep or (measured is not None and measured < assumed):
-        measured = None  # time is simulated, or part of the delay follows the mirror's report
+    assumed_delay = float(states[0].delay_frames)
+    measured_delay = delay_from_times(steps.sequence, steps.time_ns - config.exposure_ns, applied, applied_ns)
+    if config.lockstep or (measured_delay is not None and measured_delay < assumed_delay):
+        measured_delay = None  # time is simulated, or the mirror still moves after its report
     played = np.zeros(steps.sequence.shape, np.bool_)
     for state in states:
         if state.HasField("play"):
             played |= during_probe(steps.sequence, state.play.first_sequence, state.play.frames)
-    seen = SeenCommands.of(steps, missing_before(steps.sequence), states, assumed, measured, played)
-    steps, usable = _without_probes(steps, seen, assumed, played)
+    seen = SeenCommands.of(steps, missing_before(steps.sequence), states, assumed_delay, measured_delay, played)
+    steps, usable = _without_probes(steps, seen, assumed_delay, played)
     timing = Timing.of(seen.delay_frames, config.camera.exposure_fraction)
     lost = [f"{counted(stream.lost, 'step')} lost between the controller and this program"] if stream.lost else []
     return _telemetry(
@@ -184,7 +185,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
         config,
         calibration_in_use(states[-1], calibration),
         [
-            *_delay_warnings(assumed, seen, measured, "the times of frames and mirror"),
+            *_delay_warnings(assumed_delay, seen, measured_delay, "the times of frames and mirror"),
             *_weighting_warnings(states[-1], calibration),
             *lost,
         ],
@@ -207,23 +208,23 @@ def _from_first_used(run_id: str, steps: Steps) -> Steps:
     return steps.at(rows)
 
 
-def _without_probes(steps: Steps, seen: SeenCommands, assumed: float, played: Mask) -> tuple[Steps, Mask]:
+def _without_probes(steps: Steps, seen: SeenCommands, assumed_delay: float, played: Mask) -> tuple[Steps, Mask]:
     """The steps with pseudo-open-loop modes for the measured delay, and whether each step is usable (steps,).
 
     Steps with a probe sequence (`played`) get mode 0, as if the loop were not closed, so that the time to settle after
     the sequence is excluded, too.
     """
-    pol_nm = steps.pol_nm if seen.delay_frames == assumed else steps.error_nm + seen.target_nm - seen.seen_nm
+    pol_nm = steps.pol_nm if seen.delay_frames == assumed_delay else steps.error_nm + seen.target_nm - seen.seen_nm
     usable = np.isfinite(pol_nm).all(axis=1) & ~seen.command_lost & ~played & (steps.saturated_pixels == 0)
     return replace(steps, pol_nm=pol_nm, mode=np.where(played, np.uint8(0), steps.mode)), usable
 
 
-def _delay_warnings(assumed: float, seen: SeenCommands, measured: float | None, source: str) -> list[str]:
-    if seen.delay_frames == assumed:
+def _delay_warnings(assumed_delay: float, seen: SeenCommands, measured_delay: float | None, source: str) -> list[str]:
+    if seen.delay_frames == assumed_delay:
         return []
     return [
-        f"the controller assumed a delay of {counted(assumed, 'frame')}, but measured from {source} it is "
-        f"{measured:.2f}: the law is made for {counted(seen.delay_frames, 'frame')}; set control.delay_frames"
+        f"the controller assumed a delay of {counted(assumed_delay, 'frame')}, but measured from {source} it is "
+        f"{measured_delay:.2f}: the law is made for {counted(seen.delay_frames, 'frame')}; set control.delay_frames"
     ]
 
 
@@ -239,7 +240,7 @@ def _weighting_warnings(state: wire.ControllerState | None, calibration: Calibra
 
 
 def _last_change(states: Sequence[wire.ControllerState], modes: int) -> int:
-    """Sequence of the frame after which the last law and gains were in force; 0 if they never changed."""
+    """Sequence of the frame after which the last law and gains came into force; 0 if they never changed."""
     newest, changed, before = 0, 0, None
     for state in states:
         newest = max(newest, state.frame_sequence)  # a state after a `clear` has the sequence 0
@@ -258,7 +259,7 @@ def _telemetry(
     rate_hz: float,
     timing: Timing,
     laws: tuple[Integrator, LinearLaw | None],
-    changed: int,
+    last_change: int,
     steps: Steps,
     usable: Mask,
     true_residual: tuple[Single | None, Single | None],
@@ -269,7 +270,7 @@ def _telemetry(
     """The usable steps after the closed loop has settled, or all usable steps if the former are too few.
 
     `laws` are the integrator and the linear law in force, if any. `true_residual` has the residual at the start of each
-    exposure and its rms over all time (steps, modes). The laws are in force since the frame `changed`.
+    exposure and its rms over all time (steps, modes). The laws are in force from the frame after `last_change` on.
     """
     was_closed, index = steps.mode == LoopMode.CLOSED, np.arange(len(steps.mode))
     frames_since = index - np.maximum.accumulate(np.where(was_closed, -1, index))  # since the loop was last not closed
@@ -295,12 +296,12 @@ def _telemetry(
         )
     if Limit.LAW_OVERRULED in count_reasons(steps.reasons[rows]):
         warnings = [*warnings, "in some of these frames the integrator drove in place of a law (LAW_OVERRULED)"]
-    under_law = rows & (steps.sequence > changed + settling)
+    under_law = rows & (steps.sequence > last_change + settling)
     last = np.count_nonzero(under_law)
-    extent = f"that of the last {last}, theory is for all of them"
+    extent = f"that of the last {last} frames, theory is for all of them"
     if last < FEWEST:
         under_law, extent = rows, "that of all of them, theory is for the last law and gains"
-    if closed and (steps.sequence[rows] <= changed).any():
+    if closed and (steps.sequence[rows] <= last_change).any():
         warnings = [*warnings, f"law or gains changed in these frames: the achieved residual is {extent}"]
     contrast = contrast_or_none(config) if config is not None and config.noll == calibration.noll else None
     finite = [None if each is None else each[under_law & np.isfinite(each).all(axis=1)] for each in true_residual]

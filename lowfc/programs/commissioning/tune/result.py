@@ -35,18 +35,18 @@ OPTICAL_GAIN_MAS = 10.0
 """Open-loop tilt, rms per axis, above which the optical gain of the sensor is low."""
 
 
-def tuned(run: Telemetry, controller: str) -> tuple[Tuned, Gains]:
+def tuned(data: Telemetry, controller: str) -> tuple[Tuned, Gains]:
     """The best law of a kind for a run; ValueError if there are too few frames, or no law of this kind is stable."""
-    leak = run.law.leak.astype(np.float64)
-    gains = best_gains(run.pol, run.rate_hz, run.timing, leak)
-    models = identify_modes(run.pol, run.rate_hz)
+    leak = data.law.leak.astype(np.float64)
+    gains = best_gains(data.pol, data.rate_hz, data.timing, leak)
+    models = identify_modes(data.pol, data.rate_hz)
     match controller:
         case "integrator":
-            return tune_integrator(models, gains, run.noll, leak, run.timing), gains
+            return tune_integrator(models, gains, data.noll, leak, data.timing), gains
         case "pi-notch":
-            return tune_pi_notch(models, gains, run.noll, leak, run.timing), gains
+            return tune_pi_notch(models, gains, data.noll, leak, data.timing), gains
         case _:
-            return tune_lqg(run.pol, models, gains, run.noll, leak, run.timing), gains
+            return tune_lqg(data.pol, models, gains, data.noll, leak, data.timing), gains
 
 
 class TunedMode(Result):
@@ -117,19 +117,19 @@ class TuneResult(Result):
         ]
 
 
-def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> TuneResult:
+def result_of(data: Telemetry, best: Tuned, gains: Gains, controller: str) -> TuneResult:
     """Predicted residual of a tuned law, with the residual of the run."""
-    now, stable = _present_law(run)
-    leak = run.law.leak.astype(np.float64)
-    integrators = tune_integrator(best.models, gains, run.noll, leak, run.timing)
-    now_nm = predicted_nm(now, best.models, run.timing) if stable else None
-    achieved_nm = _achieved_nm(run, gains.noise_nm)
-    has_truth = run.true_nm2 is not None or run.continuous_rms_nm is not None
-    if achieved_nm is not None and now_nm is not None and run.continuous_rms_nm is None:
+    now, stable = _present_law(data)
+    leak = data.law.leak.astype(np.float64)
+    integrators = tune_integrator(best.models, gains, data.noll, leak, data.timing)
+    now_nm = predicted_nm(now, best.models, data.timing) if stable else None
+    achieved_nm = _achieved_nm(data, gains.noise_nm)
+    has_truth = data.true_nm2 is not None or data.continuous_rms_nm is not None
+    if achieved_nm is not None and now_nm is not None and data.continuous_rms_nm is None:
         # The frames give the residual at one instant per frame; theory adds the residual between these instants.
-        sampled_nm = predicted_nm(now, best.models, Timing.sampled(run.timing.delay))
+        sampled_nm = predicted_nm(now, best.models, Timing.sampled(data.timing.delay))
         achieved_nm = np.sqrt(np.maximum(achieved_nm**2 + now_nm**2 - sampled_nm**2, 0.0))
-    mean_nm = max(run.pol.values, key=len).mean(axis=0)
+    mean_nm = max(data.pol.values, key=len).mean(axis=0)
 
     def with_mean(law: LinearLaw, changing_nm: Array) -> Array:
         """Rms (modes,) with the part of the disturbance's mean that a leak leaves; the models have no mean."""
@@ -141,7 +141,7 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
         "predicted_now_nm": None if now_nm is None else with_mean(now, now_nm),
         "predicted_nm": best_nm,
         "integrator_predicted_nm": integrator_nm,
-        "gain_now": None if run.driving else run.law.gain.astype(float).round(6),
+        "gain_now": None if data.driving else data.law.gain.astype(float).round(6),
         "gain_best": gains.gain.round(4),
         "phase_margin_deg": best.margins.phase_margin_deg,
         "max_rejection": best.margins.peak,
@@ -156,48 +156,48 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
             lines=_lines(best.models[k]),
             **{name: None if each is None else each[k] for name, each in columns.items()},
         )
-        for k, noll in enumerate(run.noll)
+        for k, noll in enumerate(data.noll)
     ]
     rms_nm = {
-        "open": np.sqrt(np.mean(run.pol.joined() ** 2, axis=0)),
+        "open": np.sqrt(np.mean(data.pol.joined() ** 2, axis=0)),
         "achieved": achieved_nm,
         "predicted": best_nm,
         "integrator_predicted": integrator_nm,
     }
-    tilt_mas = {name: _tilt_mas(run, each) for name, each in rms_nm.items()}
+    tilt_mas = {name: _tilt_mas(data, each) for name, each in rms_nm.items()}
     return TuneResult(
-        source=run.source,
+        source=data.source,
         controller=controller,
         law_now=now.name,
-        rate_hz=run.rate_hz,
-        delay_frames=run.timing.delay,
-        closed=run.closed,
-        frames_closed=run.frames_closed,
-        frames=run.pol.frames,
+        rate_hz=data.rate_hz,
+        delay_frames=data.timing.delay,
+        closed=data.closed,
+        frames_closed=data.frames_closed,
+        frames=data.pol.frames,
         achieved_from=None if achieved_nm is None else "truth" if has_truth else "error less noise",
         tilt_mas=tilt_mas,
-        added_contrast=_added_contrast(run, best, now, achieved_nm, best_nm),
+        added_contrast=_added_contrast(data, best, now, achieved_nm, best_nm),
         gain_margin=_finite(float(best.margins.gain_margin.min())),
         phase_margin_deg=best.margins.phase_margin_deg.min(),
         max_rejection=best.margins.peak.max(),
         modes=modes,
-        warnings=[*run.warnings, *_doubts(run, tilt_mas["open"], stable)],
+        warnings=[*data.warnings, *_doubts(data, tilt_mas["open"], stable)],
     )
 
 
-def picture(run: Telemetry, best: Tuned) -> bytes:
+def picture(data: Telemetry, best: Tuned) -> bytes:
     """PNG: spectra of the two largest modes: measured, modelled, and predicted with the present and the tuned law."""
     from lowfc.adapters.files.drawing import figure_class, png
 
     drawing = figure_class()(figsize=(10, 8), layout="constrained")
-    pol_spectrum = spectrum(run.pol, run.rate_hz)
+    pol_spectrum = spectrum(data.pol, data.rate_hz)
     assert pol_spectrum is not None  # noqa: S101  # tuning needs more frames than a spectrum
     largest = np.sort(np.argsort(-pol_spectrum.variance_nm2())[:2])
     shown_hz = pol_spectrum.frequency_hz[1:]
-    edges = np.append(shown_hz - pol_spectrum.spacing_hz / 2, shown_hz[-1]) * 2 * np.pi / run.rate_hz
+    edges = np.append(shown_hz - pol_spectrum.spacing_hz / 2, shown_hz[-1]) * 2 * np.pi / data.rate_hz
     noise_nm2 = np.array([each.noise_nm2 for each in best.models])
-    closed = spectrum(run.error, run.rate_hz) if run.closed else None
-    now, stable = _present_law(run)
+    closed = spectrum(data.error, data.rate_hz) if data.closed else None
+    now, stable = _present_law(data)
     for axes, mode in zip(drawing.subplots(2, 1, sharex=True), largest.tolist(), strict=False):
         omega = fine_frequencies(best.models[mode])
         modelled = best.models[mode].spectrum_nm2(omega) + noise_nm2[mode]
@@ -205,24 +205,24 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
         curves = {"model of the pseudo-open-loop": ("tab:blue", modelled)}
         laws = {"present law": ("black", now)} if stable else {}
         for name, (colour, law) in {**laws, f"tuned law ({best.kinds[mode]})": ("tab:green", best.law)}.items():
-            residual = residual_spectrum(law, omega, measured, noise_nm2, run.timing)[:, mode]
+            residual = residual_spectrum(law, omega, measured, noise_nm2, data.timing)[:, mode]
             curves[f"predicted true residual with the {name}"] = colour, residual
         axes.loglog(shown_hz, pol_spectrum.power_nm2_hz[1:, mode], color="0.6", label="pseudo-open-loop")
         if closed is not None:
             binned_hz, (power,) = in_bins(closed.frequency_hz, [closed.power_nm2_hz[:, mode]])
             axes.loglog(binned_hz, power, color="tab:orange", label="measured error")
         for label, (colour, power) in curves.items():
-            axes.loglog(shown_hz, 2 / run.rate_hz * _means(power, omega, edges), color=colour, lw=1, label=label)
-        axes.set(ylabel=f"Z{run.noll[mode]} {mode_name(run.noll[mode])}, nm$^2$/Hz")
+            axes.loglog(shown_hz, 2 / data.rate_hz * _means(power, omega, edges), color=colour, lw=1, label=label)
+        axes.set(ylabel=f"Z{data.noll[mode]} {mode_name(data.noll[mode])}, nm$^2$/Hz")
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2, frameon=False)  # above all lines
     axes.set(xlabel="frequency, Hz")
     return png(drawing)
 
 
-def _present_law(run: Telemetry) -> tuple[LinearLaw, bool]:
+def _present_law(data: Telemetry) -> tuple[LinearLaw, bool]:
     """The law in force, and whether it is stable with the run's delay."""
-    law = run.driving or integrator(run.law.gain, run.law.leak, run.noll, run.timing.delay, run.rate_hz)
-    return law, margins.margins(law, run.timing.delay).stable
+    law = data.driving or integrator(data.law.gain, data.law.leak, data.noll, data.timing.delay, data.rate_hz)
+    return law, margins.margins(law, data.timing.delay).stable
 
 
 def _means(power: Array, omega: Array, edges: Array) -> Array:
@@ -232,38 +232,38 @@ def _means(power: Array, omega: Array, edges: Array) -> Array:
 
 
 def _added_contrast(
-    run: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Array | None, best_nm: Array
+    data: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Array | None, best_nm: Array
 ) -> dict[str, Any] | None:
     """Contrast added to the dark zone: in open loop, in closed loop as measured, and predicted with the tuned law."""
-    if run.noise_nm2 is None:
+    if data.noise_nm2 is None:
         return None
-    opened, closed = run.pol.joined(), None
+    opened, closed = data.pol.joined(), None
     if closed_nm is not None:
-        instants_nm2 = run.true_nm2
+        instants_nm2 = data.true_nm2
         if instants_nm2 is None:  # predicted: the measured error contains noise that may exceed the residual
-            instants_nm2 = predicted_covariance_nm2(now, best.models, run.noise_nm2, run.timing)
+            instants_nm2 = predicted_covariance_nm2(now, best.models, data.noise_nm2, data.timing)
         closed = with_variances(instants_nm2, closed_nm)
     return added_contrast(
-        run.contrast,
+        data.contrast,
         {
-            "open": opened.T @ opened / len(opened) - frame_noise_nm2(best.models, run.noise_nm2),
+            "open": opened.T @ opened / len(opened) - frame_noise_nm2(best.models, data.noise_nm2),
             "closed": closed,
             "predicted": with_variances(
-                predicted_covariance_nm2(best.law, best.models, run.noise_nm2, run.timing), best_nm
+                predicted_covariance_nm2(best.law, best.models, data.noise_nm2, data.timing), best_nm
             ),
         },
     )
 
 
-def _achieved_nm(run: Telemetry, noise_nm: Array) -> Array | None:
-    """Rms (modes,) of the true residual, over all time if known; otherwise of the error minus the noise."""
-    if not run.closed:
+def _achieved_nm(data: Telemetry, noise_nm: Array) -> Array | None:
+    """Rms (modes,) of the true residual, over all time if known; else of the error less noise; None in open loop."""
+    if not data.closed:
         return None
-    if run.continuous_rms_nm is not None:
-        return run.continuous_rms_nm
-    if run.true_nm2 is not None:
-        return np.asarray(np.sqrt(np.diag(run.true_nm2)))
-    squares = np.mean(run.error.joined() ** 2, axis=0)
+    if data.continuous_rms_nm is not None:
+        return data.continuous_rms_nm
+    if data.true_nm2 is not None:
+        return np.asarray(np.sqrt(np.diag(data.true_nm2)))
+    squares = np.mean(data.error.joined() ** 2, axis=0)
     return np.asarray(np.sqrt(np.maximum(squares - noise_nm**2, 0.0)))
 
 
@@ -278,16 +278,16 @@ def _lines(model: Model) -> list[dict[str, float]]:
     ]
 
 
-def _tilt_mas(run: Telemetry, rms_nm: Array | None) -> float | None:
-    tilts = np.isin(run.noll, TIP_TILT)
-    if rms_nm is None or run.nm_per_mas is None or not tilts.any():
+def _tilt_mas(data: Telemetry, rms_nm: Array | None) -> float | None:
+    tilts = np.isin(data.noll, TIP_TILT)
+    if rms_nm is None or data.nm_per_mas is None or not tilts.any():
         return None
-    return float(np.sqrt(np.mean(rms_nm[tilts] ** 2))) / run.nm_per_mas
+    return float(np.sqrt(np.mean(rms_nm[tilts] ** 2))) / data.nm_per_mas
 
 
-def _doubts(run: Telemetry, open_mas: float | None, stable: bool) -> list[str]:
+def _doubts(data: Telemetry, open_mas: float | None, stable: bool) -> list[str]:
     doubts = []
-    if not run.closed and open_mas is not None and open_mas > OPTICAL_GAIN_MAS:
+    if not data.closed and open_mas is not None and open_mas > OPTICAL_GAIN_MAS:
         doubts.append(
             f"an open loop with {open_mas:.1f} mas rms of tilt per axis, above {OPTICAL_GAIN_MAS:g}: the optical gain "
             "of the sensor is low, and some lines are spurious; close the loop with any stable gain and tune again"
