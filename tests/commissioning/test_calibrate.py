@@ -67,7 +67,7 @@ def mode_of(loop: InProcessLoop) -> int:
 
 def calibrated(loop: InProcessLoop, method: str) -> tuple[Calibration, CalibrationData]:
     calibrator, data = measure(loop, method)
-    return measured_calibration(loop.config, calibrator.before, data.measured, calibrator.request)[0], data
+    return measured_calibration(loop.config, calibrator.in_use, data.measured, calibrator.request)[0], data
 
 
 @pytest.mark.parametrize(

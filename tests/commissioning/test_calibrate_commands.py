@@ -414,7 +414,7 @@ def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop)
         ("--method poke --config test.toml", "--config requires --method analytic"),
         ("--at 4=15", "--at requires --method analytic"),
         ("--compare one.fits other.fits --load", "--load has no effect with --compare"),
-        ("--method analytic --resume --snr 50", "--snr is for pokes, but --method analytic computes: omit it"),
+        ("--method analytic --resume --snr 50", "--snr is for pokes, but --method analytic computes H: omit it"),
         ("--method analytic --run bench", "--run has no effect with --method analytic unless --load"),
         ("dark --file cube.fits --frames 50", "--frames has no effect with --file"),
     ],

@@ -129,7 +129,7 @@ def test_disturbance_of_a_mode_is_not_mistaken_for_nonlinearity(scatter: float, 
     def cycle(*played: object) -> SimpleNamespace:
         return SimpleNamespace(response=first.response * next(answers))
 
-    player: Any = SimpleNamespace(before=first, cycle=cycle, report=lambda text: None)
+    player: Any = SimpleNamespace(in_use=first, cycle=cycle, report=lambda text: None)
     delay: Any = SimpleNamespace(delay_frames=1.0)
     assert linear_amplitude_nm(player, CONFIG, delay, 3.0) == chosen_nm
 
@@ -218,7 +218,7 @@ def test_tilt_is_poked_to_find_a_reflection_unless_the_sensor_is_another_one(noi
     image *= 1 + noise * np.random.default_rng(1).standard_normal(image.size)
     first_poke = Mock(side_effect=lambda mode, plan: Delay(1.0, 0.1, H[:, mode]))
     before = replace(first, reference=single(image))
-    player: Any = SimpleNamespace(before=before, report=lambda text: None, first_poke=first_poke)
+    player: Any = SimpleNamespace(in_use=before, report=lambda text: None, first_poke=first_poke)
     results: dict[str, Any] = {}
     aligned_calibration(player, config, first, Delay(1.0, 0.1, H[:, 0]), results)
     assert [call.args[0] for call in first_poke.call_args_list] == poked

@@ -53,22 +53,22 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
     require_folder(out)
     console = Console(stderr=True)
     with Client(run) as loop, loop.reserved("lowfc calibrate align"):
-        config, before = configuration_of(loop), replace(loop.calibration(), camera=loop.camera())
+        config, in_use = configuration_of(loop), replace(loop.calibration(), camera=loop.camera())
         pixels = next_frames(loop, frames)
-        check_size(pixels.shape[1:], before)
-        light_dn = pixels.mean(axis=0) - before.dark.reshape(before.shape).astype(np.float64)
+        check_size(pixels.shape[1:], in_use)
+        light_dn = pixels.mean(axis=0) - in_use.dark.reshape(in_use.shape).astype(np.float64)
         computed = analytic(config, console)
         with raised_as(CalibrationError, ValueError):
             model = computed.reference.astype(np.float64).reshape(computed.shape)
-            alignment = align(light_dn, model, before.good.reshape(before.shape) > 0)
-            before = replace(before, flux_dn=float(light_dn.reshape(-1) @ before.good))
-        player = Player(loop, on_sensor(config, computed, alignment.geometry, before), reporter(console))
+            alignment = align(light_dn, model, in_use.good.reshape(in_use.shape) > 0)
+            in_use = replace(in_use, flux_dn=float(light_dn.reshape(-1) @ in_use.good))
+        player = Player(loop, on_sensor(config, computed, alignment.geometry, in_use), reporter(console))
 
         def poke(mode: int) -> Array:
-            amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_nm(config, player.before)[mode]))
+            amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_nm(config, player.in_use)[mode]))
             return player.first_poke(mode, first_poke_plan(amplitude_nm)).response
 
-        alignment, calibration, mean_correlation = oriented(config, computed, alignment, before, poke)
+        alignment, calibration, mean_correlation = oriented(config, computed, alignment, in_use, poke)
         if mean_correlation < MIN_CORRELATION:
             raise CalibrationError(
                 f"the images of pokes do not resemble the computed ones: the correlation is {mean_correlation:.2f}, "
@@ -79,7 +79,7 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
     return AlignResult(
         **asdict(alignment.geometry),
         pixels_per_lambda_d=alignment.geometry.scale * computed_scale(config),
-        flux_dn=before.flux_dn,
+        flux_dn=in_use.flux_dn,
         background_dn=alignment.background,
         residual=alignment.residual,
         other_parity_residual=alignment.other_parity,
@@ -87,15 +87,15 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
     )
 
 
-def on_sensor(config: Configuration, computed: Calibration, geometry: Geometry, before: Calibration) -> Calibration:
-    """The computed calibration on the pixels of a real sensor, with flux, dark and mask of the calibration `before`.
+def on_sensor(config: Configuration, computed: Calibration, geometry: Geometry, in_use: Calibration) -> Calibration:
+    """The computed calibration on the pixels of a real sensor, with flux, dark and mask of the calibration `in_use`.
 
     CalibrationError if the good pixels see too little of the image.
     """
-    shape, pixels = (*computed.shape, -1), before.good.size  # shape: rows, columns, modes
-    I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, before.shape).reshape(-1)
-    H = onto(computed.response.astype(np.float64).reshape(shape), geometry, before.shape).reshape(pixels, -1)
-    good = before.good.astype(np.float64)
+    shape, pixels = (*computed.shape, -1), in_use.good.size  # shape: rows, columns, modes
+    I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, in_use.shape).reshape(-1)
+    H = onto(computed.response.astype(np.float64).reshape(shape), geometry, in_use.shape).reshape(pixels, -1)
+    good = in_use.good.astype(np.float64)
     with raised_as(CalibrationError, (ValueError, CalibrationError), "too little of the image falls on the sensor"):
         I0, H = normalise_flux(np.maximum(I0, 0), H, good)
         calibration = replace(
@@ -103,14 +103,14 @@ def on_sensor(config: Configuration, computed: Calibration, geometry: Geometry, 
             reference=single(I0),
             response=single(H),
             reconstructor=np.zeros(H.T.shape, np.float32),
-            good=before.good,
-            dark=before.dark,
-            shape=before.shape,
-            flux_dn=before.flux_dn,
-            saturation_dn=before.saturation_dn,
+            good=in_use.good,
+            dark=in_use.dark,
+            shape=in_use.shape,
+            flux_dn=in_use.flux_dn,
+            saturation_dn=in_use.saturation_dn,
             estimator=f"{config.control.estimator}+aligned",
             operator_hash="",
-            camera=before.camera,
+            camera=in_use.camera,
         )
         R = compute_reconstructor(config, calibration, None, estimator=config.control.estimator).matrix
     return identified(replace(calibration, reconstructor=single(R)))
@@ -120,12 +120,12 @@ def oriented(
     config: Configuration,
     computed: Calibration,
     alignment: Alignment,
-    before: Calibration,
+    in_use: Calibration,
     poke: Callable[[int], Array],
 ) -> tuple[Alignment, Calibration, float]:
     """Choose the orientation that fits pokes of tip, and of tilt if needed, among those that the image allows.
 
-    `poke` measures the response to a mode, given its index; other arguments as for `on_sensor`.
+    `poke` measures the response to the mode of an index; `alignment` is the image's fit; the others as for `on_sensor`.
 
     Returns:
         The alignment, its calibration, and the mean correlation of measured with computed responses.
@@ -135,7 +135,7 @@ def oriented(
     responses = [poke(mode) for mode in modes]
 
     def scored(geometry: Geometry) -> tuple[float, Calibration]:
-        calibration = on_sensor(config, computed, geometry, before)
+        calibration = on_sensor(config, computed, geometry, in_use)
         return float(np.mean([correlation(responses[k], calibration.response[:, k]) for k in modes])), calibration
 
     if alignment.circular:  # the responses' correlation is a cosine of the rotation: two values give its maximum
@@ -157,7 +157,7 @@ def computed_scale(config: Configuration) -> float:
     return 1 / (optics.pitch * optics.binning)
 
 
-def in_words(alignment: Alignment, scale: float) -> str:
+def geometry_in_words(alignment: Alignment, scale: float) -> str:
     """Text of the image's geometry and its residual; `scale` in pixels per lambda/D."""
     geometry = alignment.geometry
     return (

@@ -96,7 +96,7 @@ def calibrate(
     if method == "analytic":
         for option in ("--snr", "--amplitude", "--cycles", "--resume"):
             if option in options:
-                raise ConfigurationError(f"{option} is for pokes, but --method analytic computes: omit it")
+                raise ConfigurationError(f"{option} is for pokes, but --method analytic computes H: omit it")
         if "--run" in options and not load:
             raise ConfigurationError("--run has no effect with --method analytic unless --load is given: omit it")
         print_result(tasks.compute_calibration(config, request, at, run, load=load), as_json=as_json)
@@ -157,7 +157,7 @@ def reference(
 ) -> None:
     """Take the present wavefront as the zero point; write the calibration in use with the new reference image.
 
-    The wavefront need not be flat. H does not change: far from flat, measure it there with --method poke or hadamard,
+    The wavefront need not be flat. H does not change: far from flat, measure H there with --method poke or hadamard,
     or compute it with --method analytic --at.
 
     Example: lowfc calibrate reference --frames 5000 --out night.fits

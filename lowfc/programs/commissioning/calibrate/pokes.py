@@ -20,7 +20,7 @@ AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
 MIN_SNR = 20.0
 """Signal-to-noise ratio required by default if the number of cycles is given."""
 FULL_AMPLITUDE_SNR = 70.0
-"""Signal-to-noise ratio above which the default amplitude is reduced: third-order errors grow as its square."""
+"""Signal-to-noise ratio above which the default amplitude is reduced: relative errors grow as the amplitude squared."""
 MAX_HADAMARD_NM = 3.0
 """Largest amplitude of a mode, nm rms: all modes at once add up to some four times that, within the linear range."""
 SETTLE = 2
@@ -107,7 +107,10 @@ class Pokes:
         return max(ceil(frames / self.cycle(0).per_column), MIN_CYCLES)
 
     def more_cycles(self, cycles: int, error: float) -> int:
-        """Cycles required, given the error after `cycles`; `cycles` itself if they suffice or too many are required."""
+        """Number of cycles required, given the standard error of R H after `cycles` cycles.
+
+        `cycles` itself if these suffice, or if too many would be required.
+        """
         if self._request.cycles is not None or error * self._request.snr <= 1:
             return cycles
         needed = cycles_for(self._request.snr, cycles, error)
@@ -166,13 +169,13 @@ def _largest_move_nm(config: Configuration) -> float:
 
 
 def default_nm(method: str, snr: float) -> float:
-    """Default amplitude of a mode, nm rms: halved above `FULL_AMPLITUDE_SNR`, and again for each factor of four."""
+    """Default amplitude of a mode, nm rms: halved above `FULL_AMPLITUDE_SNR`, and again above 4, 16, ... times it."""
     halvings = max(0, ceil(log(snr / FULL_AMPLITUDE_SNR, 4)))
     return float(AMPLITUDE_NM[method] / 2**halvings)
 
 
 def cycles_for(snr: float, cycles: int, error: float) -> int:
-    """Number of cycles to reach a signal-to-noise ratio, given the standard error `error` after `cycles` cycles."""
+    """Number of cycles to reach a signal-to-noise ratio, given the standard `error` of R H after `cycles` cycles."""
     return max(ceil(min(cycles * (error * snr / MARGIN) ** 2, 1e9)), cycles + 1)
 
 

@@ -140,9 +140,9 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
 
 
 def await_mirror(loop: Client) -> None:
-    """Wait, before a probe sequence, until the controller knows that the mirror follows; at most `FAULT_S`.
+    """Wait until the controller reports no fault of the mirror, as a probe sequence requires; at most `FAULT_S`.
 
-    The first state of a restarted mirror arrives up to 0.1 s before the end of its fault.
+    After a restart of the mirror, its first state arrives up to 0.1 s before the controller ends the fault.
     """
     deadline_s = monotonic() + FAULT_S
     while (state := loop.status().state) and state.mirror_fault and monotonic() < deadline_s:
@@ -154,17 +154,17 @@ def next_frames(loop: Client, count: int) -> Pixels:
     return np.array([image.pixels for image in loop.frames(count)])
 
 
-def check_size(shape: tuple[int, ...], before: Calibration) -> None:
+def check_size(shape: tuple[int, ...], in_use: Calibration) -> None:
     """CalibrationError unless the frames have the size (rows, columns) of the calibration in use."""
-    if shape != before.shape:
+    if shape != in_use.shape:
         raise CalibrationError(
             f"the frames have {shape[0]} x {shape[1]} pixels and are refused as WRONG_SIZE: the calibration in use, "
-            f"with its dark and bad pixels, is for {before.shape[0]} x {before.shape[1]}: load one for these frames, "
+            f"with its dark and bad pixels, is for {in_use.shape[0]} x {in_use.shape[1]}: load one for these frames, "
             "or measure one with `lowfc commission`"
         )
 
 
-def warn_of_additions(loop: Client, report: Report) -> None:
+def warn_of_added_shapes(loop: Client, report: Report) -> None:
     """Warn of an offset and channels that a new reference image contains: a loop with this image adds them again."""
     state = loop.status().state or wire.ControllerState()
     added = [f"channel {channel.name}" for channel in state.channels if channel.shifts]
@@ -258,13 +258,13 @@ class Player:
 
     Attributes:
         loop: connection to the controller.
-        before: calibration in use: dark, good pixels, reference image and the mirror's commands.
+        in_use: calibration in use: dark, good pixels, reference image and the mirror's commands.
         report: function that receives the reason if a sequence is repeated.
         closed: whether the loop is closed and corrects the pokes.
     """
 
     loop: Client
-    before: Calibration
+    in_use: Calibration
     report: Report
     closed: bool = False
 
@@ -285,7 +285,7 @@ class Player:
         command = recording.command_nm[: len(plan), mode] if self.closed else None
         try:
             fractions, _ = self._normalised(recording)
-            reference = self.before.reference.astype(float)
+            reference = self.in_use.reference.astype(float)
             return measure_delay(fractions[: len(plan)], reference, plan.table[:, 0], command)
         except NotSeenError as error:
             raise PokesNotSeenError(str(error)) from None
@@ -306,10 +306,10 @@ class Player:
         return self._repeated(attempt, "a cycle is repeated", "no cycle was usable")
 
     def _play(self, plan: Plan, modes: slice = slice(None)) -> Recording:
-        return play(self.loop, self.before.modes_to_actuators.T[modes], plan.table)
+        return play(self.loop, self.in_use.modes_to_actuators.T[modes], plan.table)
 
     def _normalised(self, recording: Recording) -> tuple[Array, Array]:
-        return normalised(recording.pixels, self.before.dark.astype(float), self.before.good.astype(float))
+        return normalised(recording.pixels, self.in_use.dark.astype(float), self.in_use.good.astype(float))
 
     def _repeated(self, attempt: Callable[[], T], repeat_text: str, failure_text: str) -> T:
         for _ in range(ATTEMPTS):

@@ -26,7 +26,7 @@ from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrat
 MAX_NOISE_RATIO = 1.5
 """Largest accepted ratio of the noise of the measured R to that of the computed R, at the same flux. A sensor far from
 its zero point exceeds it."""
-_OTHER_SENSOR = 0.5  # error of an element of R H from which on a model is of another sensor or orientation
+_MAX_MODEL_ERROR = 0.5  # of an element of R H; a model with more is of another sensor or orientation
 DELAY_TOLERANCE_FRAMES = 0.1
 """Largest difference between measured and configured delay without a warning, frames."""
 
@@ -87,7 +87,7 @@ class CalibrationResult(Verdict, CalibrationProperties):
 
 
 class Comparison(Result):
-    """Differences of two calibrations: `estimators` and `bad_pixels` of each of the two, other lists by mode."""
+    """Differences of two calibrations; `estimators` and `bad_pixels` are lists by calibration, the others by mode."""
 
     modes: int = result_field("modes")
     noll: list[int] = result_field("mode", form="Z{}", column=True)
@@ -104,7 +104,7 @@ class Comparison(Result):
 def finish_calibration(calibrator: Calibrator, data: CalibrationData) -> tuple[Calibration, CalibrationResult]:
     """Compute R, check it on separate frames, and write the file; under another name if R is not recommended."""
     config, request, computed, measured = calibrator.config, calibrator.request, calibrator.computed, data.measured
-    calibration, quality = measured_calibration(config, calibrator.before, measured, request)
+    calibration, reconstruction = measured_calibration(config, calibrator.in_use, measured, request)
     check = calibrator.check(calibration, data)
     delay_frames, delay_error_frames = data.delay[:2]
     fields: dict[str, Any] = {
@@ -121,7 +121,7 @@ def finish_calibration(calibrator: Calibrator, data: CalibrationData) -> tuple[C
     verdict = judge(request.snr, measured.cycles, measured.error, check, ratio, calibration.noll)
     out = request.out  # a calibration that is not recommended does not replace it
     file = out.with_name(f"{out.stem}.rejected{out.suffix}") if verdict.faults else out
-    result = result_of(config, calibration, quality, request.method, file, **fields, **verdict.json_object())
+    result = result_of(config, calibration, reconstruction, request.method, file, **fields, **verdict.json_object())
     calibration_file.save(calibration, file)
     configured = configured_delay(config)
     if abs(delay_frames - configured) > DELAY_TOLERANCE_FRAMES:
@@ -145,13 +145,13 @@ def compute_reconstructor(
 
 
 def measured_calibration(
-    config: Configuration, before: Calibration, measured: Measured, request: CalibrationRequest
+    config: Configuration, in_use: Calibration, measured: Measured, request: CalibrationRequest
 ) -> tuple[Calibration, Reconstruction]:
     """The calibration from cycles of pokes, with dark, mask and mirror commands of the previous one."""
     estimators = dict.fromkeys([*measured.initial.estimator.removesuffix(FIRST).split("+"), request.method])
     calibration = replace(
-        before,
-        reference=before.reference if measured.reference is None else single(measured.reference),
+        in_use,
+        reference=in_use.reference if measured.reference is None else single(measured.reference),
         response=single(measured.response),
         flux_dn=measured.flux_dn,
         estimator="+".join(estimators),
@@ -160,13 +160,13 @@ def measured_calibration(
     reconstruction = compute_reconstructor(
         config, calibration, measured.initial.matrix, truncate=request.truncate, tikhonov=request.tikhonov
     )
-    actuators = single(_actuators_to_modes(config, before, reconstruction.matrix, measured.response))
+    actuators = single(_actuators_to_modes(config, in_use, reconstruction.matrix, measured.response))
     calibration = replace(calibration, reconstructor=single(reconstruction.matrix), actuators_to_modes=actuators)
     return identified(calibration), reconstruction
 
 
 def computed_noise_nm(config: Configuration, calibration: Calibration, computed: Calibration) -> Array | None:
-    """Noise (modes,) of a computed reconstructor at the flux of a calibration, nm; None for another sensor."""
+    """Noise (modes,) of a computed reconstructor at the flux of a calibration, nm; None if it is of another sensor."""
     if not comparable(calibration, computed):
         return None
     return factory.frame_noise_nm(config, replace(calibration, reconstructor=computed.reconstructor * calibration.good))
@@ -220,7 +220,7 @@ def judge(
         noll: Noll index of each mode.
     """
     reached = 1 / max(float(error.max()), 1e-300)
-    rms, largest = MAX_ELEMENT_RMS / required_snr, MAX_ELEMENT / required_snr
+    rms_limit, largest_limit = MAX_ELEMENT_RMS / required_snr, MAX_ELEMENT / required_snr
     faults = []
     if reached < required_snr:
         needed = cycles_for(required_snr, cycles, float(error.max()))
@@ -229,11 +229,11 @@ def judge(
             f"what disturbs this mode, or measure about {needed} cycles (repeat the command with --resume --snr "
             f"{required_snr:g} --cycles {needed})"
         )
-    if not check.within(rms, largest):
+    if not check.within(rms_limit, largest_limit):
         faults.append(
-            f"cross-talk on separate frames: rms {check.rms:.3g} (limit {rms:.3g}), largest {check.largest:.3g} (limit "
-            f"{check.bound(largest):.3g}, with noise): did the wavefront, the flux or the sensor change during the "
-            "calibration?"
+            f"cross-talk on separate frames: rms {check.rms:.3g} (limit {rms_limit:.3g}), largest {check.largest:.3g} "
+            f"(limit {check.bound(largest_limit):.3g}, with noise): did the wavefront, the flux or the sensor "
+            "change during the calibration?"
         )
     if noise_ratio is not None and noise_ratio.max() > MAX_NOISE_RATIO:
         faults.append(
@@ -247,10 +247,10 @@ def judge(
         check_cycles=check.cycles,
         check_cross_talk_rms=check.rms,
         check_cross_talk_max=check.largest,
-        check_cross_talk_bound=check.bound(largest),
+        check_cross_talk_bound=check.bound(largest_limit),
         check_error=float(check.error.max()),
-        promised_cross_talk_rms=rms,
-        promised_cross_talk_max=largest,
+        promised_cross_talk_rms=rms_limit,
+        promised_cross_talk_max=largest_limit,
         recommended=not faults,
         faults=faults,
     )
@@ -285,7 +285,7 @@ def comparison(first: Calibration, second: Calibration) -> Comparison:
     )
 
 
-def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array, response: Array) -> Array:
+def _actuators_to_modes(config: Configuration, in_use: Calibration, matrix: Array, response: Array) -> Array:
     """Modes (modes, actuators) that R measures per nm of each actuator.
 
     The result agrees with the measurement for the mirror's modal shapes, and with the optical model for other shapes.
@@ -296,27 +296,27 @@ def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Arra
     orientation than the model, the result for other shapes is that of the calibration in use, or else that of their
     projection onto the modal shapes.
     """
-    commands, own = before.modes_to_actuators.astype(np.float64), before.actuators_to_modes.astype(np.float64)
+    commands, previous = in_use.modes_to_actuators.astype(np.float64), in_use.actuators_to_modes.astype(np.float64)
     inverse, product = np.linalg.pinv(commands), matrix @ response  # R H is the identity unless R is regularised
     optics = factory.twin(config, None, lambda _: None)
     twin_image = twin_reference(optics)
     candidates = []
-    if twin_image.shape == before.shape:
+    if twin_image.shape == in_use.shape:
         on_nodes = factory.mirror_on_twin(config, optics, lambda _: None)
         modelled = factory.actuators_to_modes(
-            matrix, twin_image.reshape(-1), before.good.astype(float), optics, on_nodes
+            matrix, twin_image.reshape(-1), in_use.good.astype(float), optics, on_nodes
         )
-        if own.size:
-            modelled[:, ~own.any(axis=0)] = 0  # actuators that are not active
+        if previous.size:
+            modelled[:, ~previous.any(axis=0)] = 0  # actuators that are not active
         candidates.append(modelled)
-    if own.size:
-        candidates.append(matrix @ np.linalg.pinv(before.reconstructor.astype(np.float64)) @ own)
-    symmetric = any(noll_to_orders(index)[1] == 0 for index in before.noll)
+    if previous.size:
+        candidates.append(matrix @ np.linalg.pinv(in_use.reconstructor.astype(np.float64)) @ previous)
+    symmetric = any(noll_to_orders(index)[1] == 0 for index in in_use.noll)
     for candidate in candidates:
         modes = candidate @ commands
         factor = float(np.vdot(modes, product)) / (float(np.vdot(modes, modes)) or 1.0)
         error = factor * modes - product
-        if (factor > 0 or symmetric) and np.abs(error).max() < _OTHER_SENSOR:
+        if (factor > 0 or symmetric) and np.abs(error).max() < _MAX_MODEL_ERROR:
             return np.asarray(factor * candidate - error @ inverse)
     return np.asarray(product @ inverse)
 

@@ -37,7 +37,7 @@ from lowfc.control.calibration.response_fit import (
 from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, check_cycles
-from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size, warn_of_additions
+from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size, warn_of_added_shapes
 
 _MIN_CORRELATION = 0.3
 """A smaller correlation of the first poke's image with the calibration in use is reported as a warning."""
@@ -57,7 +57,7 @@ class Calibrator:
         request: the requested calibration.
         computed: the computed calibration.
         config: configuration of the loop.
-        before: calibration in use.
+        in_use: calibration in use.
         pokes: the probe sequences.
         completed: number of completed cycles stored for --resume.
     """
@@ -83,20 +83,20 @@ class Calibrator:
         self.request = request
         self._report = report
         self.config = configuration_of(loop)
-        self.before = replace(loop.calibration(), camera=loop.camera())
-        if self.before.camera is not None:
-            check_size(self.before.camera.shape, self.before)
+        self.in_use = replace(loop.calibration(), camera=loop.camera())
+        if self.in_use.camera is not None:
+            check_size(self.in_use.camera.shape, self.in_use)
         self.computed = computed
         self._closed = request.method == "in-loop"
         if not self._closed:  # the in-loop method keeps the reference image
-            warn_of_additions(loop, report)
-        self.pokes = Pokes(self.config, self.before, request)
+            warn_of_added_shapes(loop, report)
+        self.pokes = Pokes(self.config, self.in_use, request)
         self._progress = progress
-        self._player = Player(loop, self.before, report, self._closed)
+        self._player = Player(loop, self.in_use, report, self._closed)
         self._conditions: dict[str, Any] = {
             "method": request.method,
             "amplitude_nm": self.pokes.amplitude_nm,
-            "calibration": self.before.id,
+            "calibration": self.in_use.id,
         }
         self._resumed = resumed(partial_path(request.out), self._conditions) if request.resume else None
         self.completed = self._resumed.cycles if self._resumed else 0
@@ -157,7 +157,7 @@ class Calibrator:
     @property
     def _quietest_mode(self) -> int:
         """Index of the mode with the lowest noise; tip and tilt, the most disturbed, only if there is no other."""
-        tilt = np.isin(self.before.noll, TIP_TILT)
+        tilt = np.isin(self.in_use.noll, TIP_TILT)
         return int(np.where(tilt & ~tilt.all(), np.inf, self.pokes.noise_nm).argmin())
 
     def delay(self) -> Delay:
@@ -168,23 +168,23 @@ class Calibrator:
         delay = self._player.first_poke(mode, plan)
         self._compare_response(delay.response, mode)
         self._report(
-            f"pokes of Z{self.before.noll[mode]} are detected after {delay.delay_frames:.3f} +- "
+            f"pokes of Z{self.in_use.noll[mode]} are detected after {delay.delay_frames:.3f} +- "
             f"{delay.error_frames:.3f} frames, {delay.delay_frames * self.config.period_ns * 1e-6:.3g} ms (from the "
             "end of an exposure to the end of the exposure that sees the resulting command)"
         )
         return delay
 
     def _compare_response(self, response: Array, mode: int) -> None:
-        expected = self.before.response[:, mode].astype(np.float64)
+        expected = self.in_use.response[:, mode].astype(np.float64)
         image_correlation = correlation(response, expected)
         if abs(image_correlation) < _MIN_CORRELATION:
             self._report(
-                f"warning: the image of Z{self.before.noll[mode]} differs from that of the calibration in use "
+                f"warning: the image of Z{self.in_use.noll[mode]} differs from that of the calibration in use "
                 f"(correlation {image_correlation:.2f}): is the sensor aligned (`lowfc calibrate align`)?"
             )
         elif image_correlation < 0:
             self._report(
-                f"warning: Z{self.before.noll[mode]} has the opposite sign of the calibration in use: the mirror or "
+                f"warning: Z{self.in_use.noll[mode]} has the opposite sign of the calibration in use: the mirror or "
                 "the camera is reflected or rotated; do not close the loop with that calibration"
             )
 
@@ -227,10 +227,10 @@ class Calibrator:
 
     def _initial(self, delay: Delay) -> Initial:
         """The initial R of the fit: the computed R, unless the R in use measures pokes with less noise."""
-        before = self.before
-        usable = [each for each in (self.computed, before) if comparable(each, before)]
-        candidates = [Initial(each.reconstructor.astype(np.float64) * before.good, each.estimator) for each in usable]
-        full_rank = [each for each in candidates if np.linalg.matrix_rank(each.matrix) == len(before.noll)]
+        in_use = self.in_use
+        usable = [each for each in (self.computed, in_use) if comparable(each, in_use)]
+        candidates = [Initial(each.reconstructor.astype(np.float64) * in_use.good, each.estimator) for each in usable]
+        full_rank = [each for each in candidates if np.linalg.matrix_rank(each.matrix) == len(in_use.noll)]
         if not full_rank:
             raise CalibrationError(
                 "neither the optical model nor the calibration in use distinguishes all modes on these pixels, as R "
@@ -238,8 +238,8 @@ class Calibrator:
             )
         camera = factory.detector(self.config)
         variance = pixel_variance(
-            before.reference.astype(np.float64),
-            before.flux_dn * camera.gain_e_per_dn / camera.em_gain,
+            in_use.reference.astype(np.float64),
+            in_use.flux_dn * camera.gain_e_per_dn / camera.em_gain,
             factory.equivalent_read_noise_e(camera),
         )
         return best_initial(full_rank, delay.response, self._quietest_mode, variance)
@@ -264,8 +264,8 @@ def resumed(path: Path, conditions: dict[str, Any]) -> Sums:
     for key, value in conditions.items():
         if stored.get(key) != value:
             raise DataFileError(
-                f"{path} is of another calibration: {key} is {stored.get(key)} in the file, now {value}; remove the "
-                "file, or omit --resume"
+                f"{path} belongs to another calibration: {key} is {stored.get(key)} in the file, but {value} now; "
+                "remove the file, or omit --resume"
             )
     return sums
 

@@ -32,7 +32,7 @@ from lowfc.programs.cli.modes import HIGHEST
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.analytic import WavefrontFunction, analytic
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
-from lowfc.programs.commissioning.calibrate.recording import Report, check_size, next_frames, warn_of_additions
+from lowfc.programs.commissioning.calibrate.recording import Report, check_size, next_frames, warn_of_added_shapes
 from lowfc.programs.commissioning.calibrate.result import (
     CalibrationResult,
     compute_reconstructor,
@@ -107,21 +107,21 @@ def compute_calibration(
     # with fitted nuisance parameters, R does not follow from I0 and H
     initial = calibration.reconstructor.astype(np.float64) if config.control.nuisance else None
     options = {"truncate": request.truncate, "tikhonov": request.tikhonov}
-    quality = compute_reconstructor(config, calibration, initial, estimator=config.control.estimator, **options)
+    reconstruction = compute_reconstructor(config, calibration, initial, estimator=config.control.estimator, **options)
     if name:
         calibration = replace(calibration, estimator=f"{calibration.estimator}+at {name}")
     if request.truncate or request.tikhonov:
-        R, measured = quality.matrix, quality.matrix @ calibration.response  # what R measures of each mode
-        actuators = single(measured @ calibration.actuators_to_modes)
+        R = reconstruction.matrix
+        actuators = single(R @ calibration.response @ calibration.actuators_to_modes)  # R H: what R measures of a mode
         estimator = f"{calibration.estimator}+regularised"
         calibration = replace(calibration, reconstructor=single(R), actuators_to_modes=actuators, estimator=estimator)
     with Client(run) if load else contextlib.nullcontext() as loop:
         calibration = write(calibration, request.out, loop)
-    return result_of(config, calibration, quality, "analytic", request.out)
+    return result_of(config, calibration, reconstruction, "analytic", request.out)
 
 
 def zero_point(config: Configuration, text: str) -> tuple[str, WavefrontFunction]:
-    """The wavefront of --at: modes as in 4=15,7=-10, Noll index = nm rms, or a file as for `lowfc ctl channel`.
+    """The wavefront of --at: modes as in 4=15,7=-10 (Noll index = nm rms), or a file as for `lowfc ctl channel`.
 
     Returns:
         The wavefront's name in a calibration, and the function that computes it.
@@ -157,15 +157,15 @@ def _modes(text: str) -> dict[int, float]:
 def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, load: bool) -> DarkResult:
     """Write the calibration in use with a new dark and mask, from the loop's frames or a cube."""
     require_folder(out)
-    with Client(run) as loop, _in_use(loop) as (before, noise_and_gain):
+    with Client(run) as loop, _in_use(loop) as (in_use, noise_and_gain):
         cube = next_frames(loop, frames) if file is None else images(file)
         if file is None:
-            check_size(cube.shape[1:], before)
-        elif cube.shape[1:] != before.shape:
-            raise DataFileError(f"{file}: its frames have {cube.shape[1:]} pixels, the calibration {before.shape}")
+            check_size(cube.shape[1:], in_use)
+        elif cube.shape[1:] != in_use.shape:
+            raise DataFileError(f"{file}: its frames have {cube.shape[1:]} pixels, the calibration {in_use.shape}")
         measured = measure_dark(cube.reshape(len(cube), -1))
-        check_dark(measured.dark_dn, before.reference.astype(np.float64), before.flux_dn)
-        calibration = with_dark(before, measured.dark_dn, measured.good, *noise_and_gain)
+        check_dark(measured.dark_dn, in_use.reference.astype(np.float64), in_use.flux_dn)
+        calibration = with_dark(in_use, measured.dark_dn, measured.good, *noise_and_gain)
         write(calibration, out, loop if load else None)
     counts = {name: int(np.count_nonzero(getattr(measured, name))) for name in ("hot", "noisy", "dead")}
     level, noise_dn = float(np.median(measured.dark_dn)), float(np.median(measured.noise_dn))
@@ -175,22 +175,22 @@ def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, loa
 def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> ReferenceResult:
     """Write the calibration in use with the present image as its reference."""
     require_folder(out)
-    with Client(run) as loop, loop.reserved("lowfc calibrate reference"), _in_use(loop) as (before, noise_and_gain):
-        warn_of_additions(loop, reporter(Console(stderr=True)))
+    with Client(run) as loop, loop.reserved("lowfc calibrate reference"), _in_use(loop) as (in_use, noise_and_gain):
+        warn_of_added_shapes(loop, reporter(Console(stderr=True)))
         cube = next_frames(loop, frames)
         loop.check_lease()  # without the lease another client may have changed the mirror's shape and the zero point
-        check_size(cube.shape[1:], before)
+        check_size(cube.shape[1:], in_use)
         pixels, allowed = cube.reshape(frames, -1), configuration_of(loop).control.max_saturated_pixels
-        if (saturated := max(saturated_pixels(before, frame) for frame in pixels)) > allowed:
+        if (saturated := max(saturated_pixels(in_use, frame) for frame in pixels)) > allowed:
             raise CalibrationError(
-                f"a frame has {counted(saturated, 'good pixel')} at full well, {before.saturation_dn:g} DN; the loop "
+                f"a frame has {counted(saturated, 'good pixel')} at full well, {in_use.saturation_dn:g} DN; the loop "
                 f"uses frames with at most {allowed}: shorten the exposure, or dim the star"
             )
-        light, flux = normalised(pixels, before.dark.astype(np.float64), before.good.astype(np.float64))
+        light, flux = normalised(pixels, in_use.dark.astype(np.float64), in_use.good.astype(np.float64))
         image = light.mean(axis=0)
-        calibration = with_reference(before, image, float(flux.mean()), *noise_and_gain)
+        calibration = with_reference(in_use, image, float(flux.mean()), *noise_and_gain)
         calibration = write(calibration, out, loop if load else None)
-    shift = before.reconstructor.astype(np.float64) @ (image - before.reference)
+    shift = in_use.reconstructor.astype(np.float64) @ (image - in_use.reference)
     shift_nm, noll = shift.tolist(), list(calibration.noll)
     return ReferenceResult(
         frames=frames, noll=noll, reference_shift_nm=shift_nm, flux_dn=calibration.flux_dn, file=str(out)
@@ -202,11 +202,11 @@ def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
     """Context with the calibration in use, and the camera's read noise per pixel, e-, and gain, e-/DN."""
     camera = factory.detector(configuration_of(loop))
     noise_and_gain = factory.equivalent_read_noise_e(camera), camera.gain_e_per_dn / camera.em_gain
-    before = replace(loop.calibration(), camera=loop.camera())
-    if before.camera is not None:  # also with frames from a file: the calibration is written with this camera
-        check_size(before.camera.shape, before)
+    in_use = replace(loop.calibration(), camera=loop.camera())
+    if in_use.camera is not None:  # also with frames from a file: the calibration is written with this camera
+        check_size(in_use.camera.shape, in_use)
     with raised_as(CalibrationError, ValueError):
-        yield before, noise_and_gain
+        yield in_use, noise_and_gain
 
 
 def write(calibration: Calibration, out: Path, loop: Client | None) -> Calibration:

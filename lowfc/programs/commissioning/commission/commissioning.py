@@ -99,22 +99,22 @@ class Commissioning:
 
     def run(self) -> tuple[dict[str, Any], str]:
         """Carry out all steps; return the results, and the text to print without --json."""
-        options, first_file = self._options, provisional_path(self._options.out)
-        if options.resume and not first_file.is_file():
+        options, provisional_file = self._options, provisional_path(self._options.out)
+        if options.resume and not provisional_file.is_file():
             if options.out.is_file():
                 raise CalibrationError(
                     f"nothing to resume: {options.out} is finished; `lowfc ctl load {options.out}` loads it; --force "
                     "in place of --resume starts a new commissioning"
                 )
             self._report(f"nothing to resume beside {options.out}: starting from the beginning")
-        before = self._prepare_loop()
+        previous = self._prepare_loop()
         try:
-            return self._carry_out(first_file)
+            return self._carry_out(provisional_file)
         except BaseException:
-            self._report(self._how_to_continue(before))
+            self._report(self._how_to_continue(previous))
             raise
 
-    def _how_to_continue(self, before: Calibration | None) -> str:
+    def _how_to_continue(self, previous: Calibration | None) -> str:
         """Text after a commissioning that ended early: the calibration in use, and how to continue."""
         if self._advice:
             return self._advice
@@ -122,39 +122,41 @@ class Commissioning:
             return "no calibration was changed"
         text = f"the completed steps are kept in {self._provisional_file}: the same command with --resume continues"
         with contextlib.suppress(LowfcError):
-            if before is not None:
+            if previous is not None:
                 self._loop.check_lease()
-                self._loop.load(before)
+                self._loop.load(previous)
                 return f"{text}; the previous calibration is in use again"
         return (
             f"{text}; until then the provisional calibration of this commissioning is in use, without a verdict: "
             "`lowfc ctl load FILE` loads another one"
         )
 
-    def _carry_out(self, first_file: Path) -> tuple[dict[str, Any], str]:
+    def _carry_out(self, provisional_file: Path) -> tuple[dict[str, Any], str]:
         options, config = self._options, self._config
-        resumed = options.resume and first_file.is_file()
+        resumed = options.resume and provisional_file.is_file()
         if resumed:
-            first, commands = calibration_file.load(first_file), self._computed.modes_to_actuators
-            same_modes = first.noll == self._computed.noll and first.grid == self._computed.grid
-            if not (same_modes and np.allclose(first.modes_to_actuators, commands, atol=1e-3)):
+            provisional, commands = calibration_file.load(provisional_file), self._computed.modes_to_actuators
+            same_modes = provisional.noll == self._computed.noll and provisional.grid == self._computed.grid
+            if not (same_modes and np.allclose(provisional.modes_to_actuators, commands, atol=1e-3)):
                 raise CalibrationError(
-                    f"{first_file} has other modes or mirror commands than the configuration: omit --resume"
+                    f"{provisional_file} has other modes or mirror commands than the configuration: omit --resume"
                 )
             camera = self._loop.camera()
-            if camera is not None and camera.shape != first.shape:
+            if camera is not None and camera.shape != provisional.shape:
                 raise CalibrationError(
-                    f"{first_file} is for frames of {first.shape[0]} x {first.shape[1]} pixels, the camera's are "
-                    f"{camera.shape[0]} x {camera.shape[1]}: omit --resume"
+                    f"{provisional_file} is for frames of {provisional.shape[0]} x {provisional.shape[1]} pixels, "
+                    f"the camera's are {camera.shape[0]} x {camera.shape[1]}: omit --resume"
                 )
-            self._report(f"resuming from {first_file} with its dark: --dark, --no-dark and --frames have no effect")
+            self._report(
+                f"resuming from {provisional_file} with its dark: --dark, --no-dark and --frames have no effect"
+            )
         else:
-            first, delay = self._provisional()
-            calibration_file.save(first, first_file)
+            provisional, delay = self._measure_provisional()
+            calibration_file.save(provisional, provisional_file)
             partial_path(options.out).unlink(missing_ok=True)  # cycles of a former commissioning
-        self._provisional_file = first_file
-        self._loop.load(first)
-        player = Player(self._loop, first, self._report)
+        self._provisional_file = provisional_file
+        self._loop.load(provisional)
+        player = Player(self._loop, provisional, self._report)
         if resumed:
             delay = first_calibration.first_delay(player, config)
         has_cycles = resumed and partial_path(options.out).is_file()
@@ -162,7 +164,7 @@ class Commissioning:
             amplitude_nm = float(stored_cycles(partial_path(options.out))[0]["amplitude_nm"])
         else:
             self._announce("poke amplitude")
-            default_nm = Pokes(config, first, self._request()).amplitude_nm
+            default_nm = Pokes(config, provisional, self._request()).amplitude_nm
             amplitude_nm = first_calibration.linear_amplitude_nm(player, config, delay, default_nm)
         self._announce("response")
         request = self._request(amplitude_nm, resume=has_cycles)
@@ -178,7 +180,7 @@ class Commissioning:
             )
         self._loop.load(calibration)
         self._advice = f"the calibration is good, saved in {options.out} and loaded: `lowfc ctl close` closes the loop"
-        for path in (first_file, partial_path(options.out)):
+        for path in (provisional_file, partial_path(options.out)):
             path.unlink(missing_ok=True)
         self._report(result.text())
         return self._results, self._predict_and_close(delay.delay_frames)
@@ -213,7 +215,7 @@ class Commissioning:
             raise CalibrationError("the controller did not report its state")
         return state
 
-    def _provisional(self) -> tuple[Calibration, Delay]:
+    def _measure_provisional(self) -> tuple[Calibration, Delay]:
         """Measure the provisional calibration (dark, reference image, a first response) and the delay."""
         self._announce("camera")
         frames = list(self._loop.frames(CAMERA_FRAMES))
@@ -230,17 +232,17 @@ class Commissioning:
             sensor = with_measured_dark(camera, next_frames(self._loop, options.frames), self._report)
             self._confirm("unblock the star; is it visible?")
         self._announce("reference image")
-        before = calibration_with_reference(
+        without_response = calibration_with_reference(
             sensor, next_frames(self._loop, options.frames), self._computed, self._report
         )
         self._announce("delay")
-        player = Player(self._loop, before, self._report)
+        player = Player(self._loop, without_response, self._report)
         delay = first_calibration.first_delay(player, self._config)
         self._announce("orientation and sign")
-        first = first_calibration.aligned_calibration(player, self._config, self._computed, delay, self._results)
-        if first is None:
-            first = first_calibration.poked_calibration(player, self._config, delay)
-        return first, delay
+        provisional = first_calibration.aligned_calibration(player, self._config, self._computed, delay, self._results)
+        if provisional is None:
+            provisional = first_calibration.poked_calibration(player, self._config, delay)
+        return provisional, delay
 
     def _predict_and_close(self, delay_frames: float) -> str:
         """Predict the residual; if requested, close the loop and compare."""
@@ -251,18 +253,18 @@ class Commissioning:
             opened = self._observe(frames)
             weights = delay_weights(max(delay_frames, 1.0)).astype(np.float32)
             missing = missing_before(opened.sequence)
-            predicted = _rms_nm(counterfactual(controller, weights, opened.pol_nm, missing)[0], settling)
-        self._results["predicted_error_nm"] = predicted
+            predicted_nm = _rms_nm(counterfactual(controller, weights, opened.pol_nm, missing)[0], settling)
+        self._results["predicted_error_nm"] = predicted_nm
         gain = f", at a gain of {CHECK_GAIN:g} in place of automatic gains" if automatic else ""
-        text = (
-            f"predicted error with noise in closed loop{gain}: {predicted:.3g} nm rms, from {frames} open-loop frames"
-        )
+        prediction = f"predicted error with noise in closed loop{gain}: {predicted_nm:.3g} nm rms"
+        text = f"{prediction}, from {frames} open-loop frames"
         if not self._options.close:
             return f"{text}\n`lowfc ctl close` closes the loop"
         self._announce("closed loop")
         with self._fixed_gains(automatic):
-            measured = self._measured_nm(frames, settling, predicted)
-        return f"{text}\nmeasured in closed loop: {measured:.3g} nm rms, {measured / predicted:.2f} of the prediction"
+            measured_nm = self._measured_nm(frames, settling, predicted_nm)
+        ratio = measured_nm / predicted_nm
+        return f"{text}\nmeasured in closed loop: {measured_nm:.3g} nm rms, {ratio:.2f} times the prediction"
 
     def _law_of_check(self) -> tuple[Controller, int, list[int]]:
         """Controller of the closed-loop check, its settling time in frames, and the modes with automatic gains.
@@ -297,8 +299,11 @@ class Commissioning:
                     f"{','.join(map(str, modes))}` makes them automatic again"
                 )
 
-    def _measured_nm(self, frames: int, settling: int, predicted: float) -> float:
-        """Close the loop and measure its error, nm rms; a failure opens it, unless another operator ended the lease."""
+    def _measured_nm(self, frames: int, settling: int, predicted_nm: float) -> float:
+        """Close the loop and measure its error, nm rms.
+
+        A failure opens the loop again, unless another operator ended the lease.
+        """
         first = self._loop.close_loop().frame_sequence
         try:
             closed = self._observe(frames, LoopMode.CLOSED, first)
@@ -307,12 +312,12 @@ class Commissioning:
                 "predicted: check the sign of the mirror, the delay and the disturbance before you close it; "
                 "`lowfc ctl reset` removes the loop's command from the mirror"
             )
-            measured = _rms_nm(closed.error_nm, settling)
-            self._results["measured_error_nm"] = measured
-            if measured > MAX_ERROR_RATIO * predicted:
+            measured_nm = _rms_nm(closed.error_nm, settling)
+            self._results["measured_error_nm"] = measured_nm
+            if measured_nm > MAX_ERROR_RATIO * predicted_nm:
                 raise CalibrationError(
-                    f"the measured error in closed loop is {measured:.3g} nm rms, but {predicted:.3g} was predicted: "
-                    "are sign and delay right, did the disturbance change? The loop is opened"
+                    f"the measured error in closed loop is {measured_nm:.3g} nm rms, but {predicted_nm:.3g} was "
+                    "predicted: are sign and delay right, did the disturbance change? The loop is opened"
                 )
         except BaseException as error:
             with contextlib.suppress(LowfcError):
@@ -321,7 +326,7 @@ class Commissioning:
             if isinstance(error, ValueError):
                 raise CalibrationError(f"the residual cannot be measured: {error}") from None
             raise
-        return measured
+        return measured_nm
 
     def _observe(self, frames: int, mode: LoopMode = LoopMode.OPEN, first: int = 0) -> Steps:
         steps: list[Step] = []

@@ -14,7 +14,13 @@ from lowfc.control.calibration.alignment import align
 from lowfc.control.calibration.calibration import FIRST, Calibration
 from lowfc.control.calibration.delay_fit import Delay
 from lowfc.control.calibration.response_fit import correlation
-from lowfc.programs.commissioning.calibrate.align import MIN_CORRELATION, computed_scale, in_words, on_sensor, oriented
+from lowfc.programs.commissioning.calibrate.align import (
+    MIN_CORRELATION,
+    computed_scale,
+    geometry_in_words,
+    on_sensor,
+    oriented,
+)
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, first_poke_plan, largest_nm
 from lowfc.programs.commissioning.calibrate.recording import TRAILING_FRAMES, Player, PokesNotSeenError
 from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
@@ -23,8 +29,8 @@ FIRST_NM = AMPLITUDE_NM["poke"]
 MAX_FIRST_NM = 32.0
 """Largest amplitude of the first pokes, which is doubled until they are detected, nm rms of wavefront."""
 MAX_MISFIT = 0.35
-"""If the rms difference of the image and the fitted computed image, relative to the image's rms, is larger, the sensor
-is not the configured one."""
+"""Largest rms difference of the image from the fitted computed image, relative to the image's rms, at which the sensor
+is the configured one."""
 CYCLES = 12  # cycles of pokes that measure the response without an optical model
 MAX_NONLINEARITY = 0.1
 """Largest relative difference of the gains at full and half amplitude, beyond `_STANDARD_ERRORS` standard errors."""
@@ -33,8 +39,8 @@ _STANDARD_ERRORS = 3.0
 
 def first_delay(player: Player, config: Configuration, mode: int = 0) -> Delay:
     """Delay and image of a poke of a mode, with increasing amplitude until it is detected."""
-    before, report = player.before, player.report
-    amplitude_nm, most_nm = FIRST_NM, float(largest_nm(config, before)[mode])
+    in_use, report = player.in_use, player.report
+    amplitude_nm, most_nm = FIRST_NM, float(largest_nm(config, in_use)[mode])
     while True:
         amplitude_nm = min(amplitude_nm, most_nm)
         try:
@@ -46,7 +52,7 @@ def first_delay(player: Player, config: Configuration, mode: int = 0) -> Delay:
             report(f"pokes of {amplitude_nm:g} nm are not detected: amplitude doubled")
             amplitude_nm *= 2
     report(
-        f"pokes of Z{before.noll[mode]} of {amplitude_nm:g} nm are detected after {delay.delay_frames:.3f} +- "
+        f"pokes of Z{in_use.noll[mode]} of {amplitude_nm:g} nm are detected after {delay.delay_frames:.3f} +- "
         f"{delay.error_frames:.3f} frames, {delay.delay_frames * config.period_ns * 1e-6:.3g} ms"
     )
     return delay
@@ -59,12 +65,12 @@ def aligned_calibration(
 
     None if the sensor is not the configured one. The sensor's geometry is added to `results`.
     """
-    before, report = player.before, player.report
-    image = (before.reference * before.flux_dn).reshape(before.shape).astype(np.float64)
+    in_use, report = player.in_use, player.report
+    image = (in_use.reference * in_use.flux_dn).reshape(in_use.shape).astype(np.float64)
     model = computed.reference.astype(np.float64).reshape(computed.shape)
     try:
-        alignment = align(image, model, before.good.reshape(before.shape) > 0)
-        calibration = on_sensor(config, computed, alignment.geometry, before)
+        alignment = align(image, model, in_use.good.reshape(in_use.shape) > 0)
+        calibration = on_sensor(config, computed, alignment.geometry, in_use)
     except (ValueError, CalibrationError) as error:
         report(f"the image cannot be compared with the computed one: {error}")
         return None
@@ -74,10 +80,11 @@ def aligned_calibration(
         def poke(mode: int) -> Array:
             return (first_delay(player, config, mode) if mode else first_poke).response
 
-        alignment, calibration, poke_correlation = oriented(config, computed, alignment, before, poke)
+        alignment, calibration, poke_correlation = oriented(config, computed, alignment, in_use, poke)
     scale = alignment.geometry.scale * computed_scale(config)
     report(
-        f"{in_words(alignment, scale)}; correlation of the poke's image with the computed one: {poke_correlation:.2f}"
+        f"{geometry_in_words(alignment, scale)}; correlation of the poke's image with the computed one: "
+        f"{poke_correlation:.2f}"
     )
     if alignment.residual > MAX_MISFIT or poke_correlation < MIN_CORRELATION:
         report("this is not the configured sensor: the response is measured without the optical model")
@@ -89,20 +96,20 @@ def aligned_calibration(
         "image_residual": alignment.residual,
         "poke_correlation": poke_correlation,
     }
-    calibration = replace(calibration, reference=before.reference, estimator=f"{calibration.estimator}{FIRST}")
+    calibration = replace(calibration, reference=in_use.reference, estimator=f"{calibration.estimator}{FIRST}")
     return identified(calibration)
 
 
 def poked_calibration(player: Player, config: Configuration, delay: Delay) -> Calibration:
     """A calibration from pokes of each mode, without an optical model."""
-    before, modes = player.before, len(player.before.noll)
-    amplitude_nm = min(FIRST_NM, float(largest_nm(config, before).min()))
-    response = np.zeros_like(before.response, dtype=np.float64)
+    in_use, modes = player.in_use, len(player.in_use.noll)
+    amplitude_nm = min(FIRST_NM, float(largest_nm(config, in_use).min()))
+    response = np.zeros_like(in_use.response, dtype=np.float64)
     _report_time(player, config, CYCLES)
     for number in range(CYCLES):
         plan = _poke_cycle(modes, amplitude_nm, number)
         response += player.cycle(plan, delay.delay_frames).response / CYCLES
-    calibration = replace(before, response=single(response), estimator=f"{config.control.estimator}+poke{FIRST}")
+    calibration = replace(in_use, response=single(response), estimator=f"{config.control.estimator}+poke{FIRST}")
     matrix = compute_reconstructor(config, calibration, None).matrix
     player.report(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")
     return identified(replace(calibration, reconstructor=single(matrix)))
@@ -113,9 +120,9 @@ def linear_amplitude_nm(player: Player, config: Configuration, delay: Delay, def
 
     It is `default_nm`, halved if single pokes at full and half amplitude show that the sensor is not linear.
     """
-    first = player.before
-    R, modes = first.reconstructor.astype(np.float64), len(first.noll)
-    top_nm = min(FIRST_NM, float(largest_nm(config, first).min()))
+    provisional = player.in_use
+    R, modes = provisional.reconstructor.astype(np.float64), len(provisional.noll)
+    top_nm = min(FIRST_NM, float(largest_nm(config, provisional).min()))
     gains = np.empty((2, 2, modes))
     _report_time(player, config, gains[..., 0].size)
     for level, amplitude_nm in enumerate((top_nm, top_nm / 2)):
@@ -123,19 +130,19 @@ def linear_amplitude_nm(player: Player, config: Configuration, delay: Delay, def
             plan = _poke_cycle(modes, amplitude_nm, repetition)
             gains[level, repetition] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
     difference = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
-    variance = gains.var(axis=1, ddof=1).mean(axis=0)  # of one gain, and of the difference of two means of two
+    variance = gains.var(axis=1, ddof=1).mean(axis=0)  # of one gain, and of the difference of means of two gains each
     error = np.sqrt(np.maximum(variance, variance.mean()))
     worst = int((difference - _STANDARD_ERRORS * error).argmax())
     chosen_nm = default_nm / 2 if difference[worst] > MAX_NONLINEARITY + _STANDARD_ERRORS * error[worst] else default_nm
     player.report(
         f"the gains at {top_nm:.3g} nm and at half of that differ by {difference[worst]:.1%} (+- {error[worst]:.1%}; "
-        f"Z{first.noll[worst]}); amplitude of each mode: {chosen_nm:.3g} nm"
+        f"Z{provisional.noll[worst]}); amplitude of each mode: {chosen_nm:.3g} nm"
     )
     return chosen_nm
 
 
 def _report_time(player: Player, config: Configuration, cycles: int) -> None:
-    frames = len(_poke_cycle(len(player.before.noll), 1.0, 0)) + TRAILING_FRAMES
+    frames = len(_poke_cycle(len(player.in_use.noll), 1.0, 0)) + TRAILING_FRAMES
     player.report(f"{cycles} cycles of {frames} frames; about {cycles * frames / config.camera.rate_hz:.0f} s to go")
 
 

@@ -22,7 +22,7 @@ from lowfc.programs.commissioning.conformance.settings import agreement_checks
 
 MAX_RATE_DIFFERENCE = 0.05
 """Largest relative difference between the rate from the frames' times and the rate in the camera's settings."""
-_FULL = 0.9  # brightest pixel allowed, as a fraction of saturation
+_MAX_BRIGHTNESS = 0.9  # of a good pixel, as a fraction of saturation
 _NS = 1e9
 
 
@@ -94,7 +94,7 @@ def calibration_with_reference(
     """
     pixels, saturation_dn = frames.reshape(len(frames), -1), float(sensor.camera.saturation_dn)
     brightest_dn = int((pixels.max(axis=0) * (sensor.good > 0)).max())
-    if brightest_dn > _FULL * saturation_dn:
+    if brightest_dn > _MAX_BRIGHTNESS * saturation_dn:
         raise CalibrationError(
             f"the brightest good pixel is at {brightest_dn} of {saturation_dn:g} DN; shorten the exposure until this "
             "pixel is below half of full well; a hot pixel is excluded by a dark, but not with --no-dark"
